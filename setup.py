@@ -21,8 +21,9 @@ def repository_url() -> str:
     """
     url = os.environ.get("LIDAR_REPOSITORY_URL", "")
     if not url and (ROOT / ".git").exists():
-        asked = subprocess.run(["git", "-C", str(ROOT), "config", "remote.origin.url"],
-                               capture_output=True, text=True, check=False)
+        asked = subprocess.run(
+            ["git", "-C", str(ROOT), "config", "remote.origin.url"], capture_output=True, text=True, check=False
+        )
         url = re.sub(r"^git@([^:]+):", r"https://\1/", asked.stdout.strip())
     return url.removesuffix(".git").rstrip("/") if url.startswith("https://") else ""
 
@@ -36,8 +37,12 @@ def index_page(text: str, url: str) -> str:
 
 
 def project_urls(url: str) -> dict[str, str]:
-    pages = {"Source": "", "Documentation": "/tree/main/docs", "Issues": "/issues",
-             "Changelog": "/blob/main/CHANGELOG.md"}
+    pages = {
+        "Source": "",
+        "Documentation": "/tree/main/docs",
+        "Issues": "/issues",
+        "Changelog": "/blob/main/CHANGELOG.md",
+    }
     return {name: url + path for name, path in pages.items()} if url else {}
 
 
@@ -58,15 +63,25 @@ setup(
     name=NAME,
     version=VERSION,
     description="LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned "
-                "detectors, tracks, a simulator and training",
+    "detectors, tracks, a simulator and training",
     long_description=index_page((ROOT / "README.md").read_text(), URL),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
     url=URL or None,
     project_urls=project_urls(URL),
     maintainer="lidar_perception maintainers",
-    keywords=["lidar", "point cloud", "3D object detection", "ROS 2", "PointPillars", "tracking",
-              "KITTI", "ground segmentation", "clustering", "pedestrian detection"],
+    keywords=[
+        "lidar",
+        "point cloud",
+        "3D object detection",
+        "ROS 2",
+        "PointPillars",
+        "tracking",
+        "KITTI",
+        "ground segmentation",
+        "clustering",
+        "pedestrian detection",
+    ],
     classifiers=[
         "Development Status :: 4 - Beta",
         "Intended Audience :: Developers",
@@ -81,9 +96,15 @@ setup(
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "lidar_studio*", "msg_utils*"]),
     package_data={
-        NAME: ["py.typed", "nodes/*.xml", "candidates/*.json",
-               "simulation/sensors/*.yaml", "detectors/fused/*.json",
-               "detectors/pointnet/weights/*", "detectors/pointpillars/weights/pointpillars_v4_*"],
+        NAME: [
+            "py.typed",
+            "nodes/*.xml",
+            "candidates/*.json",
+            "simulation/sensors/*.yaml",
+            "detectors/fused/*.json",
+            "detectors/pointnet/weights/*",
+            "detectors/pointpillars/weights/pointpillars_v4_*",
+        ],
         "lidar_studio": ["py.typed", "page/*"],
         "msg_utils": ["py.typed"],
     },
@@ -96,16 +117,39 @@ setup(
         (f"lib/{NAME}", glob("scripts/nodes/*")),  # where ros2 run looks, and nowhere else
     ],
     install_requires=[
-        "click>=8.1", "matplotlib>=3.7", "lz4>=4.0", "mcap>=1.2",
-        "numba>=0.59", "numpy>=1.26", "pillow>=9.4", "pyyaml>=6", "rich>=13",
-        "rosbags>=0.11.6", "ruamel.yaml.clib>=0.2.12", "safetensors>=0.4", "scikit-learn>=1.3",
-        "scipy>=1.11", "threadpoolctl>=3.1", "torch>=2.2", "zstandard>=0.21",
+        "click>=8.1",
+        "matplotlib>=3.7",
+        "lz4>=4.0",
+        "mcap>=1.2",
+        "numba>=0.59",
+        "numpy>=1.26",
+        "pillow>=9.4",
+        "pyyaml>=6",
+        "rich>=13",
+        "rosbags>=0.11.6",
+        "ruamel.yaml.clib>=0.2.12",
+        "safetensors>=0.4",
+        "scikit-learn>=1.3",
+        "scipy>=1.11",
+        "threadpoolctl>=3.1",
+        "torch>=2.2",
+        "zstandard>=0.21",
     ],
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
-        "test": ["pytest>=7.4", "hypothesis>=6.90", "mypy>=1.15", "opencv-python-headless>=4.8",
-                 "playwright>=1.50", "pypatchworkpp>=1.0", "pytest-cov>=7.0",
-                 "pytest-xdist>=3.7", "ruff>=0.9", "setuptools>=70.1", "shapely>=2.0"],
+        "test": [
+            "pytest>=7.4",
+            "hypothesis>=6.90",
+            "mypy>=1.15",
+            "opencv-python-headless>=4.8",
+            "playwright>=1.50",
+            "pypatchworkpp>=1.0",
+            "pytest-cov>=7.0",
+            "pytest-xdist>=3.7",
+            "ruff>=0.9",
+            "setuptools>=70.1",
+            "shapely>=2.0",
+        ],
         "studio": ["aiohttp>=3.9"],
         "docs": ["mkdocs-material>=9.5", "mkdocstrings[python]>=0.26"],
         "distributed": ["distributed>=2024.1"],
@@ -113,8 +157,12 @@ setup(
         "onnx": ["onnx>=1.16", "onnxruntime>=1.18", "onnxscript>=0.2", "torch>=2.6"],
         "train": ["tensorboard>=2.15"],
         "video": ["av>=14"],
-        "benchmark": ["cloth-simulation-filter>=1.1.5", "dbscan>=1.0",
-                      "opencv-python-headless>=4.8", "pypatchworkpp>=1.0"],
+        "benchmark": [
+            "cloth-simulation-filter>=1.1.5",
+            "dbscan>=1.0",
+            "opencv-python-headless>=4.8",
+            "pypatchworkpp>=1.0",
+        ],
     },
     entry_points={"console_scripts": ["lidar-perception = lidar_perception.cli.entry:main"]},
     zip_safe=False,

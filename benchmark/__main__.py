@@ -38,25 +38,46 @@ from lidar_perception.scoring.centres.report import select_pedestrians
 from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
-FULL_SCAN = 60_000   # points; a scan cut to the camera's view has some 20,000
-FEW = 3              # with fewer pedestrian frames, frames without pedestrians are used too
+FULL_SCAN = 60_000  # points; a scan cut to the camera's view has some 20,000
+FEW = 3  # with fewer pedestrian frames, frames without pedestrians are used too
 
 
 @click.command(context_settings=dict(help_option_names=["-h", "--help"]))
-@click.option("--data", type=click.Path(path_type=Path), required=True, metavar="PATH",
-              multiple=True, help="A recording with Pedestrian labels and a camera, such as KITTI. "
-              "A second one, with labelled points (SemanticKITTI), scores the ground methods too, "
-              "and one with track ids (KITTI tracking) the trackers.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
-              help="Write the figures to this file.")
-@click.option("--repeat", type=click.IntRange(1), default=5, show_default=True,
-              help="Runs per frame; the median counts. Fewer for slow peers.")
-@click.option("--frames", "count", type=click.IntRange(1), default=8, show_default=True,
-              help="Frames for the single algorithms, evenly spread over the recording.")
-@click.option("--graph/--no-graph", default=True, show_default=True,
-              help="Also replay a bag of the frames through the nodes at 10 Hz.")
-def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int,
-         graph: bool) -> None:
+@click.option(
+    "--data",
+    type=click.Path(path_type=Path),
+    required=True,
+    metavar="PATH",
+    multiple=True,
+    help="A recording with Pedestrian labels and a camera, such as KITTI. "
+    "A second one, with labelled points (SemanticKITTI), scores the ground methods too, "
+    "and one with track ids (KITTI tracking) the trackers.",
+)
+@click.option(
+    "--json", "json_file", type=click.Path(path_type=Path), metavar="FILE", help="Write the figures to this file."
+)
+@click.option(
+    "--repeat",
+    type=click.IntRange(1),
+    default=5,
+    show_default=True,
+    help="Runs per frame; the median counts. Fewer for slow peers.",
+)
+@click.option(
+    "--frames",
+    "count",
+    type=click.IntRange(1),
+    default=8,
+    show_default=True,
+    help="Frames for the single algorithms, evenly spread over the recording.",
+)
+@click.option(
+    "--graph/--no-graph",
+    default=True,
+    show_default=True,
+    help="Also replay a bag of the frames through the nodes at 10 Hz.",
+)
+def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int, graph: bool) -> None:
     """Time our candidate pipeline and a plain scikit-learn + OpenCV implementation of the paper,
     each algorithm and its peers, and the steps of every version of EG-PointPillars and of the
     PointNet detector. Peers that are not installed are left out.
@@ -73,17 +94,22 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     frames = [f for f in recording if len(select_pedestrians(f.truth()))]
     if not frames:
         raise InputError(f"{recording.path} has no frame with a Pedestrian label")
-    labelled = [f for each in recordings if POINT_LABELS in each.has
-                for f in choose_evenly(each.frames, count)]
+    labelled = [f for each in recordings if POINT_LABELS in each.has for f in choose_evenly(each.frames, count)]
     warm_up()
     content: dict[str, Any] = {
-        "machine": {"cpu": read_cpu_name(), "cores": os.cpu_count(),
-                    "python": platform.python_version(), "numpy": np.__version__},
+        "machine": {
+            "cpu": read_cpu_name(),
+            "cores": os.cpu_count(),
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+        },
         "peers": {p.package: p.version() for p in peers.ALL},
-        "candidates": compare_candidates(frames, repeat)}
+        "candidates": compare_candidates(frames, repeat),
+    }
     print_comparison(content["candidates"])
-    in_view = [crop_to_view(f, camera, ViewParams(enabled=True))[1].xyz
-               for f, camera in _with_camera(recording, frames, count)]
+    in_view = [
+        crop_to_view(f, camera, ViewParams(enabled=True))[1].xyz for f, camera in _with_camera(recording, frames, count)
+    ]
     scans = _full_scans(recording, count)
     content |= _measure(in_view, scans, repeat)
     if scans:
@@ -123,10 +149,14 @@ def _full_scans(recording: Recording, count: int) -> list[PointCloud]:
 def _measure(in_view: list[np.ndarray], scans: list[PointCloud], repeat: int) -> dict:
     """Measure and print each algorithm and its peers."""
     whole = [f.xyz for f in scans]
-    near, far, rest = ([xyz.compress(~segment(xyz), axis=0) for xyz in clouds]
-                       for clouds, segment in ((in_view, segment_by_threshold),
-                                               (whole, segment_by_threshold),
-                                               (whole, segment_by_cloth)))
+    near, far, rest = (
+        [xyz.compress(~segment(xyz), axis=0) for xyz in clouds]
+        for clouds, segment in (
+            (in_view, segment_by_threshold),
+            (whole, segment_by_threshold),
+            (whole, segment_by_cloth),
+        )
+    )
     content = {}
 
     def show(name: str, result: dict) -> None:

@@ -24,37 +24,41 @@ def compare_candidates(frames: list[Frame], repeat: int) -> dict:
     ours: dict[str, list[float]] = {}
     plain: dict[str, list[float]] = {}
     best: dict[str, list[float]] = {}
-    agree = {"frames": len(frames), "labels_identical": 0, "candidates_same_given_ground": 0,
-             "candidates": 0, "candidates_same": 0}
+    agree = {
+        "frames": len(frames),
+        "labels_identical": 0,
+        "candidates_same_given_ground": 0,
+        "candidates": 0,
+        "candidates_same": 0,
+    }
     for f in show_progress(frames, "timing", len(frames)):
         truth, scan, camera = select_pedestrians(f.truth()), f.load(), f.camera()
         arguments = scan.xyz, camera.projection, camera.width, camera.height, truth
         theirs = [plain_stm_cpa.candidates(*arguments) for _ in range(min(repeat, 3))]
-        mine = [find_candidates(scan, make_truth_source(truth), camera, PAPER)
-                for _ in range(repeat)]
+        mine = [find_candidates(scan, make_truth_source(truth), camera, PAPER) for _ in range(repeat)]
         _median_of_steps(plain, [r["ms"] for r in theirs])
         _median_of_steps(ours, [found.ms for _, found in mine])
-        _median_of_steps(best, [find_candidates(scan, make_truth_source(truth), camera, BEST)[1].ms
-                                for _ in range(repeat)])
+        _median_of_steps(
+            best, [find_candidates(scan, make_truth_source(truth), camera, BEST)[1].ms for _ in range(repeat)]
+        )
         result = theirs[0]
         # The same ground for both: then clusters must be identical, and so the candidates.
         ids = cluster_obstacles(result["points"], result["ground"], PAPER.clustering)
         agree["labels_identical"] += np.array_equal(ids, result["labels"])
         boxes = fit_grounded_boxes(result["points"], result["ground"], ids)
-        segmented = SegmentedCloud(np.arange(len(ids)), result["points"], result["ground"], ids,
-                                   boxes)
+        segmented = SegmentedCloud(np.arange(len(ids)), result["points"], result["ground"], ids, boxes)
         found = refine_segmented(segmented, make_truth_source(truth), PAPER)
         agree["candidates_same_given_ground"] += all(
-            len(getattr(found, s))
-            == len(result[s])
-            == _count_shared(getattr(found, s).boxes, result[s])
+            len(getattr(found, s)) == len(result[s]) == _count_shared(getattr(found, s).boxes, result[s])
             for s in STAGES
         )
         # Each with its own RANSAC.
         agree["candidates"] += max(len(mine[0][1].final), len(result["final"]))
         agree["candidates_same"] += _count_shared(mine[0][1].final.boxes, result["final"])
-    medians = {name: {k: float(np.median(v)) for k, v in steps.items()}
-               for name, steps in (("ours_ms", ours), ("plain_ms", plain), ("best_ms", best))}
+    medians = {
+        name: {k: float(np.median(v)) for k, v in steps.items()}
+        for name, steps in (("ours_ms", ours), ("plain_ms", plain), ("best_ms", best))
+    }
     ratios = {k: medians["plain_ms"][k] / medians["ours_ms"][k] for k in medians["plain_ms"]}
     return {**medians, "times_faster": ratios, "agreement": agree}
 
@@ -79,14 +83,20 @@ def print_comparison(content: dict) -> None:
         table.add_column(name, justify="left" if name == "step" else "right")
     for step, best in content["best_ms"].items():
         peer = content["plain_ms"].get(step)
-        table.add_row(step, "" if peer is None else f"{peer:.2f}",
-                      f"{content['ours_ms'][step]:.2f}",
-                      "" if peer is None else f"{content['times_faster'][step]:.1f}", f"{best:.2f}",
-                      style="bold" if step == "total" else "")
+        table.add_row(
+            step,
+            "" if peer is None else f"{peer:.2f}",
+            f"{content['ours_ms'][step]:.2f}",
+            "" if peer is None else f"{content['times_faster'][step]:.1f}",
+            f"{best:.2f}",
+            style="bold" if step == "total" else "",
+        )
     console.print(table)
     agree = content["agreement"]
-    console.print(f"cluster labels identical in {agree['labels_identical']} of {agree['frames']} "
-                  "frames, border points included; candidates of all stages the same in "
-                  f"{agree['candidates_same_given_ground']} (same ground for both); with each "
-                  f"its own RANSAC {agree['candidates_same']} of {agree['candidates']} final "
-                  "candidates are the same")
+    console.print(
+        f"cluster labels identical in {agree['labels_identical']} of {agree['frames']} "
+        "frames, border points included; candidates of all stages the same in "
+        f"{agree['candidates_same_given_ground']} (same ground for both); with each "
+        f"its own RANSAC {agree['candidates_same']} of {agree['candidates']} final "
+        "candidates are the same"
+    )

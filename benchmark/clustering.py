@@ -37,19 +37,17 @@ def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: fl
         ([p for p in here if p == peers.WHEEL], partial(run_in_child, measure_dbscans)),
     ):
         if group:
-            times, same, differ = run([peers.DBSCANS.index(p) for p in group], clouds, repeat,
-                                      title)
+            times, same, differ = run([peers.DBSCANS.index(p) for p in group], clouds, repeat, title)
             ms |= times
-            rows |= {p.name: compute_speedup(p.name, times, None, same[p.name], differ[p.name])
-                     for p in group}
+            rows |= {p.name: compute_speedup(p.name, times, None, same[p.name], differ[p.name]) for p in group}
     faster = min((p.name for p in peers.SKLEARN), key=lambda name: ms[name])
     rows[faster] = add_target(rows[faster], target)
-    return make_measurement(title, len(clouds), np.median([len(c) for c in clouds]),
-                            list(rows.values()))
+    return make_measurement(title, len(clouds), np.median([len(c) for c in clouds]), list(rows.values()))
 
 
-def measure_dbscans(chosen: list[int], clouds: list[np.ndarray], repeat: int,
-                    title: str) -> tuple[dict, Counter, Counter]:
+def measure_dbscans(
+    chosen: list[int], clouds: list[np.ndarray], repeat: int, title: str
+) -> tuple[dict, Counter, Counter]:
     """Measure our DBSCAN and the chosen peers.
 
     chosen are indices into peers.DBSCANS, which can be sent to a child process. Returns median
@@ -59,8 +57,10 @@ def measure_dbscans(chosen: list[int], clouds: list[np.ndarray], repeat: int,
     group = [peers.DBSCANS[i] for i in chosen]
 
     def calls(xyz):
-        return {**{p.name: partial(peers.by_bands, p.run, xyz) for p in group},
-                "ours": partial(distance_aware_dbscan, xyz)}
+        return {
+            **{p.name: partial(peers.by_bands, p.run, xyz) for p in group},
+            "ours": partial(distance_aware_dbscan, xyz),
+        }
 
     clock = Clock(repeat, calls(thin(clouds[0])))
     same: Counter[str] = Counter()
@@ -70,8 +70,9 @@ def measure_dbscans(chosen: list[int], clouds: list[np.ndarray], repeat: int,
         ours, core = found["ours"], find_core_points(xyz)
         for p in group:
             theirs = found[p.name]
-            same[p.name] += (np.array_equal(theirs, ours) if p in peers.SKLEARN
-                             else have_same_clusters(theirs, ours, core))
+            same[p.name] += (
+                np.array_equal(theirs, ours) if p in peers.SKLEARN else have_same_clusters(theirs, ours, core)
+            )
             differ[p.name] += int(((theirs == 0) != (ours == 0)).sum())
     return clock.medians(), same, differ
 
@@ -86,8 +87,7 @@ def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> 
         clouds, repeat = choose_evenly(clouds, (len(clouds) + 1) // 2), min(repeat, SLOW_REPEAT)
 
     def calls(xyz):
-        return {PLAIN: partial(plain_euclidean.euclidean, xyz, params),
-                "ours": partial(cluster_euclidean, xyz, params)}
+        return {PLAIN: partial(plain_euclidean.euclidean, xyz, params), "ours": partial(cluster_euclidean, xyz, params)}
 
     title = f"Adaptive Euclidean, {threshold} threshold, whole scan"
     clock, same = Clock(repeat, calls(thin(clouds[0]))), 0
@@ -100,31 +100,31 @@ def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> 
 
 def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
     """Measure paper C's segmentation of whole scans: cloth, then Euclidean clustering."""
+
     def segment(xyz, threshold):
         rest = xyz.compress(~segment_by_cloth(xyz), axis=0)
         return cluster_euclidean(rest, EuclideanParams(threshold=threshold))
 
     def calls(xyz):
-        return {"cloth": partial(segment_by_cloth, xyz),
-                **{t: partial(segment, xyz, t) for t in ("global", "local")}}
+        return {"cloth": partial(segment_by_cloth, xyz), **{t: partial(segment, xyz, t) for t in ("global", "local")}}
 
     title = "Paper C: cloth and Euclidean, whole scan"
     clock = Clock(repeat, calls(thin(scans[0])))
     for xyz in show_progress(scans, title, len(scans)):
         clock.time(calls(xyz))
     ms = clock.medians()
-    rows = [make_row(f"({t} threshold)", ours_ms=ms[t], value=ms[t], unit="ms", target=60)
-            for t in ("global", "local")]
-    return make_measurement(title, len(scans), np.median([len(s) for s in scans]), rows,
-                            cloth_ms=ms["cloth"])
+    rows = [make_row(f"({t} threshold)", ours_ms=ms[t], value=ms[t], unit="ms", target=60) for t in ("global", "local")]
+    return make_measurement(title, len(scans), np.median([len(s) for s in scans]), rows, cloth_ms=ms["cloth"])
 
 
 def find_core_points(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
     """Return the mask (N,) of points with min_samples points of their band within its eps."""
+
     def labels(band, eps, min_samples):
         tree = cKDTree(band.astype(np.float64))
         found = tree.query_ball_point(tree.data, eps, return_length=True)
         return np.where(found >= min_samples, 0, -1)
+
     return peers.by_bands(labels, xyz, params) > 0
 
 

@@ -34,13 +34,12 @@ from lidar_perception.runs.threads import set_thread_count, thread_count
 from lidar_perception.types import PointCloud
 
 PAPER_TO_V0 = {"v0": 1.0, "v1": 1.06, "v2": 1.86, "v3": 2.48, "v4": 3.54}  # paper B, RTX 4090
-TARGET = 1.6      # of v4 to v0, less than
+TARGET = 1.6  # of v4 to v0, less than
 CANDIDATES = 200  # anchors that pass, as in a street
-FEW = 3           # scans for full on a CPU, where a frame takes half a second
+FEW = 3  # scans for full on a CPU, where a frame takes half a second
 
 
-def measure_detection(scans: list[PointCloud], repeat: int,
-                      sizes: Sequence[str] = tuple(SIZES)) -> dict:
+def measure_detection(scans: list[PointCloud], repeat: int, sizes: Sequence[str] = tuple(SIZES)) -> dict:
     """Measure the median time of each step over whole scans, versions in turn, all in torch.
 
     Weights are random: time depends on them only through the number of anchors above the
@@ -51,16 +50,18 @@ def measure_detection(scans: list[PointCloud], repeat: int,
     content: dict[str, Any] = {"device": name, "threads": thread_count(), "sizes": {}}
     for size in sizes:
         chosen = choose_evenly(scans, FEW) if (size, device) == ("full", CPU) else scans
-        detectors = {version: _make_detector(version, size, device, chosen[0])
-                     for version in VERSIONS}
+        detectors = {version: _make_detector(version, size, device, chosen[0]) for version in VERSIONS}
         content["sizes"][size] = {
-            "frames": len(chosen), "points": float(np.median([len(s) for s in chosen])),
-            "versions": _compute_medians(detectors, chosen, repeat, f"PointPillars {size}")}
+            "frames": len(chosen),
+            "points": float(np.median([len(s) for s in chosen])),
+            "versions": _compute_medians(detectors, chosen, repeat, f"PointPillars {size}"),
+        }
     return content
 
 
-def _compute_medians(detectors: dict[str, PointPillarsDetector], scans: list[PointCloud],
-                     repeat: int, title: str) -> dict[str, dict]:
+def _compute_medians(
+    detectors: dict[str, PointPillarsDetector], scans: list[PointCloud], repeat: int, title: str
+) -> dict[str, dict]:
     ms = {version: np.zeros((len(scans), repeat, len(STEPS))) for version in detectors}
     for i, scan in enumerate(show_progress(scans, title, len(scans))):
         for j in range(repeat):
@@ -71,10 +72,13 @@ def _compute_medians(detectors: dict[str, PointPillarsDetector], scans: list[Poi
     for version, runs in ms.items():
         steps = np.median(np.median(runs, axis=1), axis=0)
         total = float(np.median(np.median(runs.sum(axis=2), axis=1)))
-        found[version] = {"ms": dict(zip(STEPS, steps.tolist())), "total_ms": total,
-                          "share": dict(zip(STEPS, (steps / steps.sum()).tolist())),
-                          "to_v0": total / found["v0"]["total_ms"] if found else 1.0,
-                          "paper_to_v0": PAPER_TO_V0[version]}
+        found[version] = {
+            "ms": dict(zip(STEPS, steps.tolist())),
+            "total_ms": total,
+            "share": dict(zip(STEPS, (steps / steps.sum()).tolist())),
+            "to_v0": total / found["v0"]["total_ms"] if found else 1.0,
+            "paper_to_v0": PAPER_TO_V0[version],
+        }
     return found
 
 
@@ -97,8 +101,7 @@ class RecordingNetwork:
         return prediction
 
 
-def _make_detector(version: str, size: str, device: str,
-                   scan: PointCloud) -> PointPillarsDetector:
+def _make_detector(version: str, size: str, device: str, scan: PointCloud) -> PointPillarsDetector:
     """Return a warmed-up detector whose thresholds CANDIDATES anchors of this scan pass."""
     config = make_config(version, size)
     torch.manual_seed(0)
@@ -118,23 +121,29 @@ def _make_detector(version: str, size: str, device: str,
 def print_detection(content: dict) -> None:
     """Print a table for each size, with the share of each step."""
     for size, figures in content["sizes"].items():
-        table = Table(title=f"EG-PointPillars {size}, ms a frame ({figures['frames']} scans, "
-                            f"{figures['points']:.0f} points) on {content['device']}, "
-                            f"{content['threads']} CPU threads, random weights")
+        table = Table(
+            title=f"EG-PointPillars {size}, ms a frame ({figures['frames']} scans, "
+            f"{figures['points']:.0f} points) on {content['device']}, "
+            f"{content['threads']} CPU threads, random weights"
+        )
         for name in ("version", *STEPS, "total", "to v0", "paper's"):
             table.add_column(name, justify="left" if name == "version" else "right")
         for version, found in figures["versions"].items():
-            table.add_row(version, *(f"{found['ms'][step]:.1f} ({100 * found['share'][step]:.0f} %)"
-                                     for step in STEPS), f"{found['total_ms']:.1f}",
-                          f"{found['to_v0']:.2f}", f"{found['paper_to_v0']:.2f}")
+            table.add_row(
+                version,
+                *(f"{found['ms'][step]:.1f} ({100 * found['share'][step]:.0f} %)" for step in STEPS),
+                f"{found['total_ms']:.1f}",
+                f"{found['to_v0']:.2f}",
+                f"{found['paper_to_v0']:.2f}",
+            )
         console.print(table)
         ratio = figures["versions"]["v4"]["to_v0"]
-        console.print(f"v4 takes {ratio:.2f} of the time of v0, target < {TARGET}: "
-                      + ("met" if ratio < TARGET else "not met"))
+        console.print(
+            f"v4 takes {ratio:.2f} of the time of v0, target < {TARGET}: " + ("met" if ratio < TARGET else "not met")
+        )
 
 
-def measure_engines(scans: list[PointCloud], repeat: int,
-                    detectors: Sequence[str] = (POINTPILLARS, FUSED)) -> dict:
+def measure_engines(scans: list[PointCloud], repeat: int, detectors: Sequence[str] = (POINTPILLARS, FUSED)) -> dict:
     """Compare the engines torch and sparse of PointPillars with the shipped weights.
 
     Median CPU time of one thread, in turn. `same` counts scans with equal detections.
@@ -144,14 +153,16 @@ def measure_engines(scans: list[PointCloud], repeat: int,
     rows = []
     for weights in detectors:
         for range_ in "ahead", "around":
-            engines = {name: open_detector(weights, "cpu", range=range_, settings={
-                f"{weights}.threads": 1, f"{weights}.engine": engine})
-                for name, engine in (("torch", "torch"), ("ours", "sparse"))}
+            engines = {
+                name: open_detector(
+                    weights, "cpu", range=range_, settings={f"{weights}.threads": 1, f"{weights}.engine": engine}
+                )
+                for name, engine in (("torch", "torch"), ("ours", "sparse"))
+            }
             name, same = f"{weights} {range_}, engine torch", 0
             clock = Clock(repeat, {}, process_time)
             for scan in show_progress(scans, name, len(scans)):
-                found = clock.time({each: partial(detector, scan)
-                                    for each, detector in engines.items()})
+                found = clock.time({each: partial(detector, scan) for each, detector in engines.items()})
                 same += _have_same_detections(found["torch"], found["ours"])
             ms = clock.medians()
             rows.append(compute_speedup(name, {name: ms["torch"], "ours": ms["ours"]}, same=same))
@@ -162,6 +173,8 @@ def measure_engines(scans: list[PointCloud], repeat: int,
 
 def _have_same_detections(a: DetectionResult, b: DetectionResult) -> bool:
     a_, b_ = a.detections, b.detections
-    return bool(np.array_equal(a_.class_ids, b_.class_ids)
-                and np.allclose(a_.boxes, b_.boxes, rtol=0, atol=1e-4)
-                and np.allclose(a_.scores, b_.scores, rtol=0, atol=1e-5))
+    return bool(
+        np.array_equal(a_.class_ids, b_.class_ids)
+        and np.allclose(a_.boxes, b_.boxes, rtol=0, atol=1e-4)
+        and np.allclose(a_.scores, b_.scores, rtol=0, atol=1e-5)
+    )

@@ -43,8 +43,10 @@ from lidar_perception.types import Detections, InputError
 
 # Detector -> its classes, and the score from which on the peer gets its detections.
 NETWORKS = ("fused", "pointpillars", "pointnet")
-DETECTORS = {**dict.fromkeys(NETWORKS, (tuple(DETECTED), ScoreParams().car)),
-             "candidates": (("Pedestrian",), BEST.confidence.threshold)}
+DETECTORS = {
+    **dict.fromkeys(NETWORKS, (tuple(DETECTED), ScoreParams().car)),
+    "candidates": (("Pedestrian",), BEST.confidence.threshold),
+}
 RESAMPLED, LEAST, INTERVAL = 2000, 0.001, (2.5, 97.5)
 Drive = list[tuple[TrackedFrame, dict[str, Detections]]]
 Counts = dict[str, tuple[HotaCounts, ClearCounts]]
@@ -54,16 +56,17 @@ def detect(street: int, frames: int, people: float) -> Drive:
     """Detect in the first scans of a street with each detector, weak detections included."""
     params = with_values(BEST, {"seed.source": "automatic"})
     detectors: dict[str, Detector] = {
-        "candidates": CandidateDetector(make_automatic_source(load_seeds(), params),
-                                        FORWARD_CAMERA.camera(), params),
-        **{name: open_detector(name, "cpu") for name in NETWORKS}}
+        "candidates": CandidateDetector(make_automatic_source(load_seeds(), params), FORWARD_CAMERA.camera(), params),
+        **{name: open_detector(name, "cpu") for name in NETWORKS},
+    }
     detectors = {name: each.with_min_score(LEAST) for name, each in detectors.items()}
     drive = []
     for i in range(frames):
         scan = simulate_scan(street, i, HDL64E, Scenes(None, people))
         found = {name: _detect_street(each, scan.frame) for name, each in detectors.items()}
-        drive.append((TrackedFrame(Detections.none(), make_kitti_labels(scan.truth),
-                                   scan.frame.stamp_ns, scan.pose), found))
+        drive.append(
+            (TrackedFrame(Detections.none(), make_kitti_labels(scan.truth), scan.frame.stamp_ns, scan.pose), found)
+        )
     return drive
 
 
@@ -91,8 +94,7 @@ def count_tracks(drive: list[TrackedFrame], step: Step, classes: tuple[str, ...]
     for seen in drive:
         ids, found = step(seen)
         frames.append(make_pairs(seen.truth, to_tracked_labels(ids, found), FORWARD_CAMERA))
-    return {name: (count_hota(own := [drop_ignored(f[name]) for f in frames]),
-                   count_clear(own)) for name in classes}
+    return {name: (count_hota(own := [drop_ignored(f[name]) for f in frames]), count_clear(own)) for name in classes}
 
 
 def measure_drives(drives: list[Drive], detector: str, params: TrackingParams) -> dict:
@@ -109,17 +111,24 @@ def _scores(peers: list[tuple], ours: list[tuple]) -> dict:
     both = {}
     for name, counted in ("peer", peers), ("ours", ours):
         clear = sum((c for _, c in counted), ClearCounts())
-        hota = resample(counted, lambda chosen: sum((h for h, _ in chosen), HotaCounts()
-                                                    ).compute_scores()["HOTA"])
-        both[name] = {**sum((h for h, _ in counted), HotaCounts()).compute_scores(),
-                      **clear.compute_scores(), "interval": _interval(hota),
-                      "switches": clear.switches,
-                      "fragments": clear.fragments, "hits": clear.tp, "false": clear.fp}
+        hota = resample(counted, lambda chosen: sum((h for h, _ in chosen), HotaCounts()).compute_scores()["HOTA"])
+        both[name] = {
+            **sum((h for h, _ in counted), HotaCounts()).compute_scores(),
+            **clear.compute_scores(),
+            "interval": _interval(hota),
+            "switches": clear.switches,
+            "fragments": clear.fragments,
+            "hits": clear.tp,
+            "false": clear.fp,
+        }
         both[name]["values"] = hota
     difference = np.subtract(both["ours"].pop("values"), both["peer"].pop("values"))
-    return {"labels": sum(labels), **both,
-            "gain": both["ours"]["HOTA"] - both["peer"]["HOTA"],
-            "gain_interval": _interval(difference)}
+    return {
+        "labels": sum(labels),
+        **both,
+        "gain": both["ours"]["HOTA"] - both["peer"]["HOTA"],
+        "gain_interval": _interval(difference),
+    }
 
 
 def resample(drives: list, value: Callable[[list], float]) -> np.ndarray:
@@ -142,12 +151,16 @@ def print_drives(content: dict) -> None:
         table.add_column(name)
     for detector, classes in content["detectors"].items():
         for name, own in classes.items():
-            pair = [f"{100 * own['peer'][k]:.1f}, {100 * own['ours'][k]:.1f}"
-                    for k in ("HOTA", "precision", "recall")]
+            pair = [f"{100 * own['peer'][k]:.1f}, {100 * own['ours'][k]:.1f}" for k in ("HOTA", "precision", "recall")]
             table.add_row(
-                detector, name, str(own["labels"]), pair[0],
+                detector,
+                name,
+                str(own["labels"]),
+                pair[0],
                 f"{100 * own['gain']:+.1f} [{_range(own['gain_interval'])}]",
-                f"{own['peer']['switches']}, {own['ours']['switches']}", *pair[1:])
+                f"{own['peer']['switches']}, {own['ours']['switches']}",
+                *pair[1:],
+            )
     console.print(table)
 
 
@@ -159,19 +172,29 @@ def _range(interval: list[float]) -> str:
 @click.option("--first", default=8301, show_default=True, help="Seed of the first street.")
 @click.option("--drives", "count", type=click.IntRange(1), default=20, show_default=True)
 @click.option("--seconds", type=click.FloatRange(0.1, 20.0), default=20.0, show_default=True)
-@click.option("--people", type=click.FloatRange(0), default=4.0, show_default=True,
-              help="Pedestrians and cyclists, as a multiple of KITTI's.")
-@click.option("--cache", type=click.Path(path_type=Path), required=True,
-              help="Folder for the detections.")
+@click.option(
+    "--people",
+    type=click.FloatRange(0),
+    default=4.0,
+    show_default=True,
+    help="Pedestrians and cyclists, as a multiple of KITTI's.",
+)
+@click.option("--cache", type=click.Path(path_type=Path), required=True, help="Folder for the detections.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path))
-def main(first: int, count: int, seconds: float, people: float, cache: Path,
-         json_file: Path | None) -> None:
+def main(first: int, count: int, seconds: float, people: float, cache: Path, json_file: Path | None) -> None:
     """Compare our tracker with a plain AB3DMOT on simulated drives."""
     frames = round(seconds * HDL64E.rate)
-    drives = [load_detections(cache, street, frames, people) for street in
-              show_progress(range(first, first + count), "detecting", count)]
-    content = {"drives": count, "seconds": seconds, "people": people, "first": first, "detectors": {
-        name: measure_drives(drives, name, TrackingParams()) for name in DETECTORS}}
+    drives = [
+        load_detections(cache, street, frames, people)
+        for street in show_progress(range(first, first + count), "detecting", count)
+    ]
+    content = {
+        "drives": count,
+        "seconds": seconds,
+        "people": people,
+        "first": first,
+        "detectors": {name: measure_drives(drives, name, TrackingParams()) for name in DETECTORS},
+    }
     print_drives(content)
     if json_file:
         write_text(json_file, json.dumps(content, indent=1))

@@ -43,6 +43,7 @@ def measure_graph(recording: Recording) -> dict[str, dict]:
         processes per cloud), memory_mb, and the load average before the run}
     """
     from lidar_perception.nodes.replay.graph_replay import replay
+
     runs = {}
     with tempfile.TemporaryDirectory() as folder:
         drive = Path(folder) / "drive"
@@ -53,10 +54,11 @@ def measure_graph(recording: Recording) -> dict[str, dict]:
             load = os.getloadavg()[0]
             with run_busy_processes(busy):
                 content = replay(drive, clouds, Path(folder) / str(i), **arguments)
-            runs[name] = {key: content[key] for key in ("clouds", "results", "latency_ms",
-                                                        "memory_mb", "stage_ms")} | {
-                "speed": 1 / content["slower"], "load": load,
-                "cpu_ms": sum(content["cpu_ms_by_process"].values())}
+            runs[name] = {key: content[key] for key in ("clouds", "results", "latency_ms", "memory_mb", "stage_ms")} | {
+                "speed": 1 / content["slower"],
+                "load": load,
+                "cpu_ms": sum(content["cpu_ms_by_process"].values()),
+            }
     return runs
 
 
@@ -74,12 +76,18 @@ def run_busy_processes(count: int) -> Iterator[None]:
 
 def print_graph(content: dict[str, dict]) -> None:
     table = Table(title="Nodes over DDS at 10 Hz")
-    for name in ("graph", "clouds", "lost", "speed", "median ms", "95 % under ms", "CPU ms",
-                 "memory MB", "load"):
+    for name in ("graph", "clouds", "lost", "speed", "median ms", "95 % under ms", "CPU ms", "memory MB", "load"):
         table.add_column(name, justify="left" if name == "graph" else "right")
     for name, run in content.items():
-        table.add_row(name, str(run["clouds"]), str(run["clouds"] - run["results"]),
-                      f"{run['speed']:.2g}x", f"{run['latency_ms']['median']:.0f}",
-                      f"{run['latency_ms']['p95']:.0f}", f"{run['cpu_ms']:.0f}",
-                      f"{run['memory_mb']:.0f}", f"{run['load']:.1f}")
+        table.add_row(
+            name,
+            str(run["clouds"]),
+            str(run["clouds"] - run["results"]),
+            f"{run['speed']:.2g}x",
+            f"{run['latency_ms']['median']:.0f}",
+            f"{run['latency_ms']['p95']:.0f}",
+            f"{run['cpu_ms']:.0f}",
+            f"{run['memory_mb']:.0f}",
+            f"{run['load']:.1f}",
+        )
     console.print(table)

@@ -28,19 +28,16 @@ def measure_threshold(title: str, clouds: list[np.ndarray], repeat: int) -> dict
     """Measure our plane fit and scikit-learn's RANSAC on points (N, 3) below paper A's z < -1.3."""
     peer, points = peers.RANSAC, np.median([len(c) for c in clouds])
     if peer.missing():
-        return make_measurement(title, len(clouds), points, [make_row(peer.name,
-                                                                      note=peer.missing())])
+        return make_measurement(title, len(clouds), points, [make_row(peer.name, note=peer.missing())])
 
     def calls(xyz):
         # The low points are selected within the measured time, as ours does.
-        return {peer.name: lambda: peer.run(xyz, xyz[:, 2] < MAX_Z),
-                "ours": partial(segment_by_threshold, xyz)}
+        return {peer.name: lambda: peer.run(xyz, xyz[:, 2] < MAX_Z), "ours": partial(segment_by_threshold, xyz)}
 
     clock = Clock(repeat, calls(thin(clouds[0])))
     for xyz in show_progress(clouds, title, len(clouds)):
         clock.time(calls(xyz))
-    return make_measurement(title, len(clouds), points, [compute_speedup(peer.name, clock.medians(),
-                                                                         3)])
+    return make_measurement(title, len(clouds), points, [compute_speedup(peer.name, clock.medians(), 3)])
 
 
 def measure_patchwork(frames: list[PointCloud], repeat: int) -> dict:
@@ -48,12 +45,13 @@ def measure_patchwork(frames: list[PointCloud], repeat: int) -> dict:
     title, name = "Patchwork++, whole scan", peers.PATCHWORK.name
     points = np.median([len(f) for f in frames])
     if peers.PATCHWORK.missing():
-        return make_measurement(title, len(frames), points,
-                                [make_row(name, note=peers.PATCHWORK.missing())])
+        return make_measurement(title, len(frames), points, [make_row(name, note=peers.PATCHWORK.missing())])
 
     def calls(frame, cloud):
-        return {name: partial(peers.PATCHWORK.run, cloud, SENSOR_HEIGHT),
-                "ours": partial(segment_by_patchwork, frame.xyz, frame.intensity, SENSOR_HEIGHT)}
+        return {
+            name: partial(peers.PATCHWORK.run, cloud, SENSOR_HEIGHT),
+            "ours": partial(segment_by_patchwork, frame.xyz, frame.intensity, SENSOR_HEIGHT),
+        }
 
     same = differ = 0
     with peers.silence_stdout():
@@ -62,8 +60,7 @@ def measure_patchwork(frames: list[PointCloud], repeat: int) -> dict:
             found = clock.time(calls(frame, frame.points()))
             apart = int((_mask(found[name], len(frame)) != found["ours"]).sum())
             same, differ = same + (apart == 0), differ + apart
-    return make_measurement(title, len(frames), points, [
-        compute_speedup(name, clock.medians(), 1.3, same, differ)])
+    return make_measurement(title, len(frames), points, [compute_speedup(name, clock.medians(), 1.3, same, differ)])
 
 
 def _mask(indices, count: int) -> np.ndarray:
@@ -81,8 +78,7 @@ def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
     scans = [_within(xyz) for xyz in scans]
     points = np.median([len(s) for s in scans])
     if peers.CLOTH.missing():
-        return make_measurement(title, len(scans), points,
-                                [make_row(name, note=peers.CLOTH.missing())])
+        return make_measurement(title, len(scans), points, [make_row(name, note=peers.CLOTH.missing())])
 
     def calls(xyz, precise):
         return {name: partial(peers.CLOTH.run, precise), "ours": partial(segment_by_cloth, xyz)}
@@ -105,8 +101,7 @@ def _within(xyz: np.ndarray, params: ClothParams = PARAMS.cloth) -> np.ndarray:
 def measure_labelled(frames: list[Frame], repeat: int) -> dict:
     """Measure precision, recall and F1 of our three methods and the wheel's cloth by protocol."""
     missing = {"patchwork": peers.PATCHWORK.missing(), peers.CLOTH.name: peers.CLOTH.missing()}
-    methods: dict[str, Callable] = {
-        **{name: partial(_of_ours, name) for name in METHODS}, peers.CLOTH.name: _of_wheel}
+    methods: dict[str, Callable] = {**{name: partial(_of_ours, name) for name in METHODS}, peers.CLOTH.name: _of_wheel}
     reports = {name: GroundReport() for name in methods if not missing.get(name)}
 
     def calls(frame):
@@ -120,9 +115,11 @@ def measure_labelled(frames: list[Frame], repeat: int) -> dict:
             for name, found in clock.time(calls(frame)).items():
                 counts = count_by_protocol(found, semantic, frame.xyz[:, 2])
                 reports[name].update(counts, clock.ms[name][-1])
-    return {"scans": len(frames), "protocols": list(PROTOCOLS),
-            "methods": {name: reports[name].compute() if name in reports
-                        else {"note": missing[name]} for name in methods}}
+    return {
+        "scans": len(frames),
+        "protocols": list(PROTOCOLS),
+        "methods": {name: reports[name].compute() if name in reports else {"note": missing[name]} for name in methods},
+    }
 
 
 def _of_ours(name: str, frame: PointCloud) -> np.ndarray:

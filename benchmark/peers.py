@@ -42,26 +42,33 @@ class Peer:
 
 # DBSCAN: points (N, 3) float32, eps, min_samples -> (N,) labels, -1 noise.
 
+
 def _sklearn(jobs: int | None) -> Callable:
     def run(xyz, eps, min_samples):
         from sklearn.cluster import DBSCAN
+
         return DBSCAN(eps=eps, min_samples=min_samples, n_jobs=jobs).fit(xyz).labels_
+
     return run
 
 
 def _wheel(xyz, eps, min_samples):
     from dbscan import DBSCAN
+
     return DBSCAN(xyz.astype(np.float64), eps, min_samples)[0]
 
 
 def _open3d(xyz, eps, min_samples):
     import open3d
+
     points = open3d.utility.Vector3dVector(xyz.astype(np.float64))
     return np.asarray(open3d.geometry.PointCloud(points).cluster_dbscan(eps, min_samples))
 
 
-SKLEARN = (Peer("scikit-learn", "scikit-learn", "sklearn", _sklearn(None)),
-           Peer("sklearn, n_jobs=-1", "scikit-learn", "sklearn", _sklearn(-1)))
+SKLEARN = (
+    Peer("scikit-learn", "scikit-learn", "sklearn", _sklearn(None)),
+    Peer("sklearn, n_jobs=-1", "scikit-learn", "sklearn", _sklearn(-1)),
+)
 OPEN3D = Peer("Open3D", "open3d", "open3d", _open3d)
 # Its threads go on polling after the call, a quarter of a core for the rest of the process.
 WHEEL = Peer("dbscan", "dbscan", "dbscan", _wheel)
@@ -88,8 +95,10 @@ TRIALS = 2000  # maximum, as in paper A
 
 def _ransac(xyz: np.ndarray, low: np.ndarray) -> np.ndarray:
     from sklearn.linear_model import LinearRegression, RANSACRegressor
-    found = RANSACRegressor(LinearRegression(), max_trials=TRIALS, residual_threshold=0.1,
-                            random_state=0).fit(xyz[low, :2], xyz[low, 2])
+
+    found = RANSACRegressor(LinearRegression(), max_trials=TRIALS, residual_threshold=0.1, random_state=0).fit(
+        xyz[low, :2], xyz[low, 2]
+    )
     return np.abs(xyz[:, 2] - found.predict(xyz[:, :2])) <= 0.1
 
 
@@ -97,6 +106,7 @@ RANSAC = Peer("scikit-learn's RANSAC", "scikit-learn", "sklearn", _ransac)
 
 
 # Ground. Both print on file descriptor 1.
+
 
 @contextmanager
 def silence_stdout() -> Iterator[None]:
@@ -112,10 +122,12 @@ def silence_stdout() -> Iterator[None]:
         os.close(null)
 
 
-def _bare_patchwork(points: np.ndarray, sensor_height: float,
-                    params: PatchworkParams = PatchworkParams()) -> np.ndarray:
+def _bare_patchwork(
+    points: np.ndarray, sensor_height: float, params: PatchworkParams = PatchworkParams()
+) -> np.ndarray:
     """Return the indices of the ground among points (N, 4) float32, by a new object."""
     import pypatchworkpp
+
     settings = pypatchworkpp.Parameters()
     settings.sensor_height = sensor_height
     settings.min_range, settings.max_range = params.min_range, params.max_range
@@ -134,6 +146,7 @@ def _falling_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()):
     Rigidness 3 and 500 iterations are its defaults.
     """
     import CSF
+
     cloth = CSF.CSF()
     cloth.params.bSloopSmooth = False
     cloth.params.cloth_resolution = params.resolution

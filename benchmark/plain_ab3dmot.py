@@ -47,8 +47,7 @@ class _Track:
             turn -= np.sign(turn) * np.pi
         difference = measured - self.state[:7]
         difference[3] = turn
-        gain = self.covariance @ SEEN.T @ np.linalg.inv(
-            SEEN @ self.covariance @ SEEN.T + np.eye(7))
+        gain = self.covariance @ SEEN.T @ np.linalg.inv(SEEN @ self.covariance @ SEEN.T + np.eye(7))
         self.state = self.state + gain @ difference
         self.covariance = (np.eye(10) - gain @ SEEN) @ self.covariance
         self.score, self.hits, self.age = score, self.hits + 1, 0
@@ -62,8 +61,7 @@ class PlainAb3dmot:
         self.frames = 0
         self.next = 1
 
-    def __call__(self, detections: Detections, pose: np.ndarray | None = None
-                 ) -> tuple[np.ndarray, Detections]:
+    def __call__(self, detections: Detections, pose: np.ndarray | None = None) -> tuple[np.ndarray, Detections]:
         pose = np.eye(4) if pose is None else pose
         self.frames += 1
         ids, boxes, classes, scores = [], [], [], []
@@ -73,8 +71,7 @@ class PlainAb3dmot:
                 boxes.append(_transform(track.state[[0, 1, 2, 4, 5, 6, 3]], np.linalg.inv(pose)))
                 classes.append(kind)
                 scores.append(track.score)
-        return np.array(ids, int), Detections.of(np.reshape(boxes, (-1, 7)),
-                                                 np.array(classes, int), np.array(scores))
+        return np.array(ids, int), Detections.of(np.reshape(boxes, (-1, 7)), np.array(classes, int), np.array(scores))
 
     def _of_class(self, kind: int, detections: Detections, pose: np.ndarray) -> list[_Track]:
         tracks = self.tracks.setdefault(kind, [])
@@ -84,15 +81,13 @@ class PlainAb3dmot:
             track.predict()
         gate, free = GATES.get(CLASSES[kind], OTHER_GATE), set(range(len(measured)))
         if tracks and measured:
-            distance = np.array([[np.linalg.norm(m[:3] - t.state[:3]) for t in tracks]
-                                 for m in measured])
+            distance = np.array([[np.linalg.norm(m[:3] - t.state[:3]) for t in tracks] for m in measured])
             for i, j in zip(*linear_sum_assignment(distance)):
                 if distance[i, j] <= gate:
                     tracks[j].update(measured[i], float(detections.scores[i]))
                     free.discard(int(i))
         for i in sorted(free):
-            tracks.append(_Track(self.next, np.append(measured[i], np.zeros(3)),
-                                 float(detections.scores[i])))
+            tracks.append(_Track(self.next, np.append(measured[i], np.zeros(3)), float(detections.scores[i])))
             self.next += 1
         self.tracks[kind] = [t for t in tracks if t.age < MAX_AGE]
         return [t for t in self.tracks[kind] if t.hits >= MIN_HITS or self.frames <= MIN_HITS]
@@ -101,5 +96,4 @@ class PlainAb3dmot:
 def _transform(box: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Transform a box (7,) by a pose (4, 4)."""
     forward = pose[:3, :3] @ [np.cos(box[6]), np.sin(box[6]), 0.0]
-    return np.concatenate([pose[:3, :3] @ box[:3] + pose[:3, 3], box[3:6],
-                           [np.arctan2(forward[1], forward[0])]])
+    return np.concatenate([pose[:3, :3] @ box[:3] + pose[:3, 3], box[3:6], [np.arctan2(forward[1], forward[0])]])

@@ -57,8 +57,7 @@ def _neighbours(tree: cKDTree, wanted: np.ndarray, radius: float) -> Iterator[tu
     count = tree.query_ball_point(tree.data[rows], radius, return_length=True)
     cuts = np.flatnonzero(np.diff(np.cumsum(count) // AT_ONCE)) + 1
     for part in np.split(rows, cuts):
-        near = cKDTree(tree.data[part]).sparse_distance_matrix(
-            tree, radius * (1 + 1e-9), output_type="ndarray")
+        near = cKDTree(tree.data[part]).sparse_distance_matrix(tree, radius * (1 + 1e-9), output_type="ndarray")
         i, j = part[near["i"]], near["j"]
         offset = tree.data[i] - tree.data[j]
         offset *= offset
@@ -76,8 +75,7 @@ def _components(tree: cKDTree, reach: np.ndarray, leads: np.ndarray) -> np.ndarr
     return component
 
 
-def _with_followers(tree: cKDTree, reach: np.ndarray, leads: np.ndarray,
-                    component: np.ndarray) -> np.ndarray:
+def _with_followers(tree: cKDTree, reach: np.ndarray, leads: np.ndarray, component: np.ndarray) -> np.ndarray:
     """Return the component (N,) of each point, -1 for followers without a leader."""
     result = np.where(leads, component, -1)
     for i, j, squared in _neighbours(tree, ~leads, reach[leads].max(initial=0.0)):
@@ -107,15 +105,14 @@ def _merged(points: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
         return labels
     size = np.bincount(labels)[1:]
     centre = np.stack([np.bincount(labels, c)[1:] / size for c in points.T], axis=1)
-    order = np.argsort(labels, kind="stable")[np.count_nonzero(labels == 0):]
+    order = np.argsort(labels, kind="stable")[np.count_nonzero(labels == 0) :]
     start = np.cumsum(size) - size
-    extent = (np.maximum.reduceat(points[order], start)
-              - np.minimum.reduceat(points[order], start))
-    diameter = np.sqrt((extent ** 2).sum(axis=1))
+    extent = np.maximum.reduceat(points[order], start) - np.minimum.reduceat(points[order], start)
+    diameter = np.sqrt((extent**2).sum(axis=1))
     first, second = [], []
     for k in range(count - 1):
-        distance = np.sqrt(((centre[k + 1:] - centre[k]) ** 2).sum(axis=1))
-        close = np.flatnonzero(distance < gamma * (diameter[k + 1:] + diameter[k]) / 2)
+        distance = np.sqrt(((centre[k + 1 :] - centre[k]) ** 2).sum(axis=1))
+        close = np.flatnonzero(distance < gamma * (diameter[k + 1 :] + diameter[k]) / 2)
         first.append(np.full(len(close), k))
         second.append(close + k + 1)
     pairs = np.concatenate(first), np.concatenate(second)

@@ -51,8 +51,9 @@ class SetAbstraction(nn.Module):
         every = torch.arange(len(xyz))[:, None]
         centres = xyz[every, farthest(xyz, self.count)]
         indices = ball(self.radius, self.neighbours, xyz, centres)
-        rows = torch.cat([xyz[every[:, :, None], indices] - centres[:, :, None],
-                          features[every[:, :, None], indices]], dim=-1)
+        rows = torch.cat(
+            [xyz[every[:, :, None], indices] - centres[:, :, None], features[every[:, :, None], indices]], dim=-1
+        )
         return centres, self.layers(rows.permute(0, 3, 2, 1)).amax(dim=2).transpose(1, 2)
 
 
@@ -62,15 +63,12 @@ class PlainPointNet2(nn.Module):
     def __init__(self, config: PointNetConfig):
         super().__init__()
         group, local, wide = config.group_channels, config.local_channels, config.global_channels
-        self.first = SetAbstraction(config.centroids, config.radii[-1], config.neighbours[-1],
-                                    5, *group, local)
-        self.second = SetAbstraction(config.coarse, config.coarse_radius,
-                                     config.coarse_neighbours, 3 + local, wide)
+        self.first = SetAbstraction(config.centroids, config.radii[-1], config.neighbours[-1], 5, *group, local)
+        self.second = SetAbstraction(config.coarse, config.coarse_radius, config.coarse_neighbours, 3 + local, wide)
         sizes, layers = (wide, *config.head_channels), []
         for a, b in pairwise(sizes):
             layers += [nn.Linear(a, b), nn.BatchNorm1d(b), nn.ReLU()]
-        self.head = nn.Sequential(*layers, nn.Linear(
-            sizes[-1], len(config.classes) + 1 + 6 + 2 * config.yaw_bins))
+        self.head = nn.Sequential(*layers, nn.Linear(sizes[-1], len(config.classes) + 1 + 6 + 2 * config.yaw_bins))
 
     def forward(self, points: Tensor) -> Tensor:
         xyz, features = self.first(points[..., :3], points[..., 3:])

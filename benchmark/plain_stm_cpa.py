@@ -20,8 +20,14 @@ CPA_RANGE, CPA_STEPS, CPA_DECREMENT, CPA_MIN = (15.0, 30.0), 2, 0.10, 0.20
 KERNEL = np.ones((3, 3), np.uint8)
 
 
-def candidates(xyz: np.ndarray, projection: np.ndarray, width: int, height: int,
-               pedestrians: np.ndarray, ground: np.ndarray | None = None) -> dict:
+def candidates(
+    xyz: np.ndarray,
+    projection: np.ndarray,
+    width: int,
+    height: int,
+    pedestrians: np.ndarray,
+    ground: np.ndarray | None = None,
+) -> dict:
     """Find candidates in xyz (N, 3).
 
     Returns points in view, ground, labels, boxes by stage (K, 7) and ms by step. A given ground
@@ -37,8 +43,9 @@ def candidates(xyz: np.ndarray, projection: np.ndarray, width: int, height: int,
 
     low = points[:, 2] < Z_MAX
     if ground is None:
-        ransac = RANSACRegressor(LinearRegression(), max_trials=TRIALS, residual_threshold=INLIER,
-                                 random_state=0).fit(points[low, :2], points[low, 2])
+        ransac = RANSACRegressor(LinearRegression(), max_trials=TRIALS, residual_threshold=INLIER, random_state=0).fit(
+            points[low, :2], points[low, 2]
+        )
         away = np.abs(points[:, 2] - ransac.predict(points[:, :2]))
         ground = low & (away <= INLIER)
     plane = LinearRegression().fit(points[ground, :2], points[ground, 2])
@@ -72,11 +79,15 @@ def candidates(xyz: np.ndarray, projection: np.ndarray, width: int, height: int,
     t.append(perf_counter())
 
     steps = ("view", "ground", "clustering", "boxes", "height", "stm", "cpa")
-    return {"points": points, "ground": ground, "labels": labels + 1,
-            "stage1": boxes[kept],
-            "stage2": boxes[[k for k in kept if plain[k] >= TAU]],
-            "final": boxes[[k for k in kept if final[k] >= TAU]],
-            "ms": {s: 1e3 * (b - a) for s, a, b in zip(steps, t, t[1:])}}
+    return {
+        "points": points,
+        "ground": ground,
+        "labels": labels + 1,
+        "stage1": boxes[kept],
+        "stage2": boxes[[k for k in kept if plain[k] >= TAU]],
+        "final": boxes[[k for k in kept if final[k] >= TAU]],
+        "ms": {s: 1e3 * (b - a) for s, a, b in zip(steps, t, t[1:])},
+    }
 
 
 def _box(cluster: np.ndarray, plane: LinearRegression) -> list[float]:
@@ -90,8 +101,7 @@ def _inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
     offset = points - box[:3]
     along = offset[:, 0] * np.cos(box[6]) + offset[:, 1] * np.sin(box[6])
     across = offset[:, 1] * np.cos(box[6]) - offset[:, 0] * np.sin(box[6])
-    return ((np.abs(along) <= box[3] / 2) & (np.abs(across) <= box[4] / 2)
-            & (np.abs(offset[:, 2]) <= box[5] / 2))
+    return (np.abs(along) <= box[3] / 2) & (np.abs(across) <= box[4] / 2) & (np.abs(offset[:, 2]) <= box[5] / 2)
 
 
 def _silhouette(cluster: np.ndarray, steps: int) -> np.ndarray:
@@ -108,8 +118,7 @@ def _silhouette(cluster: np.ndarray, steps: int) -> np.ndarray:
     columns = (every_y - y.min()) / max(np.ptp(y), 1e-6) * COLUMNS
     rows = (z.max() - every_z) / max(np.ptp(z), 1e-6) * ROWS
     image = np.zeros((ROWS, COLUMNS), np.uint8)
-    image[np.minimum(rows.astype(int), ROWS - 1),
-          np.minimum(columns.astype(int), COLUMNS - 1)] = 1
+    image[np.minimum(rows.astype(int), ROWS - 1), np.minimum(columns.astype(int), COLUMNS - 1)] = 1
     closed = cv2.morphologyEx(image, cv2.MORPH_CLOSE, KERNEL)
     return cv2.dilate(closed, KERNEL).ravel().astype(float)
 

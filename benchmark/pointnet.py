@@ -26,7 +26,7 @@ from lidar_perception.runs.terminal import console
 from lidar_perception.runs.threads import thread_count
 from lidar_perception.types import PointCloud
 
-COUNT = 100                  # clusters
+COUNT = 100  # clusters
 NETWORK, WHOLE = 40.0, 120.0  # ms, targets
 
 
@@ -38,11 +38,14 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
     """
     torch.manual_seed(0)
     config = make_pointnet_config()
-    networks = {name: TorchPointNet(fuse_norms(make_pointnet(make_pointnet_config(name))))
-                for name in ("improved", "pointnet2", "pointnet")}
+    networks = {
+        name: TorchPointNet(fuse_norms(make_pointnet(make_pointnet_config(name))))
+        for name in ("improved", "pointnet2", "pointnet")
+    }
     plain = PlainPointNet2(config).eval()
-    detector = PointNetDetector(PointNetClassifier(
-        TorchPointNet(fuse_norms(make_pointnet(config)), "auto"), Header(config)))
+    detector = PointNetDetector(
+        PointNetClassifier(TorchPointNet(fuse_norms(make_pointnet(config)), "auto"), Header(config))
+    )
     detector.warm_up()
     rows, steps, counts = [], [], []
     for scan in scans:
@@ -59,10 +62,15 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
         steps.append([results["detector"].timings[step] for step in STEPS])
         counts.append((len(some), len(every), len(scan)))
     middle = np.median(counts, axis=0)
-    return {"clusters": float(middle[0]), "all_clusters": float(middle[1]),
-            "points": float(middle[2]), "threads": thread_count(), "scans": len(rows),
-            "ms": {name: float(np.median([row[name] for row in rows])) for name in rows[0]},
-            "steps": dict(zip(STEPS, np.median(steps, axis=0).tolist()))}
+    return {
+        "clusters": float(middle[0]),
+        "all_clusters": float(middle[1]),
+        "points": float(middle[2]),
+        "threads": thread_count(),
+        "scans": len(rows),
+        "ms": {name: float(np.median([row[name] for row in rows])) for name in rows[0]},
+        "steps": dict(zip(STEPS, np.median(steps, axis=0).tolist())),
+    }
 
 
 @torch.inference_mode()
@@ -73,19 +81,27 @@ def _plain(network: PlainPointNet2, clusters: Clusters, count: int) -> torch.Ten
 def print_pointnet(content: dict) -> None:
     """Print one table; the detector processes all clusters."""
     ms = content["ms"]
-    table = Table(title=f"Paper C's network, ms for {content['clusters']:.0f} clusters, "
-                        f"{content['threads']} CPU threads, random weights")
+    table = Table(
+        title=f"Paper C's network, ms for {content['clusters']:.0f} clusters, "
+        f"{content['threads']} CPU threads, random weights"
+    )
     for name in ("network", "ms", "to ours"):
         table.add_column(name, justify="left" if name == "network" else "right")
-    titles = {"improved": "improved PointNet (ours)", "pointnet2": "PointNet++ (SSG), ours",
-              "pointnet": "PointNet, ours"}
+    titles = {
+        "improved": "improved PointNet (ours)",
+        "pointnet2": "PointNet++ (SSG), ours",
+        "pointnet": "PointNet, ours",
+    }
     for name in (*titles, "plain PointNet++ (SSG)"):
-        table.add_row(titles.get(name, name), f"{ms[name]:.1f}",
-                      f"{ms[name] / ms['improved']:.2f}")
+        table.add_row(titles.get(name, name), f"{ms[name]:.1f}", f"{ms[name] / ms['improved']:.2f}")
     console.print(table)
-    console.print(f"network {ms['improved']:.1f} ms, target < {NETWORK:.0f}: "
-                  f"{'reached' if ms['improved'] < NETWORK else 'missed'}")
+    console.print(
+        f"network {ms['improved']:.1f} ms, target < {NETWORK:.0f}: "
+        f"{'reached' if ms['improved'] < NETWORK else 'missed'}"
+    )
     steps = ", ".join(f"{step} {value:.1f}" for step, value in content["steps"].items())
-    console.print(f"whole detector {ms['detector']:.1f} ms ({steps}) for {content['points']:.0f} "
-                  f"points, {content['all_clusters']:.0f} clusters, target < {WHOLE:.0f}: "
-                  f"{'reached' if ms['detector'] < WHOLE else 'missed'}")
+    console.print(
+        f"whole detector {ms['detector']:.1f} ms ({steps}) for {content['points']:.0f} "
+        f"points, {content['all_clusters']:.0f} clusters, target < {WHOLE:.0f}: "
+        f"{'reached' if ms['detector'] < WHOLE else 'missed'}"
+    )

@@ -17,11 +17,33 @@ def make_measurement(title: str, frames: int, points: float, rows: list[dict], *
     return {"title": title, "frames": frames, "points": round(points), "rows": rows, **more}
 
 
-def make_row(name: str, *, peer_ms: float | None = None, ours_ms: float | None = None,
-             value: float | None = None, unit: str = "x", target: float | None = None,
-             same: int | None = None, differ: int | None = None, note: str = "") -> dict:
-    return add_target(dict(name=name, peer_ms=peer_ms, ours_ms=ours_ms, value=value, unit=unit,
-                           target=None, met=None, same=same, differ=differ, note=note), target)
+def make_row(
+    name: str,
+    *,
+    peer_ms: float | None = None,
+    ours_ms: float | None = None,
+    value: float | None = None,
+    unit: str = "x",
+    target: float | None = None,
+    same: int | None = None,
+    differ: int | None = None,
+    note: str = "",
+) -> dict:
+    return add_target(
+        dict(
+            name=name,
+            peer_ms=peer_ms,
+            ours_ms=ours_ms,
+            value=value,
+            unit=unit,
+            target=None,
+            met=None,
+            same=same,
+            differ=differ,
+            note=note,
+        ),
+        target,
+    )
 
 
 def add_target(content: dict, target: float | None) -> dict:
@@ -32,11 +54,13 @@ def add_target(content: dict, target: float | None) -> dict:
     return {**content, "target": target, "met": met}
 
 
-def compute_speedup(name: str, ms: dict[str, float], target: float | None = None,
-                    same: int | None = None, differ: int | None = None) -> dict:
+def compute_speedup(
+    name: str, ms: dict[str, float], target: float | None = None, same: int | None = None, differ: int | None = None
+) -> dict:
     """Return how many times faster ours is than the named peer."""
-    return make_row(name, peer_ms=ms[name], ours_ms=ms["ours"], value=ms[name] / ms["ours"],
-                    target=target, same=same, differ=differ)
+    return make_row(
+        name, peer_ms=ms[name], ours_ms=ms["ours"], value=ms[name] / ms["ours"], target=target, same=same, differ=differ
+    )
 
 
 def format_value(value: float | None, unit: str) -> str:
@@ -52,16 +76,20 @@ def format_target(target: float | None, unit: str) -> str:
 
 
 def print_measured(content: dict) -> None:
-    table = Table(title=f"{content['title']} ({content['frames']} frames, "
-                        f"{content['points']} points)")
+    table = Table(title=f"{content['title']} ({content['frames']} frames, {content['points']} points)")
     for name in ("peer", "its ms", "our ms", "measured", "target", "met", "same"):
         table.add_column(name, justify="left" if name == "peer" else "right")
     for r in content["rows"]:
         met = "" if r["met"] is None else "yes" if r["met"] else Text("no", "red")
-        table.add_row(r["name"], _ms(r["peer_ms"]), _ms(r["ours_ms"]),
-                      r["note"] or format_value(r["value"], r["unit"]),
-                      format_target(r["target"], r["unit"]), met,
-                      "" if r["same"] is None else f"{r['same']} of {content['frames']}")
+        table.add_row(
+            r["name"],
+            _ms(r["peer_ms"]),
+            _ms(r["ours_ms"]),
+            r["note"] or format_value(r["value"], r["unit"]),
+            format_target(r["target"], r["unit"]),
+            met,
+            "" if r["same"] is None else f"{r['same']} of {content['frames']}",
+        )
     console.print(table)
     for r in content["rows"]:
         if r["differ"]:

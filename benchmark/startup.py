@@ -16,13 +16,14 @@ from benchmark.rows import make_measurement, make_row
 CODE = {
     "fused": "import lidar_perception; lidar_perception.load_detector(device='cpu')",
     "fused, engine torch": "from lidar_perception.detectors.open import open_detector; "
-                           "open_detector(device='cpu', settings={'fused.engine': 'torch'})",
+    "open_detector(device='cpu', settings={'fused.engine': 'torch'})",
     "clustering": "from lidar_perception.params import ClusteringNodeParams as P; "
-                  "from lidar_perception.candidates.warm_up import warm_up_clustering; "
-                  "warm_up_clustering(P().clustering, P().boxes)",
+    "from lidar_perception.candidates.warm_up import warm_up_clustering; "
+    "warm_up_clustering(P().clustering, P().boxes)",
     "ground segmentation": "from lidar_perception.params import GroundNodeParams as P; "
-                           "from lidar_perception.candidates.warm_up import warm_up_ground; "
-                           "warm_up_ground(P().ground)"}
+    "from lidar_perception.candidates.warm_up import warm_up_ground; "
+    "warm_up_ground(P().ground)",
+}
 PRINT = """
 import resource
 usage = resource.getrusage(resource.RUSAGE_SELF)
@@ -38,12 +39,16 @@ def measure_startup(repeat: int, cold: tuple[str, ...] = ("fused", "clustering")
     Args:
         cold: names in CODE that are also compiled from nothing, which takes a minute or more.
     """
-    runs = {name: np.median([_start(code) for _ in range(repeat)], axis=0)
-            for name, code in CODE.items()}
-    rows = [make_row(WITH_TORCH, peer_ms=1e3 * runs[WITH_TORCH][0], ours_ms=1e3 * runs["fused"][0],
-                     value=runs[WITH_TORCH][0] / runs["fused"][0])]
-    rows += [make_row(f"{name}, peak memory", value=memory, unit="MB")
-             for name, (_, memory) in runs.items()]
+    runs = {name: np.median([_start(code) for _ in range(repeat)], axis=0) for name, code in CODE.items()}
+    rows = [
+        make_row(
+            WITH_TORCH,
+            peer_ms=1e3 * runs[WITH_TORCH][0],
+            ours_ms=1e3 * runs["fused"][0],
+            value=runs[WITH_TORCH][0] / runs["fused"][0],
+        )
+    ]
+    rows += [make_row(f"{name}, peak memory", value=memory, unit="MB") for name, (_, memory) in runs.items()]
     for name in cold:
         with tempfile.TemporaryDirectory() as folder:
             seconds, _ = _start(CODE[name], NUMBA_CACHE_DIR=folder)
@@ -54,8 +59,13 @@ def measure_startup(repeat: int, cold: tuple[str, ...] = ("fused", "clustering")
 
 def _start(code: str, **variables: str) -> tuple[float, float]:
     """Return CPU seconds and peak memory in MB of a process that runs some code."""
-    done = subprocess.run([sys.executable, "-c", code + PRINT], text=True, check=True,
-                          capture_output=True, env={**os.environ, **variables},
-                          cwd=Path(__file__).resolve().parents[1])
+    done = subprocess.run(
+        [sys.executable, "-c", code + PRINT],
+        text=True,
+        check=True,
+        capture_output=True,
+        env={**os.environ, **variables},
+        cwd=Path(__file__).resolve().parents[1],
+    )
     seconds, memory = map(float, done.stdout.split())
     return seconds, memory

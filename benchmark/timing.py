@@ -14,8 +14,9 @@ Calls = dict[str, Callable[[], Any]]
 SLOW_REPEAT = 2  # runs per frame at most for slow peers
 
 
-def time_interleaved(calls: Calls, repeat: int, clock: Callable[[], float] = perf_counter
-                     ) -> tuple[dict[str, float], dict[str, Any]]:
+def time_interleaved(
+    calls: Calls, repeat: int, clock: Callable[[], float] = perf_counter
+) -> tuple[dict[str, float], dict[str, Any]]:
     """Return the median ms of each call over `repeat` rounds, and its last result.
 
     A round makes each call once, in the order of the dict. clock returns seconds; time.process_time
@@ -34,8 +35,7 @@ def time_interleaved(calls: Calls, repeat: int, clock: Callable[[], float] = per
 class Clock:
     """Stopwatch over frames. The calls of warm are made once before, untimed, on a thin cloud."""
 
-    def __init__(self, repeat: int, warm: Calls,
-                 clock: Callable[[], float] = perf_counter) -> None:
+    def __init__(self, repeat: int, warm: Calls, clock: Callable[[], float] = perf_counter) -> None:
         self.repeat, self.clock = repeat, clock
         self.ms: dict[str, list[float]] = {}
         time_interleaved(warm, 1)

@@ -24,8 +24,7 @@ from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, GroundTruth
 
 OPERATING = ScoreParams().car  # lowest score for the peer, which ignores scores
-SHOWN = ("HOTA", "DetA", "AssA", "MOTA", "sAMOTA", "AMOTA", "switches", "fragments", "labels",
-         "true_tracks", "tracks")
+SHOWN = ("HOTA", "DetA", "AssA", "MOTA", "sAMOTA", "AMOTA", "switches", "fragments", "labels", "true_tracks", "tracks")
 Step = Callable[["TrackedFrame"], tuple[np.ndarray, Detections]]
 
 
@@ -44,8 +43,7 @@ def measure_recording(recording: Recording) -> dict:
     """Track PointPillars' detections in a recording with both trackers; {} without track ids."""
     if not recording.frames or not recording.frames[0].sequence:
         return {}
-    detector = open_detector("pointpillars", min_score=MIN_SCORE,
-                             sensor_height=recording.frames[0].sensor_height)
+    detector = open_detector("pointpillars", min_score=MIN_SCORE, sensor_height=recording.frames[0].sensor_height)
     drives: dict[str, list[TrackedFrame]] = {}
     source = choose_ego_source(recording)
     for frame in show_progress(recording, "detecting", len(recording)):
@@ -55,24 +53,21 @@ def measure_recording(recording: Recording) -> dict:
                 pose_of = make_pose_reader(source)
             drives.setdefault(frame.sequence, []).append(
                 TrackedFrame(
-                    detector(frame.load()).detections,
-                    truth,
-                    frame.stamp_ns,
-                    pose_of(frame),
-                    frame.calibration(),
+                    detector(frame.load()).detections, truth, frame.stamp_ns, pose_of(frame), frame.calibration()
                 )
             )
     return measure_tracking(drives) if drives else {}
 
 
-def measure_tracking(drives: Mapping[str, Sequence[TrackedFrame]],
-                     params: TrackingParams = TrackingParams()) -> dict:
+def measure_tracking(drives: Mapping[str, Sequence[TrackedFrame]], params: TrackingParams = TrackingParams()) -> dict:
     """Measure both trackers, "ours" and "plain AB3DMOT".
 
     Returns the scores of TrackingReport by centres, and ms, the median time per frame.
     """
-    return {name: _measure(drives, make) for name, make in (
-        ("plain AB3DMOT", lambda: peer(PlainAb3dmot())), ("ours", lambda: tracker(params)))}
+    return {
+        name: _measure(drives, make)
+        for name, make in (("plain AB3DMOT", lambda: peer(PlainAb3dmot())), ("ours", lambda: tracker(params)))
+    }
 
 
 def peer(plain: PlainAb3dmot, operating: float = OPERATING) -> Step:
@@ -87,6 +82,7 @@ def tracker(params: TrackingParams) -> Step:
     def step(seen: TrackedFrame) -> tuple[np.ndarray, Detections]:
         tracks = ours(seen.found, seen.stamp_ns, seen.pose)
         return tracks.ids, tracks.detections
+
     return step
 
 
@@ -98,8 +94,7 @@ def _measure(drives: Mapping[str, Sequence[TrackedFrame]], make: Callable[[], St
             start = perf_counter()
             ids, found = step(seen)
             ms.append((perf_counter() - start) * 1e3)
-            report.update(observe(name, i, seen.truth, to_tracked_labels(ids, found),
-                                  seen.calibration))
+            report.update(observe(name, i, seen.truth, to_tracked_labels(ids, found), seen.calibration))
     return {**report.compute(), "ms": float(np.median(ms)) if ms else None}
 
 
@@ -113,6 +108,9 @@ def print_tracking(content: dict) -> None:
         for tracker, scores in content.items():
             own = scores["classes"][kind]
             if own is not None:
-                table.add_row(kind, tracker, *(str(own[name]) if isinstance(own[name], int) else
-                                               f"{100 * own[name]:.1f}" for name in SHOWN))
+                table.add_row(
+                    kind,
+                    tracker,
+                    *(str(own[name]) if isinstance(own[name], int) else f"{100 * own[name]:.1f}" for name in SHOWN),
+                )
     console.print(table)

@@ -36,8 +36,7 @@ LOOK = Perspective((-12.0, -6.0, 8.0), (12.0, 1.0, -1.2), 60.0, 1600 * FINER, 80
 FILM_SIZE, FILM_PERIOD_MS = (720, 405), 100
 
 
-def draw(path: Path, view: Perspective, xyz: np.ndarray, colors: np.ndarray,
-         found: Detections) -> None:
+def draw(path: Path, view: Perspective, xyz: np.ndarray, colors: np.ndarray, found: Detections) -> None:
     """Draw a cloud with boxes, without texts."""
     boxes = Boxes(found.boxes, found.class_ids)
     canvas = Canvas(view.width, view.height, BACKGROUND)
@@ -49,8 +48,10 @@ def draw(path: Path, view: Perspective, xyz: np.ndarray, colors: np.ndarray,
 def detect_in_drive(folder: Path, simulation: list[str], detection: list[str]) -> None:
     """Simulate a drive and run `detect --track` on it; results are in `folder`/out."""
     drive = str(folder / "drive")
-    for words in (["simulate", "--out", drive, *simulation],
-                  ["detect", drive, "--out", str(folder / "out"), "--track", *detection]):
+    for words in (
+        ["simulate", "--out", drive, *simulation],
+        ["detect", drive, "--out", str(folder / "out"), "--track", *detection],
+    ):
         with suppress(SystemExit):
             cli(words, standalone_mode=False)
 
@@ -67,14 +68,19 @@ def draw_film(path: Path) -> None:
     """Draw a simulated drive by `detect --track --video`, reduced to the size of the README."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        detect_in_drive(folder, ["--frames", "40", "--seed", str(SEED), "--kind", "zone",
-                                 "--people", "2"],
-                        ["--range", "around", "--video", str(folder / "film.webp")])
+        detect_in_drive(
+            folder,
+            ["--frames", "40", "--seed", str(SEED), "--kind", "zone", "--people", "2"],
+            ["--range", "around", "--video", str(folder / "film.webp")],
+        )
         with Image.open(folder / "film.webp") as film:
-            frames = [frame.convert("RGB").resize(FILM_SIZE, Image.Resampling.LANCZOS)
-                      for frame in ImageSequence.Iterator(film)]
-        frames[0].save(path, save_all=True, append_images=frames[1:], duration=FILM_PERIOD_MS,
-                       loop=0, quality=40, method=4)
+            frames = [
+                frame.convert("RGB").resize(FILM_SIZE, Image.Resampling.LANCZOS)
+                for frame in ImageSequence.Iterator(film)
+            ]
+        frames[0].save(
+            path, save_all=True, append_images=frames[1:], duration=FILM_PERIOD_MS, loop=0, quality=40, method=4
+        )
 
 
 def make(folder: Path = FOLDER) -> None:
@@ -88,10 +94,14 @@ def make(folder: Path = FOLDER) -> None:
     draw(folder / "scene.png", README, frame.xyz, color_by_cluster(ground, cluster_ids), found)
 
     # Default displays of the layouts: clusters, ground, detections and candidates.
-    segmented, candidates = find_candidates(frame, make_fixed_source(*load_seeds(
-        PipelineParams().seed.file)))
-    draw(folder / "look.png", LOOK, segmented.xyz, color_by_cluster(
-        segmented.ground, segmented.cluster_ids), found.followed_by(candidates.final))
+    segmented, candidates = find_candidates(frame, make_fixed_source(*load_seeds(PipelineParams().seed.file)))
+    draw(
+        folder / "look.png",
+        LOOK,
+        segmented.xyz,
+        color_by_cluster(segmented.ground, segmented.cluster_ids),
+        found.followed_by(candidates.final),
+    )
     draw_detect(folder / "detect.png")
     draw_film(folder / "detect.webp")
 

@@ -27,13 +27,15 @@ FINE = make_generic_sensor(120, -30.0, 30.0, 0.25, 10.0, height=HEIGHT, divergen
 
 def main() -> None:
     """Draw docs/images/robot_scenes.png."""
-    figure, axes = plt.subplots(2 * len(SHOWN), 1, figsize=(12, 13), layout="constrained",
-                                height_ratios=[1, 2.2] * len(SHOWN))
+    figure, axes = plt.subplots(
+        2 * len(SHOWN), 1, figsize=(12, 13), layout="constrained", height_ratios=[1, 2.2] * len(SHOWN)
+    )
     for (scene, kind, seed), view, above in zip(SHOWN, axes[::2], axes[1::2]):
         made = make_scene(seed, kind, 1.0, scene)
         moment = made.at(MOMENT / FINE.rate, HEIGHT)
-        draw_view(view, cast_rays(moment.solids, made.ground, moment.position, FINE, moment.motion,
-                                  heading=moment.heading))
+        draw_view(
+            view, cast_rays(moment.solids, made.ground, moment.position, FINE, moment.motion, heading=moment.heading)
+        )
         scan = simulate_scan(seed, MOMENT, find_sensor("vlp-16", HEIGHT), Scenes(kind, 1.0, scene))
         ground = np.isin(scan.semantic, GROUND)
         for mask, size, colour in ((ground, 0.3, "0.7"), (~ground, 0.8, "tab:brown")):
@@ -47,8 +49,10 @@ def main() -> None:
 def draw_view(axes: Axes, hits: Hits) -> None:
     """All around, from behind over the left, ahead (the middle) and the right; labelled things
     red."""
+
     def picture(grid: np.ndarray) -> np.ndarray:
         return np.roll(grid[::-1], len(grid) // 2, axis=0).T
+
     far, shade, owner = picture(hits.range), picture(hits.cosine), picture(hits.owner)
     with np.errstate(invalid="ignore"):
         image = plt.get_cmap("turbo")(np.clip(np.log(far / 0.8) / np.log(60), 0, 1))[..., :3]

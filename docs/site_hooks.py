@@ -24,8 +24,9 @@ def repository() -> str:
     """Return the https address of the repository that setup.py would write, or ""."""
     url = os.environ.get("LIDAR_REPOSITORY_URL", "")
     if not url:
-        asked = subprocess.run(["git", "-C", str(ROOT), "config", "remote.origin.url"],
-                               capture_output=True, text=True, check=False)
+        asked = subprocess.run(
+            ["git", "-C", str(ROOT), "config", "remote.origin.url"], capture_output=True, text=True, check=False
+        )
         url = asked.stdout.strip()
     return url.removesuffix(".git") if url.startswith("https://") else ""
 
@@ -45,7 +46,9 @@ def help_of_all() -> str:
     return "".join(
         f"\n## {' '.join(words)}\n\n```text\n"
         + CliRunner().invoke(cli, [*words, "--help"], prog_name="lidar-perception").output
-        + "```\n" for words in commands(cli))
+        + "```\n"
+        for words in commands(cli)
+    )
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
@@ -64,4 +67,5 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
             return match[0]
         url = repository()
         return f"[{text}]({url}/blob/main/{path.relative_to(ROOT)}{anchor})" if url else text
+
     return LINK.sub(replace, markdown)

@@ -12,7 +12,9 @@ for frame in recording:
     print(f"{frame.name}: {len(found)} objects")
     for label, score, box in zip(found.labels, found.scores, found.boxes):
         x, y, _, length, width, height, yaw = box
-        print(f"  {label:10} score {score:.2f}  x {x:6.1f} m  y {y:6.1f} m  "
-              f"{length:.1f} x {width:.1f} x {height:.1f} m  yaw {yaw:5.2f} rad")
+        print(
+            f"  {label:10} score {score:.2f}  x {x:6.1f} m  y {y:6.1f} m  "
+            f"{length:.1f} x {width:.1f} x {height:.1f} m  yaw {yaw:5.2f} rad"
+        )
     if result.problem:
         print(f"  {result.problem}")

@@ -13,7 +13,6 @@ else:
 for method in "threshold", "patchwork", "cloth":
     ground = lp.segment_ground(points, method, sensor_height=1.73)
     cluster_ids = lp.cluster(points, ground=ground)
-    print(f"{method}: {ground.mean():.0%} of {len(points)} points are ground, "
-          f"{cluster_ids.max()} clusters")
+    print(f"{method}: {ground.mean():.0%} of {len(points)} points are ground, {cluster_ids.max()} clusters")
 people = lp.find_candidates(points)
 print(f"{len(people)} pedestrian candidates at x y z:", *people.boxes[:, :3].round(1).tolist())

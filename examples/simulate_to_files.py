@@ -17,8 +17,7 @@ for frame in lp.simulate(3, seed=7, sensor="vlp-16", scene="campus", sensor_heig
     name = frame.name.replace("/", "_")
     np.save(out / f"{name}.npy", frame.load().points())
     truth = frame.truth()
-    labels = [{"class": label, "box": box.tolist()}
-              for label, box in zip(truth.labels, truth.boxes)] if truth else []
+    labels = [{"class": label, "box": box.tolist()} for label, box in zip(truth.labels, truth.boxes)] if truth else []
     (out / "labels" / f"{name}.json").write_text(json.dumps(labels))
 recording = lp.open_recording(out)
 print(recording)

@@ -7,17 +7,13 @@ import click
 from lidar_perception.cli.main import LazyGroup, run_cli
 
 COMMANDS = {  # verb -> module.function, and its line in the overview
-    "compare": ("experiments.comparison.command.compare",
-                "Run every detector on the same frames, side by side."),
-    "realism": ("experiments.realism.command.realism",
-                "Compare simulated scans with real ones."),
-    "reproduce": ("experiments.framework.command.reproduce",
-                  "Reproduce the tables of a paper."),
+    "compare": ("experiments.comparison.command.compare", "Run every detector on the same frames, side by side."),
+    "realism": ("experiments.realism.command.realism", "Compare simulated scans with real ones."),
+    "reproduce": ("experiments.framework.command.reproduce", "Reproduce the tables of a paper."),
 }
 
 
-@click.group(cls=LazyGroup, commands_by_name=COMMANDS,
-             context_settings=dict(help_option_names=["-h", "--help"]))
+@click.group(cls=LazyGroup, commands_by_name=COMMANDS, context_settings=dict(help_option_names=["-h", "--help"]))
 def cli() -> None:
     """Experiments on lidar_perception, from a checkout.
 

@@ -1,6 +1,6 @@
 """Launch the fused detector of cars, pedestrians and cyclists; see detectors.launch.py.
 
-    ros2 launch lidar_perception fused.launch.py points:=/velodyne_points
+ros2 launch lidar_perception fused.launch.py points:=/velodyne_points
 """
 
 from pathlib import Path

@@ -1,6 +1,6 @@
 """Launch the pedestrian candidate pipeline; see detectors.launch.py.
 
-    ros2 launch lidar_perception perception.launch.py points:=/velodyne_points
+ros2 launch lidar_perception perception.launch.py points:=/velodyne_points
 """
 
 from pathlib import Path

@@ -1,6 +1,6 @@
 """Launch the PointNet detector of cars, pedestrians and cyclists; see detectors.launch.py.
 
-    ros2 launch lidar_perception pointnet.launch.py points:=/velodyne_points
+ros2 launch lidar_perception pointnet.launch.py points:=/velodyne_points
 """
 
 from pathlib import Path

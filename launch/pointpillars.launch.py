@@ -1,6 +1,6 @@
 """Launch the EG-PointPillars detector of cars, pedestrians and cyclists; see detectors.launch.py.
 
-    ros2 launch lidar_perception pointpillars.launch.py points:=/velodyne_points
+ros2 launch lidar_perception pointpillars.launch.py points:=/velodyne_points
 """
 
 from pathlib import Path

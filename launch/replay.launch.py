@@ -33,20 +33,25 @@ from lidar_perception.nodes.graph import (
     list_result_topics,
     relative_name,
 )
-from lidar_perception.nodes.launching import (
-    ARGUMENTS,
-    add_arguments,
-    find_given_arguments,
-    list_parameter_files,
-    reject_unknown_arguments,
-    split_detectors,
-)
+from lidar_perception.nodes.launch_parameters import add_arguments, list_parameter_files, split_detectors
+from lidar_perception.nodes.launching import ARGUMENTS, find_given_arguments, reject_unknown_arguments
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.wire.clouds import CLOUD_TYPES
 from lidar_perception.wire.topics import POINTS, TF_STATIC
 
-VALUES = ("bag", "detectors", "rate", "loop", "scores", "points", "config", "single", "real_time",
-          "use_sim_time", "log_level")
+VALUES = (
+    "bag",
+    "detectors",
+    "rate",
+    "loop",
+    "scores",
+    "points",
+    "config",
+    "single",
+    "real_time",
+    "use_sim_time",
+    "log_level",
+)
 HERE = Path(__file__).resolve().parent
 CONFIG = HERE.parent / "config" / "replay.param.yaml"
 # The protocol of the STM-CPA paper, for the candidates.
@@ -60,8 +65,7 @@ GRAPH = {"namespace": "", "name_prefix": ""}
 
 def replay(context, given):
     reject_unknown_arguments(given, context, {*VALUES, "rviz", *ARGUMENTS} - GRAPH.keys())
-    value = {k: context.perform_substitution(LaunchConfiguration(k))
-             for k in VALUES}
+    value = {k: context.perform_substitution(LaunchConfiguration(k)) for k in VALUES}
     single, detectors = value["single"] == "true", split_detectors(value["detectors"])
     own = [str(CONFIG), *([str(PAPER_CONFIG)] if "candidates" in detectors else [])]
     files = [*own, *list_parameter_files(value["config"])]
@@ -77,61 +81,115 @@ def replay(context, given):
     # launch cannot determine the type of an empty list.
     follow = {} if real_time else {"follow": finals}
     clouds_for = len(detectors) if single else 1  # subscribers of the clouds
-    waits = [*list_awaited_topics(detectors, single, clouds_for),
-             *(f"{final}:={1 if real_time else 2}" for final in finals)]  # evaluator, player
+    waits = [
+        *list_awaited_topics(detectors, single, clouds_for),
+        *(f"{final}:={1 if real_time else 2}" for final in finals),
+    ]  # evaluator, player
     player = Node(
-        package="lidar_perception", executable="bag_player", name="bag_player", output="screen",
-        parameters=add_arguments(files, "bag_player", {
-            "bag": value["bag"], "rate": float(value["rate"]), "loop": value["loop"] == "true",
-            "topics": played, **follow, "wait_for": waits}),
+        package="lidar_perception",
+        executable="bag_player",
+        name="bag_player",
+        output="screen",
+        parameters=add_arguments(
+            files,
+            "bag_player",
+            {
+                "bag": value["bag"],
+                "rate": float(value["rate"]),
+                "loop": value["loop"] == "true",
+                "topics": played,
+                **follow,
+                "wait_for": waits,
+            },
+        ),
         # Relative, so that they go into a namespace if this file is included in one.
-        remappings=[(t, relative_name(POINTS if t == clouds else t)) for t in played
-                    if t not in GLOBAL],
-        ros_arguments=log_level)
+        remappings=[(t, relative_name(POINTS if t == clouds else t)) for t in played if t not in GLOBAL],
+        ros_arguments=log_level,
+    )
     evaluator = Node(
-        package="lidar_perception", executable="evaluator", name="evaluator", output="screen",
+        package="lidar_perception",
+        executable="evaluator",
+        name="evaluator",
+        output="screen",
         parameters=add_arguments(files, "evaluator", {**scoring, **sim_time}),
-        remappings=list(remap.items()), ros_arguments=log_level)
-    end = TimerAction(period=LAST_FRAME_DELAY_S,
-                      actions=[EmitEvent(event=Shutdown(reason="the bag is played"))])
+        remappings=list(remap.items()),
+        ros_arguments=log_level,
+    )
+    end = TimerAction(period=LAST_FRAME_DELAY_S, actions=[EmitEvent(event=Shutdown(reason="the bag is played"))])
     graph = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(HERE / "detectors.launch.py")),
         launch_arguments={
-            "points": relative_name(POINTS), **GRAPH,
-            "config": ",".join(files), "detectors": value["detectors"],
+            "points": relative_name(POINTS),
+            **GRAPH,
+            "config": ",".join(files),
+            "detectors": value["detectors"],
             **{k: LaunchConfiguration(k) for k in ("single", "rviz", "use_sim_time", "log_level")},
-        }.items())
+        }.items(),
+    )
     configurations = context.launch_configurations
-    return [*(LogInfo(msg=f"{name}:={configurations[name]} is not an argument of replay.launch.py")
-              for name, fixed in GRAPH.items() if configurations.get(name, fixed) != fixed),
-            player, evaluator,
-            RegisterEventHandler(OnProcessExit(target_action=player, on_exit=[end])), graph]
+    return [
+        *(
+            LogInfo(msg=f"{name}:={configurations[name]} is not an argument of replay.launch.py")
+            for name, fixed in GRAPH.items()
+            if configurations.get(name, fixed) != fixed
+        ),
+        player,
+        evaluator,
+        RegisterEventHandler(OnProcessExit(target_action=player, on_exit=[end])),
+        graph,
+    ]
 
 
 def generate_launch_description():
     given = find_given_arguments()
-    return LaunchDescription([
-        DeclareLaunchArgument("bag", description="Folder of the bag."),
-        DeclareLaunchArgument("detectors", default_value="candidates",
-                              description="Comma-separated detectors to replay and to score: "
-                              "candidates, pointpillars, pointnet, fused."),
-        DeclareLaunchArgument("points", default_value="", description="Topic of the clouds; may be "
-                              "empty if the bag has only one."),
-        DeclareLaunchArgument("rate", default_value="1.0", description="Speed of the replay."),
-        DeclareLaunchArgument("loop", default_value="false", choices=["true", "false"],
-                              description="Restart the bag at its end."),
-        DeclareLaunchArgument("scores", default_value="", description="JSON file for the scores."),
-        DeclareLaunchArgument("config", default_value="", description="Comma-separated parameter "
-                              "files, loaded after config/replay*.param.yaml."),
-        DeclareLaunchArgument("single", default_value="false", choices=["true", "false"],
-                              description="Let each detector find ground and clusters itself."),
-        DeclareLaunchArgument("rviz", default_value="false", choices=["true", "false"],
-                              description="Start RViz with config/lidar_perception.rviz."),
-        DeclareLaunchArgument("real_time", default_value="false", choices=["true", "false"],
-                              description="Play at the rate of the sensor; false: send a cloud "
-                              "once the clouds before it have results."),
-        DeclareLaunchArgument("use_sim_time", default_value="true", choices=["true", "false"],
-                              description="Take the time from /clock."),
-        DeclareLaunchArgument("log_level", default_value="info", description="debug, info, ..."),
-        OpaqueFunction(function=lambda context: replay(context, given)),
-    ])
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("bag", description="Folder of the bag."),
+            DeclareLaunchArgument(
+                "detectors",
+                default_value="candidates",
+                description="Comma-separated detectors to replay and to score: "
+                "candidates, pointpillars, pointnet, fused.",
+            ),
+            DeclareLaunchArgument(
+                "points", default_value="", description="Topic of the clouds; may be empty if the bag has only one."
+            ),
+            DeclareLaunchArgument("rate", default_value="1.0", description="Speed of the replay."),
+            DeclareLaunchArgument(
+                "loop", default_value="false", choices=["true", "false"], description="Restart the bag at its end."
+            ),
+            DeclareLaunchArgument("scores", default_value="", description="JSON file for the scores."),
+            DeclareLaunchArgument(
+                "config",
+                default_value="",
+                description="Comma-separated parameter files, loaded after config/replay*.param.yaml.",
+            ),
+            DeclareLaunchArgument(
+                "single",
+                default_value="false",
+                choices=["true", "false"],
+                description="Let each detector find ground and clusters itself.",
+            ),
+            DeclareLaunchArgument(
+                "rviz",
+                default_value="false",
+                choices=["true", "false"],
+                description="Start RViz with config/lidar_perception.rviz.",
+            ),
+            DeclareLaunchArgument(
+                "real_time",
+                default_value="false",
+                choices=["true", "false"],
+                description="Play at the rate of the sensor; false: send a cloud "
+                "once the clouds before it have results.",
+            ),
+            DeclareLaunchArgument(
+                "use_sim_time",
+                default_value="true",
+                choices=["true", "false"],
+                description="Take the time from /clock.",
+            ),
+            DeclareLaunchArgument("log_level", default_value="info", description="debug, info, ..."),
+            OpaqueFunction(function=lambda context: replay(context, given)),
+        ]
+    )

@@ -11,31 +11,55 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
-from lidar_perception.nodes.launching import (
-    ARGUMENTS,
-    find_given_arguments,
-    reject_unknown_arguments,
-)
+from lidar_perception.nodes.launching import ARGUMENTS, find_given_arguments, reject_unknown_arguments
 
 GRAPH = Path(__file__).resolve().parent / "detectors.launch.py"
 SIDES = ("left", "right")
-SHARED = {"detectors": "candidates", "single": "false", "tracking": "false",
-          "processes": "auto", "respawn": "false", "rviz": "false", "rviz_frame": "",
-          "base_frame": "", "target_frame": "", "deskew": "", "range": "", "odometry": "odom",
-          "use_sim_time": "", "log_level": "info"}
+SHARED = {
+    "detectors": "candidates",
+    "single": "false",
+    "tracking": "false",
+    "processes": "auto",
+    "respawn": "false",
+    "rviz": "false",
+    "rviz_frame": "",
+    "base_frame": "",
+    "target_frame": "",
+    "deskew": "",
+    "range": "",
+    "odometry": "odom",
+    "use_sim_time": "",
+    "log_level": "info",
+}
 
 
 def generate_launch_description():
     given, known = find_given_arguments(), {*SIDES, *SHARED, *ARGUMENTS} - {"namespace", "points"}
-    return LaunchDescription([
-        OpaqueFunction(function=lambda context: reject_unknown_arguments(given, context, known)),
-        *(DeclareLaunchArgument(side, default_value="points", description="Topic of the clouds, in "
-                                f"the namespace {side} unless it starts with /.")
-          for side in SIDES),
-        *(DeclareLaunchArgument(name, default_value=value, description="See detectors.launch.py.")
-          for name, value in SHARED.items()),
-        *(IncludeLaunchDescription(PythonLaunchDescriptionSource(str(GRAPH)), launch_arguments={
-            "namespace": side, "points": LaunchConfiguration(side),
-            **{name: LaunchConfiguration(name) for name in SHARED}}.items())
-          for side in SIDES),
-    ])
+    return LaunchDescription(
+        [
+            OpaqueFunction(function=lambda context: reject_unknown_arguments(given, context, known)),
+            *(
+                DeclareLaunchArgument(
+                    side,
+                    default_value="points",
+                    description=f"Topic of the clouds, in the namespace {side} unless it starts with /.",
+                )
+                for side in SIDES
+            ),
+            *(
+                DeclareLaunchArgument(name, default_value=value, description="See detectors.launch.py.")
+                for name, value in SHARED.items()
+            ),
+            *(
+                IncludeLaunchDescription(
+                    PythonLaunchDescriptionSource(str(GRAPH)),
+                    launch_arguments={
+                        "namespace": side,
+                        "points": LaunchConfiguration(side),
+                        **{name: LaunchConfiguration(name) for name in SHARED},
+                    }.items(),
+                )
+                for side in SIDES
+            ),
+        ]
+    )

@@ -13,22 +13,26 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lidar_perception.api import (
-        cluster,
-        evaluate,
-        find_candidates,
-        load_detector,
-        segment_ground,
-        simulate,
-    )
+    from lidar_perception.api import cluster, evaluate, find_candidates, load_detector, segment_ground, simulate
     from lidar_perception.data.open import open_recording
     from lidar_perception.tracking.state import Tracks
     from lidar_perception.tracking.tracker import Tracker
     from lidar_perception.types import Detections, PointCloud
 
 __version__ = "0.1.0"
-__all__ = ["Detections", "PointCloud", "Tracker", "Tracks", "cluster", "evaluate",
-           "find_candidates", "load_detector", "open_recording", "segment_ground", "simulate"]
+__all__ = [
+    "Detections",
+    "PointCloud",
+    "Tracker",
+    "Tracks",
+    "cluster",
+    "evaluate",
+    "find_candidates",
+    "load_detector",
+    "open_recording",
+    "segment_ground",
+    "simulate",
+]
 
 _OTHER_MODULES = {  # (module, name) of everything outside lidar_perception.api
     "Detections": ("types", "Detections"),
@@ -40,6 +44,7 @@ _OTHER_MODULES = {  # (module, name) of everything outside lidar_perception.api
 
 
 if not TYPE_CHECKING:  # else every name would exist for a type checker
+
     def __getattr__(name: str) -> Any:
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

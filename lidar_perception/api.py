@@ -33,21 +33,20 @@ from lidar_perception.scoring.run import Skipped, measure_frames
 from lidar_perception.simulation.recording import simulate_recording
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import find_sensor
-from lidar_perception.types import (
-    SENSOR_HEIGHT,
-    Detections,
-    InputError,
-    PointCloud,
-    as_point_cloud,
-    unknown_name,
-)
+from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError, PointCloud, as_point_cloud, unknown_name
 
 P = TypeVar("P")  # a dataclass of parameters
 
 
-def load_detector(name_or_file: str | Path = FUSED, *, device: str = "auto", range: str = "auto",
-                  sensor_height: float | None = None, min_score: float | None = None,
-                  settings: Mapping[str, Any] | None = None) -> Detector:
+def load_detector(
+    name_or_file: str | Path = FUSED,
+    *,
+    device: str = "auto",
+    range: str = "auto",
+    sensor_height: float | None = None,
+    min_score: float | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> Detector:
     """Load a detector: detector(cloud).detections are the objects in a cloud.
 
     Args:
@@ -64,13 +63,19 @@ def load_detector(name_or_file: str | Path = FUSED, *, device: str = "auto", ran
     Raises:
         InputError: the detector cannot be loaded, or an argument is unknown or out of range.
     """
-    return open_detector(name_or_file, device, sensor_height=sensor_height, min_score=min_score,
-                         range=range, settings=settings or {})
+    return open_detector(
+        name_or_file, device, sensor_height=sensor_height, min_score=min_score, range=range, settings=settings or {}
+    )
 
 
-def segment_ground(xyz: PointCloud | ArrayLike, method: str = "threshold", *,
-                   sensor_height: float = SENSOR_HEIGHT, intensity: ArrayLike | None = None,
-                   **params: Any) -> np.ndarray:
+def segment_ground(
+    xyz: PointCloud | ArrayLike,
+    method: str = "threshold",
+    *,
+    sensor_height: float = SENSOR_HEIGHT,
+    intensity: ArrayLike | None = None,
+    **params: Any,
+) -> np.ndarray:
     """Segment the ground of a cloud.
 
     Args:
@@ -95,12 +100,19 @@ def segment_ground(xyz: PointCloud | ArrayLike, method: str = "threshold", *,
     defaults = GroundParams()
     pose = _set_params(defaults.sensor_pose, {"height": sensor_height})
     own = _set_params(getattr(defaults, method), params)
-    return segment.segment_ground(_make_cloud(xyz, intensity), replace(
-        defaults, method=method, sensor_pose=pose, **{method: own}))
+    return segment.segment_ground(
+        _make_cloud(xyz, intensity), replace(defaults, method=method, sensor_pose=pose, **{method: own})
+    )
 
 
-def cluster(xyz: PointCloud | ArrayLike, method: str = "dbscan", *,
-            ground: ArrayLike | None = None, density: float = 0.0, **params: Any) -> np.ndarray:
+def cluster(
+    xyz: PointCloud | ArrayLike,
+    method: str = "dbscan",
+    *,
+    ground: ArrayLike | None = None,
+    density: float = 0.0,
+    **params: Any,
+) -> np.ndarray:
     """Cluster the points of a cloud.
 
     Args:
@@ -129,10 +141,15 @@ def cluster(xyz: PointCloud | ArrayLike, method: str = "dbscan", *,
     return cluster_obstacles(cloud, mask, chosen)
 
 
-def find_candidates(xyz: PointCloud | ArrayLike, *, click: ArrayLike | None = None,
-                    sensor_height: float = SENSOR_HEIGHT, ground: np.ndarray | None = None,
-                    cluster_ids: np.ndarray | None = None,
-                    settings: Mapping[str, Any] | None = None) -> Detections:
+def find_candidates(
+    xyz: PointCloud | ArrayLike,
+    *,
+    click: ArrayLike | None = None,
+    sensor_height: float = SENSOR_HEIGHT,
+    ground: np.ndarray | None = None,
+    cluster_ids: np.ndarray | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> Detections:
     """Find pedestrian candidates without a trained network (STM-CPA, configuration `best`).
 
     Args:
@@ -152,17 +169,24 @@ def find_candidates(xyz: PointCloud | ArrayLike, *, click: ArrayLike | None = No
         InputError: an array has another shape, there is no cluster at click, or a parameter is
             unknown or out of range.
     """
-    params = _set_params(BEST, {"view.enabled": False,
-                                "ground.sensor_pose.height": sensor_height, **(settings or {})})
-    seed = (make_automatic_source(load_seeds(params.seed.file), params) if click is None else
-            make_click_source(np.asarray(click, float), params.seed))
+    params = _set_params(BEST, {"view.enabled": False, "ground.sensor_pose.height": sensor_height, **(settings or {})})
+    seed = (
+        make_automatic_source(load_seeds(params.seed.file), params)
+        if click is None
+        else make_click_source(np.asarray(click, float), params.seed)
+    )
     _, candidates = run_pipeline(xyz, seed, None, params, ground=ground, cluster_ids=cluster_ids)
     return candidates.final
 
 
-def evaluate(detector: str | Path | Detector | Callable[[PointCloud], Detections],
-             recording: str | Path | Recording, *, limit: int | None = None,
-             min_score: float | None = MIN_SCORE, intervals: int = 0) -> dict[str, Any]:
+def evaluate(
+    detector: str | Path | Detector | Callable[[PointCloud], Detections],
+    recording: str | Path | Recording,
+    *,
+    limit: int | None = None,
+    min_score: float | None = MIN_SCORE,
+    intervals: int = 0,
+) -> dict[str, Any]:
     """Score a detector on the labelled frames of a recording, as `evaluate detection` does.
 
     Args:
@@ -187,8 +211,7 @@ def evaluate(detector: str | Path | Detector | Callable[[PointCloud], Detections
     recording.require(BOXES, "evaluate")
     if isinstance(detector, (str, Path)):
         recording = apply_measured_height(recording, load_first_clouds(recording))
-        loaded: Detector = open_detector(detector, min_score=min_score,
-                                         sensor_height=recording.frames[0].sensor_height)
+        loaded: Detector = open_detector(detector, min_score=min_score, sensor_height=recording.frames[0].sensor_height)
     else:
         loaded = as_detector(detector)
         loaded = loaded if min_score is None else loaded.with_min_score(min_score)
@@ -207,9 +230,16 @@ def evaluate(detector: str | Path | Detector | Callable[[PointCloud], Detections
     return {**content, "intervals": report.compute_intervals(intervals)} if intervals else content
 
 
-def simulate(frames: int = 40, seed: int = 1, sensor: str = "hdl64e", scene: str = "street", *,
-             kind: str | None = None, people: float = 1.0,
-             sensor_height: float | None = None) -> Recording:
+def simulate(
+    frames: int = 40,
+    seed: int = 1,
+    sensor: str = "hdl64e",
+    scene: str = "street",
+    *,
+    kind: str | None = None,
+    people: float = 1.0,
+    sensor_height: float | None = None,
+) -> Recording:
     """Simulate labelled scans, which are computed when they are read.
 
     Args:
@@ -231,8 +261,9 @@ def simulate(frames: int = 40, seed: int = 1, sensor: str = "hdl64e", scene: str
     if frames < 1 or seed < 0:
         name, value, low = ("frames", frames, 1) if frames < 1 else ("seed", seed, 0)
         raise InputError(f"{name} = {value} must be {low} or more")
-    return simulate_recording(seed, frames, find_sensor(sensor, sensor_height or 0.0),
-                              scenes=Scenes(kind, people, scene))
+    return simulate_recording(
+        seed, frames, find_sensor(sensor, sensor_height or 0.0), scenes=Scenes(kind, people, scene)
+    )
 
 
 def _make_cloud(xyz: PointCloud | ArrayLike, intensity: ArrayLike | None) -> PointCloud:

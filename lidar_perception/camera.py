@@ -26,26 +26,30 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.projection).all() and 0 < self.width < MAX_PIXELS
-                and 0 < self.height < MAX_PIXELS):
-            raise InputError("the camera's calibration has a value that is not finite, or an "
-                             f"image of {self.width} x {self.height} pixels; calibrate it again")
+        if not (np.isfinite(self.projection).all() and 0 < self.width < MAX_PIXELS and 0 < self.height < MAX_PIXELS):
+            raise InputError(
+                "the camera's calibration has a value that is not finite, or an "
+                f"image of {self.width} x {self.height} pixels; calibrate it again"
+            )
 
     @staticmethod
-    def from_camera_pose(intrinsics: np.ndarray, rotation: np.ndarray, translation: np.ndarray,
-                         width: int, height: int) -> Camera:
+    def from_camera_pose(
+        intrinsics: np.ndarray, rotation: np.ndarray, translation: np.ndarray, width: int, height: int
+    ) -> Camera:
         """Make a camera of P (3, 4), as in CameraInfo or KITTI, and its pose in the LiDAR frame.
 
         The pose is that of TF: rotation is a quaternion [x y z w], translation (3,) in metres. The
         camera frame is optical: x right, y down, z forward.
         """
         to_lidar = Rotation.from_quat(rotation)
-        return Camera.from_lidar_pose(intrinsics, to_lidar.inv().as_quat(),
-                                      -to_lidar.inv().apply(translation), width, height)
+        return Camera.from_lidar_pose(
+            intrinsics, to_lidar.inv().as_quat(), -to_lidar.inv().apply(translation), width, height
+        )
 
     @staticmethod
-    def from_lidar_pose(intrinsics: np.ndarray, rotation: np.ndarray, translation: np.ndarray,
-                        width: int, height: int) -> Camera:
+    def from_lidar_pose(
+        intrinsics: np.ndarray, rotation: np.ndarray, translation: np.ndarray, width: int, height: int
+    ) -> Camera:
         """Make a camera of P (3, 4) and the LiDAR's pose in the camera frame."""
         lidar_to_camera = np.eye(4)
         lidar_to_camera[:3, :3] = Rotation.from_quat(rotation).as_matrix()
@@ -63,12 +67,10 @@ class Camera:
 
         regions (R, 4) are [left top right bottom] in pixels and may extend beyond the image.
         """
-        u, v, depth = (np.asarray(xyz, np.float64) @ self.projection[:, :3].T
-                       + self.projection[:, 3]).T
+        u, v, depth = (np.asarray(xyz, np.float64) @ self.projection[:, :3].T + self.projection[:, 3]).T
         inside = np.zeros(len(xyz), bool)
         for left, top, right, bottom in np.reshape(regions, (-1, 4)):
-            inside |= ((left * depth <= u) & (u < right * depth)
-                       & (top * depth <= v) & (v < bottom * depth))
+            inside |= (left * depth <= u) & (u < right * depth) & (top * depth <= v) & (v < bottom * depth)
         return inside & (depth > 0)
 
 
@@ -108,13 +110,13 @@ class Calibration:
     def equals(self, other: Calibration | None) -> bool:
         """Return True if the other calibration has the same values."""
         return other is not None and all(
-            np.array_equal(a, b) for a, b in zip(vars(self).values(), vars(other).values()))
+            np.array_equal(a, b) for a, b in zip(vars(self).values(), vars(other).values())
+        )
 
     def camera(self) -> Camera:
         """Return the camera with this calibration."""
         rotation, translation = self.pose
-        return Camera.from_camera_pose(self.intrinsics, rotation, translation, self.width,
-                                       self.height)
+        return Camera.from_camera_pose(self.intrinsics, rotation, translation, self.width, self.height)
 
 
 # Nominal camera of the simulator and of recordings without one: KITTI's field of view, level,
@@ -122,4 +124,6 @@ class Calibration:
 FORWARD_CAMERA = Calibration(
     intrinsics=np.array([[720.0, 0, 621, 0], [0, 720, 187.5, 0], [0, 0, 1, 0]]),
     lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]),
-    width=1242, height=375)
+    width=1242,
+    height=375,
+)

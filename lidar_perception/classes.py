@@ -51,20 +51,27 @@ class ObjectClass:
 
 
 TABLE = (
-    ObjectClass("Car", DetectionNumbers((3.9, 1.6, 1.56), 0.6, 0.45, (3.88, 1.63, 1.53), 3.00, 0.7,
-                                        0.5),
-                vehicle=True, aliases=("vehicle", "automobile")),
+    ObjectClass(
+        "Car",
+        DetectionNumbers((3.9, 1.6, 1.56), 0.6, 0.45, (3.88, 1.63, 1.53), 3.00, 0.7, 0.5),
+        vehicle=True,
+        aliases=("vehicle", "automobile"),
+    ),
     ObjectClass("Van", looks_like="Car", vehicle=True),
     ObjectClass("Truck", vehicle=True),
-    ObjectClass("Pedestrian",
-                DetectionNumbers((0.8, 0.6, 1.73), 0.5, 0.35, (0.84, 0.66, 1.76), 0.40, 0.5,
-                                 0.25), moves_as="pedestrian",
-                aliases=("person", "people", "human")),
+    ObjectClass(
+        "Pedestrian",
+        DetectionNumbers((0.8, 0.6, 1.73), 0.5, 0.35, (0.84, 0.66, 1.76), 0.40, 0.5, 0.25),
+        moves_as="pedestrian",
+        aliases=("person", "people", "human"),
+    ),
     ObjectClass("Person_sitting", looks_like="Pedestrian", moves_as="pedestrian"),
-    ObjectClass("Cyclist", DetectionNumbers((1.76, 0.6, 1.73), 0.5, 0.35, (1.76, 0.60, 1.74), 1.72,
-                                            0.5,
-                                            0.25), moves_as="cyclist",
-                aliases=("bicycle", "bicyclist", "rider")),
+    ObjectClass(
+        "Cyclist",
+        DetectionNumbers((1.76, 0.6, 1.73), 0.5, 0.35, (1.76, 0.60, 1.74), 1.72, 0.5, 0.25),
+        moves_as="cyclist",
+        aliases=("bicycle", "bicyclist", "rider"),
+    ),
     ObjectClass("Tram", vehicle=True),
     ObjectClass("Misc"),
     ObjectClass("DontCare"),
@@ -74,12 +81,10 @@ MAX_DIAGONAL = 6.40  # metres, of the largest class (paper B, Table 2)
 CLASSES = tuple(row.name for row in TABLE)
 _NAME_BY_SPELLING = {"".join(filter(str.isalnum, name)).casefold(): name for name in CLASSES}
 # Index into CLASSES by every name of a class, in lower case.
-ID_BY_ALIAS = {name.casefold(): i for i, row in enumerate(TABLE)
-               for name in (row.name, *row.aliases)}
+ID_BY_ALIAS = {name.casefold(): i for i, row in enumerate(TABLE) for name in (row.name, *row.aliases)}
 DETECTED = {row.name: row.numbers for row in TABLE if row.numbers is not None}
 BY_SIZE = sorted(DETECTED, key=lambda name: -DETECTED[name].min_diagonal)  # largest first
-CAR, PEDESTRIAN, CYCLIST, DONT_CARE = map(CLASSES.index, ("Car", "Pedestrian", "Cyclist",
-                                                          "DontCare"))
+CAR, PEDESTRIAN, CYCLIST, DONT_CARE = map(CLASSES.index, ("Car", "Pedestrian", "Cyclist", "DontCare"))
 
 
 def class_name(text: str) -> str:

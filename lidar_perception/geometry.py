@@ -58,8 +58,7 @@ def points_in_box(xyz: np.ndarray, box: np.ndarray, margin: float = 0.0) -> np.n
     return inside
 
 
-def points_in_boxes(xyz: np.ndarray, boxes: np.ndarray,
-                    margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+def points_in_boxes(xyz: np.ndarray, boxes: np.ndarray, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Find the points (N, 3) inside each of the boxes (K, 7), as points_in_box does.
 
     A point can be in several boxes. The time grows with K * N: meant for detections.
@@ -79,7 +78,7 @@ def points_in_boxes(xyz: np.ndarray, boxes: np.ndarray,
     return np.sort(inside + offset) - offset, first
 
 
-SLAB_COUNT = 256      # slabs across x in which the points of a box are searched
+SLAB_COUNT = 256  # slabs across x in which the points of a box are searched
 MAX_DISTANCE_M = 1e9  # no point is farther
 
 
@@ -184,13 +183,16 @@ def _points_in_boxes(xyz, boxes, margin, begin, end, low, high):
         height = boxes[k, 5] / 2.0 + margin
         left, right = max(begin[k], low), min(end[k], high)
         if left <= right:
-            near = order[start[int((left - low) * scale)]:start[int((right - low) * scale) + 1]]
+            near = order[start[int((left - low) * scale)] : start[int((right - low) * scale) + 1]]
             if count + len(near) > len(inside):
                 inside = np.concatenate((inside, np.empty(len(inside) + len(near), np.int64)))
             for i in near:
                 dx, dy = xyz[i, 0] - x, xyz[i, 1] - y
-                if (abs(cos * dx + sin * dy) <= length and abs(cos * dy - sin * dx) <= width
-                        and abs(xyz[i, 2] - z) <= height):
+                if (
+                    abs(cos * dx + sin * dy) <= length
+                    and abs(cos * dy - sin * dx) <= width
+                    and abs(xyz[i, 2] - z) <= height
+                ):
                     inside[count] = i
                     count += 1
         first[k + 1] = count

@@ -39,8 +39,7 @@ def group_by_id(ids: np.ndarray, min_points: int = 1) -> Groups:
     first = np.concatenate([[0], cuts]) if len(rows) else np.zeros(0, np.int64)
     sizes = np.diff(np.append(first, len(rows)))
     kept = sizes >= min_points
-    return Groups(rows[np.repeat(kept, sizes)], _cumulate(sizes[kept]),
-                  ordered[first[kept]].astype(np.int64))
+    return Groups(rows[np.repeat(kept, sizes)], _cumulate(sizes[kept]), ordered[first[kept]].astype(np.int64))
 
 
 def count_clusters(labels: np.ndarray) -> int:
@@ -52,13 +51,14 @@ def count_clusters(labels: np.ndarray) -> int:
     """
     count = int(labels.max(initial=0))
     if count > len(labels):
-        raise InputError(f"a cluster has the id {count}, but there are {len(labels)} points; "
-                         "number the clusters 1, 2, ... without gaps")
+        raise InputError(
+            f"a cluster has the id {count}, but there are {len(labels)} points; "
+            "number the clusters 1, 2, ... without gaps"
+        )
     return count
 
 
-def group_points(xyz: np.ndarray, labels: np.ndarray,
-                 wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def group_points(xyz: np.ndarray, labels: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the points (M, 3) of clusters, cluster after cluster, and the start (K + 1,) of each.
 
     Args:
@@ -96,8 +96,9 @@ def renumber_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if ids.dtype.kind == "f":
         ids = np.where(np.isfinite(ids) & (ids > 0), ids, 0).astype(np.float64)
         if not (ids == np.floor(ids)).all() or ids.max(initial=0) > 2.0**53:
-            raise InputError("the column of cluster ids has values that are not whole numbers; "
-                             "give whole numbers, 0 for no cluster")
+            raise InputError(
+                "the column of cluster ids has values that are not whole numbers; give whole numbers, 0 for no cluster"
+            )
     elif ids.dtype.kind not in "iub":
         raise InputError(f"the column of cluster ids is of type {ids.dtype}; give whole numbers")
     ids = ids.astype(np.int64)

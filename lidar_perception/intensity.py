@@ -9,21 +9,37 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import DTypeLike
 
-MAX_UNIT = 1.5         # noise and calibration make intensities of 0..1 exceed 1, but not this value
+MAX_UNIT = 1.5  # noise and calibration make intensities of 0..1 exceed 1, but not this value
 PERCENT = 100.0
 BITS = (255.0, 1023.0, 4095.0, 65535.0)  # 8, 10, 12 and 16 bits
-TOLERANCE = 1.001      # factor by which rounding lets a value exceed its scale
-MAX_OUTLIERS = 1e-4    # share of the values of a cloud that may exceed its scale
+TOLERANCE = 1.001  # factor by which rounding lets a value exceed its scale
+MAX_OUTLIERS = 1e-4  # share of the values of a cloud that may exceed its scale
 WHOLE_SAMPLE = 10_000  # number of values that are checked for being whole numbers
-MIN_BRIGHT = 0.05      # of the highest intensity in a cloud of at least MIN_POINTS points
+MIN_BRIGHT = 0.05  # of the highest intensity in a cloud of at least MIN_POINTS points
 MIN_POINTS = 1000
-MIN_KNOWN = 0.1        # share of the points that must have an intensity for it to be usable
+MIN_KNOWN = 0.1  # share of the points that must have an intensity for it to be usable
 # Distribution of positive intensities that networks read, as of an HDL-64E in towns: shares of the
 # points, and the intensity that each share does not exceed.
-REFERENCE_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98,
-                    0.99, 0.995, 1.0)
-REFERENCE_VALUES = (0.01, 0.05, 0.09, 0.135, 0.185, 0.225, 0.26, 0.285, 0.31, 0.335, 0.37, 0.42,
-                    0.48, 0.55, 0.62, 0.71, 0.99)
+REFERENCE_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 1.0)
+REFERENCE_VALUES = (
+    0.01,
+    0.05,
+    0.09,
+    0.135,
+    0.185,
+    0.225,
+    0.26,
+    0.285,
+    0.31,
+    0.335,
+    0.37,
+    0.42,
+    0.48,
+    0.55,
+    0.62,
+    0.71,
+    0.99,
+)
 INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # a cloud's first one counts
 
 
@@ -46,7 +62,7 @@ def infer_full_scale(values: np.ndarray, dtype: DTypeLike | None = None) -> floa
     if kind.kind not in "iu":
         if not _exceeds(values, MAX_UNIT):
             return 1.0
-        sample = values[::max(1, len(values) // WHOLE_SAMPLE)]
+        sample = values[:: max(1, len(values) // WHOLE_SAMPLE)]
         sample = sample[np.isfinite(sample)]
         if (sample != np.round(sample)).any() and not _exceeds(values, PERCENT * TOLERANCE):
             return PERCENT
@@ -75,8 +91,7 @@ def to_unit(values: np.ndarray, full: float) -> np.ndarray:
     return values / np.float32(full)
 
 
-def normalize_intensity(intensity: np.ndarray | None,
-                        indices: np.ndarray | None = None) -> np.ndarray | None:
+def normalize_intensity(intensity: np.ndarray | None, indices: np.ndarray | None = None) -> np.ndarray | None:
     """Map the intensities of a cloud to the distribution that networks are trained with.
 
     The result depends only on the order of the intensities, so gain, gamma and scale of the sensor
@@ -120,7 +135,7 @@ def has_usable_intensity(intensity: np.ndarray | None) -> bool:
     """
     if intensity is None:
         return False
-    sample = intensity[::max(1, len(intensity) // WHOLE_SAMPLE)]
+    sample = intensity[:: max(1, len(intensity) // WHOLE_SAMPLE)]
     positive = sample[sample > 0]
     if len(positive) <= MIN_KNOWN * len(sample):
         return False
@@ -148,13 +163,14 @@ def find_scale_problem(intensity: np.ndarray | None) -> str | None:
         return None
     greatest = float(np.fmax.reduce(intensity, initial=0))
     inferred = guess_scale(intensity)
-    if inferred == 1.0 and (greatest == 0.0 or greatest >= MIN_BRIGHT
-                            or len(intensity) < MIN_POINTS):
+    if inferred == 1.0 and (greatest == 0.0 or greatest >= MIN_BRIGHT or len(intensity) < MIN_POINTS):
         return None
     guess = f", so it is divided by {inferred:g}, a guess" if inferred != 1.0 else ""
-    return (f"intensity goes up to {greatest:.3g} where 1 is a full reflection{guess}; set "
-            "input.intensity_max, or in Python intensity_max of PointCloud.of, to the value of a "
-            "full reflection (1, 100 or 255 for most drivers; setup measures it)")
+    return (
+        f"intensity goes up to {greatest:.3g} where 1 is a full reflection{guess}; set "
+        "input.intensity_max, or in Python intensity_max of PointCloud.of, to the value of a "
+        "full reflection (1, 100 or 255 for most drivers; setup measures it)"
+    )
 
 
 def guess_scale(intensity: np.ndarray) -> float:

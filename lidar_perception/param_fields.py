@@ -22,8 +22,16 @@ SHORT_REPR.maxstring = SHORT_REPR.maxother = SHORT_REPR.maxlong = 80
 SHORT_REPR.maxlevel = 2
 
 
-def param(default: Any, doc: str, *, unit: str = "", low: float | None = None,
-          high: float | None = None, choices: tuple[str, ...] = (), fixed: bool = False) -> Any:
+def param(
+    default: Any,
+    doc: str,
+    *,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+    fixed: bool = False,
+) -> Any:
     """Declare a parameter: a dataclass field with metadata for ROS, YAML, command line and docs.
 
     Args:
@@ -32,11 +40,9 @@ def param(default: Any, doc: str, *, unit: str = "", low: float | None = None,
         low, high: inclusive limits.
         fixed: True if the parameter cannot change while a node runs.
     """
-    item = default if isinstance(default, type) else type(default[0]) if isinstance(
-        default, tuple) else None
+    item = default if isinstance(default, type) else type(default[0]) if isinstance(default, tuple) else None
     default = () if isinstance(default, type) else default
-    metadata = dict(doc=doc, unit=unit, low=low, high=high, choices=choices, fixed=fixed,
-                    item=item)
+    metadata = dict(doc=doc, unit=unit, low=low, high=high, choices=choices, fixed=fixed, item=item)
     return field(default=default, metadata=metadata)
 
 
@@ -59,13 +65,14 @@ def _check_value(f: dataclasses.Field[Any], value: Any) -> Any:
     default, limits = f.default, f.metadata
     if isinstance(default, tuple):
         if isinstance(value, str) or not hasattr(value, "__iter__"):
-            raise ValueError(f"{f.name} = {SHORT_REPR.repr(value)} must be a list of "
-                             f"{limits['item'].__name__}")
+            raise ValueError(f"{f.name} = {SHORT_REPR.repr(value)} must be a list of {limits['item'].__name__}")
         return tuple(_check_scalar(f, limits["item"], item) for item in value)
     value = _check_scalar(f, type(default), value)
     if limits["choices"] and value not in limits["choices"]:
-        raise ValueError(f"{f.name} = {value!r} must be one of {', '.join(limits['choices'])}"
-                         + did_you_mean(value, limits["choices"]))
+        raise ValueError(
+            f"{f.name} = {value!r} must be one of {', '.join(limits['choices'])}"
+            + did_you_mean(value, limits["choices"])
+        )
     return value
 
 
@@ -84,8 +91,7 @@ def _check_scalar(f: dataclasses.Field[Any], kind: type[Any], value: Any) -> Any
     return value
 
 
-def _walk_fields(params: Any,
-                 prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
+def _walk_fields(params: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
     """Yield (dotted name, value, field) of every parameter of a group or a dataclass of groups."""
     for f in fields(params):
         value = getattr(params, f.name)

@@ -17,8 +17,16 @@ from numpy.typing import ArrayLike
 from lidar_perception.classes import CLASSES, PEDESTRIAN, class_name
 from lidar_perception.intensity import to_unit
 
-__all__ = ["CLASSES", "PEDESTRIAN", "Detections", "GroundTruth", "InputError", "InputWarning",
-           "PointCloud", "usable_returns"]
+__all__ = [
+    "CLASSES",
+    "PEDESTRIAN",
+    "Detections",
+    "GroundTruth",
+    "InputError",
+    "InputWarning",
+    "PointCloud",
+    "usable_returns",
+]
 
 MAX_RANGE = 1e5  # metres; points beyond are broken returns
 MIN_NAME_SIMILARITY = 0.6  # of a misspelt name, 0..1 as in difflib
@@ -47,8 +55,11 @@ def closest_name(name: object, known: Iterable[str]) -> str | None:
     """
     wanted, by_spelling = _normalise(str(name)), {_normalise(n): n for n in known}
     same_prefix = [n for n in by_spelling if n[:MIN_PREFIX] == wanted[:MIN_PREFIX]]
-    found = ([n for n in same_prefix if n.startswith(wanted)]
-             or get_close_matches(wanted, by_spelling, 1, MIN_NAME_SIMILARITY) or same_prefix)
+    found = (
+        [n for n in same_prefix if n.startswith(wanted)]
+        or get_close_matches(wanted, by_spelling, 1, MIN_NAME_SIMILARITY)
+        or same_prefix
+    )
     return by_spelling[found[0]] if found else None
 
 
@@ -68,8 +79,7 @@ def valid_names(name: object, known: Iterable[str]) -> str:
     """Return the end of a message about an unknown name, with the closest match and all names."""
     known = list(known)
     guess = did_you_mean(name, known)
-    return f"{guess} Valid names: {', '.join(known)}" if guess else (
-        f"; valid names: {', '.join(known)}")
+    return f"{guess} Valid names: {', '.join(known)}" if guess else (f"; valid names: {', '.join(known)}")
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
@@ -94,15 +104,22 @@ class PointCloud:
     def __post_init__(self) -> None:
         shape = np.shape(self.xyz)
         if len(shape) != 2 or shape[1] != 3:
-            raise InputError(f"xyz of a PointCloud has shape {shape}, not (N, 3); PointCloud.of "
-                             "takes points (N, 3) or (N, 4)")
+            raise InputError(
+                f"xyz of a PointCloud has shape {shape}, not (N, 3); PointCloud.of takes points (N, 3) or (N, 4)"
+            )
         if self.intensity is not None and np.shape(self.intensity) != shape[:1]:
-            raise InputError(f"intensity has shape {np.shape(self.intensity)} for {shape[0]} "
-                             f"points; give ({shape[0]},) or None")
+            raise InputError(
+                f"intensity has shape {np.shape(self.intensity)} for {shape[0]} points; give ({shape[0]},) or None"
+            )
 
     @staticmethod
-    def of(points: ArrayLike, intensity: ArrayLike | None = None, stamp_ns: int = 0,
-           frame_id: str = "", intensity_max: float | None = None) -> PointCloud:
+    def of(
+        points: ArrayLike,
+        intensity: ArrayLike | None = None,
+        stamp_ns: int = 0,
+        frame_id: str = "",
+        intensity_max: float | None = None,
+    ) -> PointCloud:
         """Make a cloud of the usable points (see usable_returns) of a sensor.
 
         Args:
@@ -133,35 +150,50 @@ class PointCloud:
         return np.column_stack([self.xyz, intensity])
 
 
-def as_point_cloud(cloud: PointCloud | ArrayLike, intensity: ArrayLike | None = None,
-                   stamp_ns: int = 0, frame_id: str = "",
-                   intensity_max: float | None = None) -> PointCloud:
+def as_point_cloud(
+    cloud: PointCloud | ArrayLike,
+    intensity: ArrayLike | None = None,
+    stamp_ns: int = 0,
+    frame_id: str = "",
+    intensity_max: float | None = None,
+) -> PointCloud:
     """Make a cloud of all points, including unusable ones; a PointCloud is returned unchanged.
 
     For arguments and errors see PointCloud.of.
     """
     if isinstance(cloud, PointCloud):
         return cloud
-    points = _to_numbers(cloud, "a cloud", "a PointCloud (frame.load() of a recorded frame, "
-                      "to_point_cloud of a PointCloud2) or numbers (N, 3) [x y z] or (N, 4) "
-                      "[x y z intensity]")
+    points = _to_numbers(
+        cloud,
+        "a cloud",
+        "a PointCloud (frame.load() of a recorded frame, "
+        "to_point_cloud of a PointCloud2) or numbers (N, 3) [x y z] or (N, 4) "
+        "[x y z intensity]",
+    )
     if points.shape == (0,):
         points = points.reshape(0, 3)
     if points.ndim != 2 or points.shape[1] not in (3, 4):
         shape, remedy = points.shape, ""
         if points.ndim == 2:
-            remedy = ("; pass points[:, :4]" if shape[1] > 4 and shape[0] not in (3, 4) else
-                      "; pass points.T" if shape[0] in (3, 4) else "")
-        raise InputError(f"a cloud has shape {shape}; allowed are (N, 3) [x y z] and (N, 4) [x y z "
-                         f"intensity]{remedy}")
+            remedy = (
+                "; pass points[:, :4]"
+                if shape[1] > 4 and shape[0] not in (3, 4)
+                else "; pass points.T"
+                if shape[0] in (3, 4)
+                else ""
+            )
+        raise InputError(f"a cloud has shape {shape}; allowed are (N, 3) [x y z] and (N, 4) [x y z intensity]{remedy}")
     if points.shape[1] == 4 and intensity is not None:
-        raise InputError("the intensity is given twice, as a column of points (N, 4) and as "
-                         "intensity; pass points[:, :3]")
+        raise InputError(
+            "the intensity is given twice, as a column of points (N, 4) and as intensity; pass points[:, :3]"
+        )
     if intensity_max is not None and not 0 < intensity_max < np.inf:
-        raise InputError(f"intensity_max is {intensity_max:g}; it must be above 0: 1, 100 or 255 "
-                         "for most drivers")
-    values = points[:, 3] if points.shape[1] == 4 else (
-        None if intensity is None else _to_numbers(intensity, "intensity", "(N,) numbers"))
+        raise InputError(f"intensity_max is {intensity_max:g}; it must be above 0: 1, 100 or 255 for most drivers")
+    values = (
+        points[:, 3]
+        if points.shape[1] == 4
+        else (None if intensity is None else _to_numbers(intensity, "intensity", "(N,) numbers"))
+    )
     if values is not None:
         full = intensity_max or (255.0 if values.dtype == np.uint8 else 1.0)
         values = to_unit(values, full)
@@ -174,8 +206,9 @@ def _to_numbers(array: Any, what: str, allowed: str) -> np.ndarray:
     try:
         values = np.asarray(array)
     except (TypeError, ValueError, RuntimeError) as error:  # ragged lists, tensors on a GPU
-        raise InputError(f"{what} cannot be read as an array "
-                         f"({str(error).splitlines()[0]}); allowed: {allowed}") from None
+        raise InputError(
+            f"{what} cannot be read as an array ({str(error).splitlines()[0]}); allowed: {allowed}"
+        ) from None
     if values.dtype.kind not in "fiu":
         kind = f" of {values.dtype.name}" if isinstance(array, np.ndarray) else ""
         raise InputError(f"{what} is {type(array).__name__}{kind}; allowed: {allowed}")
@@ -214,8 +247,7 @@ class Detections:
     sources: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @staticmethod
-    def of(boxes: ArrayLike, class_ids: ArrayLike = PEDESTRIAN,
-           scores: ArrayLike = 1.0) -> Detections:
+    def of(boxes: ArrayLike, class_ids: ArrayLike = PEDESTRIAN, scores: ArrayLike = 1.0) -> Detections:
         """Make detections.
 
         Args:
@@ -228,15 +260,12 @@ class Detections:
         """
         rows = _to_numbers(boxes, "boxes", "numbers (K, 7) [x y z l w h yaw]")
         if rows.ndim > 2 or (rows.size and rows.shape[-1:] != (7,)):
-            raise InputError(f"boxes have shape {rows.shape}; allowed is (K, 7) "
-                             "[x y z l w h yaw]")
+            raise InputError(f"boxes have shape {rows.shape}; allowed is (K, 7) [x y z l w h yaw]")
         boxes = np.ascontiguousarray(rows, np.float32).reshape(-1, 7)
         count, columns = len(boxes), []
-        for name, column in (("class_ids", _to_class_ids(class_ids)),
-                             ("scores", np.asarray(scores, np.float32))):
+        for name, column in (("class_ids", _to_class_ids(class_ids)), ("scores", np.asarray(scores, np.float32))):
             if column.shape not in ((), (1,), (count,)):
-                raise InputError(f"{name} have shape {column.shape} for {count} boxes; give "
-                                 f"({count},) or one number")
+                raise InputError(f"{name} have shape {column.shape} for {count} boxes; give ({count},) or one number")
             columns.append(np.broadcast_to(column, count).copy())
         return Detections(boxes, columns[0], columns[1])
 
@@ -254,14 +283,20 @@ class Detections:
 
     def __getitem__(self, index: np.ndarray | slice) -> Detections:
         """Return the detections selected by a mask, slice or index array."""
-        return Detections(self.boxes[index], self.class_ids[index], self.scores[index],
-                          {name: scores[index] for name, scores in self.sources.items()})
+        return Detections(
+            self.boxes[index],
+            self.class_ids[index],
+            self.scores[index],
+            {name: scores[index] for name, scores in self.sources.items()},
+        )
 
     def followed_by(self, others: Detections) -> Detections:
         """Return these detections and then the others, without sources."""
-        return Detections(np.concatenate([self.boxes, others.boxes]),
-                          np.concatenate([self.class_ids, others.class_ids]),
-                          np.concatenate([self.scores, others.scores]))
+        return Detections(
+            np.concatenate([self.boxes, others.boxes]),
+            np.concatenate([self.class_ids, others.class_ids]),
+            np.concatenate([self.scores, others.scores]),
+        )
 
 
 def _to_class_ids(ids_or_names: ArrayLike) -> np.ndarray:
@@ -276,8 +311,7 @@ def _to_class_ids(ids_or_names: ArrayLike) -> np.ndarray:
 
 def class_ids(names: Iterable[str]) -> list[int]:
     """Return the indices into CLASSES of names in any spelling; that of Misc for unknown names."""
-    return [CLASSES.index(known if (known := class_name(name)) in CLASSES else "Misc")
-            for name in names]
+    return [CLASSES.index(known if (known := class_name(name)) in CLASSES else "Misc") for name in names]
 
 
 @dataclass(frozen=True)
@@ -296,12 +330,15 @@ class GroundTruth:
     notes: tuple[tuple[str, dict[str, Any]], ...] = ()
 
     @staticmethod
-    def of(boxes: ArrayLike, class_ids: ArrayLike, extras: Iterable[dict[str, Any]] | None = None,
-           notes: Iterable[tuple[str, dict[str, Any]]] = ()) -> GroundTruth:
+    def of(
+        boxes: ArrayLike,
+        class_ids: ArrayLike,
+        extras: Iterable[dict[str, Any]] | None = None,
+        notes: Iterable[tuple[str, dict[str, Any]]] = (),
+    ) -> GroundTruth:
         boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
         extras = tuple({} for _ in boxes) if extras is None else tuple(extras)
-        return GroundTruth(boxes, np.asarray(class_ids, np.int32).reshape(len(boxes)), extras,
-                           tuple(notes))
+        return GroundTruth(boxes, np.asarray(class_ids, np.int32).reshape(len(boxes)), extras, tuple(notes))
 
     def __len__(self) -> int:
         return len(self.boxes)

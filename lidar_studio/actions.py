@@ -15,22 +15,11 @@ import numpy as np
 
 from lidar_perception.types import MAX_RANGE, InputError
 from lidar_studio.interpolation import Motion, apply_correction, reinterpolate_frame
-from lidar_studio.state import (
-    ACCEPTED,
-    KEY,
-    PROPOSED,
-    REJECTED,
-    Box,
-    Change,
-    Seeds,
-    Stack,
-    State,
-    Track,
-)
+from lidar_studio.state import ACCEPTED, KEY, PROPOSED, REJECTED, Box, Change, Seeds, Stack, State, Track
 
 Action = Mapping[str, Any]
 TrackChanges = dict[int, Track | None]  # None: the track is removed
-MAX_CLASS_LENGTH = 100                  # characters
+MAX_CLASS_LENGTH = 100  # characters
 WITH_TRACKS = "seed", "propose", "import"  # actions with tracks; `tracks` of merge are ids
 
 
@@ -47,27 +36,26 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
     if name == "poses":  # not an edit of a person, so not undoable
         poses = tuple(tuple(map(float, row)) for row in action["poses"])
         return replace(state, poses=poses, seq=state.seq + 1), Change(
-            {}, (state.seeds, state.seeds), (state.checked, state.checked),
-            (state.kept, state.kept))
+            {}, (state.seeds, state.seeds), (state.checked, state.checked), (state.kept, state.kept)
+        )
     if name == "undo" or name == "redo":
         return _undo(state) if name == "undo" else _redo(state)
     if name not in HANDLERS:
-        raise InputError(f"unknown action {str(name)[:40]!r}; known actions: "
-                         f"{', '.join((*HANDLERS, 'undo', 'redo'))}")
+        raise InputError(f"unknown action {str(name)[:40]!r}; known actions: {', '.join((*HANDLERS, 'undo', 'redo'))}")
     tracks, seeds, checked = HANDLERS[name](state, action, motion)
-    change = Change({n: (state.tracks.get(n), track) for n, track in tracks.items()
-                     if state.tracks.get(n) != track},
-                    (state.seeds, seeds), (state.checked, checked),
-                    (state.kept, action.get("kept", state.kept) if name == "import"
-                     else state.kept))
+    change = Change(
+        {n: (state.tracks.get(n), track) for n, track in tracks.items() if state.tracks.get(n) != track},
+        (state.seeds, seeds),
+        (state.checked, checked),
+        (state.kept, action.get("kept", state.kept) if name == "import" else state.kept),
+    )
     undo_stack: Stack = (change, state.undo_stack)
     redo_stack: Stack = None
     if action.get("joins") and state.undo_stack is not None:  # completes the previous action
         undo_stack = state.undo_stack[0].combine_with(change), state.undo_stack[1]
     elif action.get("beside"):  # not done by a person, so it leaves undo and redo alone
         undo_stack, redo_stack = state.undo_stack, state.redo_stack
-    return replace(state.with_change(change), seq=state.seq + 1, undo_stack=undo_stack,
-                   redo_stack=redo_stack), change
+    return replace(state.with_change(change), seq=state.seq + 1, undo_stack=undo_stack, redo_stack=redo_stack), change
 
 
 def with_scan_poses(state: State, motion: Motion) -> Motion:
@@ -82,16 +70,18 @@ def _undo(state: State) -> tuple[State, Change]:
         raise InputError("there is nothing to undo")
     change, below = state.undo_stack
     back = change.invert()
-    return replace(state.with_change(back), seq=state.seq + 1, undo_stack=below,
-                   redo_stack=(change, state.redo_stack)), back
+    return replace(
+        state.with_change(back), seq=state.seq + 1, undo_stack=below, redo_stack=(change, state.redo_stack)
+    ), back
 
 
 def _redo(state: State) -> tuple[State, Change]:
     if state.redo_stack is None:
         raise InputError("there is nothing to redo")
     change, below = state.redo_stack
-    return replace(state.with_change(change), seq=state.seq + 1,
-                   undo_stack=(change, state.undo_stack), redo_stack=below), change
+    return replace(
+        state.with_change(change), seq=state.seq + 1, undo_stack=(change, state.undo_stack), redo_stack=below
+    ), change
 
 
 Outcome = tuple[TrackChanges, Seeds, frozenset[int]]
@@ -127,11 +117,12 @@ def require_numbers(action: Action, name: str, count: int) -> tuple[float, ...]:
     """Return the `count` numbers in a field of an action. InputError if they are not numbers
     within MAX_RANGE."""
     values = action.get(name)
-    if not isinstance(values, list | tuple) or len(values) != count or not all(
-            isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= MAX_RANGE
-            for v in values):
-        raise InputError(f"{name} must be {count} finite numbers within {MAX_RANGE:g}, not "
-                         f"{str(values)[:80]}")
+    if (
+        not isinstance(values, list | tuple)
+        or len(values) != count
+        or not all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= MAX_RANGE for v in values)
+    ):
+        raise InputError(f"{name} must be {count} finite numbers within {MAX_RANGE:g}, not {str(values)[:80]}")
     return tuple(map(float, values))
 
 
@@ -153,8 +144,7 @@ def require_class_name(action: Action) -> str:
     """Return the class name in an action. InputError if it is empty, too long or not a text."""
     name = action.get("class")
     if not isinstance(name, str) or not name.strip() or len(name) > MAX_CLASS_LENGTH:
-        raise InputError(f"a class is a name of up to {MAX_CLASS_LENGTH} characters, not "
-                         f"{str(name)[:40]!r}")
+        raise InputError(f"a class is a name of up to {MAX_CLASS_LENGTH} characters, not {str(name)[:40]!r}")
     return name
 
 
@@ -182,8 +172,7 @@ def add_seed(seeds: Seeds, frame: int, track: int) -> Seeds:
 
 def _add(state: State, action: Action, motion: Motion) -> Outcome:
     frame, box = require_frame(action, motion), Box(require_box_values(action), KEY)
-    return _replace(state, Track(state.next_id, require_class_name(action), ACCEPTED, 1.0, "person",
-                                 {frame: box}))
+    return _replace(state, Track(state.next_id, require_class_name(action), ACCEPTED, 1.0, "person", {frame: box}))
 
 
 def _box(state: State, action: Action, motion: Motion) -> Outcome:
@@ -235,14 +224,14 @@ def _copy(state: State, action: Action, motion: Motion) -> Outcome:
 
 def _class(state: State, action: Action, motion: Motion) -> Outcome:
     track = require_track(state, action.get("track"))
-    return _replace(state, replace(track, class_name=require_class_name(action),
-                                   edited=track.edited or track.state == PROPOSED))
+    return _replace(
+        state, replace(track, class_name=require_class_name(action), edited=track.edited or track.state == PROPOSED)
+    )
 
 
 def _reject_rest(state: State, action: Action, motion: Motion) -> Outcome:
     only = require_class_name(action) if "class" in action else None
-    left = [t for t in state.tracks.values() if t.state == PROPOSED
-            and only in (None, t.class_name)]
+    left = [t for t in state.tracks.values() if t.state == PROPOSED and only in (None, t.class_name)]
     if not left:
         raise InputError(f"no track{f' of class {only}' if only else ''} is left to reject")
     return _replace(state, *(replace(t, state=REJECTED) for t in left))
@@ -271,11 +260,11 @@ def _merge(state: State, action: Action, motion: Motion) -> Outcome:
         raise InputError("merging needs two different tracks; select a second one")
     first, second = (require_track(state, number) for number in pair)
     boxes = {**second.boxes, **first.boxes}
-    boxes |= {f: b for f, b in second.boxes.items()
-              if b.kind == KEY and boxes[f].kind != KEY}
+    boxes |= {f: b for f, b in second.boxes.items() if b.kind == KEY and boxes[f].kind != KEY}
     removed = (first.removed_frames | second.removed_frames) - boxes.keys()
-    merged = replace(first, boxes=boxes, removed_frames=removed,
-                     extra={**second.extra, **first.extra}, edited=True, nearby=False)
+    merged = replace(
+        first, boxes=boxes, removed_frames=removed, extra={**second.extra, **first.extra}, edited=True, nearby=False
+    )
     seeds = tuple(dict.fromkeys((f, first.id if t == second.id else t) for f, t in state.seeds))
     return {first.id: merged, second.id: None}, seeds, state.checked
 
@@ -284,19 +273,24 @@ def _split(state: State, action: Action, motion: Motion) -> Outcome:
     track, frame = require_track(state, action.get("track")), require_frame(action, motion)
     early, late = ({f for f in track.boxes if (f >= frame) == after} for after in (False, True))
     if not early or not late:
-        raise InputError(f"track {track.id} has boxes on one side of frame {frame} only; split it "
-                         "between its first and last box")
+        raise InputError(
+            f"track {track.id} has boxes on one side of frame {frame} only; split it between its first and last box"
+        )
 
     def part(frames: set[int], number: int, after: bool) -> Track:
-        return replace(track, id=number, boxes={f: track.boxes[f] for f in sorted(frames)},
-                       removed_frames=frozenset(
-                           f for f in track.removed_frames if (f >= frame) == after),
-                       extra={f: v for f, v in track.extra.items() if (f >= frame) == after},
-                       edited=True, nearby=False)
+        return replace(
+            track,
+            id=number,
+            boxes={f: track.boxes[f] for f in sorted(frames)},
+            removed_frames=frozenset(f for f in track.removed_frames if (f >= frame) == after),
+            extra={f: v for f, v in track.extra.items() if (f >= frame) == after},
+            edited=True,
+            nearby=False,
+        )
+
     new = state.next_id
     seeds = tuple((f, new if t == track.id and f >= frame else t) for f, t in state.seeds)
-    return ({track.id: part(early, track.id, False), new: part(late, new, True)}, seeds,
-            state.checked)
+    return ({track.id: part(early, track.id, False), new: part(late, new, True)}, seeds, state.checked)
 
 
 def _trim(state: State, action: Action, motion: Motion) -> Outcome:
@@ -304,13 +298,11 @@ def _trim(state: State, action: Action, motion: Motion) -> Outcome:
     side = action.get("side")
     if side not in ("before", "after"):
         raise InputError("side must be 'before' or 'after'")
-    beyond = {f for f in range(len(motion.times))
-              if (f < frame if side == "before" else f > frame)}
+    beyond = {f for f in range(len(motion.times)) if (f < frame if side == "before" else f > frame)}
     cut = beyond & track.boxes.keys()
     kept = {f: b for f, b in track.boxes.items() if f not in cut}
     if not cut or not kept:
-        raise InputError(f"track {track.id} has {'no' if kept else 'only'} boxes {side} frame "
-                         f"{frame}")
+        raise InputError(f"track {track.id} has {'no' if kept else 'only'} boxes {side} frame {frame}")
     seeds = tuple(s for s in state.seeds if s[1] != track.id or s[0] not in cut)
     # Tracking may still reach frames that have no box yet.
     removed = track.removed_frames | (beyond if track.nearby else cut)
@@ -325,10 +317,24 @@ def _check(state: State, action: Action, motion: Motion) -> Outcome:
 
 
 HANDLERS: dict[str, Callable[[State, Action, Motion], Outcome]] = {
-    "seed": _seed, "add": _add, "box": _box, "size": _size, "remove_box": _remove_box,
-    "interpolate": _interpolate, "copy": _copy, "class": _class, "accept": _accept,
-    "reject": _reject, "reject_rest": _reject_rest, "reopen": _reopen, "merge": _merge,
-    "split": _split, "trim": _trim, "check": _check, "snap": _box, "propose": _replace_computed,
+    "seed": _seed,
+    "add": _add,
+    "box": _box,
+    "size": _size,
+    "remove_box": _remove_box,
+    "interpolate": _interpolate,
+    "copy": _copy,
+    "class": _class,
+    "accept": _accept,
+    "reject": _reject,
+    "reject_rest": _reject_rest,
+    "reopen": _reopen,
+    "merge": _merge,
+    "split": _split,
+    "trim": _trim,
+    "check": _check,
+    "snap": _box,
+    "propose": _replace_computed,
     "import": _replace_computed,
 }
 
@@ -336,3 +342,19 @@ HANDLERS: dict[str, Callable[[State, Action, Motion], Outcome]] = {
 def round_box(values: np.ndarray[Any, Any]) -> list[float]:
     """Round a computed box to a tenth of a millimetre, for the journal."""
     return [round(v, 4) for v in np.asarray(values, np.float64).tolist()]
+
+
+def strip_computed(action: Mapping[str, Any]) -> Action:
+    """Remove the fields that only the session may set."""
+    if action.get("do") == "poses":
+        raise InputError("poses come from the drive")
+    computed = {
+        "seed": ("track", "tracks", "removed"),
+        "propose": ("tracks", "removed"),
+        "import": ("tracks", "removed", "kept"),
+        "accept": ("seed",),
+        "reopen": ("seed",),
+        "snap": ("box",),
+    }
+    unwanted = ("seq", "time", "by", "joins", "beside", *computed.get(str(action.get("do")), ()))
+    return {k: v for k, v in action.items() if k not in unwanted}

@@ -27,8 +27,17 @@ from lidar_studio.journal import make_journal_header
 Array = np.ndarray[Any, Any]
 MAX_CACHE_BYTES = 200 * 10**6
 MAGIC = b"LPC1"
-COLORS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#cc79a7", "#0072b2", "#d55e00", "#999999",
-          "#666666")  # colour-blind safe palette of Okabe and Ito, and two greys
+COLORS = (
+    "#e69f00",
+    "#56b4e9",
+    "#009e73",
+    "#f0e442",
+    "#cc79a7",
+    "#0072b2",
+    "#d55e00",
+    "#999999",
+    "#666666",
+)  # colour-blind safe palette of Okabe and Ito, and two greys
 DEFAULT_SIZE_M = (1.0, 1.0, 1.0)  # of a new box whose class has no usual size
 
 
@@ -53,15 +62,22 @@ class Scan:
     def encode(self) -> bytes:
         """Return the bytes of /api/cloud: the magic LPC1, N, then the columns."""
         count = len(self.xyz)
-        return b"".join((MAGIC, np.uint32(count).tobytes(), self.xyz.tobytes(),
-                         self.intensity.tobytes(), self.ground.astype(np.uint8).tobytes(),
-                         bytes(-2 * count % 4), self.cluster_ids.astype(np.uint32).tobytes()))
+        return b"".join(
+            (
+                MAGIC,
+                np.uint32(count).tobytes(),
+                self.xyz.tobytes(),
+                self.intensity.tobytes(),
+                self.ground.astype(np.uint8).tobytes(),
+                bytes(-2 * count % 4),
+                self.cluster_ids.astype(np.uint32).tobytes(),
+            )
+        )
 
 
 def make_pipeline_params(frame: Frame) -> PipelineParams:
     """Return the configuration `best` for all directions and the frame's sensor height."""
-    return with_values(BEST, {"view.enabled": False,
-                              "ground.sensor_pose.height": frame.sensor_height})
+    return with_values(BEST, {"view.enabled": False, "ground.sensor_pose.height": frame.sensor_height})
 
 
 def segment_frame(frame: Frame) -> Scan:
@@ -76,8 +92,7 @@ def to_scan(cloud: PointCloud, ground: Array, cluster_ids: Array) -> Scan:
     order = np.random.default_rng(0).permutation(len(cloud))
     intensity = np.zeros(len(cloud)) if cloud.intensity is None else cloud.intensity
     shown = np.nan_to_num(np.clip(intensity, 0.0, 1.0)) * 255
-    return Scan(cloud.xyz[order], shown[order].astype(np.uint8), ground[order],
-                cluster_ids[order].astype(np.int32))
+    return Scan(cloud.xyz[order], shown[order].astype(np.uint8), ground[order], cluster_ids[order].astype(np.int32))
 
 
 class ScanCache:
@@ -145,9 +160,13 @@ class Drive:
             digest = ""
         else:
             digest = hashlib.sha256(clouds).hexdigest()[:16]
-        return make_journal_header(self.name, [f.name for f in self.frames],
-                                   [f.stamp_ns for f in self.frames], digest,
-                                   self.motion.poses is not None)
+        return make_journal_header(
+            self.name,
+            [f.name for f in self.frames],
+            [f.stamp_ns for f in self.frames],
+            digest,
+            self.motion.poses is not None,
+        )
 
     @cached_property
     def motion(self) -> Motion:
@@ -175,11 +194,9 @@ def select_drive(recording: Recording, sequence: str | None = None) -> Drive:
     names = list(dict.fromkeys(frame.sequence for frame in all_frames))
     listed = f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}"
     if sequence is None and len(names) > 1:
-        raise InputError(f"{recording.path} has {len(names)} drives; name one with --sequence: "
-                         f"{listed}")
+        raise InputError(f"{recording.path} has {len(names)} drives; name one with --sequence: {listed}")
     if sequence is not None and sequence not in names:
-        raise InputError(f"{recording.path} has no drive {sequence}; it has {listed}"
-                         + did_you_mean(sequence, names))
+        raise InputError(f"{recording.path} has no drive {sequence}; it has {listed}" + did_you_mean(sequence, names))
     chosen = names[0] if sequence is None else sequence
     frames = [frame for frame in all_frames if frame.sequence == chosen]
     path = Path(recording.path).absolute()
@@ -201,6 +218,7 @@ def require_clouds(drive: Drive) -> None:
 def list_classes() -> list[dict[str, Any]]:
     """Return the classes of the page: name, usual size, colour."""
     named = [row for row in TABLE if row.name != "DontCare"]
-    return [{"name": row.name, "color": color,
-             "size": list(row.numbers.mean_size if row.numbers else DEFAULT_SIZE_M)}
-            for row, color in zip(named, COLORS)]
+    return [
+        {"name": row.name, "color": color, "size": list(row.numbers.mean_size if row.numbers else DEFAULT_SIZE_M)}
+        for row, color in zip(named, COLORS)
+    ]

@@ -45,8 +45,7 @@ class Motion:
 
     def to_sensor(self, box: Array, frame: int) -> Array:
         """Transform a box (7,) from the fixed frame to the sensor at `frame`."""
-        return box if self.poses is None else transform_boxes(
-            box, invert_pose(self.poses[frame]))[0]
+        return box if self.poses is None else transform_boxes(box, invert_pose(self.poses[frame]))[0]
 
 
 def interpolate_box(first: Array, last: Array, share: float) -> Array:
@@ -56,8 +55,9 @@ def interpolate_box(first: Array, last: Array, share: float) -> Array:
     return box
 
 
-def apply_correction(boxes: Mapping[int, Box], removed: frozenset[int], frame: int,
-                     values: tuple[float, ...], motion: Motion) -> dict[int, Box]:
+def apply_correction(
+    boxes: Mapping[int, Box], removed: frozenset[int], frame: int, values: tuple[float, ...], motion: Motion
+) -> dict[int, Box]:
     """Set the key box of a frame, and adjust the other boxes of the track.
 
     Up to the next key box on each side, the correction fades linearly with time, and frames without
@@ -72,8 +72,7 @@ def apply_correction(boxes: Mapping[int, Box], removed: frozenset[int], frame: i
     change[6] = wrap_angle(change[6])
     for step in (-1, 1):
         side = [f for f in boxes if (f - frame) * step > 0]
-        stop = min((f for f in side if boxes[f].kind == KEY), key=lambda f: abs(f - frame),
-                   default=None)
+        stop = min((f for f in side if boxes[f].kind == KEY), key=lambda f: abs(f - frame), default=None)
         if stop is None:
             for f in side:
                 moved = motion.to_fixed(boxes[f].values, f) + change
@@ -99,22 +98,21 @@ def _estimate_box(boxes: Mapping[int, Box], frame: int, motion: Motion) -> Array
     return _interpolate_between(boxes, before, after, frame, motion)
 
 
-def _interpolate_between(boxes: Mapping[int, Box], a: int, b: int, frame: int,
-                         motion: Motion) -> Array:
+def _interpolate_between(boxes: Mapping[int, Box], a: int, b: int, frame: int, motion: Motion) -> Array:
     share = float((motion.times[frame] - motion.times[a]) / (motion.times[b] - motion.times[a]))
     first, last = (motion.to_fixed(boxes[f].values, f) for f in (a, b))
     return interpolate_box(first, last, share)
 
 
-def _distribute_correction(found: dict[int, Box], stop: int, frame: int, new: Array, change: Array,
-                           motion: Motion) -> None:
+def _distribute_correction(
+    found: dict[int, Box], stop: int, frame: int, new: Array, change: Array, motion: Motion
+) -> None:
     """Move the boxes between the key boxes of `stop` and `frame` by their shares of a change, and
     flip opposite headings."""
     fixed = motion.to_fixed(found[stop].values, stop)
     turn = wrap_line(change[6])
     for f in [f for f in found if min(stop, frame) < f < max(stop, frame)]:
-        share = float((motion.times[f] - motion.times[stop])
-                      / (motion.times[frame] - motion.times[stop]))
+        share = float((motion.times[f] - motion.times[stop]) / (motion.times[frame] - motion.times[stop]))
         straight, moved = interpolate_box(fixed, new, share), motion.to_fixed(found[f].values, f)
         moved[:3] += share * change[:3]
         moved[3:6] = straight[3:6]
@@ -125,8 +123,7 @@ def _distribute_correction(found: dict[int, Box], stop: int, frame: int, new: Ar
         found[f] = Box.of(motion.to_sensor(moved, f), INTERPOLATED)
 
 
-def _fill_gap(found: dict[int, Box], removed: frozenset[int], a: int, b: int,
-              motion: Motion) -> None:
+def _fill_gap(found: dict[int, Box], removed: frozenset[int], a: int, b: int, motion: Motion) -> None:
     frames = sorted(f for f in found if min(a, b) <= f <= max(a, b))
     for first, last in pairwise(frames):
         for f in range(first + 1, last):
@@ -135,8 +132,9 @@ def _fill_gap(found: dict[int, Box], removed: frozenset[int], a: int, b: int,
                 found[f] = Box.of(motion.to_sensor(box, f), INTERPOLATED)
 
 
-def reinterpolate_frame(boxes: Mapping[int, Box], removed: frozenset[int], frame: int,
-                        motion: Motion) -> dict[int, Box] | None:
+def reinterpolate_frame(
+    boxes: Mapping[int, Box], removed: frozenset[int], frame: int, motion: Motion
+) -> dict[int, Box] | None:
     """Interpolate the boxes between the key boxes around `frame`, except in `removed` frames.
 
     Return None if one of the two key boxes is missing.

@@ -20,8 +20,9 @@ from lidar_perception.types import InputError
 JOURNAL_NAME, VERSION = "journal.jsonl", 1
 
 
-def make_journal_header(drive: str, names: Sequence[str], stamps_ns: Sequence[int],
-                        clouds: str = "", posed: bool | None = None) -> dict[str, Any]:
+def make_journal_header(
+    drive: str, names: Sequence[str], stamps_ns: Sequence[int], clouds: str = "", posed: bool | None = None
+) -> dict[str, Any]:
     """Make the first line of a journal, which identifies the drive by its frames.
 
     Args:
@@ -30,9 +31,16 @@ def make_journal_header(drive: str, names: Sequence[str], stamps_ns: Sequence[in
         posed: True if the drive has sensor poses.
     """
     stamps = hashlib.sha256(" ".join(map(str, stamps_ns)).encode()).hexdigest()[:16]
-    return {"journal": VERSION, "drive": drive, "frames": len(names),
-            "first": names[0] if names else "", "last": names[-1] if names else "",
-            "stamps_sha": stamps, "clouds": clouds, "posed": posed}
+    return {
+        "journal": VERSION,
+        "drive": drive,
+        "frames": len(names),
+        "first": names[0] if names else "",
+        "last": names[-1] if names else "",
+        "stamps_sha": stamps,
+        "clouds": clouds,
+        "posed": posed,
+    }
 
 
 def _encode(line: Mapping[str, Any]) -> bytes:
@@ -57,8 +65,7 @@ class Journal:
             raise InputError(f"cannot open {self.path}: {error.strerror}") from None
         try:
             if why := lock_file(self._file, self.path):  # the folder's lock has no effect on NFS
-                self.message = (f"{self.path} cannot be locked ({why}): do not label this drive "
-                                "from a second process")
+                self.message = f"{self.path} cannot be locked ({why}): do not label this drive from a second process"
             self._size = self._read_lines()
             if self._size == 0:
                 self.append(self._header)
@@ -71,22 +78,24 @@ class Journal:
         """Write a line and sync it to disk. InputError if that fails, without changing the file."""
         content, status = _encode(line), os.fstat(self._file)
         if status.st_nlink == 0:  # the data would be lost when this process ends
-            raise InputError(f"{self.path} was removed or replaced; nothing was done: export your "
-                             "labels and start again")
+            raise InputError(
+                f"{self.path} was removed or replaced; nothing was done: export your labels and start again"
+            )
         if status.st_size != self._size:  # on a file system without locks
-            raise InputError(f"another process has written {self.path}; nothing was done: stop one "
-                             "of them and start again")
+            raise InputError(
+                f"another process has written {self.path}; nothing was done: stop one of them and start again"
+            )
         try:
             view = memoryview(content)
             while view:
-                view = view[os.pwrite(self._file, view,
-                                      self._size + len(content) - len(view)):]
+                view = view[os.pwrite(self._file, view, self._size + len(content) - len(view)) :]
             os.fsync(self._file)
         except OSError as error:
             with suppress(OSError):
                 os.ftruncate(self._file, self._size)
-            raise InputError(f"cannot write {self.path}: {error.strerror}; nothing was done: free "
-                             "disk space and try again") from None
+            raise InputError(
+                f"cannot write {self.path}: {error.strerror}; nothing was done: free disk space and try again"
+            ) from None
         self._size += len(content)
 
     def close(self) -> None:
@@ -112,13 +121,17 @@ class Journal:
         if whole < len(content):
             os.ftruncate(self._file, whole)
             os.fsync(self._file)
-            self.message = (f"the last line of {self.path} was incomplete, so its "
-                            f"{len(content) - whole} bytes were cut off; one action may be lost")
+            self.message = (
+                f"the last line of {self.path} was incomplete, so its "
+                f"{len(content) - whole} bytes were cut off; one action may be lost"
+            )
         self.lines = found[1:]
         for number, line in enumerate(self.lines, 1):
             if line.get("seq") != number:
-                raise InputError(f"{self.path}:{number + 1} is action {line.get('seq')}, not "
-                                 f"{number}; the file was changed by something else")
+                raise InputError(
+                    f"{self.path}:{number + 1} is action {line.get('seq')}, not "
+                    f"{number}; the file was changed by something else"
+                )
         return whole
 
     def _parse_line(self, text: bytes, number: int) -> dict[str, Any]:
@@ -128,8 +141,9 @@ class Journal:
                 raise ValueError("not a JSON object")
             return line
         except (ValueError, RecursionError) as error:
-            raise InputError(f"{self.path}:{number} is not a line of a journal ({error}); restore "
-                             "the file or move it away") from None
+            raise InputError(
+                f"{self.path}:{number} is not a line of a journal ({error}); restore the file or move it away"
+            ) from None
 
     def _check_header(self, found: Mapping[str, Any]) -> None:
         expected = dict(self._header)
@@ -140,12 +154,13 @@ class Journal:
         posed = expected.pop("posed", None), found.get("posed")
         if set(posed) == {True, False}:
             now, then = ("with" if value else "without" for value in posed)
-            raise InputError(f"{self.path} was made {then} sensor poses, but the drive is now "
-                             f"{now} them, which would change all interpolated boxes; give the "
-                             "drive as it was, or another --out")
+            raise InputError(
+                f"{self.path} was made {then} sensor poses, but the drive is now "
+                f"{now} them, which would change all interpolated boxes; give the "
+                "drive as it was, or another --out"
+            )
         if different := find_differences({k: found.get(k) for k in expected}, expected):
-            raise InputError(f"{self.path} is the journal of another drive: "
-                             f"{'; '.join(different)}; give another --out")
+            raise InputError(f"{self.path} is the journal of another drive: {'; '.join(different)}; give another --out")
 
 
 def _sync_folder(folder: Path) -> None:

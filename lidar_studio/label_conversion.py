@@ -30,17 +30,21 @@ def to_tracks(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str
     for f, frame in enumerate(labels.frames):
         for k, name in enumerate(frame.class_names):
             number, score = int(frame.track_ids[k]), float(frame.scores[k])
-            fields = {ID: number, REST: replace_non_finite(frame.extra[k]),
-                      **({} if math.isnan(score) else {SCORE: score})}
+            fields = {
+                ID: number,
+                REST: replace_non_finite(frame.extra[k]),
+                **({} if math.isnan(score) else {SCORE: score}),
+            }
             key = (number, name) if number != NO_TRACK else (NO_TRACK, f, k)
             if key in found and f in found[key][1]:  # an id twice in one frame
                 key = NO_TRACK, f, k
             _, boxes, extra = found.setdefault(key, (name, {}, {}))
             boxes[f], extra[f] = Box.of(frame.boxes[k], KEY), fields
-    tracks = [Track(number, name, ACCEPTED, 1.0, IMPORTED, boxes, frozenset(), extra)
-              for number, (name, boxes, extra) in enumerate(found.values(), first_id)]
-    notes = {str(f): replace_non_finite(frame.notes)
-             for f, frame in enumerate(labels.frames) if frame.notes}
+    tracks = [
+        Track(number, name, ACCEPTED, 1.0, IMPORTED, boxes, frozenset(), extra)
+        for number, (name, boxes, extra) in enumerate(found.values(), first_id)
+    ]
+    notes = {str(f): replace_non_finite(frame.notes) for f, frame in enumerate(labels.frames) if frame.notes}
     return tracks, {"notes": notes, "extra": replace_non_finite(labels.extra)}
 
 
@@ -68,14 +72,22 @@ def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
         for f, box in track.boxes.items():
             rows[f].append((track, box, track.extra.get(f, {})))
     notes = state.kept.get("notes", {})
-    return DriveLabels([
-        FrameLabels.of(frame.name, frame.stamp_ns, [box.values for _, box, _ in rows[f]],
-                       [track.class_name for track, _, _ in rows[f]],
-                       [ids[track.id] for track, _, _ in rows[f]],
-                       [fields.get(SCORE, math.nan) for _, _, fields in rows[f]],
-                       [fields.get(REST, {}) for _, _, fields in rows[f]],
-                       [(name, fields) for name, fields in notes.get(str(f), [])])
-        for f, frame in enumerate(frames)], dict(state.kept.get("extra", {})))
+    return DriveLabels(
+        [
+            FrameLabels.of(
+                frame.name,
+                frame.stamp_ns,
+                [box.values for _, box, _ in rows[f]],
+                [track.class_name for track, _, _ in rows[f]],
+                [ids[track.id] for track, _, _ in rows[f]],
+                [fields.get(SCORE, math.nan) for _, _, fields in rows[f]],
+                [fields.get(REST, {}) for _, _, fields in rows[f]],
+                [(name, fields) for name, fields in notes.get(str(f), [])],
+            )
+            for f, frame in enumerate(frames)
+        ],
+        dict(state.kept.get("extra", {})),
+    )
 
 
 def _choose_ids(state: State) -> dict[int, int]:

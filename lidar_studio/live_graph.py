@@ -36,7 +36,7 @@ from msg_utils.stamps import to_ns
 Array = np.ndarray[Any, Any]
 BOXES, TRACKS, LABELS = "detections", "tracks", "labels"  # kinds of box topics
 MAX_BYTES, MAX_FRAMES = 300 * 10**6, 300  # of stored clouds: 30 s at 10 Hz
-MAX_WAIT_S = 0.5       # of a cloud for its boxes; then it is shown without them
+MAX_WAIT_S = 0.5  # of a cloud for its boxes; then it is shown without them
 MAX_EARLY_ARRAYS = 50  # per topic
 
 
@@ -89,15 +89,14 @@ class LiveGraph:
     tree: transforms of boxes in other frames; filled by the thread that adds clouds and boxes.
     """
 
-    def __init__(self, name: str, max_bytes: int = MAX_BYTES,
-                 max_frames: int = MAX_FRAMES) -> None:
+    def __init__(self, name: str, max_bytes: int = MAX_BYTES, max_frames: int = MAX_FRAMES) -> None:
         self.name, self.max_bytes, self.max_frames = name, max_bytes, max_frames
         self.listeners: list[Callable[[dict[str, Any]], None]] = []
         self.problems: list[str] = []
         self.statistics: Mapping[str, Any] = {}
         self.topics: dict[str, BoxTopic] = {}
         self.tree = TransformTree()
-        self.skipped_count = 0   # clouds that arrived while a page was paused
+        self.skipped_count = 0  # clouds that arrived while a page was paused
         self._frames: dict[int, LiveFrame] = {}
         self._by_stamp: dict[int, LiveFrame] = {}
         self._next = self._bytes = 0
@@ -147,8 +146,7 @@ class LiveGraph:
             self._frames[self._next] = self._by_stamp[stamp] = frame
             self._next += 1
             self._bytes += len(message.data)
-            while len(self._frames) > 1 and (self._bytes > self.max_bytes
-                                             or len(self._frames) > self.max_frames):
+            while len(self._frames) > 1 and (self._bytes > self.max_bytes or len(self._frames) > self.max_frames):
                 old = self._frames.pop(self.first)
                 if self._by_stamp.get(old.stamp_ns) is old:
                     del self._by_stamp[old.stamp_ns]
@@ -176,8 +174,7 @@ class LiveGraph:
             self._add_objects(frame, topic, objects, message)
         self.update()
 
-    def _add_objects(self, frame: LiveFrame, topic: str, objects: MarkedObjects,
-                     message: Any) -> None:
+    def _add_objects(self, frame: LiveFrame, topic: str, objects: MarkedObjects, message: Any) -> None:
         """Transform boxes to the cloud's coordinates and add them to its frame.
 
         If TF is late, they are added by a later update().
@@ -197,8 +194,7 @@ class LiveGraph:
             trails = {number: transform_points(trail, pose) for number, trail in trails.items()}
         box_topic.tf_problem = ""
         frame.objects[topic] = objects
-        frame.trails[topic] = {make_track_id(box_topic.number, n): trail
-                               for n, trail in trails.items()}
+        frame.trails[topic] = {make_track_id(box_topic.number, n): trail for n, trail in trails.items()}
         if frame.is_shown:
             # Labels may arrive at any time, and clouds do not wait for the first array of a topic.
             box_topic.late_count += box_topic.kind != LABELS and box_topic.received_count > 1
@@ -213,8 +209,9 @@ class LiveGraph:
             for frame, topic, objects, message in waiting:
                 if topic in self.topics:
                     self._add_objects(frame, topic, objects, message)
-            wanted = {topic for topic, t in self.topics.items()
-                      if t.received_count and t.kind != LABELS and not t.tf_problem}
+            wanted = {
+                topic for topic, t in self.topics.items() if t.received_count and t.kind != LABELS and not t.tf_problem
+            }
             for frame in reversed(self._frames.values()):
                 if frame.is_shown:
                     break
@@ -235,18 +232,32 @@ class LiveGraph:
     def get_status(self) -> dict[str, Any]:
         """Return the problems as text, and the statistics of the clouds and of each box topic."""
         with self._lock:
-            lines = [*self.problems, *(
-                f"boxes of {topic} are not shown: {box_topic.tf_problem}"
-                for topic, box_topic in self.topics.items() if box_topic.tf_problem)]
-            return {"lines": lines, "clouds": {**self.statistics, "passed": self.skipped_count},
-                    "topics": [{"topic": topic, "kind": t.kind, "came": t.received_count,
-                                "late": t.late_count, "alone": t.unmatched_count,
-                                "ms": round(float(np.median(t.delays)), -1) if t.delays else None}
-                               for topic, t in self.topics.items()]}
+            lines = [
+                *self.problems,
+                *(
+                    f"boxes of {topic} are not shown: {box_topic.tf_problem}"
+                    for topic, box_topic in self.topics.items()
+                    if box_topic.tf_problem
+                ),
+            ]
+            return {
+                "lines": lines,
+                "clouds": {**self.statistics, "passed": self.skipped_count},
+                "topics": [
+                    {
+                        "topic": topic,
+                        "kind": t.kind,
+                        "came": t.received_count,
+                        "late": t.late_count,
+                        "alone": t.unmatched_count,
+                        "ms": round(float(np.median(t.delays)), -1) if t.delays else None,
+                    }
+                    for topic, t in self.topics.items()
+                ],
+            }
 
     def _make_event(self, frame: LiveFrame) -> dict[str, Any]:
-        return {"live": {"first": self.first, **_frame_to_json(frame),
-                         "tracks": self._tracks_to_json([frame])}}
+        return {"live": {"first": self.first, **_frame_to_json(frame), "tracks": self._tracks_to_json([frame])}}
 
     def _tracks_to_json(self, frames: list[LiveFrame]) -> list[dict[str, Any]]:
         made: list[dict[str, Any]] = []
@@ -256,8 +267,10 @@ class LiveGraph:
             objects = {f.number: f.objects[topic] for f in frames if topic in f.objects}
             for track in tracks_to_json(objects, topic, box_topic.number):
                 track["trails"] = {
-                    f.number: np.round(f.trails[topic][track["id"]], 3).tolist() for f in frames
-                    if track["id"] in f.trails.get(topic, ())}
+                    f.number: np.round(f.trails[topic][track["id"]], 3).tolist()
+                    for f in frames
+                    if track["id"] in f.trails.get(topic, ())
+                }
                 made.append(track)
         return made
 
@@ -289,28 +302,40 @@ class LiveGraph:
         """
         with self._lock:
             objects = self._get_frame(i).objects
-            of_kind = {kind: {t: o for t, o in objects.items() if t in self.topics
-                              and self.topics[t].kind == kind} for kind in (BOXES, LABELS)}
+            of_kind = {
+                kind: {t: o for t, o in objects.items() if t in self.topics and self.topics[t].kind == kind}
+                for kind in (BOXES, LABELS)
+            }
         found = {name_source(t): detections_with_sources(o) for t, o in of_kind[BOXES].items()}
         truth = next((to_truth(o) for o in of_kind[LABELS].values()), None)
-        matches = {} if truth is None else {
-            name: {**match_detections(truth, d, min_score), "false": None, "ignored": None}
-            for name, d in found.items()}
+        matches = (
+            {}
+            if truth is None
+            else {
+                name: {**match_detections(truth, d, min_score), "false": None, "ignored": None}
+                for name, d in found.items()
+            }
+        )
         return layers_to_json(truth, found, matches)
 
 
 def _keep_valid(objects: MarkedObjects) -> MarkedObjects:
     """Drop objects with numbers that are not finite, or sizes that are not positive."""
-    valid = (np.isfinite(objects.boxes).all(axis=1) & (objects.boxes[:, 3:6] > 0).all(axis=1)
-             & np.isfinite(objects.scores))
+    valid = (
+        np.isfinite(objects.boxes).all(axis=1) & (objects.boxes[:, 3:6] > 0).all(axis=1) & np.isfinite(objects.scores)
+    )
     if valid.all():
         return objects
     rows = np.flatnonzero(valid).tolist()
-    return replace(objects, boxes=objects.boxes[valid], scores=objects.scores[valid],
-                   ids=objects.ids[valid], labels=[objects.labels[k] for k in rows],
-                   extras=[objects.extras[k] for k in rows])
+    return replace(
+        objects,
+        boxes=objects.boxes[valid],
+        scores=objects.scores[valid],
+        ids=objects.ids[valid],
+        labels=[objects.labels[k] for k in rows],
+        extras=[objects.extras[k] for k in rows],
+    )
 
 
 def _frame_to_json(frame: LiveFrame) -> dict[str, Any]:
-    return {"frame": frame.number, "name": f"{frame.stamp_ns / 1e9:.2f} s",
-            "stamp_ns": frame.stamp_ns}
+    return {"frame": frame.number, "name": f"{frame.stamp_ns / 1e9:.2f} s", "stamp_ns": frame.stamp_ns}

@@ -15,8 +15,7 @@ from lidar_studio.results import CLUSTERED_TOPICS
 
 ARRAY = "vision_msgs/msg/Detection3DArray"
 # Endings of cloud topics, those with the most columns first.
-CLOUD_ENDINGS = tuple(topic.lstrip("/") for topic in (
-    *CLUSTERED_TOPICS, "/ground_segmentation/output/points", POINTS))
+CLOUD_ENDINGS = tuple(topic.lstrip("/") for topic in (*CLUSTERED_TOPICS, "/ground_segmentation/output/points", POINTS))
 KIND_BY_ENDING = {FOUND: BOXES, TRACKED: TRACKS, TRUTH: LABELS}
 ARRAY_SUFFIX = "_3d"  # of a topic of markers that is also published as Detection3DArray
 
@@ -63,26 +62,31 @@ def select_cloud_topic(types: Mapping[str, str], namespace: str = "", wanted: st
     if wanted:
         full = resolve_topic(wanted, namespace)
         if full not in clouds:
-            raise InputError(f"nobody publishes clouds on {full}; there are clouds on "
-                             f"{', '.join(clouds) or 'no topic'}")
+            raise InputError(
+                f"nobody publishes clouds on {full}; there are clouds on {', '.join(clouds) or 'no topic'}"
+            )
         return full
     inside = [t for t in clouds if is_in_namespace(t, namespace)]
     if not inside:
-        raise InputError(f"nobody publishes clouds{where}; is the graph running, on this "
-                         "ROS_DOMAIN_ID?" + (f" There are clouds on {', '.join(clouds)}"
-                                             if clouds else ""))
+        raise InputError(
+            f"nobody publishes clouds{where}; is the graph running, on this "
+            "ROS_DOMAIN_ID?" + (f" There are clouds on {', '.join(clouds)}" if clouds else "")
+        )
     for end in CLOUD_ENDINGS:
         if found := [t for t in inside if t.endswith(f"/{end}") or t.endswith(f"_{end}")]:
             inside = found
             break
     if len(inside) > 1:
-        raise InputError(f"there are clouds on {', '.join(inside)}; name one with --topic"
-                         + ("" if namespace else ", or a --namespace"))
+        raise InputError(
+            f"there are clouds on {', '.join(inside)}; name one with --topic"
+            + ("" if namespace else ", or a --namespace")
+        )
     return inside[0]
 
 
-def select_box_topics(types: Mapping[str, str], clouds: str, namespace: str = "",
-                      wanted: Iterable[str] = ()) -> dict[str, str]:
+def select_box_topics(
+    types: Mapping[str, str], clouds: str, namespace: str = "", wanted: Iterable[str] = ()
+) -> dict[str, str]:
     """Select the box topics that belong to a cloud topic; leave out copies as Detection3DArray.
 
     Args:

@@ -26,7 +26,7 @@ from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
 from msg_utils.messages import load_message_class
 
-SCAN_PERIOD_S = 1.0   # of the list of topics
+SCAN_PERIOD_S = 1.0  # of the list of topics
 STOP_TIMEOUT_S = 5.0  # to handle the last message
 RECEPTION = ReceptionParams(queue=5)
 SHOWN_PROBLEMS = "publishers", "silent", "stale", "lost", "dropped"  # kinds of Reception.problems
@@ -40,8 +40,14 @@ class LiveView(ExternalNode):
         boxes: topics of detections; () to choose them by select_box_topics.
     """
 
-    def __init__(self, live: LiveGraph, domain: int | None = None, namespace: str = "",
-                 clouds: str = "", boxes: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        live: LiveGraph,
+        domain: int | None = None,
+        namespace: str = "",
+        clouds: str = "",
+        boxes: Sequence[str] = (),
+    ) -> None:
         super().__init__(domain, f"view_{os.getpid()}")
         self.live, self.namespace, self.wanted = live, namespace, (clouds, tuple(boxes))
         self.receptions: dict[str, Reception] = {}
@@ -50,17 +56,23 @@ class LiveView(ExternalNode):
         if has_tf():
             for topic, qos in ((TF, TF_QOS), (TF_STATIC, STATIC_QOS)):
                 self.node.create_subscription(
-                    load_message_class(TF_MESSAGE), topic, self._make_handler(
-                        topic, TF_MESSAGE, partial(add_transforms, live.tree,
-                                                   static=topic == TF_STATIC)), qos, raw=True)
+                    load_message_class(TF_MESSAGE),
+                    topic,
+                    self._make_handler(
+                        topic, TF_MESSAGE, partial(add_transforms, live.tree, static=topic == TF_STATIC)
+                    ),
+                    qos,
+                    raw=True,
+                )
 
     def run(self, stop: threading.Event) -> None:
         """Spin until `stop` is set. An exception is shown on the page and raised."""
         try:
             self.spin_until(stop.is_set, math.inf, self._step)
         except Exception as error:  # nobody joins this thread
-            self.live.problems = [f"reception has stopped: {type(error).__name__}: "
-                               f"{shorten_error(error)}; start view again"]
+            self.live.problems = [
+                f"reception has stopped: {type(error).__name__}: {shorten_error(error)}; start view again"
+            ]
             self.live.update()
             raise
 
@@ -75,8 +87,11 @@ class LiveView(ExternalNode):
 
         A cloud topic whose publisher has gone is kept until there is another one.
         """
-        types = {topic: kinds[0] for topic, kinds in self.node.get_topic_names_and_types()
-                 if len(kinds) == 1 and self.node.count_publishers(topic)}
+        types = {
+            topic: kinds[0]
+            for topic, kinds in self.node.get_topic_names_and_types()
+            if len(kinds) == 1 and self.node.count_publishers(topic)
+        }
         self.problem = ""
         try:
             chosen = select_cloud_topic(types, self.namespace, self.wanted[0])
@@ -104,18 +119,23 @@ class LiveView(ExternalNode):
     def _subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
         handle = self._make_handler(topic, kind, take)
         reception = self.receptions[topic] = Reception(
-            self.node, load_message_class(kind), topic, lambda data, patient: handle(data),
-            lambda: RECEPTION, "cloud" if kind == CLOUD else "array")
+            self.node,
+            load_message_class(kind),
+            topic,
+            lambda data, patient: handle(data),
+            lambda: RECEPTION,
+            "cloud" if kind == CLOUD else "array",
+        )
         reception.open()
 
-    def _make_handler(self, topic: str, kind: str,
-                      take: Callable[[Any], None]) -> Callable[[bytes], None]:
+    def _make_handler(self, topic: str, kind: str, take: Callable[[Any], None]) -> Callable[[bytes], None]:
         def handle(data: bytes) -> None:
             try:
                 take(decode_message(data, kind))
                 self.decode_errors.pop(topic, None)
             except Exception as error:  # other nodes may send invalid messages
                 self.decode_errors[topic] = f"{topic}: {shorten_error(error)}"
+
         return handle
 
     def _make_box_handler(self, topic: str, kind: str) -> Callable[[Any], None]:

@@ -27,18 +27,18 @@ Array = np.ndarray[Any, Any]
 PlacedBox = tuple[Array, str]  # a box (7,) and its class
 Hit = tuple[int, Array, int, float, bool]  # frame, box, class id, score, and True for a candidate
 SAME_OBJECT_DISTANCE_M = 0.6  # between the centres of a candidate and a detection of one person
-MIN_CONFIDENCE = 0.3          # of a candidate
-UNDETECTED_WEIGHT = 0.5       # of the size similarity of objects without a detection
-MIN_HITS = 2                  # of a proposed track, unless there is only one frame
-MIN_SCORE = 0.3               # of a proposed track
-PLACED_SCORE = 0.95           # of a box that a person placed
-CANDIDATES = "candidates"     # source of a track without detections
-MAX_HIT_DISTANCE_M = 1.0      # between a track and the detection that updated it
+MIN_CONFIDENCE = 0.3  # of a candidate
+UNDETECTED_WEIGHT = 0.5  # of the size similarity of objects without a detection
+MIN_HITS = 2  # of a proposed track, unless there is only one frame
+MIN_SCORE = 0.3  # of a proposed track
+PLACED_SCORE = 0.95  # of a box that a person placed
+CANDIDATES = "candidates"  # source of a track without detections
+MAX_HIT_DISTANCE_M = 1.0  # between a track and the detection that updated it
 NO_HIT = -1
 # Standard deviations of a cluster's size, as shares of the seed's length, width or height. Hidden
 # parts make a cluster shorter, so a deficit in length counts less than an excess.
 LENGTH_EXCESS, LENGTH_DEFICIT, WIDTH_EXCESS, HEIGHT_DEVIATION = 0.12, 0.3, 0.2, 0.12
-END_VIEW_PENALTY = 0.5        # deviation added where only the front or rear may be visible
+END_VIEW_PENALTY = 0.5  # deviation added where only the front or rear may be visible
 # The tracker reports every track; uncertain ones are dropped at the end.
 ALL_TRACKS = TrackingParams(report=0.0, report_unseen=0.0)
 
@@ -78,8 +78,9 @@ def compute_likeness(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> Ar
     best = np.zeros(len(survey.boxes))
     for seed in seeds if len(survey.boxes) else ():
         similarity = compute_similarity(survey.images, seed.image, BEST.stm)
-        best = np.maximum(best, compute_confidence(survey.features, similarity,
-                                                   survey.features["height_m"] - seed.height))
+        best = np.maximum(
+            best, compute_confidence(survey.features, similarity, survey.features["height_m"] - seed.height)
+        )
     return best
 
 
@@ -96,29 +97,29 @@ def compute_size_similarity(shapes: Array, size: Size) -> Array:
     length, width, height = size
     long, short, tall = (shapes[:, k].astype(np.float64) for k in (3, 4, 5))
     excess = long / length - 1
-    deviation = np.hypot(np.where(excess > 0, excess / LENGTH_EXCESS, excess / LENGTH_DEFICIT),
-                         np.maximum(short / width - 1, 0) / WIDTH_EXCESS)
+    deviation = np.hypot(
+        np.where(excess > 0, excess / LENGTH_EXCESS, excess / LENGTH_DEFICIT),
+        np.maximum(short / width - 1, 0) / WIDTH_EXCESS,
+    )
     if length > LONG_OBJECT_M:
-        deviation = np.minimum(
-            deviation, np.hypot((long / width - 1) / WIDTH_EXCESS, END_VIEW_PENALTY))
-    return np.exp(-0.5 * (deviation ** 2 + ((tall / height - 1) / HEIGHT_DEVIATION) ** 2))
+        deviation = np.minimum(deviation, np.hypot((long / width - 1) / WIDTH_EXCESS, END_VIEW_PENALTY))
+    return np.exp(-0.5 * (deviation**2 + ((tall / height - 1) / HEIGHT_DEVIATION) ** 2))
 
 
-def find_objects(survey: FrameSurvey, request: ProposalRequest,
-                 placed: Sequence[PlacedBox] = ()) -> tuple[Detections, Array]:
+def find_objects(
+    survey: FrameSurvey, request: ProposalRequest, placed: Sequence[PlacedBox] = ()
+) -> tuple[Detections, Array]:
     """Return the objects of a frame, and a mask (K,) bool of the candidates among them.
 
     Objects are detections, candidates where there is no detection, and boxes that a person placed,
     which replace others at the same place.
     """
-    detections, candidates = _add_similar_objects(survey, request,
-                                                  *_find_people(survey, request.seeds))
+    detections, candidates = _add_similar_objects(survey, request, *_find_people(survey, request.seeds))
     for box, name in placed:
         if name in CLASSES:
             distances = centre_distances(detections.boxes, box[None])[:, 0]
             others = distances > max(SAME_OBJECT_DISTANCE_M, box[3] / 3)
-            detections = detections[others].followed_by(
-                Detections.of(box, CLASSES.index(name), PLACED_SCORE))
+            detections = detections[others].followed_by(Detections.of(box, CLASSES.index(name), PLACED_SCORE))
             candidates = np.append(candidates[others], False)
     return detections, candidates
 
@@ -128,15 +129,17 @@ def _find_people(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> tuple[
     chosen = np.flatnonzero(scores >= MIN_CONFIDENCE)
     found = survey.detections
     people = found.boxes[np.isin(found.class_ids, NOT_VEHICLE_IDS)]
-    boxes = np.array([complete_box(b, find_usual_size(CLASSES[PEDESTRIAN]))
-                      for b in survey.boxes[chosen].astype(np.float64)]).reshape(-1, 7)
+    boxes = np.array(
+        [complete_box(b, find_usual_size(CLASSES[PEDESTRIAN])) for b in survey.boxes[chosen].astype(np.float64)]
+    ).reshape(-1, 7)
     new = centre_distances(boxes, people).min(axis=1, initial=np.inf) > SAME_OBJECT_DISTANCE_M
     objects = found.followed_by(Detections.of(boxes[new], PEDESTRIAN, scores[chosen][new]))
     return objects, np.arange(len(objects)) >= len(found)
 
 
-def _add_similar_objects(survey: FrameSurvey, request: ProposalRequest, found: Detections,
-                         candidates: Array) -> tuple[Detections, Array]:
+def _add_similar_objects(
+    survey: FrameSurvey, request: ProposalRequest, found: Detections, candidates: Array
+) -> tuple[Detections, Array]:
     """Add clusters of about the size of a seed, where there is no object."""
     sizes = request.sizes
     if not sizes or not len(survey.shapes):
@@ -146,22 +149,25 @@ def _add_similar_objects(survey: FrameSurvey, request: ProposalRequest, found: D
     best = scores.argmax(axis=0)
     chosen = np.flatnonzero(scores.max(axis=0) >= MIN_CONFIDENCE)
     shapes = survey.shapes[chosen].astype(np.float64)
-    boxes = np.array([complete_box(b, sizes[best[k]].size)
-                      for k, b in zip(chosen, shapes)]).reshape(-1, 7)
+    boxes = np.array([complete_box(b, sizes[best[k]].size) for k, b in zip(chosen, shapes)]).reshape(-1, 7)
     min_distances = np.maximum(SAME_OBJECT_DISTANCE_M, boxes[:, None, 3] / 3)
     new = (centre_distances(boxes, found.boxes) > min_distances).all(axis=1)
     classes = np.array([CLASSES.index(sizes[k].class_name) for k in best[chosen]], np.int32)
-    objects = found.followed_by(Detections.of(boxes[new], classes[new],
-                                           scores.max(axis=0)[chosen][new]))
+    objects = found.followed_by(Detections.of(boxes[new], classes[new], scores.max(axis=0)[chosen][new]))
     return objects, np.append(candidates, np.ones(int(new.sum()), bool))
 
 
 NOT_VEHICLE_IDS = [i for i, kind in enumerate(KIND_OF_CLASS) if kind != KIND_OF_CLASS[0]]
 
 
-def propose_tracks(surveys: Sequence[FrameSurvey], request: ProposalRequest,
-                   stamps_ns: Sequence[int], motion: Motion, frames: range,
-                   on_progress: Callable[[int], bool] = lambda count: True) -> list[Track] | None:
+def propose_tracks(
+    surveys: Sequence[FrameSurvey],
+    request: ProposalRequest,
+    stamps_ns: Sequence[int],
+    motion: Motion,
+    frames: range,
+    on_progress: Callable[[int], bool] = lambda count: True,
+) -> list[Track] | None:
     """Return the tracks in consecutive frames of a surveyed drive, the most certain first.
 
     Args:
@@ -183,8 +189,8 @@ def propose_tracks(surveys: Sequence[FrameSurvey], request: ProposalRequest,
             match, box = matches[k], tracks.detections.boxes[k].astype(np.float64)
             box[:3] = found.boxes[match, :3]
             hits.setdefault(int(tracks.ids[k]), []).append(
-                (i, box, int(tracks.detections.class_ids[k]), float(found.scores[match]),
-                 bool(candidates[match])))
+                (i, box, int(tracks.detections.class_ids[k]), float(found.scores[match]), bool(candidates[match]))
+            )
     min_hits = min(MIN_HITS, len(frames))
     made = [_make_track(rows, motion) for rows in hits.values() if len(rows) >= min_hits]
     return sorted((t for t in made if t.score >= MIN_SCORE), key=lambda t: -t.score)
@@ -209,5 +215,4 @@ def _make_track(hits: list[Hit], motion: Motion) -> Track:
         box[3:6] = size
         fixed[frame] = Box.of(np.round(box, 4), PROPOSED)
     source = CANDIDATES if np.mean(candidates) > 0.5 else FUSED
-    return Track(0, name, PROPOSED, round(float(np.mean(scores)), 4), source,
-                 fill_gaps(fixed, motion))
+    return Track(0, name, PROPOSED, round(float(np.mean(scores)), 4), source, fill_gaps(fixed, motion))

@@ -36,10 +36,10 @@ from lidar_studio.state import KEY, Box, State, Track
 from lidar_studio.survey import FrameSurvey, survey_drive
 
 Array = np.ndarray[Any, Any]
-BOX_MARGIN_M = 0.1             # around a box, when taking its points
+BOX_MARGIN_M = 0.1  # around a box, when taking its points
 # Two tracks are the same object if enough boxes coincide: this share of the shorter track's boxes,
 MIN_COMMON_SHARE = 0.5
-SAME_TRACK_DISTANCE_M = 0.7    # with centres within this distance,
+SAME_TRACK_DISTANCE_M = 0.7  # with centres within this distance,
 SAME_TRACK_LENGTH_SHARE = 0.4  # or within this share of the length
 
 
@@ -51,8 +51,9 @@ class Proposer:
     problem: error message of the cache, or "".
     """
 
-    def __init__(self, drive: Drive, detector: DetectorChoice | None = DetectorChoice(),
-                 folder: Path | None = None) -> None:
+    def __init__(
+        self, drive: Drive, detector: DetectorChoice | None = DetectorChoice(), folder: Path | None = None
+    ) -> None:
         self.drive, self.detector, self.folder = drive, detector, folder
         self.problem = ""
         self._surveys: list[FrameSurvey] = []  # incomplete until all frames are surveyed
@@ -111,20 +112,21 @@ class Proposer:
         if self.drive.motion.poses is not None or not self.surveys:
             return None
         found = [survey.pose for survey in self.surveys if survey.pose is not None]
-        return [np.round(pose, 6).ravel().tolist() for pose in found] if len(found) == len(
-            self.surveys) else None
+        return [np.round(pose, 6).ravel().tolist() for pose in found] if len(found) == len(self.surveys) else None
 
-    def make_proposals(self, state: State, motion: Motion, frames: range | None = None,
-                       on_progress: Callable[[int], bool] = lambda count: True
-                       ) -> list[Track] | None:
+    def make_proposals(
+        self,
+        state: State,
+        motion: Motion,
+        frames: range | None = None,
+        on_progress: Callable[[int], bool] = lambda count: True,
+    ) -> list[Track] | None:
         """Return proposed tracks in some frames (None: all) of a surveyed drive; None if cancelled.
 
         on_progress: see propose_tracks().
         """
-        seeds = [SilhouetteSeed(seed.silhouette(BEST), seed.height)
-                 for seed in self.find_seeds(state)]
-        sizes = [SizeSeed(t.class_name, _track_size(t, f))
-                 for f, t in self._find_size_seeds(state)]
+        seeds = [SilhouetteSeed(seed.silhouette(BEST), seed.height) for seed in self.find_seeds(state)]
+        sizes = [SizeSeed(t.class_name, _track_size(t, f)) for f, t in self._find_size_seeds(state)]
         placed: dict[int, list[tuple[Array, str]]] = {}
         for t in state.tracks.values():
             for f, b in t.boxes.items() if t.awaits_tracking else ():
@@ -133,14 +135,16 @@ class Proposer:
         stamps = [frame.stamp_ns for frame in self.drive.frames]
         request = ProposalRequest(seeds, sizes, placed, self.detector is not None)
         surveys = self.surveys or []
-        return propose_tracks(surveys, request, stamps, motion,
-                              range(len(surveys)) if frames is None else frames, on_progress)
+        return propose_tracks(
+            surveys, request, stamps, motion, range(len(surveys)) if frames is None else frames, on_progress
+        )
 
     def _find_size_seeds(self, state: State) -> list[tuple[int, Track]]:
         """Return frame and track of the seeds that are not pedestrians."""
         found = [(f, state.tracks[t]) for f, t in state.seeds if t in state.tracks]
-        return [(f, t) for f, t in found if f in t.boxes and t.class_name in CLASSES
-                and t.class_name != CLASSES[PEDESTRIAN]]
+        return [
+            (f, t) for f, t in found if f in t.boxes and t.class_name in CLASSES and t.class_name != CLASSES[PEDESTRIAN]
+        ]
 
     def find_seeds(self, state: State) -> list[Seed]:
         """Return the pedestrian seeds of a state that have enough points."""
@@ -181,8 +185,11 @@ class Proposer:
         image, templates = candidate.silhouette(BEST), [seed.silhouette(BEST) for seed in seeds]
         scores = [float(compute_similarity(image[None], t, BEST.stm)[0]) for t in templates]
         best = int(np.argmax(scores))
-        return {"seed": _bits_to_json(to_pixels(templates[best])),
-                "candidate": _bits_to_json(to_pixels(image)), "similarity": scores[best]}
+        return {
+            "seed": _bits_to_json(to_pixels(templates[best])),
+            "candidate": _bits_to_json(to_pixels(image)),
+            "similarity": scores[best],
+        }
 
     def _points_inside(self, frame: int, box: Array) -> Array:
         scan = self.drive.load_scan(frame)
@@ -196,8 +203,7 @@ class Proposer:
         found = self.surveys[frame].detections
         found = found[found.class_ids == CLASSES.index(class_name)]
         distances = centre_distances(found.boxes, box[None])[:, 0]
-        if distances.min(initial=np.inf) > max(SAME_OBJECT_DISTANCE_M,
-                                               SAME_TRACK_LENGTH_SHARE * box[3]):
+        if distances.min(initial=np.inf) > max(SAME_OBJECT_DISTANCE_M, SAME_TRACK_LENGTH_SHARE * box[3]):
             return box
         return found.boxes[int(distances.argmin())].astype(np.float64)
 
@@ -208,12 +214,14 @@ def _track_size(track: Track, frame: int) -> Size:
 
 
 def _bits_to_json(pixels: Array) -> dict[str, Any]:
-    return {"rows": pixels.shape[0], "cols": pixels.shape[1],
-            "bits": "".join("01"[bit] for bit in pixels.ravel().astype(int))}
+    return {
+        "rows": pixels.shape[0],
+        "cols": pixels.shape[1],
+        "bits": "".join("01"[bit] for bit in pixels.ravel().astype(int)),
+    }
 
 
-def merge_proposals(state: State, proposals: Sequence[Track],
-                    motion: Motion) -> tuple[list[Track], list[int]]:
+def merge_proposals(state: State, proposals: Sequence[Track], motion: Motion) -> tuple[list[Track], list[int]]:
     """Merge new proposals with the existing tracks.
 
     Tracks that a person accepted, rejected or edited stay; a matching proposal extends a clicked
@@ -223,16 +231,14 @@ def merge_proposals(state: State, proposals: Sequence[Track],
         New and changed tracks, and the ids of removed tracks.
     """
     index = _TrackIndex(state.tracks)
-    waiting = {t.id for t in state.tracks.values()
-               if not t.has_human_edits and t.source in (FUSED, CANDIDATES)}
+    waiting = {t.id for t in state.tracks.values() if not t.has_human_edits and t.source in (FUSED, CANDIDATES)}
     found: list[Track] = []
     next_id, used_ids = state.next_id, set[int]()
     for proposal in proposals:
         matches = index.find_matches(proposal)
         by_person = [t for t in matches if t.id not in waiting]
         if by_person:
-            clicked = next((t for t in by_person
-                            if t.awaits_tracking and t.id not in used_ids), None)
+            clicked = next((t for t in by_person if t.awaits_tracking and t.id not in used_ids), None)
             if clicked is not None:
                 used_ids.add(clicked.id)
                 found.append(extend_track(clicked, proposal.boxes, motion))
@@ -241,8 +247,7 @@ def merge_proposals(state: State, proposals: Sequence[Track],
         next_id += number == next_id
         used_ids.add(number)
         found.append(replace(proposal, id=number))
-    found += [extend_track(t, {}, motion) for t in state.tracks.values()
-              if t.awaits_tracking and t.id not in used_ids]
+    found += [extend_track(t, {}, motion) for t in state.tracks.values() if t.awaits_tracking and t.id not in used_ids]
     return [t for t in found if t != state.tracks.get(t.id)], sorted(waiting - used_ids)
 
 
@@ -274,9 +279,7 @@ class _TrackIndex:
             if rows is not None:
                 distances = np.hypot(rows[:, 1] - b.values[0], rows[:, 2] - b.values[1])
                 lengths = np.minimum(rows[:, 3], b.values[3])
-                matches = distances <= np.maximum(SAME_TRACK_DISTANCE_M,
-                                                  SAME_TRACK_LENGTH_SHARE * lengths)
+                matches = distances <= np.maximum(SAME_TRACK_DISTANCE_M, SAME_TRACK_LENGTH_SHARE * lengths)
                 votes.update(rows[matches, 0].astype(int).tolist())
         shorter = {n: min(len(self._tracks[n].boxes), len(proposal.boxes)) for n in votes}
-        return [self._tracks[n] for n, count in votes.most_common()
-                if count >= MIN_COMMON_SHARE * shorter[n]]
+        return [self._tracks[n] for n, count in votes.most_common() if count >= MIN_COMMON_SHARE * shorter[n]]

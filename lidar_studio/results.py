@@ -28,13 +28,7 @@ from lidar_perception.runs.terminal import errors
 from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, assign_pairs
 from lidar_perception.scoring.recorded import read_objects_by_stamp
 from lidar_perception.types import Detections, GroundTruth, InputError
-from lidar_perception.wire.messages import (
-    FullScale,
-    read_cluster_ids,
-    read_column,
-    to_detections,
-    to_point_cloud,
-)
+from lidar_perception.wire.messages import FullScale, read_cluster_ids, read_column, to_detections, to_point_cloud
 from lidar_perception.wire.topics import FOUND, TRACKS, TRUTH
 from lidar_studio.drive import Drive, Scan, segment_frame, to_scan
 from msg_utils.markers import MarkedObjects
@@ -72,9 +66,14 @@ class Results:
         truth = frame.truth()
         camera = frame.camera() if self.sources and truth is not None else None
         found = {name: source.find(i, frame) for name, source in self.sources.items()}
-        matches = {} if truth is None else {
-            name: match_detections(truth, d, min_score, camera, self.sources[name].classes)
-            for name, d in found.items()}
+        matches = (
+            {}
+            if truth is None
+            else {
+                name: match_detections(truth, d, min_score, camera, self.sources[name].classes)
+                for name, d in found.items()
+            }
+        )
         return layers_to_json(truth, found, matches)
 
     def bind_layers(self, drive: Drive) -> Callable[[int, float], dict[str, Any]]:
@@ -82,28 +81,39 @@ class Results:
         return lambda i, min_score: self.layers(i, drive.frames[i], min_score)
 
 
-def layers_to_json(truth: GroundTruth | None, found: Mapping[str, Detections],
-                   matches: Mapping[str, Any]) -> dict[str, Any]:
+def layers_to_json(
+    truth: GroundTruth | None, found: Mapping[str, Detections], matches: Mapping[str, Any]
+) -> dict[str, Any]:
     """Convert labels and detections to rows: box, class, and track id or score.
 
     found: detections by source; their rows end with the probabilities by the detector's own
         sources.
     """
-    labels = [] if truth is None else [
-        [*map(float, box), name, extra.get("track_id")]
-        for box, name, extra in zip(truth.boxes, truth.labels, truth.extras)]
+    labels = (
+        []
+        if truth is None
+        else [
+            [*map(float, box), name, extra.get("track_id")]
+            for box, name, extra in zip(truth.boxes, truth.labels, truth.extras)
+        ]
+    )
     rows = {}
     for name, d in found.items():
-        parts = [{k: round(float(v[i]), 3) for k, v in d.sources.items() if np.isfinite(v[i])}
-                 for i in range(len(d))]
-        rows[name] = [[*map(float, box), CLASSES[c], float(score), row]
-                      for box, c, score, row in zip(d.boxes, d.class_ids, d.scores, parts)]
+        parts = [{k: round(float(v[i]), 3) for k, v in d.sources.items() if np.isfinite(v[i])} for i in range(len(d))]
+        rows[name] = [
+            [*map(float, box), CLASSES[c], float(score), row]
+            for box, c, score, row in zip(d.boxes, d.class_ids, d.scores, parts)
+        ]
     return {"labels": labels, "detections": rows, "matches": dict(matches)}
 
 
-def match_detections(truth: GroundTruth, found: Detections, min_score: float,
-                     camera: Camera | None = None,
-                     classes: frozenset[str] = frozenset(DETECTED)) -> dict[str, list[int]]:
+def match_detections(
+    truth: GroundTruth,
+    found: Detections,
+    min_score: float,
+    camera: Camera | None = None,
+    classes: frozenset[str] = frozenset(DETECTED),
+) -> dict[str, list[int]]:
     """Compare the detections of at least min_score with the labels.
 
     A hit reaches the relaxed BEV overlap of its class, or is a pedestrian with its centre within
@@ -121,17 +131,14 @@ def match_detections(truth: GroundTruth, found: Detections, min_score: float,
     true_names = np.array([SIMILAR_CLASS[CLASSES[c]] for c in truth.class_ids], object)
     for name in classes & DETECTED.keys():
         labels = np.flatnonzero(true_names == name)
-        rows = np.flatnonzero((found.class_ids == CLASSES.index(name))
-                              & (found.scores >= min_score))
+        rows = np.flatnonzero((found.class_ids == CLASSES.index(name)) & (found.scores >= min_score))
         boxes, label_boxes = found.boxes[rows].astype(np.float64), truth.boxes[labels]
         overlaps = bev_iou(boxes, label_boxes)
         hit = overlaps >= DETECTED[name].relaxed
         if name == CLASSES[PEDESTRIAN]:
             distances = np.linalg.norm(boxes[:, None, :2] - label_boxes[None, :, :2], axis=2)
             hit |= distances <= MAX_CENTRE_DISTANCE
-        i, j = (
-            assign_pairs(1.0 - overlaps, hit) if hit.size else (np.zeros(0, int), np.zeros(0, int))
-        )
+        i, j = assign_pairs(1.0 - overlaps, hit) if hit.size else (np.zeros(0, int), np.zeros(0, int))
         own = truth.class_ids[labels] == CLASSES.index(name)
         missed += labels[own & ~np.isin(np.arange(len(labels)), j)].tolist()
         hits += rows[i[own[j]]].tolist()
@@ -141,16 +148,21 @@ def match_detections(truth: GroundTruth, found: Detections, min_score: float,
         false += wrong.tolist()
     wanted = [CLASSES.index(name) for name in classes & DETECTED.keys()]
     counted = np.flatnonzero(found.scores >= min_score)
-    return {"missed": sorted(missed), "false": sorted(false),
-            "ignored_labels": np.flatnonzero(~np.isin(truth.class_ids, wanted)).tolist(),
-            "ignored": np.setdiff1d(counted, [*hits, *false]).tolist()}
+    return {
+        "missed": sorted(missed),
+        "false": sorted(false),
+        "ignored_labels": np.flatnonzero(~np.isin(truth.class_ids, wanted)).tolist(),
+        "ignored": np.setdiff1d(counted, [*hits, *false]).tolist(),
+    }
 
 
 def make_detector_source(detector: Detector) -> Source:
     """Make a source that runs a detector on request, with a cache."""
+
     @lru_cache(maxsize=MAX_CACHED_FRAMES)
     def detect(i: int, frame: Frame) -> Detections:
         return detector(frame.load()).detections
+
     return Source(detect, frozenset(detector.classes))
 
 
@@ -170,6 +182,7 @@ def make_file_source(folder: Path) -> Source:
             return Detections.none()
         rows = read_results(path, choose_calibration(frame)[0].lidar_to_camera)
         return Detections.of(rows.boxes, rows.class_ids, [e["score"] for e in rows.extras])
+
     return Source(read)
 
 
@@ -189,8 +202,11 @@ def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
     A topic whose boxes cannot be transformed to the clouds' frame is left out, with a warning.
     """
     bag = poses.handle.bag()
-    wanted = {topic for topic, kind in bag.topics.items() if kind == MARKERS and topic != TRUTH
-              and topic.endswith((FOUND, TRACKS))}
+    wanted = {
+        topic
+        for topic, kind in bag.topics.items()
+        if kind == MARKERS and topic != TRUTH and topic.endswith((FOUND, TRACKS))
+    }
     found = read_objects_by_stamp(bag, sorted(wanted))
     numbers = {stamp: i for i, stamp in enumerate(stamps)}
     sources: dict[str, Source] = {}
@@ -198,8 +214,11 @@ def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
     trackers = [topic for topic in found if topic.endswith(TRACKS)]
     for topic, marked in found.items():
         try:
-            frames = {numbers[stamp]: poses.to_cloud_frame(objects, topic)
-                      for stamp, objects in marked.items() if stamp in numbers}
+            frames = {
+                numbers[stamp]: poses.to_cloud_frame(objects, topic)
+                for stamp, objects in marked.items()
+                if stamp in numbers
+            }
         except InputError as error:
             errors.print(f"left out: {error}", style="yellow")
             continue
@@ -207,7 +226,8 @@ def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
             tracks += tracks_to_json(frames, topic, trackers.index(topic))
         else:
             sources[name_source(topic)] = _make_source(
-                {i: detections_with_sources(objects) for i, objects in frames.items()})
+                {i: detections_with_sources(objects) for i, objects in frames.items()}
+            )
     return Results(sources, tuple(tracks))
 
 
@@ -215,9 +235,10 @@ def detections_with_sources(objects: MarkedObjects) -> Detections:
     """Convert markers to detections, with the probabilities of sources that their text contains."""
     parts = [e["sources"] if isinstance(e.get("sources"), dict) else {} for e in objects.extras]
     names = list(dict.fromkeys(name for row in parts for name in row))[:MAX_SOURCES]
-    return replace(to_detections(objects), sources={
-        name: np.array([_to_probability(row.get(name)) for row in parts], np.float32)
-        for name in names})
+    return replace(
+        to_detections(objects),
+        sources={name: np.array([_to_probability(row.get(name)) for row in parts], np.float32) for name in names},
+    )
 
 
 def _to_probability(value: Any) -> float:
@@ -241,20 +262,21 @@ def read_recorded_scan(frame: Frame) -> Scan:
     """
     message = frame.native()
     is_segmented = {"ground", "cluster_id"} <= {field.name for field in message.fields}
-    return (scan_from_message(message, frame.intensity_max()) if is_segmented
-            else segment_frame(frame))
+    return scan_from_message(message, frame.intensity_max()) if is_segmented else segment_frame(frame)
 
 
-def scan_from_message(message: Any, intensity_max: float = 0.0,
-                      scale: FullScale = infer_full_scale) -> Scan:
+def scan_from_message(message: Any, intensity_max: float = 0.0, scale: FullScale = infer_full_scale) -> Scan:
     """Convert a PointCloud2 to a scan; without such columns it has neither ground nor clusters.
 
     intensity_max, scale: see to_point_cloud. Raises InputError for an invalid message.
     """
     cloud, indices = to_point_cloud(message, intensity_max, scale)
     ground, clusters = read_column(message, "ground", indices), read_cluster_ids(message, indices)
-    return to_scan(cloud, np.zeros(len(cloud), bool) if ground is None else ground > 0,
-                   np.zeros(len(cloud), np.int32) if clusters is None else clusters[0])
+    return to_scan(
+        cloud,
+        np.zeros(len(cloud), bool) if ground is None else ground > 0,
+        np.zeros(len(cloud), np.int32) if clusters is None else clusters[0],
+    )
 
 
 def make_track_id(tracker: int, number: int) -> int:
@@ -262,8 +284,7 @@ def make_track_id(tracker: int, number: int) -> int:
     return tracker * TRACKER_ID_STEP + number % TRACKER_ID_STEP
 
 
-def tracks_to_json(frames: Mapping[int, MarkedObjects], topic: str,
-                   tracker: int) -> list[dict[str, Any]]:
+def tracks_to_json(frames: Mapping[int, MarkedObjects], topic: str, tracker: int) -> list[dict[str, Any]]:
     """Convert the messages of a tracker, by frame, to JSON objects of tracks.
 
     tracker: see make_track_id.
@@ -271,12 +292,19 @@ def tracks_to_json(frames: Mapping[int, MarkedObjects], topic: str,
     made: dict[int, dict[str, Any]] = {}
     for i in sorted(frames):
         objects = frames[i]
-        for box, label, number, score in zip(objects.boxes, objects.labels, objects.ids.tolist(),
-                                             objects.scores):
-            track = made.setdefault(number, {
-                "id": make_track_id(tracker, number), "class": label, "state": "accepted",
-                "score": 0.0, "source": topic.strip("/").split("/")[0], "boxes": [],
-                "uncertainty": 0.0})
+        for box, label, number, score in zip(objects.boxes, objects.labels, objects.ids.tolist(), objects.scores):
+            track = made.setdefault(
+                number,
+                {
+                    "id": make_track_id(tracker, number),
+                    "class": label,
+                    "state": "accepted",
+                    "score": 0.0,
+                    "source": topic.strip("/").split("/")[0],
+                    "boxes": [],
+                    "uncertainty": 0.0,
+                },
+            )
             track["class"] = label  # the tracker's last decision
             track["score"] = max(track["score"], float(score))
             track["boxes"].append([i, *map(float, box), "proposed"])

@@ -31,14 +31,17 @@ from lidar_studio.state import find_next_uncertain
 LOG = logging.getLogger(__name__)
 HOSTS = ("127.0.0.1", "localhost")
 PAGE = Path(__file__).with_name("page")
-MAX_REQUEST = 10**7     # bytes
+MAX_REQUEST = 10**7  # bytes
 MAX_QUEUED_EVENTS = 1000
-PREFETCH_FRAMES = 2     # on either side of the requested frame
+PREFETCH_FRAMES = 2  # on either side of the requested frame
 Events = asyncio.Queue[dict[str, Any] | None]  # of one page; None: it is too far behind
-HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff",
-           "Referrer-Policy": "no-referrer",
-           "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
-                                      "img-src 'self' data: blob:; frame-ancestors 'none'"}
+HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; frame-ancestors 'none'",
+}
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
@@ -65,20 +68,41 @@ class PageContent:
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer of /api/drive."""
-        common = {"name": self.drive.name, "mode": "label" if self.session else "view",
-                  "classes": list_classes(), "live": self.live is not None,
-                  "min_score": ScoreParams().get(CLASSES[PEDESTRIAN]),
-                  "can_export": [*FORMATS] if self.session else []}
+        common = {
+            "name": self.drive.name,
+            "mode": "label" if self.session else "view",
+            "classes": list_classes(),
+            "live": self.live is not None,
+            "min_score": ScoreParams().get(CLASSES[PEDESTRIAN]),
+            "can_export": [*FORMATS] if self.session else [],
+        }
         if isinstance(self.drive, LiveGraph):
-            return {**common, "path": "", "layout": "live", "has": [],
-                    "first": self.drive.first, "frames": self.drive.list_frames(),
-                    "status": self.drive.get_status()}
+            return {
+                **common,
+                "path": "",
+                "layout": "live",
+                "has": [],
+                "first": self.drive.first,
+                "frames": self.drive.list_frames(),
+                "status": self.drive.get_status(),
+            }
         poses = (self.session or self.drive).motion.poses
-        frames = [{"name": f.name, "stamp_ns": f.stamp_ns, "sequence": f.sequence,
-                   "pose": None if poses is None else poses[i].ravel().tolist()}
-                  for i, f in enumerate(self.drive.frames)]
-        return {**common, "path": str(self.drive.recording.path), "frames": frames,
-                "layout": self.drive.recording.layout, "has": sorted(self.drive.recording.has)}
+        frames = [
+            {
+                "name": f.name,
+                "stamp_ns": f.stamp_ns,
+                "sequence": f.sequence,
+                "pose": None if poses is None else poses[i].ravel().tolist(),
+            }
+            for i, f in enumerate(self.drive.frames)
+        ]
+        return {
+            **common,
+            "path": str(self.drive.recording.path),
+            "frames": frames,
+            "layout": self.drive.recording.layout,
+            "has": sorted(self.drive.recording.has),
+        }
 
 
 class Server:
@@ -91,13 +115,21 @@ class Server:
         self.pages: set[Events] = set()
         self.prefetching: set[int] = set()
         self.app = web.Application(middlewares=[self.check_request], client_max_size=MAX_REQUEST)
-        self.app.add_routes([
-            web.get("/", self.index), web.get("/static/{name}", self.static),
-            web.get("/api/drive", self.drive), web.get("/api/cloud/{i}", self.cloud),
-            web.get("/api/state", self.state), web.post("/api/do", self.do),
-            web.get("/api/events", self.events), web.get("/api/labels/{i}", self.labels),
-            web.get("/api/silhouettes", self.silhouettes), web.get("/api/next", self.next),
-            web.post("/api/export", self.export)])
+        self.app.add_routes(
+            [
+                web.get("/", self.index),
+                web.get("/static/{name}", self.static),
+                web.get("/api/drive", self.drive),
+                web.get("/api/cloud/{i}", self.cloud),
+                web.get("/api/state", self.state),
+                web.post("/api/do", self.do),
+                web.get("/api/events", self.events),
+                web.get("/api/labels/{i}", self.labels),
+                web.get("/api/silhouettes", self.silhouettes),
+                web.get("/api/next", self.next),
+                web.post("/api/export", self.export),
+            ]
+        )
 
     @web.middleware
     async def check_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -108,8 +140,9 @@ class Server:
         if host not in HOSTS or (origin is not None and origin != f"http://{request.host}"):
             return web.Response(status=403, text="this page is only available on this machine\n")
         if not hmac.compare_digest(token.encode(), self.content.token.encode()):
-            return web.Response(status=403, text="the token is wrong or missing; open the address "
-                                                 "that lidar-perception printed\n")
+            return web.Response(
+                status=403, text="the token is wrong or missing; open the address that lidar-perception printed\n"
+            )
         try:
             response = await handler(request)
         except InputError as error:
@@ -118,8 +151,7 @@ class Server:
             response = _error_response(error.status, error.reason)
         except Exception as error:  # a bug; the journal still matches the labels
             LOG.exception("%s %s", request.method, request.path)
-            response = _error_response(500, f"internal error: {type(error).__name__}: "
-                                       f"{shorten_error(error)}")
+            response = _error_response(500, f"internal error: {type(error).__name__}: {shorten_error(error)}")
         if not response.prepared:
             response.headers.update(HEADERS)
         return response
@@ -127,8 +159,7 @@ class Server:
     async def index(self, request: web.Request) -> web.StreamResponse:
         """Serve the page, and set the cookie for all further requests."""
         response = web.FileResponse(PAGE / "index.html")
-        response.set_cookie(_cookie_name(request), self.content.token, httponly=True,
-                            samesite="Strict", path="/")
+        response.set_cookie(_cookie_name(request), self.content.token, httponly=True, samesite="Strict", path="/")
         return response
 
     async def static(self, request: web.Request) -> web.StreamResponse:
@@ -243,26 +274,28 @@ class Server:
         track = require_track(session.state, _parse_number(request.query.get("track", "")))
         frame = self.parse_frame(request.query.get("frame", ""))
         try:
-            return web.json_response(await self.run_in_thread(partial(
-                session.proposer.compare_with_seed, session.state, track, frame)))
+            return web.json_response(
+                await self.run_in_thread(partial(session.proposer.compare_with_seed, session.state, track, frame))
+            )
         except InputError as error:
             return _error_response(404, str(error))
 
     async def next(self, request: web.Request) -> web.StreamResponse:
         """Send the next uncertain track."""
         after, only = _parse_number(request.query.get("after", "")), request.query.get("class")
-        track = find_next_uncertain(self.session.state, after,
-                                    lambda track: only in (None, track.class_name))
-        return web.json_response({"track": track and track.id,
-                                  "frame": track.find_nearest_frame() if track else 0})
+        track = find_next_uncertain(self.session.state, after, lambda track: only in (None, track.class_name))
+        return web.json_response({"track": track and track.id, "frame": track.find_nearest_frame() if track else 0})
 
     async def export(self, request: web.Request) -> web.StreamResponse:
         """Write the labels in another format."""
         options, session = await _read_json(request), self.session
         if not isinstance(options.get("format"), str) or not isinstance(options.get("out"), str):
             raise InputError("an export needs `format`, and `out`, a file or folder")
-        return web.json_response(await self.run_in_thread(partial(
-            session.export, options["format"], options["out"], options.get("force") is True)))
+        return web.json_response(
+            await self.run_in_thread(
+                partial(session.export, options["format"], options["out"], options.get("force") is True)
+            )
+        )
 
 
 def _parse_number(text: str) -> int | None:
@@ -322,8 +355,9 @@ async def serve(content: PageContent, port: int, started: Callable[[str], None])
         await site.start()
     except OSError as error:
         await runner.cleanup()
-        raise InputError(f"cannot listen on port {port}: {error.strerror or error}; give another "
-                         "--port, or 0 for any") from None
+        raise InputError(
+            f"cannot listen on port {port}: {error.strerror or error}; give another --port, or 0 for any"
+        ) from None
     address = runner.addresses[0]
     started(f"http://{HOSTS[0]}:{address[1]}/?token={content.token}")
     try:

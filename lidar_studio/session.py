@@ -22,12 +22,12 @@ from lidar_studio.actions import (
     add_seed,
     apply,
     convert_tracks,
-    require_box,
     require_class_name,
     require_frame,
     require_numbers,
     require_track,
     round_box,
+    strip_computed,
     with_scan_poses,
 )
 from lidar_studio.drive import Drive
@@ -35,7 +35,7 @@ from lidar_studio.interpolation import Motion
 from lidar_studio.journal import Journal, open_journal
 from lidar_studio.label_conversion import compute_digest, join_extras, to_labels, to_tracks
 from lidar_studio.proposer import Proposer, merge_proposals
-from lidar_studio.snap import fit_clicked_box, resize_box, snap_to_cluster, snap_to_ground
+from lidar_studio.snap import fit_clicked_box, snap_box
 from lidar_studio.state import (
     ACCEPTED,
     CLICK,
@@ -67,8 +67,7 @@ class Session:
     busy: progress of the background task, for the page; None without a task.
     """
 
-    def __init__(self, drive: Drive, journal: Journal,
-                 detector: DetectorChoice | None = DetectorChoice()) -> None:
+    def __init__(self, drive: Drive, journal: Journal, detector: DetectorChoice | None = DetectorChoice()) -> None:
         self.drive, self.journal, self.state = drive, journal, State()
         self.proposer = Proposer(drive, detector, journal.path.with_name(survey_cache.FOLDER))
         self.listeners: list[Listener] = []
@@ -95,10 +94,9 @@ class Session:
             InputError: the action is invalid or cannot be written; the labels are unchanged.
         """
         if action.get("do") in ("propose", "cancel"):
-            return (self.start_proposals(by, True) if action["do"] == "propose"
-                    else self.cancel())
+            return self.start_proposals(by, True) if action["do"] == "propose" else self.cancel()
         with self._lock:
-            seq = self._record(self._complete(_strip_computed(action)), by)
+            seq = self._record(self._complete(strip_computed(action)), by)
             name = action.get("do")
             # Undo restores a track from before its tracking ended, and a rejected click is not
             # tracked further. These actions may therefore leave a click that has to be tracked.
@@ -128,8 +126,7 @@ class Session:
         with self._lock:
             if self._task == "proposing":
                 raise InputError("proposals are already being made")
-            self._start("proposing", lambda: self.propose(by, again=again or not self.has_proposals,
-                                                          by_person=again))
+            self._start("proposing", lambda: self.propose(by, again=again or not self.has_proposals, by_person=again))
         return self.state.seq
 
     def _start(self, task: str, work: Callable[[], None]) -> None:
@@ -146,14 +143,20 @@ class Session:
             try:
                 work()
             except Exception as error:  # the page shows it, as nobody joins this thread
-                self.notify({"error": str(error) if isinstance(error, InputError) else
-                             f"no proposals: {type(error).__name__}: {shorten_error(error)}"})
+                self.notify(
+                    {
+                        "error": str(error)
+                        if isinstance(error, InputError)
+                        else f"no proposals: {type(error).__name__}: {shorten_error(error)}"
+                    }
+                )
             finally:
                 self.busy = None
                 with self._lock:
                     if self._worker is threading.current_thread():
                         self._task = ""
                 self.notify({"progress": self.get_progress()})
+
         self._worker = threading.Thread(target=run, daemon=True)
         self._worker.start()
 
@@ -206,8 +209,7 @@ class Session:
         state = self.state
         found = self.proposer.make_proposals(state, self.motion, None, self._report_progress)
         with self._lock:
-            if found is None or self._cancelled.is_set() or (
-                    seed is not None and not self._has_waiting_clicks()):
+            if found is None or self._cancelled.is_set() or (seed is not None and not self._has_waiting_clicks()):
                 return
             tracks, removed = merge_proposals(self.state, found, self.motion)
             # Undoing a seed also undoes its proposals, but never the first proposals of a drive.
@@ -231,31 +233,27 @@ class Session:
         if name == "seed":
             return self._complete_seed(action)
         if name == "snap":
-            return {**action, "box": round_box(self._snap_box(action))}
+            return {**action, "box": round_box(snap_box(action, self.state, self.drive))}
         if name == "import":
             return self._complete_import(action)
         if name in ("accept", "reopen"):
             track = require_track(self.state, action.get("track"))
             was_seed = track.source == CLICK and track.state == REJECTED
-            if track.boxes and (was_seed or (name == "accept"
-                                             and track.class_name == CLASSES[PEDESTRIAN])):
+            if track.boxes and (was_seed or (name == "accept" and track.class_name == CLASSES[PEDESTRIAN])):
                 return {**action, "seed": track.find_nearest_frame()}
         return action
 
     def _complete_import(self, action: Action) -> Action:
         path, name = action.get("path"), action.get("format") or ""
         if not isinstance(path, str) or not isinstance(name, str):
-            raise InputError("an import needs the path of a label file or folder, and optionally a "
-                             "format, as text")
+            raise InputError("an import needs the path of a label file or folder, and optionally a format, as text")
         labels = import_labels(Path(path), name or recognise_format(Path(path)), self.drive.frames)
         tracks, kept = to_tracks(labels, self.state.next_id)
         before = self.state.kept
         digest, imports = compute_digest(tracks, kept), before.get("imports", [])
         if digest in imports:
-            raise AlreadyImportedError(f"the labels in {path} were already imported; nothing was "
-                                       "done")
-        return {**action, "tracks": tracks,
-                "kept": {**join_extras(before, kept), "imports": [*imports, digest]}}
+            raise AlreadyImportedError(f"the labels in {path} were already imported; nothing was done")
+        return {**action, "tracks": tracks, "kept": {**join_extras(before, kept), "imports": [*imports, digest]}}
 
     def export(self, format_name: str, out: str, force: bool = False) -> dict[str, Any]:
         """Export the accepted tracks.
@@ -278,26 +276,35 @@ class Session:
         if path.resolve() == self.journal.path.resolve():
             raise InputError(f"{path} is the journal of these labels; give another name")
         with self._exporting:  # a button may be pressed twice
-            written = export_labels(to_labels(self.state, self.drive.frames), format_name, path,
-                                    self.drive.frames, force)
+            written = export_labels(
+                to_labels(self.state, self.drive.frames), format_name, path, self.drive.frames, force
+            )
         nearby = [t.id for t in self.state.tracks.values() if t.nearby and t.awaits_tracking]
-        return {"path": str(written.path), "boxes": written.boxes, "frames": written.frames,
-                "left_out": [*written.left_out, *(
-                    [f"later boxes of tracks that are still being tracked: {nearby}"]
-                    if nearby else [])]}
+        return {
+            "path": str(written.path),
+            "boxes": written.boxes,
+            "frames": written.frames,
+            "left_out": [
+                *written.left_out,
+                *([f"later boxes of tracks that are still being tracked: {nearby}"] if nearby else []),
+            ],
+        }
 
     def _complete_seed(self, action: Action) -> Action:
         frame, class_name = require_frame(action, self.drive.motion), require_class_name(action)
         click = np.array(require_numbers(action, "xyz", 3))
         box = fit_clicked_box(self.drive.load_scan(frame), click, class_name)
         box = self.proposer.refine_with_detection(frame, box, class_name)
-        track = Track(self.state.next_id, class_name, ACCEPTED, 1.0, CLICK,
-                      {frame: Box(tuple(round_box(box)), KEY)})
+        track = Track(self.state.next_id, class_name, ACCEPTED, 1.0, CLICK, {frame: Box(tuple(round_box(box)), KEY)})
         action = {**action, "track": track.id}
         if self.proposer.surveys is None:
             return {**action, "tracks": [track]}
-        state = replace(self.state, tracks={**self.state.tracks, track.id: track},
-                        seeds=add_seed(self.state.seeds, frame, track.id), next_id=track.id + 1)
+        state = replace(
+            self.state,
+            tracks={**self.state.tracks, track.id: track},
+            seeds=add_seed(self.state.seeds, frame, track.id),
+            next_id=track.id + 1,
+        )
         count = len(self.drive.frames)
         nearby = range(max(frame - NEARBY_FRAMES, 0), min(frame + NEARBY_FRAMES + 1, count))
         is_long = count > 2 * NEARBY_FRAMES
@@ -310,20 +317,6 @@ class Session:
         tracks = [t for t in tracks if t is not own] + [replace(own, nearby=is_long)]
         return {**action, "tracks": tracks, "removed": removed}
 
-    def _snap_box(self, action: Action) -> Array:
-        track = require_track(self.state, action.get("track"))
-        frame = require_frame(action, self.drive.motion)
-        box = np.array(require_box(track, frame).values)
-        if action.get("to") == "size":
-            others = [b.values[3:6] for f, b in track.boxes.items() if f != frame]
-            keys = [b.values[3:6] for f, b in track.boxes.items() if f != frame and b.kind == KEY]
-            return resize_box(box, np.median(keys or others or [tuple(box[3:6])], axis=0))
-        if action.get("to") not in ("cluster", "ground"):
-            raise InputError("a box snaps to cluster, ground or size")
-        scan = self.drive.load_scan(frame)
-        return snap_to_cluster(scan, box) if action["to"] == "cluster" else snap_to_ground(scan,
-                                                                                           box)
-
     def _record(self, action: Action, by: str) -> int:
         """Apply an action, write it to the journal, and notify the listeners."""
         after, change = apply(self.state, action, self.drive.motion)
@@ -333,20 +326,27 @@ class Session:
             if track.id not in encoded:
                 encoded[track.id] = track_to_json(track)
             return encoded[track.id]
-        self.journal.append({"seq": after.seq, "time": datetime.now(UTC).isoformat(), "by": by,
-                             **convert_tracks(action, encode)})
+
+        self.journal.append(
+            {"seq": after.seq, "time": datetime.now(UTC).isoformat(), "by": by, **convert_tracks(action, encode)}
+        )
         self.state = after
         self._notify_change(action, change, by, encode)
         return after.seq
 
-    def _notify_change(self, action: Action, change: Change, by: str,
-                       encode: Callable[[Track], dict[str, Any]]) -> None:
+    def _notify_change(
+        self, action: Action, change: Change, by: str, encode: Callable[[Track], dict[str, Any]]
+    ) -> None:
         tracks = [encode(track) for _, track in change.tracks.values() if track]
         removed = [n for n, (_, track) in change.tracks.items() if track is None]
-        shown = {k: v for k, v in action.items() if k not in ("tracks", "removed", "poses", "kept")
-                 or action["do"] == "merge"}
-        self.notify({"seq": self.state.seq, "by": by, "action": shown, "tracks": tracks,
-                     "removed": removed, **self.summarize()})
+        shown = {
+            k: v
+            for k, v in action.items()
+            if k not in ("tracks", "removed", "poses", "kept") or action["do"] == "merge"
+        }
+        self.notify(
+            {"seq": self.state.seq, "by": by, "action": shown, "tracks": tracks, "removed": removed, **self.summarize()}
+        )
 
     def notify(self, event: dict[str, Any]) -> None:
         """Send an event to all listeners."""
@@ -360,31 +360,26 @@ class Session:
     def summarize(self) -> dict[str, Any]:
         """Return the part of the state that every event contains: all but the tracks."""
         state = self.state
-        return {"checked": sorted(state.checked), "seeds": [list(s) for s in state.seeds],
-                "can_undo": state.undo_stack is not None,
-                "can_redo": state.redo_stack is not None, "progress": self.get_progress()}
+        return {
+            "checked": sorted(state.checked),
+            "seeds": [list(s) for s in state.seeds],
+            "can_undo": state.undo_stack is not None,
+            "can_redo": state.redo_stack is not None,
+            "progress": self.get_progress(),
+        }
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer of /api/state."""
         with self._lock:
-            return {"seq": self.state.seq, **self.summarize(),
-                    "tracks": [track_to_json(t) for t in self.state.tracks.values()]}
-
-
-def _strip_computed(action: Mapping[str, Any]) -> Action:
-    """Remove the fields that only the session may set."""
-    if action.get("do") == "poses":
-        raise InputError("poses come from the drive")
-    computed = {"seed": ("track", "tracks", "removed"), "propose": ("tracks", "removed"),
-                "import": ("tracks", "removed", "kept"),
-                "accept": ("seed",), "reopen": ("seed",), "snap": ("box",)}
-    unwanted = ("seq", "time", "by", "joins", "beside", *computed.get(str(action.get("do")), ()))
-    return {k: v for k, v in action.items() if k not in unwanted}
+            return {
+                "seq": self.state.seq,
+                **self.summarize(),
+                "tracks": [track_to_json(t) for t in self.state.tracks.values()],
+            }
 
 
 @contextmanager
-def open_session(drive: Drive, folder: Path,
-                 detector: DetectorChoice | None = DetectorChoice()) -> Iterator[Session]:
+def open_session(drive: Drive, folder: Path, detector: DetectorChoice | None = DetectorChoice()) -> Iterator[Session]:
     """Open the labels of a drive that are stored in a folder, or start new ones.
 
     Raises:

@@ -13,20 +13,22 @@ from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.geometry import points_in_box, to_box_frame, wrap_angle
 from lidar_perception.ground.surface import fit_ground_surface
 from lidar_perception.types import InputError
-from lidar_studio.drive import Scan
+from lidar_studio.actions import Action, require_box, require_frame, require_track
+from lidar_studio.drive import Drive, Scan
+from lidar_studio.state import KEY, State
 
 Array = np.ndarray[Any, Any]
-BOX_MARGIN_M = 0.3            # around a box, when searching its cluster
+BOX_MARGIN_M = 0.3  # around a box, when searching its cluster
 # Without ground points below a box, this many of the nearest ones are used, up to this distance.
 MIN_GROUND_POINTS, MAX_GROUND_DISTANCE_M = 20, 15.0
-MIN_PIECE_SHARE = 0.2         # of the largest cluster in a box; smaller ones are other objects
+MIN_PIECE_SHARE = 0.2  # of the largest cluster in a box; smaller ones are other objects
 # A cluster is part of a clicked vehicle if this share of its points is within this share of the
 # usual length from the click.
 MIN_INSIDE_SHARE, PIECE_REACH = 0.8, 0.55
-MIN_REACH_M = 0.1             # beyond the point of a cluster nearest to the click
-MAX_LENGTH_RATIO = 1.5        # to the usual length; a longer cluster contains other objects
-LONG_OBJECT_M = 2.5           # usual length of objects whose far side is hidden
-MAX_END_RATIO = 1.3           # to the usual width; a shorter side is the front or the rear
+MIN_REACH_M = 0.1  # beyond the point of a cluster nearest to the click
+MAX_LENGTH_RATIO = 1.5  # to the usual length; a longer cluster contains other objects
+LONG_OBJECT_M = 2.5  # usual length of objects whose far side is hidden
+MAX_END_RATIO = 1.3  # to the usual width; a shorter side is the front or the rear
 
 
 def fit_clicked_box(scan: Scan, click: Array, class_name: str) -> Array:
@@ -37,8 +39,9 @@ def fit_clicked_box(scan: Scan, click: Array, class_name: str) -> Array:
     usual = find_usual_size(class_name)
     if usual is not None and usual[0] > LONG_OBJECT_M:  # often split into several clusters
         near = np.hypot(*(scan.xyz[:, :2] - click[:2]).T) < usual[0] * PIECE_REACH
-        inside, total = (np.bincount(scan.cluster_ids[mask], minlength=scan.cluster_ids.max() + 1)
-                         for mask in (near, slice(None)))
+        inside, total = (
+            np.bincount(scan.cluster_ids[mask], minlength=scan.cluster_ids.max() + 1) for mask in (near, slice(None))
+        )
         is_part = (inside > MIN_INSIDE_SHARE * total) & (np.arange(len(total)) > 0)
         members |= is_part[scan.cluster_ids]
     box = _fit_box(scan, members)
@@ -85,8 +88,15 @@ def resize_box(box: Array, size: Array) -> Array:
     sensor = to_box_frame(np.zeros((1, 3)), box)[0, :2]
     away = -np.where(np.abs(sensor) > box[3:5] / 2, np.sign(sensor), 0.0)
     along, across = away * (size[:2] - box[3:5]) / 2
-    return np.array([box[0] + cos * along - sin * across, box[1] + sin * along + cos * across,
-                     box[2] + (size[2] - box[5]) / 2, *size, box[6]])
+    return np.array(
+        [
+            box[0] + cos * along - sin * across,
+            box[1] + sin * along + cos * across,
+            box[2] + (size[2] - box[5]) / 2,
+            *size,
+            box[6],
+        ]
+    )
 
 
 def align_heading(box: Array, yaw: float) -> Array:
@@ -114,8 +124,7 @@ def complete_box(box: Array, usual: Size | None) -> Array:
     vehicle = length > LONG_OBJECT_M
     if vehicle and box[3] < MAX_END_RATIO * width:
         box = align_heading(box, box[6] + np.pi / 2)
-    size = np.array([max(box[3], length), max(box[4], width),
-                     box[5] if box[5] > height / 2 else height])
+    size = np.array([max(box[3], length), max(box[4], width), box[5] if box[5] > height / 2 else height])
     if vehicle:
         return resize_box(box, size)
     return np.array([*box[:2], box[2] + (size[2] - box[5]) / 2, *size, box[6]])
@@ -131,3 +140,22 @@ def _fit_box(scan: Scan, members: Array) -> Array:
         box[2], box[5] = (floor + top) / 2, top - floor
     box[3:6] = np.maximum(box[3:6], 0.05)
     return box
+
+
+def snap_box(action: Action, state: State, drive: Drive) -> Array:
+    """Return the box of a "snap" action: the track's box moved to its cluster or the ground, or resized.
+
+    Raises:
+        InputError: no such track, frame or box, or an unknown target.
+    """
+    track = require_track(state, action.get("track"))
+    frame = require_frame(action, drive.motion)
+    box = np.array(require_box(track, frame).values)
+    if action.get("to") == "size":
+        others = [b.values[3:6] for f, b in track.boxes.items() if f != frame]
+        keys = [b.values[3:6] for f, b in track.boxes.items() if f != frame and b.kind == KEY]
+        return resize_box(box, np.median(keys or others or [tuple(box[3:6])], axis=0))
+    if action.get("to") not in ("cluster", "ground"):
+        raise InputError("a box snaps to cluster, ground or size")
+    scan = drive.load_scan(frame)
+    return snap_to_cluster(scan, box) if action["to"] == "cluster" else snap_to_ground(scan, box)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 KEY, PROPOSED, INTERPOLATED = "key", "proposed", "interpolated"  # kinds of boxes
-ACCEPTED, REJECTED = "accepted", "rejected"                      # of tracks, as is PROPOSED
+ACCEPTED, REJECTED = "accepted", "rejected"  # of tracks, as is PROPOSED
 CLICK = "click"  # source of a clicked track, which is then tracked through the drive
 
 
@@ -54,14 +54,22 @@ class Track:
     @property
     def has_human_edits(self) -> bool:
         """True if a person accepted, rejected or changed the track."""
-        return (self.state != PROPOSED or self.edited or bool(self.removed_frames)
-                or any(box.kind == KEY for box in self.boxes.values()))
+        return (
+            self.state != PROPOSED
+            or self.edited
+            or bool(self.removed_frames)
+            or any(box.kind == KEY for box in self.boxes.values())
+        )
 
     @property
     def awaits_tracking(self) -> bool:
         """True for a clicked track that is not yet tracked through the whole drive."""
-        return (self.source == CLICK and self.state != REJECTED and not self.edited
-                and (len(self.boxes) == 1 or self.nearby))
+        return (
+            self.source == CLICK
+            and self.state != REJECTED
+            and not self.edited
+            and (len(self.boxes) == 1 or self.nearby)
+        )
 
     @property
     def uncertainty(self) -> float:
@@ -84,21 +92,28 @@ class Change(NamedTuple):
 
     def combine_with(self, later: Change) -> Change:
         """Return this change and a later one as a single change."""
-        tracks = {n: (self.tracks[n] if n in self.tracks else later.tracks[n])[:1]
-                  + (later.tracks[n] if n in later.tracks else self.tracks[n])[1:]
-                  for n in (*self.tracks, *later.tracks)}
-        return Change(tracks, (self.seeds[0], later.seeds[1]),
-                      (self.checked[0], later.checked[1]), (self.kept[0], later.kept[1]))
+        tracks = {
+            n: (self.tracks[n] if n in self.tracks else later.tracks[n])[:1]
+            + (later.tracks[n] if n in later.tracks else self.tracks[n])[1:]
+            for n in (*self.tracks, *later.tracks)
+        }
+        return Change(
+            tracks, (self.seeds[0], later.seeds[1]), (self.checked[0], later.checked[1]), (self.kept[0], later.kept[1])
+        )
 
     def invert(self) -> Change:
         """Return the change that undoes this one."""
-        return Change({k: (after, before) for k, (before, after) in self.tracks.items()},
-                      self.seeds[::-1], self.checked[::-1], self.kept[::-1])
+        return Change(
+            {k: (after, before) for k, (before, after) in self.tracks.items()},
+            self.seeds[::-1],
+            self.checked[::-1],
+            self.kept[::-1],
+        )
 
 
-Seeds = tuple[tuple[int, int], ...]    # (frame, track id)
+Seeds = tuple[tuple[int, int], ...]  # (frame, track id)
 Kept = Mapping[str, Any]  # preserved fields of imported files, see label_conversion.py
-Stack = tuple[Change, Any] | None      # a change, and the stack below it: shared between states
+Stack = tuple[Change, Any] | None  # a change, and the stack below it: shared between states
 
 
 @dataclass(frozen=True)
@@ -129,17 +144,27 @@ class State:
                 tracks.pop(number, None)
             else:
                 tracks[number] = track
-        return replace(self, tracks=tracks, seeds=change.seeds[1], checked=change.checked[1],
-                       kept=change.kept[1],
-                       next_id=max(self.next_id, *(n + 1 for n in change.tracks), 1))
+        return replace(
+            self,
+            tracks=tracks,
+            seeds=change.seeds[1],
+            checked=change.checked[1],
+            kept=change.kept[1],
+            next_id=max(self.next_id, *(n + 1 for n in change.tracks), 1),
+        )
 
 
 def track_to_json(track: Track) -> dict[str, Any]:
     """Convert a track to the JSON object of the page and the journal."""
-    found = {"id": track.id, "class": track.class_name, "state": track.state,
-             "score": track.score, "source": track.source,
-             "boxes": [[f, *b.values, b.kind] for f, b in sorted(track.boxes.items())],
-             "uncertainty": track.uncertainty}
+    found = {
+        "id": track.id,
+        "class": track.class_name,
+        "state": track.state,
+        "score": track.score,
+        "source": track.source,
+        "boxes": [[f, *b.values, b.kind] for f, b in sorted(track.boxes.items())],
+        "uncertainty": track.uncertainty,
+    }
     if track.removed_frames:
         found["gone"] = sorted(track.removed_frames)
     if track.extra:
@@ -149,22 +174,31 @@ def track_to_json(track: Track) -> dict[str, Any]:
 
 def track_from_json(found: Mapping[str, Any]) -> Track:
     """Make a track from the object of track_to_json."""
-    boxes = {int(f): Box(tuple(map(float, values)), kind)
-             for f, *values, kind in found["boxes"]}
-    return Track(int(found["id"]), str(found["class"]), found["state"], float(found["score"]),
-                 str(found["source"]), boxes, frozenset(found.get("gone", ())),
-                 {int(f): v for f, v in found.get("extra", {}).items()},
-                 found.get("edited", False), found.get("nearby", False))
+    boxes = {int(f): Box(tuple(map(float, values)), kind) for f, *values, kind in found["boxes"]}
+    return Track(
+        int(found["id"]),
+        str(found["class"]),
+        found["state"],
+        float(found["score"]),
+        str(found["source"]),
+        boxes,
+        frozenset(found.get("gone", ())),
+        {int(f): v for f, v in found.get("extra", {}).items()},
+        found.get("edited", False),
+        found.get("nearby", False),
+    )
 
 
-def find_next_uncertain(state: State, after: int | None = None,
-                        condition: Callable[[Track], bool] = lambda track: True) -> Track | None:
+def find_next_uncertain(
+    state: State, after: int | None = None, condition: Callable[[Track], bool] = lambda track: True
+) -> Track | None:
     """Return the most uncertain proposed track that meets a condition, or None.
 
     after: id of such a track; the one after it is returned, and after the last one the first.
     """
-    waiting = sorted((t for t in state.tracks.values() if t.state == PROPOSED and condition(t)),
-                     key=lambda t: (-t.uncertainty, t.id))
+    waiting = sorted(
+        (t for t in state.tracks.values() if t.state == PROPOSED and condition(t)), key=lambda t: (-t.uncertainty, t.id)
+    )
     if not waiting:
         return None
     place = next((i for i, t in enumerate(waiting) if t.id == after), -1)
@@ -175,6 +209,12 @@ def count_progress(state: State, frames: int) -> dict[str, int]:
     """Count tracks by state, checked frames and actions, for the page."""
     states = [t.state for t in state.tracks.values()]
     accepted, rejected = states.count(ACCEPTED), states.count(REJECTED)
-    return {"tracks": len(states), "accepted": accepted, "rejected": rejected,
-            "left": len(states) - accepted - rejected, "frames": frames,
-            "checked": len(state.checked), "actions": state.seq}
+    return {
+        "tracks": len(states),
+        "accepted": accepted,
+        "rejected": rejected,
+        "left": len(states) - accepted - rejected,
+        "frames": frames,
+        "checked": len(state.checked),
+        "actions": state.seq,
+    }

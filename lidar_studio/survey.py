@@ -29,12 +29,12 @@ from lidar_perception.types import Detections
 from lidar_studio.drive import Drive, make_pipeline_params, select_drive
 
 Array = np.ndarray[Any, Any]
-MIN_DETECTION_SCORE = 0.1    # low, as the tracker filters weak detections
+MIN_DETECTION_SCORE = 0.1  # low, as the tracker filters weak detections
 PERSON_HEIGHTS_M = 0.9, 2.4  # above the ground
-MAX_PERSON_WIDTH_M = 2.0     # diagonal of the cluster in BEV
+MAX_PERSON_WIDTH_M = 2.0  # diagonal of the cluster in BEV
 MIN_PERSON_POINTS = 5
 OBJECT_HEIGHTS_M = 0.7, 4.5  # above the ground
-MAX_OBJECT_LENGTH_M = 14.0   # diagonal of the cluster in BEV
+MAX_OBJECT_LENGTH_M = 14.0  # diagonal of the cluster in BEV
 MIN_OBJECT_POINTS = 10
 
 
@@ -57,8 +57,7 @@ class FrameSurvey:
     pose: Array | None = None
 
 
-def survey_frame(frame: Frame, detector: Detector | None = None,
-                 odometry: Odometry | None = None) -> FrameSurvey:
+def survey_frame(frame: Frame, detector: Detector | None = None, odometry: Odometry | None = None) -> FrameSurvey:
     """Survey a frame.
 
     Args:
@@ -73,8 +72,7 @@ def survey_frame(frame: Frame, detector: Detector | None = None,
     detections = Detections.none() if detector is None else detector(cloud).detections
     pose = None if odometry is None else odometry(cloud.xyz)
     counts = np.bincount(found.cluster_ids, minlength=len(found.boxes) + 1)[1:]
-    people = _find_clusters(found.boxes, counts, PERSON_HEIGHTS_M, MAX_PERSON_WIDTH_M,
-                            MIN_PERSON_POINTS)
+    people = _find_clusters(found.boxes, counts, PERSON_HEIGHTS_M, MAX_PERSON_WIDTH_M, MIN_PERSON_POINTS)
     boxes, shapes = found.boxes[people], _fit_objects(found, counts)
     if len(people) == 0:
         return FrameSurvey(detections, boxes, np.zeros((0, ROWS), np.uint32), {}, shapes, pose)
@@ -82,18 +80,21 @@ def survey_frame(frame: Frame, detector: Detector | None = None,
     return FrameSurvey(detections, boxes, images, features, shapes, pose)
 
 
-def _find_clusters(boxes: Array, counts: Array, heights: tuple[float, float], max_diagonal: float,
-                   min_points: int) -> Array:
+def _find_clusters(
+    boxes: Array, counts: Array, heights: tuple[float, float], max_diagonal: float, min_points: int
+) -> Array:
     """Return the indices (K,) int of clusters within these limits."""
-    return np.flatnonzero((boxes[:, 5] >= heights[0]) & (boxes[:, 5] <= heights[1])
-                          & (np.hypot(boxes[:, 3], boxes[:, 4]) <= max_diagonal)
-                          & (counts >= min_points))
+    return np.flatnonzero(
+        (boxes[:, 5] >= heights[0])
+        & (boxes[:, 5] <= heights[1])
+        & (np.hypot(boxes[:, 3], boxes[:, 4]) <= max_diagonal)
+        & (counts >= min_points)
+    )
 
 
 def _fit_objects(found: SegmentedCloud, counts: Array) -> Array:
     """Fit the L-shapes (T, 7) float32 of clusters of object size."""
-    chosen = _find_clusters(found.boxes, counts, OBJECT_HEIGHTS_M, MAX_OBJECT_LENGTH_M,
-                            MIN_OBJECT_POINTS)
+    chosen = _find_clusters(found.boxes, counts, OBJECT_HEIGHTS_M, MAX_OBJECT_LENGTH_M, MIN_OBJECT_POINTS)
     numbers = np.zeros(len(found.boxes) + 1, np.int32)
     numbers[chosen + 1] = np.arange(1, len(chosen) + 1)
     labels = numbers[found.cluster_ids]
@@ -102,16 +103,18 @@ def _fit_objects(found: SegmentedCloud, counts: Array) -> Array:
     return shapes
 
 
-def _describe_people(xyz: Array, cluster_ids: Array, boxes: Array, numbers: Array,
-                     params: PipelineParams) -> tuple[Array, dict[str, Array]]:
+def _describe_people(
+    xyz: Array, cluster_ids: Array, boxes: Array, numbers: Array, params: PipelineParams
+) -> tuple[Array, dict[str, Array]]:
     points, start = group_points(xyz, cluster_ids, numbers)
     floors = (boxes[:, 2] - boxes[:, 5] / 2).astype(np.float64)
     images = draw_silhouettes(points, start, np.ones((len(boxes), 1)), floors, params)
     return images, compute_shape_features(points, start, boxes, params)
 
 
-def survey_drive(drive: Drive, choice: DetectorChoice | None,
-                 first: int = 0) -> Generator[FrameSurvey | None, None, None]:
+def survey_drive(
+    drive: Drive, choice: DetectorChoice | None, first: int = 0
+) -> Generator[FrameSurvey | None, None, None]:
     """Yield the surveys of all frames from `first` on, in order.
 
     The frames are surveyed in a separate process if the recording can be reopened there; it ends
@@ -134,10 +137,12 @@ def _needs_odometry(drive: Drive) -> bool:
     return choose_recorded_source(drive.motion.poses is not None) == "kiss_icp"
 
 
-def _make_surveyor(drive: Drive, choice: DetectorChoice | None,
-                   first: int) -> Callable[[int], FrameSurvey | None]:
-    detector = None if choice is None else choice.open(
-        sensor_height=drive.frames[0].sensor_height, min_score=MIN_DETECTION_SCORE)
+def _make_surveyor(drive: Drive, choice: DetectorChoice | None, first: int) -> Callable[[int], FrameSurvey | None]:
+    detector = (
+        None
+        if choice is None
+        else choice.open(sensor_height=drive.frames[0].sensor_height, min_score=MIN_DETECTION_SCORE)
+    )
     odometry = Odometry() if _needs_odometry(drive) else None
 
     def survey(i: int) -> FrameSurvey | None:
@@ -146,10 +151,12 @@ def _make_surveyor(drive: Drive, choice: DetectorChoice | None,
         if odometry is not None:
             odometry(drive.frames[i].load().xyz)
         return None
+
     return survey
 
 
-def _make_process_surveyor(reopen: Callable[[], Recording], choice: DetectorChoice | None,
-                           sequence: str, first: int) -> Callable[[int], FrameSurvey | None]:
+def _make_process_surveyor(
+    reopen: Callable[[], Recording], choice: DetectorChoice | None, sequence: str, first: int
+) -> Callable[[int], FrameSurvey | None]:
     os.nice(10)  # so that the page stays responsive
     return _make_surveyor(select_drive(reopen(), sequence), choice, first)

@@ -33,13 +33,21 @@ def make_key(drive: Drive, choice: DetectorChoice | None) -> str:
     the version of the package."""
     weights = "" if choice is None else choice.weights
     file = Path(weights)
-    parameters = {} if choice is None else {
-        **({} if choice.range == "auto" else {"range": choice.range}), **choice.settings}
+    parameters = (
+        {} if choice is None else {**({} if choice.range == "auto" else {"range": choice.range}), **choice.settings}
+    )
     content = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
-    return json.dumps({**drive.journal_header, "layout": LAYOUT,
-                       "weights": weights, "content": content[:16], "version": __version__,
-                       **({"settings": parameters} if parameters else {}),
-                       "posed": drive.motion.poses is not None})
+    return json.dumps(
+        {
+            **drive.journal_header,
+            "layout": LAYOUT,
+            "weights": weights,
+            "content": content[:16],
+            "version": __version__,
+            **({"settings": parameters} if parameters else {}),
+            "posed": drive.motion.poses is not None,
+        }
+    )
 
 
 def clear(folder: Path) -> None:
@@ -62,9 +70,18 @@ def write(folder: Path, key: str, first: int, surveys: Sequence[FrameSurvey]) ->
     for survey in surveys:
         found = survey.detections
         features = np.array([survey.features.get(n, np.zeros(len(survey.boxes))) for n in names])
-        for column, part in zip(columns, (
-                found.boxes, found.class_ids, found.scores, survey.boxes, survey.images,
-                features.reshape(len(names), -1).T, survey.shapes)):
+        for column, part in zip(
+            columns,
+            (
+                found.boxes,
+                found.class_ids,
+                found.scores,
+                survey.boxes,
+                survey.images,
+                features.reshape(len(names), -1).T,
+                survey.shapes,
+            ),
+        ):
             column.append(part)
     arrays: dict[str, Any] = {}
     for name, column in zip(PARTS, columns):
@@ -72,12 +89,10 @@ def write(folder: Path, key: str, first: int, surveys: Sequence[FrameSurvey]) ->
         arrays[f"{name}_counts"] = np.array([len(part) for part in column])
     poses = [survey.pose for survey in surveys if survey.pose is not None]
     content = io.BytesIO()
-    np.savez_compressed(content, key=np.array(key), names=np.array(names, str),
-                        poses=np.array(poses), **arrays)
+    np.savez_compressed(content, key=np.array(key), names=np.array(names, str), poses=np.array(poses), **arrays)
     size = content.getbuffer().nbytes + sum(p.stat().st_size for p in folder.glob("*.npz"))
     if size > MAX_BYTES:
-        raise InputError(f"the survey is larger than {MAX_BYTES / 1e6:.0f} MB; only frames before "
-                         f"{first} are cached")
+        raise InputError(f"the survey is larger than {MAX_BYTES / 1e6:.0f} MB; only frames before {first} are cached")
     write_bytes(folder / _file_name(first), content.getbuffer())
 
 
@@ -96,12 +111,11 @@ def read(folder: Path, key: str) -> tuple[list[FrameSurvey], str]:
                 surveys += _read_file(file) if found == key else []
             if found != key:
                 other = "; ".join(find_differences(json.loads(found), json.loads(key)))
-                return [], (f"{folder} belongs to another survey ({other}); the drive is surveyed "
-                            "again")
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, BadZipFile,
-                zlib.error) as error:
-            return surveys, (f"{path} is damaged ({shorten_error(error)}); the drive is surveyed "
-                             f"again from frame {first} on")
+                return [], (f"{folder} belongs to another survey ({other}); the drive is surveyed again")
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, BadZipFile, zlib.error) as error:
+            return surveys, (
+                f"{path} is damaged ({shorten_error(error)}); the drive is surveyed again from frame {first} on"
+            )
         first += FRAMES_PER_FILE
     return surveys, ""
 
@@ -109,8 +123,14 @@ def read(folder: Path, key: str) -> tuple[list[FrameSurvey], str]:
 def _read_file(file: Any) -> list[FrameSurvey]:
     names, poses = [str(name) for name in file["names"]], file["poses"]
     parts = [np.split(file[name], np.cumsum(file[f"{name}_counts"])[:-1]) for name in PARTS]
-    return [FrameSurvey(Detections(boxes, classes, scores), clusters, images,
-                        dict(zip(names, features.T)) if len(clusters) else {}, shapes,
-                        poses[i] if len(poses) else None)
-            for i, (boxes, classes, scores, clusters, images, features, shapes)
-            in enumerate(zip(*parts, strict=True))]
+    return [
+        FrameSurvey(
+            Detections(boxes, classes, scores),
+            clusters,
+            images,
+            dict(zip(names, features.T)) if len(clusters) else {},
+            shapes,
+            poses[i] if len(poses) else None,
+        )
+        for i, (boxes, classes, scores, clusters, images, features, shapes) in enumerate(zip(*parts, strict=True))
+    ]

@@ -22,9 +22,13 @@ from msg_utils.stamps import make_duration, to_ns
 CUBE, ADD, DELETE = 1, 0, 2
 
 COLORS = {  # r g b, from a palette for colour-blind readers
-    "Car": (0.00, 0.45, 0.70), "Van": (0.34, 0.71, 0.91), "Truck": (0.00, 0.62, 0.45),
-    "Pedestrian": (0.84, 0.37, 0.00), "Person_sitting": (0.80, 0.47, 0.65),
-    "Cyclist": (0.90, 0.62, 0.00), "Tram": (0.95, 0.90, 0.25),
+    "Car": (0.00, 0.45, 0.70),
+    "Van": (0.34, 0.71, 0.91),
+    "Truck": (0.00, 0.62, 0.45),
+    "Pedestrian": (0.84, 0.37, 0.00),
+    "Person_sitting": (0.80, 0.47, 0.65),
+    "Cyclist": (0.90, 0.62, 0.00),
+    "Tram": (0.95, 0.90, 0.25),
 }
 OTHER_COLOR = (0.6, 0.6, 0.6)
 
@@ -81,13 +85,17 @@ class MarkerRows(NamedTuple):
         return self.rows
 
 
-def make_marker_rows(boxes: np.ndarray, labels: Sequence[str],
-                     scores: Sequence[float] | np.ndarray | None = None, *,
-                     ids: Sequence[int] | np.ndarray | None = None,
-                     extras: Sequence[dict[str, Any]] | None = None,
-                     notes: Iterable[tuple[str, dict[str, Any]]] = (),
-                     previous: Iterable[tuple[str, int]] = (),
-                     color: tuple[float, float, float] | None = None) -> list[MarkerRow]:
+def make_marker_rows(
+    boxes: np.ndarray,
+    labels: Sequence[str],
+    scores: Sequence[float] | np.ndarray | None = None,
+    *,
+    ids: Sequence[int] | np.ndarray | None = None,
+    extras: Sequence[dict[str, Any]] | None = None,
+    notes: Iterable[tuple[str, dict[str, Any]]] = (),
+    previous: Iterable[tuple[str, int]] = (),
+    color: tuple[float, float, float] | None = None,
+) -> list[MarkerRow]:
     """Return the markers of K boxes; for the arguments see to_marker_array."""
     rows, shown = [], set()
     numbers = np.asarray(boxes, np.float64).reshape(-1, 7).tolist()
@@ -97,19 +105,35 @@ def make_marker_rows(boxes: np.ndarray, labels: Sequence[str],
         if scores is not None:
             content["score"] = float(scores[i])
         half = box[6] / 2
-        rows.append(MarkerRow(label, number, ADD, CUBE, json.dumps(content) if content else "",
-                              box[:3], (math.sin(half), math.cos(half)), box[3:6],
-                              (*(color or COLORS.get(label, OTHER_COLOR)), 0.4)))
+        rows.append(
+            MarkerRow(
+                label,
+                number,
+                ADD,
+                CUBE,
+                json.dumps(content) if content else "",
+                box[:3],
+                (math.sin(half), math.cos(half)),
+                box[3:6],
+                (*(color or COLORS.get(label, OTHER_COLOR)), 0.4),
+            )
+        )
         shown.add((label, number))
-    rows += [MarkerRow(label, -1 - i, DELETE, text=json.dumps(content))
-             for i, (label, content) in enumerate(notes)]
+    rows += [MarkerRow(label, -1 - i, DELETE, text=json.dumps(content)) for i, (label, content) in enumerate(notes)]
     rows += [MarkerRow(label, number, DELETE) for label, number in sorted(set(previous) - shown)]
     return rows or [MarkerRow("", 0, DELETE)]
 
 
-def to_marker_array(boxes: np.ndarray, labels: Sequence[str],
-                    scores: Sequence[float] | np.ndarray | None = None, *, header: Any, make: Any,
-                    lifetime_ns: int = 0, **more: Any) -> Any:
+def to_marker_array(
+    boxes: np.ndarray,
+    labels: Sequence[str],
+    scores: Sequence[float] | np.ndarray | None = None,
+    *,
+    header: Any,
+    make: Any,
+    lifetime_ns: int = 0,
+    **more: Any,
+) -> Any:
     """Build a MarkerArray of K boxes.
 
     Args:
@@ -120,12 +144,12 @@ def to_marker_array(boxes: np.ndarray, labels: Sequence[str],
         color: (r, g, b) in place of the labels' colours.
         lifetime_ns: 0 for no limit.
     """
-    return rows_to_message(make_marker_rows(boxes, labels, scores, **more), header, make,
-                           lifetime_ns)
+    return rows_to_message(make_marker_rows(boxes, labels, scores, **more), header, make, lifetime_ns)
 
 
 def rows_to_message(rows: Iterable[MarkerRow], header: Any, make: Any, lifetime_ns: int = 0) -> Any:
     """Build a MarkerArray of rows."""
+
     def vector(kind: str, numbers: Sequence[float]) -> Any:
         x, y, z = map(float, numbers)
         return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
@@ -135,13 +159,22 @@ def rows_to_message(rows: Iterable[MarkerRow], header: Any, make: Any, lifetime_
         (z, w), (r, g, b, a) = row.quaternion, row.color
         turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
         points = [] if row.points is None else [vector("Point", point) for point in row.points]
-        markers.append(make(
-            "visualization_msgs/msg/Marker", header=header, ns=row.ns, id=row.id, type=row.type,
-            action=row.action, lifetime=lifetime, text=row.text, points=points,
-            pose=make("geometry_msgs/msg/Pose", position=vector("Point", row.position),
-                      orientation=turn),
-            scale=vector("Vector3", row.scale),
-            color=make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a)))
+        markers.append(
+            make(
+                "visualization_msgs/msg/Marker",
+                header=header,
+                ns=row.ns,
+                id=row.id,
+                type=row.type,
+                action=row.action,
+                lifetime=lifetime,
+                text=row.text,
+                points=points,
+                pose=make("geometry_msgs/msg/Pose", position=vector("Point", row.position), orientation=turn),
+                scale=vector("Vector3", row.scale),
+                color=make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
+            )
+        )
     return make("visualization_msgs/msg/MarkerArray", markers=markers)
 
 
@@ -153,9 +186,16 @@ def from_marker_array(msg: Any) -> MarkedObjects:
     boxes = np.array([_read_box(m) for m in cubes], np.float64).reshape(-1, 7)
     notes = [(m.ns, _parse_text(m.text)) for m in msg.markers if m.action == DELETE and m.text]
     header = find_header(msg)
-    return MarkedObjects(boxes, [m.ns for m in cubes], np.array(scores, np.float64),
-                         np.array([m.id for m in cubes], int), extras, notes,
-                         to_ns(header.stamp) if header else 0, header.frame_id if header else "")
+    return MarkedObjects(
+        boxes,
+        [m.ns for m in cubes],
+        np.array(scores, np.float64),
+        np.array([m.id for m in cubes], int),
+        extras,
+        notes,
+        to_ns(header.stamp) if header else 0,
+        header.frame_id if header else "",
+    )
 
 
 def find_header(msg: Any) -> Any | None:
@@ -175,18 +215,17 @@ def list_marker_keys(array: Any) -> frozenset[tuple[str, int]]:
 
     This is `previous` of the next array.
     """
-    return frozenset((m.ns, int(m.id)) for m in getattr(array, "markers", array)
-                     if m.action == ADD)
+    return frozenset((m.ns, int(m.id)) for m in getattr(array, "markers", array) if m.action == ADD)
 
 
 def make_box_pose(box: np.ndarray, make: Any) -> Any:
     """Build the geometry_msgs/Pose of the centre and yaw of a box (7,)."""
     half = float(box[6]) / 2
-    return make("geometry_msgs/msg/Pose",
-                position=make("geometry_msgs/msg/Point", x=float(box[0]), y=float(box[1]),
-                              z=float(box[2])),
-                orientation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half),
-                                 w=math.cos(half)))
+    return make(
+        "geometry_msgs/msg/Pose",
+        position=make("geometry_msgs/msg/Point", x=float(box[0]), y=float(box[1]), z=float(box[2])),
+        orientation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half)),
+    )
 
 
 def compute_yaw(pose: Any) -> float:

@@ -29,16 +29,14 @@ def compute_dtype(msg: Any) -> np.dtype:
             point_step above MAX_STEP.
     """
     if msg.point_step > MAX_STEP:
-        raise CloudError(f"point_step = {msg.point_step} is more than {MAX_STEP} bytes a point; "
-                         "the message is broken")
+        raise CloudError(f"point_step = {msg.point_step} is more than {MAX_STEP} bytes a point; the message is broken")
     order = ">" if msg.is_bigendian else "<"
     names, formats, offsets = [], [], []
     for f in msg.fields:
         if not f.name:
             continue
         if f.datatype not in DATATYPES:
-            raise CloudError(f"field '{f.name}' has datatype {f.datatype}; "
-                             "sensor_msgs/PointField knows 1 to 8")
+            raise CloudError(f"field '{f.name}' has datatype {f.datatype}; sensor_msgs/PointField knows 1 to 8")
         if f.name in names:
             raise CloudError(f"field '{f.name}' exists twice; give each field a unique name")
         base = np.dtype(order + DATATYPES[f.datatype])
@@ -46,8 +44,10 @@ def compute_dtype(msg: Any) -> np.dtype:
         formats.append((base, (f.count,)) if f.count > 1 else base)
         offsets.append(f.offset)
         if f.offset + base.itemsize * max(f.count, 1) > msg.point_step:
-            raise CloudError(f"field '{f.name}' at offset {f.offset} reaches past point_step = "
-                             f"{msg.point_step}; the driver's field offsets are wrong")
+            raise CloudError(
+                f"field '{f.name}' at offset {f.offset} reaches past point_step = "
+                f"{msg.point_step}; the driver's field offsets are wrong"
+            )
     return np.dtype(dict(names=names, formats=formats, offsets=offsets, itemsize=msg.point_step))
 
 
@@ -71,9 +71,11 @@ def to_array(msg: Any) -> np.ndarray:
         raise CloudError(f"row_step = {step} is less than width x point_step = {row}")
     needed = (msg.height - 1) * step + row
     if len(data) < needed:
-        raise CloudError(f"data has {len(data)} bytes where height {msg.height} x width "
-                         f"{msg.width} x point_step {msg.point_step} needs {needed}; "
-                         "the message was cut")
+        raise CloudError(
+            f"data has {len(data)} bytes where height {msg.height} x width "
+            f"{msg.width} x point_step {msg.point_step} needs {needed}; "
+            "the message was cut"
+        )
     rows = np.ndarray((msg.height, msg.width), dtype, data, strides=(step, msg.point_step))
     rows.flags.writeable = False
     return rows.reshape(count)
@@ -98,8 +100,7 @@ def read_columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     """
     for name in names:
         if name not in (points.dtype.names or ()):
-            raise CloudError(f"the cloud has no field '{name}'; it has "
-                             f"{', '.join(points.dtype.names or ()) or 'none'}")
+            raise CloudError(f"the cloud has no field '{name}'; it has {', '.join(points.dtype.names or ()) or 'none'}")
         if points.dtype[name].shape:
             raise CloudError(f"field '{name}' has count > 1; a single number is needed")
     out = np.empty((len(points), len(names)), np.float32)
@@ -118,13 +119,11 @@ def read_xyz(points: np.ndarray) -> np.ndarray:
     out = read_columns(points, ("x", "y", "z"))
     for name in "xyz":
         if points.dtype[name].kind != "f":
-            raise CloudError(f"field '{name}' is of type {points.dtype[name]}; metres as float32 "
-                             "or float64 are needed")
+            raise CloudError(f"field '{name}' is of type {points.dtype[name]}; metres as float32 or float64 are needed")
     return out
 
 
-def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1,
-               is_dense: bool = True) -> Any:
+def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1, is_dense: bool = True) -> Any:
     """Build a PointCloud2 from a structured array (N,) of any layout; N is a multiple of height."""
     width = len(points) // height
     if width * height != len(points):
@@ -133,9 +132,17 @@ def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1,
     orders = {points.dtype[n].base.byteorder for n in points.dtype.names or ()} - {"|"}
     if len(orders) > 1:
         raise ValueError("fields of both byte orders cannot be in one cloud")
-    return _make_cloud(header, make, make_point_fields(points.dtype, make), data, height=height,
-                       width=width, point_step=points.dtype.itemsize, is_bigendian=">" in orders,
-                       is_dense=is_dense)
+    return _make_cloud(
+        header,
+        make,
+        make_point_fields(points.dtype, make),
+        data,
+        height=height,
+        width=width,
+        point_step=points.dtype.itemsize,
+        is_bigendian=">" in orders,
+        is_dense=is_dense,
+    )
 
 
 def make_point_fields(dtype: np.dtype, make: Any) -> list[Any]:
@@ -145,8 +152,15 @@ def make_point_fields(dtype: np.dtype, make: Any) -> list[Any]:
         code = CODES.get(f"{kind.base.kind}{kind.base.itemsize}")
         if code is None:
             raise ValueError(f"field '{name}' of type {kind} has no PointField datatype")
-        fields.append(make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code,
-                           count=int(np.prod(kind.shape, dtype=int))))
+        fields.append(
+            make(
+                "sensor_msgs/msg/PointField",
+                name=name,
+                offset=offset,
+                datatype=code,
+                count=int(np.prod(kind.shape, dtype=int)),
+            )
+        )
     return fields
 
 
@@ -170,8 +184,7 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
             continue
         fields = [f for f in fields if f.name != name]
         offset = -(-offset // kind.itemsize) * kind.itemsize  # aligned as in C structs
-        fields.append(make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code,
-                           count=1))
+        fields.append(make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code, count=1))
         places[name] = (offset, kind)
         offset += kind.itemsize
     # A step that is a multiple of 4 bytes keeps float fields aligned in every point.
@@ -180,18 +193,44 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
     if len(old):
         raw = np.frombuffer(msg.data, np.uint8)
         if (step_in := compute_row_step(msg)) != msg.width * msg.point_step:
-            raw = np.ndarray((msg.height, msg.width * msg.point_step), np.uint8, raw,
-                             strides=(step_in, 1)).reshape(-1)
-        data[:, :msg.point_step] = raw[:len(old) * msg.point_step].reshape(-1, msg.point_step)
+            raw = np.ndarray((msg.height, msg.width * msg.point_step), np.uint8, raw, strides=(step_in, 1)).reshape(-1)
+        data[:, : msg.point_step] = raw[: len(old) * msg.point_step].reshape(-1, msg.point_step)
         for name, (at, kind) in places.items():
             np.ndarray(len(old), kind, data, offset=at, strides=(step,))[:] = new[name]
-    return _make_cloud(msg.header, make, fields, data.reshape(-1), height=msg.height,
-                       width=msg.width, point_step=step, is_bigendian=msg.is_bigendian,
-                       is_dense=msg.is_dense)
+    return _make_cloud(
+        msg.header,
+        make,
+        fields,
+        data.reshape(-1),
+        height=msg.height,
+        width=msg.width,
+        point_step=step,
+        is_bigendian=msg.is_bigendian,
+        is_dense=msg.is_dense,
+    )
 
 
-def _make_cloud(header: Any, make: Any, fields: list[Any], data: np.ndarray, *, height: int,
-                width: int, point_step: int, is_bigendian: bool, is_dense: bool) -> Any:
-    return make("sensor_msgs/msg/PointCloud2", header=header, height=height, width=width,
-                fields=fields, is_bigendian=is_bigendian, point_step=point_step,
-                row_step=width * point_step if data.size else 0, data=data, is_dense=is_dense)
+def _make_cloud(
+    header: Any,
+    make: Any,
+    fields: list[Any],
+    data: np.ndarray,
+    *,
+    height: int,
+    width: int,
+    point_step: int,
+    is_bigendian: bool,
+    is_dense: bool,
+) -> Any:
+    return make(
+        "sensor_msgs/msg/PointCloud2",
+        header=header,
+        height=height,
+        width=width,
+        fields=fields,
+        is_bigendian=is_bigendian,
+        point_step=point_step,
+        row_step=width * point_step if data.size else 0,
+        data=data,
+        is_dense=is_dense,
+    )

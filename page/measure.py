@@ -16,8 +16,10 @@ from time import monotonic
 
 from playwright.sync_api import Page, sync_playwright
 
-FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
-         "--disable-background-networking --disable-component-update --disable-sync").split()
+FLAGS = (
+    "--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
+    "--disable-background-networking --disable-component-update --disable-sync"
+).split()
 PICTURES = """async ([count, thinned]) => {
   const { drawn, fly, limits } = page, took = [];
   await new Promise((r) => setTimeout(r, 1000)); // at rest
@@ -100,7 +102,8 @@ def list_processes() -> dict[int, str]:
             line = (folder / "cmdline").read_text()
             if "chromium" in line:
                 found[int(folder.name)] = next(
-                    (kind for kind in ("renderer", "gpu-process") if f"--type={kind}" in line), "")
+                    (kind for kind in ("renderer", "gpu-process") if f"--type={kind}" in line), ""
+                )
     return found
 
 
@@ -123,8 +126,7 @@ class MeasuredPage:
         self.page = page
         own = {pid: kind for pid, kind in list_processes().items() if pid not in others}
         self.page_pid = max((p for p, kind in own.items() if kind == "renderer"), key=read_memory)
-        self.pids = {"page": self.page_pid,
-                     "drawing": next(p for p, kind in own.items() if kind == "gpu-process")}
+        self.pids = {"page": self.page_pid, "drawing": next(p for p, kind in own.items() if kind == "gpu-process")}
 
     def measure(self, title: str, script: str, arguments: object) -> None:
         """Run a script that returns durations, and print them with the mean CPU time of the page's
@@ -132,10 +134,12 @@ class MeasuredPage:
         before = {name: read_cpu_ms(pid) for name, pid in self.pids.items()}
         result = self.page.evaluate(script, arguments)
         took, count = sorted(result["took"]), len(result["took"])
-        cpu = ", ".join(f"{name} {(read_cpu_ms(pid) - before[name]) / count:.1f}"
-                        for name, pid in self.pids.items())
-        print(f"{title}, {result['points']:,} points: median {statistics.median(took):.1f} ms, "
-              f"slowest of {count} {took[-1]:.1f} ms; mean CPU time in ms: {cpu}", flush=True)
+        cpu = ", ".join(f"{name} {(read_cpu_ms(pid) - before[name]) / count:.1f}" for name, pid in self.pids.items())
+        print(
+            f"{title}, {result['points']:,} points: median {statistics.median(took):.1f} ms, "
+            f"slowest of {count} {took[-1]:.1f} ms; mean CPU time in ms: {cpu}",
+            flush=True,
+        )
 
     def measure_playback(self) -> None:
         """Play to the last frame, and print the duration and the memory."""
@@ -149,8 +153,10 @@ class MeasuredPage:
             max_memory = max(max_memory, read_memory(self.page_pid))
         mean = 1e3 * (monotonic() - start) / max(last - first, 1)
         page.wait_for_timeout(2000)
-        print(f"played {last - first} frames, {mean:.0f} ms each; memory of the page at most "
-              f"{max_memory / 1e6:.0f} MB, at the end {read_memory(self.page_pid) / 1e6:.0f} MB")
+        print(
+            f"played {last - first} frames, {mean:.0f} ms each; memory of the page at most "
+            f"{max_memory / 1e6:.0f} MB, at the end {read_memory(self.page_pid) / 1e6:.0f} MB"
+        )
 
 
 def main() -> None:

@@ -45,14 +45,19 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
     """Calibrate checkpoints, in place."""
     for path in weights:
         report = DetectionReport()
-        fill(report, open_recording(scans),
-             partial(measure_detector, partial(load_uncalibrated, path), 1.0, None), jobs=jobs,
-             limit=limit)
+        fill(
+            report,
+            open_recording(scans),
+            partial(measure_detector, partial(load_uncalibrated, path), 1.0, None),
+            jobs=jobs,
+            limit=limit,
+        )
         found = fit_calibrations(Comparison.of(report.frames)) if report.frames else {}
         header = read_header(path)
         if lost := sorted({*header.calibration} - {*found}):
-            raise click.ClickException(f"{path} stays unchanged: {scans} has too few correct "
-                                       f"or wrong detections of {', '.join(lost)}")
+            raise click.ClickException(
+                f"{path} stays unchanged: {scans} has too few correct or wrong detections of {', '.join(lost)}"
+            )
         save_header(path, replace(header, calibration=found))
         console.print(f"{path.name}: {found}")
 

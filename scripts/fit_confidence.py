@@ -57,14 +57,16 @@ def collect_samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | 
         return None
     points, start = group_points(segmented.xyz, segmented.cluster_ids, ids)
     features = compute_shape_features(points, start, boxes, params)
-    images = draw_silhouettes(points, start, np.ones((len(boxes), 1)),
-                              boxes[:, 2] - boxes[:, 5] / 2,
-                              params)
+    images = draw_silhouettes(points, start, np.ones((len(boxes), 1)), boxes[:, 2] - boxes[:, 5] / 2, params)
     features["similarity"] = compute_similarity(images, seed.silhouette(params), params.stm)
     features["height_difference_m"] = np.abs(features["height_m"] - seed.height)
     found, _ = match_centres(boxes, truth)
-    return {"features": features, "hit": np.isin(np.arange(len(boxes)), found),
-            "bins": find_range_bins(boxes), "truth": find_range_bins(truth)}
+    return {
+        "features": features,
+        "hit": np.isin(np.arange(len(boxes)), found),
+        "bins": find_range_bins(boxes),
+        "truth": find_range_bins(truth),
+    }
 
 
 def find_seed(job: tuple[str, int]) -> Seed | None:
@@ -72,7 +74,7 @@ def find_seed(job: tuple[str, int]) -> Seed | None:
     frame = open_recording(job[0]).frames[job[1]]
     try:
         segmented = segment_cloud(frame.load(), frame.camera(), BEST)
-        seed, = make_truth_source(select_pedestrians(frame))(segmented)
+        (seed,) = make_truth_source(select_pedestrians(frame))(segmented)
         return seed
     except InputError:
         return None
@@ -89,19 +91,22 @@ def main(roots: list[str]) -> None:
     jobs = [(root, i) for root in roots for i in range(len(open_recording(root).frames))]
     with Pool() as pool:
         seeds = pool.map(find_seed, jobs, chunksize=8)
-        others = [next(s for s in seeds[i + 1:] + seeds[:i + 1] if s is not None)
-                  for i in range(len(seeds))]
+        others = [next(s for s in seeds[i + 1 :] + seeds[: i + 1] if s is not None) for i in range(len(seeds))]
         results = pool.map(run_job, list(zip(jobs, others)), chunksize=8)
         frames = [result for result in results if result is not None]
-    features = {name: np.concatenate([f["features"][name] for f in frames])
-                for name in (*SHAPE_KNOTS, *SEED_KNOTS)}
+    features = {name: np.concatenate([f["features"][name] for f in frames]) for name in (*SHAPE_KNOTS, *SEED_KNOTS)}
     hit, bins = (np.concatenate([f[name] for f in frames]) for name in ("hit", "bins"))
     truth = np.bincount(np.concatenate([f["truth"] for f in frames]), minlength=5)
     share = KITTI_RANGES / KITTI_RANGES.sum() / np.maximum(truth / truth.sum(), 1e-9)
     weight = np.where(hit, share[bins], 1.0)
     models = {
-        "trained_on": {"frames": len(frames), "clusters": len(hit), "pedestrians": int(hit.sum()),
-                       "of": int(truth.sum()), "weights_by_range": share.round(2).tolist()},
+        "trained_on": {
+            "frames": len(frames),
+            "clusters": len(hit),
+            "pedestrians": int(hit.sum()),
+            "of": int(truth.sum()),
+            "weights_by_range": share.round(2).tolist(),
+        },
         "shape": fit_curves(features, hit, weight, SHAPE_KNOTS),
         "seed": fit_curves(features, hit, weight, {**SHAPE_KNOTS, **SEED_KNOTS}, RISING),
     }

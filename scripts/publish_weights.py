@@ -47,25 +47,26 @@ DEFAULT_SENSOR = {"name": "hdl64e", "beams": 64, "height": 1.73}  # missing in e
 SAMPLES = 200  # bootstrap samples of the intervals
 SENSOR_FAILURES = [
     "Other sensors: many people are missed if the beams are sparser than in training.",
-    "Clouds without intensity: fewer people are found."]
+    "Clouds without intensity: fewer people are found.",
+]
 FAILURES = {  # by the name of the network
     "pointpillars": [
         *SENSOR_FAILURES,
         "False people: thin objects beyond 36 m, round signs on posts, posts with reflectors.",
-        "Boxes of real cars are about 0.1 m too far away and 0.1 m too long (median)."],
-    POINTNET: [
-        *SENSOR_FAILURES,
-        "Missed: people in one cluster with walls or other people, far cyclists."]}
-JUDGE_NOTE = ("Use: classifies the boxes that PointPillars proposes in `fused`. Alone, `pointnet` "
-              "finds real cars better.")
+        "Boxes of real cars are about 0.1 m too far away and 0.1 m too long (median).",
+    ],
+    POINTNET: [*SENSOR_FAILURES, "Missed: people in one cluster with walls or other people, far cyclists."],
+}
+JUDGE_NOTE = (
+    "Use: classifies the boxes that PointPillars proposes in `fused`. Alone, `pointnet` finds real cars better."
+)
 
 
 def evaluate_weights(weights: Path, folder: Path) -> dict[str, Any]:
     """Return the results of `evaluate detection --intervals`, as in its JSON file."""
     recording = open_recording(folder)
     report = DetectionReport(follow=recording.is_sequential)
-    fill(report, recording, partial(
-        measure_detector, partial(open_detector, weights, min_score=MIN_SCORE), 1.0, None))
+    fill(report, recording, partial(measure_detector, partial(open_detector, weights, min_score=MIN_SCORE), 1.0, None))
     return {**report.compute(), "intervals": report.compute_intervals(SAMPLES)}
 
 
@@ -74,8 +75,16 @@ def format_card(header: checkpoint.Header, title: str, scored: dict[str, dict[st
     lines = [f"# {title}", "", *(f"- {line}" for line in describe_weights(header, title)), ""]
     for name, content in scored.items():
         lines += format_figures(name, content, header.config.classes)
-    lines += ["## Known failures", "", *(f"- {line}" for line in FAILURES[header.network]), "",
-              "## Licence", "", "Apache-2.0, as the package.", ""]
+    lines += [
+        "## Known failures",
+        "",
+        *(f"- {line}" for line in FAILURES[header.network]),
+        "",
+        "## Licence",
+        "",
+        "Apache-2.0, as the package.",
+        "",
+    ]
     return "\n".join(lines)
 
 
@@ -86,37 +95,47 @@ def describe_weights(header: checkpoint.Header, title: str) -> list[str]:
     sensor = training.get("sensor") or DEFAULT_SENSOR
     init, others = training.get("init"), training["validation_scenes"]
     if init:
-        init = "earlier shipped weights" if "package" in init else (
-            "/".join(Path(init).parts[-2:]) if init.startswith("/") else init)
+        init = (
+            "earlier shipped weights"
+            if "package" in init
+            else ("/".join(Path(init).parts[-2:]) if init.startswith("/") else init)
+        )
     start = f", starting from {init}" if init else ""
     return [
-        f"Network: {header.network} {config.title}".rstrip() + "; the header of the file has the "
-        "full config.",
+        f"Network: {header.network} {config.title}".rstrip() + "; the header of the file has the full config.",
         *([JUDGE_NOTE] if title == Path(JUDGE).stem else []),
         f"Training data: {', '.join(training['data'])}, {training['scenes']} scenes; "
         + (f"validation on {others} others." if others else "no validation.")
         + (" Simulated streets only, no real scan." if training["data"] == ["sim"] else ""),
         f"Training: {training['steps']} steps of {training['batch']} scenes in "
         f"{training['seconds'] / 60:.0f} minutes, seed {training['seed']}{start}.",
-        *(f"Mean of these and earlier weights ({other['steps']} steps, commit {other['commit']})."
-          for other in training.get("mean_with", ())),
+        *(
+            f"Mean of these and earlier weights ({other['steps']} steps, commit {other['commit']})."
+            for other in training.get("mean_with", ())
+        ),
         f"Commit: {header.commit}.",
         f"Classes: {', '.join(config.classes)}.",
-        "Range: all clusters of the cloud." if low is None or high is None else
-        f"Range: x {low[0]:g} to {high[0]:g} m, y {low[1]:g} to {high[1]:g} m. `range: around` "
+        "Range: all clusters of the cloud."
+        if low is None or high is None
+        else f"Range: x {low[0]:g} to {high[0]:g} m, y {low[1]:g} to {high[1]:g} m. `range: around` "
         "covers 51.2 m in all directions.",
-        f"Sensor: {sensor['name']}, {sensor['beams']} beams, {sensor['height']} m above the "
-        "ground.",
+        f"Sensor: {sensor['name']}, {sensor['beams']} beams, {sensor['height']} m above the ground.",
         "Scores: calibrated probabilities." if header.calibration else "Scores: not calibrated.",
-        "Stored as float16."]
+        "Stored as float16.",
+    ]
 
 
 def format_figures(name: str, content: dict[str, Any], classes: tuple[str, ...]) -> list[str]:
     """Return the section of the card about one data set, as lines of Markdown."""
-    lines = [f"## {name}: {content['frames']} frames", "",
-             f"AP in percent (R40, moderate), with the {INTERVAL_PERCENT} % interval of {SAMPLES} "
-             "bootstrap samples where it is computed, and the number of labels in brackets.", "",
-             "| | overlap | " + " | ".join(classes) + " |", "|---|---|" + "---|" * len(classes)]
+    lines = [
+        f"## {name}: {content['frames']} frames",
+        "",
+        f"AP in percent (R40, moderate), with the {INTERVAL_PERCENT} % interval of {SAMPLES} "
+        "bootstrap samples where it is computed, and the number of labels in brackets.",
+        "",
+        "| | overlap | " + " | ".join(classes) + " |",
+        "|---|---|" + "---|" * len(classes),
+    ]
     for row, metric in ROWS:
         cells, overlaps = [], []
         for kind in classes:
@@ -128,26 +147,32 @@ def format_figures(name: str, content: dict[str, Any], classes: tuple[str, ...])
         lines.append(f"| {metric} | {' / '.join(overlaps)} | {' | '.join(cells)} |")
     centres = content["pedestrian_centres"]
     total = centres["at_best_score"]["all"]
-    return [*lines, "", f"Pedestrians within 1.0 m, at the best threshold "
-            f"({centres['best_score'] or 0:.2f}): F1 {100 * total['f1']:.1f} (TP {total['tp']}, FP "
-            f"{total['fp']}, FN {total['fn']}).", ""]
+    return [
+        *lines,
+        "",
+        f"Pedestrians within 1.0 m, at the best threshold "
+        f"({centres['best_score'] or 0:.2f}): F1 {100 * total['f1']:.1f} (TP {total['tp']}, FP "
+        f"{total['fp']}, FN {total['fn']}).",
+        "",
+    ]
 
 
 @click.command()
 @click.argument("weights", type=click.Path(exists=True, path_type=Path))
 @click.argument("folders", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
-@click.option("--mean-with", "before", type=click.Path(exists=True, path_type=Path),
-              help="Store the mean of both, weight by weight (Wortsman et al., CVPR 2022).")
+@click.option(
+    "--mean-with",
+    "before",
+    type=click.Path(exists=True, path_type=Path),
+    help="Store the mean of both, weight by weight (Wortsman et al., CVPR 2022).",
+)
 @click.option("--judge", is_flag=True, help="A PointNet for `fused`, not to be used alone.")
-@click.option("--card", is_flag=True, help="Only score WEIGHTS and write the model card next to "
-              "them.")
-def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: bool,
-         card: bool) -> None:
+@click.option("--card", is_flag=True, help="Only score WEIGHTS and write the model card next to them.")
+def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: bool, card: bool) -> None:
     """Score, store and describe one checkpoint."""
     if card:
         content = {folder.name: evaluate_weights(weights, folder) for folder in folders}
-        write_text(weights.with_suffix(".md"),
-                   format_card(read_header(weights), weights.stem, content))
+        write_text(weights.with_suffix(".md"), format_card(read_header(weights), weights.stem, content))
         return
     load = load_pointnet if read_network_name(weights) == POINTNET else load_network
     header, network = load(weights)
@@ -155,11 +180,16 @@ def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: b
         earlier, other = load(before)
         require_same_config(header.config, earlier.config, str(before))
         state = other.state_dict()
-        network.load_state_dict({
-            name: (value + state[name]) / 2 if value.is_floating_point() else value
-            for name, value in network.state_dict().items()})
-        header = replace(header, training={**header.training, "mean_with": [
-            {"steps": earlier.training["steps"], "commit": earlier.commit}]})
+        network.load_state_dict(
+            {
+                name: (value + state[name]) / 2 if value.is_floating_point() else value
+                for name, value in network.state_dict().items()
+            }
+        )
+        header = replace(
+            header,
+            training={**header.training, "mean_with": [{"steps": earlier.training["steps"], "commit": earlier.commit}]},
+        )
     if header.network == POINTNET:
         out = POINTNET_WEIGHTS.with_name(JUDGE) if judge else POINTNET_WEIGHTS
     else:

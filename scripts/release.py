@@ -18,8 +18,10 @@ EMPTY = "## Unreleased\n\n### Added\n\n### Changed\n\n### Fixed\n\n### Removed\n
 
 def set_version(root: Path, version: str) -> None:
     """Write the version into the two files that state it."""
-    for name, pattern in (("lidar_perception/__init__.py", r'(__version__ = ")[^"]+'),
-                          ("package.xml", r"(<version>)[^<]+")):
+    for name, pattern in (
+        ("lidar_perception/__init__.py", r'(__version__ = ")[^"]+'),
+        ("package.xml", r"(<version>)[^<]+"),
+    ):
         path = root / name
         text, count = re.subn(pattern, rf"\g<1>{version}", path.read_text())
         if count != 1:
@@ -36,7 +38,7 @@ def date_changelog(text: str, version: str, day: str) -> str:
     kept = "".join(part.rstrip() + "\n\n" for part in parts if len(part.strip().splitlines()) > 1)
     if not kept:
         raise SystemExit("CHANGELOG.md has no unreleased change")
-    return f"{text[:match.start()]}{EMPTY}## {version} - {day}\n\n{kept}{text[match.end():]}"
+    return f"{text[: match.start()]}{EMPTY}## {version} - {day}\n\n{kept}{text[match.end() :]}"
 
 
 def main(version: str) -> None:
@@ -50,8 +52,7 @@ def main(version: str) -> None:
     set_version(ROOT, version)
     changelog.write_text(text)
     subprocess.run(["git", "commit", "-qam", f"Release {version}"], cwd=ROOT, check=True)
-    subprocess.run(["git", "tag", "-a", f"v{version}", "-m", f"Version {version}"], cwd=ROOT,
-                   check=True)
+    subprocess.run(["git", "tag", "-a", f"v{version}", "-m", f"Version {version}"], cwd=ROOT, check=True)
     print(f"tagged v{version}; publish it with: git push --follow-tags")
 
 

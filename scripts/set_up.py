@@ -22,16 +22,39 @@ ROOT = Path(__file__).resolve().parents[1]
 CONSTRAINTS = ROOT / "constraints.txt"
 PIP = [sys.executable, "-m", "pip"]
 # Options of uv for settings of pip with one or more values, separated by whitespace.
-OPTIONS = {"find-links": "--find-links", "index-url": "--default-index",
-           "extra-index-url": "--index", "constraint": "--constraint",
-           "trusted-host": "--allow-insecure-host", "only-binary": "--only-binary",
-           "no-binary": "--no-binary"}
-VARIABLES = {"cert": "SSL_CERT_FILE", "timeout": "UV_HTTP_TIMEOUT",
-             "default-timeout": "UV_HTTP_TIMEOUT", "proxy": "ALL_PROXY"}
-IRRELEVANT = {"disable-pip-version-check", "no-color", "no-input", "no-python-version-warning",
-              "progress-bar", "quiet", "retries", "root-user-action", "verbose", "cache-dir",
-              "no-cache-dir", "break-system-packages", "require-virtualenv", "log",
-              "no-warn-script-location", "config-file"}
+OPTIONS = {
+    "find-links": "--find-links",
+    "index-url": "--default-index",
+    "extra-index-url": "--index",
+    "constraint": "--constraint",
+    "trusted-host": "--allow-insecure-host",
+    "only-binary": "--only-binary",
+    "no-binary": "--no-binary",
+}
+VARIABLES = {
+    "cert": "SSL_CERT_FILE",
+    "timeout": "UV_HTTP_TIMEOUT",
+    "default-timeout": "UV_HTTP_TIMEOUT",
+    "proxy": "ALL_PROXY",
+}
+IRRELEVANT = {
+    "disable-pip-version-check",
+    "no-color",
+    "no-input",
+    "no-python-version-warning",
+    "progress-bar",
+    "quiet",
+    "retries",
+    "root-user-action",
+    "verbose",
+    "cache-dir",
+    "no-cache-dir",
+    "break-system-packages",
+    "require-virtualenv",
+    "log",
+    "no-warn-script-location",
+    "config-file",
+}
 
 
 def main(extras: list[str]) -> int:
@@ -39,13 +62,31 @@ def main(extras: list[str]) -> int:
     target = f"{ROOT}[{','.join(extras)}]"
     if uv_options := find_uv_options(read_pip_settings()):
         options, variables = uv_options
-        if (uv := find_uv()) and _run([
-                uv, "pip", "install", "--python", sys.executable, *options,
-                "--constraint", str(CONSTRAINTS), "--editable", target, *find_torch()], variables):
+        if (uv := find_uv()) and _run(
+            [
+                uv,
+                "pip",
+                "install",
+                "--python",
+                sys.executable,
+                *options,
+                "--constraint",
+                str(CONSTRAINTS),
+                "--editable",
+                target,
+                *find_torch(),
+            ],
+            variables,
+        ):
             return 0
         print("set_up.py: pip installs instead of uv", flush=True)
-    return 0 if _run([*PIP, "install", "--disable-pip-version-check", "--constraint",
-                      str(CONSTRAINTS), "--editable", target]) else 1
+    return (
+        0
+        if _run(
+            [*PIP, "install", "--disable-pip-version-check", "--constraint", str(CONSTRAINTS), "--editable", target]
+        )
+        else 1
+    )
 
 
 def read_pip_settings() -> dict[str, str]:
@@ -97,16 +138,28 @@ def find_torch() -> list[str]:
         return []
     except PackageNotFoundError:
         pass
-    done = subprocess.run([*PIP, "install", "--dry-run", "--no-deps", "--quiet", "--report", "-",
-                           "--disable-pip-version-check", "--constraint", str(CONSTRAINTS),
-                           "torch"], capture_output=True, text=True)
+    done = subprocess.run(
+        [
+            *PIP,
+            "install",
+            "--dry-run",
+            "--no-deps",
+            "--quiet",
+            "--report",
+            "-",
+            "--disable-pip-version-check",
+            "--constraint",
+            str(CONSTRAINTS),
+            "torch",
+        ],
+        capture_output=True,
+        text=True,
+    )
     try:
         url = json.loads(done.stdout)["install"][0]["download_info"]["url"]
     except (ValueError, LookupError):
-        print(done.stderr, f"set_up.py: pip installs torch, exit code {done.returncode}",
-              flush=True)
-        _run([*PIP, "install", "--disable-pip-version-check", "--constraint", str(CONSTRAINTS),
-              "torch"])
+        print(done.stderr, f"set_up.py: pip installs torch, exit code {done.returncode}", flush=True)
+        _run([*PIP, "install", "--disable-pip-version-check", "--constraint", str(CONSTRAINTS), "torch"])
         return []
     return [f"torch @ {url}"]
 

@@ -74,6 +74,7 @@ def pytest_sessionfinish():
 def data() -> Path:
     """Folder of real scans next to the checkout; the test is skipped without it."""
     from samples import DATA
+
     if not DATA.is_dir():
         pytest.skip("real data is not beside the checkout (../shared/data)")
     return DATA
@@ -83,6 +84,7 @@ def data() -> Path:
 def carrier_too(monkeypatch):
     """Keep detections at the ego vehicle, where networks with random weights find objects, too."""
     from lidar_perception.detectors import normalized_view
+
     monkeypatch.setattr(normalized_view, "drop_ego_vehicle", lambda detections, height: detections)
 
 
@@ -92,6 +94,7 @@ def one_thread():
     import torch
 
     from lidar_perception.runs.threads import set_thread_count
+
     before = torch.get_num_threads()
     set_thread_count(1)
     yield
@@ -104,6 +107,7 @@ def one_thread_for_all():
     import torch
 
     from lidar_perception.runs.threads import set_thread_count
+
     before = torch.get_num_threads()
     set_thread_count(1)
     yield
@@ -116,6 +120,7 @@ def streets():
     from functools import cache
 
     from lidar_perception.simulation import drive
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drive, "_make_cached_scene", cache(drive._make_cached_scene.__wrapped__))
         yield
@@ -127,6 +132,7 @@ def written(tmp_path_factory) -> Path:
     from bag_samples import scans
 
     from lidar_perception.data.to_bag import write_bag
+
     path = tmp_path_factory.mktemp("bags") / "drive"
     assert write_bag(path, scans()) == 3
     return path
@@ -136,10 +142,22 @@ def written(tmp_path_factory) -> Path:
 def tiny_size(monkeypatch):
     """The compact size of PointPillars has few channels and a coarse grid."""
     from lidar_perception.detectors.pointpillars import config
-    monkeypatch.setitem(config.SIZES, "compact", dict(
-        low=(0.0, -20.48, -3.0), high=(40.96, 20.48, 1.0), cell=0.64, pillar_channels=8,
-        map_channels=(4, 8), block_channels=(8, 12, 16), block_layers=(1, 1, 1), deconv_channels=8,
-        fpn_channels=8))
+
+    monkeypatch.setitem(
+        config.SIZES,
+        "compact",
+        dict(
+            low=(0.0, -20.48, -3.0),
+            high=(40.96, 20.48, 1.0),
+            cell=0.64,
+            pillar_channels=8,
+            map_channels=(4, 8),
+            block_channels=(8, 12, 16),
+            block_layers=(1, 1, 1),
+            deconv_channels=8,
+            fpn_channels=8,
+        ),
+    )
 
 
 @pytest.fixture
@@ -148,6 +166,7 @@ def tiny_sensor(monkeypatch):
     from simulate_samples import TINY
 
     from lidar_perception.simulation.sensor import SENSORS
+
     monkeypatch.setitem(SENSORS, "tiny", TINY)
 
 
@@ -158,6 +177,7 @@ def made(streets, tmp_path_factory) -> Path:
 
     from lidar_perception.simulation.dataset import LAYOUTS
     from lidar_perception.simulation.sensor import SENSORS
+
     root = tmp_path_factory.mktemp("made")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(SENSORS, "tiny", TINY)
@@ -171,6 +191,7 @@ def crowds(tmp_path_factory) -> Path:
     """KITTI folder with crowds of people."""
     from experiment_samples import COUNT
     from samples import crowd_folder
+
     return crowd_folder(tmp_path_factory.mktemp("kitti"), COUNT)
 
 
@@ -179,6 +200,7 @@ def whole(crowds, tmp_path_factory) -> Path:
     """Folder of a complete run of the paper's experiment on `crowds`; its output is in ../said."""
     from experiment_samples import command
     from samples import write
+
     out = tmp_path_factory.mktemp("whole") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COLUMNS", "160")
@@ -190,4 +212,5 @@ def whole(crowds, tmp_path_factory) -> Path:
 def few(tmp_path) -> Path:
     """KITTI folder of five scans."""
     from samples import object_folder
+
     return object_folder(tmp_path / "few", count=5)

@@ -17,8 +17,19 @@ from lidar_perception.ground.params import GroundParams, PatchworkParams, Sensor
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.types import InputError
 
-NAMES = ["Detections", "PointCloud", "Tracker", "Tracks", "cluster", "evaluate", "find_candidates",
-         "load_detector", "open_recording", "segment_ground", "simulate"]
+NAMES = [
+    "Detections",
+    "PointCloud",
+    "Tracker",
+    "Tracks",
+    "cluster",
+    "evaluate",
+    "find_candidates",
+    "load_detector",
+    "open_recording",
+    "segment_ground",
+    "simulate",
+]
 TINY = "generic:8,-10,10,2,10"
 
 
@@ -42,17 +53,18 @@ def test_public_names_are_listed_and_all_exist():
 def test_type_checker_sees_the_same_objects():
     tree = ast.parse(Path(lp.__file__).read_text())
     block = next(node for node in tree.body if ast.unparse(node).startswith("if TYPE_CHECKING"))
-    imported = {alias.asname or alias.name: getattr(import_module(node.module), alias.name)
-                for node in block.body for alias in node.names}
+    imported = {
+        alias.asname or alias.name: getattr(import_module(node.module), alias.name)
+        for node in block.body
+        for alias in node.names
+    }
     assert imported == {name: getattr(lp, name) for name in NAMES}
 
 
 def test_ground_and_clusters_equal_those_of_the_core():
     xyzi = scene(0)
-    ground = lp.segment_ground(xyzi[:, :3], "patchwork", sensor_height=1.8,
-                               intensity=xyzi[:, 3], max_range=60)
-    params = GroundParams("patchwork", SensorPoseParams(1.8), patchwork=PatchworkParams(
-        max_range=60.0))
+    ground = lp.segment_ground(xyzi[:, :3], "patchwork", sensor_height=1.8, intensity=xyzi[:, 3], max_range=60)
+    params = GroundParams("patchwork", SensorPoseParams(1.8), patchwork=PatchworkParams(max_range=60.0))
     np.testing.assert_array_equal(ground, segment_ground(xyzi, params))
     ids = lp.cluster(xyzi, ground=ground)
     assert ids.dtype == np.int32 and ids.max() > 0 and not ids[ground].any()
@@ -61,23 +73,26 @@ def test_ground_and_clusters_equal_those_of_the_core():
     assert everything.shape == (len(xyzi),) and everything[ground].any()
 
 
-@pytest.mark.parametrize("call, words", [
-    (lambda xyz: lp.segment_ground(xyz, "patchwerk"), "did you mean 'patchwork'"),
-    (lambda xyz: lp.segment_ground(xyz, max_hight=1.0), "did you mean 'max_height'"),
-    (lambda xyz: lp.segment_ground(xyz, sensor_height=-1.0), "height = -1.0 is outside"),
-    (lambda xyz: lp.segment_ground(xyz[:, :2]), "allowed are"),
-    (lambda xyz: lp.segment_ground(lp.PointCloud(xyz), intensity=xyz[:, 0]), "its own intensity"),
-    (lambda xyz: lp.cluster(xyz, "dbscam"), "did you mean 'dbscan'"),
-    (lambda xyz: lp.cluster(xyz, min_sample=3), "did you mean 'min_samples'"),
-    (lambda xyz: lp.cluster(xyz, ground=[True]), "ground has 1 values"),
-    (lambda xyz: lp.find_candidates(xyz, settings={"stm.treshold": 0.5}), "stm.threshold"),
-    (lambda xyz: lp.load_detector("fusd"), "did you mean 'fused'"),
-    (lambda xyz: lp.simulate(0), "frames = 0"),
-    (lambda xyz: lp.simulate(scene="stret"), "did you mean 'street'"),
-    (lambda xyz: lp.simulate(sensor="vpl-16"), "vlp-16"),
-    (lambda xyz: lp.evaluate(NearestBox, lp.simulate(1)), "give an instance"),
-    (lambda xyz: lp.evaluate(NearestBox(), "nowhere"), "nowhere does not exist"),
-])
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda xyz: lp.segment_ground(xyz, "patchwerk"), "did you mean 'patchwork'"),
+        (lambda xyz: lp.segment_ground(xyz, max_hight=1.0), "did you mean 'max_height'"),
+        (lambda xyz: lp.segment_ground(xyz, sensor_height=-1.0), "height = -1.0 is outside"),
+        (lambda xyz: lp.segment_ground(xyz[:, :2]), "allowed are"),
+        (lambda xyz: lp.segment_ground(lp.PointCloud(xyz), intensity=xyz[:, 0]), "its own intensity"),
+        (lambda xyz: lp.cluster(xyz, "dbscam"), "did you mean 'dbscan'"),
+        (lambda xyz: lp.cluster(xyz, min_sample=3), "did you mean 'min_samples'"),
+        (lambda xyz: lp.cluster(xyz, ground=[True]), "ground has 1 values"),
+        (lambda xyz: lp.find_candidates(xyz, settings={"stm.treshold": 0.5}), "stm.threshold"),
+        (lambda xyz: lp.load_detector("fusd"), "did you mean 'fused'"),
+        (lambda xyz: lp.simulate(0), "frames = 0"),
+        (lambda xyz: lp.simulate(scene="stret"), "did you mean 'street'"),
+        (lambda xyz: lp.simulate(sensor="vpl-16"), "vlp-16"),
+        (lambda xyz: lp.evaluate(NearestBox, lp.simulate(1)), "give an instance"),
+        (lambda xyz: lp.evaluate(NearestBox(), "nowhere"), "nowhere does not exist"),
+    ],
+)
 def test_bad_argument_is_named_in_one_line(call, words):
     with pytest.raises(InputError, match=words) as error:
         call(np.ones((4, 3), np.float32))
@@ -91,8 +106,13 @@ def test_candidates_are_pedestrians_at_the_click():
     ground = lp.segment_ground(xyz)
     ids = lp.cluster(xyz, ground=ground)
     point = xyz[ids > 0][0]
-    clicked = lp.find_candidates(xyz, click=point, ground=ground, cluster_ids=ids,
-                                 settings={"confidence.threshold": 0.0, "height.tolerance": 5.0})
+    clicked = lp.find_candidates(
+        xyz,
+        click=point,
+        ground=ground,
+        cluster_ids=ids,
+        settings={"confidence.threshold": 0.0, "height.tolerance": 5.0},
+    )
     assert isinstance(clicked, lp.Detections) and len(clicked) >= len(automatic)
 
 

@@ -47,8 +47,7 @@ def nothing_installed(monkeypatch):
 
 def test_contenders_run_in_turn_after_untimed_warm_up():
     called = []
-    ms, results = time_interleaved({name: lambda name=name: called.append(name) or name.upper()
-                                    for name in "abc"}, 3)
+    ms, results = time_interleaved({name: lambda name=name: called.append(name) or name.upper() for name in "abc"}, 3)
     assert called == list("abc" * 3)
     assert results == {"a": "A", "b": "B", "c": "C"} and ms.keys() == results.keys()
     called.clear()
@@ -64,8 +63,7 @@ def test_dbscan_peers_give_our_clusters(place):
     if peer.missing():
         pytest.skip(f"{peer.package} is {peer.missing()}")
     arguments = ([place], [cloud()], 1, "test")
-    _, same, differ = (run_in_child(measure_dbscans, *arguments) if peer == peers.WHEEL
-                       else measure_dbscans(*arguments))
+    _, same, differ = run_in_child(measure_dbscans, *arguments) if peer == peers.WHEEL else measure_dbscans(*arguments)
     assert same[peer.name] == 1 and differ[peer.name] == 0
 
 
@@ -86,8 +84,10 @@ def test_same_clusters_compares_noise_and_core_partition():
     assert not have_same_clusters(np.array([7, 8, 3, 3, 0]), ours, core)  # cut
 
 
-@pytest.mark.parametrize("unit, target, good, bad, text", [
-    ("x", 12, 12.0, 11.9, "12x"), ("ms", 60, 59.9, 60.0, "< 60 ms"), ("", 1.1, 1.0, 1.1, "< 1.1")])
+@pytest.mark.parametrize(
+    "unit, target, good, bad, text",
+    [("x", 12, 12.0, 11.9, "12x"), ("ms", 60, 59.9, 60.0, "< 60 ms"), ("", 1.1, 1.0, 1.1, "< 1.1")],
+)
 def test_missed_target_is_shown(unit, target, good, bad, text):
     assert make_row("a", value=good, unit=unit, target=target)["met"] is True
     assert make_row("a", value=bad, unit=unit, target=target)["met"] is False
@@ -97,8 +97,11 @@ def test_missed_target_is_shown(unit, target, good, bad, text):
 
 def test_missing_peers_are_reported(nothing_installed, capsys):
     xyz, frame = cloud(), PointCloud(scene()[:, :3], scene()[:, 3])
-    for content in (measure_dbscan("DBSCAN", [xyz], 1, 12.0), ground.measure_patchwork([frame], 1),
-                    ground.measure_cloth([xyz], 1)):
+    for content in (
+        measure_dbscan("DBSCAN", [xyz], 1, 12.0),
+        ground.measure_patchwork([frame], 1),
+        ground.measure_cloth([xyz], 1),
+    ):
         print_measured(json.loads(json.dumps(content)))
         assert "not installed" in capsys.readouterr().out
         for r in content["rows"]:
@@ -108,8 +111,9 @@ def test_missing_peers_are_reported(nothing_installed, capsys):
 def test_ground_scores_do_without_the_libraries(nothing_installed, capsys):
     points = scene()
     semantic = np.where(points[:, 2] < -1.6, 40, 30).astype(np.uint16)
-    scan = Frame.of("a", PointCloud(points[:, :3], points[:, 3]),
-                    point_truth=lambda: PointTruth(semantic, np.zeros_like(semantic)))
+    scan = Frame.of(
+        "a", PointCloud(points[:, :3], points[:, 3]), point_truth=lambda: PointTruth(semantic, np.zeros_like(semantic))
+    )
     content = ground.measure_labelled([scan], 1)
     print_ground(json.loads(json.dumps(content)))
     assert capsys.readouterr().out.count("not installed") == 2 * len(content["protocols"])
@@ -123,6 +127,7 @@ def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsy
         made = experts(frame, config, *given)
         ran[config.version] = tuple(column is not None for column in made)
         return made
+
     monkeypatch.setattr(pointpillars, "run_experts", seen)
     content = measure_detection([PointCloud(points[:, :3], points[:, 3])], 1, ("compact",))
     print_detection(json.loads(json.dumps(content)))
@@ -135,8 +140,7 @@ def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsy
         assert name in shown and found["to_v0"] == found["total_ms"] / versions["v0"]["total_ms"]
         assert found["ms"]["experts"] >= 0
     # What a version has no use for is not part of its time.
-    assert ran == {"v0": (False, False), "v1": (True, False),
-                   **dict.fromkeys(("v2", "v3", "v4"), (True, True))}
+    assert ran == {"v0": (False, False), "v1": (True, False), **dict.fromkeys(("v2", "v3", "v4"), (True, True))}
 
 
 def test_engines_are_timed_and_compared(one_thread, capsys):
@@ -144,15 +148,14 @@ def test_engines_are_timed_and_compared(one_thread, capsys):
     content = measure_engines([PointCloud(points[:, :3], points[:, 3])], 1, ("pointpillars",))
     print_measured(json.loads(json.dumps(content)))
     assert "around, engine torch" in " ".join(capsys.readouterr().out.split())
-    assert [(make_row["same"], make_row["value"] > 0) for make_row in content["rows"]] == [
-        (1, True)
-    ] * 2
+    assert [(make_row["same"], make_row["value"] > 0) for make_row in content["rows"]] == [(1, True)] * 2
 
 
 @pytest.mark.no_cover
 def test_startup_is_measured_with_and_without_torch(monkeypatch, capsys):
-    monkeypatch.setattr(startup, "CODE", {"fused": "a = 0", "fused, engine torch": "import numpy",
-                                          "clustering": "a = 1"})
+    monkeypatch.setattr(
+        startup, "CODE", {"fused": "a = 0", "fused, engine torch": "import numpy", "clustering": "a = 1"}
+    )
     content = measure_startup(1, cold=("clustering",))
     print_measured(json.loads(json.dumps(content)))
     assert "compiled from nothing" in " ".join(capsys.readouterr().out.split())
@@ -176,16 +179,26 @@ def test_command_writes_the_measurements(nothing_installed, monkeypatch, tmp_pat
     pytest.importorskip("cv2")
     monkeypatch.setattr(peers, "TRIALS", 20)
     import benchmark.__main__ as benchmark
-    monkeypatch.setattr(benchmark, "measure_startup", lambda repeat: {  # compiles for minutes
-        "title": "start", "frames": 0, "points": 0, "rows": []})
+
+    monkeypatch.setattr(
+        benchmark,
+        "measure_startup",
+        lambda repeat: {  # compiles for minutes
+            "title": "start",
+            "frames": 0,
+            "points": 0,
+            "rows": [],
+        },
+    )
     root, out = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "b.json"
-    done = CliRunner().invoke(benchmark.main, [
-        "--data", str(root), "--json", str(out), "--repeat", "1", "--frames", "1", "--no-graph"],
-        catch_exceptions=False)
+    done = CliRunner().invoke(
+        benchmark.main,
+        ["--data", str(root), "--json", str(out), "--repeat", "1", "--frames", "1", "--no-graph"],
+        catch_exceptions=False,
+    )
     assert done.exit_code == 0, done.output
     content = json.loads(out.read_text())
-    assert {"machine", "peers", "candidates", "dbscan_in_view", "threshold_in_view",
-            "startup"} == set(content)
+    assert {"machine", "peers", "candidates", "dbscan_in_view", "threshold_in_view", "startup"} == set(content)
     assert content["peers"]["open3d"] == "not installed"
     assert content["dbscan_in_view"]["rows"][0]["same"] == 1
 
@@ -194,14 +207,20 @@ def test_graph_rows_have_speed_and_cpu_time(drive_bag, monkeypatch, capsys):
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     from benchmark.graph import RUNS, measure_graph, print_graph
     from lidar_perception.nodes.replay import graph_replay
+
     asked = []
 
     def replay(drive, clouds, out, **arguments):
         asked.append(arguments)
-        return {"clouds": clouds, "results": clouds - 1, "memory_mb": 900.0,
-                "latency_ms": {"median": 140.0, "p95": 180.0},
-                "stage_ms": {}, "slower": 4.0,
-                "cpu_ms_by_process": {"graph": 150.0, "bag_player": 10.0}}
+        return {
+            "clouds": clouds,
+            "results": clouds - 1,
+            "memory_mb": 900.0,
+            "latency_ms": {"median": 140.0, "p95": 180.0},
+            "stage_ms": {},
+            "slower": 4.0,
+            "cpu_ms_by_process": {"graph": 150.0, "bag_player": 10.0},
+        }
 
     monkeypatch.setattr(graph_replay, "replay", replay)
     runs = measure_graph(open_recording(drive_bag))

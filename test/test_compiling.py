@@ -73,18 +73,24 @@ def test_empty_cache_is_reported_before_anything_is_compiled(cached, monkeypatch
 
 def test_cache_is_found_where_numba_keeps_it(tmp_path):
     """In a process of its own, as the folder is chosen when a function is compiled."""
-    code = ("from lidar_perception.runs.compiling import _is_cached; print(_is_cached());"
-            "import numpy, lidar_perception.geometry as g;"
-            "g.counting_sort(numpy.zeros(1, int), 1, numpy.zeros(1, int)); print(_is_cached())")
-    done = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True,
-                          env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, check=True)
+    code = (
+        "from lidar_perception.runs.compiling import _is_cached; print(_is_cached());"
+        "import numpy, lidar_perception.geometry as g;"
+        "g.counting_sort(numpy.zeros(1, int), 1, numpy.zeros(1, int)); print(_is_cached())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        text=True,
+        capture_output=True,
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
+        check=True,
+    )
     assert done.stdout.split() == ["False", "True"]
 
 
 def test_block_waits_for_another_process_that_compiles(tmp_path, monkeypatch):
     log, lines, done = tmp_path / "compile.log", [], tmp_path / "done"
-    code = ("import pathlib, time; time.sleep(0.3); print('said'); "
-            f"pathlib.Path({str(done)!r}).touch()")
+    code = f"import pathlib, time; time.sleep(0.3); print('said'); pathlib.Path({str(done)!r}).touch()"
     monkeypatch.setattr(compiling, "_is_cached", lambda: True)
     with compiling.compile_meanwhile(code, log, lines.append):
         pass
@@ -94,6 +100,8 @@ def test_block_waits_for_another_process_that_compiles(tmp_path, monkeypatch):
         assert not done.exists()
     assert done.exists() and log.read_text() == "said\n"
     assert len(lines) == 1 and str(log) in lines[0]
-    with pytest.raises(ZeroDivisionError), compiling.compile_meanwhile(
-            "import time; time.sleep(60)", log, lines.append):
+    with (
+        pytest.raises(ZeroDivisionError),
+        compiling.compile_meanwhile("import time; time.sleep(60)", log, lines.append),
+    ):
         raise ZeroDivisionError  # which does not wait

@@ -55,6 +55,7 @@ def test_options_for_readings_of_the_papers_exist():
     from lidar_perception.detectors.pointpillars.config import make_config
     from lidar_perception.param_fields import with_values
     from lidar_perception.training.params import PointNetTraining
+
     for option in re.findall("`([^`]*)`", " ".join(row.option for row in DEPARTURES)):
         if match := re.fullmatch(r"([a-z_]+)='?([^']*)'?", option):  # of make_config
             kind = type(getattr(make_config(), match[1]))
@@ -68,19 +69,37 @@ def test_options_for_readings_of_the_papers_exist():
                 with_values(PipelineParams(), {name: yaml.safe_load(value)})
 
 
-@pytest.mark.parametrize("name", ["ground_segmentation", "clustering", "candidate_refinement",
-                                  "perception", "evaluator", "pointpillars_detector",
-                                  "pointnet_detector", "fused_detector", "tracker"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ground_segmentation",
+        "clustering",
+        "candidate_refinement",
+        "perception",
+        "evaluator",
+        "pointpillars_detector",
+        "pointnet_detector",
+        "fused_detector",
+        "tracker",
+    ],
+)
 def test_documented_topics_are_those_of_the_node(generate, name, domain):
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     from lidar_perception.nodes.external_node import create_context, shut_down_context
+
     context = create_context(domain)
     node = load_node_class(name)(context=context)
     node.start()
-    listed = {t for t, _ in [*node.get_publisher_names_and_types_by_node(name, "/"),
-                             *node.get_subscriber_names_and_types_by_node(name, "/")]}
+    listed = {
+        t
+        for t, _ in [
+            *node.get_publisher_names_and_types_by_node(name, "/"),
+            *node.get_subscriber_names_and_types_by_node(name, "/"),
+        ]
+    }
     assert {node.resolve_topic_name(f"~/input/{t}") for t in getattr(node, "waits_for", ())} >= {
-        reception.topic for reception in node._receptions()}
+        reception.topic for reception in node._receptions()
+    }
     shut_down_context(context, node)
     documented = set()
     entry = generate.PAGES[name]
@@ -88,15 +107,17 @@ def test_documented_topics_are_those_of_the_node(generate, name, domain):
         first, *others = topics.split(", ")
         names = [first, *(f"{first.rsplit('/', 1)[0]}/{o}" for o in others)]
         if not (kind.startswith("vision_msgs") or ("_ms" in topics and "processing" not in topics)):
-            documented |= {("" if n[0] in "~/" else "/") + n.replace("~", f"/{name}").replace(
-                "STAGE", "final") for n in names}
+            documented |= {
+                ("" if n[0] in "~/" else "/") + n.replace("~", f"/{name}").replace("STAGE", "final") for n in names
+            }
     listed = {t for t in listed if not t.endswith("_ms") or "processing" in t}  # one row for all
     standard = {"/parameter_events", "/rosout", "/clock", "/tf_static"}
     assert listed - standard == documented
 
 
-@pytest.mark.parametrize("page", [*ROOT.glob("docs/**/*.md"), ROOT / "README.md"],
-                         ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize(
+    "page", [*ROOT.glob("docs/**/*.md"), ROOT / "README.md"], ids=lambda p: str(p.relative_to(ROOT))
+)
 def test_link_targets_exist(page):
     for target in re.findall(r"\]\(([^)#]+)", page.read_text()):
         if "://" not in target:
@@ -108,9 +129,11 @@ def test_parameter_file_of_best_matches_the_code(generate):
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
     from lidar_perception.param_fields import with_values
+
     assert generate.BEST.read_text() == generate.best(), "run: python docs/generate.py"
-    assert (with_values(PipelineParams(), read_config(generate.BEST, PipelineParams()))
-            == with_values(PipelineParams(), BEST_VALUES))
+    assert with_values(PipelineParams(), read_config(generate.BEST, PipelineParams())) == with_values(
+        PipelineParams(), BEST_VALUES
+    )
     assert read_config(Path("best"), PipelineParams()) == BEST_VALUES
 
 
@@ -120,6 +143,7 @@ def test_nodes_of_a_detector_graph_share_its_parameters(generate, network):
     from lidar_perception.cli.options import read_config
     from lidar_perception.param_fields import with_values
     from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
+
     file = generate.config_file(network)
     assert file.read_text() == generate.config(network), "run: python docs/generate.py"
     values = read_config(file, PipelineParams())

@@ -48,16 +48,20 @@ def run(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr("sys.argv", [name, *map(str, arguments)])
         runpy.run_path(str(EXAMPLES / name), run_name="__main__")
         return capsys.readouterr().out
+
     return run_script
 
 
-@pytest.mark.parametrize("name, words", [
-    ("detect.py", "0000/000001: "),
-    ("own_detector.py", "AP on 2 frames"),
-    ("ground_and_clusters.py", "points are ground"),
-    ("track.py", "tracks"),
-    ("evaluate.py", "fused on 2 frames"),
-])
+@pytest.mark.parametrize(
+    "name, words",
+    [
+        ("detect.py", "0000/000001: "),
+        ("own_detector.py", "AP on 2 frames"),
+        ("ground_and_clusters.py", "points are ground"),
+        ("track.py", "tracks"),
+        ("evaluate.py", "fused on 2 frames"),
+    ],
+)
 def test_example_runs_on_simulated_scans(run, name, words):
     assert words in run(name)
 
@@ -78,6 +82,7 @@ def test_example_writes_simulated_clouds(run, tmp_path):
 def test_cells_of_notebook_run(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "Agg")
     import matplotlib.pyplot as plt
+
     plt.switch_backend("Agg")
     names: dict = {}
     for cell in code_of(NOTEBOOK):

@@ -25,15 +25,19 @@ def find_parts(name: str) -> list[tuple[str, str, str]]:
     """Return the parts of an example: from its new file up to that of the next example."""
     own = [i for i, (_, kind, _) in enumerate(PARTS) if kind == "python"]
     first = next(i for i in own if name in PARTS[i][0])
-    return PARTS[first:next((i for i in own if i > first), len(PARTS))]
+    return PARTS[first : next((i for i in own if i > first), len(PARTS))]
 
 
 @pytest.fixture
 def copy(tmp_path) -> Path:
     """Copy the package as hard links, so that no weights are copied and Numba's cache is valid."""
     for package in ("lidar_perception", "msg_utils"):
-        shutil.copytree(ROOT / package, tmp_path / "copy" / package, copy_function=os.link,
-                        ignore=shutil.ignore_patterns("*.pyc*", "*.tmp.*"))
+        shutil.copytree(
+            ROOT / package,
+            tmp_path / "copy" / package,
+            copy_function=os.link,
+            ignore=shutil.ignore_patterns("*.pyc*", "*.tmp.*"),
+        )
     return tmp_path / "copy"
 
 
@@ -67,8 +71,13 @@ def apply_example(copy: Path, name: str) -> list[str]:
 def run(copy: Path, *arguments, folder: Path | None = None) -> str:
     """Run a command with the package at `copy` and return its output."""
     environment = {**os.environ, "PYTHONPATH": str(copy), "COLUMNS": "200"}
-    done = subprocess.run([sys.executable, "-m", "lidar_perception.cli.main", *map(str, arguments)],
-                          cwd=folder or copy, env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "lidar_perception.cli.main", *map(str, arguments)],
+        cwd=folder or copy,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout + done.stderr
 
@@ -89,27 +98,51 @@ def test_data_format_is_one_file_and_one_entry(copy, tmp_path):
 
 
 def test_detector_is_a_class_in_your_own_file(tmp_path):
-    source, = re.findall(r"`my_detector.py`:\n\n```python\n(.*?)```", PAGE, re.S)
+    (source,) = re.findall(r"`my_detector.py`:\n\n```python\n(.*?)```", PAGE, re.S)
     (tmp_path / "my_detector.py").write_text(source)
-    output = run(ROOT, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"),
-                 "--weights", "my_detector:TallClusters", folder=tmp_path)
+    output = run(
+        ROOT,
+        "evaluate",
+        "detection",
+        "--data",
+        object_folder(tmp_path / "kitti"),
+        "--weights",
+        "my_detector:TallClusters",
+        folder=tmp_path,
+    )
     assert "2 frames" in output and "Ped" in output
-    run(ROOT, "detect", tmp_path / "kitti", "--weights", "my_detector:TallClusters", "--out",
-        tmp_path / "results", folder=tmp_path)
+    run(
+        ROOT,
+        "detect",
+        tmp_path / "kitti",
+        "--weights",
+        "my_detector:TallClusters",
+        "--out",
+        tmp_path / "results",
+        folder=tmp_path,
+    )
     assert "Pedestrian" in (tmp_path / "results" / "detections.json").read_text()
 
 
 def test_detector_is_one_folder_and_one_entry(copy, tmp_path):
     apply_example(copy, "sizes")
-    output = run(copy, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"),
-                 "--weights", "sizes")
+    output = run(copy, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"), "--weights", "sizes")
     assert "2 frames" in output
 
 
 def test_ground_method_is_one_file_and_two_entries(copy, tmp_path):
     apply_example(copy, "lowest")
-    output = run(copy, "evaluate", "segmentation", "--data", object_folder(tmp_path / "kitti"),
-                 "--methods", "dbscan", "--set", "ground.method=lowest")
+    output = run(
+        copy,
+        "evaluate",
+        "segmentation",
+        "--data",
+        object_folder(tmp_path / "kitti"),
+        "--methods",
+        "dbscan",
+        "--set",
+        "ground.method=lowest",
+    )
     assert "ground by lowest" in output
 
 

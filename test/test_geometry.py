@@ -30,8 +30,9 @@ sizes = st.floats(0.01, 20)
 some_boxes = st.tuples(places, places, places, sizes, sizes, sizes, angles).map(np.array)
 
 # Front left, rear left, rear right, front right: counter-clockwise seen from above.
-SIGNS = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1],
-                  [1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]]) / 2
+SIGNS = (
+    np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1], [1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]]) / 2
+)
 
 
 @given(seeds)
@@ -71,8 +72,7 @@ def test_points_in_box_equals_a_plain_implementation(box, seed, margin):
     inside, clear = [], []
     for point in xyz.astype(np.float64):
         x, y, z = Rotation.from_euler("z", -box[6]).apply(point - box[:3])
-        depth = [box[3] / 2 + margin - abs(x), box[4] / 2 + margin - abs(y),
-                 box[5] / 2 + margin - abs(z)]
+        depth = [box[3] / 2 + margin - abs(x), box[4] / 2 + margin - abs(y), box[5] / 2 + margin - abs(z)]
         inside.append(min(depth) >= 0)
         clear.append(abs(min(depth)) > 1e-9)
     found = points_in_box(xyz, box, margin)
@@ -80,8 +80,7 @@ def test_points_in_box_equals_a_plain_implementation(box, seed, margin):
     np.testing.assert_array_equal(found[clear], np.array(inside)[clear])
 
 
-@given(st.integers(-40, 40), st.integers(-40, 40), st.sampled_from([0.0, np.pi]),
-       st.sampled_from([0.0, 0.5, 2.0]))
+@given(st.integers(-40, 40), st.integers(-40, 40), st.sampled_from([0.0, np.pi]), st.sampled_from([0.0, 0.5, 2.0]))
 def test_points_on_the_faces_are_inside(x, y, yaw, margin):
     box = np.array([x / 4, y / 4, 1.0, 2.0, 1.0, 1.5, 0.0])
     half = box[3:6] / 2 + margin
@@ -131,8 +130,7 @@ def test_wrapped_angles_are_equal_and_in_the_interval(angle):
 
 def test_wrap_angle_at_the_ends_of_the_interval():
     below = np.nextafter(-np.pi, -4)
-    assert wrap_angle(np.array([np.pi, -np.pi, 3 * np.pi, 0.0])).tolist() == [
-        -np.pi, -np.pi, -np.pi, 0.0]
+    assert wrap_angle(np.array([np.pi, -np.pi, 3 * np.pi, 0.0])).tolist() == [-np.pi, -np.pi, -np.pi, 0.0]
     assert -np.pi <= wrap_angle(below) < np.pi
 
 
@@ -147,14 +145,28 @@ def test_horizontal_range_ignores_height_and_heading(seed, dtype):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("point, usable", [
-    ([1, 2, 3], True), ([0, 0, 1e-6], True), ([-0.001, 0, 0], True), ([0, 0, 0], False),
-    ([-0.0, 0, -0.0], False), ([np.nan, 1, 1], False), ([1, np.nan, 1], False),
-    ([1, 1, np.nan], False), ([np.inf, 1, 1], False), ([1, -np.inf, 1], False),
-    ([np.inf, -np.inf, np.nan], False), ([9e4, 0, 0], True), ([MAX_RANGE, 0, 0], True),
-    ([1.001e5, 0, 0], False), ([8e4, 8e4, 0], False), ([0, 0, -1e20], False),
-    ([3e38, 3e38, 3e38], False),
-])
+@pytest.mark.parametrize(
+    "point, usable",
+    [
+        ([1, 2, 3], True),
+        ([0, 0, 1e-6], True),
+        ([-0.001, 0, 0], True),
+        ([0, 0, 0], False),
+        ([-0.0, 0, -0.0], False),
+        ([np.nan, 1, 1], False),
+        ([1, np.nan, 1], False),
+        ([1, 1, np.nan], False),
+        ([np.inf, 1, 1], False),
+        ([1, -np.inf, 1], False),
+        ([np.inf, -np.inf, np.nan], False),
+        ([9e4, 0, 0], True),
+        ([MAX_RANGE, 0, 0], True),
+        ([1.001e5, 0, 0], False),
+        ([8e4, 8e4, 0], False),
+        ([0, 0, -1e20], False),
+        ([3e38, 3e38, 3e38], False),
+    ],
+)
 def test_usable_returns_are_finite_near_and_not_the_origin(point, usable, dtype):
     xyz = np.array([[1, 1, 1], point, [2, 2, 2]], dtype)
     found = usable_returns(xyz)
@@ -203,15 +215,13 @@ def test_in_view_equals_the_float64_projection(seed):
 def test_both_directions_of_the_pose_give_the_same_camera(seed):
     camera, rotation, translation, p = make_camera(np.random.default_rng(seed))
     inverse = rotation.inv()
-    other = Camera.from_lidar_pose(p, inverse.as_quat(), -inverse.apply(translation), WIDTH,
-                                   HEIGHT)
+    other = Camera.from_lidar_pose(p, inverse.as_quat(), -inverse.apply(translation), WIDTH, HEIGHT)
     np.testing.assert_allclose(other.projection, camera.projection, rtol=0, atol=1e-9)
 
 
 def test_the_image_includes_its_left_and_top_border_only():
     camera = Camera(np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]), 2, 1)  # u = -y / x
-    xyz = np.float32([[4, 0, 0], [4, -8, 0], [4, -7.99, 0], [4, 0, -4], [4, 0, -3.99],
-                      [4, 0.01, 0], [4, 0, 0.01]])
+    xyz = np.float32([[4, 0, 0], [4, -8, 0], [4, -7.99, 0], [4, 0, -4], [4, 0, -3.99], [4, 0.01, 0], [4, 0, 0.01]])
     assert camera.in_view(xyz).tolist() == [True, False, True, False, True, False, False]
 
 
@@ -224,13 +234,13 @@ def test_points_behind_the_camera_are_not_in_view():
     assert camera.in_view(np.zeros((0, 3), np.float32)).shape == (0,)
 
 
-@pytest.mark.parametrize("values", [[3.0], [2.0, 1.0], [1.0] * 40, range(40), range(40, 0, -1),
-                                    np.random.default_rng(0).normal(size=999)])
+@pytest.mark.parametrize(
+    "values", [[3.0], [2.0, 1.0], [1.0] * 40, range(40), range(40, 0, -1), np.random.default_rng(0).normal(size=999)]
+)
 def test_quantile_and_lower_bound_equal_numpy(values):
     values = np.array(values, float)
     for share in 0.0, 0.1, 0.5, 0.77, 1.0:
-        assert quantile(values.copy(), share) == pytest.approx(
-            np.quantile(values, share), rel=1e-12, abs=1e-12)
+        assert quantile(values.copy(), share) == pytest.approx(np.quantile(values, share), rel=1e-12, abs=1e-12)
     ascending = np.sort(values)
     for number in (*ascending[::7], -5.0, 99.0):
         assert lower_bound(ascending, number) == np.searchsorted(ascending, number)

@@ -16,7 +16,7 @@ from lidar_perception.types import InputError
 from lidar_perception.wire.messages import read_cluster_ids
 from msg_utils.point_cloud2 import from_array
 
-ids = st.lists(st.sampled_from([-2**31, -1, 0, 1, 2, 3, 7, 2**31, 2**32 - 1]), max_size=30)
+ids = st.lists(st.sampled_from([-(2**31), -1, 0, 1, 2, 3, 7, 2**31, 2**32 - 1]), max_size=30)
 
 
 def plain(values):
@@ -78,6 +78,7 @@ def test_memory_depends_on_the_points_not_on_the_ids():
         found = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return found
+
     assert measure_peak(2**32 - 2) < 100 * 3600 and measure_peak(30_000_000) < 100 * 3600
 
 
@@ -92,11 +93,16 @@ def test_cluster_column_reads_the_given_rows(make):
     assert read_cluster_ids(without_ids, np.arange(5)) is None
 
 
-@pytest.mark.parametrize("size_by_id", [
-    count_clusters, lambda ids: fit_boxes(np.zeros((len(ids), 3), np.float32), ids, "min_area"),
-    lambda ids: fit_ellipses(np.zeros((len(ids), 3), np.float32), ids),
-    lambda ids: group_points(np.zeros((len(ids), 3)), ids, np.array([1]))],
-                         ids=["count_clusters", "fit_boxes", "fit_ellipses", "group_points"])
+@pytest.mark.parametrize(
+    "size_by_id",
+    [
+        count_clusters,
+        lambda ids: fit_boxes(np.zeros((len(ids), 3), np.float32), ids, "min_area"),
+        lambda ids: fit_ellipses(np.zeros((len(ids), 3), np.float32), ids),
+        lambda ids: group_points(np.zeros((len(ids), 3)), ids, np.array([1])),
+    ],
+    ids=["count_clusters", "fit_boxes", "fit_ellipses", "group_points"],
+)
 def test_a_huge_id_is_refused_before_memory_is_allocated(size_by_id):
     size_by_id(np.array([0, 1, 2, 3, 3], np.int32))
     tracemalloc.start()

@@ -33,16 +33,37 @@ UNIT[0] = 1.0
 WHOLE = {full: np.round(UNIT * full) for full in (100, 255, 1023, 4095, 65535)}
 
 
-@pytest.mark.parametrize("values, kind, full", [
-    (UNIT, "f4", 1), (UNIT * 1.4, "f4", 1), (UNIT * 100, "f4", 100), (UNIT * 255, "f8", 255),
-    (WHOLE[100], "f4", 255),  # Velodyne: diffuse surfaces up to 100, retroreflectors beyond
-    (WHOLE[255], "f4", 255), (WHOLE[1023], "f4", 1023), (WHOLE[4095], "f4", 4095),
-    (WHOLE[65535], "f8", 65535), (UNIT * 1e9, "f8", 65535),
-    (UNIT, "u1", 255), (WHOLE[255], "u1", 255), (WHOLE[100] // 2, "i1", 127),
-    (WHOLE[255], "u2", 255), (WHOLE[1023], "u2", 1023), (WHOLE[4095], "u2", 4095),
-    (WHOLE[65535], "u2", 65535), (WHOLE[65535], "u4", 65535), (UNIT, "i4", 255),
-    (UNIT * 0, "f4", 1), (UNIT * 0 + 7, "f4", 255), ([], "f4", 1), ([], "u1", 255),
-    ([np.nan, np.inf, -5, 0.5], "f4", 1), ([np.nan] * 3, "f4", 1), (-UNIT, "f4", 1)])
+@pytest.mark.parametrize(
+    "values, kind, full",
+    [
+        (UNIT, "f4", 1),
+        (UNIT * 1.4, "f4", 1),
+        (UNIT * 100, "f4", 100),
+        (UNIT * 255, "f8", 255),
+        (WHOLE[100], "f4", 255),  # Velodyne: diffuse surfaces up to 100, retroreflectors beyond
+        (WHOLE[255], "f4", 255),
+        (WHOLE[1023], "f4", 1023),
+        (WHOLE[4095], "f4", 4095),
+        (WHOLE[65535], "f8", 65535),
+        (UNIT * 1e9, "f8", 65535),
+        (UNIT, "u1", 255),
+        (WHOLE[255], "u1", 255),
+        (WHOLE[100] // 2, "i1", 127),
+        (WHOLE[255], "u2", 255),
+        (WHOLE[1023], "u2", 1023),
+        (WHOLE[4095], "u2", 4095),
+        (WHOLE[65535], "u2", 65535),
+        (WHOLE[65535], "u4", 65535),
+        (UNIT, "i4", 255),
+        (UNIT * 0, "f4", 1),
+        (UNIT * 0 + 7, "f4", 255),
+        ([], "f4", 1),
+        ([], "u1", 255),
+        ([np.nan, np.inf, -5, 0.5], "f4", 1),
+        ([np.nan] * 3, "f4", 1),
+        (-UNIT, "f4", 1),
+    ],
+)
 def test_full_scale_follows_values_and_type(values, kind, full):
     values = np.asarray(values)
     assert infer_full_scale(values.astype(kind)) == full
@@ -74,20 +95,20 @@ def test_the_scale_of_a_stream_never_falls(order):
 
 def test_a_node_reads_dark_clouds_in_the_scale_of_its_stream():
     """The scale of one node does not affect another node."""
+
     def message(values, stamp):
         return make_cloud_message(np.column_stack([np.ones((len(values), 3)), values]), stamp)
 
     params = SimpleNamespace(input=InputParams(), crop=CropParams(), ground=GroundParams())
     placement = SimpleNamespace(level_frame=lambda frame: frame)
-    transforms = SimpleNamespace(find_placement=lambda header: placement,
-                                 with_mounting=lambda params, placement: params)
+    transforms = SimpleNamespace(
+        find_placement=lambda header: placement, with_mounting=lambda params, placement: params
+    )
     node = SimpleNamespace(params=params, transforms=transforms, counts={})
     check, other = SensorCheck(node), SensorCheck(node)
     bright, dark = WHOLE[255], np.float32([0, 1, 1])
-    assert np.array_equal(check.read_frame(message(bright, 1), True)[0].intensity,
-                          bright / np.float32(255))
-    assert np.array_equal(check.read_frame(message(dark, 2), True)[0].intensity,
-                          dark / np.float32(255))
+    assert np.array_equal(check.read_frame(message(bright, 1), True)[0].intensity, bright / np.float32(255))
+    assert np.array_equal(check.read_frame(message(dark, 2), True)[0].intensity, dark / np.float32(255))
     assert np.array_equal(other.read_frame(message(dark, 2), True)[0].intensity, dark)
     node.params.input = InputParams(intensity_max=2.0)
     assert np.array_equal(check.read_frame(message(dark, 3), True)[0].intensity, dark / 2)
@@ -110,8 +131,9 @@ def test_dark_intensities_are_reported():
         assert find_scale_problem(fine) is None
 
 
-@pytest.mark.parametrize("change", [lambda x: 0.1 * x, lambda x: 255 * x, lambda x: x ** 2.2,
-                                    lambda x: np.round(x * 255)])
+@pytest.mark.parametrize(
+    "change", [lambda x: 0.1 * x, lambda x: 255 * x, lambda x: x**2.2, lambda x: np.round(x * 255)]
+)
 def test_normalized_intensity_ignores_gain_and_gamma(change):
     rng = np.random.default_rng(2)
     intensity = rng.beta(2, 5, 20_000).astype(np.float32)
@@ -119,11 +141,9 @@ def test_normalized_intensity_ignores_gain_and_gamma(change):
     normalized = normalize_intensity(intensity)
     np.testing.assert_allclose(normalize_intensity(change(intensity)), normalized, atol=0.02)
     assert (normalized[::10] == 0).all() and normalized.dtype == np.float32
-    np.testing.assert_array_equal(normalize_intensity(intensity, np.arange(7, 900)),
-                                  normalized[7:900])
+    np.testing.assert_array_equal(normalize_intensity(intensity, np.arange(7, 900)), normalized[7:900])
     positive = normalized[normalized > 0]
-    np.testing.assert_allclose(np.quantile(positive, REFERENCE_SHARES), REFERENCE_VALUES,
-                               atol=0.02)
+    np.testing.assert_allclose(np.quantile(positive, REFERENCE_SHARES), REFERENCE_VALUES, atol=0.02)
 
 
 def test_an_unusable_intensity_normalizes_to_none():
@@ -138,16 +158,27 @@ def test_an_unusable_intensity_normalizes_to_none():
 CLOUD = np.random.default_rng(1).uniform([2, -9, -2, 0], [30, 9, 1, 1], (400, 4))
 
 
-@pytest.mark.parametrize("points, remedy", [
-    (np.ones((9, 5)), r"shape \(9, 5\).*points\[:, :4\]"), (np.ones((9, 2)), r"shape \(9, 2\)"),
-    (np.ones((4, 90)), r"points\.T"), (np.ones((3, 90)), r"points\.T"), (np.ones(9), r"\(9,\)"),
-    (np.ones((2, 9, 3)), r"\(2, 9, 3\)"), (np.ones((9, 3), object), "ndarray of object"),
-    (np.ones((9, 3), bool), "ndarray of bool"), (np.ones((9, 3), complex), "complex"),
-    (np.ones(9, [("x", "f4"), ("y", "f4")]), "ndarray of void"), ([[1, 2, 3], [1]], "as an array"),
-    ("drive.bag", "is str"), (None, "is NoneType"), (7.0, r"shape \(\)")])
+@pytest.mark.parametrize(
+    "points, remedy",
+    [
+        (np.ones((9, 5)), r"shape \(9, 5\).*points\[:, :4\]"),
+        (np.ones((9, 2)), r"shape \(9, 2\)"),
+        (np.ones((4, 90)), r"points\.T"),
+        (np.ones((3, 90)), r"points\.T"),
+        (np.ones(9), r"\(9,\)"),
+        (np.ones((2, 9, 3)), r"\(2, 9, 3\)"),
+        (np.ones((9, 3), object), "ndarray of object"),
+        (np.ones((9, 3), bool), "ndarray of bool"),
+        (np.ones((9, 3), complex), "complex"),
+        (np.ones(9, [("x", "f4"), ("y", "f4")]), "ndarray of void"),
+        ([[1, 2, 3], [1]], "as an array"),
+        ("drive.bag", "is str"),
+        (None, "is NoneType"),
+        (7.0, r"shape \(\)"),
+    ],
+)
 def test_every_entry_point_refuses_invalid_clouds(points, remedy):
-    for function in (PointCloud.of, segment_ground, cluster,
-                     lambda cloud: cluster_obstacles(cloud, np.zeros(9, bool))):
+    for function in (PointCloud.of, segment_ground, cluster, lambda cloud: cluster_obstacles(cloud, np.zeros(9, bool))):
         with pytest.raises(InputError, match=f"a cloud .*{remedy}") as error:
             function(points)
         assert r"(N, 3) [x y z]" in str(error.value) and "\n" not in str(error.value)
@@ -157,11 +188,13 @@ def test_clouds_of_three_and_four_columns_give_equal_frames():
     plain = PointCloud.of(CLOUD[:, :3])
     four = PointCloud.of(CLOUD, stamp_ns=5, frame_id="velodyne")
     assert plain.intensity is None and (four.stamp_ns, four.frame_id) == (5, "velodyne")
-    for same in (PointCloud.of(CLOUD.tolist()), PointCloud.of(CLOUD[:, :3], CLOUD[:, 3]),
-                 PointCloud.of(CLOUD[:, :3], list(CLOUD[:, 3])),
-                 PointCloud.of(CLOUD.copy("F"))):
-        assert np.array_equal(same.xyz, plain.xyz) and np.array_equal(same.intensity,
-                                                                      four.intensity)
+    for same in (
+        PointCloud.of(CLOUD.tolist()),
+        PointCloud.of(CLOUD[:, :3], CLOUD[:, 3]),
+        PointCloud.of(CLOUD[:, :3], list(CLOUD[:, 3])),
+        PointCloud.of(CLOUD.copy("F")),
+    ):
+        assert np.array_equal(same.xyz, plain.xyz) and np.array_equal(same.intensity, four.intensity)
         assert same.xyz.flags.c_contiguous and same.intensity.dtype == np.float32
     whole = PointCloud.of(np.int64([[5, 0, -1], [0, 0, 0]]))
     assert whole.xyz.tolist() == [[5, 0, -1]]
@@ -173,16 +206,21 @@ def test_intensity_scale_is_declared_or_inferred_from_the_type():
     raw = (CLOUD[:, 3] * 255).astype(np.uint8)
     expected = raw / np.float32(255)
     xyz = CLOUD[:, :3]
-    for frame in (PointCloud.of(xyz, raw), PointCloud.of(xyz, raw.astype(float), intensity_max=255),
-                  PointCloud.of(np.column_stack([xyz, raw]), intensity_max=255)):
+    for frame in (
+        PointCloud.of(xyz, raw),
+        PointCloud.of(xyz, raw.astype(float), intensity_max=255),
+        PointCloud.of(np.column_stack([xyz, raw]), intensity_max=255),
+    ):
         assert np.array_equal(frame.intensity, expected)
     odd = PointCloud.of(xyz[:3], [np.nan, -1, 0.5]).intensity
     assert odd.tolist() == [0, 0, 0.5]
-    for wrong, said in ((dict(intensity=raw[:9]), r"\(9,\) for 400 points"),
-                        (dict(intensity=raw[:, None]), r"\(400, 1\) for 400"),
-                        (dict(intensity=["a"] * 400), "intensity is list"),
-                        (dict(intensity_max=0.0), "intensity_max is 0"),
-                        (dict(intensity_max=np.nan), "intensity_max is nan")):
+    for wrong, said in (
+        (dict(intensity=raw[:9]), r"\(9,\) for 400 points"),
+        (dict(intensity=raw[:, None]), r"\(400, 1\) for 400"),
+        (dict(intensity=["a"] * 400), "intensity is list"),
+        (dict(intensity_max=0.0), "intensity_max is 0"),
+        (dict(intensity_max=np.nan), "intensity_max is nan"),
+    ):
         with pytest.raises(InputError, match=said):
             PointCloud.of(xyz, **wrong)
     with pytest.raises(InputError, match="given twice"):
@@ -202,8 +240,9 @@ def test_ground_of_an_array_equals_that_of_its_frame(method):
     found = segment_ground(cloud, params)
     assert found.shape == (2000,) and not found[7]
     bright = segment_ground(np.column_stack([xyz, UNIT[:2000] * 255]), params)
-    assert np.array_equal(bright, segment_ground(PointCloud.of(np.column_stack(
-        [xyz, UNIT[:2000] * 255]), intensity_max=255), params))
+    assert np.array_equal(
+        bright, segment_ground(PointCloud.of(np.column_stack([xyz, UNIT[:2000] * 255]), intensity_max=255), params)
+    )
 
 
 def test_clusters_of_an_array_equal_those_of_its_frame():
@@ -214,14 +253,20 @@ def test_clusters_of_an_array_equal_those_of_its_frame():
     with pytest.raises(InputError, match="cluster_ids has 3 values for 400 points"):
         segment_cloud(CLOUD, cluster_ids=np.zeros(3, int))
     expected = segment_cloud(PointCloud.of(CLOUD))
-    for same in (segment_cloud(CLOUD),
-                 segment_cloud(CLOUD.tolist(), ground=expected.ground.tolist())):
+    for same in (segment_cloud(CLOUD), segment_cloud(CLOUD.tolist(), ground=expected.ground.tolist())):
         assert np.array_equal(same.cluster_ids, expected.cluster_ids)
 
 
-@pytest.mark.parametrize("boxes, said", [
-    (np.ones((7, 2)), r"\(7, 2\)"), (np.ones((2, 8)), r"\(2, 8\)"), (np.ones(14), r"\(14,\)"),
-    (np.ones((1, 2, 7)), r"\(1, 2, 7\)"), ("box", "is str")])
+@pytest.mark.parametrize(
+    "boxes, said",
+    [
+        (np.ones((7, 2)), r"\(7, 2\)"),
+        (np.ones((2, 8)), r"\(2, 8\)"),
+        (np.ones(14), r"\(14,\)"),
+        (np.ones((1, 2, 7)), r"\(1, 2, 7\)"),
+        ("box", "is str"),
+    ],
+)
 def test_boxes_of_another_shape_are_refused(boxes, said):
     with pytest.raises(InputError, match=f"boxes .*{said}"):
         Detections.of(boxes)

@@ -23,6 +23,7 @@ pytestmark = pytest.mark.skipif(not (ROOT / "setup.py").exists(), reason="needs 
 @pytest.fixture
 def metadata(monkeypatch):
     """Return a function that returns the arguments of setup() for a repository URL."""
+
     def read(url):
         arguments = {}
         monkeypatch.chdir(ROOT)
@@ -30,6 +31,7 @@ def metadata(monkeypatch):
         monkeypatch.setattr(setuptools, "setup", arguments.update)
         run_path(str(ROOT / "setup.py"))
         return arguments
+
     return read
 
 
@@ -62,11 +64,11 @@ def test_both_packages_ship_their_types(metadata):
 
 def test_release_moves_unreleased_changes_under_the_version():
     release = run_path(str(ROOT / "scripts/release.py"))
-    text = ("# Changes\n\n## Unreleased\n\n### Added\n\n### Fixed\n\n- A bug.\n\n"
-            "## 0.1.0\n\n- Old.\n")
+    text = "# Changes\n\n## Unreleased\n\n### Added\n\n### Fixed\n\n- A bug.\n\n## 0.1.0\n\n- Old.\n"
     dated = release["date_changelog"](text, "0.2.0", "2026-12-01")
-    assert dated == ("# Changes\n\n" + release["EMPTY"] + "## 0.2.0 - 2026-12-01\n\n### Fixed\n\n"
-                     "- A bug.\n\n## 0.1.0\n\n- Old.\n")
+    assert dated == (
+        "# Changes\n\n" + release["EMPTY"] + "## 0.2.0 - 2026-12-01\n\n### Fixed\n\n- A bug.\n\n## 0.1.0\n\n- Old.\n"
+    )
     with pytest.raises(SystemExit, match="no unreleased change"):
         release["date_changelog"](text.replace("- A bug.\n", ""), "0.2.0", "2026-12-01")
 
@@ -84,6 +86,7 @@ def test_release_sets_the_version_in_both_files(tmp_path):
 
 def test_citation_names_the_three_papers():
     import yaml
+
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert len(cited["references"]) == 3
     assert all(paper["doi"].startswith("10.") for paper in cited["references"])
@@ -95,15 +98,22 @@ def test_each_node_has_one_executable_in_lib(metadata):
     files = dict(arguments["data_files"])["lib/lidar_perception"]
     assert sorted(Path(file).name for file in files) == sorted(NODES)
     assert all(os.access(ROOT / file, os.X_OK) for file in files)
-    assert [line.split()[0] for line in arguments["entry_points"]["console_scripts"]] == [
-        "lidar-perception"]
+    assert [line.split()[0] for line in arguments["entry_points"]["console_scripts"]] == ["lidar-perception"]
 
 
 def test_wheel_ships_the_weights_of_the_default_detector_and_v4(metadata):
     package = ROOT / "lidar_perception"
-    shipped = {path.name for pattern in metadata(URL)["package_data"]["lidar_perception"]
-               for path in package.glob(pattern) if path.suffix == ".safetensors"}
-    assert shipped == {"judge.safetensors", "judge_no_intensity.safetensors",
-                       "pointnet.safetensors", "pointpillars_v4_compact.safetensors",
-                       "pointpillars_v4_compact_no_intensity.safetensors",
-                       "pointpillars_v4_full.safetensors"}
+    shipped = {
+        path.name
+        for pattern in metadata(URL)["package_data"]["lidar_perception"]
+        for path in package.glob(pattern)
+        if path.suffix == ".safetensors"
+    }
+    assert shipped == {
+        "judge.safetensors",
+        "judge_no_intensity.safetensors",
+        "pointnet.safetensors",
+        "pointpillars_v4_compact.safetensors",
+        "pointpillars_v4_compact_no_intensity.safetensors",
+        "pointpillars_v4_full.safetensors",
+    }

@@ -36,22 +36,42 @@ from lidar_perception.training.params import PointPillarsTraining
 from lidar_perception.types import InputError
 from lidar_perception.wire import params as wire_params
 
-MODULES = (node_params, candidate_params, clustering_params, detector_params, ground_params,
-           robot_params, wire_params, tracking_params, pointpillars_params, pointnet_params,
-           training_params)
+MODULES = (
+    node_params,
+    candidate_params,
+    clustering_params,
+    detector_params,
+    ground_params,
+    robot_params,
+    wire_params,
+    tracking_params,
+    pointpillars_params,
+    pointnet_params,
+    training_params,
+)
 
 
 def find_groups(base: type) -> list[type]:
     return [group for kind in base.__subclasses__() for group in (kind, *find_groups(kind))]
 
 
-GROUPS = [group for group in find_groups(Params)
-          if group.__module__ in [module.__name__ for module in MODULES]]
-COMPOSITES = [TrackerNodeParams, PipelineParams, GroundNodeParams,
-              ClusteringNodeParams, RefinementNodeParams,
-              DetectorParams, PointNetDetectorParams, PointPillarsTraining]
-FIELDS = [pytest.param(group, f, id=f"{group.__name__}.{f.name}")
-          for group in GROUPS for f in dataclasses.fields(group) if f.metadata]
+GROUPS = [group for group in find_groups(Params) if group.__module__ in [module.__name__ for module in MODULES]]
+COMPOSITES = [
+    TrackerNodeParams,
+    PipelineParams,
+    GroundNodeParams,
+    ClusteringNodeParams,
+    RefinementNodeParams,
+    DetectorParams,
+    PointNetDetectorParams,
+    PointPillarsTraining,
+]
+FIELDS = [
+    pytest.param(group, f, id=f"{group.__name__}.{f.name}")
+    for group in GROUPS
+    for f in dataclasses.fields(group)
+    if f.metadata
+]
 
 each_field = for_all(FIELDS)
 each_params = for_all([*GROUPS, *COMPOSITES])
@@ -97,9 +117,12 @@ def config(tmp_path, text: str, params=None):
 
 
 def test_every_parameter_group_is_tested():
-    public = [v for module in MODULES for v in vars(module).values()
-              if isinstance(v, type) and dataclasses.is_dataclass(v)
-              and v.__module__ in [m.__name__ for m in MODULES]]
+    public = [
+        v
+        for module in MODULES
+        for v in vars(module).values()
+        if isinstance(v, type) and dataclasses.is_dataclass(v) and v.__module__ in [m.__name__ for m in MODULES]
+    ]
     assert {*public} == {*GROUPS, *COMPOSITES}
 
 
@@ -118,8 +141,7 @@ def test_each_field_is_documented(group, f):
 
 @each_params
 def test_with_values_inverts_flatten(kind):
-    changed = with_values(kind(), {n: other_value(f)
-                                   for n, f in collect_fields(kind()).items()})
+    changed = with_values(kind(), {n: other_value(f) for n, f in collect_fields(kind()).items()})
     assert changed != kind()
     assert with_values(kind(), flatten(changed)) == changed
     assert flatten(with_values(kind(), flatten(changed))) == flatten(changed)
@@ -130,8 +152,7 @@ def test_with_values_keeps_other_values(kind):
     for name, f in collect_fields(kind()).items():
         if name.endswith(("eps", "range_limits")):
             continue  # their lengths depend on each other
-        assert flatten(with_values(kind(), {name: other_value(f)})) == {
-            **flatten(kind()), name: other_value(f)}
+        assert flatten(with_values(kind(), {name: other_value(f)})) == {**flatten(kind()), name: other_value(f)}
 
 
 @for_all(bounded("low"))
@@ -152,8 +173,7 @@ def test_error_above_the_range_names_field_and_range(group, f):
         assert word in str(error.value)
 
 
-@for_all([p for p in bounded("low") + bounded("high")
-          if not p.values[1].metadata["item"]])
+@for_all([p for p in bounded("low") + bounded("high") if not p.values[1].metadata["item"]])
 def test_range_includes_its_limits(group, f):
     for limit in (f.metadata["low"], f.metadata["high"]):
         if limit is not None:
@@ -162,8 +182,7 @@ def test_range_includes_its_limits(group, f):
 
 @each_field
 def test_error_of_a_wrong_type_names_field_and_type(group, f):
-    wrong = {bool: [1, 0.0, "true"], int: [1.0, "1", True], float: ["1.0", True, 1j],
-             str: [1, 2.0, True]}[kind_of(f)]
+    wrong = {bool: [1, 0.0, "true"], int: [1.0, "1", True], float: ["1.0", True, 1j], str: [1, 2.0, True]}[kind_of(f)]
     for value in [None, *wrong]:
         with pytest.raises(ValueError, match=f"^{f.name} = ") as error:
             group(**{f.name: as_field(f, value)})
@@ -222,7 +241,7 @@ def test_range_limits_ascend(limits):
         DbscanParams(range_limits=limits)
 
 
-@pytest.mark.parametrize("value", [10**400, -10**400, 2**63, float("inf")])
+@pytest.mark.parametrize("value", [10**400, -(10**400), 2**63, float("inf")])
 def test_huge_numbers_are_out_of_range(value):
     """Integers in YAML may be larger than any float."""
     with pytest.raises(ValueError, match=r"eps = .* is outside"):
@@ -243,13 +262,14 @@ def test_error_of_with_values_names_the_group():
 
 def test_a_node_declares_the_parameters_of_the_pipeline():
     whole = collect_fields(PipelineParams())
-    parts = [collect_fields(kind()) for kind in (GroundNodeParams, ClusteringNodeParams,
-                                                 RefinementNodeParams)]
+    parts = [collect_fields(kind()) for kind in (GroundNodeParams, ClusteringNodeParams, RefinementNodeParams)]
     assert {k: v for part in parts for k, v in part.items()} == whole
 
 
 def test_a_config_may_be_nested_or_dotted(tmp_path):
-    nested = config(tmp_path, """
+    nested = config(
+        tmp_path,
+        """
 /**:
   ros__parameters:
     clustering:
@@ -257,32 +277,39 @@ def test_a_config_may_be_nested_or_dotted(tmp_path):
         min_samples: 5
         eps: [0.1, 0.2, 0.3]
     seed: {source: file}
-""")
-    dotted = config(tmp_path, """
+""",
+    )
+    dotted = config(
+        tmp_path,
+        """
 perception:
   ros__parameters:
     clustering.dbscan.min_samples: 5
     clustering.dbscan.eps: [0.1, 0.2, 0.3]
     seed.source: file
-""")
+""",
+    )
     assert nested == dotted
-    assert with_values(PipelineParams(), nested).clustering.dbscan == DbscanParams(
-        eps=(0.1, 0.2, 0.3), min_samples=5)
+    assert with_values(PipelineParams(), nested).clustering.dbscan == DbscanParams(eps=(0.1, 0.2, 0.3), min_samples=5)
 
 
 def test_every_parameter_can_come_from_a_config(tmp_path):
     text = "node:\n  ros__parameters:\n" + "".join(
         f"    {name}: {list(value) if isinstance(value, tuple) else repr(value)}\n"
-        for name, value in flatten(PlayerParams()).items())
+        for name, value in flatten(PlayerParams()).items()
+    )
     assert with_values(PlayerParams(), config(tmp_path, text, PlayerParams())) == PlayerParams()
 
 
 def test_a_config_may_have_parameters_of_other_nodes(tmp_path):
-    values = config(tmp_path, """
+    values = config(
+        tmp_path,
+        """
 player: {ros__parameters: {rate: 2.0}}
 clustering: {ros__parameters: {clustering.dbscan: {min_samples: 7}, use_sim_time: true}}
 silent: {ros__parameters: }
-""")
+""",
+    )
     assert values == {"clustering.dbscan.min_samples": 7}
 
 
@@ -290,15 +317,18 @@ def test_an_empty_config_sets_nothing(tmp_path):
     assert config(tmp_path, "# nothing yet\n") == {}
 
 
-@pytest.mark.parametrize("text, words", [
-    ("node: [1, 2\n", ("cannot read",)),
-    ("\tnode: 1\n", ("cannot read",)),
-    ("perception: {dbscan: {eps: 1}}", ("'perception'", "ros__parameters")),
-    ("perception: 5", ("'perception'", "ros__parameters")),
-    ("perception: {ros__parameters: [1]}", ("'perception'", "ros__parameters")),
-    ("- perception\n", ("no parameter file",)),
-    ("perception", ("no parameter file",)),
-])
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("node: [1, 2\n", ("cannot read",)),
+        ("\tnode: 1\n", ("cannot read",)),
+        ("perception: {dbscan: {eps: 1}}", ("'perception'", "ros__parameters")),
+        ("perception: 5", ("'perception'", "ros__parameters")),
+        ("perception: {ros__parameters: [1]}", ("'perception'", "ros__parameters")),
+        ("- perception\n", ("no parameter file",)),
+        ("perception", ("no parameter file",)),
+    ],
+)
 def test_error_of_an_invalid_config_names_the_file(tmp_path, text, words):
     with pytest.raises(InputError) as error:
         config(tmp_path, text)

@@ -44,23 +44,36 @@ def count_threads() -> Callable[[int], int]:
 
 def run_script(script: str, **environment: str) -> subprocess.CompletedProcess:
     path = os.pathsep.join(map(str, (ROOT, ROOT / "test", ROOT / "test/support")))
-    return subprocess.run([sys.executable, "-c", script], text=True, capture_output=True,
-                          env={**os.environ, "PYTHONPATH": path, **environment}, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", script],
+        text=True,
+        capture_output=True,
+        env={**os.environ, "PYTHONPATH": path, **environment},
+        check=False,
+    )
 
 
 @pytest.mark.skipif(os.cpu_count() == 1, reason="has one core")
 def test_processes_that_share_cores_use_one_thread_each():
     """Threads of linear algebra libraries spin while they wait."""
-    script = ("from lidar_perception.runs.processes import run_in_order, run_in_processes\n"
-              "from test_processes import count_threads\n"
-              "print(*run_in_processes(count_threads, [0, 1], 2, 'worked'),\n"
-              "      *run_in_order(count_threads, [0], 1, 1, 'worked'),\n"
-              "      *run_in_processes(count_threads, [0], 1, 'worked', apart=True))\n")
+    script = (
+        "from lidar_perception.runs.processes import run_in_order, run_in_processes\n"
+        "from test_processes import count_threads\n"
+        "print(*run_in_processes(count_threads, [0, 1], 2, 'worked'),\n"
+        "      *run_in_order(count_threads, [0], 1, 1, 'worked'),\n"
+        "      *run_in_processes(count_threads, [0], 1, 'worked', apart=True))\n"
+    )
     assert run_script(script, OPENBLAS_NUM_THREADS="2").stdout.split() == ["1", "1", "1", "2"]
 
 
-@pytest.mark.parametrize("work", [DetectorChoice("pointnet"), DetectorChoice("pointnet").open,
-                                  functools.partial(map, DetectorChoice("pointnet").open)])
+@pytest.mark.parametrize(
+    "work",
+    [
+        DetectorChoice("pointnet"),
+        DetectorChoice("pointnet").open,
+        functools.partial(map, DetectorChoice("pointnet").open),
+    ],
+)
 def test_processes_share_the_imports_of_a_detector(work):
     """Opening a detector imports torch, which takes longer than detecting for some clouds."""
     assert "lidar_perception.detectors.pointnet.detector" in processes._find_modules(work)
@@ -68,13 +81,15 @@ def test_processes_share_the_imports_of_a_detector(work):
 
 
 def test_ended_processes_release_system_resources():
-    script = ("import itertools\n"
-              "from lidar_perception.runs.processes import run_in_order\n"
-              "from test_processes import hold_semaphores\n"
-              "for _ in range(8):\n"
-              "    results = run_in_order(hold_semaphores, itertools.count(), 2, 4, 'worked')\n"
-              "    assert [len(next(results)) for _ in range(3)] == [300_000] * 3\n"
-              "    results.close()\n")
+    script = (
+        "import itertools\n"
+        "from lidar_perception.runs.processes import run_in_order\n"
+        "from test_processes import hold_semaphores\n"
+        "for _ in range(8):\n"
+        "    results = run_in_order(hold_semaphores, itertools.count(), 2, 4, 'worked')\n"
+        "    assert [len(next(results)) for _ in range(3)] == [300_000] * 3\n"
+        "    results.close()\n"
+    )
     run = run_script(script)
     assert (run.returncode, run.stderr) == (0, "")
 
@@ -90,19 +105,20 @@ def test_a_process_that_ignores_sigterm_is_killed(monkeypatch):
 
 
 @pytest.mark.skipif(os.confstr("CS_GNU_LIBC_VERSION") is None, reason="not glibc")
-@pytest.mark.parametrize("user", [{}, {"MALLOC_TRIM_THRESHOLD_": "131072"}],
-                         ids=["default", "set by the user"])
+@pytest.mark.parametrize("user", [{}, {"MALLOC_TRIM_THRESHOLD_": "131072"}], ids=["default", "set by the user"])
 def test_freed_memory_is_reused_unless_the_user_sets_malloc(user):
     """Count the page faults of repeated allocations."""
-    script = ("import resource\n"
-              "import numpy as np\n"
-              "from lidar_perception.runs.memory import keep_freed_memory\n"
-              "keep_freed_memory()\n"
-              "for _ in range(2):\n"
-              "    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
-              "    for _ in range(5):\n"
-              "        np.ones(8_000_000)\n"
-              "print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)\n")
+    script = (
+        "import resource\n"
+        "import numpy as np\n"
+        "from lidar_perception.runs.memory import keep_freed_memory\n"
+        "keep_freed_memory()\n"
+        "for _ in range(2):\n"
+        "    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "    for _ in range(5):\n"
+        "        np.ones(8_000_000)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)\n"
+    )
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC", "GLIBC"))}
     pages = int(subprocess.check_output([sys.executable, "-c", script], env=environment | user))
     assert (pages > 100) == bool(user)

@@ -15,8 +15,14 @@ QUARTER = np.pi / 2
 
 def some_boxes(rng, count, reach=3.0):
     """Make boxes close to each other, some of which touch or are rotated by quarter turns."""
-    boxes = np.column_stack([rng.uniform(-reach, reach, (count, 2)), rng.uniform(-1, 1, count),
-                             rng.uniform(0.3, 5, (count, 3)), rng.uniform(-7, 7, count)])
+    boxes = np.column_stack(
+        [
+            rng.uniform(-reach, reach, (count, 2)),
+            rng.uniform(-1, 1, count),
+            rng.uniform(0.3, 5, (count, 3)),
+            rng.uniform(-7, 7, count),
+        ]
+    )
     tidy = rng.random(count) < 0.3
     boxes[tidy] = np.round(boxes[tidy])
     boxes[tidy, 6] = rng.integers(-4, 5, tidy.sum()) * QUARTER
@@ -27,8 +33,15 @@ def some_boxes(rng, count, reach=3.0):
 def moved(boxes, shift, yaw):
     cos, sin = np.cos(yaw), np.sin(yaw)
     x, y = boxes[:, 0], boxes[:, 1]
-    return np.column_stack([cos * x - sin * y + shift[0], sin * x + cos * y + shift[1],
-                            boxes[:, 2] + shift[2], boxes[:, 3:6], boxes[:, 6] + yaw])
+    return np.column_stack(
+        [
+            cos * x - sin * y + shift[0],
+            sin * x + cos * y + shift[1],
+            boxes[:, 2] + shift[2],
+            boxes[:, 3:6],
+            boxes[:, 6] + yaw,
+        ]
+    )
 
 
 def by_shapely(boxes, others):
@@ -37,22 +50,20 @@ def by_shapely(boxes, others):
     # On a fine grid: without one GEOS sometimes finds nothing where edges all but coincide.
     shared = shapely.area(shapely.intersection(a[:, None], b[None], grid_size=1e-9))
     area = shapely.area(a)[:, None] + shapely.area(b)
-    (low_a, high_a), (low_b, high_b) = ((x[:, 2] - x[:, 5] / 2, x[:, 2] + x[:, 5] / 2)
-                                        for x in (boxes, others))
+    (low_a, high_a), (low_b, high_b) = ((x[:, 2] - x[:, 5] / 2, x[:, 2] + x[:, 5] / 2) for x in (boxes, others))
     height = np.maximum(np.minimum(high_a[:, None], high_b) - np.maximum(low_a[:, None], low_b), 0)
     volume = np.prod(boxes[:, 3:6], axis=1)[:, None] + np.prod(others[:, 3:6], axis=1)
     with np.errstate(invalid="ignore"):
-        return (np.nan_to_num(shared / (area - shared)),
-                np.nan_to_num(shared * height / (volume - shared * height)))
+        return (np.nan_to_num(shared / (area - shared)), np.nan_to_num(shared * height / (volume - shared * height)))
 
 
 @given(seeds)
 def test_overlaps_are_those_of_shapely(seed):
     rng = np.random.default_rng(seed)
     boxes, others = some_boxes(rng, 12), some_boxes(rng, 12)
-    others[:4] = boxes[:4]                                              # identical
+    others[:4] = boxes[:4]  # identical
     others[4] = boxes[4] + [0, 0, 0, 0, 0, 0, QUARTER]
-    others[5] = boxes[5] * [1, 1, 1, 0.4, 0.4, 0.4, 1]                  # contained
+    others[5] = boxes[5] * [1, 1, 1, 0.4, 0.4, 0.4, 1]  # contained
     others[6:8] = moved(boxes[6:8] * [0, 0, 0, 1, 1, 1, 0], (boxes[6, 3], 0, 0), 0)  # touching
     for found, expected in zip(bev_and_3d_iou(boxes, others), by_shapely(boxes, others)):
         np.testing.assert_allclose(found, expected, atol=1e-6)
@@ -89,27 +100,30 @@ def test_a_box_is_the_same_turned_by_half_and_with_sides_swapped(seed):
         np.testing.assert_allclose(bev_and_3d_iou(same, others), before, atol=1e-9)
 
 
-@pytest.mark.parametrize("name, box, other, bev, space", [
-    # a = 4 x 2 x 2 around the origin: area 8, volume 16
-    ("itself", [0, 0, 0, 4, 2, 2, 0.7], [0, 0, 0, 4, 2, 2, 0.7], 1, 1),
-    # shared 2 x 2: 4 / (8 + 8 - 4)
-    ("a quarter turn", [0, 0, 0, 4, 2, 2, 0], [0, 0, 0, 4, 2, 2, QUARTER], 1 / 3, 1 / 3),
-    ("sides touch", [0, 0, 0, 4, 2, 2, 0], [4, 0, 0, 4, 2, 2, 0], 0, 0),
-    ("corners touch", [0, 0, 0, 4, 2, 2, 0], [4, 2, 0, 4, 2, 2, 0], 0, 0),
-    ("one on top of the other", [0, 0, 0, 4, 2, 2, 0], [0, 0, 2, 4, 2, 2, 0], 1, 0),
-    # inside: 1 / 8; 1 / 16
-    ("contained", [0, 0, 0, 4, 2, 2, 0], [0.5, 0.2, 0.1, 1, 1, 1, 0], 1 / 8, 1 / 16),
-    # half of the length: 4 / 12; and of the height: 4 / 28
-    ("moved by half", [0, 0, 0, 4, 2, 2, 0], [2, 0, 1, 4, 2, 2, 0], 1 / 3, 1 / 7),
-    # square of side 2 and its turn by 45 degrees: an octagon, 8 (sqrt 2 - 1) = 3.3137 of 8 - 3.3137
-    ("an octagon", [5, 5, 0, 2, 2, 1, 0], [5, 5, 0, 2, 2, 1, np.pi / 4], 2**-0.5, 2**-0.5),
-    ("no length", [0, 0, 0, 0, 2, 2, 0], [0, 0, 0, 0, 2, 2, 0], 0, 0),
-    ("no height", [0, 0, 0, 4, 2, 0, 0], [0, 0, 0, 4, 2, 0, 0], 1, 0),
-    ("less than nothing", [0, 0, 0, -4, -2, 2, 0], [0, 0, 0, 4, 2, 2, 0], 0, 0),
-    ("not a number", [0, 0, np.nan, 4, 2, 2, 0], [0, 0, 0, 4, 2, 2, 0], 0, 0),
-    ("endless", [0, 0, 0, np.inf, 2, 2, 0], [0, 0, 0, 4, 2, 2, 0], 0, 0),
-    ("far away", [1e6, 0, 0, 4, 2, 2, 0], [0, 0, 0, 4, 2, 2, 0], 0, 0),
-])
+@pytest.mark.parametrize(
+    "name, box, other, bev, space",
+    [
+        # a = 4 x 2 x 2 around the origin: area 8, volume 16
+        ("itself", [0, 0, 0, 4, 2, 2, 0.7], [0, 0, 0, 4, 2, 2, 0.7], 1, 1),
+        # shared 2 x 2: 4 / (8 + 8 - 4)
+        ("a quarter turn", [0, 0, 0, 4, 2, 2, 0], [0, 0, 0, 4, 2, 2, QUARTER], 1 / 3, 1 / 3),
+        ("sides touch", [0, 0, 0, 4, 2, 2, 0], [4, 0, 0, 4, 2, 2, 0], 0, 0),
+        ("corners touch", [0, 0, 0, 4, 2, 2, 0], [4, 2, 0, 4, 2, 2, 0], 0, 0),
+        ("one on top of the other", [0, 0, 0, 4, 2, 2, 0], [0, 0, 2, 4, 2, 2, 0], 1, 0),
+        # inside: 1 / 8; 1 / 16
+        ("contained", [0, 0, 0, 4, 2, 2, 0], [0.5, 0.2, 0.1, 1, 1, 1, 0], 1 / 8, 1 / 16),
+        # half of the length: 4 / 12; and of the height: 4 / 28
+        ("moved by half", [0, 0, 0, 4, 2, 2, 0], [2, 0, 1, 4, 2, 2, 0], 1 / 3, 1 / 7),
+        # square of side 2 and its turn by 45 degrees: an octagon, 8 (sqrt 2 - 1) = 3.3137 of 8 - 3.3137
+        ("an octagon", [5, 5, 0, 2, 2, 1, 0], [5, 5, 0, 2, 2, 1, np.pi / 4], 2**-0.5, 2**-0.5),
+        ("no length", [0, 0, 0, 0, 2, 2, 0], [0, 0, 0, 0, 2, 2, 0], 0, 0),
+        ("no height", [0, 0, 0, 4, 2, 0, 0], [0, 0, 0, 4, 2, 0, 0], 1, 0),
+        ("less than nothing", [0, 0, 0, -4, -2, 2, 0], [0, 0, 0, 4, 2, 2, 0], 0, 0),
+        ("not a number", [0, 0, np.nan, 4, 2, 2, 0], [0, 0, 0, 4, 2, 2, 0], 0, 0),
+        ("endless", [0, 0, 0, np.inf, 2, 2, 0], [0, 0, 0, 4, 2, 2, 0], 0, 0),
+        ("far away", [1e6, 0, 0, 4, 2, 2, 0], [0, 0, 0, 4, 2, 2, 0], 0, 0),
+    ],
+)
 def test_overlaps_worked_out_by_hand(name, box, other, bev, space):
     for a, b in ((box, other), (other, box)):
         found = bev_and_3d_iou(np.array([a], float), np.array([b], float))
@@ -123,6 +137,5 @@ def test_shapes_dtypes_and_layouts():
             assert matrix.shape == (rows, columns) and matrix.dtype == np.float64
     before = boxes.copy()
     np.testing.assert_array_equal(bev_iou(np.asfortranarray(boxes), boxes), bev_iou(boxes, boxes))
-    np.testing.assert_allclose(iou_3d(boxes.astype(np.float32), boxes), iou_3d(boxes, boxes),
-                               atol=1e-5)
+    np.testing.assert_allclose(iou_3d(boxes.astype(np.float32), boxes), iou_3d(boxes, boxes), atol=1e-5)
     np.testing.assert_array_equal(boxes, before)

@@ -37,9 +37,14 @@ class Change(NamedTuple):
     noise: float = 0.0
 
 
-CHANGES = {"50 %": Change(0.5), "20 %": Change(0.2), "10 %": Change(0.1),
-           "noise 2 cm": Change(noise=0.02), "noise 5 cm": Change(noise=0.05),
-           "noise 10 cm": Change(noise=0.1)}  # of Table 8; the paper gives no amount of noise
+CHANGES = {
+    "50 %": Change(0.5),
+    "20 %": Change(0.2),
+    "10 %": Change(0.1),
+    "noise 2 cm": Change(noise=0.02),
+    "noise 5 cm": Change(noise=0.05),
+    "noise 10 cm": Change(noise=0.1),
+}  # of Table 8; the paper gives no amount of noise
 
 
 def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[str, Any]:
@@ -62,20 +67,29 @@ def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[
     def detect(change: Change, names: list[str]) -> tuple[dict[str, Any], dict[str, float]]:
         cloud = change_cloud(frame.load(), change, frame.name)
         found = detect_with_all(cloud, {n: models[n].weights for n in names}, frame.sensor_height)
-        return ({name: to_record(to_camera_objects(to_scored_labels(boxes), calibration))
-                 for name, (boxes, _) in found.items()},
-                {name: round(ms, 3) for name, (_, ms) in found.items()})
+        return (
+            {
+                name: to_record(to_camera_objects(to_scored_labels(boxes), calibration))
+                for name, (boxes, _) in found.items()
+            },
+            {name: round(ms, 3) for name, (_, ms) in found.items()},
+        )
 
     compared = [name_model(name, 0) for name in COMPARED if name_model(name, 0) in models]
     found, times = detect(Change(), [*models])
     changed = {name: detect(change, compared) for name, change in CHANGES.items()}
-    return {"truth": to_record(to_camera_objects(truth, calibration)), "found": found,
-            "changed": {name: boxes for name, (boxes, _) in changed.items()},
-            "detector_ms": times, "changed_ms": {name: ms for name, (_, ms) in changed.items()}}
+    return {
+        "truth": to_record(to_camera_objects(truth, calibration)),
+        "found": found,
+        "changed": {name: boxes for name, (boxes, _) in changed.items()},
+        "detector_ms": times,
+        "changed_ms": {name: ms for name, (_, ms) in changed.items()},
+    }
 
 
-def detect_with_all(cloud: PointCloud, weights: Mapping[str, Path], height: float
-                    ) -> dict[str, tuple[Detections, float]]:
+def detect_with_all(
+    cloud: PointCloud, weights: Mapping[str, Path], height: float
+) -> dict[str, tuple[Detections, float]]:
     """Run networks on a cloud, whose ground and clusters are computed once for equal parameters.
 
     Args:
@@ -106,8 +120,9 @@ def detect_with_all(cloud: PointCloud, weights: Mapping[str, Path], height: floa
 @lru_cache(maxsize=64)
 def open_network(weights: Path, height: float) -> PointNetDetector:
     """Open a network that returns detections of any score, as average precision needs."""
-    detector = open_detector(weights, "cpu", sensor_height=height, min_score=MIN_SCORE,
-                             settings={"pointnet.warm_up": False})
+    detector = open_detector(
+        weights, "cpu", sensor_height=height, min_score=MIN_SCORE, settings={"pointnet.warm_up": False}
+    )
     assert isinstance(detector, PointNetDetector)
     return detector
 

@@ -21,28 +21,52 @@ REPLICATES = 100
 STRICT_3D, RELAXED_BEV, MEAN = 0, 1, len(CELLS)  # indices into the result of draw_cells()
 MAX_MS = 100.0  # the period of a frame of KITTI's sensor, for Eq. 1
 MAP = ("mAP 3D [%]", "mAP BEV, relaxed [%]")
-ABOUT_MAP = ("mAP is the mean of the average precision (KITTI, 40 recall points) of cars, "
-             "pedestrians and cyclists at three difficulties: 3D at an overlap of 0.7 and 0.5, and "
-             "BEV at 0.5 and 0.25. The paper does not name its protocol; its values are next to "
-             "3D.")
+ABOUT_MAP = (
+    "mAP is the mean of the average precision (KITTI, 40 recall points) of cars, "
+    "pedestrians and cyclists at three difficulties: 3D at an overlap of 0.7 and 0.5, and "
+    "BEV at 0.5 and 0.25. The paper does not name its protocol; its values are next to "
+    "3D."
+)
 Draws = Mapping[str, np.ndarray]  # network -> (1 + R, 2, 10), see draw_cells()
 
 
-def make_detection_sections(records: list[dict[str, Any]], data: str,
-                            models: Mapping[str, TrainedModel]) -> list[Section]:
+def make_detection_sections(
+    records: list[dict[str, Any]], data: str, models: Mapping[str, TrainedModel]
+) -> list[Section]:
     """Return Tables 4, 5, 6 and 8 of records of measure_detection()."""
     names = [r["frame"] for r in records]
     true = [r["truth"] for r in records]
-    draws = _average_seeds(draw_cells(names, {
-        model: compare_records(true, [r["found"][model] for r in records])
-        for model in models if all(model in r["found"] for r in records)}, REPLICATES))
-    changed = {change: _average_seeds(draw_cells(names, {
-        model: compare_records(true, [r["changed"][change][model] for r in records])
-        for model in (name_model(n, 0) for n in COMPARED) if model in models}, REPLICATES))
-        for change in CHANGES}
-    return [_make_ablation_section(draws, data, models), _make_radii_section(draws, data),
-            _make_difficulty_section(draws, data),
-            _make_change_section(draws, changed, records, data)]
+    draws = _average_seeds(
+        draw_cells(
+            names,
+            {
+                model: compare_records(true, [r["found"][model] for r in records])
+                for model in models
+                if all(model in r["found"] for r in records)
+            },
+            REPLICATES,
+        )
+    )
+    changed = {
+        change: _average_seeds(
+            draw_cells(
+                names,
+                {
+                    model: compare_records(true, [r["changed"][change][model] for r in records])
+                    for model in (name_model(n, 0) for n in COMPARED)
+                    if model in models
+                },
+                REPLICATES,
+            )
+        )
+        for change in CHANGES
+    }
+    return [
+        _make_ablation_section(draws, data, models),
+        _make_radii_section(draws, data),
+        _make_difficulty_section(draws, data),
+        _make_change_section(draws, changed, records, data),
+    ]
 
 
 def _average_seeds(draws: Draws) -> dict[str, np.ndarray]:
@@ -66,47 +90,83 @@ def _make_gain_cells(draws: Draws, network: str, reference: str) -> Row:
     return *make_cells(estimate(gain[:, None])), "–" if np.isnan(p) else f"{p:.3f}"
 
 
-def _make_ablation_section(draws: Draws, data: str,
-                           models: Mapping[str, TrainedModel]) -> Section:
+def _make_ablation_section(draws: Draws, data: str, models: Mapping[str, TrainedModel]) -> Section:
     def make_row(network: str, reference: str, published: float | None) -> Row:
         trained = [m for name, m in models.items() if name.startswith(f"{network}, seed ")]
         minutes = float(np.mean([m.seconds for m in trained])) / 60
-        return (network, *_make_map_cells(draws[network], published),
-                *_make_gain_cells(draws, network, reference),
-                Cell(minutes, paper=paper.MINUTES[data].get(network)),
-                str(trained[0].parameters), str(trained[0].steps), str(len(trained)))
+        return (
+            network,
+            *_make_map_cells(draws[network], published),
+            *_make_gain_cells(draws, network, reference),
+            Cell(minutes, paper=paper.MINUTES[data].get(network)),
+            str(trained[0].parameters),
+            str(trained[0].steps),
+            str(len(trained)),
+        )
 
-    header = ("network", *MAP, "BEV above the first [points]", "p", "minutes of training",
-              "parameters", "steps", "seeds")
-    rows = [make_row(name, "base", paper.TABLE_5[data][name])
-            for name in ABLATIONS if name in draws]
+    header = (
+        "network",
+        *MAP,
+        "BEV above the first [points]",
+        "p",
+        "minutes of training",
+        "parameters",
+        "steps",
+        "seeds",
+    )
+    rows = [make_row(name, "base", paper.TABLE_5[data][name]) for name in ABLATIONS if name in draws]
     rows += [make_row(name, "base", None) for name in BASELINES if name in draws]
     readings: list[Row] = [
         (text, *_make_map_cells(draws[name]), *_make_gain_cells(draws, name, OURS))
-        for name, text in READINGS.items() if name in draws]
-    note = ("Every network is trained on the same scenes with the same number of steps. pointnet: "
-            "PointNet without T-Net; pointnet2: PointNet++ with single-scale grouping. p: twice "
-            "the share of samples of frames with a difference of the other sign.")
+        for name, text in READINGS.items()
+        if name in draws
+    ]
+    note = (
+        "Every network is trained on the same scenes with the same number of steps. pointnet: "
+        "PointNet without T-Net; pointnet2: PointNet++ with single-scale grouping. p: twice "
+        "the share of samples of frames with a difference of the other sign."
+    )
     scenes = sorted({model.scenes for model in models.values()})
     text = f"Trained on {', '.join(map(str, scenes))} scenes. {ABOUT_MAP}" if scenes else ABOUT_MAP
-    return Section("Ablation (Table 5)", text, (
-        Table("table_5", "Table 5: parts of the method", header, tuple(rows), note),
-        Table("readings", "Centroids and density weights of the improved network",
-              ("centroids and weights", *MAP, "BEV above the first [points]", "p"),
-              tuple(readings))))
+    return Section(
+        "Ablation (Table 5)",
+        text,
+        (
+            Table("table_5", "Table 5: parts of the method", header, tuple(rows), note),
+            Table(
+                "readings",
+                "Centroids and density weights of the improved network",
+                ("centroids and weights", *MAP, "BEV above the first [points]", "p"),
+                tuple(readings),
+            ),
+        ),
+    )
 
 
 def _make_radii_section(draws: Draws, data: str) -> Section:
     published, nds = paper.TABLE_4[data]
     rows: list[Row] = [
-        (f"{radii} m", *_make_map_cells(draws[name], published if name == OURS else None),
-         *_make_gain_cells(draws, name, OURS), Cell(None, paper=nds if name == OURS else None))
-        for name, radii in RADII.items() if name in draws]
-    return Section("Grouping radii (Table 4)", "The text of the paper gives its best radii only. "
-                   "NDS of the trained network is in Table 7.", (
-                       Table("table_4", "Table 4: radii of the groups",
-                             ("radii", *MAP, f"BEV above {RADII[OURS]} [points]", "p", "NDS [%]"),
-                             tuple(rows)),))
+        (
+            f"{radii} m",
+            *_make_map_cells(draws[name], published if name == OURS else None),
+            *_make_gain_cells(draws, name, OURS),
+            Cell(None, paper=nds if name == OURS else None),
+        )
+        for name, radii in RADII.items()
+        if name in draws
+    ]
+    return Section(
+        "Grouping radii (Table 4)",
+        "The text of the paper gives its best radii only. NDS of the trained network is in Table 7.",
+        (
+            Table(
+                "table_4",
+                "Table 4: radii of the groups",
+                ("radii", *MAP, f"BEV above {RADII[OURS]} [points]", "p", "NDS [%]"),
+                tuple(rows),
+            ),
+        ),
+    )
 
 
 def _make_difficulty_section(draws: Draws, data: str) -> Section:
@@ -116,55 +176,88 @@ def _make_difficulty_section(draws: Draws, data: str) -> Section:
         cells = draws[network][:, :, :MEAN].reshape(-1, 2, len(SCORED), len(DIFFICULTIES))
         published = paper.TABLE_6.get(network, (None,) * 4) if data == "KITTI" else (None,) * 4
         for protocol, title in enumerate(MAP):
-            means = np.concatenate([_mean_of_classes(cells[:, protocol]),
-                                    draws[network][:, protocol, MEAN:]], axis=1)
-            by_level.append((network, title, *make_cells(
-                estimate(means), published if protocol == STRICT_3D else ())))
+            means = np.concatenate([_mean_of_classes(cells[:, protocol]), draws[network][:, protocol, MEAN:]], axis=1)
+            by_level.append((network, title, *make_cells(estimate(means), published if protocol == STRICT_3D else ())))
         for i, name in enumerate(SCORED):
             known = paper.FIGURE_10.get(network, {}).get(name, (None,) * 3)
-            by_class.append((network, name, *make_cells(
-                estimate(cells[:, STRICT_3D, i]), known if data == "KITTI" else ()),
-                *make_cells(estimate(cells[:, RELAXED_BEV, i]))))
-    return Section("Difficulties (Table 6, Figure 10)", "", (
-        Table("table_6", "Table 6: by difficulty, mean of the classes",
-              ("network", "", *(f"{level} [%]" for level in DIFFICULTIES), "mAP [%]"),
-              tuple(by_level)),
-        Table("figure_10", "Figure 10: by class and difficulty",
-              ("network", "class", *(f"3D {level} [%]" for level in DIFFICULTIES),
-               *(f"BEV, relaxed, {level} [%]" for level in DIFFICULTIES)), tuple(by_class))))
+            by_class.append(
+                (
+                    network,
+                    name,
+                    *make_cells(estimate(cells[:, STRICT_3D, i]), known if data == "KITTI" else ()),
+                    *make_cells(estimate(cells[:, RELAXED_BEV, i])),
+                )
+            )
+    return Section(
+        "Difficulties (Table 6, Figure 10)",
+        "",
+        (
+            Table(
+                "table_6",
+                "Table 6: by difficulty, mean of the classes",
+                ("network", "", *(f"{level} [%]" for level in DIFFICULTIES), "mAP [%]"),
+                tuple(by_level),
+            ),
+            Table(
+                "figure_10",
+                "Figure 10: by class and difficulty",
+                (
+                    "network",
+                    "class",
+                    *(f"3D {level} [%]" for level in DIFFICULTIES),
+                    *(f"BEV, relaxed, {level} [%]" for level in DIFFICULTIES),
+                ),
+                tuple(by_class),
+            ),
+        ),
+    )
 
 
 def _mean_of_classes(cells: np.ndarray) -> np.ndarray:
     """Return the means (R, L) over the classes that have a value, of cells (R, C, L)."""
     known = ~np.isnan(cells)
     sums = np.where(known, cells, 0).sum(axis=1)
-    return np.divide(sums, known.sum(axis=1), out=np.full(sums.shape, np.nan),
-                     where=known.any(axis=1))
+    return np.divide(sums, known.sum(axis=1), out=np.full(sums.shape, np.nan), where=known.any(axis=1))
 
 
-def _make_change_section(draws: Draws, changed: Mapping[str, Draws],
-                         records: Sequence[Mapping[str, Any]], data: str) -> Section:
+def _make_change_section(
+    draws: Draws, changed: Mapping[str, Draws], records: Sequence[Mapping[str, Any]], data: str
+) -> Section:
     rows: list[Row] = []
     for network in (name for name in COMPARED if name in draws):
         known = paper.TABLE_8[data].get(network, {})
         model, before = name_model(network, 0), draws[network]
         for change in ("all points", *CHANGES):
             own = before if change == "all points" else changed[change][network]
-            times = [r["detector_ms"][model] if change == "all points" else
-                     r["changed_ms"][change][model] for r in records]
+            times = [
+                r["detector_ms"][model] if change == "all points" else r["changed_ms"][change][model] for r in records
+            ]
             ms = float(np.mean(times)) if times else np.nan
-            kept = 100 * np.divide(own[:, :, MEAN], before[:, :, MEAN],
-                                   out=np.full(own.shape[:2], np.nan),
-                                   where=before[:, :, MEAN] > 0)
-            rows.append((network, change, *_make_map_cells(own, known.get(change)),
-                         *make_cells(estimate(kept[:, RELAXED_BEV:])),
-                         Cell(None if np.isnan(ms) else ms),
-                         "yes" if ms <= MAX_MS else "no"))
+            kept = 100 * np.divide(
+                own[:, :, MEAN], before[:, :, MEAN], out=np.full(own.shape[:2], np.nan), where=before[:, :, MEAN] > 0
+            )
+            rows.append(
+                (
+                    network,
+                    change,
+                    *_make_map_cells(own, known.get(change)),
+                    *make_cells(estimate(kept[:, RELAXED_BEV:])),
+                    Cell(None if np.isnan(ms) else ms),
+                    "yes" if ms <= MAX_MS else "no",
+                )
+            )
     return Section(
-        "Fewer points and noise (Table 8, Eq. 1)", "Points are left out at random; noise is "
+        "Fewer points and noise (Table 8, Eq. 1)",
+        "Points are left out at random; noise is "
         "Gaussian, along the beams. Retention is Eq. 1 in our reading: the mAP that is left, in "
-        f"percent, where the time for a cloud is within {MAX_MS:g} ms, the period of a frame.", (
-            Table("table_8", "Table 8: changed clouds",
-                  ("network", "change", *MAP, "retention of BEV [%]", "time of a cloud [ms]",
-                   "in time"), tuple(rows), "The paper reports 31 to 33 frames per second, on "
-                  "unknown hardware. Networks of the first seed."),))
+        f"percent, where the time for a cloud is within {MAX_MS:g} ms, the period of a frame.",
+        (
+            Table(
+                "table_8",
+                "Table 8: changed clouds",
+                ("network", "change", *MAP, "retention of BEV [%]", "time of a cloud [ms]", "in time"),
+                tuple(rows),
+                "The paper reports 31 to 33 frames per second, on unknown hardware. Networks of the first seed.",
+            ),
+        ),
+    )

@@ -40,8 +40,9 @@ DIGITS = (1, 3, 3, 3, 3, 3, 1)
 NAMES_OF_OURS = tuple(NAME_BY_CLASS.values())
 
 
-def measure_drive(frames: Sequence[Frame], number: int,
-                  models: Mapping[str, TrainedModel]) -> list[dict[str, Any]] | None:
+def measure_drive(
+    frames: Sequence[Frame], number: int, models: Mapping[str, TrainedModel]
+) -> list[dict[str, Any]] | None:
     """Detect and track the objects of the drive that frame `number` begins.
 
     Drives are the scenes of nuScenes. For other recordings, which have no such labels, the first
@@ -51,16 +52,14 @@ def measure_drive(frames: Sequence[Frame], number: int,
         For each key frame truth, and found: network -> boxes with velocities, as of to_columns();
         None for a frame that begins no drive.
     """
-    compared = {name: models[name_model(name, 0)].weights for name in COMPARED
-                if name_model(name, 0) in models}
+    compared = {name: models[name_model(name, 0)].weights for name in COMPARED if name_model(name, 0) in models}
     drive = list_drive(frames, number)
     if not drive or not compared:
         return None
     trackers, rows = {name: Tracker() for name in compared}, []
     for frame in drive:
         pose, truth, found = frame.native.pose, GlobalBoxes.none(), {}
-        for name, (boxes, _) in detect_with_all(frame.load(), compared,
-                                                frame.sensor_height).items():
+        for name, (boxes, _) in detect_with_all(frame.load(), compared, frame.sensor_height).items():
             tracks = trackers[name](boxes, frame.stamp_ns, pose)
             result = select_boxes(frame, add_velocities(to_results(boxes, frame), tracks, pose))
             if result.truth is None or result.counted is None:
@@ -86,29 +85,36 @@ def list_drive(frames: Sequence[Frame], number: int) -> Sequence[Frame]:
 def simulate_key_frames(seed: int) -> list[Frame]:
     """Return the frames of a simulated drive, with labels all around as of nuScenes."""
     scans = [*simulate_drive(seed, SCANS)]
-    return [Frame.of(f"drive {seed}/{i}", scan.frame, pose=scan.pose.copy,
-                     native=KeyFrame(f"{seed}/{i}", scan.pose, scan.pose[:3, 3],
-                                     partial(label_scan, scans, i)))
-            for i, scan in enumerate(scans)]
+    return [
+        Frame.of(
+            f"drive {seed}/{i}",
+            scan.frame,
+            pose=scan.pose.copy,
+            native=KeyFrame(f"{seed}/{i}", scan.pose, scan.pose[:3, 3], partial(label_scan, scans, i)),
+        )
+        for i, scan in enumerate(scans)
+    ]
 
 
 def label_scan(scans: Sequence[SimulatedScan], number: int) -> NuscenesLabels:
     """Return the labels of a scan of a drive, with velocities from the scans around it."""
     scan = scans[number]
     places = [_find_places(scans[k]) for k in (max(number - 1, 0), min(number + 1, len(scans) - 1))]
-    before, after = (scans[k].frame.stamp_ns for k in (max(number - 1, 0),
-                                                       min(number + 1, len(scans) - 1)))
+    before, after = (scans[k].frame.stamp_ns for k in (max(number - 1, 0), min(number + 1, len(scans) - 1)))
     ids = [extra["track_id"] for extra in scan.truth.extras]
     unknown = np.full(2, np.nan)
-    velocities = np.array([(places[1].get(i, unknown) - places[0].get(i, unknown))
-                           / max(1e-9 * (after - before), 1e-9) for i in ids]).reshape(-1, 2)
+    velocities = np.array(
+        [(places[1].get(i, unknown) - places[0].get(i, unknown)) / max(1e-9 * (after - before), 1e-9) for i in ids]
+    ).reshape(-1, 2)
     names = [NAME_BY_CLASS.get(CLASSES[i], "") for i in scan.truth.class_ids]
     points = [extra["num_points"] for extra in scan.truth.extras]
-    boxes = GlobalBoxes.of(*to_global_boxes(scan.truth.boxes, scan.pose),
-                           [NAMES.index(name) if name else -1 for name in names],
-                           velocities=velocities, points=points)
-    return NuscenesLabels(boxes, np.zeros(len(boxes), int), ("simulated",), np.array(points, int),
-                          np.array(ids, int))
+    boxes = GlobalBoxes.of(
+        *to_global_boxes(scan.truth.boxes, scan.pose),
+        [NAMES.index(name) if name else -1 for name in names],
+        velocities=velocities,
+        points=points,
+    )
+    return NuscenesLabels(boxes, np.zeros(len(boxes), int), ("simulated",), np.array(points, int), np.array(ids, int))
 
 
 def _find_places(scan: SimulatedScan) -> dict[int, np.ndarray]:
@@ -135,8 +141,7 @@ def add_velocities(boxes: GlobalBoxes, tracks: Tracks, pose: np.ndarray) -> Glob
 def to_columns(boxes: GlobalBoxes) -> dict[str, list]:
     """Return boxes as a dict that JSON can hold, with None for NaN."""
     columns = {f.name: np.round(getattr(boxes, f.name), 4) for f in fields(GlobalBoxes)}
-    return {name: np.where(np.isnan(values), np.array(None), values).tolist()
-            for name, values in columns.items()}
+    return {name: np.where(np.isnan(values), np.array(None), values).tolist() for name, values in columns.items()}
 
 
 def from_columns(columns: Mapping[str, list]) -> GlobalBoxes:
@@ -148,13 +153,15 @@ def from_columns(columns: Mapping[str, list]) -> GlobalBoxes:
 
 def compute_scores(truth: Sequence[GlobalBoxes], found: Sequence[GlobalBoxes]) -> np.ndarray:
     """Return SCORES (7,) of frames, over the classes that the networks know; NaN without labels."""
-    true_frames, found_frames = (np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-                                 for parts in (truth, found))
+    true_frames, found_frames = (
+        np.repeat(np.arange(len(parts)), [len(part) for part in parts]) for parts in (truth, found)
+    )
     all_true, all_found = (GlobalBoxes.concatenate([*parts]) for parts in (truth, found))
     if len(all_true) == 0:
         return np.full(len(SCORES), np.nan)
-    summary = summarize({name: score_class(name, all_true, true_frames, all_found, found_frames)
-                         for name in NAMES_OF_OURS})
+    summary = summarize(
+        {name: score_class(name, all_true, true_frames, all_found, found_frames) for name in NAMES_OF_OURS}
+    )
     return SCALE * [summary[name] for name in SCORES]
 
 
@@ -162,22 +169,23 @@ def make_drive_section(records: list[dict[str, Any]], data: str) -> Section:
     """Return Table 7 of the drives in the records."""
     key_frames = [row for record in records for row in record.get("drive") or ()]
     truth = [from_columns(row["truth"]) for row in key_frames]
-    samples = [np.arange(len(truth)),
-               *draw_samples([np.array([i]) for i in range(len(truth))], REPLICATES)]
+    samples = [np.arange(len(truth)), *draw_samples([np.array([i]) for i in range(len(truth))], REPLICATES)]
     rows: list[Row] = []
     for network in (name for name in COMPARED if all(name in r["found"] for r in key_frames)):
         found = [from_columns(row["found"][network]) for row in key_frames]
         unknown = [replace(b, velocities=np.full((len(b), 2), np.nan)) for b in found]
         for title, boxes in (("without velocities", unknown), ("velocities of the tracker", found)):
-            draws = np.stack([compute_scores([truth[i] for i in sample], [boxes[i] for i in sample])
-                              for sample in samples])
-            known = [paper.TABLE_7.get(score) for score in SCORES] if (
-                network == OURS and boxes is found) else ()
+            draws = np.stack(
+                [compute_scores([truth[i] for i in sample], [boxes[i] for i in sample]) for sample in samples]
+            )
+            known = [paper.TABLE_7.get(score) for score in SCORES] if (network == OURS and boxes is found) else ()
             rows.append((network, title, *make_cells(estimate(draws), known, DIGITS)))
     where = "nuScenes" if data == "nuScenes" else f"{SIMULATED_DRIVES} simulated drives"
-    return Section("Scores of nuScenes (Table 7)", f"{len(truth)} key frames of {where}. Means of "
-                   "car, pedestrian and bicycle (our Cyclist). Without velocities AVE is 1, and so "
-                   "is AAE, as there are no attributes: NDS is at most 90 with velocities, at most "
-                   "80 without. The paper does not name its classes and split.", (
-                       Table("table_7", "Table 7: scores of nuScenes",
-                             ("network", "", *TITLES), tuple(rows)),))
+    return Section(
+        "Scores of nuScenes (Table 7)",
+        f"{len(truth)} key frames of {where}. Means of "
+        "car, pedestrian and bicycle (our Cyclist). Without velocities AVE is 1, and so "
+        "is AAE, as there are no attributes: NDS is at most 90 with velocities, at most "
+        "80 without. The paper does not name its classes and split.",
+        (Table("table_7", "Table 7: scores of nuScenes", ("network", "", *TITLES), tuple(rows)),),
+    )

@@ -23,8 +23,11 @@ from lidar_perception.training.params import PointNetTraining
 from lidar_perception.types import InputError
 
 QUESTION = "Does a plain reading of the paper's methods give the paper's values?"
-SETTINGS = {"clustering": flatten(ClusteringParams()), "study": asdict(STUDY),
-            "range image": asdict(RangeImageParams())}
+SETTINGS = {
+    "clustering": flatten(ClusteringParams()),
+    "study": asdict(STUDY),
+    "range image": asdict(RangeImageParams()),
+}
 EPOCHS = 120  # on recorded frames; the text of the paper lacks its Table 1, with the settings
 
 
@@ -40,16 +43,20 @@ def make_segmentation_report(records: list[dict[str, Any]]) -> list[Section]:
     return make_segmentation_sections(records, records[0]["data"] if records else "KITTI")
 
 
-def measure_frame(frames: Sequence[Frame], number: int, *,
-                  models: Mapping[str, TrainedModel]) -> dict[str, Any]:
+def measure_frame(frames: Sequence[Frame], number: int, *, models: Mapping[str, TrainedModel]) -> dict[str, Any]:
     """Measure frame `number` and return its record.
 
     It has the content of measure_detection(); `drive`, see measure_drive(); and `segmentation`, see
     measure_segmentation(), or None for a frame whose objects have too few points.
     """
     frame = frames[number]
-    record = {"frame": frame.name, "data": _name_data(frame), **measure_detection(frame, models),
-              "drive": measure_drive(frames, number, models), "segmentation": None}
+    record = {
+        "frame": frame.name,
+        "data": _name_data(frame),
+        **measure_detection(frame, models),
+        "drive": measure_drive(frames, number, models),
+        "segmentation": None,
+    }
     try:
         record["segmentation"] = measure_segmentation(frame)
     except InputError:  # the objects that have points are detected all the same
@@ -57,14 +64,16 @@ def measure_frame(frames: Sequence[Frame], number: int, *,
     return record
 
 
-def make_sections(records: list[dict[str, Any]], *,
-                  models: Mapping[str, TrainedModel]) -> list[Section]:
+def make_sections(records: list[dict[str, Any]], *, models: Mapping[str, TrainedModel]) -> list[Section]:
     """Return the report of the records of measure_frame(); skipped frames are left out."""
     records = [record for record in records if "skipped" not in record]
     data = records[0]["data"] if records else "KITTI"
     segmented = [r["segmentation"] for r in records if r["segmentation"]]
-    return [*make_segmentation_sections(segmented, data),
-            *make_detection_sections(records, data, models), make_drive_section(records, data)]
+    return [
+        *make_segmentation_sections(segmented, data),
+        *make_detection_sections(records, data, models),
+        make_drive_section(records, data),
+    ]
 
 
 def _name_data(frame: Frame) -> str:
@@ -73,11 +82,25 @@ def _name_data(frame: Frame) -> str:
 
 
 SEGMENTATION = Experiment(
-    "clusters-segmentation", "Adaptive clustering: the tables of the paper without a network",
-    QUESTION, measure_segmented_frame, make_segmentation_report, SETTINGS)
+    "clusters-segmentation",
+    "Adaptive clustering: the tables of the paper without a network",
+    QUESTION,
+    measure_segmented_frame,
+    make_segmentation_report,
+    SETTINGS,
+)
 CLUSTERS = Experiment(
-    "clusters", "Adaptive clustering and improved PointNet: the tables of the paper",
-    QUESTION, measure_frame, make_sections,
-    {**SETTINGS, "changes": {name: list(change) for name, change in CHANGES.items()},
-     "drives": [SIMULATED_DRIVES, SCANS]},
-    training=PointNetTraining(), protocol={"epochs": EPOCHS}, models=choose_networks)
+    "clusters",
+    "Adaptive clustering and improved PointNet: the tables of the paper",
+    QUESTION,
+    measure_frame,
+    make_sections,
+    {
+        **SETTINGS,
+        "changes": {name: list(change) for name, change in CHANGES.items()},
+        "drives": [SIMULATED_DRIVES, SCANS],
+    },
+    training=PointNetTraining(),
+    protocol={"epochs": EPOCHS},
+    models=choose_networks,
+)

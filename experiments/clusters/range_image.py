@@ -34,8 +34,7 @@ class RangeImageParams:
     min_size: int = 10
 
 
-def cluster_range_image(xyz: np.ndarray, params: RangeImageParams = RangeImageParams()
-                        ) -> np.ndarray:
+def cluster_range_image(xyz: np.ndarray, params: RangeImageParams = RangeImageParams()) -> np.ndarray:
     """Cluster points (N, 3) float32, metres from the sensor, without ground, as (N,) int32 ids.
 
     0 is no cluster, 1..K are clusters. The points of a pixel are in the cluster of the nearest one.
@@ -54,8 +53,10 @@ def cluster_range_image(xyz: np.ndarray, params: RangeImageParams = RangeImagePa
     nearest = order[first]
     image = np.full((row.max() + 1, columns), -1)
     image.ravel()[filled] = np.arange(len(filled))
-    pairs = [_link(image, xyz[nearest].astype(np.float64), ranges[nearest], down, right,
-                   np.radians(params.min_angle)) for down, right in STEPS]
+    pairs = [
+        _link(image, xyz[nearest].astype(np.float64), ranges[nearest], down, right, np.radians(params.min_angle))
+        for down, right in STEPS
+    ]
     a, b = np.concatenate(pairs, axis=1)
     graph = coo_matrix((np.ones(len(a), bool), (a, b)), (len(filled), len(filled)))
     component = connected_components(graph, directed=False)[1]
@@ -65,10 +66,11 @@ def cluster_range_image(xyz: np.ndarray, params: RangeImageParams = RangeImagePa
     return np.where(kept, np.cumsum(kept), 0)[label].astype(np.int32)
 
 
-def _link(image: np.ndarray, xyz: np.ndarray, ranges: np.ndarray, down: int, right: int,
-          min_angle: float) -> np.ndarray:
+def _link(
+    image: np.ndarray, xyz: np.ndarray, ranges: np.ndarray, down: int, right: int, min_angle: float
+) -> np.ndarray:
     """Return pairs (2, E) of linked pixels, `down` rows and `right` columns apart."""
-    a, b = image[:len(image) - down], np.roll(image, -right, axis=1)[down:]
+    a, b = image[: len(image) - down], np.roll(image, -right, axis=1)[down:]
     both = (a >= 0) & (b >= 0)
     a, b = a[both], b[both]
     far, near = np.maximum(ranges[a], ranges[b]), np.minimum(ranges[a], ranges[b])

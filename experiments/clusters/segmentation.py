@@ -18,11 +18,7 @@ from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.points.clusters import find_unlabelled
-from lidar_perception.scoring.points.segmentation import (
-    Objects,
-    find_objects_in_boxes,
-    score_clusters,
-)
+from lidar_perception.scoring.points.segmentation import Objects, find_objects_in_boxes, score_clusters
 from lidar_perception.types import InputError, PointCloud
 
 PAPER = EuclideanParams()  # alpha 1.2, beta 0.5, gamma 0.8, the threshold of Eq. 11
@@ -64,7 +60,8 @@ METHODS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 SWEEPS: dict[str, dict[str, Callable[[np.ndarray], np.ndarray]]] = {
     name: {f"{value:g}": _euclidean(**{name: value}) for value in getattr(STUDY, name)}
-    for name in ("alpha", "beta", "gamma")}
+    for name in ("alpha", "beta", "gamma")
+}
 # Of a frame and method, see count_points.
 COUNTS = ("points", "right", "both", "found", "true", "objects", "hits", "judged", "iou")
 
@@ -108,8 +105,14 @@ def measure_segmentation(frame: Frame) -> dict[str, Any]:
 
 def select_counted(objects: Objects, seen: np.ndarray) -> Objects:
     """Return the objects with only the points of a mask (N,) to be compared."""
-    return Objects(np.where(seen, objects.owner, 0), np.where(seen, objects.region, 0),
-                   objects.near & seen, objects.counted & seen, objects.classes, objects.ranges)
+    return Objects(
+        np.where(seen, objects.owner, 0),
+        np.where(seen, objects.region, 0),
+        objects.near & seen,
+        objects.counted & seen,
+        objects.classes,
+        objects.ranges,
+    )
 
 
 def count_points(cluster_ids: np.ndarray, ground: np.ndarray, objects: Objects) -> list[float]:
@@ -135,9 +138,17 @@ def count_points(cluster_ids: np.ndarray, ground: np.ndarray, objects: Objects) 
     score = score_clusters(cluster_ids, objects)
     present = np.bincount(owner, minlength=len(objects.classes) + 1)[1:] > 0
     right = found == owner
-    return [len(ids), int(right.sum()), int((right & (owner > 0)).sum()), int((found > 0).sum()),
-            int((owner > 0).sum()), int(present.sum()), int((score.iou[present] > 0.5).sum()),
-            score.judged, round(float(score.iou[present].sum()), 6)]
+    return [
+        len(ids),
+        int(right.sum()),
+        int((right & (owner > 0)).sum()),
+        int((found > 0).sum()),
+        int((owner > 0).sum()),
+        int(present.sum()),
+        int((score.iou[present] > 0.5).sum()),
+        score.judged,
+        round(float(score.iou[present].sum()), 6),
+    ]
 
 
 def pair_clusters(ids: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
@@ -164,8 +175,9 @@ def _segment(height: float, scan: PointCloud) -> np.ndarray:
     return segment_ground(scan, params)
 
 
-def _measure(key: str, function: Callable[[np.ndarray], np.ndarray], scan: PointCloud,
-             ground: np.ndarray, objects: Objects) -> tuple[list[float], float]:
+def _measure(
+    key: str, function: Callable[[np.ndarray], np.ndarray], scan: PointCloud, ground: np.ndarray, objects: Objects
+) -> tuple[list[float], float]:
     rest = scan.xyz.compress(~ground, axis=0)
     found, ms = _time(key, function, rest)
     ids = np.zeros(len(scan), np.int32)
@@ -176,8 +188,7 @@ def _measure(key: str, function: Callable[[np.ndarray], np.ndarray], scan: Point
 _warm: set[str] = set()  # keys of functions whose compiled code this process has loaded
 
 
-def _time(key: str, function: Callable[[Any], np.ndarray],
-          argument: Any) -> tuple[np.ndarray, float]:
+def _time(key: str, function: Callable[[Any], np.ndarray], argument: Any) -> tuple[np.ndarray, float]:
     """Return the result of a function and its duration in milliseconds."""
     if key not in _warm:
         function(argument)

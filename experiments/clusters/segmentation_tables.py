@@ -20,7 +20,7 @@ from experiments.framework.statistics import (
 )
 
 SCORES = ("accuracy [%]", "precision [%]", "recall [%]", "F1 [%]", "IoU [%]")
-IOU = 4       # of SCORES
+IOU = 4  # of SCORES
 MEAN_IOU = 3  # of compute_object_scores()
 REFERENCE = next(iter(METHODS))
 # Our methods and the paper's name of the same kind of method.
@@ -29,7 +29,8 @@ DEFINITIONS = (
     "The paper does not say how points are counted. Here every labelled object is paired with at "
     "most one cluster, by the largest IoU of their points. A point is right in the cluster of its "
     "own object, or outside all paired clusters if it is of no object. Ground outside objects does "
-    "not count. All methods cluster the points that the cloth does not call ground.")
+    "not count. All methods cluster the points that the cloth does not call ground."
+)
 
 
 def make_segmentation_sections(records: list[dict[str, Any]], data: str) -> list[Section]:
@@ -45,9 +46,16 @@ def make_segmentation_sections(records: list[dict[str, Any]], data: str) -> list
 def compute_scores(sums: np.ndarray) -> np.ndarray:
     """Return SCORES (..., 5) of sums of COUNTS (..., 9)."""
     points, right, both, found, true, *_ = np.moveaxis(sums, -1, 0)
-    return 100 * np.stack([
-        divide(right, points), divide(both, found), divide(both, true),
-        divide(2 * both, found + true), divide(both, found + true - both)], axis=-1)
+    return 100 * np.stack(
+        [
+            divide(right, points),
+            divide(both, found),
+            divide(both, true),
+            divide(2 * both, found + true),
+            divide(both, found + true - both),
+        ],
+        axis=-1,
+    )
 
 
 def compute_object_scores(sums: np.ndarray) -> np.ndarray:
@@ -59,8 +67,7 @@ def compute_object_scores(sums: np.ndarray) -> np.ndarray:
 
 
 def _make_methods_section(records: list[dict], data: str) -> Section:
-    counts = {name: stack_counts([r["methods"][name] for r in records], len(COUNTS))
-              for name in METHODS}
+    counts = {name: stack_counts([r["methods"][name] for r in records], len(COUNTS)) for name in METHODS}
     published = paper.SEGMENTATION[data]
     rows: list[Row] = []
     hits: list[Row] = []
@@ -68,31 +75,70 @@ def _make_methods_section(records: list[dict], data: str) -> Section:
         values = published.get(PUBLISHED.get(name, ""), (None,) * 6)
         both = np.stack([own, counts[REFERENCE]], axis=1)
         p = compute_paired_p(both, compute_object_scores)[MEAN_IOU]
-        times = _bootstrap_times([[r["ms"][name], r["ms"]["ground"] + r["ms"][name]]
-                                  for r in records], 2)
-        against: Row = ("", "") if name == REFERENCE else (
-            *make_cells(bootstrap(both, _compute_gain)[:, None]),
-            "–" if np.isnan(p) else f"{p:.3f}")
-        rows.append((name, *make_cells(bootstrap(own, compute_scores), values[:5]),
-                     *make_cells(times, (None, values[5]))))
-        hits.append((name, *make_cells(bootstrap(own, compute_object_scores)), *against,
-                     *(str(int(n)) for n in own.sum(axis=0)[5:8])))
-    rows += [(f"{name} (not implemented)", *(Cell(None, paper=value) for value in values[:5]), "",
-              Cell(None, paper=values[5]))
-             for name, values in published.items() if name not in PUBLISHED.values()]
-    note = ("Times are means on this machine, those of the paper on unknown hardware: in the first "
-            "column clustering alone, in the second ground and clustering. Range image: our "
-            "stand-in for FCC.")
+        times = _bootstrap_times([[r["ms"][name], r["ms"]["ground"] + r["ms"][name]] for r in records], 2)
+        against: Row = (
+            ("", "")
+            if name == REFERENCE
+            else (*make_cells(bootstrap(both, _compute_gain)[:, None]), "–" if np.isnan(p) else f"{p:.3f}")
+        )
+        rows.append(
+            (name, *make_cells(bootstrap(own, compute_scores), values[:5]), *make_cells(times, (None, values[5])))
+        )
+        hits.append(
+            (
+                name,
+                *make_cells(bootstrap(own, compute_object_scores)),
+                *against,
+                *(str(int(n)) for n in own.sum(axis=0)[5:8]),
+            )
+        )
+    rows += [
+        (
+            f"{name} (not implemented)",
+            *(Cell(None, paper=value) for value in values[:5]),
+            "",
+            Cell(None, paper=values[5]),
+        )
+        for name, values in published.items()
+        if name not in PUBLISHED.values()
+    ]
+    note = (
+        "Times are means on this machine, those of the paper on unknown hardware: in the first "
+        "column clustering alone, in the second ground and clustering. Range image: our "
+        "stand-in for FCC."
+    )
     return Section(
         "Segmentation before any network (Table 3, Figures 6 and 8)",
         f"{len(records)} frames. {DEFINITIONS} Figure 6 and 7 plot accuracy and loss over "
         "iterations, which clustering does not have; the values of the last iteration are shown.",
-        (Table("table_3", "Table 3 and Figures 6 and 8: by points",
-               ("method", *SCORES, "clusters [ms]", "ground and clusters [ms]"), tuple(rows), note),
-         Table("table_3_objects", "By objects: a hit is an IoU of points above one half",
-               ("method", "recall [%]", "precision [%]", "F1 [%]", "mean IoU [%]",
-                f"above '{REFERENCE}' [points]", "p", "objects", "hits", "clusters near objects"),
-               tuple(hits), "p: paired permutation test of the mean IoU, over frames.")))
+        (
+            Table(
+                "table_3",
+                "Table 3 and Figures 6 and 8: by points",
+                ("method", *SCORES, "clusters [ms]", "ground and clusters [ms]"),
+                tuple(rows),
+                note,
+            ),
+            Table(
+                "table_3_objects",
+                "By objects: a hit is an IoU of points above one half",
+                (
+                    "method",
+                    "recall [%]",
+                    "precision [%]",
+                    "F1 [%]",
+                    "mean IoU [%]",
+                    f"above '{REFERENCE}' [points]",
+                    "p",
+                    "objects",
+                    "hits",
+                    "clusters near objects",
+                ),
+                tuple(hits),
+                "p: paired permutation test of the mean IoU, over frames.",
+            ),
+        ),
+    )
 
 
 def _make_sweeps_section(records: list[dict], data: str) -> Section:
@@ -108,18 +154,28 @@ def _make_sweeps_section(records: list[dict], data: str) -> Section:
             estimates.append(bootstrap(own, compute_scores)[:, IOU])
             known = (best[4], best[5]) if value == paper.BEST[name] else (None, None)
             times = _bootstrap_times([[r["ms"]["ground"] + r["ms"][key]] for r in records], 1)
-            rows.append((f"{name} = {value:g}", *make_cells(estimates[-1][:, None], known[:1]),
-                         *make_cells(times, known[1:])))
-        lines = (make_line("measured", values, np.stack(estimates, axis=1)),
-                 Line("measured, best of the paper", (paper.BEST[name],) * 2, (0.0, 100.0),
-                      dashed=True))
+            rows.append(
+                (f"{name} = {value:g}", *make_cells(estimates[-1][:, None], known[:1]), *make_cells(times, known[1:]))
+            )
+        lines = (
+            make_line("measured", values, np.stack(estimates, axis=1)),
+            Line("measured, best of the paper", (paper.BEST[name],) * 2, (0.0, 100.0), dashed=True),
+        )
         panels.append(Panel(name, name, "IoU [%]", lines))
     return Section(
-        "Sensitivity (Table 2)", "One value is changed at a time; the others are those of the "
+        "Sensitivity (Table 2)",
+        "One value is changed at a time; the others are those of the "
         "paper (1.2, 0.5, 0.8). The text of the paper gives the figures of the best values only.",
-        (Table("table_2", "Table 2: alpha, beta and gamma",
-               ("value", "IoU [%]", "ground and clusters [ms]"), tuple(rows)),),
-        (Figure("table_2", "Table 2: IoU over alpha, beta and gamma", tuple(panels)),))
+        (
+            Table(
+                "table_2",
+                "Table 2: alpha, beta and gamma",
+                ("value", "IoU [%]", "ground and clusters [ms]"),
+                tuple(rows),
+            ),
+        ),
+        (Figure("table_2", "Table 2: IoU over alpha, beta and gamma", tuple(panels)),),
+    )
 
 
 def _compute_gain(sums: np.ndarray) -> np.ndarray:

@@ -37,16 +37,25 @@ def _list_runs() -> list[Runs]:
 
 @click.command(cls=Command)
 @scoring_options()
-@a_path("--weights", "One more detector: weights of PointPillars or PointNet, or a class of your "
-        "own, module:Class; may be repeated.",
-        multiple=True)
+@a_path(
+    "--weights",
+    "One more detector: weights of PointPillars or PointNet, or a class of your own, module:Class; may be repeated.",
+    multiple=True,
+)
 @out_file("--png", "Draw F1 and mean AP against time.")
 @intervals_option
 @range_option
 @device_option
 @settings_options(lambda given: _list_runs(), candidates=True)
-def compare(options: ScoringOptions, weights: tuple[Path, ...], png: Path | None, range: str,
-            device: str, settings: Settings, intervals: int) -> None:
+def compare(
+    options: ScoringOptions,
+    weights: tuple[Path, ...],
+    png: Path | None,
+    range: str,
+    device: str,
+    settings: Settings,
+    intervals: int,
+) -> None:
     """Run all detectors on the same frames, in turns, and print scores and times side by side.
 
     The detectors are STM-CPA (`paper` and `best`), PointPillars V0 to V4 in both sizes, PointNet
@@ -73,18 +82,26 @@ def compare(options: ScoringOptions, weights: tuple[Path, ...], png: Path | None
     with errors.status("loading detectors"):
         height = recording.frames[0].sensor_height
         contenders, missing = open_contenders(weights, device, height, range, values)
-    open_ = (lambda: contenders) if options.in_this_process else partial(
-        open_contenders_alone, weights, device, height, range, values)
+    open_ = (
+        (lambda: contenders)
+        if options.in_this_process
+        else partial(open_contenders_alone, weights, device, height, range, values)
+    )
     report = ComparisonReport(contenders, intervals, recording.is_sequential)
     options.fill(report, recording, partial(start_comparison, open_), title="comparing")
     if not report.first.frames:
         raise no_labels_error(recording, report.skipped)
     centres = report.first.pedestrians.compute()
     content = {
-        "source": str(options.data), "machine": read_cpu_name(), "device": device,
-        "python": platform.python_version(), **report.compute(),
+        "source": str(options.data),
+        "machine": read_cpu_name(),
+        "device": device,
+        "python": platform.python_version(),
+        **report.compute(),
         "pedestrians": {key: centres[key] for key in ("frames", "ground_truth")},
-        "missing": [vars(detector) for detector in missing], "paper_f1": CENTRE_F1}
+        "missing": [vars(detector) for detector in missing],
+        "paper_f1": CENTRE_F1,
+    }
     print_comparison(content, console)
     options.write(content)
     if png is not None:

@@ -11,11 +11,7 @@ from typing import Any
 from experiments.comparison.outcomes import Contender
 from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.seed_sources import (
-    SeedSource,
-    make_automatic_source,
-    make_truth_source,
-)
+from lidar_perception.candidates.seed_sources import SeedSource, make_automatic_source, make_truth_source
 from lidar_perception.candidates.seeds import load_seeds
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame
@@ -24,13 +20,7 @@ from lidar_perception.detectors.candidates import CandidateDetector
 from lidar_perception.detectors.checkpoint import NETWORKS, POINTNET
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.custom import CustomDetector
-from lidar_perception.detectors.open import (
-    FUSED,
-    LOAD,
-    ConfigurableDetector,
-    open_detector,
-    resolve_weights,
-)
+from lidar_perception.detectors.open import FUSED, LOAD, ConfigurableDetector, open_detector, resolve_weights
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file as pointnet_file
@@ -73,13 +63,16 @@ class OpenedDetector:
 def make_contender(name: str, detector: Detector, source: str) -> Contender:
     """Return a contender that runs one detector on all frames, and keeps boxes of low score."""
     with_all_boxes = detector.with_min_score(MIN_SCORE)
-    return Contender(name, lambda frame: with_all_boxes, detector.classes,
-                     detector.min_scores.get(PERSON, 1.0), source)
+    return Contender(name, lambda frame: with_all_boxes, detector.classes, detector.min_scores.get(PERSON, 1.0), source)
 
 
-def open_contenders(weights: Sequence[Path] = (), device: str = "auto",
-                    sensor_height: float = SENSOR_HEIGHT, range: str = "auto",
-                    settings: Settings = NO_SETTINGS) -> tuple[list[Contender], list[Missing]]:
+def open_contenders(
+    weights: Sequence[Path] = (),
+    device: str = "auto",
+    sensor_height: float = SENSOR_HEIGHT,
+    range: str = "auto",
+    settings: Settings = NO_SETTINGS,
+) -> tuple[list[Contender], list[Missing]]:
     """Open every detector of the package that has weights.
 
     Args:
@@ -98,9 +91,14 @@ def open_contenders(weights: Sequence[Path] = (), device: str = "auto",
 
     def open_one(path: str | Path) -> ConfigurableDetector:
         kind = resolve_weights(path)[0]
-        return open_detector(path, device, sensor_height=sensor_height,
-                             range="auto" if kind == POINTNET or kind not in LOAD else range,
-                             settings=settings.get(kind, {}))
+        return open_detector(
+            path,
+            device,
+            sensor_height=sensor_height,
+            range="auto" if kind == POINTNET or kind not in LOAD else range,
+            settings=settings.get(kind, {}),
+        )
+
     files, absent = _find_package_files()
     opened: list[OpenedDetector] = []
     for path in [*files, *weights]:
@@ -110,14 +108,16 @@ def open_contenders(weights: Sequence[Path] = (), device: str = "auto",
         name = _make_name(detector, [FUSED, *(other.name for other in opened)])
         opened.append(OpenedDetector(name, detector, path))
     found = [detector.to_contender() for detector in opened]
-    missing = [Missing(name, reason) for name, reason in absent.items()
-               if name not in [detector.name for detector in opened]]
+    missing = [
+        Missing(name, reason) for name, reason in absent.items() if name not in [detector.name for detector in opened]
+    ]
     try:
         found.append(make_contender(FUSED, open_one(FUSED), "those of PointPillars and PointNet"))
     except InputError as error:
         missing.append(Missing(FUSED, str(error)))
-    paper, best = (with_values(set_sensor_height(params, sensor_height),
-                               settings.get(CANDIDATES, {})) for params in (PAPER, BEST))
+    paper, best = (
+        with_values(set_sensor_height(params, sensor_height), settings.get(CANDIDATES, {})) for params in (PAPER, BEST)
+    )
     return [*_make_candidate_contenders(paper, best), *found], missing
 
 
@@ -129,9 +129,10 @@ def open_contenders_alone(*arguments: Any) -> list[Contender]:
 def _find_package_files() -> tuple[list[Path], dict[str, str]]:
     """Return the weights in the package, and the names of missing ones with the reason."""
     finders: dict[str, Callable[[], Path]] = {
-        f"PointPillars {version} {size}": partial(
-            pointpillars_file, PointPillarsParams(version=version, size=size))
-        for size in SIZES for version in VERSIONS}
+        f"PointPillars {version} {size}": partial(pointpillars_file, PointPillarsParams(version=version, size=size))
+        for size in SIZES
+        for version in VERSIONS
+    }
     finders["PointNet"] = partial(pointnet_file, PointNetParams())
     files, absent = [], {}
     for name, find in finders.items():
@@ -159,13 +160,14 @@ def _make_name(detector: NetworkDetector | CustomDetector, used: Sequence[str]) 
 def _make_candidate_contenders(paper: PipelineParams, best: PipelineParams) -> list[Contender]:
     """Return STM-CPA with the paper's seed, and `best` with the automatic seed."""
     automatic = make_automatic_source(load_seeds(), best)
-    return [_make_seeded("STM-CPA paper", paper, _find_labelled_seed),
-            _make_seeded("STM-CPA best", best, _find_labelled_seed),
-            _make_seeded("STM-CPA best, auto", best, lambda frame: automatic)]
+    return [
+        _make_seeded("STM-CPA paper", paper, _find_labelled_seed),
+        _make_seeded("STM-CPA best", best, _find_labelled_seed),
+        _make_seeded("STM-CPA best, auto", best, lambda frame: automatic),
+    ]
 
 
-def _make_seeded(name: str, params: PipelineParams,
-                 find_seed: Callable[[Frame], SeedSource | None]) -> Contender:
+def _make_seeded(name: str, params: PipelineParams, find_seed: Callable[[Frame], SeedSource | None]) -> Contender:
     """Return a contender that needs a seed in each frame.
 
     Without a camera it runs on the whole scan, as the other detectors do.
@@ -174,8 +176,12 @@ def _make_seeded(name: str, params: PipelineParams,
 
     def make_detector(frame: Frame) -> Detector | None:
         seed, camera = find_seed(frame), frame.camera()
-        return None if seed is None else CandidateDetector(
-            seed, camera, uncropped if camera is None else params).with_min_score(MIN_SCORE)
+        return (
+            None
+            if seed is None
+            else CandidateDetector(seed, camera, uncropped if camera is None else params).with_min_score(MIN_SCORE)
+        )
+
     operating = CandidateDetector(_refuse, None, params).min_scores[PERSON]
     return Contender(name, make_detector, (PERSON,), operating)
 
@@ -188,4 +194,3 @@ def _find_labelled_seed(frame: Frame) -> SeedSource | None:
     """Return the paper's seed, the nearest label; None in frames without a pedestrian."""
     truth = load_pedestrians(frame)
     return make_truth_source(truth) if len(truth) else None
-

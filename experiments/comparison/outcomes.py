@@ -39,8 +39,9 @@ class Contender:
     source: str = ""
 
 
-def start_comparison(open_: Callable[[], list[Contender]], recording: Recording
-                     ) -> Callable[[Frame], dict[str, FrameDetections[Detections]] | None]:
+def start_comparison(
+    open_: Callable[[], list[Contender]], recording: Recording
+) -> Callable[[Frame], dict[str, FrameDetections[Detections]] | None]:
     """Return a function that runs every contender on a labelled frame, in turns.
 
     It returns the results by name, or None for a frame without labels. The first frame is run
@@ -60,6 +61,7 @@ def start_comparison(open_: Callable[[], list[Contender]], recording: Recording
         order = rotate(contenders, state["turn"])
         state["turn"] += 1
         return {contender.name: _detect(contender, frame) for contender in order}
+
     return measure
 
 
@@ -73,8 +75,7 @@ def _detect(contender: Contender, frame: Frame) -> FrameDetections[Detections]:
     sound = np.isfinite(np.column_stack([boxes, scores])).all(axis=1)
     if sound.all():
         return result
-    return replace(result, detections=result.detections[sound],
-                   problem=f"{(~sound).sum()} boxes are not finite")
+    return replace(result, detections=result.detections[sound], problem=f"{(~sound).sum()} boxes are not finite")
 
 
 def rotate(items: list, turn: int) -> list:
@@ -100,8 +101,7 @@ class ComparisonReport:
     skipped: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.reports = {contender.name: DetectionReport(follow=self.follow)
-                        for contender in self.contenders}
+        self.reports = {contender.name: DetectionReport(follow=self.follow) for contender in self.contenders}
 
     @property
     def first(self) -> DetectionReport:
@@ -115,10 +115,16 @@ class ComparisonReport:
 
     def compute(self) -> dict:
         """Return the scores of the contenders, by name, and the number of labels, for JSON."""
-        rows = {contender.name: summarize(contender, self.reports[contender.name], self.resamples)
-                for contender in self.contenders}
-        return {"frames": len(self.first.frames), "objects": count_labels(self.first), "rows": rows,
-                "skipped": self.skipped}
+        rows = {
+            contender.name: summarize(contender, self.reports[contender.name], self.resamples)
+            for contender in self.contenders
+        }
+        return {
+            "frames": len(self.first.frames),
+            "objects": count_labels(self.first),
+            "rows": rows,
+            "skipped": self.skipped,
+        }
 
 
 def summarize(contender: Contender, report: DetectionReport, resamples: int = 0) -> dict:
@@ -128,36 +134,53 @@ def summarize(contender: Contender, report: DetectionReport, resamples: int = 0)
     intervals are bootstrap intervals of `resamples` resamples of the drives; left out for 0.
     """
     ap, centres = report.compute()["ap"], report.pedestrians
-    precision = {name: {row: {level: _get_r40(ap[name][row][level]) for level in DIFFICULTIES}
-                        for row in AP_ROWS} if name in contender.classes else None
-                 for name in ap}
+    precision = {
+        name: {row: {level: _get_r40(ap[name][row][level]) for level in DIFFICULTIES} for row in AP_ROWS}
+        if name in contender.classes
+        else None
+        for name in ap
+    }
     scores = {"operating": contender.operating, "best": centres.find_best_score()}
-    intervals = {"intervals": {
-        "ap": {name: rows if name in contender.classes else None
-               for name, rows in report.compute_intervals(resamples).items()},
-        "f1": centres.compute_f1_interval(contender.operating, resamples, report.follow)}
-        } if resamples else {}
+    intervals = (
+        {
+            "intervals": {
+                "ap": {
+                    name: rows if name in contender.classes else None
+                    for name, rows in report.compute_intervals(resamples).items()
+                },
+                "f1": centres.compute_f1_interval(contender.operating, resamples, report.follow),
+            }
+        }
+        if resamples
+        else {}
+    )
     return {
-        "weights": contender.source, "classes": list(contender.classes),
-        "ap": precision, "mean_ap": {row: compute_mean_moderate(precision, row) for row in AP_ROWS},
+        "weights": contender.source,
+        "classes": list(contender.classes),
+        "ap": precision,
+        "mean_ap": {row: compute_mean_moderate(precision, row) for row in AP_ROWS},
         "pedestrian_centres": {
             key: {"score": score, **centres.make_rows(np.inf if score is None else score)["all"]}
-            for key, score in scores.items()},
+            for key, score in scores.items()
+        },
         "ms": float(np.median(report.ms)) if report.ms else None,
         "ms_of_frames": [round(ms, 3) for ms in report.ms],
-        "frames": len(report.ms), "failed": report.skipped, **intervals}
+        "frames": len(report.ms),
+        "failed": report.skipped,
+        **intervals,
+    }
 
 
 def count_labels(report: DetectionReport) -> dict[str, dict[str, int]]:
     """Count the labels by class and difficulty; the same for all contenders."""
-    return {name: {level: row["objects"] if (row := rows["3d"][level]) else 0
-                   for level in DIFFICULTIES}
-            for name, rows in report.compute()["ap"].items()}
+    return {
+        name: {level: row["objects"] if (row := rows["3d"][level]) else 0 for level in DIFFICULTIES}
+        for name, rows in report.compute()["ap"].items()
+    }
 
 
 def compute_mean_moderate(precision: dict[str, dict | None], row: str) -> float | None:
-    """Return the mean over the classes; None if the detector lacks a class or there are no labels.
-    """
+    """Return the mean over the classes; None if the detector lacks a class or there are no labels."""
     known = [rows[row]["moderate"] for rows in precision.values() if rows is not None]
     values = [value for value in known if value is not None]
     return float(np.mean(values)) if values and len(known) == len(precision) else None

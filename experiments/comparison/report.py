@@ -31,8 +31,11 @@ if TYPE_CHECKING:
 
 SHORT = {"bev": "BEV", "3d": "3D", "bev_relaxed": "BEV", "3d_relaxed": "3D"}
 FAMILIES = {  # start of a name -> colour (Okabe and Ito, 2008) and marker; the first match counts
-    "STM-CPA +": ("#cc79a7", "D"), "PP ": ("#cc79a7", "D"), "STM-CPA": ("#009e73", "s"),
-    "PointPillars": ("#0072b2", "o"), "PointNet": ("#d55e00", "^"),
+    "STM-CPA +": ("#cc79a7", "D"),
+    "PP ": ("#cc79a7", "D"),
+    "STM-CPA": ("#009e73", "s"),
+    "PointPillars": ("#0072b2", "o"),
+    "PointNet": ("#d55e00", "^"),
     "fused": ("#000000", "*"),
 }
 
@@ -44,8 +47,7 @@ def print_comparison(content: dict, console: Console) -> None:
     _print_intervals(content, console)
     for reason in dict.fromkeys(row["reason"] for row in content["missing"]):
         names = [row["name"] for row in content["missing"] if row["reason"] == reason]
-        console.print(Text("missing", "yellow") + f": {', '.join(names)}: {reason}",
-                      soft_wrap=False)
+        console.print(Text("missing", "yellow") + f": {', '.join(names)}: {reason}", soft_wrap=False)
     failed = [f"{name}: {line}" for name, row in content["rows"].items() for line in row["failed"]]
     print_skipped([*content["skipped"], *failed], console)
 
@@ -54,27 +56,52 @@ def _print_precision(content: dict, console: Console) -> None:
     titles = [title for name in SCORED for title in (name[:3], "", "", "")]
     table = make_table(f"AP (R40, moderate), {content['frames']} frames", "", *titles, width=5)
     table.add_row("", *(SHORT[row] for _ in SCORED for row in AP_ROWS), style="dim")
-    table.add_row("overlap above", *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}"
-                                     for name in SCORED for row in AP_ROWS), style="dim",
-                  end_section=True)
+    table.add_row(
+        "overlap above",
+        *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}" for name in SCORED for row in AP_ROWS),
+        style="dim",
+        end_section=True,
+    )
     for name, row in content["rows"].items():
-        table.add_row(name, *(format_number(None if row["ap"][kind] is None else
-                                            row["ap"][kind][overlap]["moderate"])
-                              for kind in SCORED for overlap in AP_ROWS))
+        table.add_row(
+            name,
+            *(
+                format_number(None if row["ap"][kind] is None else row["ap"][kind][overlap]["moderate"])
+                for kind in SCORED
+                for overlap in AP_ROWS
+            ),
+        )
     labels = {name: content["objects"][name]["moderate"] for name in SCORED}
-    table.caption = "Labels: " + ", ".join(
-        f"{name} {n}{'*' * (0 < n < MIN_OBJECTS)}" for name, n in labels.items()) + (
-        ". * too few for KITTI's 40 recall points, so AP is the area under the whole curve. A "
-        "dash: not a class of the detector, or no label.")
+    table.caption = (
+        "Labels: "
+        + ", ".join(f"{name} {n}{'*' * (0 < n < MIN_OBJECTS)}" for name, n in labels.items())
+        + (
+            ". * too few for KITTI's 40 recall points, so AP is the area under the whole curve. A "
+            "dash: not a class of the detector, or no label."
+        )
+    )
     console.print(table)
 
 
 def _print_pedestrians(content: dict, console: Console) -> None:
     centres = content["pedestrians"]
-    table = make_table(f"Pedestrians within 1.0 m ({centres['ground_truth']} in "
-                       f"{centres['frames']} frames), and time per frame", "",
-                       "score", "TP", "FP", "FN", "prec.", "recall", "F1", "best", "from", "ms",
-                       "runs", "failed", width=4)
+    table = make_table(
+        f"Pedestrians within 1.0 m ({centres['ground_truth']} in {centres['frames']} frames), and time per frame",
+        "",
+        "score",
+        "TP",
+        "FP",
+        "FN",
+        "prec.",
+        "recall",
+        "F1",
+        "best",
+        "from",
+        "ms",
+        "runs",
+        "failed",
+        width=4,
+    )
     for name, row in content["rows"].items():
         used, best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
         table.add_row(
@@ -95,7 +122,8 @@ def _print_pedestrians(content: dict, console: Console) -> None:
         "score: the default threshold. best: the highest F1 at any threshold, which is `from`, on "
         "these labels. ms: median of its frames. STM-CPA takes its seed from the labels, and so "
         "knows which frames have a pedestrian; `auto` finds the seed itself. The paper's values "
-        "are of its 1779 frames.")
+        "are of its 1779 frames."
+    )
     console.print(table)
 
 
@@ -104,15 +132,25 @@ def _print_intervals(content: dict, console: Console) -> None:
     if not rows:
         return
     shown = INTERVALS[0], INTERVALS[-1]
-    table = make_table(f"{INTERVAL_PERCENT} % intervals, resampled by drive", "",
-                       *(f"{name[:3]} {SHORT[row]}" for name in SCORED for row in shown),
-                       "F1", width=7)
-    table.add_row("overlap above", *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}"
-                                     for name in SCORED for row in shown), style="dim",
-                  end_section=True)
+    table = make_table(
+        f"{INTERVAL_PERCENT} % intervals, resampled by drive",
+        "",
+        *(f"{name[:3]} {SHORT[row]}" for name in SCORED for row in shown),
+        "F1",
+        width=7,
+    )
+    table.add_row(
+        "overlap above",
+        *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}" for name in SCORED for row in shown),
+        style="dim",
+        end_section=True,
+    )
     for name, own in rows.items():
-        table.add_row(name, *(format_interval(own["ap"][kind] and own["ap"][kind][row])
-                              for kind in SCORED for row in shown), format_interval(own["f1"]))
+        table.add_row(
+            name,
+            *(format_interval(own["ap"][kind] and own["ap"][kind][row]) for kind in SCORED for row in shown),
+            format_interval(own["f1"]),
+        )
     table.caption = "AP of moderate labels; F1 of pedestrians at the default threshold."
     console.print(table)
 
@@ -124,33 +162,54 @@ def draw_comparison(path: str | Path, content: dict) -> None:
         InputError: the file cannot be written.
     """
     import matplotlib
+
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     rows = {name: row for name, row in content["rows"].items() if row["ms"] is not None}
     centres = content["pedestrians"]
     figure, (left, right) = plt.subplots(1, 2, figsize=(15, 6.4), dpi=120, layout="constrained")
-    _draw(left, {name: (row["ms"], 100 * row["pedestrian_centres"]["operating"]["f1"],
-                        100 * row["pedestrian_centres"]["best"]["f1"])
-                 for name, row in rows.items()},
-          "filled: default threshold, hollow: best threshold", left_margin=0.31)
-    left.set(title=f"F1 of {centres['ground_truth']} pedestrians in {centres['frames']} frames",
-             ylabel="F1 within 1.0 m [%]")
+    _draw(
+        left,
+        {
+            name: (
+                row["ms"],
+                100 * row["pedestrian_centres"]["operating"]["f1"],
+                100 * row["pedestrian_centres"]["best"]["f1"],
+            )
+            for name, row in rows.items()
+        },
+        "filled: default threshold, hollow: best threshold",
+        left_margin=0.31,
+    )
+    left.set(
+        title=f"F1 of {centres['ground_truth']} pedestrians in {centres['frames']} frames", ylabel="F1 within 1.0 m [%]"
+    )
     for value in dict.fromkeys(round(100 * f1) for f1 in CENTRE_F1.values()):
         names = [name for name, f1 in CENTRE_F1.items() if round(100 * f1) == value]
         left.axhline(value, color="#bbbbbb", linewidth=0.8, linestyle=":", zorder=0)
-        left.annotate(f"paper: {', '.join(names)}", (0.01, value), fontsize=7, color="#888888",
-                      xycoords=("axes fraction", "data"), va="bottom")
-    _draw(right, {name: (row["ms"], row["mean_ap"]["3d"], row["mean_ap"]["3d_relaxed"])
-                  for name, row in rows.items() if row["mean_ap"]["3d"] is not None},
-          "filled: overlap 0.7 (Car) and 0.5, hollow: 0.5 and 0.25")
-    right.set(title=f"Mean 3D AP, moderate, {content['frames']} frames",
-              ylabel="mean AP of three classes [%]")
+        left.annotate(
+            f"paper: {', '.join(names)}",
+            (0.01, value),
+            fontsize=7,
+            color="#888888",
+            xycoords=("axes fraction", "data"),
+            va="bottom",
+        )
+    _draw(
+        right,
+        {
+            name: (row["ms"], row["mean_ap"]["3d"], row["mean_ap"]["3d_relaxed"])
+            for name, row in rows.items()
+            if row["mean_ap"]["3d"] is not None
+        },
+        "filled: overlap 0.7 (Car) and 0.5, hollow: 0.5 and 0.25",
+    )
+    right.set(title=f"Mean 3D AP, moderate, {content['frames']} frames", ylabel="mean AP of three classes [%]")
     save_picture(path, figure)
 
 
-def _draw(axes: Axes, points: dict[str, tuple[float, float, float]], legend: str,
-          left_margin: float = 0.0) -> None:
+def _draw(axes: Axes, points: dict[str, tuple[float, float, float]], legend: str, left_margin: float = 0.0) -> None:
     """Draw points (ms, value, other value) by name on a log axis, with the names at the right.
 
     left_margin: share of the axis that stays free at the left.
@@ -160,8 +219,7 @@ def _draw(axes: Axes, points: dict[str, tuple[float, float, float]], legend: str
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     if not points:
-        axes.text(0.5, 0.5, "no detector of all three classes", transform=axes.transAxes,
-                  ha="center", color="#888888")
+        axes.text(0.5, 0.5, "no detector of all three classes", transform=axes.transAxes, ha="center", color="#888888")
         return
     ms = [x for x, _, _ in points.values()]
     low, high = min(ms) / 1.6, max(ms) * 1.6
@@ -175,17 +233,28 @@ def _draw(axes: Axes, points: dict[str, tuple[float, float, float]], legend: str
         axes.plot([x, x], [y, other], color=color, linewidth=0.8, alpha=0.6)
         axes.plot(x, other, marker, color=color, markerfacecolor="white", markersize=6)
         axes.plot(x, y, marker, color=color, markersize=6)
-        axes.annotate(f"{name}  {y:.1f}", (x, y), (1.03, height), fontsize=8, color=color,
-                      textcoords=("axes fraction", "data"), va="center", annotation_clip=False,
-                      arrowprops=dict(arrowstyle="-", color=color, linewidth=0.4, alpha=0.5,
-                                      relpos=(0, 0.5), shrinkA=1, shrinkB=3))
+        axes.annotate(
+            f"{name}  {y:.1f}",
+            (x, y),
+            (1.03, height),
+            fontsize=8,
+            color=color,
+            textcoords=("axes fraction", "data"),
+            va="center",
+            annotation_clip=False,
+            arrowprops=dict(
+                arrowstyle="-", color=color, linewidth=0.4, alpha=0.5, relpos=(0, 0.5), shrinkA=1, shrinkB=3
+            ),
+        )
 
 
 def _make_ticks(low: float, high: float):
     from matplotlib.ticker import FixedLocator
+
     steps = (1, 2, 5) if high < 1e3 * low else (1, 3)  # numbers that do not overlap
-    return FixedLocator([step * 10.0 ** power for power in range(-3, 7) for step in steps
-                         if low <= step * 10.0 ** power <= high])
+    return FixedLocator(
+        [step * 10.0**power for power in range(-3, 7) for step in steps if low <= step * 10.0**power <= high]
+    )
 
 
 def spread_heights(values: Sequence[float], low: float, high: float, gap: float) -> np.ndarray:
@@ -194,6 +263,7 @@ def spread_heights(values: Sequence[float], low: float, high: float, gap: float)
     They are at least gap apart, or less where there is no room for all. N is at least 1.
     """
     from sklearn.isotonic import isotonic_regression
+
     count = len(values)
     gap = min(gap, (high - low) / max(count - 1, 1))
     order, heights = np.argsort(values, kind="stable"), np.empty(count)

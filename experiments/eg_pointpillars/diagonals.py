@@ -21,10 +21,10 @@ PERCENTILES = (5, 50, 95)
 def make_diagonal_section(records: list[dict[str, Any]]) -> Section:
     """Return Table 2 and Figure 13 of records of measure_frame()."""
     tables = []
-    for key, title in (("boxes", "Labelled boxes"), ("clusters", "Clusters of Patchwork++ and "
-                                                                 "DBSCAN")):
-        counts = np.array([count_classes(record[key]) for record in records],
-                          float).reshape(-1, len(NAMES) + 1, len(NAMES) + 1)
+    for key, title in (("boxes", "Labelled boxes"), ("clusters", "Clusters of Patchwork++ and DBSCAN")):
+        counts = np.array([count_classes(record[key]) for record in records], float).reshape(
+            -1, len(NAMES) + 1, len(NAMES) + 1
+        )
         shares = bootstrap(counts, lambda sums: 100 * divide(sums, sums.sum(-1, keepdims=True)))
         values = np.array([pair for record in records for pair in record[key]]).reshape(-1, 2)
         rows: list[Row] = []
@@ -34,19 +34,30 @@ def make_diagonal_section(records: list[dict[str, Any]]) -> Section:
                 continue
             limits = paper.TABLE_2.get(name)
             ends = np.percentile(own, PERCENTILES) if len(own) else np.full(3, np.nan)
-            rows.append((name, str(len(own)),
-                         *(Cell(v, digits=2) for v in nan_to_none(ends)),
-                         f"{limits[0]:.2f} to {limits[1]:.2f}" if limits else "none",
-                         *make_cells(shares[:, i])))
-        header = ("class", "number", *(f"{p} % [m]" for p in PERCENTILES), "limits of Table 2 [m]",
-                  *(f"taken for {name} [%]" for name in (*NAMES, "none")))
+            rows.append(
+                (
+                    name,
+                    str(len(own)),
+                    *(Cell(v, digits=2) for v in nan_to_none(ends)),
+                    f"{limits[0]:.2f} to {limits[1]:.2f}" if limits else "none",
+                    *make_cells(shares[:, i]),
+                )
+            )
+        header = (
+            "class",
+            "number",
+            *(f"{p} % [m]" for p in PERCENTILES),
+            "limits of Table 2 [m]",
+            *(f"taken for {name} [%]" for name in (*NAMES, "none")),
+        )
         tables.append(Table(f"table_2_{key}", title, header, tuple(rows)))
-    text = ("Table 2 classifies a cluster by the diagonal of its box in x-y. The paper shows the "
-            "diagonals of the labelled boxes of KITTI (Figure 13) and chose limits for clusters "
-            "by hand. Here a cluster has the class of the labelled box that contains most of its "
-            "points; all others are background.")
-    return Section("Class by diagonal (Table 2, Figure 13)", text, tuple(tables),
-                   (_draw_histograms(records),))
+    text = (
+        "Table 2 classifies a cluster by the diagonal of its box in x-y. The paper shows the "
+        "diagonals of the labelled boxes of KITTI (Figure 13) and chose limits for clusters "
+        "by hand. Here a cluster has the class of the labelled box that contains most of its "
+        "points; all others are background."
+    )
+    return Section("Class by diagonal (Table 2, Figure 13)", text, tuple(tables), (_draw_histograms(records),))
 
 
 def _find_class(class_ids: np.ndarray) -> np.ndarray:
@@ -77,8 +88,6 @@ def _draw_histograms(records: list[dict[str, Any]]) -> Figure:
             share = 100 * counts / max(counts.sum(), 1)
             lines.append(Line(name, (BINS[:-1] + np.diff(BINS) / 2).tolist(), share.tolist()))
             low = paper.TABLE_2[name][0]
-            lines.append(Line(f"{name}, limit", (low, low), (0.0, 100.0),
-                              dashed=True))
+            lines.append(Line(f"{name}, limit", (low, low), (0.0, 100.0), dashed=True))
         panels.append(Panel(title, "diagonal in x-y [m]", "% of the class", tuple(lines)))
-    return Figure("figure_13", "Figure 13: diagonals by class, and the lower limits of Table 2",
-                  tuple(panels))
+    return Figure("figure_13", "Figure 13: diagonals by class, and the lower limits of Table 2", tuple(panels))

@@ -11,8 +11,14 @@ from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EX
 from lidar_perception.param_fields import flatten
 
 EG_POINTPILLARS = Experiment(
-    "eg-pointpillars", "EG-PointPillars: the tables of the paper",
+    "eg-pointpillars",
+    "EG-PointPillars: the tables of the paper",
     "Do ground segmentation and clusters as inputs help PointPillars, and do they save labels?",
-    measure_frame, make_sections,
+    measure_frame,
+    make_sections,
     {"ground": flatten(EXPERT_GROUND), "clustering": flatten(EXPERT_CLUSTERING)},
-    training=TRAINING, protocol=PROTOCOL, models=choose_models, illustrate=make_picture_sections)
+    training=TRAINING,
+    protocol=PROTOCOL,
+    models=choose_models,
+    illustrate=make_picture_sections,
+)

@@ -24,13 +24,12 @@ from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.scoring.kitti.camera_objects import to_camera_objects, to_scored_labels
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
 
-MIN_SCORE = 0.05   # boxes of lower score hardly change the average precision
-MIN_SHARE = 0.5    # of the points of a cluster that are in a box, so that it is of the box's class
+MIN_SCORE = 0.05  # boxes of lower score hardly change the average precision
+MIN_SHARE = 0.5  # of the points of a cluster that are in a box, so that it is of the box's class
 NO_CLASS = -1
 
 
-def measure_frame(frames: Sequence[Frame], number: int, models: Mapping[str, TrainedModel]
-                  ) -> dict[str, Any]:
+def measure_frame(frames: Sequence[Frame], number: int, models: Mapping[str, TrainedModel]) -> dict[str, Any]:
     """Measure frame `number` and return its record.
 
     - true: the labels, see precision.to_record()
@@ -52,13 +51,15 @@ def measure_frame(frames: Sequence[Frame], number: int, models: Mapping[str, Tra
         begun = perf_counter()
         result = detector(scan)
         duration = 1e3 * (perf_counter() - begun)
-        found[name] = to_record(to_camera_objects(to_scored_labels(result.detections),
-                                                  calibration))
-        ms[name] = {"total": round(duration, 2),
-                    **{step: round(value, 2) for step, value in result.timings.items()}}
-    return {"frame": frame.name, "true": to_record(to_camera_objects(truth, calibration)),
-            "found": {name: found[name] for name in names}, "ms": ms,
-            **measure_diagonals(scan, truth, frame.sensor_height)}
+        found[name] = to_record(to_camera_objects(to_scored_labels(result.detections), calibration))
+        ms[name] = {"total": round(duration, 2), **{step: round(value, 2) for step, value in result.timings.items()}}
+    return {
+        "frame": frame.name,
+        "true": to_record(to_camera_objects(truth, calibration)),
+        "found": {name: found[name] for name in names},
+        "ms": ms,
+        **measure_diagonals(scan, truth, frame.sensor_height),
+    }
 
 
 @lru_cache(maxsize=64)
@@ -67,8 +68,7 @@ def open_network(weights: str, sensor_height: float) -> Detector:
     return open_detector(weights, sensor_height=sensor_height, min_score=MIN_SCORE)
 
 
-def measure_diagonals(scan: PointCloud, truth: GroundTruth, sensor_height: float
-                      ) -> dict[str, list[list[float]]]:
+def measure_diagonals(scan: PointCloud, truth: GroundTruth, sensor_height: float) -> dict[str, list[list[float]]]:
     """Measure the diagonals in x-y of labelled boxes, and of clusters (Table 2 and Figure 13).
 
     A cluster has the class of the box that contains most of its points, at least MIN_SHARE. Boxes
@@ -83,14 +83,14 @@ def measure_diagonals(scan: PointCloud, truth: GroundTruth, sensor_height: float
     boxes = fit_boxes(view.xyz, ids, "min_area")
     sizes = np.bincount(ids, minlength=len(boxes) + 1)[1:]
     rows, first = points_in_boxes(view.xyz, true_boxes)
-    counts = np.stack([np.bincount(ids[rows[first[k]:first[k + 1]]], minlength=len(boxes) + 1)[1:]
-                       for k in range(len(true_boxes))] or [np.zeros(len(boxes), int)])
+    counts = np.stack(
+        [np.bincount(ids[rows[first[k] : first[k + 1]]], minlength=len(boxes) + 1)[1:] for k in range(len(true_boxes))]
+        or [np.zeros(len(boxes), int)]
+    )
     best = counts.argmax(axis=0)
     is_object = counts.max(axis=0) >= np.maximum(MIN_SHARE * sizes, 1)
-    owners = np.where(is_object, classes[best], NO_CLASS) if len(classes) else np.full(
-        len(boxes), NO_CLASS)
-    return {"boxes": _list_diagonals(classes, true_boxes),
-            "clusters": _list_diagonals(owners, boxes)}
+    owners = np.where(is_object, classes[best], NO_CLASS) if len(classes) else np.full(len(boxes), NO_CLASS)
+    return {"boxes": _list_diagonals(classes, true_boxes), "clusters": _list_diagonals(owners, boxes)}
 
 
 def _list_diagonals(classes: np.ndarray, boxes: np.ndarray) -> list[list[float]]:

@@ -13,21 +13,34 @@ from lidar_perception.training.params import PointPillarsTraining
 
 TRAINING = PointPillarsTraining()
 # Whole range, full size and number of epochs as in Section 4.1.
-PROTOCOL = {"size": "full", "score": "map", "epochs": float(paper.EPOCHS),
-            "validate_epochs": float(paper.VALIDATION_EPOCHS), "ahead": 1000.0, "aside": 1000.0}
-STUDIED = "v0", "v4"          # in the study of labels
-SHARES = (0.5, 0.25, 0.1)     # of the labelled scenes, beside all
+PROTOCOL = {
+    "size": "full",
+    "score": "map",
+    "epochs": float(paper.EPOCHS),
+    "validate_epochs": float(paper.VALIDATION_EPOCHS),
+    "ahead": 1000.0,
+    "aside": 1000.0,
+}
+STUDIED = "v0", "v4"  # in the study of labels
+SHARES = (0.5, 0.25, 0.1)  # of the labelled scenes, beside all
 ALL_SHARES = (*reversed(SHARES), 1.0)
 
 
 def choose_models(params: PointPillarsTraining, seed: int) -> list[Model]:
     """Return the networks of a seed: all versions, then those of the study of labels."""
+
     def make(version: str, share: float) -> Model:
-        return Model(name_model(version, share, seed),
-                     with_values(params, {"version": version, "seed": seed}), share,
-                     required=share == 1.0)
-    return [*(make(version, 1.0) for version in VERSIONS),
-            *(make(version, share) for share in SHARES for version in STUDIED)]
+        return Model(
+            name_model(version, share, seed),
+            with_values(params, {"version": version, "seed": seed}),
+            share,
+            required=share == 1.0,
+        )
+
+    return [
+        *(make(version, 1.0) for version in VERSIONS),
+        *(make(version, share) for share in SHARES for version in STUDIED),
+    ]
 
 
 def name_model(version: str, share: float, seed: int) -> str:

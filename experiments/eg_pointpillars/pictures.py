@@ -29,35 +29,44 @@ SIZE = (960, 540)  # of one half, pixels
 BETTER, WORSE = 2, 1  # numbers of frames in which V4 has fewer errors, and more
 
 
-def make_picture_sections(records: list[dict[str, Any]], frames: Sequence[Frame],
-                          models: Mapping[str, TrainedModel]) -> list[Section]:
+def make_picture_sections(
+    records: list[dict[str, Any]], frames: Sequence[Frame], models: Mapping[str, TrainedModel]
+) -> list[Section]:
     """Return Figure 20: the frames in which the errors of V0 and V4 differ most, both ways."""
     groups = group_seeds(models)
     if any((version, 1.0) not in groups for version in STUDIED):
         return []
     first, last = (groups[version, 1.0][0] for version in STUDIED)
     measured = [record for record in records if "skipped" not in record]
-    errors = {name: [count_errors(frame) for frame in compare_records(
-        [r["true"] for r in measured], [r["found"][name] for r in measured])]
-        for name in (first, last)}
+    errors = {
+        name: [
+            count_errors(frame)
+            for frame in compare_records([r["true"] for r in measured], [r["found"][name] for r in measured])
+        ]
+        for name in (first, last)
+    }
     by_name = {record["frame"]: i for i, record in enumerate(measured)}
     indices = [i for i, frame in enumerate(frames) if frame.name in by_name]
-    gain = np.array([errors[first][by_name[frames[i].name]] - errors[last][by_name[frames[i].name]]
-                     for i in indices])
+    gain = np.array([errors[first][by_name[frames[i].name]] - errors[last][by_name[frames[i].name]] for i in indices])
     order = np.argsort(-gain, kind="stable")
     chosen = list(dict.fromkeys([*order[:BETTER], *order[::-1][:WORSE]]))
     pictures: list[Picture] = []
     for k in chosen:
         frame = frames[indices[k]]
         counts = [errors[name][by_name[frame.name]] for name in (first, last)]
-        pictures.append(Picture(
-            f"figure_20_{len(pictures) + 1}", f"{frame.name}: {first} (left, errors: {counts[0]}) "
-            f"and {last} (right, errors: {counts[1]})",
-            np.concatenate([_draw(frame, models[name], name) for name in (first, last)], axis=1)))
-    text = (f"Boxes with a score of at least {SHOWN_SCORE:g}; labels are dashed. The frames are "
-            f"the {BETTER} in which V4 has fewest errors compared with V0, and the {WORSE} in "
-            "which it has most; the paper shows three of the first kind. An error is a missed "
-            "object or a wrong box, in BEV at the overlaps 0.5 (Car) and 0.25.")
+        pictures.append(
+            Picture(
+                f"figure_20_{len(pictures) + 1}",
+                f"{frame.name}: {first} (left, errors: {counts[0]}) and {last} (right, errors: {counts[1]})",
+                np.concatenate([_draw(frame, models[name], name) for name in (first, last)], axis=1),
+            )
+        )
+    text = (
+        f"Boxes with a score of at least {SHOWN_SCORE:g}; labels are dashed. The frames are "
+        f"the {BETTER} in which V4 has fewest errors compared with V0, and the {WORSE} in "
+        "which it has most; the paper shows three of the first kind. An error is a missed "
+        "object or a wrong box, in BEV at the overlaps 0.5 (Car) and 0.25."
+    )
     return [Section("Side by side (Figure 20)", text, figures=tuple(pictures))]
 
 
@@ -68,9 +77,11 @@ def count_errors(frame: ComparedFrame) -> int:
     for name in SCORED:
         hit = overlaps > RELAXED_BEV[1][name]
         own = frame.true.class_ids == CLASSES.index(name)
-        found = (frame.found.class_ids == CLASSES.index(name)) & (
-            frame.found.scores >= SHOWN_SCORE) & (
-            classify_detections(frame.found, name, "moderate") == COUNTED)
+        found = (
+            (frame.found.class_ids == CLASSES.index(name))
+            & (frame.found.scores >= SHOWN_SCORE)
+            & (classify_detections(frame.found, name, "moderate") == COUNTED)
+        )
         wanted = classify_labels(frame.true, name, "moderate") == COUNTED
         errors += int((wanted & ~hit[found].any(axis=0)).sum())
         errors += int((found & ~hit[:, own].any(axis=1)).sum())
@@ -81,12 +92,16 @@ def _draw(frame: Frame, model: TrainedModel, title: str) -> np.ndarray:
     """Draw a frame with the boxes of a network, (height, width, 3) uint8."""
     scan, truth = frame.load(), frame.truth()
     try:
-        found = open_detector(str(model.weights), sensor_height=frame.sensor_height,
-                              min_score=SHOWN_SCORE)(scan).detections
+        found = open_detector(str(model.weights), sensor_height=frame.sensor_height, min_score=SHOWN_SCORE)(
+            scan
+        ).detections
         boxes = Boxes(found.boxes, found.class_ids, [f"{score:.2f}" for score in found.scores])
     except InputError:
         boxes = Boxes()
-    labels = np.zeros((0, 7)) if truth is None else truth.boxes[
-        np.isin(truth.class_ids, [CLASSES.index(name) for name in SCORED])]
+    labels = (
+        np.zeros((0, 7))
+        if truth is None
+        else truth.boxes[np.isin(truth.class_ids, [CLASSES.index(name) for name in SCORED])]
+    )
     stage = Stage.of(scan, frame.sensor_height, True, size=SIZE)
     return draw_frame(stage, scan, boxes, labels, title)

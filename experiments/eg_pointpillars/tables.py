@@ -12,76 +12,104 @@ from experiments.eg_pointpillars.diagonals import make_diagonal_section
 from experiments.eg_pointpillars.models import ALL_SHARES, STUDIED, group_seeds
 from experiments.framework.experiment import Cell, Figure, Panel, Row, Section, Table
 from experiments.framework.precision import CELLS, compare_records, draw_cells
-from experiments.framework.statistics import (
-    compute_sampled_p,
-    estimate,
-    make_cells,
-    make_line,
-    nan_to_none,
-)
+from experiments.framework.statistics import compute_sampled_p, estimate, make_cells, make_line, nan_to_none
 from experiments.framework.trained_models import TrainedModel
 from lidar_perception.detectors.pointpillars.config import VERSIONS
 
 MEAN = len(CELLS)  # column of the mean, see precision.compute_cells()
 STRICT, RELAXED = 0, 1  # see precision.PROTOCOLS
 MIN_AP = 1.0  # percent; below it the report says that the training was too short
-TITLES = {"v0": "PointPillars", **{v: f"EG-PointPillars {v.upper()}" for v in VERSIONS
-                                   if v != "v0"}}
+TITLES = {"v0": "PointPillars", **{v: f"EG-PointPillars {v.upper()}" for v in VERSIONS if v != "v0"}}
 Draws = dict[tuple[str, float], np.ndarray]  # (version, share) -> (1 + R, 2, 10)
 
 
-def make_sections(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]
-                  ) -> list[Section]:
+def make_sections(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> list[Section]:
     """Return the report of the records of measure_frame()."""
     records = [record for record in records if "skipped" not in record]
     names = [record["frame"] for record in records]
     true = [record["true"] for record in records]
-    by_model = draw_cells(names, {name: compare_records(true, [r["found"][name] for r in records])
-                                  for name in models})
-    draws = {key: np.mean([by_model[name] for name in group], axis=0)
-             for key, group in group_seeds(models).items()}
-    return [make_training_section(models), make_table_5(draws, len(records)),
-            make_table_6(draws, records, models), make_diagonal_section(records),
-            make_label_section(draws), *make_seed_sections(by_model, models)]
+    by_model = draw_cells(names, {name: compare_records(true, [r["found"][name] for r in records]) for name in models})
+    draws = {key: np.mean([by_model[name] for name in group], axis=0) for key, group in group_seeds(models).items()}
+    return [
+        make_training_section(models),
+        make_table_5(draws, len(records)),
+        make_table_6(draws, records, models),
+        make_diagonal_section(records),
+        make_label_section(draws),
+        *make_seed_sections(by_model, models),
+    ]
 
 
 def make_training_section(models: Mapping[str, TrainedModel]) -> Section:
     """Return the table of networks with their training data and length."""
     rows: list[Row] = [
-        (name, f"{100 * m.model.label_share:g} %", str(m.scenes), str(m.steps), str(m.best_step),
-         f"{m.seconds / 60:.1f}", f"{m.parameters / 1e3:.1f}") for name, m in models.items()]
+        (
+            name,
+            f"{100 * m.model.label_share:g} %",
+            str(m.scenes),
+            str(m.steps),
+            str(m.best_step),
+            f"{m.seconds / 60:.1f}",
+            f"{m.parameters / 1e3:.1f}",
+        )
+        for name, m in models.items()
+    ]
     params: Any = next((m.model.params for m in models.values()), None)
-    text = "" if params is None else (
-        f"All networks have the size `{params.size}`, batches of {params.batch}, the same scenes "
-        "and the same number of steps. The weights with the best validation score are measured. "
-        + (f"They were trained up to {params.ahead:g} m ahead and {params.aside:g} m to each side, "
-           "and are measured in the whole range. " if 0 < params.ahead < 100 else "")
-        + f"The paper trains {paper.EPOCHS} epochs with a validation every "
-        f"{paper.VALIDATION_EPOCHS}, on KITTI.")
-    return Section("What was trained", text, (Table(
-        "models", "Networks", ("network", "labels", "scenes", "steps", "best step",
-                               "training [min]", "parameters [thousands]"), tuple(rows)),))
+    text = (
+        ""
+        if params is None
+        else (
+            f"All networks have the size `{params.size}`, batches of {params.batch}, the same scenes "
+            "and the same number of steps. The weights with the best validation score are measured. "
+            + (
+                f"They were trained up to {params.ahead:g} m ahead and {params.aside:g} m to each side, "
+                "and are measured in the whole range. "
+                if 0 < params.ahead < 100
+                else ""
+            )
+            + f"The paper trains {paper.EPOCHS} epochs with a validation every "
+            f"{paper.VALIDATION_EPOCHS}, on KITTI."
+        )
+    )
+    return Section(
+        "What was trained",
+        text,
+        (
+            Table(
+                "models",
+                "Networks",
+                ("network", "labels", "scenes", "steps", "best step", "training [min]", "parameters [thousands]"),
+                tuple(rows),
+            ),
+        ),
+    )
 
 
 def make_table_5(draws: Draws, frames: int) -> Section:
     """Return Table 5 at the paper's overlaps, and in BEV at lower ones."""
-    header = ("version", *(f"{name} {level}" for name, level in CELLS), "mean", "above V0",
-              "p")
+    header = ("version", *(f"{name} {level}" for name, level in CELLS), "mean", "above V0", "p")
     tables = []
     for index, name, title in (
-            (STRICT, "table_5", "Table 5: 3D AP [%] at the overlaps 0.7 (Car) and 0.5"),
-            (RELAXED, "table_5_bev", "The same in BEV at the overlaps 0.5 (Car) and 0.25")):
-        rows: list[Row] = [(TITLES[version], *_make_version_cells(draws, version, index))
-                           for version in VERSIONS if (version, 1.0) in draws]
+        (STRICT, "table_5", "Table 5: 3D AP [%] at the overlaps 0.7 (Car) and 0.5"),
+        (RELAXED, "table_5_bev", "The same in BEV at the overlaps 0.5 (Car) and 0.25"),
+    ):
+        rows: list[Row] = [
+            (TITLES[version], *_make_version_cells(draws, version, index))
+            for version in VERSIONS
+            if (version, 1.0) in draws
+        ]
         tables.append(Table(name, title, header, tuple(rows)))
-    text = (f"{frames} frames that no network was trained on. R40, mean over seeds. Intervals and "
-            "p values: samples of the frames, the same for all versions, so that the differences "
-            "are paired. The paper does not say which recall points it uses.")
+    text = (
+        f"{frames} frames that no network was trained on. R40, mean over seeds. Intervals and "
+        "p values: samples of the frames, the same for all versions, so that the differences "
+        "are paired. The paper does not say which recall points it uses."
+    )
     best = max((values[0, RELAXED, MEAN] for values in draws.values()), default=np.nan)
     if not best >= MIN_AP:  # or NaN
-        text = ("No version was trained long enough, or the frames have too few objects (mean BEV "
-                f"AP {best:.1f}), so neither the versions nor the study of labels can be compared. "
-                + text)
+        text = (
+            "No version was trained long enough, or the frames have too few objects (mean BEV "
+            f"AP {best:.1f}), so neither the versions nor the study of labels can be compared. " + text
+        )
     return Section("Versions (Table 5)", text, tuple(tables))
 
 
@@ -93,19 +121,29 @@ def _make_version_cells(draws: Draws, version: str, index: int) -> tuple[Cell, .
     if version == "v0" or ("v0", 1.0) not in draws:
         return (*cells, Cell(None), Cell(None))
     gain = own[:, MEAN] - draws["v0", 1.0][:, index, MEAN]
-    return (*cells, *make_cells(estimate(gain)[:, None],
-                                [paper.IMPROVEMENT[version]] if strict else ()),
-            Cell(nan_to_none([compute_sampled_p(gain)])[0], digits=3))
+    return (
+        *cells,
+        *make_cells(estimate(gain)[:, None], [paper.IMPROVEMENT[version]] if strict else ()),
+        Cell(nan_to_none([compute_sampled_p(gain)])[0], digits=3),
+    )
 
 
-def make_table_6(draws: Draws, records: list[dict[str, Any]],
-                 models: Mapping[str, TrainedModel]) -> Section:
+def make_table_6(draws: Draws, records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> Section:
     """Return Table 6: gain, time per frame, overhead and parameters."""
     groups = group_seeds(models)
-    ms = {version: np.array([[np.mean([r["ms"][name][step] for name in groups[version, 1.0]])
-                              for step in ("total", "experts", "network")] for r in records]
-                            ).reshape(-1, 3)
-          for version in VERSIONS if (version, 1.0) in groups}
+    ms = {
+        version: np.array(
+            [
+                [
+                    np.mean([r["ms"][name][step] for name in groups[version, 1.0]])
+                    for step in ("total", "experts", "network")
+                ]
+                for r in records
+            ]
+        ).reshape(-1, 3)
+        for version in VERSIONS
+        if (version, 1.0) in groups
+    }
     rows: list[Row] = []
     for version, times in ms.items():
         total, experts, network = np.median(times, axis=0) if len(times) else [np.nan] * 3
@@ -114,19 +152,39 @@ def make_table_6(draws: Draws, records: list[dict[str, Any]],
         count = models[groups[version, 1.0][0]].parameters / 1e3
         values = nan_to_none([gain, total, total - base, experts, network])
         first = version == "v0"
-        rows.append((TITLES[version],
-                     Cell(None if first else values[0], paper=paper.IMPROVEMENT.get(version),
-                          digits=2),
-                     Cell(values[1], paper=paper.MS[version]),
-                     Cell(None if first else values[2], paper=paper.OVERHEAD_MS.get(version)),
-                     Cell(values[3]), Cell(values[4]), Cell(count)))
+        rows.append(
+            (
+                TITLES[version],
+                Cell(None if first else values[0], paper=paper.IMPROVEMENT.get(version), digits=2),
+                Cell(values[1], paper=paper.MS[version]),
+                Cell(None if first else values[2], paper=paper.OVERHEAD_MS.get(version)),
+                Cell(values[3]),
+                Cell(values[4]),
+                Cell(count),
+            )
+        )
     return Section(
-        "Gain and time (Table 6)", "Median time per frame on the machine named above, in one "
+        "Gain and time (Table 6)",
+        "Median time per frame on the machine named above, in one "
         "process with one thread unless several processes measured; the paper's times are of a "
         "GPU. The paper's overhead of V4 contradicts its Table 5, which gives 33.3 ms.",
-        (Table("table_6", "Table 6", ("version", "mean 3D AP above V0 [points]", "time [ms]",
-                                      "overhead [ms]", "ground and clusters [ms]", "network [ms]",
-                                      "parameters [thousands]"), tuple(rows)),))
+        (
+            Table(
+                "table_6",
+                "Table 6",
+                (
+                    "version",
+                    "mean 3D AP above V0 [points]",
+                    "time [ms]",
+                    "overhead [ms]",
+                    "ground and clusters [ms]",
+                    "network [ms]",
+                    "parameters [thousands]",
+                ),
+                tuple(rows),
+            ),
+        ),
+    )
 
 
 def make_label_section(draws: Draws) -> Section:
@@ -138,21 +196,25 @@ def make_label_section(draws: Draws) -> Section:
         row: list[str | Cell] = [f"{100 * share:g} %"]
         for index in (STRICT, RELAXED):
             first, last = (draws[version, share][:, index, MEAN] for version in STUDIED)
-            row += [*make_cells(np.stack([estimate(d) for d in (first, last, last - first)],
-                                         axis=1)),
-                    Cell(nan_to_none([compute_sampled_p(last - first)])[0], digits=3)]
+            row += [
+                *make_cells(np.stack([estimate(d) for d in (first, last, last - first)], axis=1)),
+                Cell(nan_to_none([compute_sampled_p(last - first)])[0], digits=3),
+            ]
         rows.append(tuple(row))
-    header = ("labelled scenes", *(f"{what}, {kind} [%]" for kind in ("3D", "BEV")
-                                   for what in ("V0", "V4", "V4 above V0", "p")))
-    header = tuple(name.replace("p, 3D [%]", "p, 3D").replace("p, BEV [%]", "p, BEV")
-                   for name in header)
+    header = (
+        "labelled scenes",
+        *(f"{what}, {kind} [%]" for kind in ("3D", "BEV") for what in ("V0", "V4", "V4 above V0", "p")),
+    )
+    header = tuple(name.replace("p, 3D [%]", "p, 3D").replace("p, BEV [%]", "p, BEV") for name in header)
     return Section(
-        "Dependency on labels", "The paper claims that the experts reduce the dependency on "
+        "Dependency on labels",
+        "The paper claims that the experts reduce the dependency on "
         "labels (Sections 1 and 5) and has no experiment for it. Here both networks get the same "
         "part of the labelled scenes and the same number of steps. Mean AP over classes and "
         "difficulties, overlaps as in the tables above.",
         (Table("labels", "V0 and V4 by share of the labelled scenes", header, tuple(rows)),),
-        _draw_label_figure(draws))
+        _draw_label_figure(draws),
+    )
 
 
 def _draw_label_figure(draws: Draws) -> tuple[Figure, ...]:
@@ -162,31 +224,33 @@ def _draw_label_figure(draws: Draws) -> tuple[Figure, ...]:
         for version in STUDIED:
             shares = [share for share in ALL_SHARES if (version, share) in draws]
             if shares:
-                values = np.stack([draws[version, share][:, index, MEAN] for share in shares],
-                                  axis=1)
-                lines.append(make_line(version.upper(), [100 * s for s in shares],
-                                       estimate(values)))
+                values = np.stack([draws[version, share][:, index, MEAN] for share in shares], axis=1)
+                lines.append(make_line(version.upper(), [100 * s for s in shares], estimate(values)))
         panels.append(Panel(title, "labelled scenes [%]", "mean AP", tuple(lines)))
     return (Figure("labels", "Mean AP by share of the labelled scenes", tuple(panels)),)
 
 
-def make_seed_sections(by_model: Mapping[str, np.ndarray], models: Mapping[str, TrainedModel]
-                       ) -> list[Section]:
+def make_seed_sections(by_model: Mapping[str, np.ndarray], models: Mapping[str, TrainedModel]) -> list[Section]:
     """Return a section with the mean AP of each seed; none with one seed."""
     groups = group_seeds(models)
     count = max(map(len, groups.values()), default=0)
     if count < 2:
         return []
-    rows: list[Row] = [(TITLES[version], f"{100 * share:g} %",
-                        *_list_seeds(by_model, names, count))
-                       for (version, share), names in groups.items()]
+    rows: list[Row] = [
+        (TITLES[version], f"{100 * share:g} %", *_list_seeds(by_model, names, count))
+        for (version, share), names in groups.items()
+    ]
     header = ("version", "labels", *(f"seed {i}" for i in range(count)), "standard deviation")
-    return [Section("Seeds", "Mean 3D AP of the networks of each seed.",
-                    (Table("seeds", "Mean 3D AP [%] by seed", header, tuple(rows)),))]
+    return [
+        Section(
+            "Seeds",
+            "Mean 3D AP of the networks of each seed.",
+            (Table("seeds", "Mean 3D AP [%] by seed", header, tuple(rows)),),
+        )
+    ]
 
 
-def _list_seeds(by_model: Mapping[str, np.ndarray], names: Sequence[str], count: int
-                ) -> tuple[Cell, ...]:
+def _list_seeds(by_model: Mapping[str, np.ndarray], names: Sequence[str], count: int) -> tuple[Cell, ...]:
     values = [by_model[name][0, STRICT, MEAN] for name in names]
     spread = np.std(values, ddof=1) if len(values) > 1 else np.nan
     shown = nan_to_none([*values, *[np.nan] * (count - len(values)), spread])

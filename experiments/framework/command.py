@@ -15,14 +15,7 @@ import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.command import Choice, Command, refuse_given
-from lidar_perception.cli.data import (
-    WHAT,
-    a_path,
-    dask_option,
-    limit_option,
-    open_and_describe,
-    out_folder,
-)
+from lidar_perception.cli.data import WHAT, a_path, dask_option, limit_option, open_and_describe, out_folder
 from lidar_perception.cli.options import Runs, Settings, checked, device_option, settings_options
 from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.machine import count_cores, read_cpu_name
@@ -51,28 +44,50 @@ def _list_parameters(given: Mapping[str, Any]) -> list[Runs]:
 
 @click.command(cls=Command)
 @click.argument("words", nargs=-1, metavar="[EXPERIMENT] DATA|sim")
-@a_path("--data", f"Same as DATA. {WHAT} `sim`: simulated scans, for experiments that train.",
-        "DATA|sim")
-@a_path("--split", "Measure only the frames or sequences named in this file, one per line. "
-        "Experiments that train use the others for training.")
-@out_folder("Folder for the report; the same command resumes a run that was stopped.",
-            required=True)
-@click.option("--budget", type=click.FloatRange(0, min_open=True), metavar="HOURS",
-              help="Time for training and measuring, which sets the number of steps of all "
-              "networks. Default: 2 with `sim`, otherwise the paper's number of epochs.")
-@click.option("--seeds", type=click.IntRange(1, 20), metavar="N", help="Train every network with "
-              "this many seeds. Default: up to 3, as the budget allows.")
+@a_path("--data", f"Same as DATA. {WHAT} `sim`: simulated scans, for experiments that train.", "DATA|sim")
+@a_path(
+    "--split",
+    "Measure only the frames or sequences named in this file, one per line. "
+    "Experiments that train use the others for training.",
+)
+@out_folder("Folder for the report; the same command resumes a run that was stopped.", required=True)
+@click.option(
+    "--budget",
+    type=click.FloatRange(0, min_open=True),
+    metavar="HOURS",
+    help="Time for training and measuring, which sets the number of steps of all "
+    "networks. Default: 2 with `sim`, otherwise the paper's number of epochs.",
+)
+@click.option(
+    "--seeds",
+    type=click.IntRange(1, 20),
+    metavar="N",
+    help="Train every network with this many seeds. Default: up to 3, as the budget allows.",
+)
 @device_option
-@click.option("--jobs", type=click.IntRange(1), help="Number of processes. Default: one for each "
-                                                     "core.")
+@click.option("--jobs", type=click.IntRange(1), help="Number of processes. Default: one for each core.")
 @dask_option
 @limit_option
-@click.option("--force", is_flag=True, help="Start over, whatever is in --out. Networks that were "
-              "trained there with the same settings are used again.")
+@click.option(
+    "--force",
+    is_flag=True,
+    help="Start over, whatever is in --out. Networks that were trained there with the same settings are used again.",
+)
 @settings_options(_list_parameters, "batch=8")
-def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out: Path,
-              budget: float | None, seeds: int | None, device: str, jobs: int | None,
-              dask: str | None, limit: int | None, force: bool, settings: Settings) -> None:
+def reproduce(
+    words: tuple[str, ...],
+    data: Path | None,
+    split: Path | None,
+    out: Path,
+    budget: float | None,
+    seeds: int | None,
+    device: str,
+    jobs: int | None,
+    dask: str | None,
+    limit: int | None,
+    force: bool,
+    settings: Settings,
+) -> None:
     """Run an experiment of a paper and report each value next to the paper's.
 
     EXPERIMENT is stm-cpa (default: every table of the STM-CPA paper), stm-cpa-configurations
@@ -104,18 +119,17 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
     started, before = datetime.now().astimezone(), perf_counter()
     workers = jobs or count_cores()
     if experiment.training is None:
-        refuse_given(("budget", "seeds", "device", "config", "given"),
-                     f"is for experiments that train networks; {name} trains none")
+        refuse_given(
+            ("budget", "seeds", "device", "config", "given"),
+            f"is for experiments that train networks; {name} trains none",
+        )
         recording = open_and_describe(data, split=split)
         recording.require(BOXES, "reproduce")
-        records = run_experiment(experiment, recording, out, jobs=workers, dask=dask, force=force,
-                                 limit=limit)
+        records = run_experiment(experiment, recording, out, jobs=workers, dask=dask, force=force, limit=limit)
     else:
-        request = _make_request(experiment, data, split, out, budget, seeds, device, workers,
-                                limit, settings)
+        request = _make_request(experiment, data, split, out, budget, seeds, device, workers, limit, settings)
         recording = request.scenes.open_test_recording(request.params, out / "scans")
-        experiment, records = run_with_models(experiment, request, recording, dask=dask,
-                                              force=force, limit=limit)
+        experiment, records = run_with_models(experiment, request, recording, dask=dask, force=force, limit=limit)
     seconds = perf_counter() - before
     sections = experiment.make_sections(records)
     if experiment.illustrate is not None:
@@ -124,10 +138,11 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
         "data": ("simulated scans" if str(data) == SIM else str(data.resolve()))
         + (f", the first {limit} scans" if limit else ""),
         "started": started.isoformat(" ", "seconds"),
-        "duration of this run": f"{seconds:.0f} s" + (
-            f" on the cluster at {dask}" if dask else f", processes: {workers}"),
+        "duration of this run": f"{seconds:.0f} s"
+        + (f" on the cluster at {dask}" if dask else f", processes: {workers}"),
         "machine": f"{read_cpu_name()}, {os.cpu_count()} cores; Python {platform.python_version()}",
-        "version": f"lidar_perception {__version__}"}
+        "version": f"lidar_perception {__version__}",
+    }
     page = write_report(out, experiment, records, sections, about)
     if all("skipped" in record for record in records):
         raise InputError(f"{data}: no frame could be measured ({records[0]['skipped']})")
@@ -135,9 +150,18 @@ def reproduce(words: tuple[str, ...], data: Path | None, split: Path | None, out
     console.print(f"report: {page}")
 
 
-def _make_request(experiment: Experiment, data: Path, split: Path | None, out: Path,
-                  budget: float | None, seeds: int | None, device: str, jobs: int,
-                  limit: int | None, settings: Settings) -> ModelRequest:
+def _make_request(
+    experiment: Experiment,
+    data: Path,
+    split: Path | None,
+    out: Path,
+    budget: float | None,
+    seeds: int | None,
+    device: str,
+    jobs: int,
+    limit: int | None,
+    settings: Settings,
+) -> ModelRequest:
     """Return the request for the models of an experiment.
 
     Raises:
@@ -145,6 +169,7 @@ def _make_request(experiment: Experiment, data: Path, split: Path | None, out: P
     """
     from experiments.framework.scenes import TEST_SCANS, ExperimentScenes
     from experiments.framework.trained_models import DEFAULT_BUDGET_H, ModelRequest
+
     assert experiment.training is not None and experiment.models is not None
     scenes = ExperimentScenes.split(str(data), split)
     given = settings.values(Runs(experiment.name, collect_fields(experiment.training), None))[0]
@@ -154,8 +179,9 @@ def _make_request(experiment: Experiment, data: Path, split: Path | None, out: P
     protocol = experiment.protocol if budget is None and not has_steps else {}
     params = checked(experiment.training, {**protocol, **given})
     frames = TEST_SCANS if scenes.is_simulated else len(scenes.test)
-    return ModelRequest(experiment.models, params, scenes, out, budget, seeds, device, jobs,
-                        min(frames, limit or frames))
+    return ModelRequest(
+        experiment.models, params, scenes, out, budget, seeds, device, jobs, min(frames, limit or frames)
+    )
 
 
 def load_experiment(name: str) -> Experiment:
@@ -171,14 +197,14 @@ def _split_words(words: tuple[str, ...], data: Path | None) -> tuple[str, Path]:
         UsageError: DATA is missing, or something is given twice.
     """
     first = words[0] if words else ""
-    is_experiment = first in EXPERIMENTS or len(words) > 1 or (
-        first and data is not None and not Path(first).exists())
+    is_experiment = first in EXPERIMENTS or len(words) > 1 or (first and data is not None and not Path(first).exists())
     given = first if is_experiment else None
-    rest = words[given is not None:]
+    rest = words[given is not None :]
     name = Choice(EXPERIMENTS).convert(given or next(iter(EXPERIMENTS)), None, None)
     if len(rest) + (data is not None) > 1:
-        raise click.UsageError(f"DATA is given twice, {' '.join(rest)}"
-                               + (f" and --data {data}" if data else "") + "; give one")
+        raise click.UsageError(
+            f"DATA is given twice, {' '.join(rest)}" + (f" and --data {data}" if data else "") + "; give one"
+        )
     if not rest and data is None:
         raise click.UsageError("DATA is missing: give the path of a recording, or `sim`")
     return name, data or Path(rest[0])

@@ -138,6 +138,9 @@ class Experiment:
 
     def with_models(self, models: Mapping[str, TrainedModel]) -> Experiment:
         """Return the experiment whose functions get these models."""
-        return replace(self, measure=partial(self.measure, models=models),
-                       make_sections=partial(self.make_sections, models=models),
-                       illustrate=self.illustrate and partial(self.illustrate, models=models))
+        return replace(
+            self,
+            measure=partial(self.measure, models=models),
+            make_sections=partial(self.make_sections, models=models),
+            illustrate=self.illustrate and partial(self.illustrate, models=models),
+        )

@@ -15,8 +15,11 @@ MAX_COLUMNS = 3  # panels side by side
 
 def encode_figure(figure: Figure | Picture, *, dark: bool = False) -> str:
     """Return a figure as a data URL for a page."""
-    kind, content = (("png", _encode_picture(figure)) if isinstance(figure, Picture)
-                     else ("svg+xml", draw_figure(figure, "svg", dark=dark)))
+    kind, content = (
+        ("png", _encode_picture(figure))
+        if isinstance(figure, Picture)
+        else ("svg+xml", draw_figure(figure, "svg", dark=dark))
+    )
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
@@ -27,6 +30,7 @@ def encode_png(figure: Figure | Picture) -> bytes:
 
 def _encode_picture(picture: Picture) -> bytes:
     from PIL import Image
+
     stream = BytesIO()
     Image.fromarray(picture.pixels).save(stream, format="png")
     return stream.getvalue()
@@ -43,10 +47,19 @@ def draw_figure(figure: Figure, kind: str = "svg", *, dark: bool = False) -> byt
 
     back, front, grid = ("#16181c", "#d8dade", "#34383f") if dark else ("white", "black", "#e3e3e3")
     style: Any = {
-        "figure.facecolor": back, "axes.facecolor": back, "savefig.facecolor": back,
-        "text.color": front, "axes.labelcolor": front, "axes.edgecolor": GREY,
-        "xtick.color": front, "ytick.color": front, "grid.color": grid, "font.size": 9,
-        "legend.frameon": False, "svg.hashsalt": figure.name}
+        "figure.facecolor": back,
+        "axes.facecolor": back,
+        "savefig.facecolor": back,
+        "text.color": front,
+        "axes.labelcolor": front,
+        "axes.edgecolor": GREY,
+        "xtick.color": front,
+        "ytick.color": front,
+        "grid.color": grid,
+        "font.size": 9,
+        "legend.frameon": False,
+        "svg.hashsalt": figure.name,
+    }
     with matplotlib.rc_context(style):
         columns = min(MAX_COLUMNS, len(figure.panels))
         rows = -(-len(figure.panels) // columns)
@@ -64,10 +77,14 @@ def draw_figure(figure: Figure, kind: str = "svg", *, dark: bool = False) -> byt
                 axis.set_ylim(0, 102)
             axis.grid(linewidth=0.6)
             axis.spines[["top", "right"]].set_visible(False)
-        for axis in axes[len(figure.panels):]:
+        for axis in axes[len(figure.panels) :]:
             axis.set_visible(False)
-        canvas.legend(handles.values(), handles.keys(), ncols=1 if legend_at_right else 2 * columns,
-                      loc="outside right upper" if legend_at_right else "outside lower center")
+        canvas.legend(
+            handles.values(),
+            handles.keys(),
+            ncols=1 if legend_at_right else 2 * columns,
+            loc="outside right upper" if legend_at_right else "outside lower center",
+        )
         stream = BytesIO()
         metadata = {"Date": None} if kind == "svg" else {}
         canvas.savefig(stream, format=kind, metadata=metadata)
@@ -78,17 +95,16 @@ def _choose_colors(lines: tuple[Line, ...]) -> list[str]:
     """Return a colour for each line; a dashed line "a, paper" has the colour of the line "a"."""
     solid = [line.label for line in lines if not line.dashed]
     by_label = {label: COLORS[i % len(COLORS)] for i, label in enumerate(solid)}
-    return [next((color for label, color in by_label.items() if line.label.startswith(label)), GREY)
-            for line in lines]
+    return [next((color for label, color in by_label.items() if line.label.startswith(label)), GREY) for line in lines]
 
 
 def _plot_line(axes, line: Line, color: str):
-    x, y, low, high = ([float("nan") if v is None else v for v in values]
-                       for values in (line.x, line.y, line.low, line.high))
+    x, y, low, high = (
+        [float("nan") if v is None else v for v in values] for values in (line.x, line.y, line.low, line.high)
+    )
     if len(low) and len(high):
         axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
-    style = dict(linestyle="--", marker="D", markerfacecolor="none") if line.dashed else dict(
-        marker="o", markersize=3)
+    style = dict(linestyle="--", marker="D", markerfacecolor="none") if line.dashed else dict(marker="o", markersize=3)
     if line.dashed and len(x) == 2 and x[0] == x[1]:
         style["marker"] = ""  # a vertical line marks a value on the x axis
     return axes.plot(x, y, color=color, linewidth=1.4, **style)[0]

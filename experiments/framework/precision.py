@@ -45,19 +45,26 @@ def to_record(objects: CameraObjects) -> dict[str, Any]:
 def from_record(record: Mapping[str, Any]) -> CameraObjects:
     """Return the objects of a record; their observation angles are NaN."""
     count = len(record["class_ids"])
-    columns = {name: np.array(record[name], float).reshape(-1, WIDTHS[name]) if name in WIDTHS
-               else np.array(record[name], float) for name in COLUMNS}
+    columns = {
+        name: np.array(record[name], float).reshape(-1, WIDTHS[name])
+        if name in WIDTHS
+        else np.array(record[name], float)
+        for name in COLUMNS
+    }
     pixels = record.get("image_boxes")
     return CameraObjects(
-        columns["class_ids"].astype(np.int32), columns["boxes"],
-        np.tile(NO_CAMERA, (count, 1)) if pixels is None
-        else np.array(pixels, float).reshape(-1, 4),
-        np.full(count, np.nan), columns["truncated"], columns["occluded"].astype(int),
-        columns["scores"], columns["regions"])
+        columns["class_ids"].astype(np.int32),
+        columns["boxes"],
+        np.tile(NO_CAMERA, (count, 1)) if pixels is None else np.array(pixels, float).reshape(-1, 4),
+        np.full(count, np.nan),
+        columns["truncated"],
+        columns["occluded"].astype(int),
+        columns["scores"],
+        columns["regions"],
+    )
 
 
-def compare_records(true: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]]
-                    ) -> list[ComparedFrame]:
+def compare_records(true: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]]) -> list[ComparedFrame]:
     """Return the comparison of the records of labels and of detections of the same frames."""
     return [compare_objects(from_record(t), from_record(f)) for t, f in zip(true, found)]
 
@@ -80,8 +87,9 @@ def compute_cells(frames: list[ComparedFrame]) -> np.ndarray:
     return cells
 
 
-def draw_cells(names: Sequence[str], detectors: Mapping[str, list[ComparedFrame]],
-               replicates: int = REPLICATES) -> dict[str, np.ndarray]:
+def draw_cells(
+    names: Sequence[str], detectors: Mapping[str, list[ComparedFrame]], replicates: int = REPLICATES
+) -> dict[str, np.ndarray]:
     """Return the cells of each detector for all frames and for samples of them.
 
     Args:
@@ -93,5 +101,7 @@ def draw_cells(names: Sequence[str], detectors: Mapping[str, list[ComparedFrame]
         for frames that cannot be divided.
     """
     samples = [np.arange(len(names)), *draw_samples(group_frames(names), replicates)]
-    return {name: np.stack([compute_cells([frames[i] for i in sample]) for sample in samples])
-            for name, frames in detectors.items()}
+    return {
+        name: np.stack([compute_cells([frames[i] for i in sample]) for sample in samples])
+        for name, frames in detectors.items()
+    }

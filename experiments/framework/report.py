@@ -21,14 +21,17 @@ from experiments.framework.figures import encode_figure, encode_png
 from experiments.framework.report_files import REPORT
 from lidar_perception.runs.files import write_bytes, write_text
 
-LEGEND = ("A value, [its 95 % interval] by a bootstrap over frames, and the paper's value. An "
-          "interval from few frames, or from frames that all agree, is too narrow.")
-MAX_ROWS = 30   # a longer table is folded in the page
+LEGEND = (
+    "A value, [its 95 % interval] by a bootstrap over frames, and the paper's value. An "
+    "interval from few frames, or from frames that all agree, is too narrow."
+)
+MAX_ROWS = 30  # a longer table is folded in the page
 MAX_NAMES = 10  # of frames skipped for the same reason
 
 
-def write_report(out: Path, experiment: Experiment, records: list[dict[str, Any]],
-                 sections: list[Section], about: dict[str, str]) -> Path:
+def write_report(
+    out: Path, experiment: Experiment, records: list[dict[str, Any]], sections: list[Section], about: dict[str, str]
+) -> Path:
     """Write report.html, .md and .json, tables/*.csv and figures/*.png into out.
 
     Args:
@@ -44,9 +47,15 @@ def write_report(out: Path, experiment: Experiment, records: list[dict[str, Any]
     counts["skipped"] = len(records) - counts["measured"]
     about = {"frames": f"{counts['measured']} measured, {counts['skipped']} skipped", **about}
     groups = group_skipped_frames(records)
-    content = {"experiment": experiment.name, "title": experiment.title,
-               "question": experiment.question, "about": about, **counts,
-               "skipped_frames": [r for r in records if "skipped" in r], "sections": sections}
+    content = {
+        "experiment": experiment.name,
+        "title": experiment.title,
+        "question": experiment.question,
+        "about": about,
+        **counts,
+        "skipped_frames": [r for r in records if "skipped" in r],
+        "sections": sections,
+    }
     write_text(out / REPORT, json.dumps(to_json_data(content), indent=1, allow_nan=False))
     for table in (table for section in sections for table in section.tables):
         write_text(out / "tables" / f"{table.name}.csv", to_csv(table))
@@ -67,15 +76,18 @@ def group_skipped_frames(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for record in records:
         if "skipped" in record:
             groups.setdefault(re.sub(r"\d+", "0", record["skipped"]), []).append(record)
-    return [{"count": len(group), "reason": group[0]["skipped"],
-             "names": [r["frame"] for r in group[:MAX_NAMES]]}
-            for group in sorted(groups.values(), key=len, reverse=True)]
+    return [
+        {"count": len(group), "reason": group[0]["skipped"], "names": [r["frame"] for r in group[:MAX_NAMES]]}
+        for group in sorted(groups.values(), key=len, reverse=True)
+    ]
 
 
 def format_cell(cell: Cell) -> tuple[str, str, str]:
     """Return value, interval and the paper's value as text; "" where there is none."""
-    value, low, high, paper = (None if number is None else f"{number:.{cell.digits}f}" for number
-                               in (cell.value, cell.low, cell.high, cell.paper))
+    value, low, high, paper = (
+        None if number is None else f"{number:.{cell.digits}f}"
+        for number in (cell.value, cell.low, cell.high, cell.paper)
+    )
     return value or "–", f"[{low}, {high}]" if low and high else "", paper or ""
 
 
@@ -84,37 +96,64 @@ def is_number(cell: str | Cell) -> bool:
     return isinstance(cell, Cell) or re.fullmatch(r"[-\d.]+", cell) is not None
 
 
-def to_html(experiment: Experiment, sections: list[Section], about: dict[str, str],
-            skipped: list[dict[str, Any]]) -> str:
+def to_html(
+    experiment: Experiment, sections: list[Section], about: dict[str, str], skipped: list[dict[str, Any]]
+) -> str:
     """Return the report as one HTML page that needs no other file."""
     import jinja2
 
-    template = jinja2.Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"),
-                               autoescape=True, undefined=jinja2.StrictUndefined)
+    template = jinja2.Template(
+        Path(__file__).with_name("report.html").read_text(encoding="utf-8"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+    )
     return template.render(
-        title=experiment.title, question=experiment.question, about=about, skipped=skipped,
-        sections=sections, legend=LEGEND, max_rows=MAX_ROWS, format_cell=format_cell,
-        encode_figure=encode_figure, is_number=is_number)
+        title=experiment.title,
+        question=experiment.question,
+        about=about,
+        skipped=skipped,
+        sections=sections,
+        legend=LEGEND,
+        max_rows=MAX_ROWS,
+        format_cell=format_cell,
+        encode_figure=encode_figure,
+        is_number=is_number,
+    )
 
 
-def to_markdown(experiment: Experiment, sections: list[Section], about: dict[str, str],
-                skipped: list[dict[str, Any]]) -> str:
+def to_markdown(
+    experiment: Experiment, sections: list[Section], about: dict[str, str], skipped: list[dict[str, Any]]
+) -> str:
     """Return the report in Markdown, with links to the figures."""
-    lines = [f"# {experiment.title}", "", experiment.question, "",
-             *_format_rows(("", ""), list(about.items())), ""]
+    lines = [f"# {experiment.title}", "", experiment.question, "", *_format_rows(("", ""), list(about.items())), ""]
     if skipped:
-        lines += ["## Skipped frames", "", *_format_rows(
-            ("frames", "reason of the first", "names"),
-            [(str(g["count"]), g["reason"], ", ".join(g["names"])
-              + (", ..." if g["count"] > len(g["names"]) else "")) for g in skipped]), ""]
+        lines += [
+            "## Skipped frames",
+            "",
+            *_format_rows(
+                ("frames", "reason of the first", "names"),
+                [
+                    (
+                        str(g["count"]),
+                        g["reason"],
+                        ", ".join(g["names"]) + (", ..." if g["count"] > len(g["names"]) else ""),
+                    )
+                    for g in skipped
+                ],
+            ),
+            "",
+        ]
     lines += [LEGEND, ""]
     for section in sections:
         lines += [f"## {section.title}", "", *([section.text, ""] if section.text else [])]
         for table in section.tables:
-            lines += [f"**{table.title}**", "",
-                      *_format_rows(table.header, [[_format_inline(cell) for cell in row]
-                                                   for row in table.rows]),
-                      "", *([table.note, ""] if table.note else [])]
+            lines += [
+                f"**{table.title}**",
+                "",
+                *_format_rows(table.header, [[_format_inline(cell) for cell in row] for row in table.rows]),
+                "",
+                *([table.note, ""] if table.note else []),
+            ]
         for figure in section.figures:
             lines += [f"![{figure.title}](figures/{figure.name}.png)", ""]
     return "\n".join(lines)
@@ -123,6 +162,7 @@ def to_markdown(experiment: Experiment, sections: list[Section], about: dict[str
 def _format_rows(header, rows) -> list[str]:
     def line(row) -> str:
         return "| " + " | ".join(text.replace("|", r"\|") for text in row) + " |"
+
     return [line(header), "|" + "---|" * len(header), *map(line, rows)]
 
 
@@ -135,17 +175,30 @@ def _format_inline(cell: str | Cell) -> str:
 
 def to_csv(table: Table) -> str:
     """Return a table as CSV. A column of values becomes four: value, low, high and paper."""
-    has_values = [any(isinstance(row[i], Cell) for row in table.rows)
-                  for i in range(len(table.header))]
+    has_values = [any(isinstance(row[i], Cell) for row in table.rows) for i in range(len(table.header))]
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([name for i, title in enumerate(table.header) for name in (
-        [title, *(f"{title} {end}" for end in ("low", "high", "paper"))] if has_values[i]
-        else [title])])
+    writer.writerow(
+        [
+            name
+            for i, title in enumerate(table.header)
+            for name in ([title, *(f"{title} {end}" for end in ("low", "high", "paper"))] if has_values[i] else [title])
+        ]
+    )
     for row in table.rows:
-        writer.writerow([value for i, cell in enumerate(row) for value in (
-            [cell.value, cell.low, cell.high, cell.paper] if isinstance(cell, Cell)
-            else [cell, "", "", ""] if has_values[i] else [cell])])
+        writer.writerow(
+            [
+                value
+                for i, cell in enumerate(row)
+                for value in (
+                    [cell.value, cell.low, cell.high, cell.paper]
+                    if isinstance(cell, Cell)
+                    else [cell, "", "", ""]
+                    if has_values[i]
+                    else [cell]
+                )
+            ]
+        )
     return stream.getvalue()
 
 
@@ -169,8 +222,7 @@ def to_json_data(value: Any) -> Any:
     return to_json_data(value.item())
 
 
-def print_report(sections: list[Section], skipped: list[dict[str, Any]], console: Console,
-                 max_rows: int = 20) -> None:
+def print_report(sections: list[Section], skipped: list[dict[str, Any]], console: Console, max_rows: int = 20) -> None:
     """Print the tables of at most max_rows rows, without intervals, and the skipped frames."""
     for table in (table for section in sections for table in section.tables):
         if len(table.rows) <= max_rows:
@@ -181,8 +233,7 @@ def print_report(sections: list[Section], skipped: list[dict[str, Any]], console
 
 
 def _make_grid(table: Table) -> Grid:
-    grid = Grid(title=table.title, title_justify="left", box=SIMPLE_HEAD,
-                padding=(0, 1, 0, 0))
+    grid = Grid(title=table.title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for i, name in enumerate(table.header):
         right = i > 0 and all(is_number(row[i]) for row in table.rows)
         grid.add_column(name, justify="right" if right else "left", overflow="fold")

@@ -19,6 +19,10 @@ def list_report_files(folder: Path) -> list[Path]:
     names = []
     with suppress(OSError, ValueError, KeyError, TypeError):  # no report, or not ours
         report = json.loads((folder / REPORT).read_text())
-        names = [f"{kind}/{Path(item['name']).name}{ending}" for section in report["sections"]
-                 for kind, ending in FOLDERS.items() for item in section[kind]]
+        names = [
+            f"{kind}/{Path(item['name']).name}{ending}"
+            for section in report["sections"]
+            for kind, ending in FOLDERS.items()
+            for item in section[kind]
+        ]
     return [folder / name for name in (*names, *PAGES)]

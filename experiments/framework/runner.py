@@ -22,9 +22,16 @@ from lidar_perception.runs.resuming import hash_names
 from lidar_perception.scoring.run import fill_journal
 
 
-def run_experiment(experiment: Experiment, recording: Recording, out: Path, *, jobs: int = 1,
-                   dask: str | None = None, force: bool = False,
-                   limit: int | None = None) -> list[dict[str, Any]]:
+def run_experiment(
+    experiment: Experiment,
+    recording: Recording,
+    out: Path,
+    *,
+    jobs: int = 1,
+    dask: str | None = None,
+    force: bool = False,
+    limit: int | None = None,
+) -> list[dict[str, Any]]:
     """Measure the first `limit` frames of a recording, or all, and return their records in order.
 
     Every record is written to out/frames.jsonl as soon as it is measured, and a run that was
@@ -46,9 +53,15 @@ def run_experiment(experiment: Experiment, recording: Recording, out: Path, *, j
         return _measure(experiment, recording, journal, jobs, dask, limit)
 
 
-def run_with_models(experiment: Experiment, request: ModelRequest, recording: Recording, *,
-                    dask: str | None = None, force: bool = False, limit: int | None = None
-                    ) -> tuple[Experiment, list[dict[str, Any]]]:
+def run_with_models(
+    experiment: Experiment,
+    request: ModelRequest,
+    recording: Recording,
+    *,
+    dask: str | None = None,
+    force: bool = False,
+    limit: int | None = None,
+) -> tuple[Experiment, list[dict[str, Any]]]:
     """Train the models of an experiment, then measure frames as run_experiment() does.
 
     Models that were trained in request.out before, with the same configuration, are not trained
@@ -67,26 +80,40 @@ def run_with_models(experiment: Experiment, request: ModelRequest, recording: Re
 
 
 @contextmanager
-def _open_run(experiment: Experiment, recording: Recording, out: Path, force: bool,
-              training: dict[str, Any] | None = None) -> Iterator[Journal]:
+def _open_run(
+    experiment: Experiment, recording: Recording, out: Path, force: bool, training: dict[str, Any] | None = None
+) -> Iterator[Journal]:
     """Open the journal in out, see run_experiment."""
     names = [frame.name for frame in recording]
     path = recording.path.resolve() if recording.path.exists() else recording.path  # simulated
-    plan = {"experiment": experiment.name, "version": __version__, "data": str(path),
-            "frames": len(names), "frame_names": hash_names(names),
-            "settings": experiment.settings,
-            **({} if training is None else {"training": training})}
+    plan = {
+        "experiment": experiment.name,
+        "version": __version__,
+        "data": str(path),
+        "frames": len(names),
+        "frame_names": hash_names(names),
+        "settings": experiment.settings,
+        **({} if training is None else {"training": training}),
+    }
     with open_journal(out, plan, force=force, list_files=list_report_files) as journal:
         yield journal
 
 
-def _measure(experiment: Experiment, recording: Recording, journal: Journal, jobs: int,
-             dask: str | None, limit: int | None) -> list[dict[str, Any]]:
+def _measure(
+    experiment: Experiment, recording: Recording, journal: Journal, jobs: int, dask: str | None, limit: int | None
+) -> list[dict[str, Any]]:
     """Measure the frames that the journal lacks, and return all records, see run_experiment."""
     names = [frame.name for frame in recording]
     with threadpool_limits(1):
-        fill_journal(journal, recording, functools.partial(_make_measure, experiment),
-                     names[:limit], jobs=jobs, dask=dask, title=experiment.name)
+        fill_journal(
+            journal,
+            recording,
+            functools.partial(_make_measure, experiment),
+            names[:limit],
+            jobs=jobs,
+            dask=dask,
+            title=experiment.name,
+        )
     journal.sort(names)
     records = [json.loads(journal.lines[name]) for name in names[:limit]]
     lost = recording.missing_scans if limit is None else ()
@@ -102,4 +129,5 @@ def _make_measure(experiment: Experiment, recording: Recording) -> Callable[[Fra
     def measure(frame: Frame) -> str:
         record = experiment.measure(recording.frames, number[frame.name])
         return json.dumps({"frame": frame.name, **record}, allow_nan=False)
+
     return measure

@@ -67,8 +67,7 @@ class ExperimentScenes:
             measured = open_labelled_frames(path, test)
             rest = frames.exclude([measured], "train on")
         train, val = rest.split(PAPER_SHARE * len(frames.frames) / len(rest.frames), SPLIT_SEED)
-        return ExperimentScenes(data, _list_names(train), _list_names(val), _list_names(measured),
-                                frames.height)
+        return ExperimentScenes(data, _list_names(train), _list_names(val), _list_names(measured), frames.height)
 
     @property
     def is_simulated(self) -> bool:
@@ -76,8 +75,10 @@ class ExperimentScenes:
 
     def settings(self) -> dict[str, Any]:
         """Return what identifies these scenes, for the settings of a run."""
-        return {"data": self.data if self.is_simulated else str(Path(self.data).resolve()),
-                **{name: hash_names(getattr(self, name)) for name in ("train", "val", "test")}}
+        return {
+            "data": self.data if self.is_simulated else str(Path(self.data).resolve()),
+            **{name: hash_names(getattr(self, name)) for name in ("train", "val", "test")},
+        }
 
     def select_labelled(self, share: float) -> tuple[str, ...]:
         """Return a share of the frames to train on. Smaller shares are part of larger ones."""
@@ -112,11 +113,15 @@ class ExperimentScenes:
     def describe(self, params: Any) -> str:
         """Return one sentence about the scenes to train on, to validate on and to measure on."""
         if self.is_simulated:
-            return (f"{params.data.scans} simulated {params.scene} scans of {params.sensor} to "
-                    f"train on, {params.data.val_scans} of other scenes to validate on, and others "
-                    "again to measure on")
-        return (f"{len(self.train)} frames to train on, {len(self.val)} to validate on and "
-                f"{len(self.test)} to measure on, all of {self.data}")
+            return (
+                f"{params.data.scans} simulated {params.scene} scans of {params.sensor} to "
+                f"train on, {params.data.val_scans} of other scenes to validate on, and others "
+                "again to measure on"
+            )
+        return (
+            f"{len(self.train)} frames to train on, {len(self.val)} to validate on and "
+            f"{len(self.test)} to measure on, all of {self.data}"
+        )
 
 
 def _list_names(frames: LabelledFrames) -> tuple[str, ...]:
@@ -127,19 +132,35 @@ def open_selected(path: Path, names: Sequence[str], height: float | None) -> Rec
     """Open the frames of a recording that have these names."""
     recording = open_recording(path, sensor_height=height)
     frames = {frame.name: frame for frame in recording.frames[:]}
-    return replace(recording, frames=[frames[name] for name in names], missing_scans=(),
-                   reopen=partial(open_selected, path, names, height))
+    return replace(
+        recording,
+        frames=[frames[name] for name in names],
+        missing_scans=(),
+        reopen=partial(open_selected, path, names, height),
+    )
 
 
 def open_simulated(params: Any, folder: Path, count: int) -> Recording:
     """Return simulated scans to measure on as a recording; each is computed once and kept."""
     scenes = Scenes(None, params.data.val_people, params.scene)
     source = SimulatedScenes(
-        FIRST_TEST_SCENE, count, find_sensor(params.sensor, params.mount_height), scenes,
-        folder, params.data.cache_gb, around=getattr(params, "range", "") == "around")
+        FIRST_TEST_SCENE,
+        count,
+        find_sensor(params.sensor, params.mount_height),
+        scenes,
+        folder,
+        params.data.cache_gb,
+        around=getattr(params, "range", "") == "around",
+    )
     has = frozenset({BOXES, CAMERA} if scenes.camera else {BOXES})
-    return Recording(Path(SIM), f"simulated {params.scene}", TestFrames(source), has,
-                     reopen=partial(open_simulated, params, folder, count), is_sequential=False)
+    return Recording(
+        Path(SIM),
+        f"simulated {params.scene}",
+        TestFrames(source),
+        has,
+        reopen=partial(open_simulated, params, folder, count),
+        is_sequential=False,
+    )
 
 
 class TestFrames(ComputedFrames):
@@ -156,8 +177,11 @@ class TestFrames(ComputedFrames):
     def compute_frame(self, number: int) -> Frame:
         read = cache(partial(self.source.frame, number))
         scene, _ = self.source.locate(number)
-        return Frame(f"scene {scene}", 0, lambda: read().load(), lambda: read().truth(),
-                     calibration=lambda: read().calibration(),
-                     sensor_height=self.source.sensor.height)
-
-
+        return Frame(
+            f"scene {scene}",
+            0,
+            lambda: read().load(),
+            lambda: read().truth(),
+            calibration=lambda: read().calibration(),
+            sensor_height=self.source.sensor.height,
+        )

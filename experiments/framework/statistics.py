@@ -26,8 +26,9 @@ class BootstrapParams:
     seed: int = 0
 
 
-def bootstrap(counts: np.ndarray, compute: Callable[[np.ndarray], np.ndarray],
-              params: BootstrapParams = BootstrapParams()) -> np.ndarray:
+def bootstrap(
+    counts: np.ndarray, compute: Callable[[np.ndarray], np.ndarray], params: BootstrapParams = BootstrapParams()
+) -> np.ndarray:
     """Return values computed from counts, with their intervals.
 
     Args:
@@ -57,8 +58,9 @@ def bootstrap(counts: np.ndarray, compute: Callable[[np.ndarray], np.ndarray],
     return np.stack([value, *np.where(np.isnan(value), np.nan, limits)])
 
 
-def compute_paired_p(counts: np.ndarray, compute: Callable[[np.ndarray], np.ndarray],
-                     params: BootstrapParams = BootstrapParams()) -> np.ndarray:
+def compute_paired_p(
+    counts: np.ndarray, compute: Callable[[np.ndarray], np.ndarray], params: BootstrapParams = BootstrapParams()
+) -> np.ndarray:
     """Return p values of the differences between two methods on the same frames.
 
     A paired permutation test: under the hypothesis that the methods are equal, the counts of each
@@ -79,8 +81,7 @@ def compute_paired_p(counts: np.ndarray, compute: Callable[[np.ndarray], np.ndar
 
     def difference(first: np.ndarray) -> np.ndarray:
         rows = first.shape[:-1]
-        return compute(first.reshape(*rows, *shape)) - compute(
-            (total - first).reshape(*rows, *shape))
+        return compute(first.reshape(*rows, *shape)) - compute((total - first).reshape(*rows, *shape))
 
     observed = np.abs(difference(flat[:, 0].sum(axis=0)))
     if frames == 0:
@@ -103,8 +104,7 @@ def estimate(draws: np.ndarray, level: float = BootstrapParams.level) -> np.ndar
     """
     if len(draws) == 1:
         return np.stack([draws[0], *np.full((2, *draws[0].shape), np.nan)])
-    return np.stack([draws[0], *np.where(np.isnan(draws[0]), np.nan,
-                                         _compute_limits(draws[1:], level))])
+    return np.stack([draws[0], *np.where(np.isnan(draws[0]), np.nan, _compute_limits(draws[1:], level))])
 
 
 def compute_sampled_p(draws: np.ndarray) -> float:
@@ -129,8 +129,11 @@ def compute_sampled_p(draws: np.ndarray) -> float:
 def _compute_limits(replicates: np.ndarray, level: float) -> np.ndarray:
     """Return the ends (2, *V) of the interval of replicates (R, *V); NaN where all are NaN."""
     empty = np.isnan(replicates).all(axis=0)
-    ends = np.nanpercentile(np.where(empty, 0.0, replicates),  # NumPy warns about columns of NaN
-                            [50 - 50 * level, 50 + 50 * level], axis=0)
+    ends = np.nanpercentile(
+        np.where(empty, 0.0, replicates),  # NumPy warns about columns of NaN
+        [50 - 50 * level, 50 + 50 * level],
+        axis=0,
+    )
     return np.where(empty, np.nan, ends)
 
 
@@ -142,12 +145,12 @@ def divide(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
 
 def compute_rates(tp: np.ndarray, fp: np.ndarray, fn: np.ndarray) -> np.ndarray:
     """Return recall, precision and F1 (..., 3) in percent of counts (...,); NaN without cases."""
-    return 100 * np.stack([divide(tp, tp + fn), divide(tp, tp + fp),
-                           divide(2 * tp, 2 * tp + fp + fn)], axis=-1)
+    return 100 * np.stack([divide(tp, tp + fn), divide(tp, tp + fp), divide(2 * tp, 2 * tp + fp + fn)], axis=-1)
 
 
-def make_cells(estimates: np.ndarray, paper: Iterable[float | None] = (),
-               digits: int | Iterable[int] = 1) -> tuple[Cell, ...]:
+def make_cells(
+    estimates: np.ndarray, paper: Iterable[float | None] = (), digits: int | Iterable[int] = 1
+) -> tuple[Cell, ...]:
     """Return the cells of estimates (3, V) of bootstrap().
 
     Args:
@@ -157,9 +160,10 @@ def make_cells(estimates: np.ndarray, paper: Iterable[float | None] = (),
     count = estimates.shape[1]
     paper = [*paper] or [None] * count
     digits = [digits] * count if isinstance(digits, int) else [*digits]
-    return tuple(Cell(value, low, high, published, shown)
-                 for (value, low, high), published, shown in
-                 zip(map(nan_to_none, estimates.T), paper, digits, strict=True))
+    return tuple(
+        Cell(value, low, high, published, shown)
+        for (value, low, high), published, shown in zip(map(nan_to_none, estimates.T), paper, digits, strict=True)
+    )
 
 
 def make_line(label: str, x: Iterable[float], estimates: np.ndarray) -> Line:

@@ -30,7 +30,7 @@ from lidar_perception.training.request import TrainingRequest
 Training = PointPillarsTraining | PointNetTraining
 DEFAULT_BUDGET_H = 2.0  # with simulated scans
 MAX_SEEDS = 3
-STEPS_PER_SEED = 4000   # from this many steps of each model on, another seed is worth more
+STEPS_PER_SEED = 4000  # from this many steps of each model on, another seed is worth more
 NORM_STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
 
 
@@ -103,14 +103,28 @@ class ModelRequest:
 
     def settings(self) -> dict[str, Any]:
         """Return everything that the trained models depend on, apart from this machine's speed."""
-        return {"params": self.params.fixed_settings(), "scenes": self.scenes.settings(),
-                "budget": self.budget, "seeds": self.seeds, "version": __version__}
+        return {
+            "params": self.params.fixed_settings(),
+            "scenes": self.scenes.settings(),
+            "budget": self.budget,
+            "seeds": self.seeds,
+            "version": __version__,
+        }
 
     def to_training(self, model: Model, folder: Path) -> TrainingRequest:
         """Return the request for the training of one model."""
         split, val_split = self.scenes.write_splits(self.folder, model.label_share)
-        return TrainingRequest((self.scenes.data,), (), split, val_split, folder, True, None,
-                               self.device, self.jobs if self.jobs > 1 else 0)
+        return TrainingRequest(
+            (self.scenes.data,),
+            (),
+            split,
+            val_split,
+            folder,
+            True,
+            None,
+            self.device,
+            self.jobs if self.jobs > 1 else 0,
+        )
 
 
 @dataclass(frozen=True)
@@ -132,8 +146,12 @@ class SharedPlan:
     def apply(self, model: Model) -> Model:
         """Return the model with the numbers of the plan."""
         scans = self.values["data.scans"]  # 0 without simulated ones
-        return replace(model, params=with_values(model.params, {
-            **self.values, "data.scans": max(min(scans, 1), round(model.label_share * scans))}))
+        return replace(
+            model,
+            params=with_values(
+                model.params, {**self.values, "data.scans": max(min(scans, 1), round(model.label_share * scans))}
+            ),
+        )
 
 
 def plan_training(request: ModelRequest) -> SharedPlan:
@@ -170,22 +188,32 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
         key = replace(model.params, seed=0)
         if key not in known:
             trainer = make_trainer(model.params)
-            planner = Planner(trainer, request.to_training(model, request.folder), model.params,
-                              find_sensor(model.params.sensor, model.params.mount_height), device)
+            planner = Planner(
+                trainer,
+                request.to_training(model, request.folder),
+                model.params,
+                find_sensor(model.params.sensor, model.params.mount_height),
+                device,
+            )
             sources = planner.open_few_scenes()
             known[key] = planner.measure_speed(*sources)
             if model.label_share == 1.0 and data is None:
                 data, reduced = planner.describe_scenes(*sources), trainer.reduced_range(params)
     assert data is not None, "an experiment needs a model with all labels"
     speeds = {model.name: known[replace(model.params, seed=0)] for model in models}
-    given = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps,
-                 bool(reduced))
+    given = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps, bool(reduced))
     measuring = request.test_frames * sum(s.frame for s in speeds.values()) / request.jobs
 
     def fit(seeds: int) -> Plan:
         hours = request.budget or DEFAULT_BUDGET_H
-        return fit_plan(max(0.1 * hours, hours - seeds * measuring / 3600), request.jobs,
-                        _add_speeds(list(speeds.values()) * seeds), data, given, params.epochs)
+        return fit_plan(
+            max(0.1 * hours, hours - seeds * measuring / 3600),
+            request.jobs,
+            _add_speeds(list(speeds.values()) * seeds),
+            data,
+            given,
+            params.epochs,
+        )
 
     plan = fit(request.seeds or 1)
     seeds = request.seeds or min(max(plan.steps // STEPS_PER_SEED, 1), MAX_SEEDS)
@@ -194,18 +222,31 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
     if params.validate_epochs and not params.validate_steps:
         epoch = max(1, round((plan.scans + data.recorded) / data.batch))
         plan = replace(plan, validate_steps=params.validation_steps(epoch))
-    values = {"steps": plan.steps, "validate_steps": plan.validate_steps, "data.scans": plan.scans,
-              "data.val_scans": plan.val_scans, **(reduced if plan.part else {})}
+    values = {
+        "steps": plan.steps,
+        "validate_steps": plan.validate_steps,
+        "data.scans": plan.scans,
+        "data.val_scans": plan.val_scans,
+        **(reduced if plan.part else {}),
+    }
     durations = {name: sum(training_durations(plan, speed, data)) for name, speed in speeds.items()}
-    errors.print(f"{seeds} x {len(models)} networks of {plan.steps} steps: about "
-                 + format_duration(seeds * sum(durations.values())))
+    errors.print(
+        f"{seeds} x {len(models)} networks of {plan.steps} steps: about "
+        + format_duration(seeds * sum(durations.values()))
+    )
     return SharedPlan(values, seeds, durations, speeds)
 
 
 def _add_speeds(speeds: Sequence[Speed]) -> Speed:
     """Return the speed of a training of several networks at once, on the same scans."""
-    return Speed(speeds[0].scan, max(s.cut for s in speeds), sum(s.step for s in speeds),
-                 sum(s.whole for s in speeds), sum(s.frame for s in speeds), speeds[0].scan_mb)
+    return Speed(
+        speeds[0].scan,
+        max(s.cut for s in speeds),
+        sum(s.step for s in speeds),
+        sum(s.whole for s in speeds),
+        sum(s.frame for s in speeds),
+        speeds[0].scan_mb,
+    )
 
 
 def train_models(request: ModelRequest, plan: SharedPlan) -> dict[str, TrainedModel]:
@@ -218,8 +259,7 @@ def train_models(request: ModelRequest, plan: SharedPlan) -> dict[str, TrainedMo
     limit = math.inf if request.budget is None else 3600 * request.budget
     trained: dict[str, TrainedModel] = {}
     for seed in range(plan.seeds):
-        for first, model in zip(request.models(request.params, 0),
-                                request.models(request.params, seed)):
+        for first, model in zip(request.models(request.params, 0), request.models(request.params, seed)):
             planned = plan.apply(model)
             folder = request.folder / _name_folder(planned, request.scenes)
             if not (folder / "last.safetensors").exists():
@@ -238,9 +278,9 @@ def _train(model: Model, request: ModelRequest, folder: Path, speed: Speed) -> N
     from lidar_perception.cli.train import find_commit
     from lidar_perception.training.start import start_training
     from lidar_perception.training.trainers import make_trainer
+
     params = with_values(model.params, {"data.cache": str(request.out / "scans")})
-    result = start_training(make_trainer(params), request.to_training(model, folder), params,
-                            find_commit(), speed)
+    result = start_training(make_trainer(params), request.to_training(model, folder), params, find_commit(), speed)
     if result is not None and result.progress.stopped:
         errors.print("stopped; the same command resumes")
         raise KeyboardInterrupt
@@ -251,19 +291,28 @@ def read_trained(model: Model, folder: Path) -> TrainedModel:
     from safetensors import safe_open
 
     from lidar_perception.detectors.checkpoint import read_header
+
     best, last = folder / "best.safetensors", folder / "last.safetensors"
     record = read_header(last).training
     with safe_open(best, "np") as tensors:
-        count = sum(math.prod(tensors.get_slice(name).get_shape()) for name in tensors.keys()
-                    if not name.endswith(NORM_STATISTICS))
-    return TrainedModel(model, best, record["steps"], record["seconds"],
-                        read_header(best).training["steps"], record["scenes"], count)
+        count = sum(
+            math.prod(tensors.get_slice(name).get_shape())
+            for name in tensors.keys()
+            if not name.endswith(NORM_STATISTICS)
+        )
+    return TrainedModel(
+        model, best, record["steps"], record["seconds"], read_header(best).training["steps"], record["scenes"], count
+    )
 
 
 def _name_folder(model: Model, scenes: ExperimentScenes) -> str:
     """Return the name of a model's folder, which depends on everything that it is trained with."""
-    chosen = {"params": model.params.fixed_settings(), "scenes": scenes.settings(),
-              "labelled": model.label_share, "version": __version__}
+    chosen = {
+        "params": model.params.fixed_settings(),
+        "scenes": scenes.settings(),
+        "labelled": model.label_share,
+        "version": __version__,
+    }
     return f"{re.sub(r'[^a-z0-9]+', '-', model.name.lower()).strip('-')}-{_hash(chosen)}"
 
 

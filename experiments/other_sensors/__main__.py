@@ -15,12 +15,13 @@ from lidar_perception.types import InputError
 
 @click.command(cls=Command, context_settings=dict(help_option_names=["-h", "--help"]))
 @click.argument("data", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option("--weights", default="", help="Weights or file of `train fused`. Default: the "
-              "default detector.")
-@click.option("--min-score", type=float, help="One threshold for all classes. Default: the "
-              "detector's.")
-@click.option("--kitti", type=click.Path(exists=True, file_okay=False, path_type=Path),
-              help="Also evaluate KITTI object frames, with changed intensity.")
+@click.option("--weights", default="", help="Weights or file of `train fused`. Default: the default detector.")
+@click.option("--min-score", type=float, help="One threshold for all classes. Default: the detector's.")
+@click.option(
+    "--kitti",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Also evaluate KITTI object frames, with changed intensity.",
+)
 def main(data: Path, weights: str, min_score: float | None, kitti: Path | None) -> None:
     """Count found / false / missed objects of DATA/DATASET/*.npz, as recorded and without
     intensity.
@@ -38,18 +39,18 @@ def main(data: Path, weights: str, min_score: float | None, kitti: Path | None) 
         sums = count_all(detector, clouds, with_intensity)
         click.echo("as recorded" if with_intensity else "without intensity")
         for dataset in sorted({dataset for dataset, _ in sums}):
-            click.echo(f"  {dataset:14}" + "".join(
-                _cell(name, sums.get((dataset, name))) for name in MAX_DISTANCE_M))
-        total = {name: sum((counts for (_, own), counts in sums.items() if own == name), Counts())
-                 for name in MAX_DISTANCE_M}
-        click.echo("  all           " + "".join(f"{_cell(name, counts)} F1 {counts.f1:4.1f}"
-                                                for name, counts in total.items()))
+            click.echo(f"  {dataset:14}" + "".join(_cell(name, sums.get((dataset, name))) for name in MAX_DISTANCE_M))
+        total = {
+            name: sum((counts for (_, own), counts in sums.items() if own == name), Counts()) for name in MAX_DISTANCE_M
+        }
+        click.echo(
+            "  all           " + "".join(f"{_cell(name, counts)} F1 {counts.f1:4.1f}" for name, counts in total.items())
+        )
     if kitti is None:
         return
     for title, change in CHANGES.items():
         scores = evaluate_kitti(open_detector(weights or "fused", "cpu"), kitti, change)
-        click.echo(f"KITTI, intensity {title}: "
-                   + ", ".join(f"{name} {value:.1f}" for name, value in scores.items()))
+        click.echo(f"KITTI, intensity {title}: " + ", ".join(f"{name} {value:.1f}" for name, value in scores.items()))
 
 
 def _cell(name: str, counts: Counts | None) -> str:

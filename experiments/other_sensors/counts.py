@@ -12,10 +12,13 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.geometry import centre_distances
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, PointCloud
 
-MAX_RANGE_M, MIN_POINTS = 40.0, 10           # of the objects that must be found
+MAX_RANGE_M, MIN_POINTS = 40.0, 10  # of the objects that must be found
 MAX_DISTANCE_M = {"Pedestrian": 1.0, "Cyclist": 1.0, "Car": 2.0}  # from a centre to its label
-UNLABELLED = {"nuscenes_seg": ("Car", "Cyclist"), "aachen": ("Car", "Cyclist"),
-              "logictronix": ("Cyclist",)}   # classes without labels in a data set
+UNLABELLED = {
+    "nuscenes_seg": ("Car", "Cyclist"),
+    "aachen": ("Car", "Cyclist"),
+    "logictronix": ("Cyclist",),
+}  # classes without labels in a data set
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,7 @@ class Counts:
     missed: int = 0
 
     def __add__(self, other: Counts) -> Counts:
-        return Counts(self.found + other.found, self.false + other.false,
-                      self.missed + other.missed)
+        return Counts(self.found + other.found, self.false + other.false, self.missed + other.missed)
 
     @property
     def f1(self) -> float:
@@ -67,8 +69,7 @@ def read_clouds(folder: Path) -> Iterator[LabelledCloud]:
         bottoms = boxes[counted if counted.any() else slice(None)]
         lift = -SENSOR_HEIGHT - np.median(bottoms[:, 2] - bottoms[:, 5] / 2)
         boxes = boxes + np.array([0, 0, lift, 0, 0, 0, 0])
-        cloud = PointCloud(points[:, :3] + np.array([0, 0, lift], np.float32),
-                           np.ascontiguousarray(points[:, 3]))
+        cloud = PointCloud(points[:, :3] + np.array([0, 0, lift], np.float32), np.ascontiguousarray(points[:, 3]))
         yield LabelledCloud(path.parent.name, path.stem, cloud, boxes, names.astype(str), num)
 
 
@@ -100,8 +101,9 @@ def count_detections(labelled: LabelledCloud, detections: Detections) -> dict[st
     return counts
 
 
-def count_all(detector: Detector, clouds: list[LabelledCloud],
-              with_intensity: bool = True) -> dict[tuple[str, str], Counts]:
+def count_all(
+    detector: Detector, clouds: list[LabelledCloud], with_intensity: bool = True
+) -> dict[tuple[str, str], Counts]:
     """Return the counts by (data set, class), with the intensity as recorded or without."""
     sums: dict[tuple[str, str], Counts] = {}
     for labelled in clouds:

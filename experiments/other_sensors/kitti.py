@@ -21,7 +21,7 @@ Change = Callable[[np.ndarray], np.ndarray | None]
 
 def quantize_dark(intensity: np.ndarray) -> np.ndarray:
     """Return the intensity as of a sensor with a fifth of the gain, a gamma and 6 bits."""
-    return np.round(0.2 * intensity ** 1.5 * 63) / np.float32(63)
+    return np.round(0.2 * intensity**1.5 * 63) / np.float32(63)
 
 
 CHANGES: dict[str, Change] = {
@@ -32,8 +32,7 @@ CHANGES: dict[str, Change] = {
 }
 
 
-def evaluate_kitti(detector: Detector, folder: Path, change: Change,
-                   every: int = 1) -> dict[str, float]:
+def evaluate_kitti(detector: Detector, folder: Path, change: Change, every: int = 1) -> dict[str, float]:
     """Return AP (R40, moderate, percent) of KITTI object frames after a change of the intensity."""
     report, recording = DetectionReport(), open_recording(folder)
     low = detector.with_min_score(MIN_SCORE)
@@ -41,8 +40,7 @@ def evaluate_kitti(detector: Detector, folder: Path, change: Change,
         cloud = frame.load()
         assert cloud.intensity is not None  # KITTI has it
         truth, calibration = frame.truth(), frame.calibration()
-        changed = Frame.of(frame.name, replace(cloud, intensity=change(cloud.intensity)), truth,
-                           calibration)
+        changed = Frame.of(frame.name, replace(cloud, intensity=change(cloud.intensity)), truth, calibration)
         report.update(run_detector(low, changed, truth, calibration))
     ap = report.compute()["ap"]
 
@@ -50,8 +48,11 @@ def evaluate_kitti(detector: Detector, folder: Path, change: Change,
         value = ap[name][row]["moderate"]
         return float("nan") if value is None else value["r40"]
 
-    found = {"Car 3D .7": score("Car", "3d"), "Car BEV .7": score("Car", "bev"),
-             "Pedestrian BEV .25": score("Pedestrian", "bev_relaxed"),
-             "Cyclist BEV .25": score("Cyclist", "bev_relaxed")}
+    found = {
+        "Car 3D .7": score("Car", "3d"),
+        "Car BEV .7": score("Car", "bev"),
+        "Pedestrian BEV .25": score("Pedestrian", "bev_relaxed"),
+        "Cyclist BEV .25": score("Cyclist", "bev_relaxed"),
+    }
     relaxed = [score(name, "bev_relaxed") for name in ("Car", "Pedestrian", "Cyclist")]
     return {**found, "mean BEV .5/.25/.25": float(np.mean(relaxed))}

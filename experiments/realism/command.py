@@ -21,19 +21,43 @@ from lidar_perception.simulation.sensor import find_sensor
 
 @click.command(cls=Command)
 @data_argument("Real labelled scans: a data set or bag.")
-@click.option("--sensor", default="hdl64e", show_default=True, help="Sensor to simulate, as in "
-              "`lidar-perception simulate`.")
-@click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
-              help="Height of the sensor above the ground. Default: that of its file or preset.")
-@click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
-              help="Number of simulated scans, each of another street.")
+@click.option(
+    "--sensor", default="hdl64e", show_default=True, help="Sensor to simulate, as in `lidar-perception simulate`."
+)
+@click.option(
+    "--mount-height",
+    type=click.FloatRange(0, 10),
+    default=0.0,
+    metavar="M",
+    help="Height of the sensor above the ground. Default: that of its file or preset.",
+)
+@click.option(
+    "--frames",
+    type=click.IntRange(1),
+    default=40,
+    show_default=True,
+    help="Number of simulated scans, each of another street.",
+)
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
-@click.option("--people", type=click.FloatRange(0, MAX_PEOPLE), default=1.0, show_default=True,
-              help="Pedestrians and cyclists, as a multiple of the usual number.")
+@click.option(
+    "--people",
+    type=click.FloatRange(0, MAX_PEOPLE),
+    default=1.0,
+    show_default=True,
+    help="Pedestrians and cyclists, as a multiple of the usual number.",
+)
 @out_file("--json", "Write every curve to this file.")
 @out_file("--png", "Draw every curve into this file.")
-def realism(data: Path, sensor: str, mount_height: float, frames: int, seed: int, people: float,
-            json: Path | None, png: Path | None) -> None:
+def realism(
+    data: Path,
+    sensor: str,
+    mount_height: float,
+    frames: int,
+    seed: int,
+    people: float,
+    json: Path | None,
+    png: Path | None,
+) -> None:
     """Compare scans of simulated streets with the labelled ones of DATA, curve by curve.
 
     \b
@@ -54,4 +78,3 @@ def realism(data: Path, sensor: str, mount_height: float, frames: int, seed: int
     if png:
         draw_realism(png, content)
         console.print(f"picture: {png}")
-

@@ -91,8 +91,13 @@ class ScanMeasurements:
 
     def to_dict(self) -> dict:
         """Return the counts, for JSON."""
-        return {"scans": self.scans, "whole_scans": self.whole_scans, "objects": self.objects,
-                "pedestrian_frames": self.report.frames, "skipped": self.skipped}
+        return {
+            "scans": self.scans,
+            "whole_scans": self.whole_scans,
+            "objects": self.objects,
+            "pedestrian_frames": self.report.frames,
+            "skipped": self.skipped,
+        }
 
 
 def select_frames(recording: Recording) -> list[Frame]:
@@ -105,8 +110,10 @@ def select_frames(recording: Recording) -> list[Frame]:
     chosen = np.linspace(0, len(recording) - 1, count).astype(int)
     frames = [recording.frames[i] for i in chosen]
     if not any(map(may_have_labels, frames)):
-        raise InputError(f"{recording.path} has no labels; give the training folder with label_2 "
-                         "(object) or label_02 (tracking), or a raw drive with tracklets")
+        raise InputError(
+            f"{recording.path} has no labels; give the training folder with label_2 "
+            "(object) or label_02 (tracking), or a raw drive with tracklets"
+        )
     return frames
 
 
@@ -123,8 +130,7 @@ def measure_scans(scans: Iterable[Frame], protocol: PipelineParams) -> ScanMeasu
         except InputError as error:
             measured.skipped.append(str(error))
     if measured.skipped and not measured.scans:
-        raise InputError(f"none of {len(measured.skipped)} scans can be read: "
-                         f"{measured.skipped[0]}")
+        raise InputError(f"none of {len(measured.skipped)} scans can be read: {measured.skipped[0]}")
     return measured
 
 
@@ -135,14 +141,20 @@ def compare_scans(real: ScanMeasurements, simulated: ScanMeasurements) -> dict:
     curves = {}
     for name, curve in CURVES.items():
         stage, _, score = name.partition(" ")
-        columns = [_make_score_bins(tables[side].get(stage), score) if stage in STAGES
-                   else _make_bins(measured.rows[name], curve) for side, measured in sides.items()]
+        columns = [
+            _make_score_bins(tables[side].get(stage), score)
+            if stage in STAGES
+            else _make_bins(measured.rows[name], curve)
+            for side, measured in sides.items()
+        ]
         bins = [_compare_bins(curve, *row) for row in zip(curve.bins, *columns)]
-        curves[name] = {"title": curve.title, "axis": curve.axis, **_count_verdicts(bins),
-                        "bins": bins}
+        curves[name] = {"title": curve.title, "axis": curve.axis, **_count_verdicts(bins), "bins": bins}
     all_bins = [b for curve in curves.values() for b in curve["bins"]]
-    return {**{side: measured.to_dict() for side, measured in sides.items()},
-            **_count_verdicts(all_bins), "curves": curves}
+    return {
+        **{side: measured.to_dict() for side, measured in sides.items()},
+        **_count_verdicts(all_bins),
+        "curves": curves,
+    }
 
 
 def compute_ratio(simulated: float | None, real: float | None) -> float | None:
@@ -171,15 +183,17 @@ def _compare_bins(curve: Curve, name: str, real: dict, simulated: dict) -> dict:
             low, high = real["interval"] or (math.inf, -math.inf)
             within = within or off <= curve.step * 1.001
             plausible = within or low <= simulated["median"] <= high
-    return {"bin": name, "real": real, "simulated": simulated, "ratio": value, "within": within,
-            "plausible": plausible}
+    return {"bin": name, "real": real, "simulated": simulated, "ratio": value, "within": within, "plausible": plausible}
 
 
 def _count_verdicts(bins: list[dict]) -> dict:
     judged = [b["within"] for b in bins if b["within"] is not None]
-    return {"within": sum(judged), "judged": len(judged),
-            "plausible": sum(b["plausible"] for b in bins if b["within"] is not None),
-            "share": sum(judged) / len(judged) if judged else None}
+    return {
+        "within": sum(judged),
+        "judged": len(judged),
+        "plausible": sum(b["plausible"] for b in bins if b["within"] is not None),
+        "share": sum(judged) / len(judged) if judged else None,
+    }
 
 
 def _make_bins(rows: list[np.ndarray], curve: Curve) -> list[dict]:
@@ -207,14 +221,17 @@ def compute_median_interval(values: np.ndarray) -> list[float]:
     return [float(ordered[rank]), float(ordered[-1 - rank])]
 
 
-def _make_row(n: int, median: float | None, low: float | None = None, high: float | None = None,
-              interval: list[float] | None = None) -> dict:
+def _make_row(
+    n: int,
+    median: float | None,
+    low: float | None = None,
+    high: float | None = None,
+    interval: list[float] | None = None,
+) -> dict:
     return {"n": n, "median": median, "low": low, "high": high, "interval": interval}
 
 
 def _make_score_bins(table: dict | None, score: str) -> list[dict]:
     """Return a score of all frames together, which has no spread; n is the number of cases."""
-    counts = [sum(table[name][k] for k in SCORES[score]) if table else 0
-              for name in (*RANGE_NAMES, "all")]
-    return [_make_row(n, table[name][score] if table and n else None)
-            for name, n in zip((*RANGE_NAMES, "all"), counts)]
+    counts = [sum(table[name][k] for k in SCORES[score]) if table else 0 for name in (*RANGE_NAMES, "all")]
+    return [_make_row(n, table[name][score] if table and n else None) for name, n in zip((*RANGE_NAMES, "all"), counts)]

@@ -22,8 +22,10 @@ def print_realism(content: dict, console: Console) -> None:
     for side in ("real", "simulated"):
         row = content[side]
         objects = ", ".join(f"{count} {name}" for name, count in row["objects"].items())
-        console.print(f"{side}: {row['scans']} scans, {row['whole_scans']} of them whole; "
-                      f"{objects}; {row['pedestrian_frames']} scans with a pedestrian")
+        console.print(
+            f"{side}: {row['scans']} scans, {row['whole_scans']} of them whole; "
+            f"{objects}; {row['pedestrian_frames']} scans with a pedestrian"
+        )
     _print_curves(content, console)
     _print_worst(content, console)
     print_skipped(content["real"]["skipped"] + content["simulated"]["skipped"], console)
@@ -32,8 +34,10 @@ def print_realism(content: dict, console: Console) -> None:
 
 def format_summary(content: dict) -> str:
     """Return a line with the numbers of right and of plausible bins."""
-    return (f"{content['within']} of {content['judged']} bins within 20 % of the real median, "
-            f"{content['plausible']} with those within its 95 % interval")
+    return (
+        f"{content['within']} of {content['judged']} bins within 20 % of the real median, "
+        f"{content['plausible']} with those within its 95 % interval"
+    )
 
 
 def find_typical_factor(curve: dict) -> float | None:
@@ -43,31 +47,49 @@ def find_typical_factor(curve: dict) -> float | None:
 
 
 def _print_curves(content: dict, console: Console) -> None:
-    table = make_table("Simulated against real, worst curves first",
-                       "curve", "within 20 %", "typical", "worst at", "ratio")
+    table = make_table(
+        "Simulated against real, worst curves first", "curve", "within 20 %", "typical", "worst at", "ratio"
+    )
     judged = [c for c in content["curves"].values() if c["judged"]]
     for curve in sorted(judged, key=lambda c: (c["share"], -(find_typical_factor(c) or 0.0))):
         worst = max((b for b in curve["bins"] if b["within"] is not None), key=compute_factor)
-        table.add_row(_format_title(curve), f"{curve['within']} of {curve['judged']}",
-                      format_number(find_typical_factor(curve), width=9), worst["bin"],
-                      format_number(worst["ratio"], width=9))
-    unknown = sum(not curve["judged"] and not CURVES[name].histogram
-                  for name, curve in content["curves"].items())
-    table.caption = ("typical: the median factor between simulated and real. ratio: simulated / "
-                     f"real at the worst bin. {unknown} curves have no bin with {MIN_SAMPLES} "
-                     "real samples.")
+        table.add_row(
+            _format_title(curve),
+            f"{curve['within']} of {curve['judged']}",
+            format_number(find_typical_factor(curve), width=9),
+            worst["bin"],
+            format_number(worst["ratio"], width=9),
+        )
+    unknown = sum(not curve["judged"] and not CURVES[name].histogram for name, curve in content["curves"].items())
+    table.caption = (
+        "typical: the median factor between simulated and real. ratio: simulated / "
+        f"real at the worst bin. {unknown} curves have no bin with {MIN_SAMPLES} "
+        "real samples."
+    )
     console.print(table)
 
 
 def _print_worst(content: dict, console: Console) -> None:
-    bins = [(curve, b) for curve in content["curves"].values() for b in curve["bins"]
-            if b["within"] is False]
-    table = make_table(f"The {min(WORST, len(bins))} worst bins of {len(bins)} not within 20 %",
-                       "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio")
+    bins = [(curve, b) for curve in content["curves"].values() for b in curve["bins"] if b["within"] is False]
+    table = make_table(
+        f"The {min(WORST, len(bins))} worst bins of {len(bins)} not within 20 %",
+        "curve",
+        "bin",
+        "real",
+        "10..90 %",
+        "n",
+        "sim.",
+        "10..90 %",
+        "n",
+        "ratio",
+    )
     for curve, b in sorted(bins, key=lambda item: -compute_factor(item[1]))[:WORST]:
-        table.add_row(_format_title(curve), b["bin"],
-                      *(cell for side in ("real", "simulated") for cell in _format_cells(b[side])),
-                      format_number(b["ratio"], width=9))
+        table.add_row(
+            _format_title(curve),
+            b["bin"],
+            *(cell for side in ("real", "simulated") for cell in _format_cells(b[side])),
+            format_number(b["ratio"], width=9),
+        )
     table.caption = "Median and spread of the scans or objects, n of them."
     if bins:
         console.print(table)
@@ -94,25 +116,34 @@ def draw_realism(path: Path, content: dict) -> None:
         InputError: The file cannot be written.
     """
     import matplotlib
+
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
     from matplotlib.patches import Patch
 
     rows = math.ceil(len(content["curves"]) / PANELS)
-    figure, grid = plt.subplots(rows, PANELS, figsize=(4.4 * PANELS, 3.0 * rows), dpi=100,
-                                squeeze=False, layout="constrained")
+    figure, grid = plt.subplots(
+        rows, PANELS, figsize=(4.4 * PANELS, 3.0 * rows), dpi=100, squeeze=False, layout="constrained"
+    )
     for axes, (name, curve) in zip(grid.flat, content["curves"].items()):
         (_draw_histogram if CURVES[name].histogram else _draw_curve)(axes, curve, CURVES[name].log)
-    for axes in grid.flat[len(content["curves"]):]:
+    for axes in grid.flat[len(content["curves"]) :]:
         axes.set_visible(False)
-    handles = [Patch(color=REAL, label="real"), Patch(color=SIMULATED, label="simulated"),
-               Patch(color="#eeeeee", label=f"fewer than {MIN_SAMPLES} real samples"),
-               Patch(color=WRONG, label="red title: most bins are wrong")]
+    handles = [
+        Patch(color=REAL, label="real"),
+        Patch(color=SIMULATED, label="simulated"),
+        Patch(color="#eeeeee", label=f"fewer than {MIN_SAMPLES} real samples"),
+        Patch(color=WRONG, label="red title: most bins are wrong"),
+    ]
     figure.legend(handles=handles, loc="outside lower right", ncols=4, fontsize=13)
-    figure.suptitle(f"{format_summary(content)}; {content['real']['scans']} real "
-                    f"scans, {content['simulated']['scans']} simulated\nmedian and 10 to 90 % of "
-                    "the scans or objects; [bins within 20 % / bins judged]", x=0.01, ha="left",
-                    fontsize=15)
+    figure.suptitle(
+        f"{format_summary(content)}; {content['real']['scans']} real "
+        f"scans, {content['simulated']['scans']} simulated\nmedian and 10 to 90 % of "
+        "the scans or objects; [bins within 20 % / bins judged]",
+        x=0.01,
+        ha="left",
+        fontsize=15,
+    )
     save_picture(path, figure)
 
 
@@ -125,17 +156,19 @@ def _draw_curve(axes, curve: dict, log: bool) -> None:
         ranges = len(x) - (curve["bins"][-1]["bin"] == "all")  # no line leads to `all`
         axes.plot(x[:ranges], median[:ranges], color=color, linewidth=1.6)
         axes.plot(x, median, "o", color=color, markersize=4)
-        spread = [[max(m - a, 0) for m, a in zip(median, low)],
-                  [max(b - m, 0) for m, b in zip(median, high)]]
-        axes.errorbar(x, median, spread, fmt="none", ecolor=color, elinewidth=1, alpha=0.6,
-                      capsize=2)
+        spread = [[max(m - a, 0) for m, a in zip(median, low)], [max(b - m, 0) for m, b in zip(median, high)]]
+        axes.errorbar(x, median, spread, fmt="none", ecolor=color, elinewidth=1, alpha=0.6, capsize=2)
     for i in positions:
         if curve["bins"][i]["within"] is None:
             axes.axvspan(i - 0.5, i + 0.5, color="#eeeeee", linewidth=0)
     if log:
         axes.set_yscale("symlog", linthresh=10)
-    axes.set_xticks(positions, [b["bin"] for b in curve["bins"]], fontsize=8,
-                    rotation=60 if len(positions) > 9 else 30 if len(positions) > 6 else 0)
+    axes.set_xticks(
+        positions,
+        [b["bin"] for b in curve["bins"]],
+        fontsize=8,
+        rotation=60 if len(positions) > 9 else 30 if len(positions) > 6 else 0,
+    )
     axes.set_xlim(-0.5, len(positions) - 0.5)
     verdict = f"{curve['within']}/{curve['judged']}" if curve["judged"] else "not judged"
     wrong = curve["judged"] and curve["share"] < 0.5

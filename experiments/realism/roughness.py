@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-CELL = 1.0            # m
-MIN_IN_CELL = 8     # points
-MIN_GROUND = 0.6    # smallest share of low points in a ground cell
+CELL = 1.0  # m
+MIN_IN_CELL = 8  # points
+MIN_GROUND = 0.6  # smallest share of low points in a ground cell
 LOW_SHARE, MAX_ABOVE_LOW = 0.2, 0.35  # low: up to 0.35 m above this quantile of a cell
-MIN_CELLS = 20      # in a range bin, to measure its roughness
+MIN_CELLS = 20  # in a range bin, to measure its roughness
 ROUGH_QUANTILE = 0.75  # most cells are on the road, which is smooth
 REGULARIZATION = 1e-6  # m2, added to the scatter along x and y: a line of points has a plane, too
 
@@ -39,8 +39,9 @@ def measure_cell_scatter(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     middle = np.stack([mean(column) for column in points.T], axis=1).reshape(-1, 3)
     x, y, z = (points - middle[number]).T
-    across = np.moveaxis(np.array([[mean(x * x) + REGULARIZATION, mean(x * y)],
-                                   [mean(x * y), mean(y * y) + REGULARIZATION]]), 2, 0)
+    across = np.moveaxis(
+        np.array([[mean(x * x) + REGULARIZATION, mean(x * y)], [mean(x * y), mean(y * y) + REGULARIZATION]]), 2, 0
+    )
     slopes = np.linalg.solve(across, np.stack([mean(x * z), mean(y * z)], axis=1)[..., None])
     off = z - x * slopes[number, 0, 0] - y * slopes[number, 1, 0]
     return middle[:, :2], np.sqrt(mean(off * off))

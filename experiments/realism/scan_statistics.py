@@ -25,10 +25,10 @@ from lidar_perception.scoring.centres.matching import RANGE_NAMES
 from lidar_perception.types import GroundTruth, PointCloud
 
 CLASSES = tuple(DETECTED)
-PERSON_HEIGHT = 1.7       # metres; seed height of the height filter in stage 1 of the STM-CPA paper
-SECTORS, MIN_SECTORS = 36, 27   # of a turn; a scan with points in fewer is cropped to a view
-MIN_POINTS = 5          # of an object, to measure its extent or intensity
-MIN_IN_BIN = 50         # points in a range bin, to measure its ground share
+PERSON_HEIGHT = 1.7  # metres; seed height of the height filter in stage 1 of the STM-CPA paper
+SECTORS, MIN_SECTORS = 36, 27  # of a turn; a scan with points in fewer is cropped to a view
+MIN_POINTS = 5  # of an object, to measure its extent or intensity
+MIN_IN_BIN = 50  # points in a range bin, to measure its ground share
 MAX_QUERIES, MIN_QUERIES = 600, 10  # points in a range bin, to measure neighbours
 RANGES = np.array([0.0, 5, 10, 15, 20, 30, 40, 60, 80, np.inf])
 OBJECT_RANGES = np.array([0.0, 10, 20, 30, 45, 60])
@@ -36,8 +36,8 @@ ELEVATIONS = np.arange(-26.0, 4.1, 2.0)
 QUANTILES = (5, 25, 50, 75, 95)
 INTENSITIES = np.arange(20) * 0.05 - 0.005  # between the steps of KITTI's reflectance
 INTENSITY_STEP = 0.01
-ROUGH_STEP = 0.002        # metres
-BELT = 0.65               # share of an object's height; above it a car has windows
+ROUGH_STEP = 0.002  # metres
+BELT = 0.65  # share of an object's height; above it a car has windows
 CAR_NAME = CLASSES[CAR]
 CAR_FROM = f"{CAR_NAME} from "
 # Directions from which a sensor sees only one face of a car, degrees from its front.
@@ -75,29 +75,47 @@ _SURFACES = ("ground", "above ground", *CLASSES)
 CURVES = {
     "scan points": Curve("points per scan", ("all",), ""),
     "points": Curve("points", _BY_RANGE, log=True),
-    "elevation": Curve("points", tuple(f"{a:g}..{a + 2:g}" for a in ELEVATIONS[:-1]),
-                       "elevation [deg]", log=True),
+    "elevation": Curve("points", tuple(f"{a:g}..{a + 2:g}" for a in ELEVATIONS[:-1]), "elevation [deg]", log=True),
     "ground share": Curve("share of points on the ground", _BY_RANGE),
     "roughness": Curve("scatter about the ground of 1 m2, 75 % [m]", _BY_RANGE, step=ROUGH_STEP),
     "neighbour": Curve("distance to the nearest point [m]", _BY_RANGE),
     "clusters": Curve("clusters", _BY_RANGE),
     "person clusters": Curve("clusters as high as a person", _BY_RANGE),
-    **{f"{name} density": Curve(f"{name}: points per square degree", _BY_OBJECT_RANGE)
-       for name in CLASSES},
-    **{f"{what} intensity": Curve(f"intensity, {what}", _BY_QUANTILE, "quantile",
-                                  step=INTENSITY_STEP) for what in _SURFACES},
-    **{f"{what} intensity histogram": Curve(f"share of points, {what}", _BY_INTENSITY, "intensity",
-                                            histogram=True) for what in _SURFACES},
-    **{f"{name} {what}": Curve(f"{name}: {title}", _BY_OBJECT_RANGE, log="points" in what)
-       for name in CLASSES for what, title in (
-           ("points", "points, not occluded"), ("points of all", "points, all"),
-           ("height", "height seen / box"), ("length", "length seen / box"),
-           ("width", "width seen / box"), ("above", "points above 0.65 of the height"))},
-    **{CAR_FROM + face: Curve(f"{CAR_FROM}{face}: depth of the points in the box [m]",
-                              tuple(f"{q}%" for q in FACE_QUANTILES), "quantile", step=FACE_STEP)
-       for face in FACES},
-    **{f"{stage} {score}": Curve(f"paper A, {stage}: {score}", (*RANGE_NAMES, "all"))
-       for stage in STAGES for score in SCORES},
+    **{f"{name} density": Curve(f"{name}: points per square degree", _BY_OBJECT_RANGE) for name in CLASSES},
+    **{
+        f"{what} intensity": Curve(f"intensity, {what}", _BY_QUANTILE, "quantile", step=INTENSITY_STEP)
+        for what in _SURFACES
+    },
+    **{
+        f"{what} intensity histogram": Curve(f"share of points, {what}", _BY_INTENSITY, "intensity", histogram=True)
+        for what in _SURFACES
+    },
+    **{
+        f"{name} {what}": Curve(f"{name}: {title}", _BY_OBJECT_RANGE, log="points" in what)
+        for name in CLASSES
+        for what, title in (
+            ("points", "points, not occluded"),
+            ("points of all", "points, all"),
+            ("height", "height seen / box"),
+            ("length", "length seen / box"),
+            ("width", "width seen / box"),
+            ("above", "points above 0.65 of the height"),
+        )
+    },
+    **{
+        CAR_FROM + face: Curve(
+            f"{CAR_FROM}{face}: depth of the points in the box [m]",
+            tuple(f"{q}%" for q in FACE_QUANTILES),
+            "quantile",
+            step=FACE_STEP,
+        )
+        for face in FACES
+    },
+    **{
+        f"{stage} {score}": Curve(f"paper A, {stage}: {score}", (*RANGE_NAMES, "all"))
+        for stage in STAGES
+        for score in SCORES
+    },
 }
 
 
@@ -121,14 +139,16 @@ def compute_scan_rows(frame: PointCloud, params: PipelineParams = PipelineParams
     boxes = segment_cloud(frame, params=params).boxes
     at = _find_bins(horizontal_range(boxes), RANGES)
     person = select_by_height(boxes, PERSON_HEIGHT, params.height)
-    rows = {"scan points": [len(xyz)], "points": count,
-            "elevation": np.histogram(elevation, ELEVATIONS)[0],
-            "ground share": np.where(count >= MIN_IN_BIN, on_ground / np.maximum(count, 1),
-                                     np.nan),
-            "roughness": compute_roughness(xyz, RANGES),
-            "neighbour": _measure_neighbours(xyz, where),
-            "clusters": np.bincount(at, minlength=bins),
-            "person clusters": np.bincount(at[person], minlength=bins)}
+    rows = {
+        "scan points": [len(xyz)],
+        "points": count,
+        "elevation": np.histogram(elevation, ELEVATIONS)[0],
+        "ground share": np.where(count >= MIN_IN_BIN, on_ground / np.maximum(count, 1), np.nan),
+        "roughness": compute_roughness(xyz, RANGES),
+        "neighbour": _measure_neighbours(xyz, where),
+        "clusters": np.bincount(at, minlength=bins),
+        "person clusters": np.bincount(at[person], minlength=bins),
+    }
     if frame.intensity is not None:
         for name, mask in (("ground", ground), ("above ground", ~ground)):
             rows.update(_describe_intensity(name, frame.intensity.compress(mask)))
@@ -158,8 +178,7 @@ def compute_object_rows(frame: PointCloud, truth: GroundTruth, camera: Camera | 
                 own = to_box_frame(frame.xyz[inside].astype(float), box) / box[3:6]
                 values |= dict(zip(("length", "width", "height"), np.ptp(own, axis=0)))
                 values["above"] = (own[:, 2] > BELT - 0.5).mean()
-        new = {f"{name} {what}": np.where(np.arange(bins) == at, value, np.nan)
-               for what, value in values.items()}
+        new = {f"{name} {what}": np.where(np.arange(bins) == at, value, np.nan) for what, value in values.items()}
         if frame.intensity is not None and len(inside) >= MIN_POINTS:
             new |= _describe_intensity(name, frame.intensity[inside])
         if name == CAR_NAME and truth.extras[i].get("occluded", 0) == 0:
@@ -220,5 +239,7 @@ def _describe_intensity(name: str, values: np.ndarray) -> dict:
     if len(values) == 0:
         return {}
     count = np.bincount(np.maximum(_find_bins(values, INTENSITIES), 0), minlength=len(INTENSITIES))
-    return {f"{name} intensity": np.quantile(values, np.array(QUANTILES) / 100),
-            f"{name} intensity histogram": count / len(values)}
+    return {
+        f"{name} intensity": np.quantile(values, np.array(QUANTILES) / 100),
+        f"{name} intensity histogram": count / len(values),
+    }

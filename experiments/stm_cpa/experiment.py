@@ -15,22 +15,13 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.refine import STAGES, Candidates, refine_clusters, select_by_height
 from lidar_perception.candidates.seeds import Seed
-from lidar_perception.candidates.segmented_cloud import (
-    SegmentedCloud,
-    fit_ground_plane,
-    snap_to_ground,
-)
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud, fit_ground_plane, snap_to_ground
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import bev_and_3d_iou
 from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.scoring.centres.matching import (
-    RANGE_NAMES,
-    count_by_range,
-    find_range_bins,
-    match_centres,
-)
+from lidar_perception.scoring.centres.matching import RANGE_NAMES, count_by_range, find_range_bins, match_centres
 from lidar_perception.types import InputError
 
 NUMBERS = StmCpaParams()
@@ -59,8 +50,7 @@ def measure_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:
         seed = make_nearest_seed(segmented, labelled)
         found = _refine(segmented, seed, PAPER)
         unfiltered = _refine(segmented, seed, drop_height_filter())
-        sweep = [_refine(segmented, seed, extend_cpa(steps)).final.boxes
-                 for steps in range(NUMBERS.cpa_steps + 1)]
+        sweep = [_refine(segmented, seed, extend_cpa(steps)).final.boxes for steps in range(NUMBERS.cpa_steps + 1)]
     except InputError as error:
         no_seed = str(error)
     boxes = {stage: getattr(found, stage).boxes for stage in STAGES}
@@ -84,12 +74,12 @@ def drop_height_filter() -> PipelineParams:
 
 def extend_cpa(steps: int) -> PipelineParams:
     """Return the paper's parameters with CPA at all far ranges (Table 5)."""
-    return with_values(PAPER, {"cpa.steps": steps, "cpa.min_range": NUMBERS.cpa_min_range,
-                               "cpa.max_range": NUMBERS.cpa_max_range})
+    return with_values(
+        PAPER, {"cpa.steps": steps, "cpa.min_range": NUMBERS.cpa_min_range, "cpa.max_range": NUMBERS.cpa_max_range}
+    )
 
 
-def search_clustering(segmented: SegmentedCloud, seed: Seed | None,
-                      truth: np.ndarray) -> list[list[list[int]]]:
+def search_clustering(segmented: SegmentedCloud, seed: Seed | None, truth: np.ndarray) -> list[list[list[int]]]:
     """Count true and false positives by range for each eps and each min_samples (Section 4.2).
 
     The same eps applies in all bands of range, which are clustered one by one as in the paper.
@@ -109,11 +99,11 @@ def search_clustering(segmented: SegmentedCloud, seed: Seed | None,
     return counts
 
 
-def _find_clusters(segmented: SegmentedCloud, plane: np.ndarray | None, seed: Seed, eps: float,
-                   min_samples: int) -> np.ndarray:
+def _find_clusters(
+    segmented: SegmentedCloud, plane: np.ndarray | None, seed: Seed, eps: float, min_samples: int
+) -> np.ndarray:
     bands = len(PAPER.clustering.dbscan.eps)
-    params = with_values(PAPER, {"clustering.dbscan.eps": (eps,) * bands,
-                                 "clustering.dbscan.min_samples": min_samples})
+    params = with_values(PAPER, {"clustering.dbscan.eps": (eps,) * bands, "clustering.dbscan.min_samples": min_samples})
     ids = cluster_obstacles(segmented.xyz, segmented.ground, params.clustering)
     boxes = snap_to_ground(fit_boxes(segmented.xyz, ids, params.boxes.shape), plane)
     return boxes[select_by_height(boxes, seed.height, params.height)]
@@ -127,8 +117,13 @@ def count_stage(found: np.ndarray, truth: np.ndarray, before: np.ndarray) -> dic
     pairs = match_centres(found, truth)
     tp, fp, fn, error = count_by_range(found, truth, pairs)
     kept = np.intersect1d(pairs[1], match_centres(before, truth)[1])
-    return {"tp": tp.tolist(), "fp": fp.tolist(), "fn": fn.tolist(),
-            "kept": _count_by_range(truth[kept]), "error": np.round(error, 6).tolist()}
+    return {
+        "tp": tp.tolist(),
+        "fp": fp.tolist(),
+        "fn": fn.tolist(),
+        "kept": _count_by_range(truth[kept]),
+        "error": np.round(error, 6).tolist(),
+    }
 
 
 def measure_overlaps(found: np.ndarray, truth: np.ndarray) -> list[float]:
@@ -140,9 +135,12 @@ def measure_overlaps(found: np.ndarray, truth: np.ndarray) -> list[float]:
     """
     i, j = match_centres(found, truth)
     bev, space = (np.diagonal(iou) for iou in bev_and_3d_iou(found[i], truth[j]))
-    return [len(i), *(int((iou >= limit).sum()) for iou in (space, bev)
-                      for limit in NUMBERS.iou_limits),
-            round(float(space.sum()), 6), round(float(bev.sum()), 6)]
+    return [
+        len(i),
+        *(int((iou >= limit).sum()) for iou in (space, bev) for limit in NUMBERS.iou_limits),
+        round(float(space.sum()), 6),
+        round(float(bev.sum()), 6),
+    ]
 
 
 def _refine(segmented: SegmentedCloud, seed: Seed, params: PipelineParams) -> Candidates:
@@ -154,7 +152,10 @@ def _count_by_range(boxes: np.ndarray) -> list[int]:
 
 
 STM_CPA = Experiment(
-    "stm-cpa", "STM-CPA: the tables of the paper",
+    "stm-cpa",
+    "STM-CPA: the tables of the paper",
     "Does a plain reading of the paper's method give the paper's values?",
-    measure_frame, make_sections,
-    {"protocol": flatten(PAPER), "numbers": flatten(NUMBERS)})
+    measure_frame,
+    make_sections,
+    {"protocol": flatten(PAPER), "numbers": flatten(NUMBERS)},
+)

@@ -16,14 +16,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.scoring.kitti.camera_objects import select_in_image
-from lidar_perception.types import (
-    CLASSES,
-    PEDESTRIAN,
-    SENSOR_HEIGHT,
-    GroundTruth,
-    InputError,
-    PointCloud,
-)
+from lidar_perception.types import CLASSES, PEDESTRIAN, SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
 
 VEHICLES = [i for i, row in enumerate(TABLE) if row.vehicle]
 
@@ -69,8 +62,9 @@ def load_labelled_frame(frame: Frame) -> LabelledFrame:
     if PEDESTRIAN not in truth.class_ids:
         raise InputError("no Pedestrian is labelled in the image; the paper leaves such frames out")
     if not camera.in_view(cloud.xyz).any():
-        raise InputError(f"{frame.points or frame.name} has no point in the camera's view; "
-                         "download it and its calibration again")
+        raise InputError(
+            f"{frame.points or frame.name} has no point in the camera's view; download it and its calibration again"
+        )
     return LabelledFrame(cloud, camera, truth, frame.sensor_height)
 
 
@@ -90,6 +84,8 @@ def make_nearest_seed(segmented: SegmentedCloud, labelled: LabelledFrame) -> See
     for box, class_id in zip(labelled.truth.boxes, labelled.truth.class_ids):
         if class_id in VEHICLES and points_in_box(nearest[None, :3], box).any():
             x, y = nearest[:2]
-            raise InputError(f"the seed pedestrian at ({x:.1f}, {y:.1f}) m stands in a labelled "
-                             f"{CLASSES[class_id]}; correct the labels")
+            raise InputError(
+                f"the seed pedestrian at ({x:.1f}, {y:.1f}) m stands in a labelled "
+                f"{CLASSES[class_id]}; correct the labels"
+            )
     return seed_from_truth(segmented.xyz, segmented.ground, labelled.pedestrians)

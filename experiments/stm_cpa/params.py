@@ -19,8 +19,7 @@ class StmCpaParams:
         iou_limits: Overlaps of Table 8.
     """
 
-    search_eps: tuple[float, ...] = (0.10, 0.15, 0.20, 0.25, 0.30, 0.35, 0.40, 0.45, 0.50, 0.55,
-                                     0.60, 0.70, 0.80)
+    search_eps: tuple[float, ...] = (0.10, 0.15, 0.20, 0.25, 0.30, 0.35, 0.40, 0.45, 0.50, 0.55, 0.60, 0.70, 0.80)
     search_min_samples: tuple[int, ...] = (5, 10, 15, 20, 30)
     search_distance: float = 0.5
     cpa_steps: int = 8

@@ -5,14 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from experiments.framework.experiment import Cell, Figure, Line, Panel, Section, Table
-from experiments.framework.statistics import (
-    bootstrap,
-    compute_rates,
-    make_cells,
-    make_line,
-    nan_to_none,
-    stack_counts,
-)
+from experiments.framework.statistics import bootstrap, compute_rates, make_cells, make_line, nan_to_none, stack_counts
 from experiments.stm_cpa import paper
 from experiments.stm_cpa.params import StmCpaParams
 from lidar_perception.scoring.centres.matching import RANGE_NAMES
@@ -25,8 +18,7 @@ COUNTS = ("hits", "false", "misses")
 def make_search_section(records: list[dict]) -> Section:
     """Return the section of the search, of records of measure_frame()."""
     eps, min_samples = NUMBERS.search_eps, NUMBERS.search_min_samples
-    found = stack_counts([r["search"] for r in records], len(eps) * len(min_samples), 2,
-                         len(RANGE_NAMES))
+    found = stack_counts([r["search"] for r in records], len(eps) * len(min_samples), 2, len(RANGE_NAMES))
     truth = stack_counts([r["pedestrians"] for r in records], 1, len(RANGE_NAMES))
     counts = np.stack([found[:, :, 0], found[:, :, 1], truth - found[:, :, 0]], axis=1)
     estimates = bootstrap(counts, lambda sums: compute_rates(*np.moveaxis(sums, -3, 0)))
@@ -35,8 +27,7 @@ def make_search_section(records: list[dict]) -> Section:
 
     def make_row(setting: int, group: int) -> tuple[str | Cell, ...]:
         e, n = settings[setting]
-        return (f"{e:.2f}", str(n), *make_cells(estimates[:, setting, group]),
-                *map(str, sums[:, setting, group]))
+        return (f"{e:.2f}", str(n), *make_cells(estimates[:, setting, group]), *map(str, sums[:, setting, group]))
 
     best, all_rows = [], []
     for group, name in enumerate(RANGE_NAMES):
@@ -47,20 +38,32 @@ def make_search_section(records: list[dict]) -> Section:
         best.append((name, "the paper's", *make_row(chosen, group)))
         recall, _, f1 = np.nan_to_num(estimates[0, :, group]).T
         if recall.any():
-            best += [(name, what, *make_row(int(score.argmax()), group)) for what, score in
-                     (("most recall", recall + 1e-6 * f1), ("most F1", f1))]
+            best += [
+                (name, what, *make_row(int(score.argmax()), group))
+                for what, score in (("most recall", recall + 1e-6 * f1), ("most F1", f1))
+            ]
     header = ("eps [m]", "min_samples", *RATES, *COUNTS)
-    text = (f"Clusters of the seed's height; hits within {NUMBERS.search_distance:g} m. The paper "
-            "describes its Figure 7 in words: high recall at eps 0.15 to 0.20 m below 15 m, 0.25 "
-            "to 0.35 m from 15 to 30 m, 0.40 to 0.50 m beyond; a larger min_samples lowers "
-            "recall.")
+    text = (
+        f"Clusters of the seed's height; hits within {NUMBERS.search_distance:g} m. The paper "
+        "describes its Figure 7 in words: high recall at eps 0.15 to 0.20 m below 15 m, 0.25 "
+        "to 0.35 m from 15 to 30 m, 0.40 to 0.50 m beyond; a larger min_samples lowers "
+        "recall."
+    )
     return Section(
-        "DBSCAN parameters (Figure 7)", text,
-        (Table("search_best", "The paper's setting and the best of the search",
-               ("range [m]", "setting", *header), tuple(best),
-               "The intervals ignore that the best was chosen among many."),
-         Table("search", "All settings", ("range [m]", *header), tuple(all_rows))),
-        (_draw_figure_7(estimates), _draw_min_samples(estimates)))
+        "DBSCAN parameters (Figure 7)",
+        text,
+        (
+            Table(
+                "search_best",
+                "The paper's setting and the best of the search",
+                ("range [m]", "setting", *header),
+                tuple(best),
+                "The intervals ignore that the best was chosen among many.",
+            ),
+            Table("search", "All settings", ("range [m]", *header), tuple(all_rows)),
+        ),
+        (_draw_figure_7(estimates), _draw_min_samples(estimates)),
+    )
 
 
 def _find_chosen_eps(name: str) -> float:
@@ -70,20 +73,43 @@ def _find_chosen_eps(name: str) -> float:
 def _draw_figure_7(estimates: np.ndarray) -> Figure:
     eps, min_samples = NUMBERS.search_eps, NUMBERS.search_min_samples
     rows = [k * len(min_samples) + min_samples.index(paper.MIN_SAMPLES) for k in range(len(eps))]
-    return Figure("figure_7", f"Figure 7: eps, with min_samples {paper.MIN_SAMPLES}", tuple(
-        Panel(f"{name} m", "eps [m]", "%", (
-            *(make_line(label.removesuffix(" [%]"), eps,
-                        estimates[:, rows, RANGE_NAMES.index(name), k])
-              for k, label in enumerate(RATES)),
-            Line("the paper's eps", (chosen, chosen), (0.0, 100.0), dashed=True)))
-        for name, (_, chosen) in paper.FIGURE_7.items()))
+    return Figure(
+        "figure_7",
+        f"Figure 7: eps, with min_samples {paper.MIN_SAMPLES}",
+        tuple(
+            Panel(
+                f"{name} m",
+                "eps [m]",
+                "%",
+                (
+                    *(
+                        make_line(label.removesuffix(" [%]"), eps, estimates[:, rows, RANGE_NAMES.index(name), k])
+                        for k, label in enumerate(RATES)
+                    ),
+                    Line("the paper's eps", (chosen, chosen), (0.0, 100.0), dashed=True),
+                ),
+            )
+            for name, (_, chosen) in paper.FIGURE_7.items()
+        ),
+    )
 
 
 def _draw_min_samples(estimates: np.ndarray) -> Figure:
     eps, min_samples = NUMBERS.search_eps, NUMBERS.search_min_samples
     recall = estimates[0, ..., 0]
-    return Figure("figure_7_min_samples", "Recall by eps and min_samples", tuple(
-        Panel(f"{name} m", "eps [m]", "recall [%]", tuple(
-            Line(f"min_samples {n}", eps,
-                 nan_to_none(recall[k::len(min_samples), RANGE_NAMES.index(name)]))
-            for k, n in enumerate(min_samples))) for name in paper.FIGURE_7))
+    return Figure(
+        "figure_7_min_samples",
+        "Recall by eps and min_samples",
+        tuple(
+            Panel(
+                f"{name} m",
+                "eps [m]",
+                "recall [%]",
+                tuple(
+                    Line(f"min_samples {n}", eps, nan_to_none(recall[k :: len(min_samples), RANGE_NAMES.index(name)]))
+                    for k, n in enumerate(min_samples)
+                ),
+            )
+            for name in paper.FIGURE_7
+        ),
+    )

@@ -33,8 +33,14 @@ STEPS = ("preprocessing", "DBSCAN", "ground snapping", "height filter", "STM", "
 def make_sections(records: list[dict[str, Any]]) -> list[Section]:
     """Return the report of the records of measure_frame(); skipped frames are left out."""
     records = [record for record in records if "skipped" not in record]
-    makers = (_make_truth_section, make_search_section, _make_stages_section, _make_cpa_section,
-              _make_overlap_section, _make_runtime_section)
+    makers = (
+        _make_truth_section,
+        make_search_section,
+        _make_stages_section,
+        _make_cpa_section,
+        _make_overlap_section,
+        _make_runtime_section,
+    )
     return [make(records) for make in makers]
 
 
@@ -45,20 +51,34 @@ def _make_truth_section(records: list[dict]) -> Section:
     rows: list[Row] = [
         (name, Cell(float(count), paper=paper_count, digits=0), share)
         for name, count, paper_count, share in zip(
-            RANGE_NAMES, counts.sum(axis=0), published,
-            make_cells(shares, [100 * n / paper.PEDESTRIANS for n in published]))]
+            RANGE_NAMES,
+            counts.sum(axis=0),
+            published,
+            make_cells(shares, [100 * n / paper.PEDESTRIANS for n in published]),
+        )
+    ]
     rows.append(("all", Cell(float(counts.sum()), paper=paper.PEDESTRIANS, digits=0), ""))
     without = [r for r in records if r["no_seed"]]
     frames = Table(
-        "frames", "Frames", ("", "count"),
-        (("frames with a Pedestrian label", Cell(len(records), paper=paper.FRAMES, digits=0)),
-         ("without a seed", Cell(len(without), digits=0)),
-         ("pedestrians in frames without a seed (misses)",
-          Cell(sum(sum(r["pedestrians"]) for r in without), digits=0))))
-    no_seed = Table("no_seed", "Frames without a seed", ("frame", "pedestrians", "reason"),
-                    tuple((r["frame"], str(sum(r["pedestrians"])), r["no_seed"]) for r in without))
-    table = Table("table_1", "Table 1: ground truth by range",
-                  ("range [m]", "pedestrians", "share [%]"), tuple(rows))
+        "frames",
+        "Frames",
+        ("", "count"),
+        (
+            ("frames with a Pedestrian label", Cell(len(records), paper=paper.FRAMES, digits=0)),
+            ("without a seed", Cell(len(without), digits=0)),
+            (
+                "pedestrians in frames without a seed (misses)",
+                Cell(sum(sum(r["pedestrians"]) for r in without), digits=0),
+            ),
+        ),
+    )
+    no_seed = Table(
+        "no_seed",
+        "Frames without a seed",
+        ("frame", "pedestrians", "reason"),
+        tuple((r["frame"], str(sum(r["pedestrians"])), r["no_seed"]) for r in without),
+    )
+    table = Table("table_1", "Table 1: ground truth by range", ("range [m]", "pedestrians", "share [%]"), tuple(rows))
     return Section("Ground truth (Table 1)", "", (table, frames, *([no_seed] if without else ())))
 
 
@@ -68,21 +88,42 @@ def _make_stages_section(records: list[dict]) -> Section:
     for stage in STAGES:
         counts = _stack_scores(records, [r["stages"][stage] for r in records])
         estimates, sums = bootstrap(counts, _compute_scores), counts.sum(axis=0)
-        overall.append((STAGE_TITLES[stage],
-                        *_make_score_cells(estimates[:, -1], PAPER_TABLE_6[stage]),
-                        *_format_counts(sums.sum(axis=-1))))
-        by_range += [(name, STAGE_TITLES[stage], str(int(sums[0, k] + sums[2, k])),
-                      *_make_score_cells(estimates[:, k], paper.TABLE_4[name].get(stage, ())),
-                      *_format_counts(sums[:, k])) for k, name in enumerate(RANGE_NAMES)]
+        overall.append(
+            (
+                STAGE_TITLES[stage],
+                *_make_score_cells(estimates[:, -1], PAPER_TABLE_6[stage]),
+                *_format_counts(sums.sum(axis=-1)),
+            )
+        )
+        by_range += [
+            (
+                name,
+                STAGE_TITLES[stage],
+                str(int(sums[0, k] + sums[2, k])),
+                *_make_score_cells(estimates[:, k], paper.TABLE_4[name].get(stage, ())),
+                *_format_counts(sums[:, k]),
+            )
+            for k, name in enumerate(RANGE_NAMES)
+        ]
     by_range.sort(key=lambda row: RANGE_NAMES.index(row[0]))  # stable: the stages stay in order
-    note = ("Kept: share of the hits of stage 1 that are still hits. A hit: 3D "
-            f"centres within {MAX_CENTRE_DISTANCE:g} m, one to one.")
+    note = (
+        "Kept: share of the hits of stage 1 that are still hits. A hit: 3D "
+        f"centres within {MAX_CENTRE_DISTANCE:g} m, one to one."
+    )
     return Section(
-        "Stages (Tables 3, 4 and 6)", "",
-        (Table("table_3_6", "Tables 3 and 6: all ranges", ("stage", *SCORES, *COUNTS),
-               tuple(overall), note),
-         Table("table_4", "Table 4: by range", ("range [m]", "stage", "pedestrians", *SCORES,
-                                                *COUNTS), tuple(by_range), note)))
+        "Stages (Tables 3, 4 and 6)",
+        "",
+        (
+            Table("table_3_6", "Tables 3 and 6: all ranges", ("stage", *SCORES, *COUNTS), tuple(overall), note),
+            Table(
+                "table_4",
+                "Table 4: by range",
+                ("range [m]", "stage", "pedestrians", *SCORES, *COUNTS),
+                tuple(by_range),
+                note,
+            ),
+        ),
+    )
 
 
 def _make_cpa_section(records: list[dict]) -> Section:
@@ -93,47 +134,62 @@ def _make_cpa_section(records: list[dict]) -> Section:
         counts = _stack_scores(records, [r["cpa"][k] for r in records])
         estimates.append(bootstrap(counts, _compute_scores))
         published = paper.TABLE_5[k] if k < len(paper.TABLE_5) else ()
-        rows.append((str(k), *_make_score_cells(estimates[-1][:, -1], published),
-                     *_format_counts(counts.sum(axis=(0, 2)))))
+        rows.append(
+            (str(k), *_make_score_cells(estimates[-1][:, -1], published), *_format_counts(counts.sum(axis=(0, 2))))
+        )
     drawn = np.stack(estimates, axis=1)  # (3, steps, groups, scores)
     ranges = f"{NUMBERS.cpa_min_range:g} to {NUMBERS.cpa_max_range:g} m"
     panels = []
     for m, label in enumerate(RATES):
-        lines = [make_line(f"{name} m", steps, drawn[:, :, RANGE_NAMES.index(name), m])
-                 for name in paper.FIGURE_8]
+        lines = [make_line(f"{name} m", steps, drawn[:, :, RANGE_NAMES.index(name), m]) for name in paper.FIGURE_8]
         for name, points in paper.FIGURE_8.items():
             by_steps = {k: values[m] for k, values in points.items() if values[m] is not None}
-            lines.append(Line(f"{name} m, paper", tuple(by_steps), tuple(by_steps.values()),
-                              dashed=True))
+            lines.append(Line(f"{name} m, paper", tuple(by_steps), tuple(by_steps.values()), dashed=True))
         panels.append(Panel(label.removesuffix(" [%]"), "CPA steps", "%", tuple(lines)))
     by_range: list[Row] = [
         (name, str(k), *_make_score_cells(drawn[:, k, RANGE_NAMES.index(name)], ()))
-        for name in paper.FIGURE_8 for k in steps]
+        for name in paper.FIGURE_8
+        for k in steps
+    ]
     return Section(
-        "CPA steps (Table 5, Figure 8)", f"Copies are added to clusters at {ranges}. The scores of "
+        "CPA steps (Table 5, Figure 8)",
+        f"Copies are added to clusters at {ranges}. The scores of "
         "Table 5 are of all ranges. For Figure 8 the paper gives numbers without CPA, and the F1 "
         "of two steps at 15 to 30 m.",
-        (Table("table_5", f"Table 5: CPA at {ranges}", ("steps", *SCORES, *COUNTS), tuple(rows)),
-         Table("figure_8", "Figure 8 in numbers", ("range [m]", "steps", *SCORES),
-               tuple(by_range))),
-        (Figure("figure_8", "Figure 8: CPA steps by range", tuple(panels)),))
+        (
+            Table("table_5", f"Table 5: CPA at {ranges}", ("steps", *SCORES, *COUNTS), tuple(rows)),
+            Table("figure_8", "Figure 8 in numbers", ("range [m]", "steps", *SCORES), tuple(by_range)),
+        ),
+        (Figure("figure_8", "Figure 8: CPA steps by range", tuple(panels)),),
+    )
 
 
 def _make_overlap_section(records: list[dict]) -> Section:
     limits = len(NUMBERS.iou_limits)
-    header = ["stage", *(f"{kind} IoU >= {limit:.2f} [%]" for kind in ("3D", "BEV")
-                         for limit in NUMBERS.iou_limits), "mean 3D IoU", "mean BEV IoU", "hits"]
+    header = [
+        "stage",
+        *(f"{kind} IoU >= {limit:.2f} [%]" for kind in ("3D", "BEV") for limit in NUMBERS.iou_limits),
+        "mean 3D IoU",
+        "mean BEV IoU",
+        "hits",
+    ]
     scale = np.array([100.0] * 2 * limits + [1.0] * 2)
     rows: list[Row] = []
     for stage in STAGES:
         counts = stack_counts([r["overlap"][stage] for r in records], 3 + 2 * limits)
         estimates = bootstrap(counts, lambda sums: scale * divide(sums[..., 1:], sums[..., :1]))
-        rows.append((STAGE_TITLES[stage], *make_cells(estimates, paper.TABLE_8[stage],
-                                                      [1] * 2 * limits + [3, 3]),
-                     str(int(counts[:, 0].sum()))))
-    return Section("Overlap (Table 8)", "IoU of the hits with the labelled boxes, which have "
-                   "a yaw; boxes of candidates are axis-aligned.",
-                   (Table("table_8", "Table 8: IoU of the hits", tuple(header), tuple(rows)),))
+        rows.append(
+            (
+                STAGE_TITLES[stage],
+                *make_cells(estimates, paper.TABLE_8[stage], [1] * 2 * limits + [3, 3]),
+                str(int(counts[:, 0].sum())),
+            )
+        )
+    return Section(
+        "Overlap (Table 8)",
+        "IoU of the hits with the labelled boxes, which have a yaw; boxes of candidates are axis-aligned.",
+        (Table("table_8", "Table 8: IoU of the hits", tuple(header), tuple(rows)),),
+    )
 
 
 def _make_runtime_section(records: list[dict]) -> Section:
@@ -142,28 +198,38 @@ def _make_runtime_section(records: list[dict]) -> Section:
     medians: list[Row] = []
     for name, published in paper.TABLE_9.items():
         ms = stack_counts([_list_step_times(r["ms"], name) for r in timed], len(STEPS))
-        estimates = bootstrap(np.column_stack([np.ones(len(ms)), ms]),
-                              lambda sums: divide(sums[..., 1:], sums[..., :1]))
+        estimates = bootstrap(
+            np.column_stack([np.ones(len(ms)), ms]), lambda sums: divide(sums[..., 1:], sums[..., :1])
+        )
         means.append((name, *make_cells(estimates, published, 2)))
         middle = np.median(ms, axis=0) if len(ms) else np.full(len(STEPS), np.nan)
         medians.append((name, *(Cell(value, digits=2) for value in nan_to_none(middle))))
     clusters = stack_counts([r["clusters"] for r in timed], 2).sum(axis=0) / max(len(timed), 1)
-    note = ("Preprocessing is the crop to the camera; ground snapping includes the RANSAC plane. "
-            "Reading the files is not included. The paper gives means, on unknown hardware. "
-            "Processes that run at the same time slow each other down: use --jobs 1 for clean "
-            f"times. STM compares {clusters[0]:.1f} clusters per frame without the height filter, "
-            f"{clusters[1]:.1f} with it.")
+    note = (
+        "Preprocessing is the crop to the camera; ground snapping includes the RANSAC plane. "
+        "Reading the files is not included. The paper gives means, on unknown hardware. "
+        "Processes that run at the same time slow each other down: use --jobs 1 for clean "
+        f"times. STM compares {clusters[0]:.1f} clusters per frame without the height filter, "
+        f"{clusters[1]:.1f} with it."
+    )
     header = ("setting", *(f"{step} [ms]" for step in STEPS))
-    return Section("Runtime (Table 9)", "", (
-        Table("table_9", "Table 9: mean time per frame", header, tuple(means), note),
-        Table("table_9_median", "Median time per frame", header, tuple(medians))))
+    return Section(
+        "Runtime (Table 9)",
+        "",
+        (
+            Table("table_9", "Table 9: mean time per frame", header, tuple(means), note),
+            Table("table_9_median", "Median time per frame", header, tuple(medians)),
+        ),
+    )
 
 
 def _list_step_times(ms: dict[str, float], configuration: str) -> list[float]:
     """Return the times of STEPS in a configuration of Table 9."""
-    height, stm, cpa = {"no height filter": (0.0, ms["stm_all"], 0.0),
-                        "height filter": (ms["height"], ms["stm"], 0.0),
-                        "final": (ms["height"], ms["stm"], ms["cpa"])}[configuration]
+    height, stm, cpa = {
+        "no height filter": (0.0, ms["stm_all"], 0.0),
+        "height filter": (ms["height"], ms["stm"], 0.0),
+        "final": (ms["height"], ms["stm"], ms["cpa"]),
+    }[configuration]
     steps = [ms["view"], ms["clustering"], ms["ground"] + ms["boxes"], height, stm, cpa]
     return [*steps, sum(steps)]
 
@@ -171,8 +237,11 @@ def _list_step_times(ms: dict[str, float], configuration: str) -> list[float]:
 def _stack_scores(records: list[dict], of_stage: list[dict]) -> np.ndarray:
     """Return (F, 6, 5): tp, fp, fn, kept, centre error and hits of stage 1, by range."""
     fields = ("tp", "fp", "fn", "kept", "error")
-    return stack_counts([[*(counts[k] for k in fields), record["stages"]["stage1"]["tp"]]
-                         for record, counts in zip(records, of_stage)], 6, len(RANGE_NAMES))
+    return stack_counts(
+        [[*(counts[k] for k in fields), record["stages"]["stage1"]["tp"]] for record, counts in zip(records, of_stage)],
+        6,
+        len(RANGE_NAMES),
+    )
 
 
 def _compute_scores(sums: np.ndarray) -> np.ndarray:
@@ -189,4 +258,4 @@ def _make_score_cells(estimates: np.ndarray, published: tuple) -> tuple[Cell, ..
 
 def _format_counts(sums: np.ndarray) -> tuple[str, ...]:
     """Format COUNTS of sums (6,) of _stack_scores() over frames and ranges."""
-    return tuple(str(int(value)) for value in sums[:len(COUNTS)])
+    return tuple(str(int(value)) for value in sums[: len(COUNTS)])

@@ -39,13 +39,13 @@ SHAPE_KNOTS = {  # feature -> knots of its curve, which is constant beyond the f
     "fill": (0.1, 0.3, 0.5, 0.7, 0.9, 1.1),
     "lopsided": (0.0, 0.05, 0.12, 0.25),
 }
-SEED_KNOTS = {"similarity": (0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0),
-              "height_difference_m": (0.0, 0.1, 0.2, 0.35, 0.6)}
+SEED_KNOTS = {"similarity": (0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0), "height_difference_m": (0.0, 0.1, 0.2, 0.35, 0.6)}
 PIXEL_AREA_M2 = WINDOW_HEIGHT_M / ROWS * WINDOW_WIDTH_M / COLUMNS
 
 
-def compute_shape_features(xyz: np.ndarray, start: np.ndarray, boxes: np.ndarray,
-                           params: PipelineParams = PipelineParams()) -> dict[str, np.ndarray]:
+def compute_shape_features(
+    xyz: np.ndarray, start: np.ndarray, boxes: np.ndarray, params: PipelineParams = PipelineParams()
+) -> dict[str, np.ndarray]:
     """Compute the features of SHAPE_KNOTS of K clusters.
 
     Args:
@@ -66,11 +66,14 @@ def compute_shape_features(xyz: np.ndarray, start: np.ndarray, boxes: np.ndarray
     """
     stm = replace(params.stm, window="metric", spread=True, dilations=0, axis="yaw")
     floors = boxes[:, 2].astype(float) - boxes[:, 5] / 2
-    drawn = count_pixels(draw_silhouettes(xyz, start, np.ones((len(boxes), 1)), floors,
-                                          replace(params, stm=stm))) * PIXEL_AREA_M2
+    drawn = (
+        count_pixels(draw_silhouettes(xyz, start, np.ones((len(boxes), 1)), floors, replace(params, stm=stm)))
+        * PIXEL_AREA_M2
+    )
     count = np.diff(start)
     ranges, low, high, spread, length, width, middle = _compute_moments(
-        np.ascontiguousarray(xyz, np.float32), np.asarray(start, np.int64)).T
+        np.ascontiguousarray(xyz, np.float32), np.asarray(start, np.int64)
+    ).T
     beam = ranges * np.radians(params.resolution.elevation_step)
     height = np.maximum(high - floors, 0.1)
     return {
@@ -86,8 +89,9 @@ def compute_shape_features(xyz: np.ndarray, start: np.ndarray, boxes: np.ndarray
     }
 
 
-def compute_confidence(shape: dict[str, np.ndarray], similarity: np.ndarray | None = None,
-                       height_difference: np.ndarray | None = None) -> np.ndarray:
+def compute_confidence(
+    shape: dict[str, np.ndarray], similarity: np.ndarray | None = None, height_difference: np.ndarray | None = None
+) -> np.ndarray:
     """Return the probability (K,) float64, 0..1, that each cluster is a pedestrian.
 
     The probability holds for simulated scans whose pedestrians are distributed over range as in
@@ -132,7 +136,7 @@ def _compute_moments(xyz, start):
     z, extent along and across the widest direction, distance of the median from the middle."""
     out = np.zeros((len(start) - 1, 7))
     for k in range(len(start) - 1):
-        points = xyz[start[k]:start[k + 1]].astype(np.float64)
+        points = xyz[start[k] : start[k + 1]].astype(np.float64)
         n = len(points)
         x, y, z = points[:, 0].mean(), points[:, 1].mean(), points[:, 2].mean()
         xx, xy, yy, zz = 0.0, 0.0, 0.0, 0.0
@@ -146,7 +150,13 @@ def _compute_moments(xyz, start):
         along = points[:, 0] * ax + points[:, 1] * ay
         across = points[:, 1] * ax - points[:, 0] * ay
         middle = (along.max() + along.min()) / 2
-        out[k] = (np.hypot(x, y), points[:, 2].min(), points[:, 2].max(), np.sqrt(zz / n),
-                  along.max() - along.min(), across.max() - across.min(),
-                  abs(quantile(along.copy(), 0.5) - middle))
+        out[k] = (
+            np.hypot(x, y),
+            points[:, 2].min(),
+            points[:, 2].max(),
+            np.sqrt(zz / n),
+            along.max() - along.min(),
+            across.max() - across.min(),
+            abs(quantile(along.copy(), 0.5) - middle),
+        )
     return out

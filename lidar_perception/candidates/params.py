@@ -15,18 +15,17 @@ from lidar_perception.wire.params import InputParams, ViewParams
 class HeightParams(Params):
     """Height filter (paper A, Section 3.5)."""
 
-    tolerance: float = param(0.2, "Maximum difference between the height of a candidate and that "
-                             "of the seed.", unit="m", low=0.0, high=100.0)
+    tolerance: float = param(
+        0.2, "Maximum difference between the height of a candidate and that of the seed.", unit="m", low=0.0, high=100.0
+    )
 
 
 @dataclass(frozen=True)
 class ResolutionParams(Params):
     """Angular resolution of the sensor; the defaults are those of KITTI's HDL-64E."""
 
-    elevation_step: float = param(0.43, "Angle between neighbouring beams.", unit="deg",
-                                  low=0.01, high=20.0)
-    azimuth_step: float = param(0.17, "Angle between neighbouring points of a beam.", unit="deg",
-                                low=0.01, high=20.0)
+    elevation_step: float = param(0.43, "Angle between neighbouring beams.", unit="deg", low=0.01, high=20.0)
+    azimuth_step: float = param(0.17, "Angle between neighbouring points of a beam.", unit="deg", low=0.01, high=20.0)
 
 
 SILHOUETTE_WINDOWS = ("stretched", "metric")
@@ -37,33 +36,48 @@ SILHOUETTE_AXES = ("yaw", "pca")
 class StmParams(Params):
     """Single template matching (paper A, Section 3.6)."""
 
-    threshold: float = param(0.40, "Minimum cosine similarity between the silhouettes of a "
-                             "cluster and the seed.", low=0.0, high=1.0)
-    window: str = param("stretched", "stretched: the silhouette of a cluster fills the window. "
-                        "metric: the window is 1.6 m wide and 2.4 m high, starting at the ground.",
-                        choices=SILHOUETTE_WINDOWS)
-    axis: str = param("yaw", "yaw: rotate clusters about z only. pca: also rotate the longest "
-                      "axis to the vertical.", choices=SILHOUETTE_AXES)
-    spread: bool = param(False, "Draw every point as large as the surface that it represents "
-                         "(see resolution), so that a silhouette does not depend on the range.")
+    threshold: float = param(
+        0.40, "Minimum cosine similarity between the silhouettes of a cluster and the seed.", low=0.0, high=1.0
+    )
+    window: str = param(
+        "stretched",
+        "stretched: the silhouette of a cluster fills the window. "
+        "metric: the window is 1.6 m wide and 2.4 m high, starting at the ground.",
+        choices=SILHOUETTE_WINDOWS,
+    )
+    axis: str = param(
+        "yaw",
+        "yaw: rotate clusters about z only. pca: also rotate the longest axis to the vertical.",
+        choices=SILHOUETTE_AXES,
+    )
+    spread: bool = param(
+        False,
+        "Draw every point as large as the surface that it represents "
+        "(see resolution), so that a silhouette does not depend on the range.",
+    )
     dilations: int = param(1, "Number of 3 x 3 dilations of the silhouette.", low=0, high=10)
-    seen_only: bool = param(False, "With the metric window: compare only the part above the "
-                            "lowest points of both the cluster and the seed, because the part "
-                            "below is hidden in one of them.")
-    shifts: int = param(0, "Maximum horizontal shift of the silhouette, in columns, to fit that "
-                        "of the seed.", low=0, high=16)
+    seen_only: bool = param(
+        False,
+        "With the metric window: compare only the part above the "
+        "lowest points of both the cluster and the seed, because the part "
+        "below is hidden in one of them.",
+    )
+    shifts: int = param(
+        0, "Maximum horizontal shift of the silhouette, in columns, to fit that of the seed.", low=0, high=16
+    )
 
 
 @dataclass(frozen=True)
 class CpaParams(Params):
     """Centralized point augmentation (paper A, Section 3.7)."""
 
-    min_range: float = param(15.0, "Minimum horizontal range of clusters that get additional "
-                             "points.", unit="m", low=0.0, high=1e6)
-    max_range: float = param(30.0, "Maximum horizontal range of clusters that get additional "
-                             "points.", unit="m", low=0.0, high=1e6)
-    steps: int = param(2, "Number of shrunken copies of the cluster that are added; 0: none.",
-                       low=0, high=100)
+    min_range: float = param(
+        15.0, "Minimum horizontal range of clusters that get additional points.", unit="m", low=0.0, high=1e6
+    )
+    max_range: float = param(
+        30.0, "Maximum horizontal range of clusters that get additional points.", unit="m", low=0.0, high=1e6
+    )
+    steps: int = param(2, "Number of shrunken copies of the cluster that are added; 0: none.", low=0, high=100)
     decrement: float = param(0.10, "Decrease of the scale from copy to copy.", low=0.0, high=1.0)
     min_scale: float = param(0.20, "Minimum scale of a copy.", low=0.0, high=1.0)
 
@@ -72,8 +86,11 @@ class CpaParams(Params):
 class ConfidenceParams(Params):
     """Probability of each candidate, from its shape and its similarity to the seed."""
 
-    enabled: bool = param(False, "Accept candidates by confidence instead of similarity, and use "
-                          "it as the score. The confidence is fitted to the configuration best.")
+    enabled: bool = param(
+        False,
+        "Accept candidates by confidence instead of similarity, and use "
+        "it as the score. The confidence is fitted to the configuration best.",
+    )
     threshold: float = param(0.5, "Minimum confidence of a candidate.", low=0.0, high=1.0)
 
 
@@ -84,19 +101,26 @@ SEED_SOURCES = ("ground_truth", "click", "file", "automatic")
 class SeedParams(Params):
     """Source of the seed pedestrian (paper A, Section 3.5)."""
 
-    source: str = param("file", "ground_truth: the nearest labelled Pedestrian of the frame (the "
-                        "paper's protocol). click: the cluster at /clicked_point. file: a saved "
-                        "template. automatic: the cluster of the frame that resembles a "
-                        "pedestrian most, or the template if there is none.", choices=SEED_SOURCES)
-    file: str = param("", "Template file for source 'file', or several separated by commas; empty: "
-                      "the shipped one.")
-    bank: int = param(1, "Number of the last clicks whose seeds are kept for source 'click'. A "
-                      "cluster is compared with all seeds; the most similar one counts.", low=1,
-                      high=16)
-    min_confidence: float = param(0.3, "For source 'automatic': minimum confidence of the seed.",
-                                  low=0.0, high=1.0)
-    click_radius: float = param(2.0, "A click selects the nearest cluster within this distance.",
-                                unit="m", low=0.01, high=100.0)
+    source: str = param(
+        "file",
+        "ground_truth: the nearest labelled Pedestrian of the frame (the "
+        "paper's protocol). click: the cluster at /clicked_point. file: a saved "
+        "template. automatic: the cluster of the frame that resembles a "
+        "pedestrian most, or the template if there is none.",
+        choices=SEED_SOURCES,
+    )
+    file: str = param("", "Template file for source 'file', or several separated by commas; empty: the shipped one.")
+    bank: int = param(
+        1,
+        "Number of the last clicks whose seeds are kept for source 'click'. A "
+        "cluster is compared with all seeds; the most similar one counts.",
+        low=1,
+        high=16,
+    )
+    min_confidence: float = param(0.3, "For source 'automatic': minimum confidence of the seed.", low=0.0, high=1.0)
+    click_radius: float = param(
+        2.0, "A click selects the nearest cluster within this distance.", unit="m", low=0.01, high=100.0
+    )
 
 
 # The steps of the candidate pipeline whose durations are measured, in order.

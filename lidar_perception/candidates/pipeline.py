@@ -18,20 +18,21 @@ from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.refine import Candidates, refine_clusters
 from lidar_perception.candidates.seed_sources import SeedSource
-from lidar_perception.candidates.segmented_cloud import (
-    SegmentedCloud,
-    crop_to_view,
-    fit_grounded_boxes,
-)
+from lidar_perception.candidates.segmented_cloud import SegmentedCloud, crop_to_view, fit_grounded_boxes
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.ground.segment import crop_with_sensor_pose, segment_ground
 from lidar_perception.groups import renumber_ids
 from lidar_perception.types import PointCloud, as_point_cloud, check_columns
 
 
-def segment_cloud(cloud: PointCloud | ArrayLike, camera: Camera | None = None,
-                  params: PipelineParams = PipelineParams(), *, ground: np.ndarray | None = None,
-                  cluster_ids: np.ndarray | None = None) -> SegmentedCloud:
+def segment_cloud(
+    cloud: PointCloud | ArrayLike,
+    camera: Camera | None = None,
+    params: PipelineParams = PipelineParams(),
+    *,
+    ground: np.ndarray | None = None,
+    cluster_ids: np.ndarray | None = None,
+) -> SegmentedCloud:
     """Run the stages up to the boxes.
 
     Args:
@@ -49,8 +50,7 @@ def segment_cloud(cloud: PointCloud | ArrayLike, camera: Camera | None = None,
     indices, seen = crop_to_view(frame, camera, params.view)
     indices = kept.take(indices)
     t1 = perf_counter()
-    ground = (segment_ground(seen, params.ground) if ground is None else
-              np.asarray(ground, bool)[indices])
+    ground = segment_ground(seen, params.ground) if ground is None else np.asarray(ground, bool)[indices]
     t2 = perf_counter()
     numbers = None
     if cluster_ids is None:
@@ -61,13 +61,18 @@ def segment_cloud(cloud: PointCloud | ArrayLike, camera: Camera | None = None,
     boxes = fit_grounded_boxes(seen.xyz, ground, cluster_ids, params.boxes)
     t4 = perf_counter()
     ms = dict(view=t1 - t0, ground=t2 - t1, clustering=t3 - t2, boxes=t4 - t3)
-    return SegmentedCloud(indices, seen.xyz, ground, cluster_ids, boxes, numbers,
-                          ms={k: v * 1e3 for k, v in ms.items()})
+    return SegmentedCloud(
+        indices, seen.xyz, ground, cluster_ids, boxes, numbers, ms={k: v * 1e3 for k, v in ms.items()}
+    )
 
 
-def find_candidates(cloud: PointCloud | ArrayLike, seed: SeedSource, camera: Camera | None = None,
-                    params: PipelineParams = PipelineParams(),
-                    **columns: np.ndarray | None) -> tuple[SegmentedCloud, Candidates]:
+def find_candidates(
+    cloud: PointCloud | ArrayLike,
+    seed: SeedSource,
+    camera: Camera | None = None,
+    params: PipelineParams = PipelineParams(),
+    **columns: np.ndarray | None,
+) -> tuple[SegmentedCloud, Candidates]:
     """Run the whole pipeline on one cloud.
 
     cloud and columns are those of segment_cloud(). `ms` of the candidates covers every step of
@@ -80,15 +85,15 @@ def find_candidates(cloud: PointCloud | ArrayLike, seed: SeedSource, camera: Cam
     return segmented, refine_segmented(segmented, seed, params)
 
 
-def refine_segmented(segmented: SegmentedCloud, seed: SeedSource,
-                     params: PipelineParams = PipelineParams()) -> Candidates:
+def refine_segmented(
+    segmented: SegmentedCloud, seed: SeedSource, params: PipelineParams = PipelineParams()
+) -> Candidates:
     """Find the candidates among the clusters of a cloud, and name clusters by the cloud's ids.
 
     Raises:
         InputError: if there is no seed.
     """
-    found = refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed(segmented),
-                            params)
+    found = refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed(segmented), params)
     clusters = found.clusters
     if segmented.numbers is not None:
         clusters = segmented.numbers[clusters - 1]

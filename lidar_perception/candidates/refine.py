@@ -11,11 +11,7 @@ import numpy as np
 from lidar_perception.candidates.confidence import compute_confidence, compute_shape_features
 from lidar_perception.candidates.params import HeightParams, PipelineParams
 from lidar_perception.candidates.seeds import Seed, find_seed_cluster
-from lidar_perception.candidates.silhouette import (
-    compute_cpa_scales,
-    compute_similarity,
-    draw_silhouettes,
-)
+from lidar_perception.candidates.silhouette import compute_cpa_scales, compute_similarity, draw_silhouettes
 from lidar_perception.groups import group_points
 from lidar_perception.types import PEDESTRIAN, Detections
 
@@ -47,8 +43,13 @@ def select_by_height(boxes: np.ndarray, seed_height: float, params: HeightParams
     return np.abs(boxes[:, 5] - seed_height) <= params.tolerance
 
 
-def refine_clusters(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray,
-                    seeds: Sequence[Seed], params: PipelineParams = PipelineParams()) -> Candidates:
+def refine_clusters(
+    xyz: np.ndarray,
+    labels: np.ndarray,
+    boxes: np.ndarray,
+    seeds: Sequence[Seed],
+    params: PipelineParams = PipelineParams(),
+) -> Candidates:
     """Find the candidates among clusters 1..K of points (N, 3).
 
     labels (N,) are the points' cluster ids, boxes (K, 7) are snapped to the ground. Of several
@@ -71,8 +72,7 @@ def refine_clusters(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray,
     chosen = np.flatnonzero((scales < 1.0).any(axis=1))
     final = plain.copy()
     if len(chosen):
-        images = draw_silhouettes(*group_points(xyz, labels, kept[chosen] + 1), scales[chosen],
-                                  floors[chosen], params)
+        images = draw_silhouettes(*group_points(xyz, labels, kept[chosen] + 1), scales[chosen], floors[chosen], params)
         for scores, template in zip(final, templates):
             scores[chosen] = compute_similarity(images, template, params.stm)
     t3 = perf_counter()
@@ -86,17 +86,17 @@ def refine_clusters(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray,
             seed_confidence = 1.0 if seed.certain else compute_confidence(shape)
             height_difference = shape["height_m"] - seed.height
             for scores in similarities:
-                scores[:] = np.where(is_seed, seed_confidence, compute_confidence(
-                    shape, scores, height_difference))
+                scores[:] = np.where(is_seed, seed_confidence, compute_confidence(shape, scores, height_difference))
     plain, final = (np.where(fits, scores, -np.inf).max(axis=0) for scores in (plain, final))
     t4 = perf_counter()
 
     def detections(scores: np.ndarray, accepted: np.ndarray) -> Detections:
         return Detections.of(boxes[accepted], PEDESTRIAN, scores[accepted])
 
-    return Candidates(detections(plain, np.ones(len(kept), bool)),
-                      detections(plain, plain >= threshold),
-                      detections(final, final >= threshold),
-                      kept[final >= threshold] + 1,
-                      dict(height=(t1 - t0) * 1e3, stm=(t2 - t1) * 1e3, cpa=(t3 - t2) * 1e3,
-                           confidence=(t4 - t3) * 1e3))
+    return Candidates(
+        detections(plain, np.ones(len(kept), bool)),
+        detections(plain, plain >= threshold),
+        detections(final, final >= threshold),
+        kept[final >= threshold] + 1,
+        dict(height=(t1 - t0) * 1e3, stm=(t2 - t1) * 1e3, cpa=(t3 - t2) * 1e3, confidence=(t4 - t3) * 1e3),
+    )

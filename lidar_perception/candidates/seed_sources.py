@@ -8,13 +8,7 @@ import numpy as np
 
 from lidar_perception.candidates.confidence import compute_confidence, compute_shape_features
 from lidar_perception.candidates.params import PipelineParams, SeedParams
-from lidar_perception.candidates.seeds import (
-    MIN_POINTS,
-    Seed,
-    seed_from_click,
-    seed_from_points,
-    seed_from_truth,
-)
+from lidar_perception.candidates.seeds import MIN_POINTS, Seed, seed_from_click, seed_from_points, seed_from_truth
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.groups import group_points
 
@@ -34,16 +28,18 @@ def make_click_source(click: np.ndarray, params: SeedParams = SeedParams()) -> S
 
 def make_automatic_source(templates: Sequence[Seed], params: PipelineParams) -> SeedSource:
     """Return a source that takes the cluster most likely to be a pedestrian, or the templates."""
+
     def source(s: SegmentedCloud) -> tuple[Seed, ...]:
         clusters = np.arange(1, len(s.boxes) + 1)
-        likely = compute_confidence(compute_shape_features(*group_points(s.xyz, s.cluster_ids,
-                                                                         clusters), s.boxes,
-                                                           params))
+        likely = compute_confidence(
+            compute_shape_features(*group_points(s.xyz, s.cluster_ids, clusters), s.boxes, params)
+        )
         likely[np.bincount(s.cluster_ids, minlength=len(s.boxes) + 1)[1:] < MIN_POINTS] = -1.0
         if likely.max(initial=-1.0) < params.seed.min_confidence:  # min_confidence may be 0
             return tuple(templates)
         best = int(likely.argmax())
         return (seed_from_points(s.xyz[s.cluster_ids == best + 1], s.boxes[best]),)
+
     return source
 
 

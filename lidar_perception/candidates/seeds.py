@@ -36,17 +36,16 @@ class Seed:
 
     def silhouette(self, params: PipelineParams = PipelineParams()) -> np.ndarray:
         """Draw the seed's silhouette, (80,) uint32 (see silhouette.py)."""
-        return draw_silhouettes(self.xyz, np.array([0, len(self.xyz)]), np.ones((1, 1)),
-                                np.array([self.floor]), params)[0]
+        return draw_silhouettes(
+            self.xyz, np.array([0, len(self.xyz)]), np.ones((1, 1)), np.array([self.floor]), params
+        )[0]
 
 
 def seed_from_points(xyz: np.ndarray, box: np.ndarray, certain: bool = False) -> Seed:
     """Make a seed of a pedestrian's points (M, 3), M >= 10, and its box (7,) on the ground."""
     if len(xyz) < MIN_POINTS:
-        raise InputError(f"the seed pedestrian has {len(xyz)} points; pick a nearer one "
-                         f"(at least {MIN_POINTS})")
-    return Seed(np.ascontiguousarray(xyz, np.float32), float(box[2] - box[5] / 2), float(box[5]),
-                certain)
+        raise InputError(f"the seed pedestrian has {len(xyz)} points; pick a nearer one (at least {MIN_POINTS})")
+    return Seed(np.ascontiguousarray(xyz, np.float32), float(box[2] - box[5] / 2), float(box[5]), certain)
 
 
 def find_seed_cluster(seed: Seed, xyz: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -56,8 +55,10 @@ def find_seed_cluster(seed: Seed, xyz: np.ndarray, start: np.ndarray) -> np.ndar
     other than the seed's.
     """
     row = np.dtype((np.void, 12))
-    same = np.isin(np.ascontiguousarray(xyz, np.float32).view(row).ravel(),
-                   np.ascontiguousarray(seed.xyz, np.float32).view(row).ravel())
+    same = np.isin(
+        np.ascontiguousarray(xyz, np.float32).view(row).ravel(),
+        np.ascontiguousarray(seed.xyz, np.float32).view(row).ravel(),
+    )
     shared = np.diff(np.concatenate([[0], np.cumsum(same)])[start])
     return 2 * shared >= len(seed.xyz)
 
@@ -76,8 +77,7 @@ def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray
     return seed_from_points(xyz[points_in_box(xyz, nearest) & ~ground], nearest, certain=True)
 
 
-def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray,
-                    radius: float) -> Seed:
+def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, radius: float) -> Seed:
     """Make a seed of the cluster nearest to click (3,).
 
     Clusters have labels 1..K and ground-snapped boxes (K, 7). Raises InputError as
@@ -87,8 +87,7 @@ def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxe
     return seed_from_points(xyz[labels == label], boxes[label - 1], certain=True)
 
 
-def find_clicked_cluster(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray,
-                         radius: float) -> int:
+def find_clicked_cluster(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, radius: float) -> int:
     """Return the label of the cluster with the point nearest to click (3,).
 
     labels (N,) are those of points (N, 3), 0 for no cluster.
@@ -105,8 +104,9 @@ def find_clicked_cluster(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray,
     with np.errstate(over="ignore"):
         distance = np.linalg.norm(xyz[clustered] - click.astype(np.float32), axis=1)
     if not distance.min() <= radius:
-        raise InputError(f"nearest cluster is {distance.min():.1f} m from the clicked point; "
-                         f"click within {radius:g} m of one")
+        raise InputError(
+            f"nearest cluster is {distance.min():.1f} m from the clicked point; click within {radius:g} m of one"
+        )
     return int(labels[clustered[distance.argmin()]])
 
 
@@ -114,9 +114,18 @@ def save_seed(seed: Seed, path: str | Path) -> None:
     """Write a template as JSON: the points, and the silhouette as text for readers."""
     rows = ["".join(".#"[bit] for bit in row) for row in to_pixels(seed.silhouette()).astype(int)]
     points = [[round(float(v), DECIMALS) for v in p] for p in seed.xyz]
-    write_text(path, json.dumps({"height_m": round(seed.height, DECIMALS),
-                                 "floor_m": round(seed.floor, DECIMALS), "points_m": points,
-                                 "silhouette": rows}, indent=1))
+    write_text(
+        path,
+        json.dumps(
+            {
+                "height_m": round(seed.height, DECIMALS),
+                "floor_m": round(seed.floor, DECIMALS),
+                "points_m": points,
+                "silhouette": rows,
+            },
+            indent=1,
+        ),
+    )
 
 
 def load_seeds(paths: str = "") -> tuple[Seed, ...]:
@@ -140,10 +149,19 @@ def load_seed(path: str | Path = "") -> Seed:
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{source} is not a template ({shorten_error(error)}); make one with "
-                         "'lidar-perception seed'") from None
-    if (xyz.ndim != 2 or xyz.shape[1] != 3 or len(xyz) < MIN_POINTS or not 0 < height <= MAX_RANGE
-            or not (np.abs(xyz) <= MAX_RANGE).all() or not abs(floor) <= MAX_RANGE):
-        raise InputError(f"{source}: a template has {MIN_POINTS} points_m or more of x, y, z, and "
-                         "height_m above 0; make one with 'lidar-perception seed'")
+        raise InputError(
+            f"{source} is not a template ({shorten_error(error)}); make one with 'lidar-perception seed'"
+        ) from None
+    if (
+        xyz.ndim != 2
+        or xyz.shape[1] != 3
+        or len(xyz) < MIN_POINTS
+        or not 0 < height <= MAX_RANGE
+        or not (np.abs(xyz) <= MAX_RANGE).all()
+        or not abs(floor) <= MAX_RANGE
+    ):
+        raise InputError(
+            f"{source}: a template has {MIN_POINTS} points_m or more of x, y, z, and "
+            "height_m above 0; make one with 'lidar-perception seed'"
+        )
     return Seed(xyz, floor, height)

@@ -35,8 +35,9 @@ class SegmentedCloud:
     ms: dict[str, float] = field(default_factory=dict)
 
 
-def fit_grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray,
-                       params: BoxParams = BoxParams()) -> np.ndarray:
+def fit_grounded_boxes(
+    xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray, params: BoxParams = BoxParams()
+) -> np.ndarray:
     """Fit boxes (K, 7) to clusters 1..K, down to the plane through the ground points."""
     plane = fit_ground_plane(xyz.compress(ground, axis=0), params)
     return snap_to_ground(fit_boxes(xyz, cluster_ids, params.shape), plane)
@@ -65,8 +66,7 @@ def fit_ground_plane(ground: np.ndarray, params: BoxParams) -> np.ndarray | None
     return fit_plane(ground)
 
 
-def diagnose_empty(usable: int, ground: np.ndarray,
-                   cluster_ids: np.ndarray | None = None) -> str | None:
+def diagnose_empty(usable: int, ground: np.ndarray, cluster_ids: np.ndarray | None = None) -> str | None:
     """Explain why a cloud has no candidates, with the remedy; None if there is no reason so far.
 
     usable is the number of finite points; ground (M,) and cluster_ids (M,) are those of the points
@@ -75,19 +75,15 @@ def diagnose_empty(usable: int, ground: np.ndarray,
     if usable == 0:
         return "the cloud is empty or has no finite point, or crop.* leaves none"
     if len(ground) == 0:
-        return ("no point is in the camera's view, or crop.* leaves none there; check the "
-                "LiDAR-to-camera transform")
+        return "no point is in the camera's view, or crop.* leaves none there; check the LiDAR-to-camera transform"
     if not ground.any():
-        return ("no ground found; is the sensor mounted at another height or angle? set "
-                "ground.sensor_pose")
+        return "no ground found; is the sensor mounted at another height or angle? set ground.sensor_pose"
     if cluster_ids is not None and not cluster_ids.any():
-        return ("no clusters; are the numbers of clustering.dbscan or clustering.euclidean right "
-                "for this sensor?")
+        return "no clusters; are the numbers of clustering.dbscan or clustering.euclidean right for this sensor?"
     return None
 
 
-def crop_to_view(frame: PointCloud, camera: Camera | None,
-                 params: ViewParams) -> tuple[np.ndarray, PointCloud]:
+def crop_to_view(frame: PointCloud, camera: Camera | None, params: ViewParams) -> tuple[np.ndarray, PointCloud]:
     """Keep the points of a frame that are in the camera's view.
 
     Returns:
@@ -100,7 +96,9 @@ def crop_to_view(frame: PointCloud, camera: Camera | None,
     if not params.enabled:
         return np.arange(len(frame)), frame
     if camera is None:
-        raise InputError("view.enabled is on but there is no camera calibration; give CameraInfo "
-                         "and the LiDAR-to-camera transform, or set view.enabled to false")
+        raise InputError(
+            "view.enabled is on but there is no camera calibration; give CameraInfo "
+            "and the LiDAR-to-camera transform, or set view.enabled to false"
+        )
     indices = np.flatnonzero(camera.in_view(frame.xyz))
     return indices, frame.take(indices)

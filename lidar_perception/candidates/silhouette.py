@@ -17,9 +17,13 @@ FULL_ROW = np.uint64(0xFFFFFFFF)
 ONE, LAST_COLUMN = np.uint64(1), np.uint64(31)
 
 
-def draw_silhouettes(xyz: np.ndarray, start: np.ndarray, scales: np.ndarray,
-                     floors: np.ndarray | None = None, params: PipelineParams = PipelineParams()
-                     ) -> np.ndarray:
+def draw_silhouettes(
+    xyz: np.ndarray,
+    start: np.ndarray,
+    scales: np.ndarray,
+    floors: np.ndarray | None = None,
+    params: PipelineParams = PipelineParams(),
+) -> np.ndarray:
     """Draw the silhouettes of K clusters.
 
     The steps are those of the paper, except where params.stm changes them: rotate about z so that
@@ -40,11 +44,16 @@ def draw_silhouettes(xyz: np.ndarray, start: np.ndarray, scales: np.ndarray,
     stm, cell = params.stm, params.resolution
     floors = np.zeros(len(start) - 1) if floors is None else floors
     half = np.radians([cell.azimuth_step, cell.elevation_step]) / 2 * stm.spread
-    return _draw_silhouettes(np.ascontiguousarray(xyz, np.float32), np.asarray(start, np.int64),
-                             scales,
-                             np.asarray(floors, np.float64), stm.window == "metric",
-                             stm.axis == "pca",
-                             half, stm.dilations)
+    return _draw_silhouettes(
+        np.ascontiguousarray(xyz, np.float32),
+        np.asarray(start, np.int64),
+        scales,
+        np.asarray(floors, np.float64),
+        stm.window == "metric",
+        stm.axis == "pca",
+        half,
+        stm.dilations,
+    )
 
 
 def compute_cpa_scales(ranges: np.ndarray, params: CpaParams) -> np.ndarray:
@@ -60,8 +69,7 @@ def compute_cpa_scales(ranges: np.ndarray, params: CpaParams) -> np.ndarray:
     return np.where(inside[:, None], contracted, 1.0)
 
 
-def compute_similarity(images: np.ndarray, template: np.ndarray, params: StmParams = StmParams()
-                       ) -> np.ndarray:
+def compute_similarity(images: np.ndarray, template: np.ndarray, params: StmParams = StmParams()) -> np.ndarray:
     """Return (K,) float64 cosine of binary images (K, 80) and a template (80,); 0 if one is blank.
 
     params.shifts: the best cosine of the images shifted sideways by up to this many columns.
@@ -69,8 +77,7 @@ def compute_similarity(images: np.ndarray, template: np.ndarray, params: StmPara
     """
     if params.seen_only and params.window == "metric":
         rows = np.arange(ROWS)
-        last = np.minimum(ROWS - 1 - (images[:, ::-1] != 0).argmax(axis=1),
-                          ROWS - 1 - (template[::-1] != 0).argmax())
+        last = np.minimum(ROWS - 1 - (images[:, ::-1] != 0).argmax(axis=1), ROWS - 1 - (template[::-1] != 0).argmax())
         seen = np.where(rows <= last[:, None], np.uint32(FULL_ROW), np.uint32(0))
         images, templates = images & seen, template & seen
     else:
@@ -104,10 +111,9 @@ def _draw_silhouettes(xyz, start, scales, floors, metric, upright, half, dilatio
     images = np.zeros((len(start) - 1, ROWS), np.uint32)
     rows = np.empty(ROWS, np.uint64)
     for k in range(len(start) - 1):
-        points = xyz[start[k]:start[k + 1]]
+        points = xyz[start[k] : start[k + 1]]
         centre = _find_centroid(points)
-        lateral, vertical = (_find_principal_axes(points, centre) if upright else
-                             _find_yaw_axes(points, centre))
+        lateral, vertical = _find_principal_axes(points, centre) if upright else _find_yaw_axes(points, centre)
         y, z = np.empty(len(points)), np.empty(len(points))
         for i in range(len(points)):
             y[i] = z[i] = 0.0

@@ -31,14 +31,24 @@ CAMERA = Camera(np.array([[50, -100, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]], flo
 @report_compilation(whole_detector=True)
 def warm_up() -> None:
     """Run every stage and method once on synthetic points to trigger JIT compilation."""
-    for ground, clustering, boxes, sure in (("threshold", "dbscan", "axis_aligned", False),
-                                            ("cloth", "euclidean", "l_shape", True)):
-        warm_up_candidates(with_values(PipelineParams(view=ViewParams(enabled=True)), {
-            "ground.method": ground, "clustering.method": clustering, "boxes.shape": boxes,
-            "clustering.dbscan.join_bands": True, "confidence.enabled": sure}))
+    for ground, clustering, boxes, sure in (
+        ("threshold", "dbscan", "axis_aligned", False),
+        ("cloth", "euclidean", "l_shape", True),
+    ):
+        warm_up_candidates(
+            with_values(
+                PipelineParams(view=ViewParams(enabled=True)),
+                {
+                    "ground.method": ground,
+                    "clustering.method": clustering,
+                    "boxes.shape": boxes,
+                    "clustering.dbscan.join_bands": True,
+                    "confidence.enabled": sure,
+                },
+            )
+        )
     for threshold in ("local", "global"):
-        _warm_up_tree(with_values(ClusteringParams(), {"method": "euclidean",
-                                                       "euclidean.threshold": threshold}))
+        _warm_up_tree(with_values(ClusteringParams(), {"method": "euclidean", "euclidean.threshold": threshold}))
 
 
 def warm_up_ground(params: GroundParams, view: ViewParams = ViewParams()) -> None:

@@ -34,6 +34,7 @@ class Choice(click.ParamType):
 
     def shell_complete(self, ctx: Any, param: Any, incomplete: str) -> list[Any]:
         from click.shell_completion import CompletionItem
+
         return [CompletionItem(name) for name in self.choices if name.startswith(incomplete)]
 
 
@@ -48,8 +49,7 @@ def refuse_given(names: Iterable[str], reason: str) -> None:
     """
     context = click.get_current_context()
     for param in context.command.params:
-        if param.name in names and context.get_parameter_source(param.name) not in (
-                None, ParameterSource.DEFAULT):
+        if param.name in names and context.get_parameter_source(param.name) not in (None, ParameterSource.DEFAULT):
             raise click.UsageError(f"{param.opts[0]} {reason}")
 
 
@@ -66,17 +66,27 @@ class Command(click.Command):
         try:
             return super().parse_args(ctx, args)
         except click.NoSuchOption as error:
-            flags = [flag for param in self.get_params(ctx) for flag in
-                     (*param.opts, *param.secondary_opts) if flag.startswith("-")]
+            flags = [
+                flag
+                for param in self.get_params(ctx)
+                for flag in (*param.opts, *param.secondary_opts)
+                if flag.startswith("-")
+            ]
             remedy = self.remedy(error.option_name) or did_you_mean(error.option_name, flags)
-            raise click.UsageError(f"no such option {error.option_name}"
-                                   + (remedy or f"; {ctx.command_path} --help lists them"),
-                                   ctx) from None
+            raise click.UsageError(
+                f"no such option {error.option_name}" + (remedy or f"; {ctx.command_path} --help lists them"), ctx
+            ) from None
 
     def remedy(self, flag: str) -> str:
         """Return the remedy for an unknown flag that an option knows; "" without one."""
-        return next((text for param in self.params if isinstance(param, HelpfulOption)
-                     and (text := param.suggest_option(flag))), "")
+        return next(
+            (
+                text
+                for param in self.params
+                if isinstance(param, HelpfulOption) and (text := param.suggest_option(flag))
+            ),
+            "",
+        )
 
 
 class HelpfulOption(click.Option):
@@ -84,9 +94,10 @@ class HelpfulOption(click.Option):
 
     def asks_for_help(self, args: list[str]) -> bool:
         """Return True if the command line asks for the listing."""
-        return any(f"{flag}=help" in args or [flag, "help"] in [args[i:i + 2] for i in
-                                                                range(len(args))]
-                   for flag in self.opts)
+        return any(
+            f"{flag}=help" in args or [flag, "help"] in [args[i : i + 2] for i in range(len(args))]
+            for flag in self.opts
+        )
 
     def listing(self, given: Mapping[str, Any]) -> str:
         """Return the listing, with the options that were given."""

@@ -26,31 +26,56 @@ DATASETS, LABELS = tuple(LAYOUTS), tuple(FORMATS)
 
 @click.command(cls=Command)
 @click.argument("source", type=click.Path(path_type=Path), metavar="DATA", required=False)
-@click.option("--to", "--format", "format", default=MCAP, show_default=True,
-              type=Choice(dict.fromkeys((MCAP, *DATASETS, *LABELS)), ALIASES),
-              help="Format to write.")
-@click.option("--out", type=click.Path(path_type=Path), required=True,
-              help="Bag, folder or file to make.")
-@a_path("--data", "Same as DATA. With both, DATA is the path of labels of this drive, which are "
-        "converted.", "DRIVE")
-@click.option("--from", "given", type=Choice(READERS, ALIASES), help="Format of the labels at "
-              "DATA. Default: recognised.")
-@click.option("--detections", metavar="TOPIC", help="Take the boxes on this topic of the bag at "
-              "DATA (MarkerArray or Detection3DArray), instead of its labels.")
-@click.option("--points", default="", metavar="TOPIC",
-              help="Clouds of a bag.  [default: /points, else the only ones]")
-@a_path("--robot", "robot.param.yaml that `setup` wrote, for a recording with a tilted or turned "
-        "sensor: level its clouds, x ahead, without the robot's own returns, as nodes see them.")
-@click.option("--deskew", is_flag=True, help="Of a bag: move the points of each cloud to its "
-              "stamp, by its column of times and the odometry or TF of the bag.")
+@click.option(
+    "--to",
+    "--format",
+    "format",
+    default=MCAP,
+    show_default=True,
+    type=Choice(dict.fromkeys((MCAP, *DATASETS, *LABELS)), ALIASES),
+    help="Format to write.",
+)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Bag, folder or file to make.")
+@a_path("--data", "Same as DATA. With both, DATA is the path of labels of this drive, which are converted.", "DRIVE")
+@click.option(
+    "--from", "given", type=Choice(READERS, ALIASES), help="Format of the labels at DATA. Default: recognised."
+)
+@click.option(
+    "--detections",
+    metavar="TOPIC",
+    help="Take the boxes on this topic of the bag at DATA (MarkerArray or Detection3DArray), instead of its labels.",
+)
+@click.option("--points", default="", metavar="TOPIC", help="Clouds of a bag.  [default: /points, else the only ones]")
+@a_path(
+    "--robot",
+    "robot.param.yaml that `setup` wrote, for a recording with a tilted or turned "
+    "sensor: level its clouds, x ahead, without the robot's own returns, as nodes see them.",
+)
+@click.option(
+    "--deskew",
+    is_flag=True,
+    help="Of a bag: move the points of each cloud to its "
+    "stamp, by its column of times and the odometry or TF of the bag.",
+)
 @click.option("--images", is_flag=True, help="To a bag: include the left colour images, as PNG.")
 @split_option
 @limit_option
-@click.option("--force", is_flag=True, help="Replace what is there: a bag, or files of the same "
-              "names.")
-def convert(source: Path | None, format: str, out: Path, data: Path | None, given: str | None,
-            detections: str | None, points: str, robot: Path | None, deskew: bool, images: bool,
-            split: Path | None, limit: int | None, force: bool) -> None:
+@click.option("--force", is_flag=True, help="Replace what is there: a bag, or files of the same names.")
+def convert(
+    source: Path | None,
+    format: str,
+    out: Path,
+    data: Path | None,
+    given: str | None,
+    detections: str | None,
+    points: str,
+    robot: Path | None,
+    deskew: bool,
+    images: bool,
+    split: Path | None,
+    limit: int | None,
+    force: bool,
+) -> None:
     """Convert the recording DATA to one MCAP bag, to the folder of a data set with clouds, labels,
     poses and calibration, or only its labels to a format of other tools. With --data DRIVE, DATA is
     the path of labels of that drive.
@@ -76,19 +101,18 @@ def convert(source: Path | None, format: str, out: Path, data: Path | None, give
         raise click.UsageError("DATA is missing: give the path of a recording")
     given_labels = data is not None or (format in LABELS and format not in (MCAP, *DATASETS))
     for wrong, what in (
-            (images and (given_labels or format != MCAP), "--images is for --to mcap"),
-            ((robot is not None or deskew) and (given_labels or detections is not None),
-             "--robot and --deskew are for a recording with its clouds"),
-            (given is not None and data is None, "--from is for labels at DATA; give their drive "
-                                                 "with --data"),
-            (given is not None and detections is not None, "--detections is for a bag, --from for "
-                                                           "other labels"),
-            (data is not None and format == "nuscenes", "labels are written as nuscenes-detection "
-                                                        "or nuscenes-tracking")):
+        (images and (given_labels or format != MCAP), "--images is for --to mcap"),
+        (
+            (robot is not None or deskew) and (given_labels or detections is not None),
+            "--robot and --deskew are for a recording with its clouds",
+        ),
+        (given is not None and data is None, "--from is for labels at DATA; give their drive with --data"),
+        (given is not None and detections is not None, "--detections is for a bag, --from for other labels"),
+        (data is not None and format == "nuscenes", "labels are written as nuscenes-detection or nuscenes-tracking"),
+    ):
         if wrong:
             raise click.UsageError(what)
-    recording = open_and_describe(source if data is None else data, level=robot is None,
-                                  split=split, points=points)
+    recording = open_and_describe(source if data is None else data, level=robot is None, split=split, points=points)
     seen = _make_frame_transform(recording, robot, deskew)
     if given_labels:
         _labels(source, recording, format, out, given, data is not None, detections, limit, force)
@@ -106,10 +130,14 @@ def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Ca
     if file is None and not deskew:
         return lambda frame: frame
     from lidar_perception.data import bag_frames, cloud_folder
+
     if not any(layout.is_layout(recording.path) for layout in (bag_frames, cloud_folder)):
-        raise InputError(f"{recording.path} ({recording.layout}) has level clouds; --robot and "
-                         "--deskew are for bags and files of clouds")
+        raise InputError(
+            f"{recording.path} ({recording.layout}) has level clouds; --robot and "
+            "--deskew are for bags and files of clouds"
+        )
     from lidar_perception.data.levelling import SensorMount, level_frame
+
     robot = SensorMount()
     if file is not None:
         robot, asked = _read_mount(file)
@@ -118,9 +146,9 @@ def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Ca
         return partial(level_frame, mount=robot)
     from lidar_perception.data.bag import BagHandle
     from lidar_perception.data.bag_poses import BagPoses
+
     if not bag_frames.is_layout(recording.path):
-        raise InputError(f"{recording.path} is not a bag, so it has no odometry or TF, which "
-                         "--deskew needs")
+        raise InputError(f"{recording.path} is not a bag, so it has no odometry or TF, which --deskew needs")
     first = recording.frames[len(recording) // 2]
     poses = BagPoses(BagHandle(recording.path), first.load().frame_id).lookup
     level_frame(first, robot, poses).load()  # fails early if a topic or a column is missing
@@ -134,27 +162,30 @@ def _read_mount(file: Path) -> tuple[Any, bool]:
     from lidar_perception.data.levelling import SensorMount
     from lidar_perception.param_fields import with_values
     from lidar_perception.params import CloudNodeParams
+
     try:
-        params, node = (with_values(known, read_config(file, known))
-                        for known in (PipelineParams(), CloudNodeParams()))
+        params, node = (with_values(known, read_config(file, known)) for known in (PipelineParams(), CloudNodeParams()))
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
     if params == PipelineParams() and node == CloudNodeParams():
-        raise InputError(f"{file} does not describe a mounting; give robot.param.yaml, which "
-                         "`setup` writes")
+        raise InputError(f"{file} does not describe a mounting; give robot.param.yaml, which `setup` writes")
     if node.base_frame and params.crop.body:
-        raise InputError(f"{file} has crop.body in '{node.base_frame}', its base_frame, as nodes "
-                         "read it; leave base_frame out and give the box in the sensor's frame, "
-                         "as setup writes it")
+        raise InputError(
+            f"{file} has crop.body in '{node.base_frame}', its base_frame, as nodes "
+            "read it; leave base_frame out and give the box in the sensor's frame, "
+            "as setup writes it"
+        )
     pose = params.ground.sensor_pose
-    return SensorMount(pose.height, pose.roll, pose.pitch, math.radians(node.input.ahead),
-                       params.crop,
-                       params.input.intensity_max), node.input.deskew != "off"
+    return SensorMount(
+        pose.height, pose.roll, pose.pitch, math.radians(node.input.ahead), params.crop, params.input.intensity_max
+    ), node.input.deskew != "off"
 
 
-def _bag(source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, images: bool,
-         limit: int | None, force: bool) -> None:
+def _bag(
+    source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, images: bool, limit: int | None, force: bool
+) -> None:
     from lidar_perception.data.to_bag import write_bag
+
     count = min(len(recording), limit or len(recording))
     skipped: list[str] = []
     frames = show_progress(map(seen, islice(recording, count)), f"converting {source}", count)
@@ -169,13 +200,23 @@ def _on_topic(source: Path, recording: Any, topic: str) -> Any:
     """Return the boxes on a topic of a bag as DriveLabels."""
     from lidar_perception.data.open import split_topic
     from lidar_perception.labels.formats import bag
+
     return bag.read(split_topic(source)[0], recording.frames[:], topic)
 
 
-def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: str, out: Path,
-             detections: str | None, limit: int | None, force: bool) -> None:
+def _dataset(
+    source: Path,
+    recording: Any,
+    seen: Callable[[Any], Any],
+    format: str,
+    out: Path,
+    detections: str | None,
+    limit: int | None,
+    force: bool,
+) -> None:
     from lidar_perception.labels.datasets import write_dataset
     from lidar_perception.labels.exchange import export_labels
+
     labels = None if detections is None else _on_topic(source, recording, detections)
     count = min(len(recording), limit or len(recording))
     if labels is not None and format == MCAP:
@@ -190,10 +231,20 @@ def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: s
         console.print(Text(remark, "yellow") + f" ({frames_of} scans)")
 
 
-def _labels(source: Path, recording: Any, format: str, out: Path, given: str | None,
-            elsewhere: bool, detections: str | None, limit: int | None, force: bool) -> None:
+def _labels(
+    source: Path,
+    recording: Any,
+    format: str,
+    out: Path,
+    given: str | None,
+    elsewhere: bool,
+    detections: str | None,
+    limit: int | None,
+    force: bool,
+) -> None:
     from lidar_perception.labels.drive_labels import DriveLabels, read_frame_labels
     from lidar_perception.labels.exchange import export_labels, import_labels, recognise_format
+
     count = min(len(recording), limit or len(recording))
     if detections is not None:
         labels = _on_topic(source, recording, detections)
@@ -202,7 +253,6 @@ def _labels(source: Path, recording: Any, format: str, out: Path, given: str | N
     else:
         labels = DriveLabels(list(map(read_frame_labels, recording.frames[:])))
     written = export_labels(labels.take_first(count), format, out, recording.frames[:count], force)
-    console.print(f"{out}: {written.boxes} boxes of {written.frames} frames, "
-                  f"as {format}")
+    console.print(f"{out}: {written.boxes} boxes of {written.frames} frames, as {format}")
     for what in written.left_out:
         console.print(f"left out: {what}, for which the format has no place", style="yellow")

@@ -18,9 +18,11 @@ from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
 # docs/reference/recordings.md has the complete list.
-WHAT = ("Bag (ROS 2 or ROS 1), KITTI, nuScenes or SemanticKITTI folder, .pcd, .ply, .npy or .bin "
-        "files, or the output of `simulate`. BAG:/TOPIC names the clouds of a bag that has "
-        "several.")
+WHAT = (
+    "Bag (ROS 2 or ROS 1), KITTI, nuScenes or SemanticKITTI folder, .pcd, .ply, .npy or .bin "
+    "files, or the output of `simulate`. BAG:/TOPIC names the clouds of a bag that has "
+    "several."
+)
 MAX_DEFAULT_JOBS = 16  # processes; enough to feed a GPU
 
 
@@ -42,8 +44,7 @@ class OutFile(click.Path):
 
 def out_file(name: str, what: str, *names: str, **more: Any) -> Callable:
     """Return an option that takes the path of a file to write."""
-    return click.option(name, *names, type=OutFile(path_type=Path), metavar="FILE", help=what,
-                        **more)
+    return click.option(name, *names, type=OutFile(path_type=Path), metavar="FILE", help=what, **more)
 
 
 class OutFolder(click.Path):
@@ -62,14 +63,18 @@ def out_folder(what: str, name: str = "--out", **more: Any) -> Callable:
 
 def jobs_for_all_cores(what: str, least: int = 0) -> Callable:
     """Return the option --jobs, by default one process for each core; `what` starts its help."""
-    return click.option("--jobs", type=click.IntRange(least),
-                        default=lambda: min(count_cores(), MAX_DEFAULT_JOBS),
-                        show_default=f"one for each core, {MAX_DEFAULT_JOBS} at most",
-                        help=f"{what} The result is the same.")
+    return click.option(
+        "--jobs",
+        type=click.IntRange(least),
+        default=lambda: min(count_cores(), MAX_DEFAULT_JOBS),
+        show_default=f"one for each core, {MAX_DEFAULT_JOBS} at most",
+        help=f"{what} The result is the same.",
+    )
 
 
-def data_argument(what: str = WHAT, *, required: bool = True, several: bool = False,
-                  kind: Any = click.Path(path_type=Path)) -> Callable:
+def data_argument(
+    what: str = WHAT, *, required: bool = True, several: bool = False, kind: Any = click.Path(path_type=Path)
+) -> Callable:
     """Decorator: the argument DATA, and --data as another way to give it.
 
     Args:
@@ -78,42 +83,63 @@ def data_argument(what: str = WHAT, *, required: bool = True, several: bool = Fa
         several: accept any number of values, as a tuple.
         kind: type of a value.
     """
+
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
         def wrapper(*args: Any, data: Any, data_option: Any, **kwargs: Any) -> Any:
             if data and data_option:
-                shown, again = (" ".join(map(str, each if several else [each]))
-                                for each in (data, data_option))
+                shown, again = (" ".join(map(str, each if several else [each])) for each in (data, data_option))
                 raise click.UsageError(f"DATA is given twice, {shown} and --data {again}; give one")
             if required and not (data or data_option):
                 raise click.UsageError("DATA is missing: give the path of a recording")
             return function(*args, data=data or data_option, **kwargs)
 
-        wrapper = click.option("--data", "data_option", type=kind, multiple=several,
-                               metavar="DATA", help=f"Same as DATA. {what}")(wrapper)
-        return click.argument("data", type=kind, required=False, nargs=-1 if several else 1,
-                              metavar=("DATA" if required else "[DATA]") + "..." * several)(wrapper)
+        wrapper = click.option(
+            "--data", "data_option", type=kind, multiple=several, metavar="DATA", help=f"Same as DATA. {what}"
+        )(wrapper)
+        return click.argument(
+            "data",
+            type=kind,
+            required=False,
+            nargs=-1 if several else 1,
+            metavar=("DATA" if required else "[DATA]") + "..." * several,
+        )(wrapper)
+
     return decorate
 
 
-split_option = a_path("--split", "Use only the frames or sequences named in this file, one per "
-                      "line.")
-limit_option = click.option("--limit", type=click.IntRange(1), metavar="N",
-                            help="Only the first N frames.")
-jobs_option = click.option("--jobs", type=click.IntRange(1), default=1, show_default=True,
-                           metavar="N", help="Number of processes.")
-dask_option = click.option("--dask", metavar="ADDRESS", help="Run on the workers of the Dask "
-                           "scheduler at this address, such as tcp://10.0.0.1:8786. They must see "
-                           "DATA under the same name.")
+split_option = a_path("--split", "Use only the frames or sequences named in this file, one per line.")
+limit_option = click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first N frames.")
+jobs_option = click.option(
+    "--jobs", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="Number of processes."
+)
+dask_option = click.option(
+    "--dask",
+    metavar="ADDRESS",
+    help="Run on the workers of the Dask "
+    "scheduler at this address, such as tcp://10.0.0.1:8786. They must see "
+    "DATA under the same name.",
+)
 json_option = out_file("--json", "Write the scores to this file.", "json_file")
-intervals_option = click.option("--intervals", type=click.IntRange(0), default=0, metavar="N",
-                                help="Also print bootstrap intervals from N resamples of the "
-                                "drives, or of runs of 10 frames where there are few drives. 200 "
-                                "are plenty.")
-port_option = click.option("--port", type=click.IntRange(0, 65535), default=0, show_default=True,
-                           help="Port on 127.0.0.1; 0: any that is free.")
-browser_option = click.option("--open/--no-open", "browser", default=True,
-                              help="Open the page in a browser.  [default: open]")
+intervals_option = click.option(
+    "--intervals",
+    type=click.IntRange(0),
+    default=0,
+    metavar="N",
+    help="Also print bootstrap intervals from N resamples of the "
+    "drives, or of runs of 10 frames where there are few drives. 200 "
+    "are plenty.",
+)
+port_option = click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    show_default=True,
+    help="Port on 127.0.0.1; 0: any that is free.",
+)
+browser_option = click.option(
+    "--open/--no-open", "browser", default=True, help="Open the page in a browser.  [default: open]"
+)
 
 
 @dataclass(frozen=True)
@@ -146,8 +172,8 @@ class ScoringOptions:
     def fill(self, report: Any, recording: Any, start: Any, title: str = "evaluating") -> None:
         """Score the frames of the recording, see scoring.run.fill."""
         from lidar_perception.scoring.run import fill
-        fill(report, recording, start, limit=self.limit, jobs=self.jobs, dask=self.dask,
-             title=title)
+
+        fill(report, recording, start, limit=self.limit, jobs=self.jobs, dask=self.dask, title=title)
 
     def write(self, content: dict) -> None:
         """Write the scores as JSON if --json was given."""
@@ -162,13 +188,12 @@ def scoring_options(data: Callable = data_argument(), *, parallel: bool = True) 
         data: the argument DATA.
         parallel: False leaves out --jobs and --dask.
     """
+
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
-        def wrapper(*args: Any, data, split, limit, json_file, jobs=1, dask=None,
-                    **kwargs: Any) -> Any:
+        def wrapper(*args: Any, data, split, limit, json_file, jobs=1, dask=None, **kwargs: Any) -> Any:
             if dask and jobs > 1:
-                raise click.UsageError("--jobs is for this machine, --dask for others: give one of "
-                                       "them")
+                raise click.UsageError("--jobs is for this machine, --dask for others: give one of them")
             options = ScoringOptions(data, split, limit, jobs, dask, json_file)
             return function(*args, options=options, **kwargs)
 
@@ -176,6 +201,7 @@ def scoring_options(data: Callable = data_argument(), *, parallel: bool = True) 
         for option in (json_option, *processes, limit_option, split_option, data):
             wrapper = option(wrapper)
         return wrapper
+
     return decorate
 
 
@@ -187,13 +213,10 @@ def open_and_describe(data: Path, *, level: bool = True, **how: Any) -> Any:
     Args:
         level: also report a tilted sensor and the scale of the intensity.
     """
-    from lidar_perception.data.mount_check import (
-        apply_measured_height,
-        find_mount_problem,
-        load_first_clouds,
-    )
+    from lidar_perception.data.mount_check import apply_measured_height, find_mount_problem, load_first_clouds
     from lidar_perception.data.open import open_recording
     from lidar_perception.wire.messages import diagnose_recorded_intensity
+
     recording = open_recording(data, **how)
     errors.print(str(recording), style="dim")
     for line in describe_missing_scans(recording):
@@ -202,14 +225,17 @@ def open_and_describe(data: Path, *, level: bool = True, **how: Any) -> Any:
     measured = apply_measured_height(recording, clouds)
     if measured is not recording:
         height = next(iter(measured)).sensor_height
-        errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds",
-                     style="dim")
+        errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds", style="dim")
     if level and clouds:
         if (full := recording.frames[0].intensity_max()) > 1:
             errors.print(f"its intensity is 0 .. {full:g}, read as 0 .. 1", style="dim")
-        for problem in filter(None, (
+        for problem in filter(
+            None,
+            (
                 None if recording.has_sensor_height else find_mount_problem(recording, clouds),
-                diagnose_recorded_intensity(recording.path, clouds))):
+                diagnose_recorded_intensity(recording.path, clouds),
+            ),
+        ):
             errors.print(problem, style="yellow")
     return measured
 
@@ -225,6 +251,7 @@ def with_recorded_height(recording: Any, params: Any) -> Any:
     the default."""
     from lidar_perception.ground.params import set_sensor_height
     from lidar_perception.types import SENSOR_HEIGHT
+
     if params.ground.sensor_pose.height != SENSOR_HEIGHT:
         return params
     return set_sensor_height(params, recording.frames[0].sensor_height)

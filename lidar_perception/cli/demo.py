@@ -39,12 +39,7 @@ from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice, open_detector
 from lidar_perception.groups import renumber_ids
 from lidar_perception.nodes import require_rclpy
-from lidar_perception.nodes.graph import (
-    FINAL,
-    SINGLE_PROCESS_NODES,
-    cloud_topic,
-    list_result_topics,
-)
+from lidar_perception.nodes.graph import FINAL, SINGLE_PROCESS_NODES, cloud_topic, list_result_topics
 from lidar_perception.runs.compiling import compile_meanwhile
 from lidar_perception.runs.files import make_folder, write_text
 from lidar_perception.runs.terminal import console, errors, show_progress
@@ -60,43 +55,64 @@ from lidar_perception.wire.track_markers import read_trails
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import to_ns
 
-RECORD = "demo.json"                      # in the output folder: data and detector
-BEHIND_M = 2.0                            # detections this far behind need a picture of all sides
-REPLACED = ("drive", "result", "logs")    # folders that the next demo replaces
+RECORD = "demo.json"  # in the output folder: data and detector
+BEHIND_M = 2.0  # detections this far behind need a picture of all sides
+REPLACED = ("drive", "result", "logs")  # folders that the next demo replaces
 
 
 def _runs(detector: str) -> Runs:
     """Return the detector that the nodes run, with its parameters."""
-    return (candidates_run(on_messages=True) if detector == CANDIDATES else
-            runs_of(detector, on_messages=True))
+    return candidates_run(on_messages=True) if detector == CANDIDATES else runs_of(detector, on_messages=True)
 
 
 @click.command(cls=Command)
-@data_argument(f"Replay this instead of the simulated drive; it needs labelled boxes: {WHAT}",
-               required=False)
-@click.option("--detector", type=Choice(SINGLE_PROCESS_NODES), default=FUSED, show_default=True,
-              help="Detector to run.")
+@data_argument(f"Replay this instead of the simulated drive; it needs labelled boxes: {WHAT}", required=False)
+@click.option(
+    "--detector", type=Choice(SINGLE_PROCESS_NODES), default=FUSED, show_default=True, help="Detector to run."
+)
 @out_folder("Folder for the results.", default=Path("out/demo"), show_default=True)
-@click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
-              help="Length of the simulated drive, 10 frames a second.")
-@click.option("--drive-seed", type=click.IntRange(0), default=38, show_default=True,
-              help="Seed of the simulated drive.")
-@click.option("--rate", type=click.FloatRange(0.01, 100), default=1.0, show_default=True,
-              help="Speed of the replay.")
-@click.option("--single", is_flag=True, help="Run ground, clusters and detector in one process "
-                                             "instead of three.")
-@click.option("--processes/--one-process", default=None,
-              help="Run each node in its own process, or all nodes in one process, which saves "
-                   "memory and is the default on machines with up to four cores.")
-@click.option("--real-time", is_flag=True, help="Play at the speed of the sensor, even if the "
-                                                "machine cannot keep up. Without it each cloud is "
-                                                "sent once those before it have their results.")
+@click.option(
+    "--frames",
+    type=click.IntRange(1),
+    default=40,
+    show_default=True,
+    help="Length of the simulated drive, 10 frames a second.",
+)
+@click.option(
+    "--drive-seed", type=click.IntRange(0), default=38, show_default=True, help="Seed of the simulated drive."
+)
+@click.option("--rate", type=click.FloatRange(0.01, 100), default=1.0, show_default=True, help="Speed of the replay.")
+@click.option("--single", is_flag=True, help="Run ground, clusters and detector in one process instead of three.")
+@click.option(
+    "--processes/--one-process",
+    default=None,
+    help="Run each node in its own process, or all nodes in one process, which saves "
+    "memory and is the default on machines with up to four cores.",
+)
+@click.option(
+    "--real-time",
+    is_flag=True,
+    help="Play at the speed of the sensor, even if the "
+    "machine cannot keep up. Without it each cloud is "
+    "sent once those before it have their results.",
+)
 @range_option
 @device_option
 @settings_options(lambda given: [_runs(given.get("detector") or FUSED)], candidates=True)
-def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: int, rate: float,
-         single: bool, processes: bool | None, real_time: bool, range: str, device: str,
-         settings: Settings) -> None:
+def demo(
+    data: Path | None,
+    detector: str,
+    out: Path,
+    frames: int,
+    drive_seed: int,
+    rate: float,
+    single: bool,
+    processes: bool | None,
+    real_time: bool,
+    range: str,
+    device: str,
+    settings: Settings,
+) -> None:
     """Replay a drive through the real nodes over DDS, and score the detections and their tracks.
 
     Without options, makes a simulated drive with traffic and walking pedestrians, writes it as a
@@ -116,27 +132,27 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
     """
     if data is not None:
         refuse_given(("frames", "drive_seed"), "is for a simulated drive, which DATA replaces")
-    values, = settings.values(_runs(detector))
+    (values,) = settings.values(_runs(detector))
     if detector == CANDIDATES and (range != "auto" or device != "auto"):
         raise click.UsageError("--range and --device are for a detector with a network")
-    chosen = chosen_detector(detector, range, device, values,
-                             PAPER if detector == CANDIDATES else None)
+    chosen = chosen_detector(detector, range, device, values, PAPER if detector == CANDIDATES else None)
     require_rclpy()  # before the drive is made
     recording = None if data is None else open_and_describe(data)
     if recording is not None:
         recording.require(BOXES, "demo")
     _make_room(out, data, detector)
     make_folder(out / "logs")
-    with compile_meanwhile(_code_that_compiles(chosen), out / "logs" / "compile.log",
-                           errors.print):
+    with compile_meanwhile(_code_that_compiles(chosen), out / "logs" / "compile.log", errors.print):
         drive = _bag(out / "drive", recording, frames, drive_seed)
     played = _as_replayed(drive, recording)
     clouds = len(played)
     from lidar_perception.nodes.replay.graph_replay import TRACKS, replay
+
     with errors.status("loading compiled code (the first time: compiling, half a minute or more)"):
         own = _params_of(chosen, played)
-    content = replay(drive, clouds, out, own, detector=detector, rate=rate, single=single,
-                     real_time=real_time, processes=processes)
+    content = replay(
+        drive, clouds, out, own, detector=detector, rate=rate, single=single, real_time=real_time, processes=processes
+    )
     final = list_result_topics(single, detector)[FINAL]
     found, tracks = read_results(out / "result", final, TRACKS)
     calibration = next(iter(played)).calibration()
@@ -147,14 +163,14 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
     _print_pace(content, rate, clouds)
     content["tracks"] = _print_tracks(tracks, calibration, content["poses"])
     write_text(out / "scores.json", json.dumps(content, indent=1))
-    picture = _draw_best(out, cloud_topic(single, detector), _drawn(found, detector),
-                         next(iter(played)).sensor_height)
-    console.print(f"results in {out}: result (bag), scores.json, logs"
-                  + (", birdseye.png" if picture else ""))
+    picture = _draw_best(out, cloud_topic(single, detector), _drawn(found, detector), next(iter(played)).sensor_height)
+    console.print(f"results in {out}: result (bag), scores.json, logs" + (", birdseye.png" if picture else ""))
     console.print(f"look at it: lidar-perception view {out / 'result'}")
     if missing := clouds - content["results"]:
-        errors.print(Text(f"{missing} clouds gave no result", "red") + (
-            "; without --real-time none is dropped" if real_time else f"; see {out}/logs"))
+        errors.print(
+            Text(f"{missing} clouds gave no result", "red")
+            + ("; without --real-time none is dropped" if real_time else f"; see {out}/logs")
+        )
         if not real_time:
             raise SystemExit(1)
 
@@ -167,8 +183,9 @@ def _make_room(out: Path, data: Path | None, detector: str) -> None:
     """
     old = [out / name for name in REPLACED if (out / name).exists()]
     if old and not (out / RECORD).is_file():
-        raise InputError(f"{old[0]} is there, and no {RECORD} beside it says that demo made it; "
-                         "remove it, or give another --out")
+        raise InputError(
+            f"{old[0]} is there, and no {RECORD} beside it says that demo made it; remove it, or give another --out"
+        )
     for folder in old:
         if data is not None and data.resolve().is_relative_to(folder.resolve()):
             raise InputError(f"{data} would be replaced; give another --out")
@@ -179,8 +196,7 @@ def _make_room(out: Path, data: Path | None, detector: str) -> None:
 
 def _as_replayed(drive: Path, recording: Recording | None) -> Recording:
     """Open the bag to replay, with the sensor height of the recording that it was made from."""
-    return open_recording(drive, sensor_height=None if recording is None else
-                          recording.frames[0].sensor_height)
+    return open_recording(drive, sensor_height=None if recording is None else recording.frames[0].sensor_height)
 
 
 def _params_of(chosen: DetectorChoice, played: Recording) -> Any:
@@ -197,24 +213,28 @@ def _code_that_compiles(chosen: DetectorChoice) -> str:
     if chosen.weights == CANDIDATES:
         lines += [f"from {warm_up.__module__} import warm_up", "warm_up()"]
     else:
-        lines += [f"from {open_detector.__module__} import open_detector",
-                  f"open_detector({chosen.weights!r}, {chosen.device!r}, range={chosen.range!r})"]
+        lines += [
+            f"from {open_detector.__module__} import open_detector",
+            f"open_detector({chosen.weights!r}, {chosen.device!r}, range={chosen.range!r})",
+        ]
     return "; ".join(lines)
 
 
 def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     """Return the bag to replay: as given, or made from a recording or a simulated drive."""
-    if recording is not None and isinstance(recording.frames, BagFrames) and (
-            recording.frames.points == POINTS and recording.frames.poses.needs_no_tf):
+    if (
+        recording is not None
+        and isinstance(recording.frames, BagFrames)
+        and (recording.frames.points == POINTS and recording.frames.poses.needs_no_tf)
+    ):
         return recording.path
     if recording is not None:
         found = show_progress(recording, f"converting {recording.path}", len(recording))
     else:
         from lidar_perception.simulation.recording import simulate_frames
         from lidar_perception.simulation.scene import CROWDED_ZONES
-        found = show_progress(simulate_frames(drive_seed, frames, scenes=CROWDED_ZONES),
-                              "simulating a drive",
-                              frames)
+
+        found = show_progress(simulate_frames(drive_seed, frames, scenes=CROWDED_ZONES), "simulating a drive", frames)
     write_bag(path, found, force=True)
     return path
 
@@ -222,15 +242,14 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
 def _print_detections(frames: Sequence[RecordedResult], calibration: Any) -> dict:
     """Print and return the detection scores by class, for labels in the camera's view."""
     from lidar_perception.scoring.detections import FrameDetections
-    from lidar_perception.scoring.kitti.default_threshold import (
-        print_scores_at_threshold,
-        score_at_threshold,
-    )
+    from lidar_perception.scoring.kitti.default_threshold import print_scores_at_threshold, score_at_threshold
     from lidar_perception.scoring.kitti.report import DetectionReport
+
     report = DetectionReport()
     for frame in frames:
-        report.update(FrameDetections(str(frame.stamp_ns), to_truth(frame.truth),
-                                      to_detections(frame.found), calibration))
+        report.update(
+            FrameDetections(str(frame.stamp_ns), to_truth(frame.truth), to_detections(frame.found), calibration)
+        )
     scores = score_at_threshold(report.frames)
     print_scores_at_threshold(scores, len(frames), console)
     return scores
@@ -241,25 +260,26 @@ def _print_pace(content: dict, rate: float, clouds: int) -> None:
     pace = f"{rate:g}x real time"
     if content["slower"] >= 1.05 and stages:
         slowest = max(stages, key=lambda node: stages[node])
-        pace = (f"{speed:.2g}x real time: {slowest} needs {stages[slowest]:.0f} ms per cloud on "
-                "this machine")
+        pace = f"{speed:.2g}x real time: {slowest} needs {stages[slowest]:.0f} ms per cloud on this machine"
     console.print(f"{clouds} clouds replayed at {pace}")
-    console.print(f"{content['results']} results; latency cloud to tracks median "
-                  f"{latency['median']:.0f} ms, 95 % under {latency['p95']:.0f} ms; memory of the "
-                  f"graph {content['memory_mb']:.0f} MB")
-    console.print("time per cloud: " + ", ".join(f"{node} {ms:.0f} ms" for node, ms in
-                                                 stages.items())
-                  + f"; CPU time of all processes {sum(content['cpu_ms_by_process'].values()):.0f}"
-                    " ms")
+    console.print(
+        f"{content['results']} results; latency cloud to tracks median "
+        f"{latency['median']:.0f} ms, 95 % under {latency['p95']:.0f} ms; memory of the "
+        f"graph {content['memory_mb']:.0f} MB"
+    )
+    console.print(
+        "time per cloud: "
+        + ", ".join(f"{node} {ms:.0f} ms" for node, ms in stages.items())
+        + f"; CPU time of all processes {sum(content['cpu_ms_by_process'].values()):.0f}"
+        " ms"
+    )
 
 
 def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str) -> dict:
     """Print and return the scores of the tracks by class, and the source of the poses."""
-    from lidar_perception.scoring.tracking.from_bag import (
-        count_recorded_tracks,
-        score_recorded_tracks,
-    )
+    from lidar_perception.scoring.tracking.from_bag import count_recorded_tracks, score_recorded_tracks
     from lidar_perception.scoring.tracking.tables import EGO_TITLES
+
     count, result = count_recorded_tracks(frames), {}
     try:
         result = score_recorded_tracks(frames, calibration)
@@ -270,7 +290,8 @@ def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str
             console.print(
                 f"tracks of {name}: {count.get(name, 0)}, {scores['true_tracks']} labelled; "
                 f"{scores['switches']} identity switches, HOTA {100 * scores['HOTA']:.1f} "
-                f"(detection {100 * scores['DetA']:.1f}, association {100 * scores['AssA']:.1f})")
+                f"(detection {100 * scores['DetA']:.1f}, association {100 * scores['AssA']:.1f})"
+            )
     remedy = "; pip install 'lidar_perception[odometry]' takes them from the scans"
     console.print(f"tracks are with {EGO_TITLES[poses]}{remedy * (poses == NO_SOURCE)}")
     return {"found": count, "scores": result}
@@ -279,19 +300,21 @@ def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str
 def _drawn(frames: Sequence[RecordedResult], detector: str) -> dict[int, tuple[np.ndarray, Any]]:
     """Return {stamp: (boxes of labels, detected objects)} of the classes that are detected."""
     wanted = {CLASSES[PEDESTRIAN]} if detector == CANDIDATES else {*DETECTED}
-    return {f.stamp_ns: (f.truth.boxes[[label in wanted for label in f.truth.labels]], f.found)
-            for f in frames}
+    return {f.stamp_ns: (f.truth.boxes[[label in wanted for label in f.truth.labels]], f.found) for f in frames}
 
 
-def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
-               height: float) -> bool:
+def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]], height: float) -> bool:
     """Draw the recorded frame with most hits, and its tracks; return False without labels."""
     from lidar_perception.nodes.replay.graph_replay import TRACKS
     from lidar_perception.rendering.colors import color_by_cluster
     from lidar_perception.rendering.files import write_png
     from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
-    hits = {stamp: (len(match_centres(found.boxes, truth)[0]), len(truth))
-            for stamp, (truth, found) in frames.items() if len(truth)}
+
+    hits = {
+        stamp: (len(match_centres(found.boxes, truth)[0]), len(truth))
+        for stamp, (truth, found) in frames.items()
+        if len(truth)
+    }
     if not hits:
         return False
     best = max(hits, key=lambda s: (hits[s], s))  # the last of them: its trails are longest
@@ -311,13 +334,24 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
     ground = read_column(drawing, "ground", indices)
     ids = read_column(drawing, "cluster_id", indices)
     none = np.zeros(len(frame), int)
-    colors = None if ground is None else color_by_cluster(
-        ground > 0, none if ids is None else renumber_ids(ids)[0])
-    boxes = Boxes(found.boxes, np.array(class_ids(found.labels), int),
-                  [str(i) if trails else "" for i in found.ids],
-                  [trails.get(int(i), found.boxes[k:k + 1, :3]) for k, i in enumerate(found.ids)])
+    colors = None if ground is None else color_by_cluster(ground > 0, none if ids is None else renumber_ids(ids)[0])
+    boxes = Boxes(
+        found.boxes,
+        np.array(class_ids(found.labels), int),
+        [str(i) if trails else "" for i in found.ids],
+        [trails.get(int(i), found.boxes[k : k + 1, :3]) for k, i in enumerate(found.ids)],
+    )
     stage = Stage.of(frame, height, not (found.boxes[:, 0] < -BEHIND_M).any())
-    write_png(out / "birdseye.png", draw_frame(
-        stage, frame, boxes, truth, f"{hits[best][0]} of {hits[best][1]} labelled objects found",
-        f"{best / 1e9:.1f} s", colors))
+    write_png(
+        out / "birdseye.png",
+        draw_frame(
+            stage,
+            frame,
+            boxes,
+            truth,
+            f"{hits[best][0]} of {hits[best][1]} labelled objects found",
+            f"{best / 1e9:.1f} s",
+            colors,
+        ),
+    )
     return True

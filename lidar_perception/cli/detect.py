@@ -49,35 +49,80 @@ class Formats(click.ParamType):
 @click.command(cls=Command)
 @data_argument()
 @out_folder("Folder of the results.", required=True)
-@click.option("--format", "--to", "formats", type=Formats(), multiple=True,
-              metavar="FORMAT[,FORMAT...]", help=f"What to write: {', '.join(FORMATS)}. May be "
-              "repeated.  [default: json]")
+@click.option(
+    "--format",
+    "--to",
+    "formats",
+    type=Formats(),
+    multiple=True,
+    metavar="FORMAT[,FORMAT...]",
+    help=f"What to write: {', '.join(FORMATS)}. May be repeated.  [default: json]",
+)
 @detector_options(tracking=True)
-@click.option("--min-score", type=click.FloatRange(0, 1), metavar="SCORE", help="Minimum score "
-              "of a box of any class. Default: the thresholds of the detector.")
-@click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
-              help="Height of the sensor above the ground. Default: that of the recording, or "
-              "measured on its first clouds.")
-@click.option("--track", is_flag=True, help="Write tracks, with ids and velocities, instead of the "
-              "boxes of each frame alone.")
-@click.option("--ego", type=Choice(RECORDED_EGO), default="auto", show_default=True,
-              help="With --track, the sensor's motion: from the recording's poses; from the scans, "
-              "by KISS-ICP (the extra [odometry]); or none: tracks are relative to the sensor.")
-@click.option("--clouds/--no-clouds", default=True, show_default=True, help="With --format mcap: "
-              "write the clouds into the bag too.")
+@click.option(
+    "--min-score",
+    type=click.FloatRange(0, 1),
+    metavar="SCORE",
+    help="Minimum score of a box of any class. Default: the thresholds of the detector.",
+)
+@click.option(
+    "--mount-height",
+    type=click.FloatRange(0, 10),
+    default=0.0,
+    metavar="M",
+    help="Height of the sensor above the ground. Default: that of the recording, or measured on its first clouds.",
+)
+@click.option(
+    "--track", is_flag=True, help="Write tracks, with ids and velocities, instead of the boxes of each frame alone."
+)
+@click.option(
+    "--ego",
+    type=Choice(RECORDED_EGO),
+    default="auto",
+    show_default=True,
+    help="With --track, the sensor's motion: from the recording's poses; from the scans, "
+    "by KISS-ICP (the extra [odometry]); or none: tracks are relative to the sensor.",
+)
+@click.option(
+    "--clouds/--no-clouds",
+    default=True,
+    show_default=True,
+    help="With --format mcap: write the clouds into the bag too.",
+)
 @click.option("--png", is_flag=True, help="Draw a picture of every frame, png/FRAME.png.")
 @out_file("--video", "Draw a film: .mp4 (the extra [video]), .gif or .webp.")
-@click.option("--color", type=Choice(["height", "intensity"]), default="height", show_default=True,
-              help="Colour of the points in pictures.")
+@click.option(
+    "--color",
+    type=Choice(["height", "intensity"]),
+    default="height",
+    show_default=True,
+    help="Colour of the points in pictures.",
+)
 @split_option
 @limit_option
 @jobs_option
 @dask_option
 @click.option("--force", is_flag=True, help="Start over if FOLDER has another run.")
-def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector: DetectorChoice,
-           tracking: TrackingParams, min_score: float | None, mount_height: float, track: bool,
-           ego: str, clouds: bool, png: bool, video: Path | None, color: str, split: Path | None,
-           limit: int | None, jobs: int, dask: str | None, force: bool) -> None:
+def detect(
+    data: Path,
+    out: Path,
+    formats: tuple[tuple[str, ...], ...],
+    detector: DetectorChoice,
+    tracking: TrackingParams,
+    min_score: float | None,
+    mount_height: float,
+    track: bool,
+    ego: str,
+    clouds: bool,
+    png: bool,
+    video: Path | None,
+    color: str,
+    split: Path | None,
+    limit: int | None,
+    jobs: int,
+    dask: str | None,
+    force: bool,
+) -> None:
     """Run a detector on every frame of the recording at DATA and write boxes, classes and scores,
     with --track also ids and velocities, into FOLDER. DATA needs no labels.
 
@@ -117,8 +162,10 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
         raise click.UsageError("--ego and --set tracking.* are for --track")
     recording = open_and_describe(data, split=split, sensor_height=mount_height or None)
     if track and not recording.is_sequential:
-        raise InputError(f"{data} ({recording.layout}) has frames that do not follow each other, "
-                         "so nothing can be tracked; leave out --track")
+        raise InputError(
+            f"{data} ({recording.layout}) has frames that do not follow each other, "
+            "so nothing can be tracked; leave out --track"
+        )
     chosen = list(dict.fromkeys(name for names in formats for name in names))
     if not chosen and not png and video is None:
         chosen = ["json"]
@@ -130,23 +177,35 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
         errors.print(doubt)
     open_ = partial(detector.open, sensor_height=height, min_score=min_score)
     opened_detector = open_()
-    header = make_header(recording, detector.weights, opened_detector,
-                         tracking=tracking if track else None,
-                         ego=choose_ego_source(recording, ego) if track else None,
-                         split=None if split is None else str(split), device=detector.device)
+    header = make_header(
+        recording,
+        detector.weights,
+        opened_detector,
+        tracking=tracking if track else None,
+        ego=choose_ego_source(recording, ego) if track else None,
+        split=None if split is None else str(split),
+        device=detector.device,
+    )
     if track and min_score is None:  # the tracker is given weak ones too
         open_ = partial(detector.open, sensor_height=height, min_score=tracking.min_score)
         opened_detector = open_()
     run = Run(recording, out, header, count)
     drawer = FrameDrawer(run, color)
-    makes: list[Any] = [partial(Bag, clouds=clouds, tracked=track) if name == "mcap" else
-                        WRITERS[name] for name in chosen]
+    makes: list[Any] = [
+        partial(Bag, clouds=clouds, tracked=track) if name == "mcap" else WRITERS[name] for name in chosen
+    ]
     makes += [partial(PictureWriter, drawer=drawer)] if png else []
     makes += [partial(VideoWriter, drawer=drawer, path=video)] if video else []
     summary = run_detector(
-        run, open_ if jobs > 1 or dask else lambda: opened_detector, makes,
-        tracking=tracking if track else None, ego=header["ego"] or "none", jobs=jobs, dask=dask,
-        force=force)
+        run,
+        open_ if jobs > 1 or dask else lambda: opened_detector,
+        makes,
+        tracking=tracking if track else None,
+        ego=header["ego"] or "none",
+        jobs=jobs,
+        dask=dask,
+        force=force,
+    )
     print_summary(summary, run)
     raise SystemExit(1 if summary.skipped else 0)
 
@@ -154,9 +213,9 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
 def print_summary(summary: Summary, run: Run) -> None:
     """Print counts of boxes, the paths of the results, and the problems of the run."""
     from lidar_perception.scoring.tables import make_table, print_skipped, print_time
+
     content = summary.compute()
-    table = make_table(f"{content['frames']} frames of {run.recording.path}", "class", "boxes",
-                       "a frame", width=7)
+    table = make_table(f"{content['frames']} frames of {run.recording.path}", "class", "boxes", "a frame", width=7)
     for name, count in sorted(content["boxes"].items(), key=lambda item: -item[1]):
         table.add_row(name, str(count), f"{count / content['frames']:.1f}")
     table.add_row("all", str(sum(content["boxes"].values())), "")

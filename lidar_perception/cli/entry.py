@@ -11,6 +11,8 @@ def main() -> None:
         # Before click and the rest are loaded. The node replaces this process and inherits the
         # blocked signals, and those that have arrived.
         from lidar_perception.nodes.main import STOP_SIGNALS
+
         signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     from lidar_perception.cli.main import main as command
+
     command()

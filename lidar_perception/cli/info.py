@@ -33,8 +33,7 @@ def info(data: Path, as_json: bool) -> None:
     """
     layout = find_layout(data)
     if layout is None and data.is_dir():
-        raise InputError(f"{data} has no metadata.yaml and is no other recording: "
-                         f"{describe_formats()}")
+        raise InputError(f"{data} has no metadata.yaml and is no other recording: {describe_formats()}")
     if layout in (None, bag_frames):
         content, show = _bag(data), _print_bag
     else:
@@ -47,28 +46,37 @@ def info(data: Path, as_json: bool) -> None:
 
 def _bag(path: Path) -> dict[str, Any]:
     with Bag(path) as bag:
-        return {"path": str(path), "start_ns": bag.start_ns,
-                "seconds": max(0, bag.end_ns - bag.start_ns) / 1e9,
-                "topics": [{"topic": topic, "type": kind, "messages": bag.counts[topic],
-                            "qos": next((f"{qos.reliability.name.lower()}, "
-                                         f"{qos.durability.name.lower()}"
-                                         for qos in bag.qos(topic)), None)}
-                           for topic, kind in sorted(bag.topics.items())],
-                "unreadable": [{"topic": name, "type": topic.type, "encoding": topic.encoding,
-                                "messages": topic.messages}
-                               for name, topic in sorted(bag.unreadable.items())]}
+        return {
+            "path": str(path),
+            "start_ns": bag.start_ns,
+            "seconds": max(0, bag.end_ns - bag.start_ns) / 1e9,
+            "topics": [
+                {
+                    "topic": topic,
+                    "type": kind,
+                    "messages": bag.counts[topic],
+                    "qos": next(
+                        (f"{qos.reliability.name.lower()}, {qos.durability.name.lower()}" for qos in bag.qos(topic)),
+                        None,
+                    ),
+                }
+                for topic, kind in sorted(bag.topics.items())
+            ],
+            "unreadable": [
+                {"topic": name, "type": topic.type, "encoding": topic.encoding, "messages": topic.messages}
+                for name, topic in sorted(bag.unreadable.items())
+            ],
+        }
 
 
 def _print_bag(content: dict[str, Any]) -> None:
     table = Table(title=f"{content['path']}: {content['seconds']:.1f} s", title_justify="left")
     for column in ("topic", "type", "messages", "QoS"):
-        table.add_column(column, justify="right" if column == "messages" else "left",
-                         overflow="fold")
+        table.add_column(column, justify="right" if column == "messages" else "left", overflow="fold")
     for row in content["topics"]:
         table.add_row(row["topic"], row["type"], str(row["messages"]), row["qos"])
     for row in content["unreadable"]:
-        table.add_row(row["topic"], f"{row['type']} as {row['encoding']}, not read",
-                      str(row["messages"]), "")
+        table.add_row(row["topic"], f"{row['type']} as {row['encoding']}, not read", str(row["messages"]), "")
     console.print(table)
 
 
@@ -77,16 +85,22 @@ def _recording(path: Path) -> dict[str, Any]:
     first = recording.frames[0]
     scan, truth = first.load(), first.truth()
     return {
-        "path": str(path), "summary": str(recording), "layout": recording.layout,
-        "frames": len(recording), "has": sorted(recording.has),
+        "path": str(path),
+        "summary": str(recording),
+        "layout": recording.layout,
+        "frames": len(recording),
+        "has": sorted(recording.has),
         "drives": sorted({frame.sequence for frame in recording if frame.sequence}),
         "start_ns": min(frame.stamp_ns for frame in recording) if recording.has_times else None,
         "first_cloud": {
-            "name": first.name, "points": len(scan), "full_intensity": first.intensity_max(),
-            "greatest_intensity": None if scan.intensity is None else
-            float(scan.intensity.max(initial=0)),
-            "labels": None if truth is None else truth.labels},
-        "lost_labels": describe_missing_scans(recording)}
+            "name": first.name,
+            "points": len(scan),
+            "full_intensity": first.intensity_max(),
+            "greatest_intensity": None if scan.intensity is None else float(scan.intensity.max(initial=0)),
+            "labels": None if truth is None else truth.labels,
+        },
+        "lost_labels": describe_missing_scans(recording),
+    }
 
 
 def _print_recording(content: dict[str, Any]) -> None:
@@ -94,8 +108,11 @@ def _print_recording(content: dict[str, Any]) -> None:
     if content["drives"]:
         console.print(f"drives: {', '.join(content['drives'])}")
     start = content["start_ns"]
-    console.print("times: none, 10 Hz assumed" if start is None else
-                  f"times: as recorded, the first at {start // 10**9}.{start % 10**9:09} s")
+    console.print(
+        "times: none, 10 Hz assumed"
+        if start is None
+        else f"times: as recorded, the first at {start // 10**9}.{start % 10**9:09} s"
+    )
     first = content["first_cloud"]
     greatest = first["greatest_intensity"]
     intensity = "no intensity" if greatest is None else f"intensity up to {greatest:.3g}"

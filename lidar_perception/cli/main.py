@@ -12,26 +12,20 @@ from lidar_perception import __version__
 from lidar_perception.cli.command import Group
 
 COMMANDS = {  # verb -> module.function, and its line in the overview
-    "demo": ("lidar_perception.cli.demo.demo",
-             "Replay a drive through the ROS 2 nodes and score the result."),
-    "convert": ("lidar_perception.cli.convert.convert",
-                "Turn recordings and labels into bags and other formats."),
-    "detect": ("lidar_perception.cli.detect.detect",
-               "Run a detector on a recording and write its results."),
-    "evaluate": ("lidar_perception.cli.evaluate.group.evaluate",
-                 "Score the algorithms without ROS."),
-    "view": ("lidar_studio.cli.view.view",
-             "Look at a recording and its results on a page in the browser."),
-    "setup": ("lidar_perception.cli.setup.setup",
-              "Measure a sensor and its mounting from unlabelled clouds."),
+    "demo": ("lidar_perception.cli.demo.demo", "Replay a drive through the ROS 2 nodes and score the result."),
+    "convert": ("lidar_perception.cli.convert.convert", "Turn recordings and labels into bags and other formats."),
+    "detect": ("lidar_perception.cli.detect.detect", "Run a detector on a recording and write its results."),
+    "evaluate": ("lidar_perception.cli.evaluate.group.evaluate", "Score the algorithms without ROS."),
+    "view": ("lidar_studio.cli.view.view", "Look at a recording and its results on a page in the browser."),
+    "setup": ("lidar_perception.cli.setup.setup", "Measure a sensor and its mounting from unlabelled clouds."),
     "label": ("lidar_studio.cli.label.label", "Label a drive on a page in the browser."),
     "seed": ("lidar_perception.cli.seed.seed", "Make a template of a seed pedestrian."),
-    "simulate": ("lidar_perception.cli.simulate.simulate",
-                 "Write simulated, labelled scans as a bag or a data set."),
-    "train": ("lidar_perception.cli.train.train",
-              "Train a detector on recordings or simulated streets."),
-    "import-weights": ("lidar_perception.cli.weights.import_weights",
-                       "Import PointPillars weights from other projects."),
+    "simulate": ("lidar_perception.cli.simulate.simulate", "Write simulated, labelled scans as a bag or a data set."),
+    "train": ("lidar_perception.cli.train.train", "Train a detector on recordings or simulated streets."),
+    "import-weights": (
+        "lidar_perception.cli.weights.import_weights",
+        "Import PointPillars weights from other projects.",
+    ),
     "export": ("lidar_perception.cli.weights.export", "Export a network for another runtime."),
     "info": ("lidar_perception.cli.info.info", "List what is in a bag or another recording."),
     "run": ("lidar_perception.cli.run.run_node", "Start one ROS node."),
@@ -60,6 +54,7 @@ class LazyGroup(Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Exit with code 130 on ctrl-C, as other programs do; click would exit with 1."""
         from lidar_perception.runs.terminal import show_input_warnings
+
         try:
             with show_input_warnings():
                 return super().invoke(ctx)
@@ -68,12 +63,10 @@ class LazyGroup(Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, text)
-                                for name, (_, text) in self.commands_by_name.items()])
+            formatter.write_dl([(name, text) for name, (_, text) in self.commands_by_name.items()])
 
 
-@click.group(cls=LazyGroup, commands_by_name=COMMANDS,
-             context_settings=dict(help_option_names=["-h", "--help"]))
+@click.group(cls=LazyGroup, commands_by_name=COMMANDS, context_settings=dict(help_option_names=["-h", "--help"]))
 @click.version_option(__version__, prog_name="lidar-perception")
 def cli() -> None:
     """LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned detectors of
@@ -99,6 +92,7 @@ def run_cli(group: click.Group, name: str) -> None:
     from lidar_perception.runs.memory import keep_freed_memory
     from lidar_perception.runs.threads import use_passive_waiting
     from lidar_perception.types import InputError
+
     use_passive_waiting()
     keep_freed_memory()
     try:

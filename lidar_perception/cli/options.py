@@ -1,8 +1,8 @@
 """--config and --set: the parameters of what runs. --weights, --range, --device: the detector.
 
-    @click.command(cls=Command)
-    @detector_options()
-    def verb(detector: DetectorChoice): detector.open(sensor_height=1.73)
+@click.command(cls=Command)
+@detector_options()
+def verb(detector: DetectorChoice): detector.open(sensor_height=1.73)
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ from lidar_perception.types import InputError, did_you_mean
 
 CANDIDATES = "candidates"
 CANDIDATE_NODES = "perception", "ground_segmentation", "clustering", "candidate_refinement"
-ON_OFF = {"true": True, "yes": True, "on": True, "1": True,
-          "false": False, "no": False, "off": False, "0": False}
+ON_OFF = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
 
 
 @dataclass(frozen=True)
@@ -61,11 +60,14 @@ class Settings:
         whose = " or ".join(dict.fromkeys(each.name for each in runs))
         for name, _ in self.given:
             if name not in known and name.startswith("input."):
-                raise InputError(f"{name} is for messages, which nodes read; the intensities of a "
-                                 "recording have a scale of their own")
+                raise InputError(
+                    f"{name} is for messages, which nodes read; the intensities of a "
+                    "recording have a scale of their own"
+                )
             if name not in known:
-                raise InputError(f"there is no parameter {name[:80]!r} of {whose}"
-                                 f"{_guess(name, known)} (--set help lists them all)")
+                raise InputError(
+                    f"there is no parameter {name[:80]!r} of {whose}{_guess(name, known)} (--set help lists them all)"
+                )
         found: list[dict[str, Any]] = [{} for _ in runs]
         if self.config is not None:
             read = [read_parameters(self.config, each.fields, each.nodes) for each in runs]
@@ -73,9 +75,13 @@ class Settings:
             _warn(self.config, (line for _, lines in read for line in lines))
             if not any(found):
                 errors.print(f"{self.config} has no parameter of {whose}", style="yellow")
-        return [{**values, **{name: _value(name, each.fields[name], text)
-                              for name, text in self.given if name in each.fields}}
-                for each, values in zip(runs, found)]
+        return [
+            {
+                **values,
+                **{name: _value(name, each.fields[name], text) for name, text in self.given if name in each.fields},
+            }
+            for each, values in zip(runs, found)
+        ]
 
     def __bool__(self) -> bool:
         return self.config is not None or bool(self.given)
@@ -99,8 +105,11 @@ def _value(name: str, f: Field[Any], text: str) -> Any:
         inner = text.strip().removeprefix("[").removesuffix("]")
         return tuple(_scalar(kind, word.strip()) for word in inner.split(",") if word.strip())
     except (ValueError, KeyError):
-        many = "a list of numbers such as 0.15,0.3" if isinstance(f.default, tuple) else {
-            bool: "true or false", int: "a whole number", float: "a number"}[kind]
+        many = (
+            "a list of numbers such as 0.15,0.3"
+            if isinstance(f.default, tuple)
+            else {bool: "true or false", int: "a whole number", float: "a number"}[kind]
+        )
         raise InputError(f"--set {name}={text[:80]}: the value must be {many}") from None
 
 
@@ -118,8 +127,9 @@ class Assignment(click.ParamType):
             return value
         name, equals, text = str(value).partition("=")
         if not equals and value != "help":
-            self.fail(f"{value!r} must be NAME=VALUE, such as fused.scores.car=0.7; --set help "
-                      "lists all names", param, ctx)
+            self.fail(
+                f"{value!r} must be NAME=VALUE, such as fused.scores.car=0.7; --set help lists all names", param, ctx
+            )
         return name.removesuffix(":").strip(), text
 
 
@@ -131,18 +141,21 @@ class SetOption(HelpfulOption):
         self.runs = runs
 
     def listing(self, given: Mapping[str, Any]) -> str:
-        return "\n".join(line for each in self.runs(given) for line in (
-            f"Parameters of {each.name}:", *describe_fields(each.fields)))
+        return "\n".join(
+            line for each in self.runs(given) for line in (f"Parameters of {each.name}:", *describe_fields(each.fields))
+        )
 
     def suggest_option(self, flag: str) -> str:
         plain = flag.removeprefix("--").removeprefix("no-")
-        known = {name.replace(".", "-").replace("_", "-"): name for node in NODES
-                 for name in find_node_parameters(node)}
+        known = {
+            name.replace(".", "-").replace("_", "-"): name for node in NODES for name in find_node_parameters(node)
+        }
         return f"; parameters are given as --set {known[plain]}=VALUE" if plain in known else ""
 
 
-def settings_options(runs: Callable[[Mapping[str, Any]], list[Runs]],
-                     example: str = "fused.scores.car=0.7", candidates: bool = False) -> Callable:
+def settings_options(
+    runs: Callable[[Mapping[str, Any]], list[Runs]], example: str = "fused.scores.car=0.7", candidates: bool = False
+) -> Callable:
     """Decorator: --config and --set, which the function gets as settings=Settings(...).
 
     Args:
@@ -158,12 +171,23 @@ def settings_options(runs: Callable[[Mapping[str, Any]], list[Runs]],
             return function(*args, settings=Settings(config, given), **kwargs)
 
         wrapper = click.option(
-            "--set", "given", cls=SetOption, runs=runs, multiple=True, type=Assignment(),
-            metavar="NAME=VALUE", help=f"Set a parameter, such as {example}; may be repeated. "
-            "`--set help` lists all, with units and defaults.")(wrapper)
+            "--set",
+            "given",
+            cls=SetOption,
+            runs=runs,
+            multiple=True,
+            type=Assignment(),
+            metavar="NAME=VALUE",
+            help=f"Set a parameter, such as {example}; may be repeated. "
+            "`--set help` lists all, with units and defaults.",
+        )(wrapper)
         return click.option(
-            "--config", type=click.Path(path_type=Path), metavar="FILE|NAME" if named else "FILE",
-            help=f"ROS parameter file, as in config/; --set takes precedence.{named}")(wrapper)
+            "--config",
+            type=click.Path(path_type=Path),
+            metavar="FILE|NAME" if named else "FILE",
+            help=f"ROS parameter file, as in config/; --set takes precedence.{named}",
+        )(wrapper)
+
     return decorate
 
 
@@ -172,9 +196,12 @@ def candidates_run(on_messages: bool = False) -> Runs:
     return Runs(CANDIDATES, _read_here(collect_fields(PAPER), on_messages), CANDIDATE_NODES)
 
 
-def parameter_options(defaults: Any, name: str = CANDIDATES,
-                      nodes: Collection[str] | None = CANDIDATE_NODES,
-                      example: str = "stm.threshold=0.5") -> Callable:
+def parameter_options(
+    defaults: Any,
+    name: str = CANDIDATES,
+    nodes: Collection[str] | None = CANDIDATE_NODES,
+    example: str = "stm.threshold=0.5",
+) -> Callable:
     """Decorator: --config and --set of one dataclass of parameters, which the function gets as
     params=."""
     runs = Runs(name, _read_here(collect_fields(defaults), on_messages=False), nodes)
@@ -183,7 +210,9 @@ def parameter_options(defaults: Any, name: str = CANDIDATES,
         @functools.wraps(function)
         def wrapper(*args: Any, settings: Settings, **kwargs: Any) -> Any:
             return function(*args, params=checked(defaults, settings.values(runs)[0]), **kwargs)
+
         return settings_options(lambda _: [runs], example, name == CANDIDATES)(wrapper)
+
     return decorate
 
 
@@ -216,8 +245,7 @@ def runs_of(weights: str | Path, on_messages: bool = False) -> Runs:
     """
     params = default_params(weights)
     name = str(weights)
-    node = next((f"{f.name}_detector" for f in fields(params)
-                 if f"{f.name}_detector" in NODES), name)
+    node = next((f"{f.name}_detector" for f in fields(params) if f"{f.name}_detector" in NODES), name)
     return Runs(name, _read_here(collect_fields(params), on_messages), (node,))
 
 
@@ -235,12 +263,18 @@ class Tracked:
 
 TRACKER = Runs("the tracker", collect_fields(Tracked()), ("tracker",))
 
-range_option = click.option("--range", type=Choice(RANGE_CHOICES), default="auto",
-                            show_default=True, help="Range of the detector: 69 m ahead, or 51 m "
-                            "in all directions, which takes more than twice as long. auto: the "
-                            "range that its weights were trained for, ahead for the shipped ones.")
-device_option = click.option("--device", default="auto", show_default=True,
-                             help="Where networks run: auto, cpu, cuda or cuda:N.")
+range_option = click.option(
+    "--range",
+    type=Choice(RANGE_CHOICES),
+    default="auto",
+    show_default=True,
+    help="Range of the detector: 69 m ahead, or 51 m "
+    "in all directions, which takes more than twice as long. auto: the "
+    "range that its weights were trained for, ahead for the shipped ones.",
+)
+device_option = click.option(
+    "--device", default="auto", show_default=True, help="Where networks run: auto, cpu, cuda or cuda:N."
+)
 
 
 def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> Callable:
@@ -260,18 +294,19 @@ def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> 
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
-        def wrapper(*args: Any, weights: Path | None, range: str, device: str, settings: Settings,
-                    **kwargs: Any) -> Any:
+        def wrapper(
+            *args: Any, weights: Path | None, range: str, device: str, settings: Settings, **kwargs: Any
+        ) -> Any:
             results = kwargs.get("results")
             if results is not None and (weights is not None or settings or range != "auto"):
-                form = next(p.metavar for p in click.get_current_context().command.params
-                            if p.name == "results")
-                raise click.UsageError(f"give either --results {form} or --weights FILE, --range, "
-                                       "--config and --set, which are for a detector that runs")
+                form = next(p.metavar for p in click.get_current_context().command.params if p.name == "results")
+                raise click.UsageError(
+                    f"give either --results {form} or --weights FILE, --range, "
+                    "--config and --set, which are for a detector that runs"
+                )
             name = str(weights) if weights else None if results else default
             if name is None and settings:
-                raise click.UsageError("--config and --set are for a detector that runs; give "
-                                       "--weights")
+                raise click.UsageError("--config and --set are for a detector that runs; give --weights")
             values: list[dict[str, Any]] = [{}, {}]
             if name is not None:
                 values = settings.values(runs_of(name), *others) if settings else values
@@ -284,6 +319,7 @@ def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> 
         for option in device_option, range_option, weights_option(default):
             wrapper = option(wrapper)
         return wrapper
+
     return decorate
 
 
@@ -293,15 +329,15 @@ def detectors_options(function: Callable) -> Callable:
     The function gets them as detectors=(DetectorChoice(...), ...). Each parameter of --set must
     belong to at least one of them.
     """
+
     @functools.wraps(function)
-    def wrapper(*args: Any, weights: tuple[Path, ...], range: str, device: str,
-                settings: Settings, **kwargs: Any) -> Any:
+    def wrapper(
+        *args: Any, weights: tuple[Path, ...], range: str, device: str, settings: Settings, **kwargs: Any
+    ) -> Any:
         if settings and not weights:
-            raise click.UsageError("--config and --set are for a detector that runs; give "
-                                   "--weights")
+            raise click.UsageError("--config and --set are for a detector that runs; give --weights")
         values = settings.values(*map(runs_of, weights)) if settings else [{} for _ in weights]
-        chosen = tuple(chosen_detector(name, range, device, own)
-                       for name, own in zip(weights, values))
+        chosen = tuple(chosen_detector(name, range, device, own) for name, own in zip(weights, values))
         return function(*args, detectors=chosen, **kwargs)
 
     wrapper = settings_options(lambda given: [*map(runs_of, weights_of(given) or [FUSED])])(wrapper)
@@ -310,8 +346,9 @@ def detectors_options(function: Callable) -> Callable:
     return wrapper
 
 
-def chosen_detector(weights: str | Path, range: str, device: str, values: Mapping[str, Any],
-                    params: Any = None) -> DetectorChoice:
+def chosen_detector(
+    weights: str | Path, range: str, device: str, values: Mapping[str, Any], params: Any = None
+) -> DetectorChoice:
     """Return a detector to open later, with parameters that are checked now.
 
     Args:
@@ -326,10 +363,14 @@ def weights_option(default: str | None = None, multiple: bool = False) -> Callab
     """Return the option --weights; with `multiple` it may be repeated."""
     more = " May be repeated." if multiple else f" Default: {default}." if default else ""
     return click.option(
-        "--weights", type=click.Path(path_type=Path), metavar="FILE|NAME", multiple=multiple,
+        "--weights",
+        type=click.Path(path_type=Path),
+        metavar="FILE|NAME",
+        multiple=multiple,
         help="The detector: a checkpoint, the output of `train fused`, one of fused, pointpillars "
         "and pointnet with its shipped weights, or a class of your own, "
-        f"module:Class.{more}")
+        f"module:Class.{more}",
+    )
 
 
 def read_config(path: Path, known: Any, nodes: Collection[str] | None = None) -> dict[str, Any]:

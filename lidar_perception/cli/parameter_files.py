@@ -22,8 +22,9 @@ MAX_DEPTH = 20  # groups in each other
 Fields = Mapping[str, Field[Any]]
 
 
-def read_parameters(path: Path, known: Fields, nodes: Collection[str] | None = None
-                    ) -> tuple[dict[str, Any], list[str]]:
+def read_parameters(
+    path: Path, known: Fields, nodes: Collection[str] | None = None
+) -> tuple[dict[str, Any], list[str]]:
     """Read the values of a ROS parameter file, or of a named configuration of the candidates.
 
     Args:
@@ -41,8 +42,9 @@ def read_parameters(path: Path, known: Fields, nodes: Collection[str] | None = N
     if str(path) in CONFIGURATIONS:
         named = CONFIGURATIONS[str(path)]
         if others := sorted(named.keys() - known.keys()):
-            raise InputError(f"the configuration {path} is for candidates; there is no "
-                             f"{others[0]} here, give a parameter file")
+            raise InputError(
+                f"the configuration {path} is for candidates; there is no {others[0]} here, give a parameter file"
+            )
         return dict(named), []
     content = _load(path)
     visited = count()
@@ -50,8 +52,7 @@ def read_parameters(path: Path, known: Fields, nodes: Collection[str] | None = N
     lines: list[str] = []
     unknown: list[str] = []
     for node, section in content.items():
-        if not (isinstance(section, dict)
-                and isinstance(section.get("ros__parameters", ()), dict | None)):
+        if not (isinstance(section, dict) and isinstance(section.get("ros__parameters", ()), dict | None)):
             raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for the form")
         if nodes is not None and not _applies(str(node), nodes):
             name = str(node).rpartition("/")[2]
@@ -72,8 +73,9 @@ def read_parameters(path: Path, known: Fields, nodes: Collection[str] | None = N
 
 def _load(path: Path) -> dict[Any, Any]:
     if not path.exists():
-        raise InputError(f"cannot read the parameter file {path}: there is no such file"
-                         + valid_names(str(path), CONFIGURATIONS))
+        raise InputError(
+            f"cannot read the parameter file {path}: there is no such file" + valid_names(str(path), CONFIGURATIONS)
+        )
     try:
         content = yaml.safe_load(read_text(path, MAX_BYTES))
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
@@ -90,20 +92,19 @@ def _applies(section: str, nodes: Collection[str]) -> bool:
 
 def _wrong_level(name: str, known: Iterable[str]) -> str:
     inner = [k for k in known if k.startswith(f"{name}.")]
-    return (f"a group, not a value; it holds {', '.join(inner)}" if inner else
-            "below a parameter that holds no others")
+    return f"a group, not a value; it holds {', '.join(inner)}" if inner else "below a parameter that holds no others"
 
 
-def _dotted(path: Path, section: dict, visited: Iterator[int], prefix: str = "",
-            depth: int = 0) -> Iterator[tuple[Any, Any]]:
+def _dotted(
+    path: Path, section: dict, visited: Iterator[int], prefix: str = "", depth: int = 0
+) -> Iterator[tuple[Any, Any]]:
     """Yield (dotted name, value), with the name unchanged if it is not text.
 
     visited counts the entries of all groups, because YAML anchors can nest groups without end.
     """
     for key, value in section.items():
         if next(visited) >= MAX_NAMES or depth >= MAX_DEPTH:
-            raise InputError(f"{path} has more than {MAX_NAMES} parameters, or groups in more than "
-                             f"{MAX_DEPTH} others")
+            raise InputError(f"{path} has more than {MAX_NAMES} parameters, or groups in more than {MAX_DEPTH} others")
         if not isinstance(key, str):
             yield key, value
         elif isinstance(value, dict):

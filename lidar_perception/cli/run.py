@@ -11,8 +11,7 @@ from lidar_perception.cli.command import Choice, Command
 from lidar_perception.nodes import NODES
 
 
-@click.command(cls=Command, context_settings=dict(ignore_unknown_options=True,
-                                                  allow_interspersed_args=False))
+@click.command(cls=Command, context_settings=dict(ignore_unknown_options=True, allow_interspersed_args=False))
 @click.argument("node", type=Choice(NODES), metavar="NODE")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def run_node(node: str, arguments: tuple[str, ...]) -> None:
@@ -23,5 +22,4 @@ def run_node(node: str, arguments: tuple[str, ...]) -> None:
       lidar-perception run bag_player --ros-args -p bag:=drive.bag -p rate:=0.5
     """
     # In place of this process, some of whose threads block no signal: one would end it at once.
-    os.execv(sys.executable, [sys.executable, "-P", "-m", "lidar_perception.nodes.main", node,
-                              *arguments])
+    os.execv(sys.executable, [sys.executable, "-P", "-m", "lidar_perception.nodes.main", node, *arguments])

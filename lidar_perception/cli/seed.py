@@ -15,12 +15,7 @@ from lidar_perception.candidates.seed_sources import make_click_source, make_tru
 from lidar_perception.candidates.seeds import save_seed
 from lidar_perception.candidates.silhouette import to_pixels
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import (
-    data_argument,
-    open_and_describe,
-    out_file,
-    with_recorded_height,
-)
+from lidar_perception.cli.data import data_argument, open_and_describe, out_file, with_recorded_height
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.runs.terminal import console
@@ -31,14 +26,25 @@ from lidar_perception.wire.params import ViewParams
 
 @click.command(cls=Command)
 @data_argument()
-@click.option("--frame", "number", type=click.IntRange(0), metavar="N",
-              help="Number of the frame; default: the first with a Pedestrian label.")
-@click.option("--at", nargs=3, type=float, metavar="X Y Z",
-              help="A point on the pedestrian, in the LiDAR frame; default: the nearest label.")
+@click.option(
+    "--frame",
+    "number",
+    type=click.IntRange(0),
+    metavar="N",
+    help="Number of the frame; default: the first with a Pedestrian label.",
+)
+@click.option(
+    "--at",
+    nargs=3,
+    type=float,
+    metavar="X Y Z",
+    help="A point on the pedestrian, in the LiDAR frame; default: the nearest label.",
+)
 @out_file("--out", "Template to write.", required=True)
 @parameter_options(PipelineParams(view=ViewParams(enabled=True)))
-def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, out: Path,
-         params: PipelineParams) -> None:
+def seed(
+    data: Path, number: int | None, at: tuple[float, float, float] | None, out: Path, params: PipelineParams
+) -> None:
     """Take the silhouette and height of one pedestrian as a template for later runs.
 
     Use it with --set seed.source=file --set seed.file=OUT, or with these parameters of the nodes.
@@ -55,23 +61,27 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
     if camera is None:
         params = replace(params, view=ViewParams(enabled=False))
     segmented = segment_cloud(frame.load(), camera, params)
-    source = (make_click_source(np.array(at), params.seed) if at is not None
-              else make_truth_source(load_pedestrians(frame, params.view.enabled)))
-    template, = source(segmented)
+    source = (
+        make_click_source(np.array(at), params.seed)
+        if at is not None
+        else make_truth_source(load_pedestrians(frame, params.view.enabled))
+    )
+    (template,) = source(segmented)
     save_seed(template, out)
     for row in to_pixels(template.silhouette(params))[::2]:
         console.print("".join(".#"[bit] for bit in row.astype(int)))
     console.print(f"{out}: frame {frame.name}, height {template.height:.2f} m")
 
 
-def _pick(recording: Recording, number: int | None, view: ViewParams,
-          labelled: bool) -> Frame:
+def _pick(recording: Recording, number: int | None, view: ViewParams, labelled: bool) -> Frame:
     for i, frame in enumerate(recording):
         if i == number:
             return frame
         with suppress(InputError):
             if number is None and (not labelled or len(load_pedestrians(frame, view.enabled))):
                 return frame
-    raise InputError(f"{recording.path} has no frame {number}; it has {len(recording)}"
-                     if number is not None else
-                     f"{recording.path} has no Pedestrian label; give --frame and --at")
+    raise InputError(
+        f"{recording.path} has no frame {number}; it has {len(recording)}"
+        if number is not None
+        else f"{recording.path} has no Pedestrian label; give --frame and --at"
+    )

@@ -22,18 +22,26 @@ COLORS = {"high": "green", "fair": "default", "low": "yellow"}
 
 
 @click.command(cls=Command)
-@data_argument("A bag, a .pcd, .ply, .npy or .bin file or a folder of them, or the folder of a "
-               "data set. No label is needed.")
+@data_argument(
+    "A bag, a .pcd, .ply, .npy or .bin file or a folder of them, or the folder of a data set. No label is needed."
+)
 @out_folder("Folder for the files.", required=True)
-@click.option("--topic", metavar="TOPIC", help="Topic of the clouds, for a bag with several "
-              "sensors.")
-@click.option("--scans", type=click.IntRange(1), default=40, show_default=True,
-              help="Number of clouds to look at, in pairs spread over all.")
-@click.option("--height-hint", type=click.FloatRange(0, 50, min_open=True), metavar="METRES",
-              help="Known height of the sensor, to check against the clouds.")
+@click.option("--topic", metavar="TOPIC", help="Topic of the clouds, for a bag with several sensors.")
+@click.option(
+    "--scans",
+    type=click.IntRange(1),
+    default=40,
+    show_default=True,
+    help="Number of clouds to look at, in pairs spread over all.",
+)
+@click.option(
+    "--height-hint",
+    type=click.FloatRange(0, 50, min_open=True),
+    metavar="METRES",
+    help="Known height of the sensor, to check against the clouds.",
+)
 @click.option("--force", is_flag=True, help="Replace the files of an earlier run.")
-def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: float | None,
-          force: bool) -> None:
+def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: float | None, force: bool) -> None:
     """Measure a LiDAR, its mounting and the robot's body from unlabelled clouds.
 
     Prints each value with its confidence, and warnings with remedies. Writes sensor.yaml, which
@@ -78,10 +86,12 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
             raise InputError(skipped[0])
         bar.update(task, description="measuring")
         recorded = read_recorded_poses(clouds.poses, numbers, clouds.stamps_ns)
-        m = measure_sensor(found, numbers, str(data), clouds.count, clouds.stamps_ns, recorded,
-                           height_hint)
-    files = {"sensor.yaml": format_sensor(m), "robot.param.yaml": format_params(m),
-             **_layouts(clouds.topic or "/points", m.source.scans[0].frame_id)}
+        m = measure_sensor(found, numbers, str(data), clouds.count, clouds.stamps_ns, recorded, height_hint)
+    files = {
+        "sensor.yaml": format_sensor(m),
+        "robot.param.yaml": format_params(m),
+        **_layouts(clouds.topic or "/points", m.source.scans[0].frame_id),
+    }
     make_folder(out)
     for name, text in files.items():
         write_text(out / name, text)
@@ -107,8 +117,10 @@ def _layouts(topic: str, frame: str) -> dict[str, str]:
 
     Empty if the layouts are not installed.
     """
-    places = (Path(__file__).parents[2] / "config",  # of a checkout; else where it is installed
-              *(p / "share/lidar_perception/config" for p in Path(__file__).parents))
+    places = (
+        Path(__file__).parents[2] / "config",  # of a checkout; else where it is installed
+        *(p / "share/lidar_perception/config" for p in Path(__file__).parents),
+    )
     folder = next((p for p in places if (p / FILES[-1]).is_file()), None)
     if folder is None:
         return {}

@@ -28,37 +28,88 @@ from lidar_perception.types import InputError
 
 @click.command(cls=Command)
 @out_folder("Bag or folder to make.", required=True)
-@click.option("--format", "--to", "layout", type=Choice(["mcap", *LAYOUTS], ALIASES),
-              default="mcap", show_default=True, help="A rosbag2 bag, or the folders of one of "
-              "these data sets.")
-@click.option("--sensor", "sensor_name", default="hdl64e", show_default=True,
-              help=f"One of {', '.join(SENSOR_NAMES)}, in any spelling (hdl64e is hdl-64e), a "
-              f".yaml file (`setup` writes one), or {GENERIC_FORMAT}.")
-@click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
-              help="Height of the sensor above the ground. Default: that of its file or preset.")
-@click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
-              help="Number of scans.")
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
-              help="Seed of the first street; the same seed gives the same bytes.")
-@click.option("--scene", default="street", show_default=True, metavar="NAME",
-              help=f"One of {', '.join(SCENE_TYPES)}, or several in turn, such as street,campus.")
-@click.option("--kind", "--street", "kind", metavar="KIND", help="Scenes of this kind only: "
-              + "; ".join(f"{name} {', '.join(one.kinds)}" for name, one in SCENE_TYPES.items())
-              + ". Default: all.")
-@click.option("--people", type=click.FloatRange(0, MAX_PEOPLE), default=1.0,
-              show_default=True, help="Pedestrians and cyclists, as a multiple of the usual; on "
-              "streets of KITTI's.")
-@click.option("--streets-of", type=click.IntRange(1), metavar="N",
-              help="Scans of each street. Default: 1 for kitti, a drive of 20 s for the others.")
-@click.option("--jobs", type=click.IntRange(1), help="Processes that write the folders of a data "
-              "set. Default: one for each core.")
-@click.option("--resume", is_flag=True, help="Resume an unfinished data set; needs identical "
-              "settings.")
+@click.option(
+    "--format",
+    "--to",
+    "layout",
+    type=Choice(["mcap", *LAYOUTS], ALIASES),
+    default="mcap",
+    show_default=True,
+    help="A rosbag2 bag, or the folders of one of these data sets.",
+)
+@click.option(
+    "--sensor",
+    "sensor_name",
+    default="hdl64e",
+    show_default=True,
+    help=f"One of {', '.join(SENSOR_NAMES)}, in any spelling (hdl64e is hdl-64e), a "
+    f".yaml file (`setup` writes one), or {GENERIC_FORMAT}.",
+)
+@click.option(
+    "--mount-height",
+    type=click.FloatRange(0, 10),
+    default=0.0,
+    metavar="M",
+    help="Height of the sensor above the ground. Default: that of its file or preset.",
+)
+@click.option("--frames", type=click.IntRange(1), default=40, show_default=True, help="Number of scans.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=1,
+    show_default=True,
+    help="Seed of the first street; the same seed gives the same bytes.",
+)
+@click.option(
+    "--scene",
+    default="street",
+    show_default=True,
+    metavar="NAME",
+    help=f"One of {', '.join(SCENE_TYPES)}, or several in turn, such as street,campus.",
+)
+@click.option(
+    "--kind",
+    "--street",
+    "kind",
+    metavar="KIND",
+    help="Scenes of this kind only: "
+    + "; ".join(f"{name} {', '.join(one.kinds)}" for name, one in SCENE_TYPES.items())
+    + ". Default: all.",
+)
+@click.option(
+    "--people",
+    type=click.FloatRange(0, MAX_PEOPLE),
+    default=1.0,
+    show_default=True,
+    help="Pedestrians and cyclists, as a multiple of the usual; on streets of KITTI's.",
+)
+@click.option(
+    "--streets-of",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Scans of each street. Default: 1 for kitti, a drive of 20 s for the others.",
+)
+@click.option(
+    "--jobs", type=click.IntRange(1), help="Processes that write the folders of a data set. Default: one for each core."
+)
+@click.option("--resume", is_flag=True, help="Resume an unfinished data set; needs identical settings.")
 @click.option("--force", is_flag=True, help="Replace an earlier simulated data set in --out.")
 @report_compilation()
-def simulate(out: Path, layout: str, sensor_name: str, frames: int, seed: int,
-             scene: str, kind: str | None, people: float, mount_height: float,
-             streets_of: int | None, jobs: int | None, resume: bool, force: bool) -> None:
+def simulate(
+    out: Path,
+    layout: str,
+    sensor_name: str,
+    frames: int,
+    seed: int,
+    scene: str,
+    kind: str | None,
+    people: float,
+    mount_height: float,
+    streets_of: int | None,
+    jobs: int | None,
+    resume: bool,
+    force: bool,
+) -> None:
     """Write labelled scans of simulated streets, campuses or interiors as a bag or data set.
 
     A file INCOMPLETE marks an unfinished data set; --resume resumes it.
@@ -73,12 +124,15 @@ def simulate(out: Path, layout: str, sensor_name: str, frames: int, seed: int,
     if resume and force:
         raise click.UsageError("--resume resumes, --force starts over: give one of them")
     sensor = find_sensor(sensor_name, mount_height)
-    plan = DatasetPlan(layout, sensor, seed, frames,
-                       streets_of or (1 if layout == "kitti" else longest_drive(sensor)), scenes)
+    plan = DatasetPlan(
+        layout, sensor, seed, frames, streets_of or (1 if layout == "kitti" else longest_drive(sensor)), scenes
+    )
     if layout == "mcap":
         if resume:
-            raise click.UsageError("a bag is one file and cannot be resumed; make kitti-tracking, "
-                                   "which can, and turn it into a bag with 'convert'")
+            raise click.UsageError(
+                "a bag is one file and cannot be resumed; make kitti-tracking, "
+                "which can, and turn it into a bag with 'convert'"
+            )
         _bag(out, plan, force)
     else:
         _data_set(out, plan, sensor_name, mount_height, jobs or count_cores(), resume, force)
@@ -90,19 +144,41 @@ def _bag(out: Path, plan: DatasetPlan, force: bool) -> None:
     console.print(f"{out}: {count} scans")
 
 
-def _data_set(out: Path, plan: DatasetPlan, sensor_name: str, mount_height: float, jobs: int,
-              resume: bool, force: bool) -> None:
+def _data_set(
+    out: Path, plan: DatasetPlan, sensor_name: str, mount_height: float, jobs: int, resume: bool, force: bool
+) -> None:
     scenes = plan.scenes
-    asked = {"format": plan.layout, "sensor": sensor_name, "height": plan.sensor.height,
-             "sensor_digest": hash_names([repr(plan.sensor)]), "seed": plan.seed,
-             "frames": plan.frames, "scene": scenes.scene, "street": scenes.kind,
-             "people": scenes.people, "streets_of": plan.streets_of, "version": __version__}
-    options = {"format": plan.layout, "sensor": sensor_name, "mount-height": mount_height or None,
-               "seed": plan.seed, "frames": plan.frames, "scene": scenes.scene,
-               "people": scenes.people, "streets-of": plan.streets_of, "street": scenes.kind}
-    asked["command"] = shlex.join(["lidar-perception", "simulate", *(
-        word for name, value in options.items() if value is not None
-        for word in (f"--{name}", str(value)))])
+    asked = {
+        "format": plan.layout,
+        "sensor": sensor_name,
+        "height": plan.sensor.height,
+        "sensor_digest": hash_names([repr(plan.sensor)]),
+        "seed": plan.seed,
+        "frames": plan.frames,
+        "scene": scenes.scene,
+        "street": scenes.kind,
+        "people": scenes.people,
+        "streets_of": plan.streets_of,
+        "version": __version__,
+    }
+    options = {
+        "format": plan.layout,
+        "sensor": sensor_name,
+        "mount-height": mount_height or None,
+        "seed": plan.seed,
+        "frames": plan.frames,
+        "scene": scenes.scene,
+        "people": scenes.people,
+        "streets-of": plan.streets_of,
+        "street": scenes.kind,
+    }
+    asked["command"] = shlex.join(
+        [
+            "lidar-perception",
+            "simulate",
+            *(word for name, value in options.items() if value is not None for word in (f"--{name}", str(value))),
+        ]
+    )
     complete, begun = resume and is_finished(out), False
     try:
         with make_resumable_folder(out, asked, FOLDERS, resume=resume, force=force) as missing:
@@ -114,6 +190,8 @@ def _data_set(out: Path, plan: DatasetPlan, sensor_name: str, mount_height: floa
         if not begun:
             raise
         raise InputError(f"{error}; finished frames are kept, resume with --resume") from None
-    console.print(f"{out} is complete: there is nothing to do" if complete else
-                  f"{out}: {plan.frames} scans" + (f", {plan.frames - len(missing)} of them from "
-                                                   "before" if resume else ""))
+    console.print(
+        f"{out} is complete: there is nothing to do"
+        if complete
+        else f"{out}: {plan.frames} scans" + (f", {plan.frames - len(missing)} of them from before" if resume else "")
+    )

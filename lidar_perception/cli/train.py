@@ -14,13 +14,7 @@ import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.command import Choice, Group
-from lidar_perception.cli.data import (
-    a_path,
-    data_argument,
-    jobs_for_all_cores,
-    out_file,
-    out_folder,
-)
+from lidar_perception.cli.data import a_path, data_argument, jobs_for_all_cores, out_file, out_folder
 from lidar_perception.cli.options import checked, device_option, parameter_options
 from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.terminal import console
@@ -29,29 +23,41 @@ from lidar_perception.training.request import TrainingRequest
 from lidar_perception.types import InputError
 
 OPTIONS = (
-    data_argument("Training data: a data set or bag, or `sim` for simulated scenes; may be "
-                  "repeated to mix them.", several=True, kind=str),
-    click.option("--val", multiple=True, metavar="PATH|sim",
-                 help="Validation data. Default: frames held out of --data, and other simulated "
-                 "streets."),
-    a_path("--split", "Train on the frames of --data, or whole sequences, listed in this file, one "
-           "per line."),
+    data_argument(
+        "Training data: a data set or bag, or `sim` for simulated scenes; may be repeated to mix them.",
+        several=True,
+        kind=str,
+    ),
+    click.option(
+        "--val",
+        multiple=True,
+        metavar="PATH|sim",
+        help="Validation data. Default: frames held out of --data, and other simulated streets.",
+    ),
+    a_path("--split", "Train on the frames of --data, or whole sequences, listed in this file, one per line."),
     a_path("--val-split", "Validate on the frames or sequences listed in this file."),
     out_folder("Folder for best.safetensors, last.safetensors, logs and the state.", required=True),
     click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one."),
-    a_path("--init", "Start from the matching weights of this checkpoint; `package`: "
-           "the shipped weights.", "FILE|package"),
+    a_path(
+        "--init", "Start from the matching weights of this checkpoint; `package`: the shipped weights.", "FILE|package"
+    ),
     device_option,
     jobs_for_all_cores("Processes that prepare scenes; 0: only this one."),
-    click.option("--budget", type=float, metavar="HOURS", help="Time budget on this machine. It "
-                 "determines scans, steps and validations that are not given. When it is used up, "
-                 "the run stops and can be resumed. Default: 2, or no limit with --steps or "
-                 "--epochs."),
+    click.option(
+        "--budget",
+        type=float,
+        metavar="HOURS",
+        help="Time budget on this machine. It "
+        "determines scans, steps and validations that are not given. When it is used up, "
+        "the run stops and can be resumed. Default: 2, or no limit with --steps or "
+        "--epochs.",
+    ),
 )
 
 
 def shared_options(function: Callable) -> Callable:
     """Decorate a command with the options of all networks; it gets them as request=..."""
+
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         request = TrainingRequest(**{f.name: kwargs.pop(f.name) for f in fields(TrainingRequest)})
@@ -70,13 +76,13 @@ def training_options(defaults: Any) -> Callable:
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
         def wrapper(*args: Any, params: Any, **kwargs: Any) -> Any:
-            given = {name: value for name in named
-                     if (value := kwargs.pop(name.replace(".", "_"))) is not None}
+            given = {name: value for name in named if (value := kwargs.pop(name.replace(".", "_"))) is not None}
             return function(*args, params=checked(params, given), **kwargs)
 
         for name, f in reversed(named.items()):
             wrapper = _flag(name, f)(wrapper)
         return parameter_options(defaults, "training", None, "scene=campus")(wrapper)
+
     return decorate
 
 
@@ -84,13 +90,21 @@ def _flag(name: str, f: Field[Any]) -> Callable:
     flag, variable = "--" + name.replace(".", "-").replace("_", "-"), name.replace(".", "_")
     meta, default = f.metadata, f.default
     if isinstance(default, bool):
-        return click.option(f"{flag}/--no-{flag[2:]}", variable, default=None,
-                            help=f"{meta['doc']} Default: {'on' if default else 'off'}.")
+        return click.option(
+            f"{flag}/--no-{flag[2:]}",
+            variable,
+            default=None,
+            help=f"{meta['doc']} Default: {'on' if default else 'off'}.",
+        )
     shown = f"{default:.4g}" if isinstance(default, float) else default
     return click.option(
-        flag, variable, type=Choice(meta["choices"]) if meta["choices"] else type(default),
-        default=None, help=f"{meta['doc']}{f' [{unit}]' if (unit := meta['unit']) else ''} "
-        f"Default: {'none' if shown == '' else shown}.")
+        flag,
+        variable,
+        type=Choice(meta["choices"]) if meta["choices"] else type(default),
+        default=None,
+        help=f"{meta['doc']}{f' [{unit}]' if (unit := meta['unit']) else ''} "
+        f"Default: {'none' if shown == '' else shown}.",
+    )
 
 
 @click.group(cls=Group)
@@ -143,15 +157,15 @@ def pointnet(request: TrainingRequest, params: PointNetTraining) -> None:
 
 
 @train.command()
-@a_path("--weights", "Checkpoint or exported network (.onnx) of PointPillars. Default: the shipped "
-        "one.")
+@a_path("--weights", "Checkpoint or exported network (.onnx) of PointPillars. Default: the shipped one.")
 @a_path("--classifier", "Checkpoint of PointNet. Default: the shipped one.")
 @out_file("--out", "File to write (.json), for --weights and `fused.weights`.", required=True)
 @click.option("--force", is_flag=True, help="Replace --out.")
 @jobs_for_all_cores("Processes that evaluate scans.", 1)
 @training_options(FusedTraining())
-def fused(weights: Path | None, classifier: Path | None, out: Path, force: bool, jobs: int,
-          params: FusedTraining) -> None:
+def fused(
+    weights: Path | None, classifier: Path | None, out: Path, force: bool, jobs: int, params: FusedTraining
+) -> None:
     """Fit the fused detector to your own weights.
 
     PointPillars, silhouettes and PointNet are evaluated on simulated scans of the sensor that the
@@ -168,11 +182,13 @@ def fused(weights: Path | None, classifier: Path | None, out: Path, force: bool,
       lidar-perception run fused_detector --ros-args -p fused.weights:=$PWD/robot/fused.json
     """
     from lidar_perception.detectors.fused.fusion import SUFFIX
+
     if out.suffix != SUFFIX:
         raise InputError(f"--out {out} must end with {SUFFIX}")
     if out.exists() and not force:
         raise InputError(f"{out} exists already; give another name, or --force")
     from lidar_perception.training.fusion_curves import fit_fusion
+
     print_fused(fit_fusion(weights, classifier, out, params, jobs))
     console.print(f"{out}: --weights of commands, and fused.weights of the node, take it")
 
@@ -181,6 +197,7 @@ def run(request: TrainingRequest, params: PointPillarsTraining | PointNetTrainin
     """Train, and print the result."""
     from lidar_perception.training.start import start_training
     from lidar_perception.training.trainers import make_trainer
+
     result = start_training(make_trainer(params), request, params, find_commit())
     if result is not None:
         print_result(*result, request.out)
@@ -189,40 +206,47 @@ def run(request: TrainingRequest, params: PointPillarsTraining | PointNetTrainin
 def print_fused(fits: Any) -> None:
     """Print the fit of each class."""
     from lidar_perception.scoring.tables import make_table
-    table = make_table("Curves, on scans that they were not fitted to", "", "proposals", "right",
-                       ">= 0.4", "right", "log loss")
+
+    table = make_table(
+        "Curves, on scans that they were not fitted to", "", "proposals", "right", ">= 0.4", "right", "log loss"
+    )
     few = []
     for name, own in fits.items():
         rows = [("package", own.before)]
         rows += [("fitted", own.after)] if own.after else []
         few += [] if own.after else [name]
         for k, (which, score) in enumerate(rows):
-            table.add_row(f"{name}, {which}", *(
-                (str(own.proposals), str(own.right)) if k == 0 else ("", "")),
-                str(score.right + score.wrong), str(score.right), f"{score.loss:.3f}")
+            table.add_row(
+                f"{name}, {which}",
+                *((str(own.proposals), str(own.right)) if k == 0 else ("", "")),
+                str(score.right + score.wrong),
+                str(score.right),
+                f"{score.loss:.3f}",
+            )
     console.print(table)
     if few:
-        console.print(f"{', '.join(few)}: too few to fit curves to; those of the package stay. "
-                      "More --scans, or another --scene, have more")
+        console.print(
+            f"{', '.join(few)}: too few to fit curves to; those of the package stay. "
+            "More --scans, or another --scene, have more"
+        )
 
 
 def print_result(progress: Any, steps: int, batches: Any, out: Path) -> None:
     """Print how a run ended. A run that was stopped ends the process with code 130."""
     if batches.skipped:
-        console.print(f"{len(batches.skipped)} scenes could not be used, such as: "
-                      f"{next(iter(batches.skipped))}")
+        console.print(f"{len(batches.skipped)} scenes could not be used, such as: {next(iter(batches.skipped))}")
     if progress.skipped:
         console.print(f"{progress.skipped} of {progress.step} steps were skipped: not finite")
     if progress.best is not None:
-        console.print(f"{out / 'best.safetensors'}: score {progress.best:.2f} at step "
-                      f"{progress.best_step}")
+        console.print(f"{out / 'best.safetensors'}: score {progress.best:.2f} at step {progress.best_step}")
     if progress.left_out:
-        console.print(f"{progress.left_out:.0f} of {steps} planned steps were left out, to end "
-                      "within the budget")
+        console.print(f"{progress.left_out:.0f} of {steps} planned steps were left out, to end within the budget")
     if progress.late:
-        console.print("the budget is spent and the learning rate has not come down: "
-                      f"{steps - progress.step - progress.left_out:.0f} of {steps} steps are "
-                      "missing; continue with --resume")
+        console.print(
+            "the budget is spent and the learning rate has not come down: "
+            f"{steps - progress.step - progress.left_out:.0f} of {steps} steps are "
+            "missing; continue with --resume"
+        )
     if progress.stopped:
         console.print(f"stopped at step {progress.step}; continue with --resume")
         sys.exit(130)
@@ -232,10 +256,12 @@ def find_commit() -> str:
     """Return the commit of this checkout, with + if files are changed, or else the version."""
     folder = Path(__file__).resolve().parents[2]
     try:
-        head, changes = (subprocess.run(["git", "-C", str(folder), *words], capture_output=True,
-                                        text=True, check=True, timeout=20).stdout.strip()
-                         for words in (("rev-parse", "HEAD"),
-                                       ("status", "--porcelain", "--untracked-files=no")))
+        head, changes = (
+            subprocess.run(
+                ["git", "-C", str(folder), *words], capture_output=True, text=True, check=True, timeout=20
+            ).stdout.strip()
+            for words in (("rev-parse", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
+        )
     except (OSError, subprocess.SubprocessError):
         return __version__
     return head + ("+" if changes else "")

@@ -14,8 +14,12 @@ from lidar_perception.runs.terminal import console
 @click.command("import-weights", cls=Command)
 @click.argument("source", type=click.Path(path_type=Path), metavar="FILE.pth")
 @out_file("--out", "Checkpoint to write (.safetensors).", required=True)
-@click.option("--classes", metavar="A,B,C", default="",
-              help="Classes in the order of training. Default: the project's own order for KITTI.")
+@click.option(
+    "--classes",
+    metavar="A,B,C",
+    default="",
+    help="Classes in the order of training. Default: the project's own order for KITTI.",
+)
 @click.option("--half", is_flag=True, help="Store the weights of layers as float16.")
 def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:
     """Turn PointPillars weights of OpenPCDet or mmdetection3d (1.x) into a checkpoint.
@@ -30,10 +34,10 @@ def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:
     """
     from lidar_perception.detectors.checkpoint import Header, save_checkpoint
     from lidar_perception.detectors.pointpillars.import_weights import import_weights as converted
+
     names = tuple(name.strip() for name in classes.split(",") if name.strip())
     config, network, project = converted(source, names)
-    save_checkpoint(out, network, Header(config, {"imported from": project, "file": source.name}),
-                    half)
+    save_checkpoint(out, network, Header(config, {"imported from": project, "file": source.name}), half)
     console.print(f"{out}: PointPillars of {project} for {', '.join(config.classes)}")
 
 
@@ -58,15 +62,18 @@ def onnx(weights: Path, out: Path) -> None:
       lidar-perception export onnx pointnet/best.safetensors --out pointnet.onnx
     """
     from lidar_perception.detectors.checkpoint import POINTNET, read_network_name
+
     if read_network_name(weights) == POINTNET:
         from lidar_perception.detectors.pointnet import onnx as pointnet
         from lidar_perception.detectors.pointnet.network import load_pointnet
+
         header, classifier = load_pointnet(weights)
         pointnet.export_onnx(classifier, header, out)
         title = f"PointNet {header.config.name}"
     else:
         from lidar_perception.detectors.pointpillars import onnx as pointpillars
         from lidar_perception.detectors.pointpillars.network import load_network
+
         header, network = load_network(weights)
         pointpillars.export_onnx(network.eval(), header, out)
         title = f"{header.config.version} {header.config.size}"

@@ -74,8 +74,7 @@ def _count_distances(cells, kept):
         before[a + 1] = before[a] + kept[a]
     for a in range(len(kept)):
         for k in range(cells.ranges[a]):
-            total += (cells.start[a + 1] - cells.start[a]) * (before[cells.high[a, k]]
-                                                              - before[cells.low[a, k]])
+            total += (cells.start[a + 1] - cells.start[a]) * (before[cells.high[a, k]] - before[cells.low[a, k]])
     return total
 
 
@@ -84,7 +83,7 @@ def _take_sample(cells, keys, start):
     out = np.empty((len(cells.xyz), start[-1]))
     for a in range(len(start) - 1):
         first = cells.start[a]
-        rows = np.argsort(keys[first:cells.start[a + 1]], kind="mergesort")
+        rows = np.argsort(keys[first : cells.start[a + 1]], kind="mergesort")
         kept = start[a + 1] - start[a]
         for k in range(kept):  # evenly spaced, so that coincident points are not over-represented
             out[:, start[a] + k] = cells.xyz[:, first + rows[k * len(rows) // kept]]
@@ -148,8 +147,7 @@ def gather_neighbourhood(cells, a, out):
     """
     put = np.uint64(0)
     for k in range(cells.ranges[a]):
-        for j in range(np.uint64(cells.start[cells.low[a, k]]),
-                       np.uint64(cells.start[cells.high[a, k]])):
+        for j in range(np.uint64(cells.start[cells.low[a, k]]), np.uint64(cells.start[cells.high[a, k]])):
             for axis in range(3):
                 out[axis, put] = cells.xyz[axis, j]
             put += np.uint64(1)

@@ -12,8 +12,9 @@ from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.types import PointCloud, as_point_cloud, check_columns, usable_returns
 
 
-def cluster(cloud: PointCloud | ArrayLike, params: ClusteringParams = ClusteringParams(),
-            density: float = 0.0) -> np.ndarray:
+def cluster(
+    cloud: PointCloud | ArrayLike, params: ClusteringParams = ClusteringParams(), density: float = 0.0
+) -> np.ndarray:
     """Cluster the points of a cloud.
 
     Args:
@@ -41,14 +42,16 @@ def _cluster_usable(xyz: np.ndarray, given: ClusteringParams, density: float) ->
     params = adapt_to_density(given, density)
     if params.method == "dbscan":
         return distance_aware_dbscan(xyz, params.dbscan)
-    radii = None if params is given else compute_radii(xyz, density, given.euclidean.radius,
-                                                       params.euclidean.radius)
+    radii = None if params is given else compute_radii(xyz, density, given.euclidean.radius, params.euclidean.radius)
     return cluster_euclidean(xyz, params.euclidean, radii=radii)
 
 
-def cluster_obstacles(cloud: PointCloud | ArrayLike, ground: np.ndarray,
-                      params: ClusteringParams = ClusteringParams(),
-                      sensor_xyz: np.ndarray | None = None) -> np.ndarray:
+def cluster_obstacles(
+    cloud: PointCloud | ArrayLike,
+    ground: np.ndarray,
+    params: ClusteringParams = ClusteringParams(),
+    sensor_xyz: np.ndarray | None = None,
+) -> np.ndarray:
     """Cluster the points of a cloud that are not ground.
 
     Args:
@@ -68,7 +71,6 @@ def cluster_obstacles(cloud: PointCloud | ArrayLike, ground: np.ndarray,
     check_columns(len(xyz), ground=ground)
     labels = np.zeros(len(xyz), np.int32)
     obstacles = np.flatnonzero(~ground)
-    density = (measure_density(xyz if sensor_xyz is None else sensor_xyz) if params.density
-               else 0.0)
+    density = measure_density(xyz if sensor_xyz is None else sensor_xyz) if params.density else 0.0
     labels[obstacles] = cluster(xyz.take(obstacles, axis=0), params, density)
     return labels

@@ -15,8 +15,7 @@ from numba import njit
 from lidar_perception.clustering.cells import gather_sample, sample_cells, sort_into_cells
 
 
-def find_consistent_points(xyz: np.ndarray, radii: np.ndarray, limit: float,
-                           max_work: int) -> np.ndarray:
+def find_consistent_points(xyz: np.ndarray, radii: np.ndarray, limit: float, max_work: int) -> np.ndarray:
     """Find the points whose surface variation is within `limit` of the mean around them.
 
     Args:
@@ -33,8 +32,7 @@ def find_consistent_points(xyz: np.ndarray, radii: np.ndarray, limit: float,
     covariances = _compute_covariances(cells, sample_cells(cells, max_work), radii2)
     values = np.linalg.eigvalsh(covariances)
     sums = values.sum(axis=1)
-    variation = np.divide(np.maximum(values[:, 0], 0), sums, out=np.zeros_like(sums),
-                          where=sums > 0)
+    variation = np.divide(np.maximum(values[:, 0], 0), sums, out=np.zeros_like(sums), where=sums > 0)
     carrying = cells._replace(xyz=np.vstack([cells.xyz, variation]))
     means = _average_around(carrying, sample_cells(carrying, max_work), radii2)
     consistent = np.empty(len(xyz), bool)
@@ -62,8 +60,7 @@ def _compute_covariances(cells, sample, radii2):
                             second[p, q] += weight[j] * offset[p] * offset[q]
             for p in range(3):
                 for q in range(3):
-                    out[i, p, q] = (second[p, q] - first[p] * first[q] / max(total, 1.0)) / max(
-                        total, 1.0)
+                    out[i, p, q] = (second[p, q] - first[p] * first[q] / max(total, 1.0)) / max(total, 1.0)
     return out
 
 
@@ -76,8 +73,11 @@ def _average_around(cells, sample, radii2):
         for i in range(cells.start[a], cells.start[a + 1]):
             total, value = 0.0, 0.0
             for j in range(len(weight)):
-                if ((near[0, j] - cells.xyz[0, i]) ** 2 + (near[1, j] - cells.xyz[1, i]) ** 2
-                        + (near[2, j] - cells.xyz[2, i]) ** 2) <= radii2[i]:
+                if (
+                    (near[0, j] - cells.xyz[0, i]) ** 2
+                    + (near[1, j] - cells.xyz[1, i]) ** 2
+                    + (near[2, j] - cells.xyz[2, i]) ** 2
+                ) <= radii2[i]:
                     total += weight[j]
                     value += weight[j] * near[3, j]
             means[i] = value / max(total, 1.0)

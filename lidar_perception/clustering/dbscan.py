@@ -37,8 +37,9 @@ def distance_aware_dbscan(xyz: np.ndarray, params: DbscanParams = DbscanParams()
     labels = np.zeros(len(xyz), np.int32)
     last = 0
     # The compiled code releases the GIL, so each band runs in its own thread.
-    found = _thread_pool().map(lambda members, eps: dbscan(xyz.take(members, axis=0), eps,
-                                                           params.min_samples), bands, params.eps)
+    found = _thread_pool().map(
+        lambda members, eps: dbscan(xyz.take(members, axis=0), eps, params.min_samples), bands, params.eps
+    )
     for members, ids in zip(bands, found):
         labels[members] = np.where(ids > 0, ids + last, 0)
         last += int(ids.max(initial=0))
@@ -68,8 +69,7 @@ def _sort_by_band(xyz, limits):
     return counting_sort(band, len(limits) + 1, np.arange(len(xyz)))
 
 
-def _join_bands(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray,
-                eps: tuple[float, ...]) -> np.ndarray:
+def _join_bands(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray, eps: tuple[float, ...]) -> np.ndarray:
     """Return labels (N,) with clusters joined across neighbouring bands and renumbered in order.
 
     bands holds the indices of each band's points.
@@ -110,8 +110,9 @@ def _number_roots(parent):
     return number
 
 
-def _find_touching_clusters(xyz: np.ndarray, labels: np.ndarray, inner: np.ndarray,
-                            outer: np.ndarray, reach: float) -> np.ndarray:
+def _find_touching_clusters(
+    xyz: np.ndarray, labels: np.ndarray, inner: np.ndarray, outer: np.ndarray, reach: float
+) -> np.ndarray:
     """Return pairs of labels (P, 2) that connect all clusters with points within reach.
 
     inner and outer are the indices of points of two neighbouring bands that may be within reach,
@@ -123,13 +124,13 @@ def _find_touching_clusters(xyz: np.ndarray, labels: np.ndarray, inner: np.ndarr
     side = (np.arange(len(rows)) >= len(inner)).astype(np.int64)
     tree = build_tree(xyz[rows])
     max_work = max_exact_distances(len(rows))
-    pairs, work = find_touching_labels(tree, label[tree.order], side[tree.order], reach * reach,
-                                       max_work)
+    pairs, work = find_touching_labels(tree, label[tree.order], side[tree.order], reach * reach, max_work)
     if work > max_work:
         kept, _ = thin_points(xyz[rows], reach, label)
         tree = build_tree(xyz[rows[kept]])
-        pairs, _ = find_touching_labels(tree, label[kept][tree.order], side[kept][tree.order],
-                                        (reach * (1 + SLACK)) ** 2, np.inf)
+        pairs, _ = find_touching_labels(
+            tree, label[kept][tree.order], side[kept][tree.order], (reach * (1 + SLACK)) ** 2, np.inf
+        )
     return names[pairs]
 
 

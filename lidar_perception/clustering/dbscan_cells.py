@@ -77,7 +77,7 @@ def _find_core_points(x, y, z, start, first, second, eps2, min_samples):
     for c in range(cells):
         size = start[c + 1] - start[c]
         sparse[c] = size < min_samples
-        found[start[c]:start[c + 1]] = size
+        found[start[c] : start[c + 1]] = size
     for p in range(len(first)):
         a, b = first[p], second[p]
         if sparse[a] and sparse[b]:
@@ -160,7 +160,7 @@ def _list_cells(start):
     """Return (N,) the cell of each point, in grid order."""
     cell_of = np.empty(start[-1], np.int32)
     for c in range(len(start) - 1):
-        cell_of[start[c]:start[c + 1]] = c
+        cell_of[start[c] : start[c + 1]] = c
     return cell_of
 
 

@@ -10,9 +10,9 @@ from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.geometry import horizontal_range
 from lidar_perception.types import usable_returns
 
-CELL_DEG = 2.0          # the gap between the beams of a VLP-16
-MAX_SAMPLED = 30_000    # points of a larger cloud that are sampled
-MAX_WIDENING = 4.0      # largest factor by which neighbourhoods widen
+CELL_DEG = 2.0  # the gap between the beams of a VLP-16
+MAX_SAMPLED = 30_000  # points of a larger cloud that are sampled
+MAX_WIDENING = 4.0  # largest factor by which neighbourhoods widen
 MIN_CLUSTER_POINTS = 3  # lower limit of min_size; that of min_samples is one less
 # A widened radius of the local threshold, and a widened eps at the end of its band, in multiples of
 # the distance between neighbouring points on a surface that faces the sensor.
@@ -62,13 +62,20 @@ def adapt_to_density(params: ClusteringParams, density: float) -> ClusteringPara
         params,
         dbscan=replace(
             dbscan,
-            eps=tuple(min(max(eps, SPACINGS_PER_EPS * point_spacing(density) * end), widening * eps)
-                      for eps, end in zip(dbscan.eps, ends)),
-            min_samples=_reduce_count(dbscan.min_samples, widening**2, MIN_CLUSTER_POINTS - 1)),
+            eps=tuple(
+                min(max(eps, SPACINGS_PER_EPS * point_spacing(density) * end), widening * eps)
+                for eps, end in zip(dbscan.eps, ends)
+            ),
+            min_samples=_reduce_count(dbscan.min_samples, widening**2, MIN_CLUSTER_POINTS - 1),
+        ),
         euclidean=replace(
-            euclidean, radius=min(euclidean.radius * widening, 10.0),
-            distance=min(euclidean.distance * widening, 10.0), beta=euclidean.beta / widening,
-            min_size=_reduce_count(euclidean.min_size, widening**2, MIN_CLUSTER_POINTS)))
+            euclidean,
+            radius=min(euclidean.radius * widening, 10.0),
+            distance=min(euclidean.distance * widening, 10.0),
+            beta=euclidean.beta / widening,
+            min_size=_reduce_count(euclidean.min_size, widening**2, MIN_CLUSTER_POINTS),
+        ),
+    )
 
 
 def point_spacing(density: float) -> float:

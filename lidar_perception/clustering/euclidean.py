@@ -45,12 +45,7 @@ from lidar_perception.clustering.cells import (
 from lidar_perception.clustering.curvature import find_consistent_points
 from lidar_perception.clustering.grid import number_clusters
 from lidar_perception.clustering.params import EuclideanParams
-from lidar_perception.clustering.thinning import (
-    MAX_DISTANCES_PER_POINT,
-    SLACK,
-    max_exact_distances,
-    thin_points,
-)
+from lidar_perception.clustering.thinning import MAX_DISTANCES_PER_POINT, SLACK, max_exact_distances, thin_points
 from lidar_perception.clustering.tree import (
     Tree,
     build_tree,
@@ -65,13 +60,17 @@ from lidar_perception.clustering.tree import (
 # to their nearest neighbours.
 SAMPLE_SIZE, FIRST_CELL_MEDIANS = 64, 5
 MAX_BRUTE_FORCE = 20_000_000  # distances; above this number, points are sorted into larger cells
-MAX_WORK = 2**32              # distances per cloud for local thresholds
-MAX_WORK_PER_POINT = 2**15    # distances per point for local thresholds
+MAX_WORK = 2**32  # distances per cloud for local thresholds
+MAX_WORK_PER_POINT = 2**15  # distances per point for local thresholds
 
 
-def cluster_euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
-                      max_distances: int = MAX_DISTANCES_PER_POINT, max_work: int = MAX_WORK,
-                      radii: np.ndarray | None = None) -> np.ndarray:
+def cluster_euclidean(
+    xyz: np.ndarray,
+    params: EuclideanParams = EuclideanParams(),
+    max_distances: int = MAX_DISTANCES_PER_POINT,
+    max_work: int = MAX_WORK,
+    radii: np.ndarray | None = None,
+) -> np.ndarray:
     """Cluster finite points by the adaptive Euclidean method.
 
     Args:
@@ -87,8 +86,7 @@ def cluster_euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams
     if n == 0:
         return np.zeros(0, np.int32)
     xyz = np.ascontiguousarray(xyz, np.float32)
-    radii, max_work = (np.full(n, params.radius) if radii is None else radii,
-                       min(max_work, MAX_WORK_PER_POINT * n))
+    radii, max_work = (np.full(n, params.radius) if radii is None else radii, min(max_work, MAX_WORK_PER_POINT * n))
     if params.threshold == "global":
         mean, cells = _mean_nearest_distance(xyz, max_distances)
         reach = np.full(n, np.float32(params.alpha * mean), np.float64)
@@ -97,22 +95,24 @@ def cluster_euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams
     else:
         cells, reach = sort_into_cells(xyz, float(radii.max())), np.empty(n)
         radii2, exact = radii[cells.order] ** 2, mean_neighbourhood_size(cells) * n <= max_work
-        means = (_mean_distances(cells, radii2) if exact else
-                 _mean_distances_to_sample(cells, sample_cells(cells, max_work), radii2))
+        means = (
+            _mean_distances(cells, radii2)
+            if exact
+            else _mean_distances_to_sample(cells, sample_cells(cells, max_work), radii2)
+        )
         reach[cells.order] = np.float32(params.alpha * means)
     if reach.max() > cells.reach:
         cells = sort_into_cells(xyz, reach.max())
     component, min_points = np.empty(n, np.int32), params.beta * np.log(n)
-    growing = (find_consistent_points(xyz, radii, params.curvature, max_work)
-               if params.curvature else np.ones(n, bool))
+    growing = find_consistent_points(xyz, radii, params.curvature, max_work) if params.curvature else np.ones(n, bool)
     reach2 = reach[cells.order] ** 2
     is_core, left = find_core_points(cells, reach2, min_points, float(max_distances * n))
     component[cells.order], left = _find_components(
-        cells, np.stack([*cells.xyz, reach2], axis=1), is_core & growing[cells.order], left)
+        cells, np.stack([*cells.xyz, reach2], axis=1), is_core & growing[cells.order], left
+    )
     if left < 0:
         tree = build_tree(xyz)
-        component[tree.order] = _find_components_by_tree(tree, reach[tree.order] ** 2, min_points,
-                                                         growing[tree.order])
+        component[tree.order] = _find_components_by_tree(tree, reach[tree.order] ** 2, min_points, growing[tree.order])
     size = np.bincount(component + 1)  # size[0] counts the points without a component
     kept = (component >= 0) & (size[component + 1] >= params.min_size)
     parent, indices = np.arange(len(size), dtype=np.int32), np.arange(n)
@@ -140,7 +140,7 @@ def _mean_nearest_distance(xyz: np.ndarray, max_distances: float) -> tuple[float
             tree = build_tree(xyz)
             squared[tree.order] = find_nearest_distances(tree)[0]
             return np.sqrt(squared).mean(), first
-        waiting = np.flatnonzero(squared > cells.reach ** 2)
+        waiting = np.flatnonzero(squared > cells.reach**2)
         squared[waiting] = np.inf  # a nearer point may lie outside the cells searched
         if len(waiting) * n <= MAX_BRUTE_FORCE:
             squared[waiting] = [_nearest_squared_distance(columns, n, i) for i in waiting]
@@ -234,8 +234,7 @@ def _mean_distances_to_sample(cells, sample, radii2):
     return means
 
 
-def _find_components_by_tree(tree: Tree, reach2: np.ndarray, min_points: float,
-                             growing: np.ndarray) -> np.ndarray:
+def _find_components_by_tree(tree: Tree, reach2: np.ndarray, min_points: float, growing: np.ndarray) -> np.ndarray:
     """Return the result of _find_components in the order of the tree."""
     is_core = find_core_points_in_tree(tree, reach2, min_points)[0] & growing
     max_work = max_exact_distances(len(is_core))
@@ -246,8 +245,9 @@ def _find_components_by_tree(tree: Tree, reach2: np.ndarray, min_points: float,
         np.maximum.at(widest, group, reach2[is_core])
         thinned = build_tree(tree.points[is_core][kept])
         found = np.empty(len(kept), np.int64)
-        found[thinned.order] = find_components(thinned, widest[thinned.order] * (1 + SLACK) ** 2,
-                                               np.ones(len(kept), bool), 0.0, np.inf)[0]
+        found[thinned.order] = find_components(
+            thinned, widest[thinned.order] * (1 + SLACK) ** 2, np.ones(len(kept), bool), 0.0, np.inf
+        )[0]
         component[is_core] = found[group]
     core = find_nearest_core_points(tree, reach2, is_core)[0]
     return np.where(core >= 0, component[core], component)
@@ -264,7 +264,7 @@ def _find_components(cells, points, is_core, work):
     n, start, left = len(points), cells.start, cells.start[1:].copy()
     cell, items, stack = np.empty(n, np.int32), np.arange(n), np.empty(n, np.int64)
     for a in range(len(left)):
-        cell[start[a]:start[a + 1]] = a
+        cell[start[a] : start[a + 1]] = a
         for i in range(start[a + 1] - 1, start[a] - 1, -1):
             if not is_core[i]:
                 left[a] -= 1
@@ -295,9 +295,9 @@ def _find_components(cells, points, is_core, work):
                         for m in range(others[b], start[b + 1]):
                             j = items[m]
                             squared, q = squared_distance(p, points[j]), points[nearest[j]]
-                            if squared <= p[3] and (squared < least[j] or (
-                                    squared == least[j]
-                                    and (p[0], p[1], p[2]) < (q[0], q[1], q[2]))):
+                            if squared <= p[3] and (
+                                squared < least[j] or (squared == least[j] and (p[0], p[1], p[2]) < (q[0], q[1], q[2]))
+                            ):
                                 least[j], nearest[j] = squared, i
             count += 1
     for i in range(n):

@@ -87,7 +87,7 @@ def build_grid(xyz, side, reach):
                     slot = (slot + 1) & mask
                 neighbours[c, k] = other
                 k += 1
-    return order, cell_start[:cells + 1], cell_z[:cells], column_start, neighbours
+    return order, cell_start[: cells + 1], cell_z[:cells], column_start, neighbours
 
 
 @njit(cache=True, nogil=True)

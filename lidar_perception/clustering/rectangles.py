@@ -20,8 +20,9 @@ def _to_sortable(value):
     return value if value >= 0 else -(1 << 31) - value
 
 
-def sort_by_cluster(xyz: np.ndarray, labels: np.ndarray, sizes: np.ndarray
-                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sort_by_cluster(
+    xyz: np.ndarray, labels: np.ndarray, sizes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sort points (N, 3) by cluster, then x, then y, so that their order does not affect the boxes.
 
     Args:
@@ -49,8 +50,7 @@ def _make_keys(xyz, labels, start):
     for i in range(len(xyz)):
         k = labels[i] - 1
         if k >= 0:
-            keys[place[k]] = ((_to_sortable(np.int64(bits[i, 0])) << 32)
-                              + _to_sortable(np.int64(bits[i, 1])))
+            keys[place[k]] = (_to_sortable(np.int64(bits[i, 0])) << 32) + _to_sortable(np.int64(bits[i, 1]))
             place[k] += 1
     return keys
 
@@ -83,8 +83,7 @@ def fit_rectangles(x, y, start, l_shape):
         low_u, high_u, low_v, high_v = _find_spans(hull, cos, sin)
         # In a narrower rectangle all points have the minimum distance to a side.
         if l_shape and min(high_u - low_u, high_v - low_v) > MIN_SIDE_DISTANCE_M:
-            cos, sin = _find_closest_direction(x[begin:end] - x[begin], y[begin:end] - y[begin],
-                                               hull)
+            cos, sin = _find_closest_direction(x[begin:end] - x[begin], y[begin:end] - y[begin], hull)
             low_u, high_u, low_v, high_v = _find_spans(hull, cos, sin)
         u, v = (low_u + high_u) / 2, (low_v + high_v) / 2
         length, width = high_u - low_u, high_v - low_v
@@ -118,7 +117,7 @@ def _convex_hull(x, y):
         if count == 0 or x[i] != corners[0, count - 1] or y[i] != corners[1, count - 1]:
             corners[0, count], corners[1, count] = x[i], y[i]
             count += 1
-    return corners[:, :max(count - 1, 1)]  # the last corner repeats the first
+    return corners[:, : max(count - 1, 1)]  # the last corner repeats the first
 
 
 @njit(cache=True, nogil=True)
@@ -180,8 +179,7 @@ def _find_closest_direction(x, y, hull):
         # Of two opposite sides, the one nearer to the mean has the smaller sum of squares.
         side_u = high_u if 2 * (cos * mean_x + sin * mean_y) > low_u + high_u else low_u
         side_v = high_v if 2 * (cos * mean_y - sin * mean_x) > low_v + high_v else low_v
-        closeness = _compute_closeness(x, y, np.float32(cos), np.float32(sin), np.float32(side_u),
-                                       np.float32(side_v))
+        closeness = _compute_closeness(x, y, np.float32(cos), np.float32(sin), np.float32(side_u), np.float32(side_v))
         if closeness > best:
             best, best_cos, best_sin = closeness, cos, sin
     return best_cos, best_sin

@@ -16,8 +16,7 @@ from lidar_perception.groups import count_clusters
 
 
 @njit(cache=True, nogil=True)
-def find_extents(xyz: np.ndarray, labels: np.ndarray,
-                 count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def find_extents(xyz: np.ndarray, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return low (K, 3), high (K, 3) float32 and sizes (K,) int64 of clusters 1..K = count.
 
     A cluster without points has low = inf, high = -inf.
@@ -106,8 +105,7 @@ def classify_by_diagonal(boxes: np.ndarray) -> np.ndarray:
     diagonal = np.hypot(sides[:, 0], sides[:, 1])  # in float32, so that 6.40 is not above 6.40
     ids = np.full(len(diagonal), -1, np.int32)
     for name in reversed(BY_SIZE):
-        ids[(diagonal >= DETECTED[name].min_diagonal) & (diagonal <= MAX_DIAGONAL)] = CLASSES.index(
-            name)
+        ids[(diagonal >= DETECTED[name].min_diagonal) & (diagonal <= MAX_DIAGONAL)] = CLASSES.index(name)
     return ids
 
 

@@ -24,8 +24,9 @@ def max_exact_distances(count: int) -> float:
     return float(max(MAX_DISTANCES_PER_POINT * count, MIN_DISTANCES))
 
 
-def thin_points(xyz: np.ndarray, reach: np.ndarray | float,
-                kind: np.ndarray | int = 0) -> tuple[np.ndarray, np.ndarray]:
+def thin_points(
+    xyz: np.ndarray, reach: np.ndarray | float, kind: np.ndarray | int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Keep one point per cube and kind.
 
     Args:
@@ -42,7 +43,7 @@ def thin_points(xyz: np.ndarray, reach: np.ndarray | float,
     cubes = np.floor(xyz / (2.0**octave / CUBES_PER_REACH)[:, None])
     keys = np.column_stack([cubes, octave, np.broadcast_to(kind, len(xyz))])
     order = np.lexsort(keys.T)
-    new = np.r_[True, (keys[order][1:] != keys[order][:-1]).any(axis=1)][:len(order)]
+    new = np.r_[True, (keys[order][1:] != keys[order][:-1]).any(axis=1)][: len(order)]
     group = np.empty(len(xyz), np.int64)
     group[order] = np.cumsum(new) - 1
     return order[new], group

@@ -17,8 +17,8 @@ from numba import njit
 
 from lidar_perception.geometry import counting_sort
 
-LEAF_SIZE = 16    # maximum number of points of a leaf
-STACK_SIZE = 64   # maximum number of boxes waiting in a search: the levels plus one
+LEAF_SIZE = 16  # maximum number of points of a leaf
+STACK_SIZE = 64  # maximum number of boxes waiting in a search: the levels plus one
 
 # order (N,) are the points' rows in the input, points (N, 3) their float64 coordinates, both sorted
 # by box. Box 1 holds all points, box k is halved into 2 k and 2 k + 1, and boxes from `leaves` on
@@ -60,8 +60,7 @@ def _partition(points, order, first, last, middle, axis):
     state = np.uint64(0x632BE59BD9B4E019)
     while first < last:
         state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-        pivot = points[first + np.int64((state >> np.uint64(33)) % np.uint64(last - first + 1)),
-                       axis]
+        pivot = points[first + np.int64((state >> np.uint64(33)) % np.uint64(last - first + 1)), axis]
         i, j = first, last
         while i <= j:
             while points[i, axis] < pivot:
@@ -175,8 +174,7 @@ def find_core_points_in_tree(tree, reach2, min_points):
 
 @njit(cache=True, nogil=True)
 def _find_box_maxima(tree, values, selected):
-    """Return each box's largest value among its selected points (-1 without any), and their count.
-    """
+    """Return each box's largest value among its selected points (-1 without any), and their count."""
     largest, left = np.full(2 * tree.leaves, -1.0), np.zeros(2 * tree.leaves, np.int64)
     for k in range(2 * tree.leaves - 1, 0, -1):
         if k < tree.leaves:
@@ -194,7 +192,7 @@ def _find_box_maxima(tree, values, selected):
 def _find_leaves(tree):
     leaf = np.empty(len(tree.points), np.int64)
     for k in range(tree.leaves, 2 * tree.leaves):
-        leaf[tree.begin[k]:tree.end[k]] = k
+        leaf[tree.begin[k] : tree.end[k]] = k
     return leaf
 
 
@@ -237,8 +235,7 @@ def find_components(tree, size, selected, gamma, max_work):
             while waiting:
                 waiting -= 1
                 k = stack[waiting]
-                if left[k] == 0 or not _are_linked(_min_squared_distance(tree, k, p), size[i],
-                                                   largest[k], gamma):
+                if left[k] == 0 or not _are_linked(_min_squared_distance(tree, k, p), size[i], largest[k], gamma):
                     continue
                 if k < tree.leaves:
                     waiting = _push_halves(tree, stack, waiting, k, p)
@@ -246,8 +243,7 @@ def find_components(tree, size, selected, gamma, max_work):
                 for j in range(tree.begin[k], tree.end[k]):
                     if selected[j] and component[j] < 0:
                         work += 1
-                        if _are_linked(squared_distance(p, tree.points[j]), size[i], size[j],
-                                       gamma):
+                        if _are_linked(squared_distance(p, tree.points[j]), size[i], size[j], gamma):
                             component[j], found[last] = count, j
                             last += 1
                             _remove_point(left, k)
@@ -282,8 +278,11 @@ def find_nearest_core_points(tree, reach2, is_core):
             waiting -= 1
             k = stack[waiting]
             squared = _min_squared_distance(tree, k, p)
-            if left[k] == 0 or squared > min(best, largest[k]) or (
-                    squared == best and not _precedes(tree.low[k], tree.points[nearest[i]])):
+            if (
+                left[k] == 0
+                or squared > min(best, largest[k])
+                or (squared == best and not _precedes(tree.low[k], tree.points[nearest[i]]))
+            ):
                 continue
             if k < tree.leaves:
                 waiting = _push_halves(tree, stack, waiting, k, p)
@@ -292,8 +291,9 @@ def find_nearest_core_points(tree, reach2, is_core):
                 if is_core[j]:
                     work += 1
                     squared, q = squared_distance(p, tree.points[j]), tree.points[j]
-                    if squared <= reach2[j] and (squared < best or (
-                            squared == best and _precedes(q, tree.points[nearest[i]]))):
+                    if squared <= reach2[j] and (
+                        squared < best or (squared == best and _precedes(q, tree.points[nearest[i]]))
+                    ):
                         best, nearest[i] = squared, j
     return nearest, work
 
@@ -326,7 +326,7 @@ def find_touching_labels(tree, label, side, reach2, max_work):
         while True:
             if arrived >= 0 and not done[arrived]:
                 done[arrived] = True
-                for m in by_label[start[arrived]:start[arrived + 1]]:
+                for m in by_label[start[arrived] : start[arrived + 1]]:
                     _remove_point(sides[side[m]], leaf[m])
                     queue[last] = m
                     last += 1

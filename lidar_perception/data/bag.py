@@ -45,8 +45,7 @@ __all__ = ["LATCHED_QOS", "SENSOR_QOS", "Bag", "BagHandle", "BagWriter"]
 # A KITTI cloud has 1.9 MB. Chunks of several clouds compress better and are faster to read.
 CHUNK_BYTES = 8 * 2**20
 MAX_SHOWN = 3  # differences between metadata.yaml and the files that a warning lists
-COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4,
-                "none": CompressionType.NONE}
+COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 # mcap always takes level 3 (mcap/writer.py, Writer.__finalize_chunk). Level 1 takes half the time
 # for a cloud and gives about the same size.
 _library: Any = mcap.writer
@@ -92,8 +91,7 @@ class BagWriter:
         check_unused(self.path, self.force)
         if self.path.exists():
             if not (self.path / "metadata.yaml").is_file():
-                raise InputError(f"{self.path} is not a bag and is not overwritten; give another "
-                                 "name")
+                raise InputError(f"{self.path} is not a bag and is not overwritten; give another name")
             refuse_other_files(self.path, ("metadata.yaml", "*.mcap*", "*.db3*"))
 
     def __enter__(self) -> BagWriter:
@@ -114,19 +112,31 @@ class BagWriter:
         try:
             yield
         except OSError as error:
-            raise InputError(f"cannot write the bag {self.path}: {error.strerror or error}; the "
-                             f"messages written so far are in {self.partial}") from None
+            raise InputError(
+                f"cannot write the bag {self.path}: {error.strerror or error}; the "
+                f"messages written so far are in {self.partial}"
+            ) from None
 
     def add_topic(self, topic: str, type_name: str, qos: dict = SENSOR_QOS) -> None:
         definition, _ = load_typestore().generate_msgdef(type_name, ros_version=2)
         schema = self.mcap.register_schema(type_name, "ros2msg", definition.encode())
         profile = [complete_profile(qos)]
         digest = load_typestore().hash_rihs01(type_name)
-        self.channels[topic] = self.mcap.register_channel(topic, "cdr", schema, {
-            "offered_qos_profiles": _to_yaml(profile), "topic_type_hash": digest})
-        self.topics.append({"topic_metadata": {
-            "name": topic, "type": type_name, "serialization_format": "cdr",
-            "offered_qos_profiles": profile, "type_description_hash": digest}, "message_count": 0})
+        self.channels[topic] = self.mcap.register_channel(
+            topic, "cdr", schema, {"offered_qos_profiles": _to_yaml(profile), "topic_type_hash": digest}
+        )
+        self.topics.append(
+            {
+                "topic_metadata": {
+                    "name": topic,
+                    "type": type_name,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": profile,
+                    "type_description_hash": digest,
+                },
+                "message_count": 0,
+            }
+        )
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Append a message: an object of bag_message, or CDR bytes."""
@@ -156,14 +166,24 @@ class BagWriter:
     def _finish(self) -> None:
         start = min(self.times, default=0)
         count = sum(t["message_count"] for t in self.topics)
-        span = {"starting_time": {"nanoseconds_since_epoch": start},
-                "duration": {"nanoseconds": max(self.times, default=0) - start},
-                "message_count": count}
+        span = {
+            "starting_time": {"nanoseconds_since_epoch": start},
+            "duration": {"nanoseconds": max(self.times, default=0) - start},
+            "message_count": count,
+        }
         name = f"{self.path.name}.mcap"
-        info = {"version": 9, "storage_identifier": "mcap", "relative_file_paths": [name], **span,
-                "topics_with_message_count": self.topics, "compression_format": "",
-                "compression_mode": "", "files": [{"path": name, **span}], "custom_data": None,
-                "ros_distro": "jazzy"}
+        info = {
+            "version": 9,
+            "storage_identifier": "mcap",
+            "relative_file_paths": [name],
+            **span,
+            "topics_with_message_count": self.topics,
+            "compression_format": "",
+            "compression_mode": "",
+            "files": [{"path": name, **span}],
+            "custom_data": None,
+            "ros_distro": "jazzy",
+        }
         self.mcap.add_metadata("rosbag2", {"serialized_metadata": _to_yaml(info)})
         self.mcap.finish()
         self.file.sync()
@@ -198,8 +218,7 @@ class Bag:
         self.close: Callable[[], None] = lambda: None
         with ExitStack() as stack:
             metadata = read_metadata(self.path)
-            self.files = [(file, open_file(file, stack))
-                          for file in find_files(self.path, metadata)]
+            self.files = [(file, open_file(file, stack)) for file in find_files(self.path, metadata)]
             self.topics: dict[str, str] = {}
             self.counts: dict[str, int] = {}
             self.unreadable: dict[str, Topic] = {}
@@ -215,9 +234,11 @@ class Bag:
                     self.counts.setdefault(topic, 0)
             if metadata.problems:
                 shown, more = metadata.problems[:MAX_SHOWN], len(metadata.problems) - MAX_SHOWN
-                problems.append(f"{self.path / NAME} does not match the bag: {'; '.join(shown)}"
-                                f"{f', and {more} more' if more > 0 else ''}. The contents of the "
-                                "storage files are used")
+                problems.append(
+                    f"{self.path / NAME} does not match the bag: {'; '.join(shown)}"
+                    f"{f', and {more} more' if more > 0 else ''}. The contents of the "
+                    "storage files are used"
+                )
             for problem in problems if warn else ():
                 warnings.warn(problem, InputWarning, stacklevel=2)
             self.close = stack.pop_all().close
@@ -242,8 +263,10 @@ class Bag:
             self.unreadable.pop(name, None)
             (self.topics[name], self.counts[name]), *others = found.most_common()
             if left_out := [f"{count} of {kind}" for kind, count in others if count]:
-                problems.append(f"{self.path}: {name} has messages of several types; only "
-                                f"{self.topics[name]} is read, not {', '.join(left_out)}")
+                problems.append(
+                    f"{self.path}: {name} has messages of several types; only "
+                    f"{self.topics[name]} is read, not {', '.join(left_out)}"
+                )
         return recorded, problems
 
     def __enter__(self) -> Bag:
@@ -263,30 +286,37 @@ class Bag:
     @property
     def content(self) -> str:
         """Topics with their types, as text."""
-        others = {name: f"{topic.type} as {topic.encoding}"
-                  for name, topic in self.unreadable.items()}
-        return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(
-            {**others, **self.topics}.items())) or "nothing"
+        others = {name: f"{topic.type} as {topic.encoding}" for name, topic in self.unreadable.items()}
+        return ", ".join(f"{topic} ({kind})" for topic, kind in sorted({**others, **self.topics}.items())) or "nothing"
 
     def qos(self, topic: str) -> list[Qos]:
         """Return the recorded QoS profiles of a topic, those of metadata.yaml first; [] if unknown.
 
         People edit metadata.yaml for `ros2 bag play`.
         """
-        return parse_profiles(self._offered.get(topic)) or list(dict.fromkeys(
-            profile for _, file in self.files for each in file.topics if each.name == topic
-            for profile in parse_profiles(each.qos)))
+        return parse_profiles(self._offered.get(topic)) or list(
+            dict.fromkeys(
+                profile
+                for _, file in self.files
+                for each in file.topics
+                if each.name == topic
+                for profile in parse_profiles(each.qos)
+            )
+        )
 
     def require(self, topic: str) -> None:
         """Raise InputError, with the available topics, if the bag lacks a topic."""
         if other := self.unreadable.get(topic):
-            raise InputError(f"{self.path} has {other.type} as {other.encoding} on {topic}; this "
-                             "encoding is not supported: record it with ROS 2")
+            raise InputError(
+                f"{self.path} has {other.type} as {other.encoding} on {topic}; this "
+                "encoding is not supported: record it with ROS 2"
+            )
         if topic not in self.topics:
             raise InputError(f"{self.path} has no topic {topic}; it has {self.content}")
 
-    def raw_messages(self, topics: Iterable[str] | None = None, start_ns: int | None = None,
-                     stop_ns: int | None = None) -> Iterator[tuple[str, int, bytes]]:
+    def raw_messages(
+        self, topics: Iterable[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[tuple[str, int, bytes]]:
         """Yield (topic, time in ns, CDR bytes) in order of time.
 
         Args:
@@ -302,12 +332,17 @@ class Bag:
         return merge_streams(
             (file.times[0], partial(self._read_file, path, file, wanted, start, stop))
             for path, file in self.files
-            if file.times and file.times[0] < stop and start <= file.times[1])
+            if file.times and file.times[0] < stop and start <= file.times[1]
+        )
 
-    def _read_file(self, path: Path, file: StorageFile, wanted: set[str], start: int, stop: int
-                 ) -> Iterator[tuple[str, int, bytes]]:
-        names = {topic.id: topic.name for topic in file.topics if topic.name in wanted
-                 and topic.encoding == "cdr" and topic.type == self.topics[topic.name]}
+    def _read_file(
+        self, path: Path, file: StorageFile, wanted: set[str], start: int, stop: int
+    ) -> Iterator[tuple[str, int, bytes]]:
+        names = {
+            topic.id: topic.name
+            for topic in file.topics
+            if topic.name in wanted and topic.encoding == "cdr" and topic.type == self.topics[topic.name]
+        }
         if not names:
             return
         found = Counter[int]()
@@ -317,8 +352,7 @@ class Bag:
                 yield names[topic_id], time, decompress_message(data)
             for topic in file.topics if start <= self.start_ns and stop == END else ():
                 if topic.id in names and topic.messages != found[topic.id]:
-                    raise ValueError(f"it declares {topic.messages} messages on {topic.name} and "
-                                     f"has {found[topic.id]}")
+                    raise ValueError(f"it declares {topic.messages} messages on {topic.name} and has {found[topic.id]}")
         except Exception as error:  # zstd, struct, SQLite and rosbags raise their own types
             raise InputError(describe_damage(path, error)) from None
 

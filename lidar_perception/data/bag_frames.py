@@ -20,32 +20,12 @@ from lidar_perception.data.bag import Bag, BagHandle
 from lidar_perception.data.bag_metadata import NAME
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.cloud_files import is_cloud
-from lidar_perception.data.frame import (
-    BOXES,
-    CAMERA,
-    POINT_LABELS,
-    POSES,
-    Frame,
-    PointTruth,
-    Recording,
-)
+from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES, Frame, PointTruth, Recording
 from lidar_perception.data.open_storage import list_storage_files
 from lidar_perception.data.recorded_scale import MAX_READ, infer_scale
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
-from lidar_perception.wire.clouds import (
-    CLOUD_TYPES,
-    check_readable,
-    decode_cloud,
-    diagnose_packets,
-    find_cloud_topics,
-)
-from lidar_perception.wire.messages import (
-    read_calibration,
-    read_column,
-    read_raw_intensity,
-    to_point_cloud,
-    to_truth,
-)
+from lidar_perception.wire.clouds import CLOUD_TYPES, check_readable, decode_cloud, diagnose_packets, find_cloud_topics
+from lidar_perception.wire.messages import read_calibration, read_column, read_raw_intensity, to_point_cloud, to_truth
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, INSTANCE, POINTS, SEMANTIC, TRUTH
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import SECOND_NS
@@ -69,19 +49,22 @@ def choose_cloud_topic(bag: Bag, points: str = "") -> str:
     cloud_topics = find_cloud_topics(bag.topics)
     recorded = [topic for topic in cloud_topics if bag.counts[topic]]
     if not points and POINTS not in recorded and len(recorded) > 1:
-        raise InputError(f"{bag.path} has clouds on {', '.join(recorded)}; choose a topic, as in "
-                         f"{bag.path}:{recorded[0]}")
+        raise InputError(
+            f"{bag.path} has clouds on {', '.join(recorded)}; choose a topic, as in {bag.path}:{recorded[0]}"
+        )
     if not points and not cloud_topics:
         others = {name: topic.type for name, topic in bag.unreadable.items()} | bag.topics
-        raise InputError(f"{bag.path} has no sensor_msgs/PointCloud2 and no other clouds: "
-                         + (diagnose_packets(others) or f"it has {bag.content}. Record the cloud "
-                            "topic of the sensor's driver"))
+        raise InputError(
+            f"{bag.path} has no sensor_msgs/PointCloud2 and no other clouds: "
+            + (diagnose_packets(others) or f"it has {bag.content}. Record the cloud topic of the sensor's driver")
+        )
     chosen = points or (recorded[0] if recorded and POINTS not in recorded else POINTS)
     bag.require(chosen)
     if bag.topics[chosen] not in CLOUD_TYPES:
-        raise InputError(f"{bag.path} has {bag.topics[chosen]} on {chosen} instead of clouds; "
-                         + (diagnose_packets({chosen: bag.topics[chosen]})
-                            or f"choose another topic, as in {bag.path}:/points"))
+        raise InputError(
+            f"{bag.path} has {bag.topics[chosen]} on {chosen} instead of clouds; "
+            + (diagnose_packets({chosen: bag.topics[chosen]}) or f"choose another topic, as in {bag.path}:/points")
+        )
     return chosen
 
 
@@ -95,12 +78,12 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     has_point_labels = False
     frames.check_readable()
     with suppress(InputError):  # a damaged cloud is reported when it is read
-        has_point_labels = (frames.first is not None
-                            and frames.decode_labelled(frames.first[1]) is not None)
+        has_point_labels = frames.first is not None and frames.decode_labelled(frames.first[1]) is not None
     has = frozenset(kind for kind, needed in TOPICS_BY_CONTENT.items() if needed <= topics) | {
-        *[POINT_LABELS] * has_point_labels, *[POSES] * frames.poses.available}
-    return Recording(path, f"{bag.layout}, clouds on {points}", frames, has,
-                     has_sensor_height=False, has_times=True)
+        *[POINT_LABELS] * has_point_labels,
+        *[POSES] * frames.poses.available,
+    }
+    return Recording(path, f"{bag.layout}, clouds on {points}", frames, has, has_sensor_height=False, has_times=True)
 
 
 class BagFrames(Sequence):
@@ -111,8 +94,7 @@ class BagFrames(Sequence):
     times of all clouds.
     """
 
-    def __init__(self, handle: BagHandle, points: str, kind: str, count: int,
-                 sensor_height: float = SENSOR_HEIGHT):
+    def __init__(self, handle: BagHandle, points: str, kind: str, count: int, sensor_height: float = SENSOR_HEIGHT):
         self.handle, self.points, self.kind, self.clouds = handle, points, kind, count
         self.path, self.sensor_height = handle.path, sensor_height
 
@@ -200,9 +182,8 @@ class BagFrames(Sequence):
     def files(self) -> tuple[Path, ...]:
         """Storage files of the bag."""
         if self.path.is_file():
-            return self.path,
-        return tuple(sorted(file for file in self.path.iterdir()
-                            if file.is_file() and file.suffix != ".yaml"))
+            return (self.path,)
+        return tuple(sorted(file for file in self.path.iterdir() if file.is_file() and file.suffix != ".yaml"))
 
     @cached_property
     def first(self) -> tuple[int, bytes] | None:
@@ -229,8 +210,7 @@ class BagFrames(Sequence):
 
         It is inferred from the first clouds, as others would require reading the whole bag.
         """
-        return infer_scale(self._first_clouds(),
-                           lambda data: read_raw_intensity(decode_cloud(data, self.kind)))
+        return infer_scale(self._first_clouds(), lambda data: read_raw_intensity(decode_cloud(data, self.kind)))
 
     def _first_clouds(self) -> Iterator[bytes]:
         with suppress(InputError):  # reported when the frame is read
@@ -242,15 +222,22 @@ class BagFrames(Sequence):
         """Poses of the frame_id of the first cloud."""
         return BagPoses(self.handle, _read_frame_id(self.first[1]) if self.first else "")
 
-    def _make_frame(self, i: int, time: int, stamp: int, occurrence: int,
-                    data: Callable[[], bytes]) -> Frame:
+    def _make_frame(self, i: int, time: int, stamp: int, occurrence: int, data: Callable[[], bytes]) -> Frame:
         name = str(stamp) if occurrence == 1 else f"{stamp}-{occurrence}"  # stamps may repeat
-        return Frame(name, stamp, partial(self._load, time, data), partial(self._read_truth, stamp),
-                     point_truth=partial(self._read_point_truth, time, data),
-                     calibration=partial(self._read_calibration, time),
-                     pose=lambda: self.poses(stamp), index=i, sensor_height=self.sensor_height,
-                     files=self.files, native=lambda: decode_cloud(data(), self.kind),
-                     intensity_max=lambda: self.full_scale)
+        return Frame(
+            name,
+            stamp,
+            partial(self._load, time, data),
+            partial(self._read_truth, stamp),
+            point_truth=partial(self._read_point_truth, time, data),
+            calibration=partial(self._read_calibration, time),
+            pose=lambda: self.poses(stamp),
+            index=i,
+            sensor_height=self.sensor_height,
+            files=self.files,
+            native=lambda: decode_cloud(data(), self.kind),
+            intensity_max=lambda: self.full_scale,
+        )
 
     def _load(self, time: int, data: Callable[[], bytes]) -> PointCloud:
         with self._error_context(time):
@@ -302,8 +289,8 @@ def _read_frame_id(data: bytes) -> str:
     """Return header.frame_id of a serialized message; "" if the message is too short."""
     if len(data) < 16:
         return ""
-    size, = struct.unpack_from("<I" if data[1] & 1 else ">I", data, 12)
-    return bytes(data[16:16 + size]).rstrip(b"\0").decode(errors="replace")
+    (size,) = struct.unpack_from("<I" if data[1] & 1 else ">I", data, 12)
+    return bytes(data[16 : 16 + size]).rstrip(b"\0").decode(errors="replace")
 
 
 def _find_latest(messages: list, time: int) -> Any:

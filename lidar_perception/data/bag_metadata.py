@@ -25,12 +25,16 @@ TOLERANCE_NS = 10**6  # between times in metadata.yaml and in the files
 
 # Keys and values of rosbag2. Late subscribers get the last message of a latched topic.
 SENSOR_QOS = dict(history="keep_last", depth=10, reliability="reliable", durability="volatile")
-LATCHED_QOS = dict(history="keep_last", depth=1, reliability="reliable",
-                   durability="transient_local")
+LATCHED_QOS = dict(history="keep_last", depth=1, reliability="reliable", durability="transient_local")
 
 _INFINITE = {"sec": 9223372036, "nsec": 854775807}
-_OTHER_POLICIES = {"deadline": _INFINITE, "lifespan": _INFINITE, "liveliness": "automatic",
-                   "liveliness_lease_duration": _INFINITE, "avoid_ros_namespace_conventions": False}
+_OTHER_POLICIES = {
+    "deadline": _INFINITE,
+    "lifespan": _INFINITE,
+    "liveliness": "automatic",
+    "liveliness_lease_duration": _INFINITE,
+    "avoid_ros_namespace_conventions": False,
+}
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # faster, but optional
 
 
@@ -75,26 +79,23 @@ def read_metadata(folder: Path) -> Metadata:
                 raise ValueError(f"topic {about['name']!r} has the type {about['type']!r}")
             metadata.topics[about["name"]] = about["type"], _read_number(topic, "message_count")
             metadata.qos[about["name"]] = about.get("offered_qos_profiles")
-    except (InputError, yaml.YAMLError, LookupError, TypeError, ValueError,
-            AttributeError) as error:
+    except (InputError, yaml.YAMLError, LookupError, TypeError, ValueError, AttributeError) as error:
         line = " ".join(str(error).split())
         metadata.problems.append(f"it cannot be parsed ({type(error).__name__}: {line})")
     return metadata
 
 
-def add_differences(metadata: Metadata, counts: Mapping[str, int], start_ns: int,
-                    duration_ns: int) -> None:
+def add_differences(metadata: Metadata, counts: Mapping[str, int], start_ns: int, duration_ns: int) -> None:
     """Add each difference to the message counts and times of the files to metadata.problems."""
     for topic, (_, count) in metadata.topics.items():
         if count != counts.get(topic, 0):
-            metadata.problems.append(f"it declares {count} messages on {topic}, the files have "
-                                     f"{counts.get(topic, 0)}")
-    for name, declared, actual in (("start", metadata.start_ns, start_ns),
-                                   ("duration", metadata.duration_ns, duration_ns)):
-        if (any(counts.values()) and declared is not None
-                and abs(declared - actual) > TOLERANCE_NS):
-            metadata.problems.append(f"it declares a {name} of {declared / 1e9:.3f} s instead of "
-                                     f"{actual / 1e9:.3f} s")
+            metadata.problems.append(f"it declares {count} messages on {topic}, the files have {counts.get(topic, 0)}")
+    for name, declared, actual in (
+        ("start", metadata.start_ns, start_ns),
+        ("duration", metadata.duration_ns, duration_ns),
+    ):
+        if any(counts.values()) and declared is not None and abs(declared - actual) > TOLERANCE_NS:
+            metadata.problems.append(f"it declares a {name} of {declared / 1e9:.3f} s instead of {actual / 1e9:.3f} s")
 
 
 def _read_number(tree: Mapping[str, Any], *keys: str) -> int:
@@ -119,9 +120,18 @@ def parse_profiles(profiles: Any) -> list[Qos]:
     try:
         profiles = yaml.safe_load(profiles) if isinstance(profiles, str) else profiles
         # rosbags requires all policies (rosbags/rosbag2/metadata.py, parse_qos).
-        return parse_qos(cast(Any, [
-            {**SENSOR_QOS, **{key: profile[key] for key in SENSOR_QOS
-                              if isinstance(profile.get(key), str | int)}, **_OTHER_POLICIES}
-            for profile in profiles or ()]))
+        return parse_qos(
+            cast(
+                Any,
+                [
+                    {
+                        **SENSOR_QOS,
+                        **{key: profile[key] for key in SENSOR_QOS if isinstance(profile.get(key), str | int)},
+                        **_OTHER_POLICIES,
+                    }
+                    for profile in profiles or ()
+                ],
+            )
+        )
     except (yaml.YAMLError, AttributeError, TypeError, ValueError):
         return []

@@ -15,19 +15,12 @@ from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.robot.transform_tree import MissingTransform, TransformTree
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import ODOMETRY, ODOMETRY_FRAME, TF, TF_STATIC
-from lidar_perception.wire.transforms import (
-    FIXED,
-    MOVING,
-    ODOMETRY_MESSAGE,
-    TF_MESSAGE,
-    add_odometry,
-    add_transforms,
-)
+from lidar_perception.wire.transforms import FIXED, MOVING, ODOMETRY_MESSAGE, TF_MESSAGE, add_odometry, add_transforms
 from msg_utils.markers import MarkedObjects
 
 FILTERED = "/odometry/filtered"  # of robot_localization
 MIN_TF_MESSAGES = 500  # of /tf that are read to find the frames above the sensor
-MAX_POSE_GAP_S = 0.5   # between two poses, before the first and after the last
+MAX_POSE_GAP_S = 0.5  # between two poses, before the first and after the last
 
 
 def choose_odometry_topic(topics: Mapping[str, str]) -> str:
@@ -74,8 +67,9 @@ class BagPoses:
                 return np.tile(np.eye(4), (len(times), 1, 1))
             return self.odometry_poses(times) @ self._sensor_in_odometry_child(times)
         if not self.fixed:
-            raise MissingTransform(f"{self.path} has neither odometry nor a TF in which "
-                                   f"'{self.frame_id}' moves; record one of them")
+            raise MissingTransform(
+                f"{self.path} has neither odometry nor a TF in which '{self.frame_id}' moves; record one of them"
+            )
         return self._tree.lookup_many(self.fixed, self.frame_id, times, MAX_POSE_GAP_S)
 
     @cached_property
@@ -86,8 +80,7 @@ class BagPoses:
     @property
     def needs_no_tf(self) -> bool:
         """True if nodes need no TF, as there are no poses or /odom is the sensor's own odometry."""
-        return not self.available or (self.odometry == ODOMETRY
-                                      and self.odometry_child == self.frame_id)
+        return not self.available or (self.odometry == ODOMETRY and self.odometry_child == self.frame_id)
 
     @cached_property
     def odometry_child(self) -> str:
@@ -102,16 +95,21 @@ class BagPoses:
     @cached_property
     def fixed(self) -> str:
         """TF frame in which the sensor moves; "" if nothing above the sensor moves."""
-        moving = [self._above[i + 1] for i, frame in enumerate(self._above[:-1])
-                  if not self._first_transforms.is_fixed(frame)]
+        moving = [
+            self._above[i + 1] for i, frame in enumerate(self._above[:-1]) if not self._first_transforms.is_fixed(frame)
+        ]
         return ODOMETRY_FRAME if ODOMETRY_FRAME in moving else moving[-1] if moving else ""
 
     def find_mount(self, base: str) -> np.ndarray | None:
         """Return the pose (4, 4) of the sensor in a frame of the robot; None if it is not fixed."""
         base_chain = self._list_parents(base)
         common = next((frame for frame in self._above if frame in base_chain), None)
-        if common is None or not all(map(self._first_transforms.is_fixed, (
-                *self._above[:self._above.index(common)], *base_chain[:base_chain.index(common)]))):
+        if common is None or not all(
+            map(
+                self._first_transforms.is_fixed,
+                (*self._above[: self._above.index(common)], *base_chain[: base_chain.index(common)]),
+            )
+        ):
             return None
         return self._first_transforms.lookup(base, self.frame_id, 0)
 
@@ -143,15 +141,16 @@ class BagPoses:
         Raises:
             InputError: the bag does not connect the two frames.
         """
-        if not len(objects) or not self.frame_id or objects.frame_id.lstrip("/") in (
-                "", self.frame_id):
+        if not len(objects) or not self.frame_id or objects.frame_id.lstrip("/") in ("", self.frame_id):
             return objects
         try:
             pose = self.lookup_frame(objects.frame_id, objects.stamp_ns)
         except MissingTransform as error:
-            raise InputError(f"{self.path}: the boxes on {topic} are in '{objects.frame_id}', the "
-                             f"clouds in '{self.frame_id}': {error}; record TF or odometry "
-                             "too") from None
+            raise InputError(
+                f"{self.path}: the boxes on {topic} are in '{objects.frame_id}', the "
+                f"clouds in '{self.frame_id}': {error}; record TF or odometry "
+                "too"
+            ) from None
         return replace(objects, boxes=transform_boxes(objects.boxes, pose))
 
     def odometry_poses(self, times: np.ndarray) -> np.ndarray:
@@ -185,8 +184,9 @@ class BagPoses:
         for _, _, msg in bag.messages({TF_STATIC} & self.transforms):
             self._add(tree, msg, True)
         for i, (_, _, msg) in enumerate(bag.messages({TF} & self.transforms)):
-            if i >= MIN_TF_MESSAGES and (self.odometry or not all(map(tree.is_fixed, _find_chain(
-                    tree, self.frame_id)))):
+            if i >= MIN_TF_MESSAGES and (
+                self.odometry or not all(map(tree.is_fixed, _find_chain(tree, self.frame_id)))
+            ):
                 break  # for a long time, only wheels may move
             self._add(tree, msg, False)
         return tree
@@ -204,8 +204,9 @@ class BagPoses:
         tree = TransformTree(keeps_all=True)
         above = {*self._above, *self._list_parents(self.odometry_child)}
         for topic, _, msg in self.handle.bag().messages(self.transforms):
-            msg.transforms[:] = [transform for transform in msg.transforms
-                                 if transform.child_frame_id.lstrip("/") in above]
+            msg.transforms[:] = [
+                transform for transform in msg.transforms if transform.child_frame_id.lstrip("/") in above
+            ]
             self._add(tree, msg, topic == TF_STATIC)
         return tree
 

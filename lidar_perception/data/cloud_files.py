@@ -39,8 +39,7 @@ def make_cloud_scale_reader(files: Sequence[Path]) -> Callable[[], float]:
     return make_scale_reader(files, lambda file: read_raw_intensity(to_message(file)))
 
 
-def load_points(file: Path, stamp_ns: int, frame_id: str = "", *,
-                scale: Callable[[], float]) -> PointCloud:
+def load_points(file: Path, stamp_ns: int, frame_id: str = "", *, scale: Callable[[], float]) -> PointCloud:
     """Read the usable points of a file of SUFFIXES.
 
     scale: returns the intensity of a full reflection, see make_cloud_scale_reader.
@@ -63,20 +62,23 @@ def check_range(points: np.ndarray, where: object) -> None:
     far = np.abs(coordinates[np.isfinite(coordinates).all(axis=1)]).max(axis=1, initial=0)
     if len(far) and far.min() > MAX_RANGE / 2:
         x, y = (round(float(points[axis][0]), -3) for axis in "xy")
-        raise InputError(f"{where}: all points are beyond {MAX_RANGE / 1000:g} km, probably in "
-                         f"map coordinates (UTM); subtract an offset, such as {x:.0f} {y:.0f}, "
-                         "from x y and save it again")
+        raise InputError(
+            f"{where}: all points are beyond {MAX_RANGE / 1000:g} km, probably in "
+            f"map coordinates (UTM); subtract an offset, such as {x:.0f} {y:.0f}, "
+            "from x y and save it again"
+        )
 
 
 def to_message(file: Path, stamp_ns: int = 0, frame_id: str = "") -> Any:
     """Read a file as a PointCloud2 of rosbags' class with all its columns."""
     points = read_points(file)
     # PointCloud2 has no 64-bit integers; as float64, times keep their microseconds.
-    kinds = [(name, points.dtype[name].base.str.replace("i8", "f8").replace("u8", "f8"),
-              points.dtype[name].shape) for name in points.dtype.names or ()]
+    kinds = [
+        (name, points.dtype[name].base.str.replace("i8", "f8").replace("u8", "f8"), points.dtype[name].shape)
+        for name in points.dtype.names or ()
+    ]
     try:
-        return from_array(points.astype(kinds), make_header(stamp_ns, frame_id, bag_message),
-                          bag_message)
+        return from_array(points.astype(kinds), make_header(stamp_ns, frame_id, bag_message), bag_message)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
 
@@ -101,9 +103,16 @@ def _rename_columns(points: np.ndarray) -> np.ndarray:
         new_names[new_names.index(synonym)] = "intensity"
     new_names = [name if new_names.count(name) == 1 else old for name, old in zip(new_names, names)]
     fields = [points.dtype.fields[name] for name in names] if points.dtype.fields else []
-    return points.view(np.dtype({"names": new_names, "formats": [field[0] for field in fields],
-                                 "offsets": [field[1] for field in fields],
-                                 "itemsize": points.dtype.itemsize}))
+    return points.view(
+        np.dtype(
+            {
+                "names": new_names,
+                "formats": [field[0] for field in fields],
+                "offsets": [field[1] for field in fields],
+                "itemsize": points.dtype.itemsize,
+            }
+        )
+    )
 
 
 def read_npy(file: Path) -> np.ndarray:
@@ -117,15 +126,28 @@ def read_npy(file: Path) -> np.ndarray:
     """
     try:
         array = np.array(np.load(check_regular(file), mmap_mode="r", allow_pickle=False))
-    except (OSError, ValueError, EOFError, TypeError, LookupError, OverflowError, MemoryError,
-            SyntaxError, TokenError, RecursionError) as error:  # the header is Python source
-        raise InputError(f"{file} is not a readable .npy file ({shorten_error(error)}); save it "
-                         "again with numpy.save") from None
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        TypeError,
+        LookupError,
+        OverflowError,
+        MemoryError,
+        SyntaxError,
+        TokenError,
+        RecursionError,
+    ) as error:  # the header is Python source
+        raise InputError(
+            f"{file} is not a readable .npy file ({shorten_error(error)}); save it again with numpy.save"
+        ) from None
     if array.dtype.names:
         return array.reshape(-1)
     if array.ndim != 2 or not 3 <= array.shape[1] <= MAX_COLUMNS or array.dtype.kind != "f":
-        raise InputError(f"{file} has an array {array.shape} of {array.dtype}; expected (N, 3) "
-                         "x y z or (N, 4) x y z intensity as float32")
+        raise InputError(
+            f"{file} has an array {array.shape} of {array.dtype}; expected (N, 3) "
+            "x y z or (N, 4) x y z intensity as float32"
+        )
     kind = np.float64 if array.dtype.itemsize == 8 else np.float32
     return _to_structured(array[:, :4].astype(kind), KITTI)
 
@@ -142,17 +164,23 @@ def _read_bin(file: Path) -> np.ndarray:
     cloud = read_records(file, KITTI)
     intensity = cloud[:SAMPLE_SIZE, 3]
     if np.count_nonzero(intensity < 0) > MAX_NEGATIVE_SHARE * len(intensity):
-        raise InputError(f"{file} does not have the columns {KITTI} or {SWEEP} as float32: many "
-                         "intensities would be negative; save it as .pcd, which names its columns")
+        raise InputError(
+            f"{file} does not have the columns {KITTI} or {SWEEP} as float32: many "
+            "intensities would be negative; save it as .pcd, which names its columns"
+        )
     return _to_structured(cloud, KITTI)
 
 
 def _to_structured(cloud: np.ndarray, columns: str) -> np.ndarray:
     """View an array (N, C) as (N,) with named columns; surplus names are ignored."""
-    names = columns.split()[:cloud.shape[1]]
+    names = columns.split()[: cloud.shape[1]]
     return np.ascontiguousarray(cloud).view([(name, cloud.dtype) for name in names]).reshape(-1)
 
 
 READERS: dict[str, Callable[[Path], np.ndarray]] = {
-    ".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy, ".bin": _read_bin}
+    ".pcd": read_pcd,
+    ".ply": read_ply,
+    ".npy": read_npy,
+    ".bin": _read_bin,
+}
 SUFFIXES = tuple(READERS)

@@ -9,12 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.data.cloud_files import (
-    is_cloud,
-    load_points,
-    make_cloud_scale_reader,
-    to_message,
-)
+from lidar_perception.data.cloud_files import is_cloud, load_points, make_cloud_scale_reader, to_message
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS
 
@@ -28,8 +23,9 @@ def list_cloud_files(path: Path) -> list[Path]:
     files = [file for file in ([path] if path.is_file() else path.glob("*")) if is_cloud(file)]
     if stamps := _parse_stamps(files):
         return [file for _, file in sorted(zip(stamps, files))]
-    return sorted(files, key=lambda file: [
-        (int(part or -1), text) for text, part in re.findall(r"(\D*)(\d*)", file.name)])
+    return sorted(
+        files, key=lambda file: [(int(part or -1), text) for text, part in re.findall(r"(\D*)(\d*)", file.name)]
+    )
 
 
 def is_layout(path: Path) -> bool:
@@ -51,12 +47,24 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     stamps = times or [START_NS + i * PERIOD_NS for i in range(len(files))]
     kinds = " and ".join(sorted({file.suffix.lower() for file in files}))
     scale = make_cloud_scale_reader(files)
-    return Recording(path, f"{kinds} clouds, {'times' if times else 'no times'} in file names",
-                     [Frame(name, stamp, partial(load_points, file, stamp, scale=scale), index=i,
-                            points=file, native=partial(to_message, file, stamp),
-                            intensity_max=scale)
-                      for i, (name, stamp, file) in enumerate(zip(names, stamps, files))],
-                     has_sensor_height=False, has_times=bool(times))
+    return Recording(
+        path,
+        f"{kinds} clouds, {'times' if times else 'no times'} in file names",
+        [
+            Frame(
+                name,
+                stamp,
+                partial(load_points, file, stamp, scale=scale),
+                index=i,
+                points=file,
+                native=partial(to_message, file, stamp),
+                intensity_max=scale,
+            )
+            for i, (name, stamp, file) in enumerate(zip(names, stamps, files))
+        ],
+        has_sensor_height=False,
+        has_times=bool(times),
+    )
 
 
 def parse_times(files: list[Path]) -> list[int]:
@@ -75,8 +83,11 @@ def _parse_stamps(files: list[Path]) -> list[int]:
     # Until perception_pcl 2.6.2, pointcloud_to_pcd wrote SECONDS.NANOSECONDS without leading zeros:
     # https://github.com/ros-perception/perception_pcl/pull/481
     shorter = [f for f in fractions if len(f) < NANOSECOND_DIGITS]
-    if not shorter or len(shorter) == len(fractions) or any(
-            (f.startswith("0") and f != "0") or len(f) > NANOSECOND_DIGITS for f in fractions):
+    if (
+        not shorter
+        or len(shorter) == len(fractions)
+        or any((f.startswith("0") and f != "0") or len(f) > NANOSECOND_DIGITS for f in fractions)
+    ):
         return as_decimals
     as_nanoseconds = [whole + int(fraction or 0) for whole, fraction in parts]
     spreads = [np.ptp(np.diff(sorted(stamps))) for stamps in (as_decimals, as_nanoseconds)]
@@ -91,7 +102,11 @@ def _split_name(file: Path) -> tuple[int, str] | None:
     None if it is not a time; frames of KITTI's raw drives also have ten digits, but start with 0.
     """
     whole, _, fraction = file.name.removesuffix(file.suffix).partition(".")
-    if not whole.isdecimal() or whole[0] == "0" or len(whole) not in UNIT_NS_BY_DIGITS or (
-            fraction and (len(whole) != 10 or not fraction.isdecimal())):
+    if (
+        not whole.isdecimal()
+        or whole[0] == "0"
+        or len(whole) not in UNIT_NS_BY_DIGITS
+        or (fraction and (len(whole) != 10 or not fraction.isdecimal()))
+    ):
         return None
     return int(whole) * UNIT_NS_BY_DIGITS[len(whole)], fraction

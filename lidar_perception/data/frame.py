@@ -89,11 +89,22 @@ class Frame:
         return replace(self, load=cache(self.load))
 
     @staticmethod
-    def of(name: str, scan: PointCloud, truth: GroundTruth | None = None,
-           calibration: Calibration | None = None, **more: Any) -> Frame:
+    def of(
+        name: str,
+        scan: PointCloud,
+        truth: GroundTruth | None = None,
+        calibration: Calibration | None = None,
+        **more: Any,
+    ) -> Frame:
         """Make a frame from data in memory."""
-        return Frame(name, scan.stamp_ns, partial(_identity, scan), partial(_identity, truth),
-                     calibration=partial(_identity, calibration), **more)
+        return Frame(
+            name,
+            scan.stamp_ns,
+            partial(_identity, scan),
+            partial(_identity, truth),
+            calibration=partial(_identity, calibration),
+            **more,
+        )
 
 
 def read_frame_id(frames: Sequence[Frame]) -> str:
@@ -171,17 +182,17 @@ class Recording:
     def require(self, content: str, verb: str) -> None:
         """Raise InputError if no frame has a content such as BOXES, which `verb` needs."""
         if content not in self.has:
-            raise InputError(f"{self.path} ({self.layout}) has no {content.removeprefix('a ')}, "
-                             f"which {verb} needs")
+            raise InputError(f"{self.path} ({self.layout}) has no {content.removeprefix('a ')}, which {verb} needs")
 
     def select(self, names: Sequence[str]) -> Recording:
         """Return the frames with these names, in this order. InputError for unknown names."""
         numbers = {frame.name: i for i, frame in enumerate(self.frames)}
         if unknown := [name for name in names if name not in numbers]:
-            raise InputError(f"{self.path} has no frame {unknown[0]} ({len(unknown)} unknown); its "
-                             f"first is {next(iter(numbers), 'none')}")
-        return replace(self, frames=[self.frames[numbers[name]] for name in names],
-                       missing_scans=())
+            raise InputError(
+                f"{self.path} has no frame {unknown[0]} ({len(unknown)} unknown); its "
+                f"first is {next(iter(numbers), 'none')}"
+            )
+        return replace(self, frames=[self.frames[numbers[name]] for name in names], missing_scans=())
 
 
 def is_same_drive(previous_ns: int, stamp_ns: int) -> bool:

@@ -63,9 +63,13 @@ def level_frame(frame: Frame, mount: SensorMount, poses: PoseLookup | None = Non
 
     def load() -> PointCloud:
         scan = read()[1]
-        return scan if rotation is None else replace(
-            scan, xyz=transform_points(scan.xyz, rotation),
-            frame_id=f"{scan.frame_id or LIDAR_FRAME}_level")
+        return (
+            scan
+            if rotation is None
+            else replace(
+                scan, xyz=transform_points(scan.xyz, rotation), frame_id=f"{scan.frame_id or LIDAR_FRAME}_level"
+            )
+        )
 
     def point_truth() -> PointTruth | None:
         labels = frame.point_truth()
@@ -76,18 +80,29 @@ def level_frame(frame: Frame, mount: SensorMount, poses: PoseLookup | None = Non
 
     def truth() -> GroundTruth | None:
         labels = frame.truth()
-        return labels if labels is None or rotation is None else replace(
-            labels, boxes=transform_boxes(labels.boxes, rotation))
+        return (
+            labels
+            if labels is None or rotation is None
+            else replace(labels, boxes=transform_boxes(labels.boxes, rotation))
+        )
 
     def calibration() -> Calibration | None:
         camera = frame.calibration()
-        return None if camera is None else replace(
-            camera, lidar_to_camera=camera.lidar_to_camera @ inverse_rotation)
+        return None if camera is None else replace(camera, lidar_to_camera=camera.lidar_to_camera @ inverse_rotation)
 
     def pose() -> np.ndarray | None:
         sensor_pose = frame.pose()
         return None if sensor_pose is None else sensor_pose @ inverse_rotation
 
     height = frame.sensor_height if mount.height is None else mount.height
-    return replace(frame, load=load, truth=truth, point_truth=point_truth, calibration=calibration,
-                   pose=pose, sensor_height=height, points=None, native=None)
+    return replace(
+        frame,
+        load=load,
+        truth=truth,
+        point_truth=point_truth,
+        calibration=calibration,
+        pose=pose,
+        sensor_height=height,
+        points=None,
+        native=None,
+    )

@@ -29,12 +29,12 @@ MESSAGE_INDEX, CHUNK_INDEX, DATA_END = 7, 8, 15
 HEAD_BYTES = 64  # that are read of a record before its content
 RECORD = struct.Struct("<BQ")  # kind of a record, and number of bytes that follow
 FOOTER_BYTES = RECORD.size + 20
-NO_INDEX = (RECORD.pack(DATA_END, 4) + bytes(4) + RECORD.pack(FOOTER, 20) + bytes(20)
-            + MAGIC)  # end of a file without an index
+NO_INDEX = (
+    RECORD.pack(DATA_END, 4) + bytes(4) + RECORD.pack(FOOTER, 20) + bytes(20) + MAGIC
+)  # end of a file without an index
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, number, log time, publish time
 ENTRY_BYTES = 16  # per message in a message index
-LOCATION = np.dtype([("time", np.int64), ("channel", np.uint16), ("at", np.int64),
-                     ("bytes", np.int64)])
+LOCATION = np.dtype([("time", np.int64), ("channel", np.uint16), ("at", np.int64), ("bytes", np.int64)])
 
 
 @dataclass
@@ -95,10 +95,12 @@ class McapFile:
         sources: list[tuple[int, Callable[[], Stream]]] = [
             (chunk.start, partial(self._messages_in_chunk, chunk, wanted, start, stop))
             for chunk in self.chunks
-            if chunk.start < stop and start <= chunk.end and not wanted.isdisjoint(chunk.counts)]
+            if chunk.start < stop and start <= chunk.end and not wanted.isdisjoint(chunk.counts)
+        ]
         if len(self.locations):
-            sources.append((int(self.locations["time"][0]),
-                            partial(self._messages_outside_chunks, wanted, start, stop)))
+            sources.append(
+                (int(self.locations["time"][0]), partial(self._messages_outside_chunks, wanted, start, stop))
+            )
         return merge_streams(sources)
 
     def _messages_in_chunk(self, chunk: Chunk, wanted: set[int], start: int, stop: int) -> Stream:
@@ -128,8 +130,12 @@ class McapFile:
         size = os.fstat(self.file.fileno()).st_size
         end = size - len(MAGIC) - FOOTER_BYTES
         footer = self._read(max(end, 0), FOOTER_BYTES + len(MAGIC))
-        if self._read(0, len(MAGIC)) != MAGIC or end < len(MAGIC) or not footer.endswith(MAGIC) \
-                or RECORD.unpack_from(footer) != (FOOTER, 20):
+        if (
+            self._read(0, len(MAGIC)) != MAGIC
+            or end < len(MAGIC)
+            or not footer.endswith(MAGIC)
+            or RECORD.unpack_from(footer) != (FOOTER, 20)
+        ):
             raise ValueError("the footer is missing")
         summary_at, _, checksum = struct.unpack_from("<QQI", footer, RECORD.size)
         if summary_at == 0:
@@ -137,7 +143,7 @@ class McapFile:
         if not len(MAGIC) <= summary_at <= end:
             raise ValueError("the index is outside the file")
         summary = self._read(summary_at, end - summary_at)
-        if checksum and crc32(footer[:FOOTER_BYTES - 4], crc32(summary)) != checksum:
+        if checksum and crc32(footer[: FOOTER_BYTES - 4], crc32(summary)) != checksum:
             raise ValueError("the checksum of the index is wrong")
         return summary_at, end, summary
 
@@ -154,8 +160,7 @@ class McapFile:
                 self.profile = _parse_string(self._read(at, length), 0)[0].decode(errors="replace")
             elif kind == MESSAGE:
                 channel, _, time, _ = MESSAGE_HEAD.unpack(self._read(at, MESSAGE_HEAD.size))
-                locations.append((_check_time(time), channel, at + MESSAGE_HEAD.size,
-                                  length - MESSAGE_HEAD.size))
+                locations.append((_check_time(time), channel, at + MESSAGE_HEAD.size, length - MESSAGE_HEAD.size))
             elif kind == CHUNK:
                 self.chunks.append(_parse_chunk(self._read(at, HEAD_BYTES), at, length))
             elif kind == MESSAGE_INDEX and self.chunks:
@@ -175,9 +180,9 @@ class McapFile:
         indexed = []
         for kind, at, length in _iterate_records(partial(_slice, summary), 0, len(summary)):
             if kind in (SCHEMA, CHANNEL):
-                self._add_definition(kind, summary[at:at + length])
+                self._add_definition(kind, summary[at : at + length])
             elif kind == CHUNK_INDEX:
-                indexed.append(_parse_chunk_index(summary[at:at + length]))
+                indexed.append(_parse_chunk_index(summary[at : at + length]))
         if indexed and sorted(indexed) != sorted(chunk.index_entry for chunk in self.chunks):
             raise ValueError("the index does not match the data")
 
@@ -211,9 +216,9 @@ class McapFile:
         data, counts = self._read_chunk(chunk), dict[int, int]()
         for kind, at, length in _iterate_records(partial(_slice, data), 0, len(data)):
             if kind in (SCHEMA, CHANNEL):
-                self._add_definition(kind, data[at:at + length])
+                self._add_definition(kind, data[at : at + length])
             elif kind == MESSAGE:
-                channel, = struct.unpack_from("<H", data, at)
+                (channel,) = struct.unpack_from("<H", data, at)
                 counts[channel] = counts.get(channel, 0) + 1
         chunk.counts = chunk.counts or counts
 
@@ -230,10 +235,17 @@ class McapFile:
         for chunk in self.chunks:
             for channel, count in chunk.counts.items():
                 counts[channel] = counts.get(channel, 0) + count
-        return [Topic(number, channel.topic, getattr(self.schemas.get(channel.schema_id), "name",
-                                                     ""),
-                      channel.message_encoding, channel.metadata.get("offered_qos_profiles", ""),
-                      counts.get(number, 0)) for number, channel in sorted(self.channels.items())]
+        return [
+            Topic(
+                number,
+                channel.topic,
+                getattr(self.schemas.get(channel.schema_id), "name", ""),
+                channel.message_encoding,
+                channel.metadata.get("offered_qos_profiles", ""),
+                counts.get(number, 0),
+            )
+            for number, channel in sorted(self.channels.items())
+        ]
 
     def _find_times(self) -> tuple[int, int] | None:
         spans = [(chunk.start, chunk.end) for chunk in self.chunks if chunk.counts]
@@ -242,8 +254,7 @@ class McapFile:
         return (min(s for s, _ in spans), max(e for _, e in spans)) if spans else None
 
 
-def _iterate_records(read: Callable[[int, int], bytes], at: int, end: int
-                     ) -> Iterator[tuple[int, int, int]]:
+def _iterate_records(read: Callable[[int, int], bytes], at: int, end: int) -> Iterator[tuple[int, int, int]]:
     """Yield the kind, the offset of the content, and the length of each record.
 
     Raises ValueError if the last one extends beyond `end`.
@@ -258,20 +269,24 @@ def _iterate_records(read: Callable[[int, int], bytes], at: int, end: int
 
 
 def _slice(data: bytes, at: int, size: int) -> bytes:
-    return data[at:at + size]
+    return data[at : at + size]
 
 
 def _parse_chunk(head: bytes, at: int, length: int) -> Chunk:
     """Parse the head of a chunk, whose content has `length` bytes and starts at `at`."""
     start, end, size, crc = struct.unpack_from("<QQQI", head)
     compression, sizes = _parse_string(head, 28)
-    compressed_size, = struct.unpack_from("<Q", head, sizes)
+    (compressed_size,) = struct.unpack_from("<Q", head, sizes)
     if size > MAX_BYTES:
-        raise ValueError(f"a chunk declares a decompressed size of {size} bytes; at most "
-                         f"{MAX_BYTES} are allowed")
+        raise ValueError(f"a chunk declares a decompressed size of {size} bytes; at most {MAX_BYTES} are allowed")
     begin, total = at - RECORD.size, RECORD.size + length
-    return Chunk((begin, total, start, end, compression, compressed_size, size),
-                 _check_time(start), _check_time(end), at + sizes + 8, crc)
+    return Chunk(
+        (begin, total, start, end, compression, compressed_size, size),
+        _check_time(start),
+        _check_time(end),
+        at + sizes + 8,
+        crc,
+    )
 
 
 def _parse_chunk_index(record: bytes) -> tuple[int, int, int, int, bytes, int, int]:
@@ -293,5 +308,5 @@ def _check_time(time: int) -> int:
 
 def _parse_string(record: bytes, at: int) -> tuple[bytes, int]:
     """Parse a string; return it and the offset of its end."""
-    length, = struct.unpack_from("<I", record, at)
-    return record[at + 4:at + 4 + length], at + 4 + length
+    (length,) = struct.unpack_from("<I", record, at)
+    return record[at + 4 : at + 4 + length], at + 4 + length

@@ -15,18 +15,17 @@ from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
 # The floor is fitted beyond the vehicle, and close enough for one plane.
 MIN_RANGE_M, MAX_RANGE_M = 2.5, 12.0
-CELL_M = 0.5                # size of a cell of the grid, of which the lowest point counts
+CELL_M = 0.5  # size of a cell of the grid, of which the lowest point counts
 FLOOR_PLANE = ThresholdParams(max_slope=10.0)
 STEEP_FLOOR_PLANE = ThresholdParams(max_slope=30.0)  # for a sensor that leans
 MIN_CELLS = 10
-MIN_FLOOR_SHARE = 0.25      # minimum share of the cells whose lowest point must be on the plane
-FIRST_CLOUDS = 3            # number of clouds of a recording that are checked
-HEIGHT_TOLERANCE_M = 0.25   # between the parameter and the measured height
-MAX_LEAN_DEG = 5.0          # slope of roads
+MIN_FLOOR_SHARE = 0.25  # minimum share of the cells whose lowest point must be on the plane
+FIRST_CLOUDS = 3  # number of clouds of a recording that are checked
+HEIGHT_TOLERANCE_M = 0.25  # between the parameter and the measured height
+MAX_LEAN_DEG = 5.0  # slope of roads
 
 
-def measure_sensor_height(xyz: np.ndarray,
-                          pose: SensorPoseParams = SensorPoseParams()) -> float | None:
+def measure_sensor_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPoseParams()) -> float | None:
     """Measure the height of the sensor above the ground around it, in metres.
 
     The ground is the plane through most of the lowest points of the cells of a grid, so that dense
@@ -42,10 +41,14 @@ def find_height_problem(measured: float | None, pose: SensorPoseParams) -> str |
     if measured is None or abs(measured - pose.height) <= HEIGHT_TOLERANCE_M:
         return None
     if measured < 0:
-        return (f"the ground seems to be {-measured:.2f} m above the sensor; if it is mounted "
-                "upside down, set ground.sensor_pose.roll to 3.1416")
-    return (f"the sensor is {measured:.2f} m above the ground but ground.sensor_pose.height is "
-            f"{pose.height:g}; set it to {measured:.2f}")
+        return (
+            f"the ground seems to be {-measured:.2f} m above the sensor; if it is mounted "
+            "upside down, set ground.sensor_pose.roll to 3.1416"
+        )
+    return (
+        f"the sensor is {measured:.2f} m above the ground but ground.sensor_pose.height is "
+        f"{pose.height:g}; set it to {measured:.2f}"
+    )
 
 
 def load_first_clouds(recording: Recording) -> list[PointCloud]:
@@ -85,10 +88,15 @@ def find_mount_problem(recording: Recording, clouds: Sequence[PointCloud]) -> st
     lean = float(np.median(np.degrees(np.arctan(np.hypot(*floors[:, :2].T)))))
     if height >= 0 and lean <= MAX_LEAN_DEG:
         return None
-    finding = (f"its sensor leans by {lean:.0f} degrees against the ground" if height >= 0 else
-               f"the ground seems to be {-height:.2f} m above its sensor: it is upside down")
-    return (f"{finding}, where detectors take z as up; measure it with setup, and make a level bag "
-            f"with convert {recording.path} --robot robot/robot.param.yaml --out level.bag")
+    finding = (
+        f"its sensor leans by {lean:.0f} degrees against the ground"
+        if height >= 0
+        else f"the ground seems to be {-height:.2f} m above its sensor: it is upside down"
+    )
+    return (
+        f"{finding}, where detectors take z as up; measure it with setup, and make a level bag "
+        f"with convert {recording.path} --robot robot/robot.param.yaml --out level.bag"
+    )
 
 
 def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.ndarray | None:
@@ -116,8 +124,8 @@ def _find_lowest_points(xyz: np.ndarray) -> np.ndarray:
     return near[lowest[np.unique(cell[lowest], return_index=True)[1]]]
 
 
-def _find_floors(clouds: Sequence[PointCloud],
-                 params: ThresholdParams = FLOOR_PLANE) -> np.ndarray:
+def _find_floors(clouds: Sequence[PointCloud], params: ThresholdParams = FLOOR_PLANE) -> np.ndarray:
     """Return the planes (K, 3) of the clouds that have a floor."""
-    return np.array([plane for cloud in clouds if len(cloud)
-                     if (plane := _find_floor(cloud.xyz, params)) is not None]).reshape(-1, 3)
+    return np.array(
+        [plane for cloud in clouds if len(cloud) if (plane := _find_floor(cloud.xyz, params)) is not None]
+    ).reshape(-1, 3)

@@ -34,22 +34,26 @@ LAYOUTS = {
     nuscenes: "nuScenes (v1.0-*/ and samples/)",
     cloud_folder: "",
 }
-PACKETS = ("sensor packets", "play it to the driver of the sensor and record its cloud topic in a "
-           "bag")
-LIVOX_VIEWER = ("Livox Viewer", "convert it to a bag with livox_ros_driver's lvx_to_rosbag.launch, "
-                "or export PCD files in Livox Viewer")
+PACKETS = ("sensor packets", "play it to the driver of the sensor and record its cloud topic in a bag")
+LIVOX_VIEWER = (
+    "Livox Viewer",
+    "convert it to a bag with livox_ros_driver's lvx_to_rosbag.launch, or export PCD files in Livox Viewer",
+)
 # Name and converter of unsupported formats, by their suffixes.
 CONVERTERS = {
     ".las": ("LAS", "convert it with PDAL: pdal translate IN.las OUT.pcd"),
     ".laz": ("LAZ", "convert it with PDAL: pdal translate IN.laz OUT.pcd"),
     ".e57": ("E57", "convert it with PDAL: pdal translate IN.e57 OUT.pcd"),
     ".tfrecord": ("Waymo", "convert it to KITTI with waymo_kitti_converter or mmdetection3d"),
-    ".parquet": ("Waymo (version 2)", "convert it to KITTI with waymo_kitti_converter or "
-                 "mmdetection3d"),
-    ".feather": ("Argoverse 2", "read the sweeps with av2 (av2.utils.io.read_lidar_sweep) and save "
-                 "x y z intensity with numpy.save"),
-    ".pcap": PACKETS, ".pcapng": PACKETS,
-    ".lvx": LIVOX_VIEWER, ".lvx2": LIVOX_VIEWER,
+    ".parquet": ("Waymo (version 2)", "convert it to KITTI with waymo_kitti_converter or mmdetection3d"),
+    ".feather": (
+        "Argoverse 2",
+        "read the sweeps with av2 (av2.utils.io.read_lidar_sweep) and save x y z intensity with numpy.save",
+    ),
+    ".pcap": PACKETS,
+    ".pcapng": PACKETS,
+    ".lvx": LIVOX_VIEWER,
+    ".lvx2": LIVOX_VIEWER,
     ".osf": ("Ouster OSF", "convert it with ouster-cli: ouster-cli source IN.osf save OUT.pcd"),
 }
 MAX_FILES = 10_000  # of a folder that are searched for these suffixes
@@ -62,8 +66,14 @@ MAX_DEPTH = 3  # of an opened folder below the file, as of training/velodyne/000
 MAX_HEIGHT_M = 50.0
 
 
-def open_recording(path: str | Path, *, split: str | Path | None = None, points: str = "",
-                   scans: bool = True, sensor_height: float | None = None) -> Recording:
+def open_recording(
+    path: str | Path,
+    *,
+    split: str | Path | None = None,
+    points: str = "",
+    scans: bool = True,
+    sensor_height: float | None = None,
+) -> Recording:
     """Open a bag, a data set or point cloud files.
 
     Args:
@@ -92,20 +102,26 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
         sensor_height = read_height(path)
     if sensor_height is not None:
         frames = recording.frames
-        recording = replace(recording, has_sensor_height=True, frames=(
-            frames.with_sensor_height(sensor_height) if isinstance(frames, bag_frames.BagFrames)
-            else [replace(frame, sensor_height=sensor_height) for frame in frames]))
-    recording = replace(recording, reopen=partial(
-        open_recording, path, split=split, points=points, scans=scans,
-        sensor_height=sensor_height))
+        recording = replace(
+            recording,
+            has_sensor_height=True,
+            frames=(
+                frames.with_sensor_height(sensor_height)
+                if isinstance(frames, bag_frames.BagFrames)
+                else [replace(frame, sensor_height=sensor_height) for frame in frames]
+            ),
+        )
+    recording = replace(
+        recording,
+        reopen=partial(open_recording, path, split=split, points=points, scans=scans, sensor_height=sensor_height),
+    )
     return recording if split is None else _select_split(recording, Path(split))
 
 
 def describe_formats() -> str:
     """Return the list of supported formats, for error messages."""
     *folders, last = filter(None, LAYOUTS.values())
-    return (f"expected a rosbag2 bag, or the folder of {', '.join(folders)} or {last}, or "
-            f"{', '.join(SUFFIXES)} files")
+    return f"expected a rosbag2 bag, or the folder of {', '.join(folders)} or {last}, or {', '.join(SUFFIXES)} files"
 
 
 def find_layout(path: Path) -> ModuleType | None:
@@ -120,8 +136,7 @@ def find_layout(path: Path) -> ModuleType | None:
     for file in [path] if path.is_file() else islice(path.rglob("*"), MAX_FILES):
         if file.suffix.lower() in CONVERTERS:
             name, remedy = CONVERTERS[file.suffix.lower()]
-            raise InputError(f"{path} is in the format {name} ({file.name}), which is not "
-                             f"supported; {remedy}")
+            raise InputError(f"{path} is in the format {name} ({file.name}), which is not supported; {remedy}")
     return None
 
 
@@ -149,8 +164,10 @@ def _select_split(recording: Recording, split: Path) -> Recording:
         chosen.update(dict.fromkeys(found))
         unknown += [] if found else [name]
     if unknown:
-        raise InputError(f"{split} names {unknown[0]} ({len(unknown)} unknown), which is not in "
-                         f"{recording.path}; its first frame is {first}")
+        raise InputError(
+            f"{split} names {unknown[0]} ({len(unknown)} unknown), which is not in "
+            f"{recording.path}; its first frame is {first}"
+        )
     return recording.select(list(chosen))
 
 

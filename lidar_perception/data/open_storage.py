@@ -35,8 +35,7 @@ def list_storage_files(folder: Path) -> list[Path]:
     """Return the storage files in a folder by name; [] if there is no such folder."""
     if not folder.is_dir():
         return []
-    return sorted(file for file in folder.iterdir()
-                  if _suffix(file) in FORMATS and not file.is_dir())
+    return sorted(file for file in folder.iterdir() if _suffix(file) in FORMATS and not file.is_dir())
 
 
 def find_files(path: Path, metadata: Metadata) -> list[Path]:
@@ -51,26 +50,31 @@ def find_files(path: Path, metadata: Metadata) -> list[Path]:
     if not path.is_dir():
         return [check_regular(path)]
     if metadata.compression not in ("", "zstd"):
-        raise InputError(f"{path} is compressed by {metadata.compression}, which is not "
-                         "supported; decompress it with 'ros2 bag convert'")
+        raise InputError(
+            f"{path} is compressed by {metadata.compression}, which is not "
+            "supported; decompress it with 'ros2 bag convert'"
+        )
     for file in path.iterdir():
         check_regular(file)
     found = list_storage_files(path)
     if not (path / NAME).exists():
         if len(found) == 1 or (found and _are_parts_of_one_bag(found)):
             return found
-        raise InputError(f"{path} is not a rosbag2 bag: it has no metadata.yaml and {len(found)} "
-                         "storage files; run 'ros2 bag reindex' or give one .mcap file")
+        raise InputError(
+            f"{path} is not a rosbag2 bag: it has no metadata.yaml and {len(found)} "
+            "storage files; run 'ros2 bag reindex' or give one .mcap file"
+        )
     missing = [name for name in metadata.files if not (path / name).is_file()]
     if not missing and metadata.files:
         return [path / name for name in metadata.files]
     if not found:
-        raise InputError(f"the bag {path} is truncated or damaged: its metadata.yaml names "
-                         f"{', '.join(missing) or 'no file'}, and there is no storage file; copy "
-                         "the whole folder again")
+        raise InputError(
+            f"the bag {path} is truncated or damaged: its metadata.yaml names "
+            f"{', '.join(missing) or 'no file'}, and there is no storage file; copy "
+            "the whole folder again"
+        )
     if missing:
-        metadata.problems.append(f"it names {', '.join(missing)} instead of "
-                                 f"{', '.join(file.name for file in found)}")
+        metadata.problems.append(f"it names {', '.join(missing)} instead of {', '.join(file.name for file in found)}")
     return found
 
 
@@ -85,16 +89,17 @@ def open_file(path: Path, stack: ExitStack) -> StorageFile:
     if not suffix:
         if _suffix(path) not in FORMATS:
             raise InputError(f"{path} is not a bag; {SUPPORTED}")
-        raise InputError(describe_damage(path, "it does not start as such a file does" if head
-                                         else "it is empty"))
+        raise InputError(describe_damage(path, "it does not start as such a file does" if head else "it is empty"))
     try:
         file = stack.enter_context(closing(FORMATS[suffix][1](source)))
         for topic in file.topics:
             if not all(isinstance(text, str) for text in (topic.name, topic.type, topic.encoding)):
                 raise ValueError(f"topic {topic.name!r} has the type {topic.type!r}")
         # Some writers omit "msg", or the encoding if it is that of ROS 2.
-        file.topics = [topic._replace(type=re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", topic.type),
-                                      encoding=topic.encoding or "cdr") for topic in file.topics]
+        file.topics = [
+            topic._replace(type=re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", topic.type), encoding=topic.encoding or "cdr")
+            for topic in file.topics
+        ]
         if file.times and not all(isinstance(time, int) for time in file.times):
             raise ValueError(f"{file.times!r} are not times in nanoseconds")
     except Exception as error:  # struct, SQLite, mcap and rosbags raise their own types
@@ -132,12 +137,16 @@ def _decompress(path: Path, stack: ExitStack) -> Path:
     target = folder / path.name.removesuffix(COMPRESSED_SUFFIX)
     try:
         decompressor = zstandard.ZstdDecompressor()
-        with open(path, "rb") as compressed, open(target, "wb") as copy, \
-                decompressor.stream_reader(compressed, read_across_frames=True) as stream:
+        with (
+            open(path, "rb") as compressed,
+            open(target, "wb") as copy,
+            decompressor.stream_reader(compressed, read_across_frames=True) as stream,
+        ):
             shutil.copyfileobj(stream, copy, 2**20)
     except OSError as error:
-        raise InputError(f"cannot decompress {path} to {folder}: {error.strerror}; set TMPDIR to "
-                         "a folder with more space") from None
+        raise InputError(
+            f"cannot decompress {path} to {folder}: {error.strerror}; set TMPDIR to a folder with more space"
+        ) from None
     except zstandard.ZstdError as error:
         raise InputError(describe_damage(path, error)) from None
     return target
@@ -150,5 +159,7 @@ def _diagnose_foreign_mcap(path: Path, file: McapFile) -> str:
         return ""
     if file.profile == "ros1" or "ros1" in encodings:
         return f"{path} has ROS 1 messages in MCAP; give the .bag that it was converted from"
-    return (f"{path} is an MCAP file without ROS 2 messages (profile {file.profile!r}), as written "
-            "by Foxglove and others; give clouds as sensor_msgs/PointCloud2 in a ROS 2 bag")
+    return (
+        f"{path} is an MCAP file without ROS 2 messages (profile {file.profile!r}), as written "
+        "by Foxglove and others; give clouds as sensor_msgs/PointCloud2 in a ROS 2 bag"
+    )

@@ -21,8 +21,7 @@ LINE_FORMAT = "x y z dx dy dz heading class"
 
 def is_layout(path: Path) -> bool:
     """Return True for a folder with points/*.npy and labels/ or ImageSets/."""
-    return bool(_list_scans(path)) and any((path / name).is_dir()
-                                           for name in ("labels", "ImageSets"))
+    return bool(_list_scans(path)) and any((path / name).is_dir() for name in ("labels", "ImageSets"))
 
 
 def _list_scans(path: Path) -> list[Path]:
@@ -39,18 +38,31 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     frames = []
     for i, file in enumerate(files):
         label, stamp = path / f"labels/{file.stem}.txt", START_NS + i * PERIOD_NS
-        frames.append(Frame(
-            file.stem, stamp, partial(load_points, file, stamp, LIDAR_FRAME, scale=scale),
-            truth=partial(read_labels, label), index=i, points=file, files=(file, label),
-            intensity_max=scale))
+        frames.append(
+            Frame(
+                file.stem,
+                stamp,
+                partial(load_points, file, stamp, LIDAR_FRAME, scale=scale),
+                truth=partial(read_labels, label),
+                index=i,
+                points=file,
+                files=(file, label),
+                intensity_max=scale,
+            )
+        )
     known = {frame.name for frame in frames}
-    lost = {label.stem: label for label in sorted(path.glob("labels/*.txt"))
-            if label.stem not in known}
-    return Recording(path, "OpenPCDet custom data", frames,
-                     frozenset({BOXES} if any(path.glob("labels/*.txt")) else set()),
-                     tuple((name, f"{label} has no points/{name}.npy; add this file")
-                           for name, label in lost.items()) if scans else (),
-                     has_sensor_height=False, is_sequential=False)
+    lost = {label.stem: label for label in sorted(path.glob("labels/*.txt")) if label.stem not in known}
+    return Recording(
+        path,
+        "OpenPCDet custom data",
+        frames,
+        frozenset({BOXES} if any(path.glob("labels/*.txt")) else set()),
+        tuple((name, f"{label} has no points/{name}.npy; add this file") for name, label in lost.items())
+        if scans
+        else (),
+        has_sensor_height=False,
+        is_sequential=False,
+    )
 
 
 def read_labels(path: Path) -> GroundTruth | None:
@@ -71,11 +83,11 @@ def read_labels(path: Path) -> GroundTruth | None:
             if len(words) < 8 or not ((np.abs(box) <= MAX_NUMBER).all() and (box[3:6] > 0).all()):
                 raise ValueError
         except ValueError:
-            raise InputError(f"{path}:{i} is not '{LINE_FORMAT}' with sizes above 0: "
-                             f"{line[:200]!r}; correct or remove it") from None
+            raise InputError(
+                f"{path}:{i} is not '{LINE_FORMAT}' with sizes above 0: {line[:200]!r}; correct or remove it"
+            ) from None
         boxes.append(box)
         names.append(class_name(" ".join(words[7:])))
     ids = to_class_ids(names)
     misc = CLASSES.index("Misc")
-    return GroundTruth.of(boxes, ids, [{"class_name": name} if i == misc else {}
-                                       for name, i in zip(names, ids)])
+    return GroundTruth.of(boxes, ids, [{"class_name": name} if i == misc else {} for name, i in zip(names, ids)])

@@ -34,8 +34,7 @@ def read_pcd(path: Path) -> np.ndarray:
     try:
         return _parse_points(content.removeprefix(b"\xef\xbb\xbf"))
     except (ValueError, TypeError, OverflowError, LookupError, struct.error) as error:
-        raise InputError(f"{path} is not a readable PCD file ({error}); save it again as binary "
-                         "PCD") from None
+        raise InputError(f"{path} is not a readable PCD file ({error}); save it again as binary PCD") from None
 
 
 def _parse_points(content: bytes) -> np.ndarray:
@@ -51,16 +50,21 @@ def _parse_points(content: bytes) -> np.ndarray:
     names = header.get("FIELDS") or header.get("COLUMNS")  # COLUMNS up to version .5
     if not names:
         raise ValueError("the line FIELDS is missing")
-    types, sizes, counts = (header.get(key, [usual] * len(names)) for key, usual in (
-        ("TYPE", "F"), ("SIZE", "4"), ("COUNT", "1")))
+    types, sizes, counts = (
+        header.get(key, [usual] * len(names)) for key, usual in (("TYPE", "F"), ("SIZE", "4"), ("COUNT", "1"))
+    )
     if not len(names) == len(types) == len(sizes) == len(counts):
         raise ValueError("FIELDS, TYPE, SIZE and COUNT differ in length")
     names = [name if name != "_" else f"_{i}" for i, name in enumerate(names)]
-    layout = np.dtype([
-        (name, f"<{KIND_CODES[kind[0].upper()]}{int(size)}", () if int(n) == 1 else (int(n),))
-        for name, kind, size, n in zip(names, types, sizes, counts)])
-    number = int(header["POINTS"][0] if "POINTS" in header else
-                 int(header["WIDTH"][0]) * int(header.get("HEIGHT", ["1"])[0]))
+    layout = np.dtype(
+        [
+            (name, f"<{KIND_CODES[kind[0].upper()]}{int(size)}", () if int(n) == 1 else (int(n),))
+            for name, kind, size, n in zip(names, types, sizes, counts)
+        ]
+    )
+    number = int(
+        header["POINTS"][0] if "POINTS" in header else int(header["WIDTH"][0]) * int(header.get("HEIGHT", ["1"])[0])
+    )
     if not 0 <= number * layout.itemsize <= MAX_CLOUD_BYTES:
         raise ValueError(f"it declares {number} points")
     data, kind = content[start:], header["DATA"][0].lower()
@@ -97,16 +101,14 @@ def parse_text_points(data: bytes, layout: np.dtype, number: int) -> np.ndarray:
     words = np.array(data.split())
     if len(words) < number * width:
         raise ValueError(f"it is truncated: {len(words)} of {number * width} numbers")
-    rows = words[:number * width].reshape(number, width)
+    rows = words[: number * width].reshape(number, width)
     columns, at = {}, 0
     for name in layout.names or ():
         shape = layout[name].shape
         n = int(np.prod(shape, dtype=int))
-        columns[name] = _parse_numbers(rows[:, at:at + n], layout[name].base, name).reshape(
-            (number, *shape))
+        columns[name] = _parse_numbers(rows[:, at : at + n], layout[name].base, name).reshape((number, *shape))
         at += n
-    points = np.empty(number, [(name, values.dtype, values.shape[1:])
-                               for name, values in columns.items()])
+    points = np.empty(number, [(name, values.dtype, values.shape[1:]) for name, values in columns.items()])
     for name, values in columns.items():
         points[name] = values
     return points
@@ -123,8 +125,7 @@ def _parse_numbers(words: np.ndarray, kind: np.dtype, name: str) -> np.ndarray:
         if not np.array_equal(numbers, np.floor(numbers)):
             return numbers.astype("<f4")
     limits = np.iinfo(kind)
-    if numbers.size and not (limits.min <= numbers.min().item()
-                             and numbers.max().item() <= limits.max):
+    if numbers.size and not (limits.min <= numbers.min().item() and numbers.max().item() <= limits.max):
         raise ValueError(f"a number of the field '{name}' does not fit into {kind}")
     return numbers.astype(kind)
 
@@ -134,7 +135,7 @@ def _parse_compressed_points(data: bytes, layout: np.dtype, number: int) -> np.n
     compressed_size, size = struct.unpack_from("<II", data)
     if size != number * layout.itemsize or len(data) < 8 + compressed_size:
         raise ValueError("it is truncated: the sizes of the compressed points do not match")
-    plain = data[8:8 + compressed_size]
+    plain = data[8 : 8 + compressed_size]
     try:
         plain = decompress_lzf(plain, size)
     except (ValueError, IndexError):
@@ -144,8 +145,9 @@ def _parse_compressed_points(data: bytes, layout: np.dtype, number: int) -> np.n
     for name in layout.names or ():
         part = layout[name]
         if part.itemsize:
-            points[name] = np.frombuffer(plain, part.base, number * part.itemsize
-                                         // part.base.itemsize, at).reshape((number, *part.shape))
+            points[name] = np.frombuffer(plain, part.base, number * part.itemsize // part.base.itemsize, at).reshape(
+                (number, *part.shape)
+            )
         at += number * part.itemsize
     return points
 
@@ -160,7 +162,7 @@ def decompress_lzf(data: bytes, size: int) -> bytes:
         control = data[i]
         i += 1
         if control < 32:
-            out += data[i:i + control + 1]
+            out += data[i : i + control + 1]
             i += control + 1
             continue
         length = control >> 5
@@ -173,7 +175,7 @@ def decompress_lzf(data: bytes, size: int) -> bytes:
             raise ValueError("the compressed points are damaged")
         length += 2
         if len(out) - back >= length:
-            out += out[back:back + length]
+            out += out[back : back + length]
         else:  # the run overlaps its own output
             piece = bytes(out[back:])
             out += (piece * (length // len(piece) + 1))[:length]

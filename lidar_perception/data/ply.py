@@ -6,19 +6,28 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.data.pcd import (
-    MAX_CLOUD_BYTES,
-    MAX_HEADER_BYTES,
-    parse_binary_points,
-    parse_text_points,
-)
+from lidar_perception.data.pcd import MAX_CLOUD_BYTES, MAX_HEADER_BYTES, parse_binary_points, parse_text_points
 from lidar_perception.runs.files import check_regular
 from lidar_perception.types import InputError
 
 DTYPE_CODES = {
-         "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
-               "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2",
-               "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
 BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 LIST = "list"
 
@@ -40,8 +49,7 @@ def read_ply(path: Path) -> np.ndarray:
     try:
         return _parse_vertices(content)
     except (ValueError, TypeError, OverflowError, LookupError) as error:
-        raise InputError(f"{path} is not a readable PLY file ({error}); save it again as binary "
-                         "PLY") from None
+        raise InputError(f"{path} is not a readable PLY file ({error}); save it again as binary PLY") from None
 
 
 def _parse_vertices(content: bytes) -> np.ndarray:
@@ -79,5 +87,5 @@ def _parse_vertices(content: bytes) -> np.ndarray:
             parse = parse_text_points if text else parse_binary_points
             points = parse(data, layout, number)
             return points.astype(points.dtype.newbyteorder("<"))
-        data = data[number * layout.itemsize:]
+        data = data[number * layout.itemsize :]
     raise ValueError("the element vertex is missing")

@@ -64,9 +64,13 @@ def open_clouds(path: str | Path, topic: str | None = None) -> RawClouds:
         return _open_bag(path, topic or path_topic)
     recording = open_recording(path)
     stamps = np.array([frame.stamp_ns for frame in recording])
-    return RawClouds(path, recording.layout, len(recording),
-                     stamps if recording.has_times else None,
-                     lambda i: _to_message(recording.frames[i]))
+    return RawClouds(
+        path,
+        recording.layout,
+        len(recording),
+        stamps if recording.has_times else None,
+        lambda i: _to_message(recording.frames[i]),
+    )
 
 
 def _open_bag(path: Path, topic: str) -> RawClouds:
@@ -76,15 +80,20 @@ def _open_bag(path: Path, topic: str) -> RawClouds:
     if not bag.counts[topic]:
         raise InputError(f"{path} has no clouds on {topic}; record it again")
     frames = bag_frames.BagFrames(handle, topic, bag.topics[topic], bag.counts[topic])
-    return RawClouds(path, f"{bag.layout}, clouds on {topic}", len(frames), frames.stamps(),
-                     frames.message, frames.poses, topic)
+    return RawClouds(
+        path, f"{bag.layout}, clouds on {topic}", len(frames), frames.stamps(), frames.message, frames.poses, topic
+    )
 
 
 def _open_files(path: Path, files: list[Path]) -> RawClouds:
     stamps = parse_times(files)
-    return RawClouds(path, f"{len(files)} {files[0].suffix} file{'s' * (len(files) != 1)}",
-                     len(files), np.array(stamps) if stamps else None,
-                     lambda i: to_message(files[i], stamps[i] if stamps else 0))
+    return RawClouds(
+        path,
+        f"{len(files)} {files[0].suffix} file{'s' * (len(files) != 1)}",
+        len(files),
+        np.array(stamps) if stamps else None,
+        lambda i: to_message(files[i], stamps[i] if stamps else 0),
+    )
 
 
 def _to_message(frame: Frame) -> Any:

@@ -36,7 +36,7 @@ class RecordFile:
         left = memoryview(record)
         try:
             while left:
-                left = left[self.file.write(left):]
+                left = left[self.file.write(left) :]
         except OSError as error:
             self.failure = error
             self._truncate(self.tell())
@@ -59,7 +59,7 @@ class RecordFile:
         """
         kinds = [kind for kind, _ in self.records]
         if end[0] in kinds:
-            del self.records[kinds.index(end[0]):]
+            del self.records[kinds.index(end[0]) :]
         while len(self.records) > 1:
             self.failure = None
             self._truncate(self.tell())

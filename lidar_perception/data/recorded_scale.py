@@ -19,8 +19,7 @@ Item = TypeVar("Item")
 Column = tuple[np.ndarray, np.dtype] | None  # see wire.messages.read_raw_intensity
 
 
-def make_scale_reader(items: Sequence[Item], read: Callable[[Item], Column]
-                      ) -> Callable[[], float]:
+def make_scale_reader(items: Sequence[Item], read: Callable[[Item], Column]) -> Callable[[], float]:
     """Return a cached function that infers the intensity scale of a recording from SAMPLE_SIZE
     clouds, spread evenly.
 

@@ -29,6 +29,8 @@ def read_records(path: Path, columns: str, dtype: DTypeLike = np.float32) -> np.
         raise InputError(f"cannot read {path}: {error.strerror}; download it again") from None
     count = len(columns.split())
     if size % (count * numbers.itemsize):
-        raise InputError(f"{path} has {size} bytes, not a multiple of {count * numbers.itemsize} "
-                         f"({columns} as {numbers.dtype}): it is truncated; download it again")
+        raise InputError(
+            f"{path} has {size} bytes, not a multiple of {count * numbers.itemsize} "
+            f"({columns} as {numbers.dtype}): it is truncated; download it again"
+        )
     return numbers.reshape(-1, count)

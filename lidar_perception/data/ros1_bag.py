@@ -29,24 +29,33 @@ class Ros1File:
     def __init__(self, path: Path):
         # Undocumented in rosbags: if it changes, only ROS 1 bags are affected.
         from rosbags.convert.converter import STATIC_MSGTYPE_RENAMES
+
         self.reader = AnyReader([path])
         self.reader.open()
         self.recorded = {c.id: c for c in self.reader.connections}
         self.topics = []
         for c in self.reader.connections:
             kind = STATIC_MSGTYPE_RENAMES.get(c.msgtype, c.msgtype)
-            self.topics.append(Topic(
-                c.id, c.topic, kind, "cdr" if kind in load_typestore().fielddefs else "ros1",
-                [LATCHED_QOS] if getattr(c.ext, "latching", 0) else [], c.msgcount))
+            self.topics.append(
+                Topic(
+                    c.id,
+                    c.topic,
+                    kind,
+                    "cdr" if kind in load_typestore().fielddefs else "ros1",
+                    [LATCHED_QOS] if getattr(c.ext, "latching", 0) else [],
+                    c.msgcount,
+                )
+            )
         cache: dict[str, object] = {}
         self.converters = {
             topic.id: self._make_converter(self.recorded[topic.id].msgtype, topic.type, cache)
-            for topic in self.topics if topic.encoding == "cdr"}
+            for topic in self.topics
+            if topic.encoding == "cdr"
+        }
         for topic in self.topics:
             if topic.type in LIVOX:  # rosbags converts point by point
                 self.converters[topic.id] = livox_ros1_to_cdr
-        self.times = ((self.reader.start_time, self.reader.end_time - 1)
-                      if self.reader.message_count else None)
+        self.times = (self.reader.start_time, self.reader.end_time - 1) if self.reader.message_count else None
 
     def close(self) -> None:
         self.reader.close()
@@ -58,10 +67,11 @@ class Ros1File:
         for connection, time, data in self.reader.messages(connections, start, stop):
             yield connection.id, time, bytes(self.converters[connection.id](data))
 
-    def _make_converter(self, recorded: str, wanted: str, cache: dict[str, object]
-                        ) -> Callable[[Any], Any]:
+    def _make_converter(self, recorded: str, wanted: str, cache: dict[str, object]) -> Callable[[Any], Any]:
         from rosbags.convert.converter import is_same_wireformat, migrate_bytes
+
         if is_same_wireformat(self.reader.typestore, load_typestore(), recorded, wanted):
             return partial(load_typestore().ros1_to_cdr, typename=wanted)
-        return partial(migrate_bytes, self.reader.typestore, load_typestore(), recorded, wanted,
-                       cache, src_is2=False, dst_is2=True)
+        return partial(
+            migrate_bytes, self.reader.typestore, load_typestore(), recorded, wanted, cache, src_is2=False, dst_is2=True
+        )

@@ -9,14 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lidar_perception.camera import Calibration
-from lidar_perception.data.frame import (
-    POINT_LABELS,
-    POSES,
-    Frame,
-    PointTruth,
-    Recording,
-    return_none,
-)
+from lidar_perception.data.frame import POINT_LABELS, POSES, Frame, PointTruth, Recording, return_none
 from lidar_perception.data.kitti import odometry
 from lidar_perception.data.kitti.folder import read_velodyne
 from lidar_perception.data.kitti.write import format_numbers, write_velodyne
@@ -27,17 +20,28 @@ from lidar_perception.types import InputError, usable_returns
 UNLABELLED = (0, 1)  # unlabelled, and outlier, such as a reflection
 # road, parking, sidewalk, other-ground, lane-marking, terrain
 GROUND = (40, 44, 48, 49, 60, 72)
-VEGETATION = 70      # from grass to tree tops: partly ground
+VEGETATION = 70  # from grass to tree tops: partly ground
 # Classes with instances. MOVING maps the numbers of moving objects to these classes.
-THINGS = {10: "car", 11: "bicycle", 13: "bus", 15: "motorcycle", 16: "on-rails", 18: "truck",
-          20: "other-vehicle", 30: "person", 31: "bicyclist", 32: "motorcyclist"}
+THINGS = {
+    10: "car",
+    11: "bicycle",
+    13: "bus",
+    15: "motorcycle",
+    16: "on-rails",
+    18: "truck",
+    20: "other-vehicle",
+    30: "person",
+    31: "bicyclist",
+    32: "motorcyclist",
+}
 MOVING = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
 
 
 def is_layout(path: Path) -> bool:
     """Return True for a folder of KITTI odometry (see odometry.is_layout) with labels."""
     return odometry.is_layout(path) and any(
-        (sequence / "labels").is_dir() for sequence in odometry.list_sequences(path))
+        (sequence / "labels").is_dir() for sequence in odometry.list_sequences(path)
+    )
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
@@ -45,15 +49,25 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
 
     Sequences without a labels folder, such as the test sequences, are left out.
     """
-    sequences = [sequence for sequence in odometry.list_sequences(path)
-                 if (sequence / "labels").is_dir() and any(sequence.glob("velodyne/*.bin"))]
+    sequences = [
+        sequence
+        for sequence in odometry.list_sequences(path)
+        if (sequence / "labels").is_dir() and any(sequence.glob("velodyne/*.bin"))
+    ]
     if not sequences:
-        raise InputError(f"{path} has labels but no SemanticKITTI scans: expected "
-                         "sequences/00/velodyne/*.bin and sequences/00/labels/*.label")
+        raise InputError(
+            f"{path} has labels but no SemanticKITTI scans: expected "
+            "sequences/00/velodyne/*.bin and sequences/00/labels/*.label"
+        )
     frames, timed = odometry.make_frames(sequences)
     posed = any(map(odometry.find_pose_file, sequences))
-    return Recording(path, "SemanticKITTI", [_add_point_truth(frame) for frame in frames],
-                     frozenset({POINT_LABELS} | ({POSES} if posed else set())), has_times=timed)
+    return Recording(
+        path,
+        "SemanticKITTI",
+        [_add_point_truth(frame) for frame in frames],
+        frozenset({POINT_LABELS} | ({POSES} if posed else set())),
+        has_times=timed,
+    )
 
 
 def _add_point_truth(frame: Frame) -> Frame:
@@ -61,8 +75,7 @@ def _add_point_truth(frame: Frame) -> Frame:
     scan = frame.points
     assert scan is not None
     label = scan.parents[1] / f"labels/{scan.stem}.label"
-    return replace(frame, point_truth=partial(_read_point_truth, scan, label),
-                   calibration=return_none, image=None)
+    return replace(frame, point_truth=partial(_read_point_truth, scan, label), calibration=return_none, image=None)
 
 
 def _read_point_truth(scan: Path, path: Path) -> PointTruth:
@@ -73,14 +86,12 @@ def _read_point_truth(scan: Path, path: Path) -> PointTruth:
     cloud = read_velodyne(scan)
     labels = read_records(path, "label", np.uint32)[:, 0]  # upper 16 bits: instance; lower: class
     if len(labels) != len(cloud):
-        raise InputError(f"{path} has {len(labels)} labels for the {len(cloud)} points of {scan}; "
-                         "download both again")
+        raise InputError(f"{path} has {len(labels)} labels for the {len(cloud)} points of {scan}; download both again")
     labels = labels.compress(usable_returns(cloud[:, :3]))
     return PointTruth((labels & 0xFFFF).astype(np.uint16), (labels >> 16).astype(np.uint16))
 
 
-def write_scan(folder: Path, number: int, cloud: np.ndarray, semantic: np.ndarray,
-               instance: np.ndarray) -> None:
+def write_scan(folder: Path, number: int, cloud: np.ndarray, semantic: np.ndarray, instance: np.ndarray) -> None:
     """Write scan and labels to a sequence folder.
 
     Args:
@@ -106,6 +117,5 @@ def format_pose(pose: np.ndarray, calibration: Calibration) -> str:
 def format_calibration(calibration: Calibration) -> str:
     """Return the text of calib.txt: the projections of four identical cameras and the LiDAR's
     pose."""
-    rows = {**{f"P{i}": calibration.intrinsics for i in range(4)},
-            "Tr": calibration.lidar_to_camera[:3]}
+    rows = {**{f"P{i}": calibration.intrinsics for i in range(4)}, "Tr": calibration.lidar_to_camera[:3]}
     return "".join(f"{name}: {format_numbers(matrix)}\n" for name, matrix in rows.items())

@@ -9,8 +9,7 @@ from pathlib import Path
 from lidar_perception.data.storage import Stream, Topic
 
 MAGIC = b"SQLite format 3\0"
-REQUIRED_COLUMNS = {"topics": {"id", "name", "type"},
-                    "messages": {"topic_id", "timestamp", "data"}}
+REQUIRED_COLUMNS = {"topics": {"id", "name", "type"}, "messages": {"topic_id", "timestamp", "data"}}
 
 
 class SqliteFile:
@@ -27,8 +26,7 @@ class SqliteFile:
         logs = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
         has_log = any(log.is_file() and log.stat().st_size for log in logs)
         options = "mode=ro&vfs=unix-none" if has_log else "immutable=1"
-        self.database = sqlite3.connect(f"{path.absolute().as_uri()}?{options}", uri=True,
-                                        check_same_thread=False)
+        self.database = sqlite3.connect(f"{path.absolute().as_uri()}?{options}", uri=True, check_same_thread=False)
         try:
             self.database.execute("PRAGMA locking_mode=EXCLUSIVE")
             self._read_topics()
@@ -42,28 +40,40 @@ class SqliteFile:
     def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
         """Yield (topic id, time, data) of topics with start <= time < stop, in order of time."""
         for topic, time, data in self.database.execute(
-                f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
-                f"({', '.join('?' * len(ids))}) AND timestamp >= ? AND timestamp < ? "
-                "ORDER BY timestamp, rowid", (*ids, start, stop)):
+            f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
+            f"({', '.join('?' * len(ids))}) AND timestamp >= ? AND timestamp < ? "
+            "ORDER BY timestamp, rowid",
+            (*ids, start, stop),
+        ):
             if not isinstance(data, bytes) or not isinstance(time, int):
                 raise ValueError(f"a message is {type(data).__name__} at {time!r}")
             yield topic, time, data
 
     def _read_topics(self) -> None:
-        columns = {table: {row[1] for row in self.database.execute(f"PRAGMA table_info({table})")}
-                   for table in REQUIRED_COLUMNS}
+        columns = {
+            table: {row[1] for row in self.database.execute(f"PRAGMA table_info({table})")}
+            for table in REQUIRED_COLUMNS
+        }
         if any(REQUIRED_COLUMNS[table] - columns[table] for table in REQUIRED_COLUMNS):
             raise ValueError("the tables of topics and messages are missing")
         # The first distributions stored neither encoding nor QoS.
-        encoding, qos = (name if name in columns["topics"] else "''"
-                         for name in ("serialization_format", "offered_qos_profiles"))
-        spans = {topic: (count, first, last) for topic, count, first, last in
-                 self.database.execute("SELECT topic_id, COUNT(*), MIN(timestamp), "
-                                       "MAX(timestamp) FROM messages GROUP BY topic_id")}
-        rows = self.database.execute(
-            f"SELECT id, name, type, {encoding}, {qos} FROM topics ORDER BY id")
-        self.topics = [Topic(number, name, kind, encoding, qos, spans.get(number, (0,))[0])
-                       for number, name, kind, encoding, qos in rows]
+        encoding, qos = (
+            name if name in columns["topics"] else "''" for name in ("serialization_format", "offered_qos_profiles")
+        )
+        spans = {
+            topic: (count, first, last)
+            for topic, count, first, last in self.database.execute(
+                "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages GROUP BY topic_id"
+            )
+        }
+        rows = self.database.execute(f"SELECT id, name, type, {encoding}, {qos} FROM topics ORDER BY id")
+        self.topics = [
+            Topic(number, name, kind, encoding, qos, spans.get(number, (0,))[0])
+            for number, name, kind, encoding, qos in rows
+        ]
         with_messages = [spans[topic.id] for topic in self.topics if topic.id in spans]
-        self.times = (min(first for _, first, _ in with_messages),
-                      max(last for *_, last in with_messages)) if with_messages else None
+        self.times = (
+            (min(first for _, first, _ in with_messages), max(last for *_, last in with_messages))
+            if with_messages
+            else None
+        )

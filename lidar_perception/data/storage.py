@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from heapq import heappop, heappush, heapreplace
 from typing import Any, NamedTuple, Protocol
 
-START, END = -2**63, 2**63 - 1  # before and after all times in ns
+START, END = -(2**63), 2**63 - 1  # before and after all times in ns
 Message = tuple[Any, int, bytes]  # topic id, log time in ns, data
 Stream = Iterator[Message]  # in order of time
 
@@ -59,8 +59,7 @@ def merge_streams(sources: Iterable[tuple[int, Callable[[], Stream]]]) -> Stream
     sources: start time of each stream, and the function that opens it.
     """
     open_streams: list[tuple[int, int, Message, Stream]] = []
-    for number, (start, begin) in enumerate([*sorted(sources, key=lambda source: source[0]),
-                                             (END, lambda: iter(()))]):
+    for number, (start, begin) in enumerate([*sorted(sources, key=lambda source: source[0]), (END, lambda: iter(()))]):
         while open_streams and open_streams[0][0] < start:
             _, which, message, stream = open_streams[0]
             yield message

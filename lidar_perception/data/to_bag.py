@@ -13,12 +13,7 @@ from lidar_perception.data.bag import LATCHED_QOS, BagWriter
 from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.types import GroundTruth, InputError, PointCloud
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import (
-    make_camera_info,
-    make_extrinsics,
-    make_odometry,
-    make_truth_markers,
-)
+from lidar_perception.wire.messages import make_camera_info, make_extrinsics, make_odometry, make_truth_markers
 from lidar_perception.wire.topics import (
     CAMERA_FRAME,
     CAMERA_INFO,
@@ -45,9 +40,16 @@ POINT_LABELS = np.dtype([(SEMANTIC, "<u2"), (INSTANCE, "<u2")])  # see data.fram
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 
 
-def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False,
-              force: bool = False, skipped: list[str] | None = None, clouds: bool = True,
-              detections_3d: bool = False) -> int:
+def write_bag(
+    path: str | Path,
+    frames: Iterable[Frame],
+    *,
+    images: bool = False,
+    force: bool = False,
+    skipped: list[str] | None = None,
+    clouds: bool = True,
+    detections_3d: bool = False,
+) -> int:
     """Write frames to a bag in order, and return their number.
 
     The calibration is written, latched, before the first scan and whenever it changes: as
@@ -95,8 +97,9 @@ class FrameContent(NamedTuple):
 class FrameWriter:
     """Writer of frames to an open bag, see write_bag."""
 
-    def __init__(self, bag: BagWriter, *, images: bool = False, clouds: bool = True,
-                 detections_3d: bool = False) -> None:
+    def __init__(
+        self, bag: BagWriter, *, images: bool = False, clouds: bool = True, detections_3d: bool = False
+    ) -> None:
         self.bag, self.images, self.clouds, self.detections_3d = bag, images, clouds, detections_3d
         self._marker_keys: frozenset[tuple[str, int]] = frozenset()  # of the last labels
         self._labelled_stamps: set[int] = set()
@@ -115,15 +118,24 @@ class FrameWriter:
         scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
         pose, columns = frame.pose(), frame.point_truth() if self.clouds else None
         if frame.stamp_ns < 0:
-            raise InputError(f"{frame.name}: its stamp is before 1970, which a bag cannot store; "
-                             "set the clock of the sensor")
+            raise InputError(
+                f"{frame.name}: its stamp is before 1970, which a bag cannot store; set the clock of the sensor"
+            )
         if truth is not None and frame.stamp_ns in self._labelled_stamps:
-            raise InputError(f"{frame.name}: another labelled scan has the same stamp, so labels "
-                             "could not be assigned to scans")
+            raise InputError(
+                f"{frame.name}: another labelled scan has the same stamp, so labels could not be assigned to scans"
+            )
         header = make_header(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
         image = frame.image if self.images and frame.image and frame.image.exists() else None
-        return FrameContent(header, frame.stamp_ns, calibration, pose, truth, image,
-                            to_point_array(scan, columns) if self.clouds else None)
+        return FrameContent(
+            header,
+            frame.stamp_ns,
+            calibration,
+            pose,
+            truth,
+            image,
+            to_point_array(scan, columns) if self.clouds else None,
+        )
 
     def write(self, content: FrameContent) -> None:
         """Write the content of a frame. InputError if the bag cannot be written."""
@@ -148,7 +160,7 @@ class FrameWriter:
 
 def to_point_array(scan: PointCloud, labels: PointTruth | None = None) -> np.ndarray:
     """Return a structured array (N,) with the fields of POINT and, with labels, of POINT_LABELS."""
-    fields = POINT.descr[:4 if scan.intensity is not None else 3]
+    fields = POINT.descr[: 4 if scan.intensity is not None else 3]
     points = np.empty(len(scan), fields + (POINT_LABELS.descr if labels else []))
     for i, axis in enumerate("xyz"):
         points[axis] = scan.xyz[:, i]
@@ -164,16 +176,25 @@ def _make_detections(markers: Any, header: Any) -> Any:
     objects = from_marker_array(markers)
     tracks = [track for extra in objects.extras if (track := extra.get("track_id")) is not None]
     numbered = len(set(tracks)) == len(objects)
-    return to_detection_array(objects.boxes, objects.labels, objects.scores.tolist(),
-                              header=header, make=bag_message, ids=tracks if numbered else None)
+    return to_detection_array(
+        objects.boxes,
+        objects.labels,
+        objects.scores.tolist(),
+        header=header,
+        make=bag_message,
+        ids=tracks if numbered else None,
+    )
 
 
 def _write_image(bag: BagWriter, image: Path, stamp_ns: int) -> None:
     if IMAGE not in bag.channels:
         bag.add_topic(IMAGE, "sensor_msgs/msg/CompressedImage")
     header = make_header(stamp_ns, CAMERA_FRAME, bag_message)
-    bag.write(IMAGE, stamp_ns, bag_message("sensor_msgs/msg/CompressedImage", header=header,
-                                           format="png", data=np.fromfile(image, np.uint8)))
+    bag.write(
+        IMAGE,
+        stamp_ns,
+        bag_message("sensor_msgs/msg/CompressedImage", header=header, format="png", data=np.fromfile(image, np.uint8)),
+    )
 
 
 def _write_pose(bag: BagWriter, pose: np.ndarray, stamp_ns: int, frame_id: str) -> None:
@@ -183,8 +204,7 @@ def _write_pose(bag: BagWriter, pose: np.ndarray, stamp_ns: int, frame_id: str) 
     bag.write(ODOMETRY, stamp_ns, make_odometry(pose, fixed, frame_id, bag_message))
 
 
-def _write_calibration(bag: BagWriter, calibration: Calibration, stamp_ns: int,
-                       header) -> None:
+def _write_calibration(bag: BagWriter, calibration: Calibration, stamp_ns: int, header) -> None:
     camera_header = make_header(stamp_ns, CAMERA_FRAME, bag_message)
     transform = make_extrinsics(calibration, header, bag_message)
     bag.write(CAMERA_INFO, stamp_ns, make_camera_info(calibration, camera_header, bag_message))

@@ -63,22 +63,41 @@ class Bag:
                 self.run.skipped.append(f"not in {self.path}: {error}")
                 return
         header, stamp_ns = content.header, content.stamp_ns
-        self._write(self.found, stamp_ns, header, make_detection_rows(
-            result.detections, self._shown.get(self.found, ())))
+        self._write(
+            self.found, stamp_ns, header, make_detection_rows(result.detections, self._shown.get(self.found, ()))
+        )
         self._write_3d(self.found, stamp_ns, header, result.detections)
         if self.tracks is not None and (tracks := result.tracks) is not None:
-            self._write(self.tracks, stamp_ns, header, make_track_rows(
-                tracks.ids, tracks.detections, tracks.velocities, tracks.moving, result.trails,
-                previous=self._shown.get(self.tracks, ())))
-            self._write_3d(self.tracks, stamp_ns, header, tracks.detections, ids=tracks.ids,
-                           covariances=tracks.to_pose_covariances())
+            self._write(
+                self.tracks,
+                stamp_ns,
+                header,
+                make_track_rows(
+                    tracks.ids,
+                    tracks.detections,
+                    tracks.velocities,
+                    tracks.moving,
+                    result.trails,
+                    previous=self._shown.get(self.tracks, ()),
+                ),
+            )
+            self._write_3d(
+                self.tracks,
+                stamp_ns,
+                header,
+                tracks.detections,
+                ids=tracks.ids,
+                covariances=tracks.to_pose_covariances(),
+            )
         self.writer.write(content)
 
     def _write(self, topic: str, stamp_ns: int, header: Any, rows: list[MarkerRow]) -> None:
         self._shown[topic] = list_marker_keys(rows)
         self.bag.write(topic, stamp_ns, encode_markers(rows, header))
 
-    def _write_3d(self, topic: str, stamp_ns: int, header: Any, found: Detections,
-                  **more: Any) -> None:
-        self.bag.write(f"{topic}_3d", stamp_ns, encode_detection_array(
-            found.boxes, found.labels, found.scores, header=header, **more))
+    def _write_3d(self, topic: str, stamp_ns: int, header: Any, found: Detections, **more: Any) -> None:
+        self.bag.write(
+            f"{topic}_3d",
+            stamp_ns,
+            encode_detection_array(found.boxes, found.labels, found.scores, header=header, **more),
+        )

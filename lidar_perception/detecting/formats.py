@@ -17,12 +17,7 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Recording
-from lidar_perception.data.kitti.results import (
-    FOLDER,
-    choose_calibration,
-    write_results,
-    write_tracking_results,
-)
+from lidar_perception.data.kitti.results import FOLDER, choose_calibration, write_results, write_tracking_results
 from lidar_perception.detecting.results import FrameResult, to_short_floats, with_optional_parts
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
 from lidar_perception.labels.exchange import export_labels
@@ -30,15 +25,29 @@ from lidar_perception.runs.files import write_text
 from lidar_perception.types import CLASSES, Detections
 
 BOX = ("x", "y", "z", "length", "width", "height", "yaw")
-COLUMNS = ("frame", "sequence", "index", "stamp_ns", "frame_id", "id", "class", "score", *BOX,
-           "velocity_x", "velocity_y")
+COLUMNS = (
+    "frame",
+    "sequence",
+    "index",
+    "stamp_ns",
+    "frame_id",
+    "id",
+    "class",
+    "score",
+    *BOX,
+    "velocity_x",
+    "velocity_y",
+)
 
 UNITS = {
     "box": "x y z of the centre, length, width, height in metres, yaw in radians counter-clockwise "
-           "from x, in the LiDAR frame of the cloud: x forward, y left, z up",
+    "from x, in the LiDAR frame of the cloud: x forward, y left, z up",
     "velocity": "metres a second over ground along x and y of the LiDAR frame; relative to the "
-                "sensor where ego is none", "score": "0..1", "stamp_ns": "nanoseconds",
-    "ms": "milliseconds of the detector"}
+    "sensor where ego is none",
+    "score": "0..1",
+    "stamp_ns": "nanoseconds",
+    "ms": "milliseconds of the detector",
+}
 
 
 @dataclass
@@ -81,8 +90,9 @@ class Format(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None: ...
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
 
     def add(self, result: FrameResult) -> None:
         """Write the result of the next frame."""
@@ -123,8 +133,10 @@ class Kitti(BufferedFormat):
         frame = result.frame
         calibration, nominal = choose_calibration(frame)
         if nominal:
-            self.run.add_remark("there is no camera calibration: kitti/ is in the frame of a "
-                                "nominal camera, level and 0.27 m ahead of the LiDAR")
+            self.run.add_remark(
+                "there is no camera calibration: kitti/ is in the frame of a "
+                "nominal camera, level and 0.27 m ahead of the LiDAR"
+            )
         if result.tracks is None:
             write_results(self.path / f"{frame.name}.txt", result.objects, calibration)
             return
@@ -137,9 +149,11 @@ class Kitti(BufferedFormat):
         for drive, frames in self.drives.items():
             name = self.names[drive]
             first = 0 if name == drive else frames[0][0]  # unnamed drives start at 0
-            write_tracking_results(self.path / f"{name}.txt",
-                                   [(number - first, ids, found) for number, ids, found in frames],
-                                   self.cameras[drive])
+            write_tracking_results(
+                self.path / f"{name}.txt",
+                [(number - first, ids, found) for number, ids, found in frames],
+                self.cameras[drive],
+            )
 
 
 class Json(BufferedFormat):
@@ -152,14 +166,27 @@ class Json(BufferedFormat):
     def add(self, result: FrameResult) -> None:
         """Keep the line of a frame."""
         frame = result.frame
-        self.lines.append(json.dumps({
-            "name": frame.name, "sequence": frame.sequence, "index": frame.index,
-            "stamp_ns": frame.stamp_ns, "frame_id": result.frame_id, "ms": result.ms,
-            "problem": result.problem, "objects": make_rows(result)}, allow_nan=False))
+        self.lines.append(
+            json.dumps(
+                {
+                    "name": frame.name,
+                    "sequence": frame.sequence,
+                    "index": frame.index,
+                    "stamp_ns": frame.stamp_ns,
+                    "frame_id": result.frame_id,
+                    "ms": result.ms,
+                    "problem": result.problem,
+                    "objects": make_rows(result),
+                },
+                allow_nan=False,
+            )
+        )
 
     def finish(self) -> None:
-        head = json.dumps({"format": "lidar_perception detections", "units": UNITS,
-                           **self.run.header, "skipped": self.run.skipped}, indent=1)
+        head = json.dumps(
+            {"format": "lidar_perception detections", "units": UNITS, **self.run.header, "skipped": self.run.skipped},
+            indent=1,
+        )
         write_text(self.path, f'{head[:-2]},\n "frames": [\n' + ",\n".join(self.lines) + "\n]}")
 
 
@@ -176,10 +203,20 @@ class Csv(BufferedFormat):
         """Keep the rows of a frame."""
         frame = result.frame
         for row in make_rows(result):
-            self.table.writerow([
-                frame.name, frame.sequence, frame.index, frame.stamp_ns, result.frame_id,
-                row["id"], row["class"], row["score"], *(row[name] for name in BOX),
-                *(row["velocity"] or (None, None))])
+            self.table.writerow(
+                [
+                    frame.name,
+                    frame.sequence,
+                    frame.index,
+                    frame.stamp_ns,
+                    result.frame_id,
+                    row["id"],
+                    row["class"],
+                    row["score"],
+                    *(row[name] for name in BOX),
+                    *(row["velocity"] or (None, None)),
+                ]
+            )
 
     def finish(self) -> None:
         write_text(self.path, self.text.getvalue())
@@ -197,16 +234,18 @@ class OpenLabel(BufferedFormat):
         """Keep the labels of a frame."""
         frame, found = result.frame, make_rows(result)
         self.labels[frame.name] = FrameLabels.of(
-            frame.name, frame.stamp_ns, result.objects.boxes, [row["class"] for row in found],
+            frame.name,
+            frame.stamp_ns,
+            result.objects.boxes,
+            [row["class"] for row in found],
             [-1 if row["id"] is None else row["id"] for row in found],
             [row["score"] for row in found],
-            [{"velocity": row["velocity"]} if row["velocity"] else {} for row in found])
+            [{"velocity": row["velocity"]} if row["velocity"] else {} for row in found],
+        )
 
     def finish(self) -> None:
-        frames = [with_optional_parts(self.run.recording.frames[i], self.run.add_remark)
-                  for i in range(self.run.count)]
-        labels = [self.labels.get(frame.name) or FrameLabels.of(frame.name, frame.stamp_ns)
-                  for frame in frames]
+        frames = [with_optional_parts(self.run.recording.frames[i], self.run.add_remark) for i in range(self.run.count)]
+        labels = [self.labels.get(frame.name) or FrameLabels.of(frame.name, frame.stamp_ns) for frame in frames]
         export_labels(DriveLabels(labels), "openlabel", self.path, frames, force=True)
 
 
@@ -224,8 +263,9 @@ def make_rows(result: FrameResult) -> list[dict[str, Any]]:
     found, tracks = result.objects, result.tracks
     ids = repeat(None) if tracks is None else tracks.ids.tolist()
     velocities = repeat(None) if tracks is None else to_short_floats(tracks.velocities)
-    return [{"id": number, "class": CLASSES[c], "score": score, **dict(zip(BOX, box)),
-             "velocity": velocity}
-            for number, velocity, c, score, box in zip(
-                ids, velocities, found.class_ids, to_short_floats(found.scores),
-                to_short_floats(found.boxes))]
+    return [
+        {"id": number, "class": CLASSES[c], "score": score, **dict(zip(BOX, box)), "velocity": velocity}
+        for number, velocity, c, score, box in zip(
+            ids, velocities, found.class_ids, to_short_floats(found.scores), to_short_floats(found.boxes)
+        )
+    ]

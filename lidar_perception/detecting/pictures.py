@@ -28,8 +28,7 @@ class FrameDrawer:
         size: width and height in pixels.
     """
 
-    def __init__(self, run: Run, color: str = "height",
-                 size: tuple[int, int] = (1280, 720)) -> None:
+    def __init__(self, run: Run, color: str = "height", size: tuple[int, int] = (1280, 720)) -> None:
         self.run, self.color, self.size = run, color, size
         self.stage: Stage | None = None
         self._first_ns = 0
@@ -39,8 +38,13 @@ class FrameDrawer:
         """Return the stage of the run, determined by the first result."""
         if self.stage is None:
             self._first_ns = result.frame.stamp_ns
-            self.stage = Stage.of(result.frame.load(), result.frame.sensor_height,
-                                  self.run.header.get("range") == "ahead", self.color, self.size)
+            self.stage = Stage.of(
+                result.frame.load(),
+                result.frame.sensor_height,
+                self.run.header.get("range") == "ahead",
+                self.color,
+                self.size,
+            )
         return self.stage
 
     def __call__(self, result: FrameResult) -> np.ndarray:
@@ -53,8 +57,14 @@ class FrameDrawer:
         if self._drawn is None or self._drawn[0] != frame.name:
             truth = frame.truth()
             labels = np.zeros((0, 7)) if truth is None else truth.boxes
-            image = draw_frame(self.get_stage(result), frame.load(), make_labelled_boxes(result),
-                               labels, self.title(result), self.time(frame.stamp_ns))
+            image = draw_frame(
+                self.get_stage(result),
+                frame.load(),
+                make_labelled_boxes(result),
+                labels,
+                self.title(result),
+                self.time(frame.stamp_ns),
+            )
             self._drawn = frame.name, image
         return self._drawn[1]
 
@@ -80,8 +90,10 @@ def make_labelled_boxes(result: FrameResult) -> Boxes:
         return Boxes(found.boxes, found.class_ids, [f"{score:.2f}" for score in found.scores])
     moving = tracks.moving >= MIN_MOVING
     velocities = np.where(moving[:, None], tracks.velocities, 0.0)
-    texts = [f"{number}  {np.hypot(*velocity):.1f} m/s" if moves else str(number)
-             for number, velocity, moves in zip(tracks.ids.tolist(), velocities, moving)]
+    texts = [
+        f"{number}  {np.hypot(*velocity):.1f} m/s" if moves else str(number)
+        for number, velocity, moves in zip(tracks.ids.tolist(), velocities, moving)
+    ]
     return Boxes(found.boxes, found.class_ids, texts, result.trails, velocities)
 
 
@@ -125,8 +137,7 @@ class VideoWriter:
         """Draw a frame and write the previous one, whose duration is now known."""
         picture, stamp_ns = self.drawer(result), result.frame.stamp_ns
         if self._last is not None:
-            self.film.add(self._last[1], float(np.clip((stamp_ns - self._last[0]) / 1e9,
-                                                       MIN_PICTURE_S, MAX_PICTURE_S)))
+            self.film.add(self._last[1], float(np.clip((stamp_ns - self._last[0]) / 1e9, MIN_PICTURE_S, MAX_PICTURE_S)))
         self._last = stamp_ns, picture
 
     def __exit__(self, *error: Any) -> None:

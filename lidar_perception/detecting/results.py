@@ -66,21 +66,29 @@ def measure_records(open_: Callable[[], Detector], recording: Recording) -> Call
         ms = (perf_counter() - begin) * 1e3
         objects = found.detections
         if not (np.isfinite(objects.boxes).all() and np.isfinite(objects.scores).all()):
-            raise InputError(f"{frame.name}: the detector returned numbers that are not finite; "
-                             "check its weights")
-        return json.dumps({
-            "frame": frame.name, "frame_id": scan.frame_id, "ms": round(ms, 3),
-            "problem": found.problem, "classes": [CLASSES[i] for i in objects.class_ids],
-            "boxes": to_short_floats(objects.boxes), "scores": to_short_floats(objects.scores),
-            "sources": {name: to_short_floats(p) for name, p in objects.sources.items()}})
+            raise InputError(f"{frame.name}: the detector returned numbers that are not finite; check its weights")
+        return json.dumps(
+            {
+                "frame": frame.name,
+                "frame_id": scan.frame_id,
+                "ms": round(ms, 3),
+                "problem": found.problem,
+                "classes": [CLASSES[i] for i in objects.class_ids],
+                "boxes": to_short_floats(objects.boxes),
+                "scores": to_short_floats(objects.scores),
+                "sources": {name: to_short_floats(p) for name, p in objects.sources.items()},
+            }
+        )
+
     return measure
 
 
 def read_detections(record: Mapping[str, Any]) -> Detections:
     """Return the detections of a record, bit for bit."""
     found = Detections.of(record["boxes"], class_ids(record["classes"]), record["scores"])
-    return replace(found, sources={name: np.array(probabilities, np.float32)
-                                   for name, probabilities in record["sources"].items()})
+    return replace(
+        found, sources={name: np.array(probabilities, np.float32) for name, probabilities in record["sources"].items()}
+    )
 
 
 def to_short_floats(values: np.ndarray) -> Any:
@@ -100,22 +108,30 @@ def with_optional_parts(frame: Frame, report: Callable[[str], None]) -> Frame:
     Args:
         report: called with the reason for each part that cannot be read.
     """
+
     def read_or_none(read: Callable[[], Any], name: str) -> Any:
         try:
             return read()
         except InputError as error:
             report(f"{name} left out: {error}")
             return None
+
     return replace(
-        frame.with_cached_scan(), truth=cache(partial(read_or_none, frame.truth, "labels")),
+        frame.with_cached_scan(),
+        truth=cache(partial(read_or_none, frame.truth, "labels")),
         calibration=cache(partial(read_or_none, frame.calibration, "camera calibration")),
-        pose=cache(partial(read_or_none, frame.pose, "pose")))
+        pose=cache(partial(read_or_none, frame.pose, "pose")),
+    )
 
 
-def make_results(read_record: Callable[[str], Mapping[str, Any]], min_scores: Mapping[str, float],
-                 make_tracker: Callable[[Recording], DriveTracker] | None,
-                 report: Callable[[str], None], scans: bool,
-                 recording: Recording) -> Callable[[Frame], FrameResult]:
+def make_results(
+    read_record: Callable[[str], Mapping[str, Any]],
+    min_scores: Mapping[str, float],
+    make_tracker: Callable[[Recording], DriveTracker] | None,
+    report: Callable[[str], None],
+    scans: bool,
+    recording: Recording,
+) -> Callable[[Frame], FrameResult]:
     """Return a function that makes the FrameResult of a frame from its record.
 
     Frames must be processed in order of time, in one process. With all arguments but the last,
@@ -140,12 +156,22 @@ def make_results(read_record: Callable[[str], Mapping[str, Any]], min_scores: Ma
         frame, found = with_optional_parts(frame, report), read_detections(record)
         if scans:
             frame.load()
-        result = FrameResult(frame, found[found.scores >= thresholds[found.class_ids]],
-                             record["frame_id"], record["ms"], record["problem"])
+        result = FrameResult(
+            frame,
+            found[found.scores >= thresholds[found.class_ids]],
+            record["frame_id"],
+            record["ms"],
+            record["problem"],
+        )
         if tracker is None:
             return result
         tracks, inner = tracker(frame, found), tracker.tracker
-        return replace(result, tracks=tracks, drive=tracker.drive,
-                       trails=tuple(trails(tracks, inner.pose, frame.stamp_ns, TRAIL_S)),
-                       tracking_problem=inner.problem)
+        return replace(
+            result,
+            tracks=tracks,
+            drive=tracker.drive,
+            trails=tuple(trails(tracks, inner.pose, frame.stamp_ns, TRAIL_S)),
+            tracking_problem=inner.problem,
+        )
+
     return measure

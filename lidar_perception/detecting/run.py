@@ -29,8 +29,7 @@ from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import CLASSES
 
 # Output files of a run, without the journal and the bag, which is replaced as a whole.
-OUTPUT_PATTERNS = ("kitti/**/*.txt", "detections.json", "detections.csv", "openlabel/*.json",
-                   "png/**/*.png")
+OUTPUT_PATTERNS = ("kitti/**/*.txt", "detections.json", "detections.csv", "openlabel/*.json", "png/**/*.png")
 
 
 @dataclass
@@ -73,14 +72,25 @@ class Summary:
 
     def compute(self) -> dict[str, Any]:
         """Return the statistics as JSON; ms is the median, None without frames."""
-        return {"frames": self.frames, "boxes": dict(self.boxes), "tracks": len(self.tracks),
-                "ms": float(np.median(self.ms)) if self.ms else None,
-                "problems": dict(self.problems), "skipped": self.skipped}
+        return {
+            "frames": self.frames,
+            "boxes": dict(self.boxes),
+            "tracks": len(self.tracks),
+            "ms": float(np.median(self.ms)) if self.ms else None,
+            "problems": dict(self.problems),
+            "skipped": self.skipped,
+        }
 
 
-def make_header(recording: Recording, weights: str, detector: ConfigurableDetector, *,
-                tracking: TrackingParams | None = None, ego: str | None = None,
-                **more: Any) -> dict[str, Any]:
+def make_header(
+    recording: Recording,
+    weights: str,
+    detector: ConfigurableDetector,
+    *,
+    tracking: TrackingParams | None = None,
+    ego: str | None = None,
+    **more: Any,
+) -> dict[str, Any]:
     """Return a JSON object with everything that determines the results of a run.
 
     Two runs with the same header have the same results.
@@ -93,18 +103,35 @@ def make_header(recording: Recording, weights: str, detector: ConfigurableDetect
     """
     kind, file = resolve_weights(weights)
     digest = None if file is None else hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-    return {"version": __version__, "data": str(recording.path.absolute()),
-            "layout": recording.layout, "frames_in_data": len(recording), **more,
-            "detector": kind, "weights": weights, "weights_sha256": digest,
-            "range": getattr(detector, "range", "around"), "classes": list(detector.classes),
-            "min_scores": dict(detector.min_scores),
-            "parameters": flatten(detector.params),
-            "tracking": None if tracking is None else flatten(tracking), "ego": ego}
+    return {
+        "version": __version__,
+        "data": str(recording.path.absolute()),
+        "layout": recording.layout,
+        "frames_in_data": len(recording),
+        **more,
+        "detector": kind,
+        "weights": weights,
+        "weights_sha256": digest,
+        "range": getattr(detector, "range", "around"),
+        "classes": list(detector.classes),
+        "min_scores": dict(detector.min_scores),
+        "parameters": flatten(detector.params),
+        "tracking": None if tracking is None else flatten(tracking),
+        "ego": ego,
+    }
 
 
-def detect(run: Run, open_: Callable[[], Detector], formats: Sequence[Callable[[Run], Format]], *,
-           tracking: TrackingParams | None = None, ego: str = "auto", jobs: int = 1,
-           dask: str | None = None, force: bool = False) -> Summary:
+def detect(
+    run: Run,
+    open_: Callable[[], Detector],
+    formats: Sequence[Callable[[Run], Format]],
+    *,
+    tracking: TrackingParams | None = None,
+    ego: str = "auto",
+    jobs: int = 1,
+    dask: str | None = None,
+    force: bool = False,
+) -> Summary:
     """Run a detector on the first run.count frames of a recording and write the results.
 
     Detections are written if they reach the min_scores of run.header. With tracking, the tracks of
@@ -124,8 +151,7 @@ def detect(run: Run, open_: Callable[[], Detector], formats: Sequence[Callable[[
     tracker = None if tracking is None else partial(DriveTracker, params=tracking, ego=ego)
     with open_journal(run.out, run.header, force=force, list_files=list_outputs) as done:
         names = [frame.name for frame in islice(recording, run.count)]
-        fill_journal(done, recording, partial(measure_records, open_), names, jobs=jobs, dask=dask,
-                     title="detecting")
+        fill_journal(done, recording, partial(measure_records, open_), names, jobs=jobs, dask=dask, title="detecting")
         done.sort(names)
 
         def read_record(name: str) -> Any:
@@ -133,8 +159,14 @@ def detect(run: Run, open_: Callable[[], Detector], formats: Sequence[Callable[[
 
         with ExitStack() as stack:
             made = [stack.enter_context(make(run)) for make in formats]
-            start = partial(make_results, read_record, run.header["min_scores"], tracker,
-                            run.add_remark, any(each.needs_scans for each in made))
+            start = partial(
+                make_results,
+                read_record,
+                run.header["min_scores"],
+                tracker,
+                run.add_remark,
+                any(each.needs_scans for each in made),
+            )
             summary = Summary(made, skipped=run.skipped)
             fill(summary, recording, start, limit=run.count, title="writing")
     return summary

@@ -34,25 +34,22 @@ class NetworkDetector:
         """The networks; the first one decides which classes are detected and where."""
         raise NotImplementedError
 
-    def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> DetectionResult:
+    def __call__(
+        self, cloud: Cloud, *, ground: np.ndarray | None = None, cluster_ids: np.ndarray | None = None
+    ) -> DetectionResult:
         """Detect the objects in a cloud, see contract.Detector.
 
         Raises:
             InputError: also if CUDA is out of memory and the parameter cpu_fallback is off.
         """
-        frame, ground, cluster_ids, problem = accept(cloud, ground, cluster_ids,
-                                                     self.settings.use_intensity)
+        frame, ground, cluster_ids, problem = accept(cloud, ground, cluster_ids, self.settings.use_intensity)
         if self.params.crop.enabled:
-            kept, frame = crop_with_sensor_pose(frame, self.params.crop,
-                                                self.params.ground.sensor_pose)
-            ground, cluster_ids = (column if column is None else column.take(kept)
-                                   for column in (ground, cluster_ids))
+            kept, frame = crop_with_sensor_pose(frame, self.params.crop, self.params.ground.sensor_pose)
+            ground, cluster_ids = (column if column is None else column.take(kept) for column in (ground, cluster_ids))
         found = self.detect(frame, ground, cluster_ids)
         return replace(found, problem=join_problems(problem, found.problem)) if problem else found
 
-    def detect(self, frame: PointCloud, ground: np.ndarray | None,
-               cluster_ids: np.ndarray | None) -> DetectionResult:
+    def detect(self, frame: PointCloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None) -> DetectionResult:
         """Detect the objects in a checked and cropped frame."""
         raise NotImplementedError
 
@@ -69,8 +66,7 @@ class NetworkDetector:
     @property
     def fallback(self) -> str | None:
         """Why a network runs on the CPU instead of the chosen device, or None."""
-        return next((network.placement.fallback for network in self.networks
-                     if network.placement.fallback), None)
+        return next((network.placement.fallback for network in self.networks if network.placement.fallback), None)
 
     @fallback.setter
     def fallback(self, reason: str | None) -> None:
@@ -118,8 +114,7 @@ class NetworkDetector:
             InputError: the network cannot cover that range.
         """
         if range == "ahead":
-            raise InputError(f"{self.group} always covers all directions; use the parameters "
-                             "crop.* to limit the area")
+            raise InputError(f"{self.group} always covers all directions; use the parameters crop.* to limit the area")
         return self
 
     def with_raw_scores(self) -> Self:

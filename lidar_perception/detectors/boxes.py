@@ -12,13 +12,13 @@ from numba import njit
 from lidar_perception.classes import CAR
 from lidar_perception.geometry import points_in_boxes, quantile, wrap_angle, wrap_line
 
-MARGIN_M = 0.4          # points up to this distance from a box belong to it
-MIN_HEIGHT_M = 0.2      # lower points of a box are not used
+MARGIN_M = 0.4  # points up to this distance from a box belong to it
+MIN_HEIGHT_M = 0.2  # lower points of a box are not used
 MIN_FACE_POINTS = 30
-FACE_QUANTILE = 0.03    # quantile of the points of a face that marks its surface
+FACE_QUANTILE = 0.03  # quantile of the points of a face that marks its surface
 # Depth of that quantile behind a labelled face, in metres: measured on 60 simulated scans.
 FRONT, REAR, SIDE = 0.03, 0.03, -0.01
-MIN_FACE_SLOPE = 0.3    # tangent of the flattest angle at which a face is used
+MIN_FACE_SLOPE = 0.3  # tangent of the flattest angle at which a face is used
 
 
 def move_towards(boxes: np.ndarray, others: np.ndarray, share: float) -> np.ndarray:
@@ -48,8 +48,7 @@ def move_to_ground(boxes: np.ndarray, ground_heights: np.ndarray, share: float) 
     return moved
 
 
-def move_cars_to_points(boxes: np.ndarray, class_ids: np.ndarray, xyz: np.ndarray,
-                        share: float) -> np.ndarray:
+def move_cars_to_points(boxes: np.ndarray, class_ids: np.ndarray, xyz: np.ndarray, share: float) -> np.ndarray:
     """Return boxes (K, 7) float64 with the cars moved by move_to_points."""
     moved, cars = np.array(boxes, np.float64), class_ids == CAR
     if share and cars.any():
@@ -67,8 +66,7 @@ def move_to_points(boxes: np.ndarray, xyz: np.ndarray, share: float) -> np.ndarr
         share: 0 keeps the boxes, 1 moves the faces all the way.
     """
     indices, first = points_in_boxes(xyz, boxes, MARGIN_M)
-    return _move_to_points(np.asarray(boxes, np.float64), xyz[indices].astype(np.float64), first,
-                           share)
+    return _move_to_points(np.asarray(boxes, np.float64), xyz[indices].astype(np.float64), first, share)
 
 
 @njit(cache=True, nogil=True)
@@ -78,15 +76,14 @@ def _move_to_points(boxes, points, first, share):
         x, y, z = boxes[k, :3]
         cos, sin = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
         sensor = np.array([-cos * x - sin * y, sin * x - cos * y])
-        own = points[first[k]:first[k + 1]]
+        own = points[first[k] : first[k + 1]]
         own = own[own[:, 2] > z - boxes[k, 5] / 2 + MIN_HEIGHT_M]
         flat = np.empty((len(own), 2))
         flat[:, 0] = cos * (own[:, 0] - x) + sin * (own[:, 1] - y)
         flat[:, 1] = cos * (own[:, 1] - y) - sin * (own[:, 0] - x)
         for axis in range(2):
             half, side = boxes[k, 3 + axis] / 2, np.sign(sensor[axis])
-            if abs(sensor[axis]) <= half or (
-                    abs(sensor[axis]) < MIN_FACE_SLOPE * abs(sensor[1 - axis])):
+            if abs(sensor[axis]) <= half or (abs(sensor[axis]) < MIN_FACE_SLOPE * abs(sensor[1 - axis])):
                 continue
             face = flat[np.abs(flat[:, 1 - axis]) <= boxes[k, 4 - axis] / 2 + 0.1]
             if len(face) < MIN_FACE_POINTS:

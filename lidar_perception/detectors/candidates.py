@@ -48,22 +48,24 @@ class CandidateDetector:
 
     def with_min_score(self, min_score: float) -> CandidateDetector:
         """Return a copy of this detector with another threshold."""
-        return CandidateDetector(self.seed, self.camera,
-                                 with_values(self.params, {self._threshold: min_score}))
+        return CandidateDetector(self.seed, self.camera, with_values(self.params, {self._threshold: min_score}))
 
     def with_sensor_height(self, height: float) -> CandidateDetector:
         """Return a copy of this detector for a sensor `height` metres above the ground."""
         return CandidateDetector(self.seed, self.camera, set_sensor_height(self.params, height))
 
-    def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> DetectionResult:
+    def __call__(
+        self, cloud: Cloud, *, ground: np.ndarray | None = None, cluster_ids: np.ndarray | None = None
+    ) -> DetectionResult:
         """Detect pedestrians, see contract.Detector.
 
         Raises:
             InputError: also if there is no seed, or if `params` need a camera and there is none.
         """
         frame, ground, cluster_ids, _ = accept(cloud, ground, cluster_ids)
-        segmented, candidates = find_candidates(frame, self.seed, self.camera, self.params,
-                                                ground=ground, cluster_ids=cluster_ids)
-        return DetectionResult(candidates.final, candidates.ms, diagnose_empty(
-            len(frame), segmented.ground, segmented.cluster_ids))
+        segmented, candidates = find_candidates(
+            frame, self.seed, self.camera, self.params, ground=ground, cluster_ids=cluster_ids
+        )
+        return DetectionResult(
+            candidates.final, candidates.ms, diagnose_empty(len(frame), segmented.ground, segmented.cluster_ids)
+        )

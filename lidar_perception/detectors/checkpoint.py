@@ -49,8 +49,7 @@ class Config(Protocol):
 
 POINTPILLARS, POINTNET = NetworkConfig.network, PointNetConfig.network
 NETWORKS: dict[str, tuple[str, str, type[Config]]] = {  # title, use, and class of the config
-    POINTPILLARS: ("PointPillars", "the node pointpillars_detector and pointpillars.weights",
-                   NetworkConfig),
+    POINTPILLARS: ("PointPillars", "the node pointpillars_detector and pointpillars.weights", NetworkConfig),
     POINTNET: ("PointNet", "the node pointnet_detector and pointnet.weights", PointNetConfig),
 }
 
@@ -82,19 +81,28 @@ class Header:
         """Return a warning if the weights were trained for another sensor height than `height`
         metres; None if they were not, or if the training height is unknown."""
         sensor = self.training.get("sensor")
-        if not isinstance(sensor, dict) or not isinstance(sensor.get("height"), float) or (
-                abs(sensor["height"] - height) < MIN_HEIGHT_DIFFERENCE_M):
+        if (
+            not isinstance(sensor, dict)
+            or not isinstance(sensor.get("height"), float)
+            or (abs(sensor["height"] - height) < MIN_HEIGHT_DIFFERENCE_M)
+        ):
             return None
         which = f"the sensor {sensor['name']}" if sensor.get("name") else "a sensor"
-        return (f"trained for {which} at {sensor['height']:g} m, and used with one at {height:g} "
-                "m")
+        return f"trained for {which} at {sensor['height']:g} m, and used with one at {height:g} m"
 
     def to_json(self) -> str:
         """Return the header as JSON text."""
-        return json.dumps(dict(format=FORMAT, network=self.network,
-                               config=dataclasses.asdict(self.config), training=self.training,
-                               metrics=self.metrics, commit=self.commit,
-                               calibration=self.calibration))
+        return json.dumps(
+            dict(
+                format=FORMAT,
+                network=self.network,
+                config=dataclasses.asdict(self.config),
+                training=self.training,
+                metrics=self.metrics,
+                commit=self.commit,
+                calibration=self.calibration,
+            )
+        )
 
     @staticmethod
     def from_json(text: str | None, source: str, kind: type[Config] | None = None) -> Header:
@@ -111,11 +119,14 @@ class Header:
         title, use, config = NETWORKS[content["network"]]
         if kind is not None and content["network"] != kind.network:
             wanted, own_use, _ = NETWORKS[kind.network]
-            raise InputError(f"{source} holds a {title}, which is for {use}; {own_use} take a "
-                             f"{wanted}")
-        return Header(parse_config(config, content["config"], source), content["training"],
-                      content["metrics"], content["commit"],
-                      _parse_calibration(content["calibration"], source))
+            raise InputError(f"{source} holds a {title}, which is for {use}; {own_use} take a {wanted}")
+        return Header(
+            parse_config(config, content["config"], source),
+            content["training"],
+            content["metrics"],
+            content["commit"],
+            _parse_calibration(content["calibration"], source),
+        )
 
 
 PARTS = {"config": dict, "training": dict, "metrics": dict, "commit": str}
@@ -131,14 +142,13 @@ def _parse_header(text: str | None, source: str) -> dict[str, Any]:
         if not all(isinstance(parts[name], kind) for name, kind in PARTS.items()):
             raise TypeError
     except (TypeError, ValueError, KeyError, AttributeError, RecursionError):
-        raise InputError(f"{source} has no header of this package; use import-weights for "
-                         "weights of other projects") from None
+        raise InputError(
+            f"{source} has no header of this package; use import-weights for weights of other projects"
+        ) from None
     if parts["format"] != FORMAT:
-        raise InputError(f"{source} has format {str(parts['format'])[:40]}, this version reads "
-                         f"{FORMAT}")
+        raise InputError(f"{source} has format {str(parts['format'])[:40]}, this version reads {FORMAT}")
     if not isinstance(network, str) or network not in NETWORKS:
-        raise InputError(f"{source} holds a network {str(network)[:40]!r}, this version knows "
-                         f"{' and '.join(NETWORKS)}")
+        raise InputError(f"{source} holds a network {str(network)[:40]!r}, this version knows {' and '.join(NETWORKS)}")
     return {"network": network, "calibration": calibration, **parts}
 
 
@@ -146,13 +156,14 @@ def _parse_calibration(content: Any, source: str) -> dict[str, tuple[float, floa
     """Return the calibration of a header. InputError if it is invalid."""
     try:
         lines = {name: (float(slope), float(offset)) for name, (slope, offset) in content.items()}
-        if all(name in CLASSES and 0 < slope < MAX_COEFFICIENT and abs(offset) < MAX_COEFFICIENT
-               for name, (slope, offset) in lines.items()):
+        if all(
+            name in CLASSES and 0 < slope < MAX_COEFFICIENT and abs(offset) < MAX_COEFFICIENT
+            for name, (slope, offset) in lines.items()
+        ):
             return lines
     except (TypeError, ValueError, AttributeError, OverflowError):
         pass
-    raise InputError(f"{source} has an invalid calibration; it needs a slope above 0 and an offset "
-                     "for each class")
+    raise InputError(f"{source} has an invalid calibration; it needs a slope above 0 and an offset for each class")
 
 
 def read_network_name(path: str | Path) -> str:
@@ -160,14 +171,14 @@ def read_network_name(path: str | Path) -> str:
     return _parse_header(_read(Path(path), tensors=False)[0], str(path))["network"]
 
 
-def save_checkpoint(path: str | Path, network: torch.nn.Module, header: Header,
-                    half: bool = False) -> None:
+def save_checkpoint(path: str | Path, network: torch.nn.Module, header: Header, half: bool = False) -> None:
     """Write the weights and the header of a network atomically.
 
     Args:
         half: store the weights of layers as float16; norms and biases remain float32.
     """
     from safetensors.torch import save
+
     tensors = {name: _to_stored(value, half) for name, value in network.state_dict().items()}
     write_bytes(path, save(tensors, {KEY: header.to_json()}))
 
@@ -175,11 +186,13 @@ def save_checkpoint(path: str | Path, network: torch.nn.Module, header: Header,
 def save_header(path: Path, header: Header) -> None:
     """Replace the header of a checkpoint and leave its tensors unchanged."""
     from safetensors.torch import save
+
     write_bytes(path, save(_read(path)[1], {KEY: header.to_json()}))
 
 
 def _to_stored(value: torch.Tensor, half: bool) -> torch.Tensor:
     import torch
+
     value = value.detach().cpu()
     if value.is_floating_point():
         value = value.to(torch.float16 if half and value.ndim > 1 else torch.float32)
@@ -198,8 +211,7 @@ def read_header(path: str | Path, kind: type[Config] | None = None) -> Header:
     return Header.from_json(_read(Path(path), tensors=False)[0], str(path), kind)
 
 
-def read_checkpoint(path: str | Path,
-                    kind: type[Config]) -> tuple[Header, dict[str, torch.Tensor]]:
+def read_checkpoint(path: str | Path, kind: type[Config]) -> tuple[Header, dict[str, torch.Tensor]]:
     """Read the header and the tensors as stored, on the CPU. InputError as in read_header."""
     text, tensors = _read(Path(path))
     return Header.from_json(text, str(path), kind), tensors
@@ -219,8 +231,9 @@ def read_arrays(path: str | Path, kind: type[Config]) -> tuple[Header, dict[str,
     return Header.from_json(text, str(path), kind), tensors
 
 
-def load_checkpoint(path: str | Path, kind: type[Config], make: Callable[[Any], Net],
-                    expected: Any = None) -> tuple[Header, Net]:
+def load_checkpoint(
+    path: str | Path, kind: type[Config], make: Callable[[Any], Net], expected: Any = None
+) -> tuple[Header, Net]:
     """Load the header and the network of a checkpoint: float32, on the CPU, in training mode.
 
     Args:
@@ -232,6 +245,7 @@ def load_checkpoint(path: str | Path, kind: type[Config], make: Callable[[Any], 
         InputError: see read_header and require_same_config; or the weights do not fit the config.
     """
     import torch
+
     header, tensors = read_checkpoint(path, kind)
     if expected is not None:
         require_same_config(header.config, expected, str(path))
@@ -240,11 +254,11 @@ def load_checkpoint(path: str | Path, kind: type[Config], make: Callable[[Any], 
     for name in sorted({*wanted, *tensors}, key=str):
         ours, theirs = (_describe_tensor(state.get(name)) for state in (wanted, tensors))
         if ours != theirs:
-            raise InputError(f"the weights in {path} do not fit its header: {name[:80]} is "
-                             f"{theirs}, and should be {ours}")
+            raise InputError(
+                f"the weights in {path} do not fit its header: {name[:80]} is {theirs}, and should be {ours}"
+            )
     network = make(header.config)
-    network.load_state_dict({name: value.to(wanted[name].dtype)
-                             for name, value in tensors.items()})
+    network.load_state_dict({name: value.to(wanted[name].dtype) for name, value in tensors.items()})
     return header, network
 
 
@@ -255,8 +269,7 @@ def _describe_tensor(value: torch.Tensor | None) -> str:
     return f"{kind} of shape {tuple(value.shape)}"
 
 
-def copy_matching_weights(network: torch.nn.Module, path: str | Path,
-                          kind: type[Config]) -> tuple[int, int]:
+def copy_matching_weights(network: torch.nn.Module, path: str | Path, kind: type[Config]) -> tuple[int, int]:
     """Copy the weights of a checkpoint that fit a network, for fine-tuning; configs may differ.
 
     Tensors with the same name and shape are copied. If only the number of inputs differs, the
@@ -280,8 +293,7 @@ def copy_matching_weights(network: torch.nn.Module, path: str | Path,
             continue
         if stored.shape == value.shape:
             value.copy_(stored)
-        elif value.ndim > 1 and stored.shape[0] == value.shape[0] and (
-                stored.shape[2:] == value.shape[2:]):
+        elif value.ndim > 1 and stored.shape[0] == value.shape[0] and (stored.shape[2:] == value.shape[2:]):
             common = min(stored.shape[1], value.shape[1])
             value.zero_()
             value[:, :common] = stored[:, :common]
@@ -298,13 +310,11 @@ def require_same_config(found: Any, wanted: Any, source: str) -> None:
     ours, theirs = dataclasses.asdict(wanted), dataclasses.asdict(found)
     different = [name for name in ours if ours[name] != theirs[name]]
     if different:
-        shown = "; ".join(f"{name} is {theirs[name]}, expected was {ours[name]}"
-                          for name in different[:3])
+        shown = "; ".join(f"{name} is {theirs[name]}, expected was {ours[name]}" for name in different[:3])
         raise InputError(f"{source} holds another network: {shown}")
 
 
-def _read(path: Path, tensors: bool = True, framework: str = "pt"
-          ) -> tuple[str | None, dict[str, Any]]:
+def _read(path: Path, tensors: bool = True, framework: str = "pt") -> tuple[str | None, dict[str, Any]]:
     """Return the text of the header, None if there is none, and the tensors.
 
     Args:

@@ -11,8 +11,8 @@ from lidar_perception.types import InputError
 
 C = TypeVar("C")
 
-MAX_LENGTH = 64        # of a tuple or a string
-MAX_NUMBER = 1 << 16   # far above every width, count and distance in metres of a network
+MAX_LENGTH = 64  # of a tuple or a string
+MAX_NUMBER = 1 << 16  # far above every width, count and distance in metres of a network
 
 
 def parse_config(kind: type[C], content: Any, source: str) -> C:

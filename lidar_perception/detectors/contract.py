@@ -14,13 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidar_perception.intensity import find_scale_problem, guess_scale, to_unit
-from lidar_perception.types import (
-    Detections,
-    PointCloud,
-    as_point_cloud,
-    check_columns,
-    usable_returns,
-)
+from lidar_perception.types import Detections, PointCloud, as_point_cloud, check_columns, usable_returns
 
 Cloud = PointCloud | ArrayLike  # see PointCloud.of
 FUSED = "fused"  # the default detector
@@ -60,8 +54,9 @@ class Detector(Protocol):
     def with_sensor_height(self, height: float) -> Self:
         """Return a copy of this detector for a sensor `height` metres above the ground."""
 
-    def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> DetectionResult:
+    def __call__(
+        self, cloud: Cloud, *, ground: np.ndarray | None = None, cluster_ids: np.ndarray | None = None
+    ) -> DetectionResult:
         """Detect the objects in a cloud of N points; N may be 0.
 
         Args:
@@ -90,8 +85,9 @@ class Accepted(NamedTuple):
     problem: str | None = None
 
 
-def accept(cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None,
-           use_intensity: bool = True) -> Accepted:
+def accept(
+    cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None, use_intensity: bool = True
+) -> Accepted:
     """Check and convert the arguments of a detector, see Detector.__call__.
 
     An intensity outside 0..1 is divided by the scale that it seems to have. This is a guess from
@@ -107,8 +103,7 @@ def accept(cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | No
     if frame is not cloud and not (usable := usable_returns(frame.xyz)).all():
         kept = np.flatnonzero(usable)
         frame = frame.take(kept)
-        ground, cluster_ids = (column if column is None else column.take(kept)
-                               for column in (ground, cluster_ids))
+        ground, cluster_ids = (column if column is None else column.take(kept) for column in (ground, cluster_ids))
     problem = find_scale_problem(frame.intensity) if use_intensity else None
     if problem and frame.intensity is not None:
         full = guess_scale(frame.intensity)
@@ -121,5 +116,7 @@ def join_problems(*problems: str | None) -> str | None:
     """Join problems in this order, leaving out those that a later one contains; None if there are
     no problems."""
     found = [problem for problem in problems if problem]
-    return "; ".join(problem for i, problem in enumerate(found)
-                     if not any(problem in later for later in found[i + 1:])) or None
+    return (
+        "; ".join(problem for i, problem in enumerate(found) if not any(problem in later for later in found[i + 1 :]))
+        or None
+    )

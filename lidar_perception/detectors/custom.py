@@ -23,15 +23,7 @@ from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.ground.params import SensorPoseParams, set_sensor_height
 from lidar_perception.param_fields import Params
 from lidar_perception.robot.params import CropParams
-from lidar_perception.types import (
-    CLASSES,
-    Detections,
-    InputError,
-    PointCloud,
-    RunError,
-    did_you_mean,
-    unknown_name,
-)
+from lidar_perception.types import CLASSES, Detections, InputError, PointCloud, RunError, did_you_mean, unknown_name
 
 ENTRY_POINTS = "lidar_perception.detectors"  # group of entry points: NAME = "module:Class"
 REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
@@ -104,8 +96,9 @@ class CustomDetector:
         """Return this detector for a sensor mounted `height` metres above the ground."""
         return self.with_params(set_sensor_height(self.params, height))
 
-    def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> DetectionResult:
+    def __call__(
+        self, cloud: Cloud, *, ground: np.ndarray | None = None, cluster_ids: np.ndarray | None = None
+    ) -> DetectionResult:
         """See contract.Detector; ground and cluster_ids are checked and not used.
 
         Raises:
@@ -115,14 +108,17 @@ class CustomDetector:
         pose = self.params.ground.sensor_pose
         if self.params.crop.enabled:
             from lidar_perception.ground.segment import crop_with_sensor_pose  # loads Numba
+
             _, frame = crop_with_sensor_pose(frame, self.params.crop, pose)
         begin = perf_counter()
         found = self.build(pose.height)(frame)
         milliseconds = (perf_counter() - begin) * 1e3
         if not isinstance(found, Detections):
-            raise RunError(f"{self.name} returned {type(found).__name__}; a detector returns "
-                           "Detections, such as lidar_perception.Detections.of(boxes, class_ids, "
-                           "scores)")
+            raise RunError(
+                f"{self.name} returned {type(found).__name__}; a detector returns "
+                "Detections, such as lidar_perception.Detections.of(boxes, class_ids, "
+                "scores)"
+            )
         return DetectionResult(found[self.scores.passes(found)], {"detect": milliseconds}, problem)
 
 
@@ -133,8 +129,7 @@ def as_detector(detector: Detector | Callable[[PointCloud], Detections]) -> Dete
         InputError: it cannot be called, or is a class instead of an instance.
     """
     if isinstance(detector, type) or not callable(detector):
-        raise InputError(f"{detector!r} is not a detector; give an instance with "
-                         "__call__(cloud) -> Detections")
+        raise InputError(f"{detector!r} is not a detector; give an instance with __call__(cloud) -> Detections")
     if hasattr(detector, "with_min_score") and hasattr(detector, "min_scores"):
         return cast(Detector, detector)
     name = getattr(detector, "__name__", type(detector).__name__)
@@ -145,8 +140,7 @@ def find_reference(name: str) -> str | None:
     """Return "module:Class" for a reference or the name of an entry point; None for other names."""
     if REFERENCE.fullmatch(name):
         return None if Path(name).exists() else name
-    return next((each.value for each in entry_points(group=ENTRY_POINTS) if each.name == name),
-                None)
+    return next((each.value for each in entry_points(group=ENTRY_POINTS) if each.name == name), None)
 
 
 def entry_point_names() -> list[str]:
@@ -154,8 +148,9 @@ def entry_point_names() -> list[str]:
     return sorted({each.name for each in entry_points(group=ENTRY_POINTS)})
 
 
-def load_custom_detector(reference: str, device: str = "auto", range: str = "auto",
-                         params: Any = None, group: str = "custom") -> CustomDetector:
+def load_custom_detector(
+    reference: str, device: str = "auto", range: str = "auto", params: Any = None, group: str = "custom"
+) -> CustomDetector:
     """Load a custom detector, a class whose instances return Detections for a PointCloud.
 
     Args:
@@ -171,10 +166,8 @@ def load_custom_detector(reference: str, device: str = "auto", range: str = "aut
     make = _find_class(reference)
     taken = _find_arguments(make)
     if range != "auto" and "range" not in taken:
-        raise InputError(f"{reference} takes no range; leave it out, or add an argument `range` to "
-                         "the class")
-    values = {name: value for name, value in (("device", device), ("range", range))
-              if name in taken}
+        raise InputError(f"{reference} takes no range; leave it out, or add an argument `range` to the class")
+    values = {name: value for name, value in (("device", device), ("range", range)) if name in taken}
 
     @lru_cache(maxsize=2)
     def build(height: float | None) -> Callable[[PointCloud], Any]:
@@ -190,8 +183,14 @@ def load_custom_detector(reference: str, device: str = "auto", range: str = "aut
     takes_height = "sensor_height" in taken
     params = CustomDetectorParams() if params is None else params
     first = build(params.ground.sensor_pose.height if takes_height else None)
-    return CustomDetector(reference, lambda height: build(height if takes_height else None),
-                          _find_classes(reference, first), params, group, device)
+    return CustomDetector(
+        reference,
+        lambda height: build(height if takes_height else None),
+        _find_classes(reference, first),
+        params,
+        group,
+        device,
+    )
 
 
 def _find_class(reference: str) -> Callable[..., Any]:
@@ -203,15 +202,15 @@ def _find_class(reference: str) -> Callable[..., Any]:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise InputError(f"{module_name} cannot be imported: {_describe(error)}") from error
-        raise InputError(f"there is no module {module_name!r}; run the command in its folder, or "
-                         "add the folder to PYTHONPATH") from None
+        raise InputError(
+            f"there is no module {module_name!r}; run the command in its folder, or add the folder to PYTHONPATH"
+        ) from None
     except Exception as error:
         raise InputError(f"{module_name} cannot be imported: {_describe(error)}") from error
     for name in class_name.split("."):
         if not hasattr(found, name):
             known = [key for key, value in vars(found).items() if isinstance(value, type)]
-            raise InputError(f"{module_name} has no class {class_name!r}"
-                             f"{did_you_mean(class_name, known)}")
+            raise InputError(f"{module_name} has no class {class_name!r}{did_you_mean(class_name, known)}")
         found = getattr(found, name)
     if not callable(found):
         raise InputError(f"{reference} is not a class but {type(found).__name__}")
@@ -224,8 +223,11 @@ def _find_arguments(make: Callable[..., Any]) -> set[str]:
         parameters = inspect.signature(make).parameters
     except ValueError:  # a class that is written in C
         return set()
-    return {name for name in ARGUMENTS if name in parameters
-            and parameters[name].kind is not inspect.Parameter.POSITIONAL_ONLY}
+    return {
+        name
+        for name in ARGUMENTS
+        if name in parameters and parameters[name].kind is not inspect.Parameter.POSITIONAL_ONLY
+    }
 
 
 def _find_classes(name: str, detector: Any) -> tuple[str, ...]:

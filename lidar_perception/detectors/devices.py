@@ -32,13 +32,16 @@ def find_device(name: str = "auto") -> str:
     if not match:
         raise InputError(f"there is no device {name!r}; choose auto, cpu, cuda or cuda:N")
     import torch  # slow to import
+
     available = torch.cuda.is_available()
     if name == "auto":
         return "cuda" if available else CPU
     if not (available and int(match[1] or 0) < torch.cuda.device_count()):
-        raise InputError(f"device {name!r} is not available: torch finds "
-                         f"{torch.cuda.device_count() if available else 'no'} CUDA device here; "
-                         "choose auto or cpu")
+        raise InputError(
+            f"device {name!r} is not available: torch finds "
+            f"{torch.cuda.device_count() if available else 'no'} CUDA device here; "
+            "choose auto or cpu"
+        )
     return name
 
 
@@ -65,6 +68,7 @@ def choose_dtype(amp: str, device: str | torch.device) -> torch.dtype | None:
         amp: off, bf16, fp16 (CUDA only), or auto: 16 bits if the device has instructions for it.
     """
     import torch
+
     if torch.device(device).type == CPU:
         return torch.bfloat16 if uses_16_bits(amp) else None
     if amp == "off":

@@ -46,8 +46,9 @@ class LayerWeights:
         weight = self.array(f"{name}.weight", shape)
         if norm is None or f"{norm}.weight" not in self.tensors:
             return Weights(weight, self.array(f"{name}.bias", shape[:1]))
-        scale, shift, mean, variance = (self.array(f"{norm}.{part}", shape[:1]) for part in (
-            "weight", "bias", "running_mean", "running_var"))
+        scale, shift, mean, variance = (
+            self.array(f"{norm}.{part}", shape[:1]) for part in ("weight", "bias", "running_mean", "running_var")
+        )
         count = self.tensors.pop(f"{norm}.num_batches_tracked", None)
         if count is None or count.shape or count.dtype != np.int64:
             raise WeightsMismatch(f"{norm}.num_batches_tracked")

@@ -29,9 +29,9 @@ def _vector_width() -> int:
 
 
 LANES = _vector_width()
-BLOCK = 2 * LANES                # columns of a tile: two vectors
+BLOCK = 2 * LANES  # columns of a tile: two vectors
 ROWS = 12 if LANES == 16 else 6  # rows of a tile: as many as its sums fit in the registers
-UNROLL = 4                       # channels in one turn of the inner loop
+UNROLL = 4  # channels in one turn of the inner loop
 
 
 @intrinsic
@@ -51,14 +51,12 @@ def multiply_tile(typingctx, inputs, taps, channels, weights, starts, outputs, f
     return signature, _emit_tile
 
 
-def _emit_tile(context: Any, builder: ir.IRBuilder, signature: Any, args: Sequence[ir.Value]
-               ) -> Any:
+def _emit_tile(context: Any, builder: ir.IRBuilder, signature: Any, args: Sequence[ir.Value]) -> Any:
     """Emit multiply_tile. Its sums remain in registers over all taps and channels."""
     inputs, taps, channels, weights, starts, outputs, floor = args
     i64, f32 = ir.IntType(64), ir.FloatType()
     vector = ir.VectorType(f32, LANES)
-    fma = cgutils.get_or_insert_function(
-        builder.module, ir.FunctionType(vector, [vector] * 3), f"llvm.fma.v{LANES}f32")
+    fma = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, [vector] * 3), f"llvm.fma.v{LANES}f32")
 
     def number(value: int) -> ir.Value:
         return ir.Constant(i64, value)
@@ -70,13 +68,14 @@ def _emit_tile(context: Any, builder: ir.IRBuilder, signature: Any, args: Sequen
         return builder.load(builder.inttoptr(address, kind.as_pointer()), align=4)
 
     def splat(value: ir.Value) -> ir.Value:
-        first = builder.insert_element(ir.Constant(vector, ir.Undefined), value,
-                                       ir.Constant(ir.IntType(32), 0))
-        return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), ir.Constant(
-            ir.VectorType(ir.IntType(32), LANES), [0] * LANES))
+        first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+        return builder.shuffle_vector(
+            first, ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+        )
 
-    def loop(count: ir.Value, step: int, starts: list[ir.Value],
-             body: Callable[[ir.Value, list[ir.Value]], list[ir.Value]]) -> list[ir.Value]:
+    def loop(
+        count: ir.Value, step: int, starts: list[ir.Value], body: Callable[[ir.Value, list[ir.Value]], list[ir.Value]]
+    ) -> list[ir.Value]:
         """Repeat values = body(counter, values) for counter 0, step .. below count."""
         before, head = builder.block, builder.append_basic_block()
         builder.branch(head)
@@ -95,8 +94,7 @@ def _emit_tile(context: Any, builder: ir.IRBuilder, signature: Any, args: Sequen
         builder.position_at_end(end)
         return after
 
-    sums = [load(vector, at(load(i64, at(starts, 8 * i)), 4 * LANES * half))
-            for i in range(ROWS) for half in range(2)]
+    sums = [load(vector, at(load(i64, at(starts, 8 * i)), 4 * LANES * half)) for i in range(ROWS) for half in range(2)]
 
     def tap(number_of_tap: ir.Value, values: list[ir.Value]) -> list[ir.Value]:
         table = at(inputs, builder.mul(number_of_tap, number(8 * ROWS)))
@@ -123,8 +121,7 @@ def _emit_tile(context: Any, builder: ir.IRBuilder, signature: Any, args: Sequen
         for half in range(2):
             value = sums[2 * i + half]
             value = builder.select(builder.fcmp_ordered("<", value, limit), limit, value)
-            builder.store(value, builder.inttoptr(at(place, 4 * LANES * half),
-                                                  vector.as_pointer()), align=4)
+            builder.store(value, builder.inttoptr(at(place, 4 * LANES * half), vector.as_pointer()), align=4)
     return context.get_dummy_value()
 
 
@@ -139,8 +136,7 @@ def multiply(rows, weights, bias, floor):
     """
     blocks, _, channels, _ = weights.shape
     sums = np.empty((len(rows), blocks * BLOCK), np.float32)
-    inputs, starts, outputs = np.empty(ROWS, np.int64), np.empty(ROWS, np.int64), np.empty(
-        ROWS, np.int64)
+    inputs, starts, outputs = np.empty(ROWS, np.int64), np.empty(ROWS, np.int64), np.empty(ROWS, np.int64)
     for block in range(blocks):
         starts[:] = bias.ctypes.data + 4 * BLOCK * block
         for first in range(0, len(rows), ROWS):
@@ -148,9 +144,15 @@ def multiply(rows, weights, bias, floor):
                 row = min(first + i, len(rows) - 1)  # the last is repeated
                 inputs[i] = rows.ctypes.data + 4 * row * rows.shape[1]
                 outputs[i] = sums.ctypes.data + 4 * (row * sums.shape[1] + BLOCK * block)
-            multiply_tile(inputs.ctypes.data, 1, channels,
-                          weights.ctypes.data + 4 * block * channels * BLOCK, starts.ctypes.data,
-                          outputs.ctypes.data, floor)
+            multiply_tile(
+                inputs.ctypes.data,
+                1,
+                channels,
+                weights.ctypes.data + 4 * block * channels * BLOCK,
+                starts.ctypes.data,
+                outputs.ctypes.data,
+                floor,
+            )
     return sums
 
 
@@ -173,5 +175,5 @@ def pad_bias(bias: np.ndarray | None, width: int) -> np.ndarray:
     """Return a bias (O,) or None as (width,) float32, padded with zeros."""
     filled = np.zeros(width, np.float32)
     if bias is not None:
-        filled[:len(bias)] = bias
+        filled[: len(bias)] = bias
     return filled

@@ -13,21 +13,23 @@ from lidar_perception.geometry import MAX_CORNERS, footprint_radii, lower_bound,
 from lidar_perception.types import CLASSES, Detections
 
 
-def apply_nms(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray,
-              classes: tuple[str, ...], params: NmsParams) -> Detections:
+def apply_nms(
+    boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, classes: tuple[str, ...], params: NmsParams
+) -> Detections:
     """Return the boxes that survive NMS as detections, best score first.
 
     Args:
         boxes: (N, 7), with scores (N,).
         labels: (N,) int, indices into `classes`.
     """
-    kept = rotated_nms(boxes, scores, labels, params.iou, params.across_classes)[:params.max_boxes]
+    kept = rotated_nms(boxes, scores, labels, params.iou, params.across_classes)[: params.max_boxes]
     ids = np.array([CLASSES.index(name) for name in classes])
     return Detections.of(boxes[kept], ids[labels[kept]], scores[kept])
 
 
-def rotated_nms(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: float,
-                across_classes: bool = False) -> np.ndarray:
+def rotated_nms(
+    boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: float, across_classes: bool = False
+) -> np.ndarray:
     """Return the indices (M,) int64 of the boxes (N, 7) that survive, best score first; equal
     scores keep their order.
 

@@ -14,7 +14,7 @@ from lidar_perception.ground.surface import GroundSurface
 from lidar_perception.intensity import MIN_POINTS, normalize_intensity
 from lidar_perception.types import SENSOR_HEIGHT, Detections, PointCloud
 
-MAX_MAST_M = 1.0     # a car farther below the sensor passes under a gantry
+MAX_MAST_M = 1.0  # a car farther below the sensor passes under a gantry
 MAX_ROOF_GAP_M = 1.0  # less than half of a car's width and the gap to the next car
 
 Corner = tuple[float, float, float]  # of a range: x, y, z in metres
@@ -40,9 +40,13 @@ class NormalizedView:
     use_intensity: bool
 
     @staticmethod
-    def of(source: PointCloud, pose: SensorPoseParams = SensorPoseParams(),
-           low: Corner | None = None, high: Corner | None = None,
-           use_intensity: bool = True) -> NormalizedView:
+    def of(
+        source: PointCloud,
+        pose: SensorPoseParams = SensorPoseParams(),
+        low: Corner | None = None,
+        high: Corner | None = None,
+        use_intensity: bool = True,
+    ) -> NormalizedView:
         """Return the view of a cloud.
 
         Args:
@@ -54,11 +58,11 @@ class NormalizedView:
         shift = np.array([0, 0, pose.height - SENSOR_HEIGHT], np.float32)
         xyz, indices, frame = level_points(source.xyz, pose), np.arange(len(source)), source
         if low is not None and high is not None:
-            indices = _indices_in_range(xyz, np.array(low, np.float32) - shift,
-                                        np.array(high, np.float32) - shift)
+            indices = _indices_in_range(xyz, np.array(low, np.float32) - shift, np.array(high, np.float32) - shift)
             frame, xyz = source.take(indices), xyz.take(indices, axis=0)
-        intensity = normalize_intensity(
-            source.intensity, None if frame is source else indices) if use_intensity else None
+        intensity = (
+            normalize_intensity(source.intensity, None if frame is source else indices) if use_intensity else None
+        )
         frame = replace(frame, xyz=xyz + shift, intensity=intensity)
         return NormalizedView(frame, indices, source, pose, use_intensity)
 
@@ -94,14 +98,22 @@ class NormalizedView:
         """Return the problem if the cloud has no usable intensity; None if it has, or the view
         leaves the intensity out."""
         intensity = self.source.intensity
-        if not self.use_intensity or self.frame.intensity is not None or (
-                intensity is not None and len(intensity) < MIN_POINTS):
+        if (
+            not self.use_intensity
+            or self.frame.intensity is not None
+            or (intensity is not None and len(intensity) < MIN_POINTS)
+        ):
             return None
-        lack = ("has no intensity" if intensity is None else
-                "has the intensity 0 everywhere" if not intensity.any() else
-                "has the same intensity nearly everywhere")
-        return (f"the cloud {lack}, without which fewer people are found; set use_intensity to "
-                "false if the sensor has none")
+        lack = (
+            "has no intensity"
+            if intensity is None
+            else "has the intensity 0 everywhere"
+            if not intensity.any()
+            else "has the same intensity nearly everywhere"
+        )
+        return (
+            f"the cloud {lack}, without which fewer people are found; set use_intensity to false if the sensor has none"
+        )
 
 
 def _indices_in_range(xyz: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -158,8 +170,7 @@ def drop_ego_vehicle(detections: Detections, height: float) -> Detections:
     along = np.abs(np.cos(yaw) * x + np.sin(yaw) * y) - length / 2
     across = np.abs(np.cos(yaw) * y - np.sin(yaw) * x) - width / 2
     distance = np.hypot(along.clip(0), across.clip(0))
-    is_roof = ((detections.class_ids == CAR) & (z + box_height / 2 < 0)
-               & (distance < MAX_ROOF_GAP_M))
+    is_roof = (detections.class_ids == CAR) & (z + box_height / 2 < 0) & (distance < MAX_ROOF_GAP_M)
     is_carrier = ((distance == 0) | is_roof) & (np.abs(z) <= box_height / 2 + MAX_MAST_M)
     return detections[~is_carrier] if is_carrier.any() else detections
 

@@ -20,9 +20,14 @@ if TYPE_CHECKING:
 OPSET = 18
 
 
-def write_onnx(path: str | Path, network: torch.nn.Module, header: Header,
-               inputs: Mapping[str, torch.Tensor], outputs: Sequence[str],
-               dynamic: Mapping[str, Any]) -> None:
+def write_onnx(
+    path: str | Path,
+    network: torch.nn.Module,
+    header: Header,
+    inputs: Mapping[str, torch.Tensor],
+    outputs: Sequence[str],
+    dynamic: Mapping[str, Any],
+) -> None:
     """Export a network, in eval mode, to an ONNX file.
 
     Args:
@@ -37,15 +42,24 @@ def write_onnx(path: str | Path, network: torch.nn.Module, header: Header,
         import onnx
         import onnxscript  # noqa: F401
     except ImportError:
-        raise InputError("export onnx needs the packages of the extra [onnx]: pip install "
-                         "'lidar_perception[onnx]'") from None
+        raise InputError(
+            "export onnx needs the packages of the extra [onnx]: pip install 'lidar_perception[onnx]'"
+        ) from None
     import torch
+
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is missing
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            network, tuple(inputs.values()), dynamo=True, verbose=False, opset_version=OPSET,
-            input_names=list(inputs), output_names=list(outputs), dynamic_shapes=dict(dynamic))
+            network,
+            tuple(inputs.values()),
+            dynamo=True,
+            verbose=False,
+            opset_version=OPSET,
+            input_names=list(inputs),
+            output_names=list(outputs),
+            dynamic_shapes=dict(dynamic),
+        )
     assert program is not None  # as dynamo is True
     model = program.model_proto
     onnx.helper.set_model_props(model, {KEY: header.to_json()})
@@ -65,29 +79,25 @@ def open_session(path: str | Path) -> tuple[Any, str | None]:
     try:
         import onnxruntime
     except ImportError:
-        raise InputError(f"{path} needs onnxruntime: pip install 'lidar_perception[onnx]'"
-                         ) from None
+        raise InputError(f"{path} needs onnxruntime: pip install 'lidar_perception[onnx]'") from None
     if not Path(path).is_file():
         raise InputError(f"there is no exported network {path}")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = thread_count()
     try:
-        session = onnxruntime.InferenceSession(str(path), options,
-                                               providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         return session, session.get_modelmeta().custom_metadata_map.get(KEY)
     except Exception as error:  # its errors have no common base
         reason = str(error).splitlines()[0]
         raise InputError(f"ONNX Runtime cannot read {path}: {reason}") from None
 
 
-def run_session(session: Any, source: str, outputs: Sequence[str],
-                inputs: Mapping[str, Any]) -> list[Any]:
+def run_session(session: Any, source: str, outputs: Sequence[str], inputs: Mapping[str, Any]) -> list[Any]:
     """Return the outputs of a session. InputError that names the file `source` if it fails."""
     try:
         return session.run(list(outputs), dict(inputs))
     except Exception as error:  # its errors have no common base
-        raise InputError(f"ONNX Runtime cannot run {source}: {str(error).splitlines()[0]}"
-                         ) from None
+        raise InputError(f"ONNX Runtime cannot run {source}: {str(error).splitlines()[0]}") from None
 
 
 def read_exported_header(path: Path) -> Header:

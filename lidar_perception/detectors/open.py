@@ -57,9 +57,15 @@ class ConfigurableDetector(Detector, Protocol):
 
 
 @report_compilation(whole_detector=True)
-def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
-                  sensor_height: float | None = None, min_score: float | None = None,
-                  range: str = "auto", settings: Mapping[str, Any] = {}) -> ConfigurableDetector:
+def open_detector(
+    weights: str | Path = FUSED,
+    device: str = "auto",
+    *,
+    sensor_height: float | None = None,
+    min_score: float | None = None,
+    range: str = "auto",
+    settings: Mapping[str, Any] = {},
+) -> ConfigurableDetector:
     """Open a detector by its name or from a file of weights.
 
     The first call on a machine compiles for a minute or two and reports it on standard error.
@@ -90,8 +96,11 @@ def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
         raise InputError(f"{kind}.weights is set, and {path} is given too; give one of them")
     try:
         if reference is not None:
-            custom = CustomDetectorParams() if sensor_height is None else set_sensor_height(
-                CustomDetectorParams(), sensor_height)
+            custom = (
+                CustomDetectorParams()
+                if sensor_height is None
+                else set_sensor_height(CustomDetectorParams(), sensor_height)
+            )
             detector: Any = load_custom_detector(reference, device, range, custom)
         elif kind in PARAMS:
             own = settings.get("pointnet.weights") if kind == POINTNET else None
@@ -148,9 +157,11 @@ def _as_trained(params: Any, path: Path | None) -> Any:
     from lidar_perception.detectors.checkpoint import read_header
     from lidar_perception.detectors.pointnet.config import PointNetConfig
     from lidar_perception.detectors.pointnet.weights_file import weights_file
+
     try:
         if path is not None and path.suffix == ONNX:
             from lidar_perception.detectors.onnx_file import read_exported_header
+
             config = read_exported_header(path).config
         else:
             config = read_header(path or weights_file(params.pointnet), PointNetConfig).config
@@ -181,10 +192,12 @@ def find_kind(path: Path) -> str:
     """Return the key in LOAD for a file of weights. InputError if it is not one."""
     if path.suffix == ONNX and path.is_file():
         from lidar_perception.detectors.onnx_file import read_exported_name
+
         return read_exported_name(path)
     if path.suffix in DETECTOR_BY_SUFFIX:
         return DETECTOR_BY_SUFFIX[path.suffix]
     from lidar_perception.detectors.checkpoint import read_network_name
+
     return read_network_name(path)
 
 
@@ -196,10 +209,14 @@ def check_weights(path: Path, height: float) -> list[str]:
     """
     if DETECTOR_BY_SUFFIX.get(path.suffix) == FUSED:
         from lidar_perception.detectors.fused.fusion import read_fusion
+
         fusion = read_fusion(path)
         header = _read_header(fusion.proposer)
-        return [*fusion.find_warnings(header.config.classes if header else ()),
-                *check_weights(fusion.proposer, height), *check_weights(fusion.classifier, height)]
+        return [
+            *fusion.find_warnings(header.config.classes if header else ()),
+            *check_weights(fusion.proposer, height),
+            *check_weights(fusion.classifier, height),
+        ]
     header = _read_header(path)
     mismatch = header.find_height_mismatch(height) if header else None
     return [f"{path}: {mismatch}"] if mismatch else []
@@ -209,6 +226,7 @@ def _read_header(path: Path) -> Header | None:
     if path.suffix != ".safetensors":
         return None
     from lidar_perception.detectors.checkpoint import read_header
+
     return read_header(path)
 
 
@@ -228,8 +246,13 @@ class DetectorChoice:
         loader = LOAD.get(resolve_weights(self.weights)[0])
         return () if loader is None else (_module_name(loader),)
 
-    def open(self, *, sensor_height: float | None = None,
-             min_score: float | None = None) -> ConfigurableDetector:
+    def open(self, *, sensor_height: float | None = None, min_score: float | None = None) -> ConfigurableDetector:
         """Open the detector, see open_detector."""
-        return open_detector(self.weights, self.device, sensor_height=sensor_height,
-                             min_score=min_score, range=self.range, settings=self.settings)
+        return open_detector(
+            self.weights,
+            self.device,
+            sensor_height=sensor_height,
+            min_score=min_score,
+            range=self.range,
+            settings=self.settings,
+        )

@@ -51,29 +51,34 @@ class ScoreParams(Params):
 class NmsParams(Params):
     """Non-maximum suppression: keep the best of boxes that overlap in the bird's-eye view."""
 
-    iou: float = param(0.1, "Drop a box if its bird's-eye-view IoU with a better one is above "
-                       "this.", low=0.0, high=1.0)
+    iou: float = param(0.1, "Drop a box if its bird's-eye-view IoU with a better one is above this.", low=0.0, high=1.0)
     across_classes: bool = param(False, "Boxes of different classes suppress each other too.")
-    candidates: int = param(500, "Maximum number of boxes before NMS; the best scores are kept.",
-                            low=1, high=10_000)
-    max_boxes: int = param(100, "Maximum number of boxes after NMS; the best scores are kept.",
-                           low=1, high=10_000)
+    candidates: int = param(500, "Maximum number of boxes before NMS; the best scores are kept.", low=1, high=10_000)
+    max_boxes: int = param(100, "Maximum number of boxes after NMS; the best scores are kept.", low=1, high=10_000)
 
 
 def make_range_param() -> Any:
     """Return the parameter `range` of detectors with PointPillars."""
-    return param("auto", "Covered area. ahead: 69.12 m ahead and 39.68 m to each side; around: "
-                 "51.2 m in all directions (a network trained ahead runs twice per cloud); auto: "
-                 "the area that the weights were trained for.", choices=RANGE_CHOICES,
-                 fixed=True)
+    return param(
+        "auto",
+        "Covered area. ahead: 69.12 m ahead and 39.68 m to each side; around: "
+        "51.2 m in all directions (a network trained ahead runs twice per cloud); auto: "
+        "the area that the weights were trained for.",
+        choices=RANGE_CHOICES,
+        fixed=True,
+    )
 
 
 def make_amp_param() -> Any:
     """Return the parameter `amp` of detectors with PointPillars."""
-    return param("off", "Number format of PointPillars' layers. off: float32. auto: 16 bits (bf16, "
-                 "on older GPUs fp16) if the device has instructions for it: half the time, "
-                 "slightly different scores. bf16: on every device.",
-                 choices=("off", "auto", "bf16"), fixed=True)
+    return param(
+        "off",
+        "Number format of PointPillars' layers. off: float32. auto: 16 bits (bf16, "
+        "on older GPUs fp16) if the device has instructions for it: half the time, "
+        "slightly different scores. bf16: on every device.",
+        choices=("off", "auto", "bf16"),
+        fixed=True,
+    )
 
 
 def make_engine_param(more: str = "") -> Any:
@@ -82,16 +87,25 @@ def make_engine_param(more: str = "") -> Any:
     Args:
         more: a sentence on the other network of the detector, appended to the description.
     """
-    return param("auto", "Implementation of PointPillars' layers on the CPU. sparse: kernels that "
-                 "compute only cells near points; needs a version without ground (v1, v2, v4), "
-                 "x86-64 with AVX2, and amp off. torch: all cells. auto: sparse if possible. "
-                 "Detections are the same." + more, choices=("auto", "torch", "sparse"), fixed=True)
+    return param(
+        "auto",
+        "Implementation of PointPillars' layers on the CPU. sparse: kernels that "
+        "compute only cells near points; needs a version without ground (v1, v2, v4), "
+        "x86-64 with AVX2, and amp off. torch: all cells. auto: sparse if possible. "
+        "Detections are the same." + more,
+        choices=("auto", "torch", "sparse"),
+        fixed=True,
+    )
 
 
 def make_on_points_param() -> Any:
     """Return the parameter `on_points` of detectors that align cars with their points."""
-    return param(0.75, "Align the visible faces of cars with their points. 0: keep the box, 1: "
-                 "move it all the way.", low=0.0, high=1.0)
+    return param(
+        0.75,
+        "Align the visible faces of cars with their points. 0: keep the box, 1: move it all the way.",
+        low=0.0,
+        high=1.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -100,12 +114,21 @@ class NetworkParams(Params):
 
     weights: str = param("", "Checkpoint (.safetensors); empty: the shipped one.", fixed=True)
     device: str = param("auto", "cpu, cuda or cuda:N; auto: CUDA if available.", fixed=True)
-    threads: int = param(0, "CPU threads of the network; fewer leave room for other programs. "
-                         "0: one per core.", low=0, high=1024, fixed=True)
-    cpu_fallback: bool = param(True, "Fall back to the CPU when CUDA runs out of memory; in a "
-                                     "node also when there is no CUDA device.")
+    threads: int = param(
+        0,
+        "CPU threads of the network; fewer leave room for other programs. 0: one per core.",
+        low=0,
+        high=1024,
+        fixed=True,
+    )
+    cpu_fallback: bool = param(
+        True, "Fall back to the CPU when CUDA runs out of memory; in a node also when there is no CUDA device."
+    )
     warm_up: bool = param(True, "Run once on synthetic points before the first cloud.", fixed=True)
-    use_intensity: bool = param(True, "Use the intensity. It is normalized, so that gain and scale "
-                                      "of the sensor have no effect. false: leave it out.")
+    use_intensity: bool = param(
+        True,
+        "Use the intensity. It is normalized, so that gain and scale "
+        "of the sensor have no effect. false: leave it out.",
+    )
     scores: ScoreParams = ScoreParams()
     nms: NmsParams = NmsParams()

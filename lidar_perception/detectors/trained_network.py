@@ -99,16 +99,17 @@ class TrainedNetwork:
         if not is_out_of_memory(error):
             raise error
         if self.device == CPU or not cpu_fallback:
-            raise InputError(f"{self.device} is out of memory; use the CPU or a smaller network"
-                             ) from error
-        self.placement.fallback = (f"{self.device} is out of memory, so the network runs on the "
-                                   "CPU; close other programs and start again")
+            raise InputError(f"{self.device} is out of memory; use the CPU or a smaller network") from error
+        self.placement.fallback = (
+            f"{self.device} is out of memory, so the network runs on the CPU; close other programs and start again"
+        )
         self.move(CPU)
 
     def now(self) -> float:
         """Return a time in seconds, after all work queued on the device is done."""
         if self.device.startswith("cuda"):
             import torch
+
             torch.cuda.synchronize(self.device)
         return perf_counter()
 
@@ -116,5 +117,8 @@ class TrainedNetwork:
         """Return the highest scores by class, for a cloud in which none reached its threshold, and
         the problem if one is NaN."""
         best = dict(zip(self.classes, scores))
-        return best, ("the network's scores are NaN; check the weights and the intensity"
-                      if any(map(math.isnan, best.values())) else None)
+        return best, (
+            "the network's scores are NaN; check the weights and the intensity"
+            if any(map(math.isnan, best.values()))
+            else None
+        )

@@ -18,10 +18,10 @@ from lidar_perception.ground.cloth_slopes import UNOBSERVED, find_climbing_cells
 from lidar_perception.ground.cloth_solver import settle_sheet
 from lidar_perception.ground.params import ClothParams
 
-GRID_LEVELS = 6        # grids of the solver, each twice as coarse as the previous one
-TOLERANCE_M = 0.001    # largest movement of a particle in the last step
+GRID_LEVELS = 6  # grids of the solver, each twice as coarse as the previous one
+TOLERANCE_M = 0.001  # largest movement of a particle in the last step
 SUNK_WINDOWS = (2, 6)  # half widths, in cells, of the squares around a cell that may be sunk
-SUNK_DEPTH_M = 0.4     # a lone lowest point this far below its surroundings is a reflection
+SUNK_DEPTH_M = 0.4  # a lone lowest point this far below its surroundings is a reflection
 
 
 class Cloth(NamedTuple):
@@ -52,11 +52,13 @@ def segment_by_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> np
         return np.zeros(len(xyz), bool)
     climbed = np.full(cloth.height.shape, -UNOBSERVED, np.float32)
     if params.slope > 0.0:
-        reached = find_climbing_cells(cloth.lowest, cloth.height, params.class_threshold,
-                                      params.slope * cloth.resolution)
+        reached = find_climbing_cells(
+            cloth.lowest, cloth.height, params.class_threshold, params.slope * cloth.resolution
+        )
         climbed[reached] = cloth.lowest[reached]
-    return _select_near_cloth(xyz, cloth.height, climbed, cloth.x0, cloth.y0,
-                              1.0 / cloth.resolution, params.max_range, params.class_threshold)
+    return _select_near_cloth(
+        xyz, cloth.height, climbed, cloth.x0, cloth.y0, 1.0 / cloth.resolution, params.max_range, params.class_threshold
+    )
 
 
 def lay_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> Cloth | None:
@@ -70,8 +72,7 @@ def lay_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> Cloth | N
     first = np.floor([low_x / size, low_y / size])
     columns, rows = ((np.floor([high_x / size, high_y / size]) - first + 1) * block).astype(int)
     x0, y0 = first * size
-    lowest = _find_lowest_points(xyz, params.max_range, x0, y0, 1.0 / params.resolution, rows,
-                                 columns)
+    lowest = _find_lowest_points(xyz, params.max_range, x0, y0, 1.0 / params.resolution, rows, columns)
     _drop_sunk_cells(lowest, SUNK_DEPTH_M)
     lift = params.curvature * params.resolution**2 / 4
     half = params.resolution / 2
@@ -153,8 +154,10 @@ def _select_near_cloth(xyz, height, climbed, x0, y0, scale, max_range, threshold
             v = min(max((y - y0) * scale, 0.0), rows - 1.0)
             c, r = min(int(u), columns - 2), min(int(v), rows - 2)
             a, b = u - c, v - r
-            cloth = ((1 - b) * ((1 - a) * height[r, c] + a * height[r, c + 1])
-                     + b * ((1 - a) * height[r + 1, c] + a * height[r + 1, c + 1]))
-            near[i] = (abs(xyz[i, 2] - cloth) <= threshold
-                       or xyz[i, 2] - climbed[int(v + 0.5), int(u + 0.5)] <= threshold)
+            cloth = (1 - b) * ((1 - a) * height[r, c] + a * height[r, c + 1]) + b * (
+                (1 - a) * height[r + 1, c] + a * height[r + 1, c + 1]
+            )
+            near[i] = (
+                abs(xyz[i, 2] - cloth) <= threshold or xyz[i, 2] - climbed[int(v + 0.5), int(u + 0.5)] <= threshold
+            )
     return near

@@ -8,9 +8,14 @@ from numba import njit
 UNOBSERVED = np.float32(np.inf)
 REACH_CELLS, STEP_M = 6, 0.05  # largest gap and step over which the ground continues
 # Squared distance, row and column offset of the cells around one, the nearest first.
-NEIGHBOURS = np.array(sorted(
-    (i * i + j * j, i, j) for i in range(-REACH_CELLS, REACH_CELLS + 1)
-    for j in range(-REACH_CELLS, REACH_CELLS + 1) if 0 < i * i + j * j <= REACH_CELLS**2))
+NEIGHBOURS = np.array(
+    sorted(
+        (i * i + j * j, i, j)
+        for i in range(-REACH_CELLS, REACH_CELLS + 1)
+        for j in range(-REACH_CELLS, REACH_CELLS + 1)
+        if 0 < i * i + j * j <= REACH_CELLS**2
+    )
+)
 
 
 @njit(cache=True, nogil=True)
@@ -58,8 +63,7 @@ def find_climbing_cells(lowest, height, threshold, slope):
                     if away < nearest or lowest[i, j] < base:
                         base = lowest[i, j]
                     nearest = away
-            if nearest <= REACH_CELLS * REACH_CELLS and (
-                    lowest[r, c] - base <= STEP_M + slope * np.sqrt(nearest)):
+            if nearest <= REACH_CELLS * REACH_CELLS and (lowest[r, c] - base <= STEP_M + slope * np.sqrt(nearest)):
                 new.append((r, c))
         waiting.clear()
         for r, c in new:

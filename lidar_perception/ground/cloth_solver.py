@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-SWEEPS = 2            # before and after each correction
+SWEEPS = 2  # before and after each correction
 COARSEST_SWEEPS = 40  # on the coarsest grid, which is about ten cells wide
-RELAXATION = 1.5      # over-relaxation on the coarsest grid
-MAX_CYCLES = 30       # five to seven are typical
+RELAXATION = 1.5  # over-relaxation on the coarsest grid
+MAX_CYCLES = 30  # five to seven are typical
 
 
 def settle_sheet(obstacle: np.ndarray, lift: float, tolerance: float, levels: int) -> np.ndarray:
@@ -84,8 +84,9 @@ def _smooth(sheet, above, lift, sweeps, relaxation):
             for r in range(1, rows - 1):
                 for c in range(1 + (r + colour) % 2, columns - 1, 2):
                     old = sheet[r, c]
-                    free = quarter * (sheet[r - 1, c] + sheet[r + 1, c] + sheet[r, c - 1]
-                                      + sheet[r, c + 1]) + lift[r, c]
+                    free = (
+                        quarter * (sheet[r - 1, c] + sheet[r + 1, c] + sheet[r, c - 1] + sheet[r, c + 1]) + lift[r, c]
+                    )
                     new = min(old + relaxation * (free - old), above[r, c])
                     if above[r, c] < np.inf:
                         moved = max(moved, abs(new - old))
@@ -119,8 +120,11 @@ def _restrict_residual(sheet, above, lift):
                 for j in range(2 * c - 1, 2 * c + 1):
                     room = above[i, j] - sheet[i, j]
                     gap[r, c] = min(gap[r, c], room)
-                    left = quarter * (sheet[i - 1, j] + sheet[i + 1, j] + sheet[i, j - 1]
-                                      + sheet[i, j + 1]) + lift[i, j] - sheet[i, j]
+                    left = (
+                        quarter * (sheet[i - 1, j] + sheet[i + 1, j] + sheet[i, j - 1] + sheet[i, j + 1])
+                        + lift[i, j]
+                        - sheet[i, j]
+                    )
                     rest[r, c] += left
     return gap, rest
 
@@ -137,6 +141,7 @@ def _add_correction(coarse, sheet, above):
         for j in range(1, columns - 1):
             c = (j + 1) // 2
             other_c = c - 1 if j % 2 else c + 1
-            value = (near * coarse[r, c] + side * (coarse[other_r, c] + coarse[r, other_c])
-                     + far * coarse[other_r, other_c])
+            value = (
+                near * coarse[r, c] + side * (coarse[other_r, c] + coarse[r, other_c]) + far * coarse[other_r, other_c]
+            )
             sheet[i, j] = min(sheet[i, j] + value, above[i, j])

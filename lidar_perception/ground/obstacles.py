@@ -11,8 +11,12 @@ from lidar_perception.ground.segment import level_points
 CELL_M = 0.5  # width of the cells whose mean is the height of the ground
 
 
-def find_obstacles(xyz: np.ndarray, ground: np.ndarray, params: ObstacleParams = ObstacleParams(),
-                   pose: SensorPoseParams = SensorPoseParams()) -> np.ndarray:
+def find_obstacles(
+    xyz: np.ndarray,
+    ground: np.ndarray,
+    params: ObstacleParams = ObstacleParams(),
+    pose: SensorPoseParams = SensorPoseParams(),
+) -> np.ndarray:
     """Select the points that are not ground and within a height band above the ground around them.
 
     Args:
@@ -27,8 +31,7 @@ def find_obstacles(xyz: np.ndarray, ground: np.ndarray, params: ObstacleParams =
         return chosen
     xyz = level_points(xyz, pose)
     height = height_above_ground(xyz.compress(chosen, axis=0), xyz.compress(ground, axis=0))
-    chosen[chosen] = ((height >= (params.min_height or -np.inf))
-                      & (height <= (params.max_height or np.inf)))
+    chosen[chosen] = (height >= (params.min_height or -np.inf)) & (height <= (params.max_height or np.inf))
     return chosen
 
 
@@ -39,7 +42,8 @@ def height_above_ground(xyz: np.ndarray, ground: np.ndarray) -> np.ndarray:
     points whose centre is nearest. Points are finite with z up; M > 0.
     """
     cells = np.floor(ground[:, :2].astype(np.float64) / CELL_M)
-    _, first, cell, count = np.unique(cells[:, 0] * 2.0**26 + cells[:, 1], return_index=True,
-                                      return_inverse=True, return_counts=True)
+    _, first, cell, count = np.unique(
+        cells[:, 0] * 2.0**26 + cells[:, 1], return_index=True, return_inverse=True, return_counts=True
+    )
     mean = np.bincount(cell, ground[:, 2].astype(np.float64)) / count
     return xyz[:, 2] - mean[cKDTree((cells[first] + 0.5) * CELL_M).query(xyz[:, :2])[1]]

@@ -14,29 +14,57 @@ class SensorPoseParams(Params):
     """Mounting of the sensor. Algorithms use a levelled copy of the cloud; published points keep
     their coordinates."""
 
-    height: float = param(SENSOR_HEIGHT, "Height of the sensor above the ground. It is compared "
-                          "with the first clouds; a warning reports the measured height.",
-                          unit="m", low=0.0, high=50.0)
-    roll: float = param(0.0, "Rotation of the sensor about its x axis, as in a URDF's rpy; pi is "
-                        "upside down.", unit="rad", low=-3.1416, high=3.1416)
-    pitch: float = param(0.0, "Rotation of the sensor about its y axis, as in a URDF's rpy; "
-                         "positive values tilt it down.", unit="rad", low=-1.58, high=1.58)
+    height: float = param(
+        SENSOR_HEIGHT,
+        "Height of the sensor above the ground. It is compared "
+        "with the first clouds; a warning reports the measured height.",
+        unit="m",
+        low=0.0,
+        high=50.0,
+    )
+    roll: float = param(
+        0.0,
+        "Rotation of the sensor about its x axis, as in a URDF's rpy; pi is upside down.",
+        unit="rad",
+        low=-3.1416,
+        high=3.1416,
+    )
+    pitch: float = param(
+        0.0,
+        "Rotation of the sensor about its y axis, as in a URDF's rpy; positive values tilt it down.",
+        unit="rad",
+        low=-1.58,
+        high=1.58,
+    )
 
 
 @dataclass(frozen=True)
 class ThresholdParams(Params):
     """Height threshold and RANSAC plane (paper A, Sections 3.2 and 3.4, Table 2)."""
 
-    max_height: float = param(0.43, "The plane is fitted to points below this height above the "
-                              "ground at the sensor. 0.43 m, for a sensor at 1.73 m, is the "
-                              "paper's z < -1.3.", unit="m", low=-10.0, high=100.0)
-    inlier_distance: float = param(0.1, "Maximum vertical distance of ground points from the "
-                                   "plane.", unit="m", low=0.001, high=2.0)
-    separate: str = param("plane", "plane: points near the plane are ground. height: all points "
-                          "below max_height are, as in the STM-CPA paper.",
-                          choices=("plane", "height"))
-    max_iterations: int = param(2000, "Maximum number of RANSAC trials; the search stops early "
-                                "once the best plane is unlikely to improve.", low=1, high=100_000)
+    max_height: float = param(
+        0.43,
+        "The plane is fitted to points below this height above the "
+        "ground at the sensor. 0.43 m, for a sensor at 1.73 m, is the "
+        "paper's z < -1.3.",
+        unit="m",
+        low=-10.0,
+        high=100.0,
+    )
+    inlier_distance: float = param(
+        0.1, "Maximum vertical distance of ground points from the plane.", unit="m", low=0.001, high=2.0
+    )
+    separate: str = param(
+        "plane",
+        "plane: points near the plane are ground. height: all points below max_height are, as in the STM-CPA paper.",
+        choices=("plane", "height"),
+    )
+    max_iterations: int = param(
+        2000,
+        "Maximum number of RANSAC trials; the search stops early once the best plane is unlikely to improve.",
+        low=1,
+        high=100_000,
+    )
     max_slope: float = param(30.0, "Steeper planes are rejected.", unit="deg", low=0.0, high=89.0)
     seed: int = param(0, "Seed of the random trials.", low=0, high=MAX_INT)
 
@@ -45,47 +73,61 @@ class ThresholdParams(Params):
 class PatchworkParams(Params):
     """Patchwork++: a plane in each sector of concentric zones (Lee et al., IROS 2022)."""
 
-    min_range: float = param(2.7, "Points nearer than this are not ground.", unit="m", low=0.0,
-                             high=50.0)
-    max_range: float = param(80.0, "Points farther than this are not ground.", unit="m", low=5.0,
-                             high=1000.0)
-    inlier_distance: float = param(0.125, "Maximum distance of ground points from the plane of "
-                                   "their sector.", unit="m", low=0.001, high=2.0)
-    seed_distance: float = param(0.125, "Points up to this height above the lowest ones "
-                                 "initialize the plane of a sector.", unit="m", low=0.001,
-                                 high=2.0)
-    uprightness: float = param(0.707, "Minimum z component of the normal of a ground plane; "
-                               "0.707 is 45 degrees.", low=0.0, high=1.0)
-    remove_reflections: bool = param(True, "Drop points below the ground caused by reflections "
-                                     "(RNR). Needs intensity.")
+    min_range: float = param(2.7, "Points nearer than this are not ground.", unit="m", low=0.0, high=50.0)
+    max_range: float = param(80.0, "Points farther than this are not ground.", unit="m", low=5.0, high=1000.0)
+    inlier_distance: float = param(
+        0.125, "Maximum distance of ground points from the plane of their sector.", unit="m", low=0.001, high=2.0
+    )
+    seed_distance: float = param(
+        0.125,
+        "Points up to this height above the lowest ones initialize the plane of a sector.",
+        unit="m",
+        low=0.001,
+        high=2.0,
+    )
+    uprightness: float = param(
+        0.707, "Minimum z component of the normal of a ground plane; 0.707 is 45 degrees.", low=0.0, high=1.0
+    )
+    remove_reflections: bool = param(True, "Drop points below the ground caused by reflections (RNR). Needs intensity.")
 
     def check(self) -> None:
         if self.max_range <= self.min_range:
-            raise ValueError(f"max_range = {self.max_range} must be above min_range = "
-                             f"{self.min_range}")
+            raise ValueError(f"max_range = {self.max_range} must be above min_range = {self.min_range}")
 
 
 @dataclass(frozen=True)
 class ClothParams(Params):
     """Cloth simulation (paper C, Eq. 2 and 3; Zhang et al., Remote Sensing 2016)."""
 
-    resolution: float = param(0.5, "Distance between the cloth's particles.", unit="m", low=0.1,
-                              high=10.0)
-    max_range: float = param(100.0, "Half the side of the cloth; points beyond it are not ground.",
-                             unit="m", low=1.0, high=500.0)
-    class_threshold: float = param(0.2, "Maximum vertical distance of ground points from the "
-                                   "cloth.", unit="m", low=0.001, high=5.0)
-    curvature: float = param(0.1, "Bending of the cloth under gravity if nothing supports it; "
-                             "lower is stiffer.", unit="1/m", low=0.0001, high=10.0)
+    resolution: float = param(0.5, "Distance between the cloth's particles.", unit="m", low=0.1, high=10.0)
+    max_range: float = param(
+        100.0, "Half the side of the cloth; points beyond it are not ground.", unit="m", low=1.0, high=500.0
+    )
+    class_threshold: float = param(
+        0.2, "Maximum vertical distance of ground points from the cloth.", unit="m", low=0.001, high=5.0
+    )
+    curvature: float = param(
+        0.1,
+        "Bending of the cloth under gravity if nothing supports it; lower is stiffer.",
+        unit="1/m",
+        low=0.0001,
+        high=10.0,
+    )
 
-    slope: float = param(0.08, "Maximum slope by which the ground is extended where a road rises "
-                         "faster than the cloth can bend; 0: off.", low=0.0, high=2.0)
+    slope: float = param(
+        0.08,
+        "Maximum slope by which the ground is extended where a road rises faster than the cloth can bend; 0: off.",
+        low=0.0,
+        high=2.0,
+    )
 
     def check(self) -> None:
         if (cells := (2 * self.max_range / self.resolution) ** 2) > 4_000_000:
-            raise ValueError(f"resolution = {self.resolution} m over max_range = {self.max_range} "
-                             f"m makes {cells:.0f} particles, more than 4 million; raise the one "
-                             "or lower the other")
+            raise ValueError(
+                f"resolution = {self.resolution} m over max_range = {self.max_range} "
+                f"m makes {cells:.0f} particles, more than 4 million; raise the one "
+                "or lower the other"
+            )
 
 
 GROUND_METHODS = ("threshold", "patchwork", "cloth")
@@ -95,9 +137,13 @@ GROUND_METHODS = ("threshold", "patchwork", "cloth")
 class GroundParams(Params):
     """Ground segmentation."""
 
-    method: str = param("threshold", "threshold: one plane (STM-CPA paper). patchwork: "
-                        "Patchwork++ (EG-PointPillars paper). cloth: cloth simulation "
-                        "(improved-PointNet paper).", choices=GROUND_METHODS)
+    method: str = param(
+        "threshold",
+        "threshold: one plane (STM-CPA paper). patchwork: "
+        "Patchwork++ (EG-PointPillars paper). cloth: cloth simulation "
+        "(improved-PointNet paper).",
+        choices=GROUND_METHODS,
+    )
     sensor_pose: SensorPoseParams = SensorPoseParams()
     threshold: ThresholdParams = ThresholdParams()
     patchwork: PatchworkParams = PatchworkParams()
@@ -108,16 +154,25 @@ class GroundParams(Params):
 class ObstacleParams(Params):
     """Selection of obstacles among the points that are not ground, by height above the ground."""
 
-    min_height: float = param(0.0, "Minimum height of obstacles above the ground around them; 0: "
-                              "points below the ground count, too.", unit="m", low=0.0, high=100.0)
-    max_height: float = param(0.0, "Maximum height of obstacles above the ground around them, so "
-                              "that a robot passes under branches and bridges; 0: no limit.",
-                              unit="m", low=0.0, high=100.0)
+    min_height: float = param(
+        0.0,
+        "Minimum height of obstacles above the ground around them; 0: points below the ground count, too.",
+        unit="m",
+        low=0.0,
+        high=100.0,
+    )
+    max_height: float = param(
+        0.0,
+        "Maximum height of obstacles above the ground around them, so "
+        "that a robot passes under branches and bridges; 0: no limit.",
+        unit="m",
+        low=0.0,
+        high=100.0,
+    )
 
     def check(self) -> None:
         if 0.0 < self.max_height < self.min_height:
-            raise ValueError(f"max_height = {self.max_height} must not be below min_height = "
-                             f"{self.min_height}, or 0")
+            raise ValueError(f"max_height = {self.max_height} must not be below min_height = {self.min_height}, or 0")
 
 
 P = TypeVar("P")  # a dataclass of parameters with a group `ground`

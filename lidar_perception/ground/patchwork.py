@@ -20,16 +20,16 @@ from lidar_perception.ground.params import PatchworkParams
 # Constants of the library, with their names there.
 RINGS, SECTORS = (2, 4, 4, 4), (16, 32, 54, 32)  # of each zone: num_rings_each_zone, ...sectors...
 PATCHES = sum(rings * sectors for rings, sectors in zip(RINGS, SECTORS))
-MIN_PATCH_POINTS = 10    # num_min_pts
-ITERATIONS = 3           # num_iter
-LOWEST_POINTS = 20       # num_lpr, whose mean is the lowest height of a patch
-NEAR_RINGS = 4           # num_rings_of_interest
-MIN_SEED_HEIGHT = -1.2   # adaptive_seed_selection_margin, in sensor heights
+MIN_PATCH_POINTS = 10  # num_min_pts
+ITERATIONS = 3  # num_iter
+LOWEST_POINTS = 20  # num_lpr, whose mean is the lowest height of a patch
+NEAR_RINGS = 4  # num_rings_of_interest
+MIN_SEED_HEIGHT = -1.2  # adaptive_seed_selection_margin, in sensor heights
 VERTICAL_SEED_DISTANCE, VERTICAL_DISTANCE = 0.25, 0.1  # th_seeds_v, th_dist_v, metres
-MAX_NOISE_DEG, MAX_NOISE_INTENSITY = -15.0, 0.2        # RNR_ver_angle_thr, RNR_intensity_thr
-MIN_NOISE_DEPTH = 0.8    # of reflections, metres below the ground
-MAX_LINE_RATIO = 8.0     # of the eigenvalues of a patch that may be reverted
-MANY_POINTS = 1500       # a flat patch with more points is reverted
+MAX_NOISE_DEG, MAX_NOISE_INTENSITY = -15.0, 0.2  # RNR_ver_angle_thr, RNR_intensity_thr
+MIN_NOISE_DEPTH = 0.8  # of reflections, metres below the ground
+MAX_LINE_RATIO = 8.0  # of the eigenvalues of a patch that may be reverted
+MANY_POINTS = 1500  # a flat patch with more points is reverted
 
 OTHER, GROUND, REMOVED = 0, 1, 2  # states of a point in its patch
 
@@ -50,8 +50,9 @@ class _Settings(NamedTuple):
 OFFSET, MEAN_Z, LARGEST, MIDDLE, SMALLEST = 3, 4, 5, 6, 7
 
 
-def segment_by_patchwork(xyz: np.ndarray, intensity: np.ndarray | None, sensor_height: float,
-                         params: PatchworkParams = PatchworkParams()) -> np.ndarray:
+def segment_by_patchwork(
+    xyz: np.ndarray, intensity: np.ndarray | None, sensor_height: float, params: PatchworkParams = PatchworkParams()
+) -> np.ndarray:
     """Segment the ground of finite points.
 
     Args:
@@ -62,18 +63,21 @@ def segment_by_patchwork(xyz: np.ndarray, intensity: np.ndarray | None, sensor_h
     Returns:
         (N,) bool, True = ground.
     """
-    settings = _Settings(float(sensor_height), float(params.min_range), float(params.max_range),
-                         float(params.inlier_distance), float(params.seed_distance),
-                         float(params.uprightness))
+    settings = _Settings(
+        float(sensor_height),
+        float(params.min_range),
+        float(params.max_range),
+        float(params.inlier_distance),
+        float(params.seed_distance),
+        float(params.uprightness),
+    )
     known = params.remove_reflections and intensity is not None
-    return _segment(np.array(xyz, np.float32, order="C"),
-                    np.array(intensity if known else (), np.float32), settings)
+    return _segment(np.array(xyz, np.float32, order="C"), np.array(intensity if known else (), np.float32), settings)
 
 
 @njit(cache=True, nogil=True)
 def _segment(xyz, intensity, settings):
-    order, start = counting_sort(_find_patches(xyz, intensity, settings), PATCHES + 1,
-                                 np.arange(len(xyz)))
+    order, start = counting_sort(_find_patches(xyz, intensity, settings), PATCHES + 1, np.arange(len(xyz)))
     largest = 0
     for p in range(PATCHES):
         largest = max(largest, start[p + 1] - start[p])
@@ -116,8 +120,7 @@ def _segment(xyz, intensity, settings):
                     count += 1
             limit = _flatness_limit(flatness, flat_count)
             for c in range(count):  # Temporal ground revert (TGR)
-                flat = values[c, 2] < limit or (
-                    sizes[c] > MANY_POINTS and values[c, 2] < settings.inlier_distance**2)
+                flat = values[c, 2] < limit or (sizes[c] > MANY_POINTS and values[c, 2] < settings.inlier_distance**2)
                 if not flat or values[c, 0] > MAX_LINE_RATIO * values[c, 1]:
                     for i in range(start[doubtful[c]], start[doubtful[c] + 1]):
                         ground[order[i]] = False
@@ -130,15 +133,17 @@ def _find_patches(xyz, intensity, settings):
     """Return the patch (N,) of each point in the concentric zones (CZM), ring by ring; PATCHES for
     reflections (RNR) and for points out of range."""
     nearest, farthest = settings.min_range, settings.max_range
-    limits = (nearest, (7 * nearest + farthest) / 8, (3 * nearest + farthest) / 4,
-              (nearest + farthest) / 2, farthest)
+    limits = (nearest, (7 * nearest + farthest) / 8, (3 * nearest + farthest) / 4, (nearest + farthest) / 2, farthest)
     patch = np.full(len(xyz), PATCHES)
     max_noise = math.tan(math.radians(MAX_NOISE_DEG))
     for i in range(len(xyz)):
         x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
         distance = math.sqrt(x * x + y * y)
-        if len(intensity) and (intensity[i] < MAX_NOISE_INTENSITY and z < max_noise * distance
-                               and z < -settings.sensor_height - MIN_NOISE_DEPTH):
+        if len(intensity) and (
+            intensity[i] < MAX_NOISE_INTENSITY
+            and z < max_noise * distance
+            and z < -settings.sensor_height - MIN_NOISE_DEPTH
+        ):
             continue
         if not nearest < distance <= farthest:
             continue
@@ -207,8 +212,7 @@ def _mark_seeds(points, state, size, min_height, distance):
 
 @njit(cache=True, nogil=True)
 def _distance(plane, points, i):
-    return np.float32(plane[0] * points[0, i] + plane[1] * points[1, i]
-                      + plane[2] * points[2, i]) + plane[OFFSET]
+    return np.float32(plane[0] * points[0, i] + plane[1] * points[1, i] + plane[2] * points[2, i]) + plane[OFFSET]
 
 
 @njit(cache=True, nogil=True)
@@ -262,8 +266,7 @@ def _decompose(matrix, plane):
             for j in range(3):
                 m[k, j] /= scale
     low, middle, high = _eigenvalues(m)
-    plane[LARGEST], plane[MIDDLE], plane[SMALLEST] = (
-        high * scale + shift, middle * scale + shift, low * scale + shift)
+    plane[LARGEST], plane[MIDDLE], plane[SMALLEST] = (high * scale + shift, middle * scale + shift, low * scale + shift)
     normal, column = np.zeros(3, np.float32), np.empty(3, np.float32)
     if high - low <= epsilon:
         normal[0] = 1.0
@@ -272,8 +275,7 @@ def _decompose(matrix, plane):
     else:
         _find_kernel(m, high, column, normal)
         if middle - low <= 0:  # the column found is close to the eigenvector
-            share = np.float32(1.0) - (column[0] * normal[0] + column[1] * normal[1]
-                                       + column[2] * normal[2])
+            share = np.float32(1.0) - (column[0] * normal[0] + column[1] * normal[1] + column[2] * normal[2])
             length = np.float32(0.0)
             for k in range(3):
                 normal[k] *= share
@@ -291,19 +293,28 @@ def _eigenvalues(m):
     """Return the eigenvalues of a symmetric matrix (3, 3) float32 with trace 0, ascending."""
     zero, half, two = np.float32(0.0), np.float32(0.5), np.float32(2.0)
     third, root = np.float32(1.0 / 3.0), np.float32(3.0**0.5)
-    c0 = (m[0, 0] * m[1, 1] * m[2, 2] + two * m[1, 0] * m[2, 0] * m[2, 1]
-          - m[0, 0] * m[2, 1] * m[2, 1] - m[1, 1] * m[2, 0] * m[2, 0]
-          - m[2, 2] * m[1, 0] * m[1, 0])
-    c1 = (m[0, 0] * m[1, 1] - m[1, 0] * m[1, 0] + m[0, 0] * m[2, 2] - m[2, 0] * m[2, 0]
-          + m[1, 1] * m[2, 2] - m[2, 1] * m[2, 1])
+    c0 = (
+        m[0, 0] * m[1, 1] * m[2, 2]
+        + two * m[1, 0] * m[2, 0] * m[2, 1]
+        - m[0, 0] * m[2, 1] * m[2, 1]
+        - m[1, 1] * m[2, 0] * m[2, 0]
+        - m[2, 2] * m[1, 0] * m[1, 0]
+    )
+    c1 = (
+        m[0, 0] * m[1, 1]
+        - m[1, 0] * m[1, 0]
+        + m[0, 0] * m[2, 2]
+        - m[2, 0] * m[2, 0]
+        + m[1, 1] * m[2, 2]
+        - m[2, 1] * m[2, 1]
+    )
     c2 = m[0, 0] + m[1, 1] + m[2, 2]
     mean = c2 * third
     a = max((c2 * mean - c1) * third, zero)
     b = half * (c0 + mean * (two * mean * mean - c1))
     angle = math.atan2(np.sqrt(max(a * a * a - b * b, zero)), b) * third
     radius, cos, sin = np.sqrt(a), math.cos(angle), math.sin(angle)
-    return (mean - radius * (cos + root * sin), mean - radius * (cos - root * sin),
-            mean + two * radius * cos)
+    return (mean - radius * (cos + root * sin), mean - radius * (cos - root * sin), mean + two * radius * cos)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -328,8 +339,7 @@ def _find_kernel(m, eigenvalue, kernel, column):
         length = u * u + v * v + w * w
         if step == 1 or not best > length:
             best = length
-            kernel[0], kernel[1], kernel[2] = (u / np.sqrt(length), v / np.sqrt(length),
-                                               w / np.sqrt(length))
+            kernel[0], kernel[1], kernel[2] = (u / np.sqrt(length), v / np.sqrt(length), w / np.sqrt(length))
 
 
 @njit(cache=True, nogil=True)

@@ -16,16 +16,13 @@ from lidar_perception.robot.placement import find_level_transform, make_tilted_p
 from lidar_perception.types import PointCloud, as_point_cloud, usable_returns
 
 METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
-    "threshold": lambda xyz, intensity, p: segment_by_threshold(xyz, p.threshold,
-                                                                p.sensor_pose.height),
-    "patchwork": lambda xyz, intensity, p: segment_by_patchwork(xyz, intensity,
-                                                                p.sensor_pose.height, p.patchwork),
+    "threshold": lambda xyz, intensity, p: segment_by_threshold(xyz, p.threshold, p.sensor_pose.height),
+    "patchwork": lambda xyz, intensity, p: segment_by_patchwork(xyz, intensity, p.sensor_pose.height, p.patchwork),
     "cloth": lambda xyz, intensity, p: segment_by_cloth(xyz, p.cloth),
 }
 
 
-def segment_ground(cloud: PointCloud | ArrayLike,
-                   params: GroundParams = GroundParams()) -> np.ndarray:
+def segment_ground(cloud: PointCloud | ArrayLike, params: GroundParams = GroundParams()) -> np.ndarray:
     """Segment the ground of a cloud.
 
     Args:
@@ -66,8 +63,6 @@ def level_points(xyz: np.ndarray, pose: SensorPoseParams) -> np.ndarray:
     return xyz @ make_tilted_pose(pose.roll, pose.pitch)[:3, :3].T.astype(np.float32)
 
 
-def crop_with_sensor_pose(frame: PointCloud, crop: CropParams,
-                          pose: SensorPoseParams) -> tuple[np.ndarray, PointCloud]:
+def crop_with_sensor_pose(frame: PointCloud, crop: CropParams, pose: SensorPoseParams) -> tuple[np.ndarray, PointCloud]:
     """Crop a frame with robot.crop.crop_frame, with the sectors of a level sensor."""
-    return crop_frame(frame, crop,
-                      level=find_level_transform(make_tilted_pose(pose.roll, pose.pitch)))
+    return crop_frame(frame, crop, level=find_level_transform(make_tilted_pose(pose.roll, pose.pitch)))

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 from scipy import ndimage
 
-CELL_M = 2.0       # width of the square cells whose mean heights the surface goes through
-MIN_POINTS = 3     # ground points in a cell that has a height
+CELL_M = 2.0  # width of the square cells whose mean heights the surface goes through
+MIN_POINTS = 3  # ground points in a cell that has a height
 SMOOTHING_M = 2.4  # standard deviation of the Gaussian that smooths the heights
 MIN_WEIGHT = 1e-3  # of a smoothed height; cells with less get the height of the nearest cell
 
@@ -42,8 +42,9 @@ def fit_ground_surface(ground: np.ndarray, default: float) -> GroundSurface:
     """
     if not len(ground):
         return GroundSurface(np.full((1, 1), default), (0.0, 0.0))
-    low, high = (np.floor(np.array([limit(ground[:, 0]), limit(ground[:, 1])]) / CELL_M)
-                 for limit in (np.min, np.max))  # by column, which is faster than along axis 0
+    low, high = (
+        np.floor(np.array([limit(ground[:, 0]), limit(ground[:, 1])]) / CELL_M) for limit in (np.min, np.max)
+    )  # by column, which is faster than along axis 0
     shape = (high - low).astype(np.int64) + 1
     total, count = _sum_cells(ground, low, shape)
     has_height = count >= MIN_POINTS
@@ -53,8 +54,7 @@ def fit_ground_surface(ground: np.ndarray, default: float) -> GroundSurface:
     sigma = SMOOTHING_M / CELL_M
     weight = ndimage.gaussian_filter(has_height.astype(np.float64), sigma, mode="constant")
     smooth = ndimage.gaussian_filter(mean, sigma, mode="constant") / np.maximum(weight, MIN_WEIGHT)
-    nearest = ndimage.distance_transform_edt(weight < MIN_WEIGHT, return_distances=False,
-                                             return_indices=True)
+    nearest = ndimage.distance_transform_edt(weight < MIN_WEIGHT, return_distances=False, return_indices=True)
     x, y = (low + 0.5) * CELL_M
     return GroundSurface(smooth[tuple(nearest)], (float(x), float(y)))
 
@@ -81,6 +81,7 @@ def _interpolate(heights, xy, first_x, first_y):
         i, j = min(int(u), max(last_i - 1, 0)), min(int(v), max(last_j - 1, 0))
         u, v = u - i, v - j
         next_i, next_j = min(i + 1, last_i), min(j + 1, last_j)
-        result[k] = ((1 - u) * ((1 - v) * heights[i, j] + v * heights[i, next_j])
-                     + u * ((1 - v) * heights[next_i, j] + v * heights[next_i, next_j]))
+        result[k] = (1 - u) * ((1 - v) * heights[i, j] + v * heights[i, next_j]) + u * (
+            (1 - v) * heights[next_i, j] + v * heights[next_i, next_j]
+        )
     return result

@@ -12,14 +12,15 @@ from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.types import SENSOR_HEIGHT
 
 MIN_POINTS = 3
-SAMPLE_SIZE = 2048    # points on which trial planes are compared; the fit uses all points
-CONFIDENCE = 0.9999   # probability of drawing at least one triple without outliers
-MIN_SINE = 1e-3       # of the angle in a trial's triangle; thinner triangles do not fix a plane
+SAMPLE_SIZE = 2048  # points on which trial planes are compared; the fit uses all points
+CONFIDENCE = 0.9999  # probability of drawing at least one triple without outliers
+MIN_SINE = 1e-3  # of the angle in a trial's triangle; thinner triangles do not fix a plane
 MAX_REFINEMENTS = 50  # a few suffice; this bounds the rare case that the inliers cycle
 
 
-def segment_by_threshold(xyz: np.ndarray, params: ThresholdParams = ThresholdParams(),
-                         sensor_height: float = SENSOR_HEIGHT) -> np.ndarray:
+def segment_by_threshold(
+    xyz: np.ndarray, params: ThresholdParams = ThresholdParams(), sensor_height: float = SENSOR_HEIGHT
+) -> np.ndarray:
     """Segment the ground of finite points (N, 3).
 
     Returns:
@@ -35,8 +36,9 @@ def segment_by_threshold(xyz: np.ndarray, params: ThresholdParams = ThresholdPar
     return np.abs(height_above_plane(xyz, plane)) <= params.inlier_distance
 
 
-def find_plane(xyz: np.ndarray, params: ThresholdParams = ThresholdParams(),
-               sensor_height: float = SENSOR_HEIGHT) -> np.ndarray | None:
+def find_plane(
+    xyz: np.ndarray, params: ThresholdParams = ThresholdParams(), sensor_height: float = SENSOR_HEIGHT
+) -> np.ndarray | None:
     """Find the plane of segment_by_threshold, None if there is none.
 
     It is found among the low points and fitted to all points near it.
@@ -66,8 +68,7 @@ def _run_trials(xyz: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
     sample = xyz[rng.integers(len(xyz), size=SAMPLE_SIZE)] if len(xyz) > SAMPLE_SIZE else xyz
     triples = rng.integers(len(sample), size=(params.max_iterations, 3))
     max_gradient = np.tan(np.radians(params.max_slope))
-    plane = _find_best_trial(sample.astype(np.float64), triples, params.inlier_distance,
-                             max_gradient, CONFIDENCE)
+    plane = _find_best_trial(sample.astype(np.float64), triples, params.inlier_distance, max_gradient, CONFIDENCE)
     return None if np.isnan(plane[0]) else plane
 
 
@@ -95,8 +96,7 @@ def fit_plane(xyz: np.ndarray) -> np.ndarray | None:
     return _solve_plane(_compute_moments(xyz, np.zeros(3), np.inf))
 
 
-def compute_inlier_share(xyz: np.ndarray, plane: np.ndarray,
-                         params: ThresholdParams = ThresholdParams()) -> float:
+def compute_inlier_share(xyz: np.ndarray, plane: np.ndarray, params: ThresholdParams = ThresholdParams()) -> float:
     """Return the share of points (N, 3) below max_height that are within inlier_distance.
 
     Both are measured from the plane. The share tells how well one plane describes the ground; it is

@@ -15,12 +15,7 @@ from lidar_perception.data.kitti.folder import GAP_NS, PERIOD_NS
 from lidar_perception.data.kitti.write import format_calibration, write_object_text, write_velodyne
 from lidar_perception.data.open import write_height
 from lidar_perception.labels.datasets_nuscenes import NuscenesTables
-from lidar_perception.labels.drive_labels import (
-    NO_TRACK,
-    DriveLabels,
-    FrameLabels,
-    read_frame_labels,
-)
+from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLabels, read_frame_labels
 from lidar_perception.labels.formats import kitti_object, kitti_tracking
 from lidar_perception.labels.formats.nuscenes import SIMILAR_NAMES
 from lidar_perception.labels.names import resolve_format
@@ -29,8 +24,9 @@ from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import SENSOR_HEIGHT, InputError
 
 # For a recording without a camera: level, at the LiDAR, with KITTI's field of view.
-ASSUMED_CAMERA = replace(FORWARD_CAMERA, lidar_to_camera=np.array(
-    [[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]))
+ASSUMED_CAMERA = replace(
+    FORWARD_CAMERA, lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+)
 
 
 @dataclass(frozen=True)
@@ -68,8 +64,9 @@ class Summary:
         self.remarks[text] = self.remarks.get(text, 0) + 1
 
 
-def write_dataset(layout: str, frames: Iterable[Frame], out: Path,
-                  labels: DriveLabels | None = None, force: bool = False) -> Summary:
+def write_dataset(
+    layout: str, frames: Iterable[Frame], out: Path, labels: DriveLabels | None = None, force: bool = False
+) -> Summary:
     """Write the frames of a recording as a data set in one of LAYOUTS.
 
     Frames are numbered from 0, in KITTI's tracking layout by their time at 10 Hz. A new drive
@@ -112,8 +109,11 @@ def _number_frames(frames: Iterable[Frame], labels: DriveLabels | None) -> Itera
 def _continues_drive(previous: Frame, frame: Frame) -> bool:
     before, after = previous.calibration(), frame.calibration()
     same_calibration = before is after or (before is not None and before.equals(after))
-    return (previous.sequence == frame.sequence and same_calibration
-            and 0 <= frame.stamp_ns - previous.stamp_ns < GAP_NS // 2)
+    return (
+        previous.sequence == frame.sequence
+        and same_calibration
+        and 0 <= frame.stamp_ns - previous.stamp_ns < GAP_NS // 2
+    )
 
 
 def _ensure_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
@@ -135,26 +135,31 @@ def _load_cloud(frame: Frame, summary: Summary) -> np.ndarray:
 def _remark_losses(summary: Summary, placed: DatasetFrame, kept: str) -> None:
     """Add remarks about content of the frame that is not in `kept`, which the layout can store."""
     labels = placed.labels
-    for content, exists in (("poses", placed.frame.pose() is not None),
-                            ("point labels", placed.frame.point_truth() is not None),
-                            ("boxes", len(labels) > 0),
-                            ("track ids", bool((labels.track_ids != NO_TRACK).any()))):
+    for content, exists in (
+        ("poses", placed.frame.pose() is not None),
+        ("point labels", placed.frame.point_truth() is not None),
+        ("boxes", len(labels) > 0),
+        ("track ids", bool((labels.track_ids != NO_TRACK).any())),
+    ):
         if exists and content not in kept:
             summary.remark(f"left out: {content}, which the layout cannot store")
 
 
-def _write_kitti_object(folder: Path, frames: Iterator[DatasetFrame],
-                        summary: Summary) -> Iterator[DatasetFrame]:
+def _write_kitti_object(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
     for placed in frames:
         frame, calibration = _ensure_camera(placed.frame, summary)
-        write_object_text(folder, placed.number, _load_cloud(frame, summary),
-                          kitti_object.format_frame(placed.labels, frame), calibration)
+        write_object_text(
+            folder,
+            placed.number,
+            _load_cloud(frame, summary),
+            kitti_object.format_frame(placed.labels, frame),
+            calibration,
+        )
         _remark_losses(summary, placed, "boxes")
         yield placed
 
 
-def _write_kitti_tracking(folder: Path, frames: Iterator[DatasetFrame],
-                          summary: Summary) -> Iterator[DatasetFrame]:
+def _write_kitti_tracking(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
     root = folder / "training"
     texts: dict[str, list[str]] = {}
     for placed in frames:
@@ -163,8 +168,7 @@ def _write_kitti_tracking(folder: Path, frames: Iterator[DatasetFrame],
         write_velodyne(root / f"velodyne/{name}/{placed.index:06}.bin", _load_cloud(frame, summary))
         if name not in texts:
             write_bytes(root / f"calib/{name}.txt", format_calibration(calibration).encode())
-        texts.setdefault(name, []).append(kitti_tracking.format_frame(
-            placed.labels, frame, placed.index))
+        texts.setdefault(name, []).append(kitti_tracking.format_frame(placed.labels, frame, placed.index))
         _remark_losses(summary, placed, "boxes, track ids")
         if (placed.labels.track_ids == NO_TRACK).any():
             summary.remark("without a track id: boxes, written with the id -1")
@@ -173,17 +177,23 @@ def _write_kitti_tracking(folder: Path, frames: Iterator[DatasetFrame],
         write_bytes(root / f"label_02/{name}.txt", "".join(parts).encode())
 
 
-def _write_semantickitti(folder: Path, frames: Iterator[DatasetFrame],
-                         summary: Summary) -> Iterator[DatasetFrame]:
+def _write_semantickitti(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
     drives: dict[int, list[tuple[int, Calibration, np.ndarray | None]]] = {}
     for placed in frames:
         frame, points = placed.frame, placed.frame.point_truth()
         if points is None:
-            raise InputError(f"frame {frame.name} has no point labels, which SemanticKITTI needs; "
-                             "use kitti, kitti-tracking or nuscenes for boxes")
+            raise InputError(
+                f"frame {frame.name} has no point labels, which SemanticKITTI needs; "
+                "use kitti, kitti-tracking or nuscenes for boxes"
+            )
         scans = drives.setdefault(placed.drive, [])
-        semantickitti.write_scan(folder / f"sequences/{placed.drive:02}", len(scans),
-                                 _load_cloud(frame, summary), points.classes, points.instances)
+        semantickitti.write_scan(
+            folder / f"sequences/{placed.drive:02}",
+            len(scans),
+            _load_cloud(frame, summary),
+            points.classes,
+            points.instances,
+        )
         _remark_losses(summary, placed, "point labels, poses")
         scans.append((frame.stamp_ns, frame.calibration() or ASSUMED_CAMERA, frame.pose()))
         yield placed
@@ -195,14 +205,15 @@ def _write_semantickitti(folder: Path, frames: Iterator[DatasetFrame],
         write_bytes(root / "times.txt", times.encode())
         if len(poses) == len(rows):
             to_first = np.linalg.inv(poses[0])
-            write_bytes(root / "poses.txt", "".join(semantickitti.format_pose(
-                to_first @ pose, calibration) for pose in poses).encode())
+            write_bytes(
+                root / "poses.txt",
+                "".join(semantickitti.format_pose(to_first @ pose, calibration) for pose in poses).encode(),
+            )
         elif poses:
             summary.remark("left out: poses, as some frames of the drive have none")
 
 
-def _write_nuscenes(folder: Path, frames: Iterator[DatasetFrame],
-                    summary: Summary) -> Iterator[DatasetFrame]:
+def _write_nuscenes(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
     tables = NuscenesTables(folder)
     for placed in frames:
         frame, labels = placed.frame, placed.labels
@@ -217,5 +228,8 @@ def _write_nuscenes(folder: Path, frames: Iterator[DatasetFrame],
 
 
 LAYOUTS: dict[str, Callable[[Path, Iterator[DatasetFrame], Summary], Iterator[DatasetFrame]]] = {
-    "kitti": _write_kitti_object, "kitti-tracking": _write_kitti_tracking,
-    "nuscenes": _write_nuscenes, "semantickitti": _write_semantickitti}
+    "kitti": _write_kitti_object,
+    "kitti-tracking": _write_kitti_tracking,
+    "nuscenes": _write_nuscenes,
+    "semantickitti": _write_semantickitti,
+}

@@ -29,20 +29,28 @@ from lidar_perception.data.nuscenes.folder import CHANNEL, FULL_REFLECTION
 from lidar_perception.data.nuscenes.results import format_boxes
 from lidar_perception.geometry import points_in_boxes
 from lidar_perception.labels.drive_labels import NO_TRACK, FrameLabels
-from lidar_perception.labels.formats.nuscenes import (
-    OUR_NAMES,
-    RIDDEN_CLASSES,
-    WRITTEN_NAMES,
-    find_read_rotation,
-)
+from lidar_perception.labels.formats.nuscenes import OUR_NAMES, RIDDEN_CLASSES, WRITTEN_NAMES, find_read_rotation
 from lidar_perception.runs.files import write_bytes, write_text
 
 VERSION = "v1.0-trainval"
 # Rotation from the frame's axes to those of LIDAR_TOP: x right, y ahead.
 TO_SENSOR = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 CATEGORY_BY_NAME = {name: next(c for c, n in CATEGORIES.items() if n == name) for name in NAMES}
-TABLES = ("category", "attribute", "visibility", "instance", "sensor", "calibrated_sensor",
-          "ego_pose", "log", "scene", "sample", "sample_data", "sample_annotation", "map")
+TABLES = (
+    "category",
+    "attribute",
+    "visibility",
+    "instance",
+    "sensor",
+    "calibrated_sensor",
+    "ego_pose",
+    "log",
+    "scene",
+    "sample",
+    "sample_data",
+    "sample_annotation",
+    "map",
+)
 MAP = "maps/none.png"  # required by nuscenes-devkit
 
 
@@ -57,14 +65,19 @@ class NuscenesTables:
     def __init__(self, folder: Path):
         self.folder = folder
         self.rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
-        self.rows["sensor"] = [{"token": make_token(CHANNEL), "channel": CHANNEL,
-                                "modality": "lidar"}]
-        self.rows["log"] = [{"token": make_token("log"), "logfile": "", "vehicle": "",
-                             "location": "", "date_captured": ""}]
-        self.rows["map"] = [{"token": make_token("map"), "log_tokens": [make_token("log")],
-                             "category": "semantic_prior", "filename": MAP}]
-        self.rows["attribute"] = [{"token": make_token(a), "name": a, "description": ""}
-                                  for a in ATTRIBUTES]
+        self.rows["sensor"] = [{"token": make_token(CHANNEL), "channel": CHANNEL, "modality": "lidar"}]
+        self.rows["log"] = [
+            {"token": make_token("log"), "logfile": "", "vehicle": "", "location": "", "date_captured": ""}
+        ]
+        self.rows["map"] = [
+            {
+                "token": make_token("map"),
+                "log_tokens": [make_token("log")],
+                "category": "semantic_prior",
+                "filename": MAP,
+            }
+        ]
+        self.rows["attribute"] = [{"token": make_token(a), "name": a, "description": ""} for a in ATTRIBUTES]
         self.categories: dict[str, str] = {}
         self.instances: dict[str, dict[str, Any]] = {}
         self.last: dict[str, dict[str, Any]] = {}  # last row of each chain, see _add_linked
@@ -82,23 +95,52 @@ class NuscenesTables:
         ego = pose[:3, 3] - pose[:3, :3] @ [0, 0, frame.sensor_height]
         mount = make_token("mount", frame.sensor_height)
         if not any(row["token"] == mount for row in self.rows["calibrated_sensor"]):
-            self._add("calibrated_sensor", mount, sensor_token=make_token(CHANNEL),
-                      translation=[0.0, 0.0, frame.sensor_height],
-                      rotation=_to_quaternion(TO_SENSOR.T), camera_intrinsic=[])
+            self._add(
+                "calibrated_sensor",
+                mount,
+                sensor_token=make_token(CHANNEL),
+                translation=[0.0, 0.0, frame.sensor_height],
+                rotation=_to_quaternion(TO_SENSOR.T),
+                camera_intrinsic=[],
+            )
         moment = {"timestamp": frame.stamp_ns // 1000}
-        self._add("ego_pose", make_token(sample, "ego"), **moment, translation=ego.tolist(),
-                  rotation=_to_quaternion(pose[:3, :3]))
+        self._add(
+            "ego_pose",
+            make_token(sample, "ego"),
+            **moment,
+            translation=ego.tolist(),
+            rotation=_to_quaternion(pose[:3, :3]),
+        )
         self._add_linked("sample", scene, sample, **moment, scene_token=make_token(scene))
-        self._add_linked("sample_data", scene, make_token(sample, "data"), **moment,
-                         sample_token=sample, ego_pose_token=make_token(sample, "ego"),
-                         calibrated_sensor_token=mount,
-                         fileformat="pcd", is_key_frame=True, height=0, width=0, filename=file)
+        self._add_linked(
+            "sample_data",
+            scene,
+            make_token(sample, "data"),
+            **moment,
+            sample_token=sample,
+            ego_pose_token=make_token(sample, "ego"),
+            calibrated_sensor_token=mount,
+            fileformat="pcd",
+            is_key_frame=True,
+            height=0,
+            width=0,
+            filename=file,
+        )
         if not self.rows["scene"] or self.rows["scene"][-1]["name"] != scene:
-            self._add("scene", make_token(scene), name=scene, log_token=make_token("log"),
-                      nbr_samples=0, first_sample_token=sample, last_sample_token=sample,
-                      description="")
-        self.rows["scene"][-1] |= {"last_sample_token": sample,
-                                   "nbr_samples": self.rows["scene"][-1]["nbr_samples"] + 1}
+            self._add(
+                "scene",
+                make_token(scene),
+                name=scene,
+                log_token=make_token("log"),
+                nbr_samples=0,
+                first_sample_token=sample,
+                last_sample_token=sample,
+                description="",
+            )
+        self.rows["scene"][-1] |= {
+            "last_sample_token": sample,
+            "nbr_samples": self.rows["scene"][-1]["nbr_samples"] + 1,
+        }
         self._add_boxes(scene, sample, labels, pose, cloud)
 
     def _write_sweep(self, path: Path, cloud: np.ndarray) -> None:
@@ -107,8 +149,7 @@ class NuscenesTables:
         sweep[:, 3] = cloud[:, 3] * np.float32(FULL_REFLECTION)
         write_bytes(path, sweep.tobytes())
 
-    def _add_boxes(self, scene: str, sample: str, labels: FrameLabels, pose: np.ndarray,
-                   cloud: np.ndarray) -> None:
+    def _add_boxes(self, scene: str, sample: str, labels: FrameLabels, pose: np.ndarray, cloud: np.ndarray) -> None:
         inside = np.diff(points_in_boxes(cloud, labels.boxes)[1]) if len(labels) else ()
         placements = format_boxes(sample, *to_global_boxes(labels.boxes, pose))
         for k, placement in enumerate(placements):
@@ -118,26 +159,40 @@ class NuscenesTables:
                 placement["rotation"] = rotation
                 lidar = extra.get("lidar_points", lidar)
                 radar = extra.get("points", lidar) - lidar
-            instance = (make_token(scene, "track", track) if track != NO_TRACK
-                        else make_token(sample, k))
+            instance = make_token(scene, "track", track) if track != NO_TRACK else make_token(sample, k)
             kind = WRITTEN_NAMES.get(name, name)
             category = extra.get("category")
             if CATEGORIES.get(str(category), category) != kind:
                 category = CATEGORY_BY_NAME.get(kind, name)
             attribute = extra.get("attribute") or (
-                ATTRIBUTES[WITH_RIDER] if name in OUR_NAMES.values() and kind in RIDDEN_CLASSES
-                else None)
+                ATTRIBUTES[WITH_RIDER] if name in OUR_NAMES.values() and kind in RIDDEN_CLASSES else None
+            )
             if instance not in self.instances:
-                self._add("instance", instance, category_token=self._get_category(str(category)),
-                          nbr_annotations=0, first_annotation_token=make_token(sample, instance))
+                self._add(
+                    "instance",
+                    instance,
+                    category_token=self._get_category(str(category)),
+                    nbr_annotations=0,
+                    first_annotation_token=make_token(sample, instance),
+                )
                 self.instances[instance] = self.rows["instance"][-1]
             row = self.instances[instance]
-            row |= {"nbr_annotations": row["nbr_annotations"] + 1,
-                    "last_annotation_token": make_token(sample, instance)}
+            row |= {
+                "nbr_annotations": row["nbr_annotations"] + 1,
+                "last_annotation_token": make_token(sample, instance),
+            }
             attributes = [make_token(attribute)] if attribute in ATTRIBUTES else []
-            self._add_linked("sample_annotation", instance, make_token(sample, instance),
-                             **placement, instance_token=instance, visibility_token="",
-                             attribute_tokens=attributes, num_lidar_pts=lidar, num_radar_pts=radar)
+            self._add_linked(
+                "sample_annotation",
+                instance,
+                make_token(sample, instance),
+                **placement,
+                instance_token=instance,
+                visibility_token="",
+                attribute_tokens=attributes,
+                num_lidar_pts=lidar,
+                num_radar_pts=radar,
+            )
 
     def _get_category(self, name: str) -> str:
         if name not in self.categories:
@@ -169,8 +224,13 @@ def _to_quaternion(rotation: np.ndarray) -> list[float]:
 
 def _make_png() -> bytes:
     """Return a PNG image of one black pixel."""
+
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc32(kind + data))
 
-    return (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0))
-            + chunk(b"IDAT", compress(b"\0\0")) + chunk(b"IEND", b""))
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0))
+        + chunk(b"IDAT", compress(b"\0\0"))
+        + chunk(b"IEND", b"")
+    )

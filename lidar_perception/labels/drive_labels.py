@@ -42,10 +42,17 @@ class FrameLabels:
     notes: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
 
     @staticmethod
-    def of(name: str, stamp_ns: int, boxes: ArrayLike = (), class_names: Iterable[str] = (),
-           track_ids: ArrayLike | None = None, scores: ArrayLike | None = None,
-           extra: Iterable[dict[str, Any]] | None = None,
-           notes: Iterable[tuple[str, dict[str, Any]]] = (), where: object = None) -> FrameLabels:
+    def of(
+        name: str,
+        stamp_ns: int,
+        boxes: ArrayLike = (),
+        class_names: Iterable[str] = (),
+        track_ids: ArrayLike | None = None,
+        scores: ArrayLike | None = None,
+        extra: Iterable[dict[str, Any]] | None = None,
+        notes: Iterable[tuple[str, dict[str, Any]]] = (),
+        where: object = None,
+    ) -> FrameLabels:
         """Make labels, with conversion of dtypes and shapes.
 
         Raises InputError that names `where` if a box is not finite, is beyond MAX_RANGE or has a
@@ -56,24 +63,36 @@ class FrameLabels:
             boxes = np.array(boxes, np.float64).reshape(-1, 7)
             count = len(boxes)
             ids = np.full(count, NO_TRACK) if track_ids is None else np.array(track_ids)
-            score_values = np.array(np.full(count, np.nan) if scores is None else scores,
-                                    np.float64)
-            labels = FrameLabels(name, int(stamp_ns), boxes, [str(c) for c in class_names],
-                                 _to_integers(ids).reshape(count), score_values.reshape(count),
-                                 [{} for _ in boxes] if extra is None else list(extra),
-                                 list(notes))
+            score_values = np.array(np.full(count, np.nan) if scores is None else scores, np.float64)
+            labels = FrameLabels(
+                name,
+                int(stamp_ns),
+                boxes,
+                [str(c) for c in class_names],
+                _to_integers(ids).reshape(count),
+                score_values.reshape(count),
+                [{} for _ in boxes] if extra is None else list(extra),
+                list(notes),
+            )
         except (ValueError, TypeError, OverflowError) as error:
-            raise InputError(f"{where}: a box is malformed ({error}); it needs seven numbers, a "
-                             "class and, optionally, an integer track id") from None
+            raise InputError(
+                f"{where}: a box is malformed ({error}); it needs seven numbers, a "
+                "class and, optionally, an integer track id"
+            ) from None
         if not len(labels.class_names) == len(labels.extra) == count:
-            raise InputError(f"{where}: {count} boxes, {len(labels.class_names)} classes and "
-                             f"{len(labels.extra)} extras; each box needs one of each")
-        invalid = ~((np.abs(boxes[:, :6]) <= MAX_RANGE).all(axis=1) & np.isfinite(boxes[:, 6])
-                    & (boxes[:, 3:6] > 0).all(axis=1))
+            raise InputError(
+                f"{where}: {count} boxes, {len(labels.class_names)} classes and "
+                f"{len(labels.extra)} extras; each box needs one of each"
+            )
+        invalid = ~(
+            (np.abs(boxes[:, :6]) <= MAX_RANGE).all(axis=1) & np.isfinite(boxes[:, 6]) & (boxes[:, 3:6] > 0).all(axis=1)
+        )
         if invalid.any():
-            raise InputError(f"{where}, box {np.flatnonzero(invalid)[0] + 1} of {count}: its "
-                             f"numbers must be finite and within {MAX_RANGE:g} m, its sides above "
-                             "0; correct or remove it")
+            raise InputError(
+                f"{where}, box {np.flatnonzero(invalid)[0] + 1} of {count}: its "
+                f"numbers must be finite and within {MAX_RANGE:g} m, its sides above "
+                "0; correct or remove it"
+            )
         if np.isinf(labels.scores).any():
             raise InputError(f"{where}: a score is not finite; correct or remove it")
         return labels
@@ -110,14 +129,13 @@ class DriveLabels:
 Row = tuple[Sequence[float], str, int, float, dict[str, Any]]  # box, class, track id, score, extra
 
 
-def make_frame_labels(frame: Frame, rows: Iterable[Row],
-                      notes: Iterable[tuple[str, dict[str, Any]]] = (),
-                      where: object = None) -> FrameLabels:
+def make_frame_labels(
+    frame: Frame, rows: Iterable[Row], notes: Iterable[tuple[str, dict[str, Any]]] = (), where: object = None
+) -> FrameLabels:
     """Make the labels of a frame from one row per box; see FrameLabels.of."""
     columns: list[Any] = [*zip(*rows)] or [[]] * 5
     boxes, names, ids, scores, extra = columns
-    return FrameLabels.of(frame.name, frame.stamp_ns, boxes, names, ids, scores, extra, notes,
-                          where)
+    return FrameLabels.of(frame.name, frame.stamp_ns, boxes, names, ids, scores, extra, notes, where)
 
 
 def read_frame_labels(frame: Frame) -> FrameLabels:
@@ -128,11 +146,15 @@ def read_frame_labels(frame: Frame) -> FrameLabels:
     extra = [dict(e) for e in truth.extras]
     ids = [e.pop("track_id", NO_TRACK) for e in extra]
     scores = [e.pop("score", np.nan) for e in extra]
-    classes = [str(e.pop("class_name", None) or (label == OTHER_CLASS and (
-        e.get("detection_name") or e.get("category"))) or label)
-        for e, label in zip(extra, truth.labels)]
-    return FrameLabels.of(frame.name, frame.stamp_ns, truth.boxes, classes, ids, scores, extra,
-                          truth.notes)
+    classes = [
+        str(
+            e.pop("class_name", None)
+            or (label == OTHER_CLASS and (e.get("detection_name") or e.get("category")))
+            or label
+        )
+        for e, label in zip(extra, truth.labels)
+    ]
+    return FrameLabels.of(frame.name, frame.stamp_ns, truth.boxes, classes, ids, scores, extra, truth.notes)
 
 
 def _to_integers(ids: np.ndarray) -> np.ndarray:

@@ -78,32 +78,47 @@ def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabe
         return read(path, frames[:])  # frames of a slice of a bag do not hold their clouds
 
 
-def export_labels(labels: DriveLabels, format: str, out: Path, frames: Sequence[Frame],
-                  force: bool = False) -> ExportResult:
+def export_labels(
+    labels: DriveLabels, format: str, out: Path, frames: Sequence[Frame], force: bool = False
+) -> ExportResult:
     """Write the labels of the frames of a drive; replace existing files only with `force`.
 
     Raises InputError, without partial output, if they cannot be written.
     """
     format = resolve_format(format, FORMATS)
     if len(labels) != len(frames):
-        raise InputError(f"there are labels of {len(labels)} frames for a drive of {len(frames)}; "
-                         "give labels of the same frames")
-    report_format_errors("a field that the labels keep from the file they were read from",
-                         lambda: FORMATS[format][1](labels, out, frames[:], force))
+        raise InputError(
+            f"there are labels of {len(labels)} frames for a drive of {len(frames)}; give labels of the same frames"
+        )
+    report_format_errors(
+        "a field that the labels keep from the file they were read from",
+        lambda: FORMATS[format][1](labels, out, frames[:], force),
+    )
     notes = 0 if format in WITH_NOTES else sum(len(each.notes) for each in labels.frames)
     ids = format == "kitti" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
-    return ExportResult(out, labels.box_count, len(labels), (
-        *((f"{notes} regions without a box",) if notes else ()), *(("track ids",) if ids else ())))
+    return ExportResult(
+        out,
+        labels.box_count,
+        len(labels),
+        (*((f"{notes} regions without a box",) if notes else ()), *(("track ids",) if ids else ())),
+    )
 
 
 def recognise_format(path: Path) -> str:
     """Return the format of the labels at a path. Raises InputError if it cannot be recognised."""
-    files = [path] if path.is_file() else sorted(
-        file for file in path.rglob("*") if file.suffix in (".txt", ".json")
-        and not file.name.startswith(("_", ".")))
+    files = (
+        [path]
+        if path.is_file()
+        else sorted(
+            file
+            for file in path.rglob("*")
+            if file.suffix in (".txt", ".json") and not file.name.startswith(("_", "."))
+        )
+    )
     if not path.exists():
-        raise InputError(f"{path} does not exist; give a file or folder with labels in one of the "
-                         f"formats {', '.join(READERS)}")
+        raise InputError(
+            f"{path} does not exist; give a file or folder with labels in one of the formats {', '.join(READERS)}"
+        )
     if path.suffix in (".mcap", ".db3") or (path.is_dir() and is_bag(path)):
         return "mcap"
     if path.suffix == ".xml" or any(path.glob(f"**/{TRACKLETS}")):
@@ -115,8 +130,7 @@ def recognise_format(path: Path) -> str:
         found = _recognise_text(file) if file.suffix == ".txt" else _recognise_json(read_json(file))
         if found:
             return found
-    raise InputError(f"no labels are recognised in {path}; give their format with --from, one of "
-                     f"{', '.join(READERS)}")
+    raise InputError(f"no labels are recognised in {path}; give their format with --from, one of {', '.join(READERS)}")
 
 
 def _recognise_text(file: Path) -> str:

@@ -9,20 +9,26 @@ _BOXES, _DETECTIONS = "params.BoxNodeParams", "params.DetectionNodeParams"
 NODES = {
     "bag_player": ("replay.bag_player.BagPlayer", "params.PlayerParams"),
     "bag_recorder": ("replay.bag_recorder.BagRecorder", "params.RecorderParams"),
-    "ground_segmentation": ("ground_segmentation.GroundSegmentation", "params.GroundNodeParams",
-                            "params.GroundExtraParams"),
+    "ground_segmentation": (
+        "ground_segmentation.GroundSegmentation",
+        "params.GroundNodeParams",
+        "params.GroundExtraParams",
+    ),
     "clustering": ("clustering.Clustering", "params.ClusteringNodeParams", _BOXES),
-    "candidate_refinement": ("candidate_refinement.CandidateRefinement",
-                             "params.RefinementNodeParams", _DETECTIONS),
+    "candidate_refinement": ("candidate_refinement.CandidateRefinement", "params.RefinementNodeParams", _DETECTIONS),
     "evaluator": ("replay.evaluator.Evaluator", "params.EvaluatorParams"),
-    "perception": ("perception.Perception", "candidates.params.PipelineParams",
-                   "params.PerceptionExtraParams"),
-    "pointpillars_detector": ("pointpillars_detector.PointPillarsNode",
-                              "detectors.pointpillars.params.DetectorParams", _DETECTIONS),
-    "pointnet_detector": ("pointnet_detector.PointNetNode",
-                          "detectors.pointnet.params.PointNetDetectorParams", _DETECTIONS),
-    "fused_detector": ("fused_detector.FusedNode", "detectors.fused.params.FusedDetectorParams",
-                       _DETECTIONS),
+    "perception": ("perception.Perception", "candidates.params.PipelineParams", "params.PerceptionExtraParams"),
+    "pointpillars_detector": (
+        "pointpillars_detector.PointPillarsNode",
+        "detectors.pointpillars.params.DetectorParams",
+        _DETECTIONS,
+    ),
+    "pointnet_detector": (
+        "pointnet_detector.PointNetNode",
+        "detectors.pointnet.params.PointNetDetectorParams",
+        _DETECTIONS,
+    ),
+    "fused_detector": ("fused_detector.FusedNode", "detectors.fused.params.FusedDetectorParams", _DETECTIONS),
     "tracker": ("tracker.TrackerNode", "params.TrackerNodeParams", "params.TrackerExtraParams"),
 }
 
@@ -36,9 +42,11 @@ def load_node_class(name: str) -> Any:
 def require_rclpy() -> None:
     """Raise InputError if rclpy is not installed or cannot be loaded."""
     from lidar_perception.types import InputError
+
     try:
         import rclpy  # noqa: F401
     except ImportError as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"cannot load rclpy ({reason}): source ROS 2 Jazzy, or pip install "
-                         "'lidar_perception[ros]'") from None
+        raise InputError(
+            f"cannot load rclpy ({reason}): source ROS 2 Jazzy, or pip install 'lidar_perception[ros]'"
+        ) from None

@@ -7,9 +7,9 @@ from collections import deque
 import numpy as np
 
 DEPTH = 5
-WINDOW = 100            # sent clouds, for the shares of lost and dropped ones
-RATE_SAMPLES = 20       # intervals between clouds, whose median is the expected one
-RATE_INTERVALS = 10     # intervals, whose mean gives the present rate
+WINDOW = 100  # sent clouds, for the shares of lost and dropped ones
+RATE_SAMPLES = 20  # intervals between clouds, whose median is the expected one
+RATE_INTERVALS = 10  # intervals, whose mean gives the present rate
 
 
 class Arrivals:
@@ -69,8 +69,7 @@ class Arrivals:
     def count_recent(self) -> tuple[int, int, int]:
         """Return (sent, lost, dropped) of the last WINDOW sent clouds, or more after a long gap."""
         now = self.window[-1]
-        before = next((w for w in reversed(self.window) if now[0] - w[0] >= WINDOW),
-                      self.window[0])
+        before = next((w for w in reversed(self.window) if now[0] - w[0] >= WINDOW), self.window[0])
         sent, lost, dropped = (a - b for a, b in zip(now, before))
         return sent, lost, dropped
 

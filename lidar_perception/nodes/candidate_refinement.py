@@ -26,8 +26,7 @@ class CandidateRefinement(ManagedNode):
     """Ground snapping, height filter, STM and CPA on a cloud with `ground` and `cluster_id`."""
 
     def __init__(self, **options: Any):
-        super().__init__("candidate_refinement", RefinementNodeParams(),
-                         DetectionNodeParams(), **options)
+        super().__init__("candidate_refinement", RefinementNodeParams(), DetectionNodeParams(), **options)
 
     def configure(self) -> None:
         with lock_compilation(self.get_logger().info):
@@ -42,12 +41,12 @@ class CandidateRefinement(ManagedNode):
             frame = self.transforms.find_placement(msg.header).level_frame(frame)
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
             if clusters is None:
-                raise InputError("the cloud has no column 'cluster_id'; remap ~/input/points to "
-                                 "the output of the clustering")
+                raise InputError(
+                    "the cloud has no column 'cluster_id'; remap ~/input/points to the output of the clustering"
+                )
             ids, numbers = clusters
             ground = np.zeros(len(ids), bool) if ground is None else ground > 0
-            segmented = SegmentedCloud(indices, frame.xyz, ground, ids,
-                                       fit_grounded_boxes(frame.xyz, ground, ids,
-                                                          self.params.boxes), numbers)
-            self.outputs.publish(msg.header, frame.xyz,
-                                 lambda: refine_segmented(segmented, source, self.params))
+            segmented = SegmentedCloud(
+                indices, frame.xyz, ground, ids, fit_grounded_boxes(frame.xyz, ground, ids, self.params.boxes), numbers
+            )
+            self.outputs.publish(msg.header, frame.xyz, lambda: refine_segmented(segmented, source, self.params))

@@ -47,14 +47,15 @@ class Clustering(ManagedNode):
             column = read_column(msg, "ground", indices)
             ground = np.zeros(len(frame), bool) if column is None else column > 0
             ids = cluster_obstacles(frame.xyz, ground, self.params.clustering)
-            self.points.publish(add_columns(
-                msg, bag_message, cluster_id=scatter_values(ids, indices, msg, "u4")))
-        self.boxes.publish(msg.header, lambda: fit_grounded_boxes(
-            frame.xyz, ground, ids, self.params.boxes))
+            self.points.publish(add_columns(msg, bag_message, cluster_id=scatter_values(ids, indices, msg, "u4")))
+        self.boxes.publish(msg.header, lambda: fit_grounded_boxes(frame.xyz, ground, ids, self.params.boxes))
         self.counts["clusters"] = int(ids.max(initial=0))
         if column is None:
-            self.report(WARN, "the cloud has no column 'ground', so all points are clustered; "
-                        "remap ~/input/points to the output of the ground segmentation")
+            self.report(
+                WARN,
+                "the cloud has no column 'ground', so all points are clustered; "
+                "remap ~/input/points to the output of the ground segmentation",
+            )
         else:
             problem = diagnose_empty(len(frame), ground, ids)
             self.report(WARN if problem else OK, problem or "clustering")

@@ -36,8 +36,7 @@ class DetectorNode(ManagedNode):
         with report_compilation(self.get_logger().info, whole_detector=True):
             self.detector = self._load_detector()
         name = self.describe_network(self.detector.networks[0].config)
-        self.counts.update(network=f"{name}, {' '.join(self.detector.classes)}",
-                           device=self.detector.device)
+        self.counts.update(network=f"{name}, {' '.join(self.detector.classes)}", device=self.detector.device)
         if self.detector.warning:  # not the state, which tells what the node waits for
             self.counts["doubt"] = self.detector.warning
             self.get_logger().warning(self.detector.warning)
@@ -70,6 +69,7 @@ class DetectorNode(ManagedNode):
         network_params, fallback = getattr(self.params, self.group), None
         weights = self.weights()
         from lidar_perception.detectors.devices import find_device
+
         # One thread is the default, by the environment that main.py sets.
         set_thread_count(network_params.threads or count_cores())
         device = network_params.device
@@ -89,13 +89,15 @@ class DetectorNode(ManagedNode):
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
             network_params = getattr(params, self.group)
             detector = self.detector.with_params(self._lower_thresholds(params, network_params))
-            result = detector(frame, ground=None if ground is None else ground > 0,
-                              cluster_ids=None if clusters is None else clusters[0])
+            result = detector(
+                frame,
+                ground=None if ground is None else ground > 0,
+                cluster_ids=None if clusters is None else clusters[0],
+            )
             weak = result.detections
             if self.outputs.tracks is not None:
                 result = replace(result, detections=weak[network_params.scores.passes(weak)])
-            tracking_problem = self.outputs.publish(msg.header, result.detections, result.timings,
-                                                    frame.xyz, weak=weak)
+            tracking_problem = self.outputs.publish(msg.header, result.detections, result.timings, frame.xyz, weak=weak)
         self._diagnose(frame, result, params, tracking_problem)
 
     def _lower_thresholds(self, params: Any, network_params: NetworkParams) -> Any:
@@ -105,16 +107,19 @@ class DetectorNode(ManagedNode):
         low = network_params.scores.with_maximum(self.node_params.tracking.min_score)
         return replace(params, **{self.group: replace(network_params, scores=low)})
 
-    def _diagnose(self, frame: PointCloud, result: DetectionResult, params: Any,
-                  tracking_problem: str | None) -> None:
+    def _diagnose(self, frame: PointCloud, result: DetectionResult, params: Any, tracking_problem: str | None) -> None:
         # The problem of the detector includes those of the intensity.
-        problem = join_problems(result.problem, self.sensor.check_height(
-            frame, params.ground.sensor_pose), tracking_problem)
+        problem = join_problems(
+            result.problem, self.sensor.check_height(frame, params.ground.sensor_pose), tracking_problem
+        )
         self.counts.update(detections=len(result.detections), device=self.detector.device)
-        self.counts["best scores"] = " ".join(
-            f"{name} {score:.2f}" for name, score in result.best.items())
+        self.counts["best scores"] = " ".join(f"{name} {score:.2f}" for name, score in result.best.items())
         if problem:
             self.report(WARN, problem)
         else:
-            self.report(OK, "detecting" if len(result.detections) else "nothing detected: every "
-                        f"score is below its threshold in {self.group}.scores")
+            self.report(
+                OK,
+                "detecting"
+                if len(result.detections)
+                else f"nothing detected: every score is below its threshold in {self.group}.scores",
+            )

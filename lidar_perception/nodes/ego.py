@@ -20,9 +20,9 @@ from msg_utils.stamps import SECOND_NS, to_ns
 
 START, SCAN = "start", "scan"  # frames of KISS-ICP
 ICP_MS = "kiss_icp_cpu_ms_median"
-PAUSE_S = 1.0            # without waiting, after waiting for a pose has timed out
-GRACE_NS = SECOND_NS        # without a pose, before ego.source auto uses the scans
-TIMED_SCANS = 100        # for the median time of KISS-ICP
+PAUSE_S = 1.0  # without waiting, after waiting for a pose has timed out
+GRACE_NS = SECOND_NS  # without a pose, before ego.source auto uses the scans
+TIMED_SCANS = 100  # for the median time of KISS-ICP
 ODOMETRY_TIMEOUT_S = 2.0
 MAX_OFFSET_NS = 10 * SECOND_NS  # a larger offset of odometry and detections means different clocks
 
@@ -70,8 +70,7 @@ class EgoInput:
         xyz: (N, 3) scan of the frame, if the node subscribes to clouds.
         """
         frame_id, stamp = header.frame_id, to_ns(header.stamp)
-        if (self.icp is not None and self.clouds and xyz is not None and len(xyz)
-            and self._uses_scans()):
+        if self.icp is not None and self.clouds and xyz is not None and len(xyz) and self._uses_scans():
             self._register(header, xyz)
         pose, self.pose_problem = None, ""
         try:
@@ -111,27 +110,39 @@ class EgoInput:
             topic = self.node.resolve_topic_name("~/input/odometry")
             silent = monotonic() - self.transforms.odometry_arrival
             if silent > ODOMETRY_TIMEOUT_S and stamp - last > self.params().max_gap * SECOND_NS:
-                return (f"no odometry on {topic} for {silent:.0f} s: the sensor is assumed to "
-                        "stand; is the odometry running?")
+                return (
+                    f"no odometry on {topic} for {silent:.0f} s: the sensor is assumed to "
+                    "stand; is the odometry running?"
+                )
             if silent <= ODOMETRY_TIMEOUT_S and abs(last - stamp) > MAX_OFFSET_NS:
-                return (f"the odometry on {topic} is stamped {abs(last - stamp) / SECOND_NS:.0f} s "
-                        f"{'ahead of' if last > stamp else 'behind'} the detections, so none of "
-                        "its poses is used: do both use the same clock (use_sim_time)?")
+                return (
+                    f"the odometry on {topic} is stamped {abs(last - stamp) / SECOND_NS:.0f} s "
+                    f"{'ahead of' if last > stamp else 'behind'} the detections, so none of "
+                    "its poses is used: do both use the same clock (use_sim_time)?"
+                )
         if wanted == "tf" and self.source != "tf":
             fixed = self.node.node_params.input.fixed_frame
-            return (f"TF does not connect '{frame_id}' with '{fixed}' (input.fixed_frame): tracks "
-                    "are relative to the sensor")
+            return (
+                f"TF does not connect '{frame_id}' with '{fixed}' (input.fixed_frame): tracks "
+                "are relative to the sensor"
+            )
         if wanted in ("odometry", "kiss_icp") and self.source != wanted:
             topic = "odometry" if wanted == "odometry" else "points"
-            return (f"no pose from {self.node.resolve_topic_name(f'~/input/{topic}')} yet: "
-                    "tracks are relative to the sensor")
+            return (
+                f"no pose from {self.node.resolve_topic_name(f'~/input/{topic}')} yet: "
+                "tracks are relative to the sensor"
+            )
         if not self.is_mounting_known and frame_id:
-            return (f"the odometry is of '{odometry_child}', the detections are in '{frame_id}', "
-                    "and TF does not connect them: they are assumed to coincide"
-                    + ("; its child_frame_id is empty" if not odometry_child else ""))
+            return (
+                f"the odometry is of '{odometry_child}', the detections are in '{frame_id}', "
+                "and TF does not connect them: they are assumed to coincide"
+                + ("; its child_frame_id is empty" if not odometry_child else "")
+            )
         if self.source == "kiss_icp" and self.is_disconnected:
-            return (f"KISS-ICP moves with '{self.scan_frame}', the detections are in '{frame_id}', "
-                    "and TF does not connect them: tracks are relative to the sensor")
+            return (
+                f"KISS-ICP moves with '{self.scan_frame}', the detections are in '{frame_id}', "
+                "and TF does not connect them: tracks are relative to the sensor"
+            )
         if self.pose_problem:
             return f"the pose of the sensor is unknown: {self.pose_problem}"
         return None
@@ -143,8 +154,7 @@ class EgoInput:
             available.add("odometry")
         if self.scan_ns:
             available.add("kiss_icp")
-        if choose_source(wanted, {"tf", *available}) == "tf" != self.source and (
-                self._is_connected(frame_id, stamp)):
+        if choose_source(wanted, {"tf", *available}) == "tf" != self.source and (self._is_connected(frame_id, stamp)):
             available.add("tf")
         self.source, self.is_mounting_known = choose_source(wanted, available), True
         if self.source == "odometry":
@@ -167,8 +177,7 @@ class EgoInput:
         """Return True while there is no better source than scans."""
         return self.source in (NO_SOURCE, "kiss_icp")
 
-    def _look_up(self, source: str, frame_id: str, stamp: int,
-                 max_gap: float | None) -> np.ndarray | None:
+    def _look_up(self, source: str, frame_id: str, stamp: int, max_gap: float | None) -> np.ndarray | None:
         at = np.array([stamp])
         if source == "kiss_icp":
             scan = self.scans.lookup(START, SCAN, stamp, max_gap)
@@ -186,8 +195,7 @@ class EgoInput:
             return np.eye(4)
         self.transforms.subscribe_to_tf()
         try:
-            poses: np.ndarray = self.transforms.tree.lookup_many(self.scan_frame, frame_id, at,
-                                                                 max_gap)
+            poses: np.ndarray = self.transforms.tree.lookup_many(self.scan_frame, frame_id, at, max_gap)
         except MissingTransform as error:
             self.is_disconnected = not error.late
             raise
@@ -232,6 +240,5 @@ class EgoInput:
         pose = self.icp(xyz)
         self.icp_ms.append((thread_time() - begin) * 1e3)
         self.node.counts[ICP_MS] = f"{np.median(self.icp_ms):.1f}"
-        self.scans.set(START, SCAN, stamp_ns, pose[:3, 3],
-                       Rotation.from_matrix(pose[:3, :3]).as_quat())
+        self.scans.set(START, SCAN, stamp_ns, pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_quat())
         self.node.counts["last_pose_ns"] = stamp_ns

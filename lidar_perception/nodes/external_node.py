@@ -65,9 +65,13 @@ def shut_down_context(context: Context, *nodes: Node) -> None:
 
 def _graph_state(node: Node) -> tuple[Any, ...]:
     """Return the nodes on the domain, and the numbers of endpoints of each topic."""
-    return (sorted(node.get_node_names_and_namespaces()),
-            [(topic, node.count_publishers(topic), node.count_subscribers(topic))
-             for topic, _ in node.get_topic_names_and_types()])
+    return (
+        sorted(node.get_node_names_and_namespaces()),
+        [
+            (topic, node.count_publishers(topic), node.count_subscribers(topic))
+            for topic, _ in node.get_topic_names_and_types()
+        ],
+    )
 
 
 class ExternalNode:
@@ -116,12 +120,15 @@ class ExternalNode:
 
     def is_connected(self, outputs: Mapping[str, set[str]]) -> bool:
         """Return True if by the diagnostics each of the outputs {node: topics} has a subscriber."""
-        return all(node in self.diagnostics and all(
-            int(self.get_value(node, f"subscribers of {topic}") or 0) for topic in topics)
-            for node, topics in outputs.items())
+        return all(
+            node in self.diagnostics
+            and all(int(self.get_value(node, f"subscribers of {topic}") or 0) for topic in topics)
+            for node, topics in outputs.items()
+        )
 
-    def spin_until(self, condition: Callable[[], Any], timeout: float,
-                   on_spin: Callable[[], None] = lambda: None) -> bool:
+    def spin_until(
+        self, condition: Callable[[], Any], timeout: float, on_spin: Callable[[], None] = lambda: None
+    ) -> bool:
         """Spin until condition() holds; return False if it does not within timeout seconds.
 
         on_spin() is called before each spin.

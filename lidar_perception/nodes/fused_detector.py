@@ -36,10 +36,9 @@ class FusedNode(DetectorNode):
         self.sensor = SensorCheck(self)
         self.outputs = DetectionOutputs(self, self.steps)
         self.detector = load_custom_detector(
-            reference, self.params.fused.device, self.params.fused.range,
-            params=self.params, group=self.group)
-        self.counts.update(network=f"{reference}, {' '.join(self.detector.classes)}",
-                           device=self.detector.device)
+            reference, self.params.fused.device, self.params.fused.range, params=self.params, group=self.group
+        )
+        self.counts.update(network=f"{reference}, {' '.join(self.detector.classes)}", device=self.detector.device)
         self.input("points", CLOUD, self.on_points)
 
     def weights(self) -> Path:
@@ -47,6 +46,7 @@ class FusedNode(DetectorNode):
 
     def load(self, weights: Path, device: str) -> FusedDetector:
         from lidar_perception.detectors.fused.detector import load_fused_detector
+
         return load_fused_detector(weights, device, self.params)
 
     def describe_network(self, config: NetworkConfig) -> str:

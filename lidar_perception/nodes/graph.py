@@ -35,8 +35,7 @@ def relative_name(topic: str) -> str:
     return topic.lstrip("/")
 
 
-CAMERA = {"~/input/camera_info": relative_name(CAMERA_INFO),
-          "~/input/extrinsics": relative_name(EXTRINSICS)}
+CAMERA = {"~/input/camera_info": relative_name(CAMERA_INFO), "~/input/extrinsics": relative_name(EXTRINSICS)}
 TRUTH_INPUT = {"~/input/ground_truth": relative_name(TRUTH)}
 CLOUDS = {"~/input/points": relative_name(POINTS)}
 ODOMETRY_INPUT = {"~/input/odometry": relative_name(ODOMETRY)}
@@ -68,12 +67,10 @@ SINGLE_PROCESS_NODES = {
 
 
 # Detectors with a network; each has a parameter group of the same name.
-NETWORKS = tuple(name for name, nodes in SINGLE_PROCESS_NODES.items()
-                 if f"{name}_detector" in nodes)
+NETWORKS = tuple(name for name, nodes in SINGLE_PROCESS_NODES.items() if f"{name}_detector" in nodes)
 
 
-def build_graph(detectors: Sequence[str], single: bool = False,
-                tracking: bool = False) -> dict[str, Mapping[str, str]]:
+def build_graph(detectors: Sequence[str], single: bool = False, tracking: bool = False) -> dict[str, Mapping[str, str]]:
     """Return the nodes of one or several detectors, each node once.
 
     Args:
@@ -92,8 +89,7 @@ def build_graph(detectors: Sequence[str], single: bool = False,
             raise InputError(f"detectors: '{name}' is none of {', '.join(DETECTOR_NODES)}")
     parts = [(SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[name] for name in detectors]
     if tracking:
-        parts += [{tracker: _remap_tracker(name, single)}
-                  for tracker, name in find_trackers(detectors).items()]
+        parts += [{tracker: _remap_tracker(name, single)} for tracker, name in find_trackers(detectors).items()]
     return {k: v for part in ([] if single else [EXPERTS]) + parts for k, v in part.items()}
 
 
@@ -133,10 +129,11 @@ def find_executable(node: str) -> str:
 
 def add_node_prefix(graph: Graph, prefix: str) -> dict[str, dict[str, str]]:
     """Return the graph with a prefix on the names of its nodes and of the topics between them."""
+
     def renamed(topic: str) -> str:
         return prefix + topic if topic.partition("/")[0] in graph else topic
-    return {prefix + node: {a: renamed(b) for a, b in remap.items()}
-            for node, remap in graph.items()}
+
+    return {prefix + node: {a: renamed(b) for a, b in remap.items()} for node, remap in graph.items()}
 
 
 STAGES, SINGLE = build_graph(["candidates"]), build_graph(["candidates"], single=True)
@@ -145,7 +142,7 @@ POINTPILLARS, POINTNET = build_graph(["pointpillars"]), build_graph(["pointnet"]
 
 def find_result_node(detector: str, single: bool = False) -> str:
     """Return the node that publishes the detections of a detector."""
-    node, = (SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[detector]
+    (node,) = (SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[detector]
     return node
 
 
@@ -153,8 +150,7 @@ def list_result_topics(single: bool = False, detector: str = "candidates") -> di
     """Return the topic of detections by stage, without a namespace; networks have one stage."""
     node = find_result_node(detector, single)
     before = ("stage1", "stage2") if detector == "candidates" else ()
-    return {**{stage: f"/{node}/debug/{stage}" for stage in before},
-            FINAL: f"/{node}/output/detections"}
+    return {**{stage: f"/{node}/debug/{stage}" for stage in before}, FINAL: f"/{node}/output/detections"}
 
 
 def cloud_topic(single: bool = False, detector: str = "candidates") -> str:
@@ -173,8 +169,7 @@ def list_stages(detectors: Sequence[str], single: bool = False) -> dict[str, str
     return {name: list_result_topics(single, name)[FINAL] for name in detectors}
 
 
-def list_timing_topics(detectors: Sequence[str] = ("candidates",), single: bool = False
-                       ) -> list[str]:
+def list_timing_topics(detectors: Sequence[str] = ("candidates",), single: bool = False) -> list[str]:
     """Return the topics with the times of the nodes, and of single steps of the candidates."""
     topics = [f"/{node}/debug/processing_time_ms" for node in build_graph(detectors, single)]
     if "candidates" in detectors:
@@ -183,20 +178,27 @@ def list_timing_topics(detectors: Sequence[str] = ("candidates",), single: bool 
     return topics
 
 
-def configure_evaluator(file: Path | str, single: bool = False,
-                        detectors: Sequence[str] = ("candidates",)
-                        ) -> tuple[dict[str, str], dict[str, Any]]:
+def configure_evaluator(
+    file: Path | str, single: bool = False, detectors: Sequence[str] = ("candidates",)
+) -> tuple[dict[str, str], dict[str, Any]]:
     """Return the remapping and the parameters of an evaluator of all stages.
 
     The candidates alone are scored as in the STM-CPA paper: pedestrians, and all labels. Networks
     see more than the labels, which are those of the camera image.
     """
     topics, only_candidates = list_stages(detectors, single), [*detectors] == ["candidates"]
-    remap = TRUTH_INPUT | ({} if only_candidates else CAMERA) | {
-        f"~/input/{k}": relative_name(v) for k, v in topics.items()}
+    remap = (
+        TRUTH_INPUT
+        | ({} if only_candidates else CAMERA)
+        | {f"~/input/{k}": relative_name(v) for k, v in topics.items()}
+    )
     timing = [*map(relative_name, list_timing_topics(detectors, single))]
-    return remap, {"stages": list(topics), "timing": timing, "file": str(file),
-                   **({"classes": [CLASSES[PEDESTRIAN]]} if only_candidates else {})}
+    return remap, {
+        "stages": list(topics),
+        "timing": timing,
+        "file": str(file),
+        **({"classes": [CLASSES[PEDESTRIAN]]} if only_candidates else {}),
+    }
 
 
 def runs_in_one_process(processes: str | bool | None) -> bool:
@@ -216,13 +218,13 @@ def runs_in_one_process(processes: str | bool | None) -> bool:
 def find_connected_outputs(graph: Graph) -> dict[str, set[str]]:
     """Return the topics of each node that another node of the graph subscribes to, without a
     namespace."""
-    subscribed = {f"/{relative_name(topic)}"
-                  for remap in graph.values() for topic in remap.values()}
+    subscribed = {f"/{relative_name(topic)}" for remap in graph.values() for topic in remap.values()}
     return {node: {t for t in subscribed if t.startswith(f"/{node}/")} for node in graph}
 
 
-def list_awaited_topics(detectors: Sequence[str] = ("candidates",), single: bool = False,
-                        points: int = 1, truth: int = 1) -> list[str]:
+def list_awaited_topics(
+    detectors: Sequence[str] = ("candidates",), single: bool = False, points: int = 1, truth: int = 1
+) -> list[str]:
     """Return the parameter wait_for of bag_player for a graph.
 
     It waits for subscribers of the clouds and of the labels, and for one subscriber of each result
@@ -234,8 +236,12 @@ def list_awaited_topics(detectors: Sequence[str] = ("candidates",), single: bool
     """
     between = sorted(set().union(*find_connected_outputs(build_graph(detectors, single)).values()))
     truth += "candidates" in detectors
-    topics = [f"{POINTS}:={points}", f"{TRUTH}:={truth}", *between,
-              *(topic for name in detectors for topic in list_result_topics(single, name).values())]
+    topics = [
+        f"{POINTS}:={points}",
+        f"{TRUTH}:={truth}",
+        *between,
+        *(topic for name in detectors for topic in list_result_topics(single, name).values()),
+    ]
     return [*map(relative_name, topics)]
 
 
@@ -249,11 +255,16 @@ def choose_cloud_topic(bag: str, types: Mapping[str, str], wanted: str = "") -> 
     if wanted in clouds or (not wanted and len(clouds) == 1):
         return wanted or clouds[0]
     if not clouds:
-        raise InputError(f"{bag} has no clouds: none of its topics is a sensor_msgs/PointCloud2"
-                         f"{'; ' + problem if (problem := diagnose_packets(types)) else ''}")
+        raise InputError(
+            f"{bag} has no clouds: none of its topics is a sensor_msgs/PointCloud2"
+            f"{'; ' + problem if (problem := diagnose_packets(types)) else ''}"
+        )
     has = f"it has {', '.join(clouds)}"
-    raise InputError(f"{bag} has no cloud on {wanted}; {has}" if wanted else
-                     f"{bag}: give the topic of the clouds with points:=TOPIC; {has}")
+    raise InputError(
+        f"{bag} has no cloud on {wanted}; {has}"
+        if wanted
+        else f"{bag}: give the topic of the clouds with points:=TOPIC; {has}"
+    )
 
 
 _domain_locks: list[Any] = []  # open lock files of our domains, until this process ends
@@ -290,8 +301,7 @@ class Processes:
         self.logs = logs
         self.environment = dict(os.environ)
         if domain is not None:
-            self.environment.update(ROS_DOMAIN_ID=str(domain),
-                                    ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
+            self.environment.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
         self.running: dict[str, Any] = {}  # as subprocess.Popen
         self._gathered: list[list[str]] | None = None  # arguments of nodes, see together()
 
@@ -299,16 +309,18 @@ class Processes:
         self.logs.mkdir(parents=True, exist_ok=True)
         return self
 
-    def start(self, node: str, remap: Mapping[str, str], params: Mapping[str, Any],
-              namespace: str = "") -> None:
+    def start(self, node: str, remap: Mapping[str, str], params: Mapping[str, Any], namespace: str = "") -> None:
         """Start a node of a graph; with a namespace its key in `running` is NAMESPACE.NODE."""
         values = {k: list(v) if isinstance(v, tuple) else v for k, v in params.items()}
         values = {k: v for k, v in values.items() if v != []}  # an empty list has no type in YAML
         name = f"{namespace}.{node}" if namespace else node
         file = self.logs / f"{name}.param.yaml"
         file.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}))
-        rules = {**remap, **({"__ns": f"/{namespace}"} if namespace else {}),
-                 **({"__node": node} if find_executable(node) != node else {})}
+        rules = {
+            **remap,
+            **({"__ns": f"/{namespace}"} if namespace else {}),
+            **({"__node": node} if find_executable(node) != node else {}),
+        }
         remapping = [word for rule in rules.items() for word in ("-r", ":=".join(rule))]
         arguments = [find_executable(node), "--ros-args", "--params-file", str(file), *remapping]
         if self._gathered is None:
@@ -333,8 +345,8 @@ class Processes:
         """Start any program with its output in the log file."""
         with open(self.logs / f"{name}.log", "w") as log:
             self.running[name] = subprocess.Popen(
-                command, env=self.environment, stdin=subprocess.DEVNULL, stdout=log,
-                stderr=subprocess.STDOUT)
+                command, env=self.environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+            )
 
     def check(self, *finished: str) -> None:
         """Raise InputError with the last log line if a node that is not in `finished` has ended."""
@@ -342,8 +354,7 @@ class Processes:
             code = process.poll()
             if code is not None and (node not in finished or code):
                 lines = (self.logs / f"{node}.log").read_text().strip().splitlines() or ["no log"]
-                raise InputError(f"{node} ended with code {code}: {lines[-1]} "
-                                 f"(log: {self.logs / node}.log)")
+                raise InputError(f"{node} ended with code {code}: {lines[-1]} (log: {self.logs / node}.log)")
 
     def has_ended(self, node: str) -> bool:
         return self.running[node].poll() is not None

@@ -53,31 +53,34 @@ class GroundSegmentation(ManagedNode):
             indices, visible_frame = crop_to_view(frame, camera, params.view)
             visible = usable.take(indices)
             if self.node_params.range == "all":
-                segmented, indices, ground = (visible_frame, visible,
-                                              segment_ground(visible_frame, params.ground))
+                segmented, indices, ground = (visible_frame, visible, segment_ground(visible_frame, params.ground))
             else:  # as the detector does without ground
-                view = NormalizedView.of(visible_frame, params.ground.sensor_pose,
-                                         **RANGES[self.node_params.range])
-                segmented, indices, ground = (view.frame, visible.take(view.indices),
-                                              segment_view_ground(view.frame, params.ground))
+                view = NormalizedView.of(visible_frame, params.ground.sensor_pose, **RANGES[self.node_params.range])
+                segmented, indices, ground = (
+                    view.frame,
+                    visible.take(view.indices),
+                    segment_view_ground(view.frame, params.ground),
+                )
             in_view = scatter_values(OUT_OF_RANGE, visible, msg, "u1")
             in_view[indices] = IN_VIEW
-            self.points.publish(add_columns(
-                msg, bag_message, ground=scatter_values(ground, indices, msg, "u1"),
-                in_view=in_view))
-        self._publish_parts(msg, visible_frame, visible, params,
-                            ground if self.node_params.range == "all" else None)
+            self.points.publish(
+                add_columns(msg, bag_message, ground=scatter_values(ground, indices, msg, "u1"), in_view=in_view)
+            )
+        self._publish_parts(msg, visible_frame, visible, params, ground if self.node_params.range == "all" else None)
         plane = fit_plane(segmented.xyz.compress(ground, axis=0))
         if plane is not None:
             share = compute_inlier_share(segmented.xyz, plane)
-            self.counts.update(plane=" ".join(f"{v:.4f}" for v in plane),
-                               plane_inlier_share=f"{share:.3f}",
-                               ground_share=f"{ground.mean():.3f}")
+            self.counts.update(
+                plane=" ".join(f"{v:.4f}" for v in plane),
+                plane_inlier_share=f"{share:.3f}",
+                ground_share=f"{ground.mean():.3f}",
+            )
         problem = diagnose_empty(len(frame), ground) or self.sensor.find_problem(frame, params)
         self.report(WARN if problem else OK, problem or "segmenting")
 
-    def _publish_parts(self, msg: Any, frame: PointCloud, indices: np.ndarray, params: Any,
-                       ground: np.ndarray | None) -> None:
+    def _publish_parts(
+        self, msg: Any, frame: PointCloud, indices: np.ndarray, params: Any, ground: np.ndarray | None
+    ) -> None:
         """Publish ~/output/ground, nonground and obstacles if anybody subscribes.
 
         Args:
@@ -93,6 +96,5 @@ class GroundSegmentation(ManagedNode):
             ground = segment_ground(frame, params.ground)
         for publisher, chosen in ((self.ground, ground), (self.nonground, ~ground)):
             if publisher.get_subscription_count():
-                publisher.publish(from_array(to_array(msg).take(indices[chosen]), msg.header,
-                                             bag_message))
+                publisher.publish(from_array(to_array(msg).take(indices[chosen]), msg.header, bag_message))
         self.obstacles.publish(msg, frame.xyz, ground, indices)

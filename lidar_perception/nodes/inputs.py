@@ -21,14 +21,7 @@ from lidar_perception.candidates.seed_sources import (
 from lidar_perception.candidates.seeds import Seed, load_seeds
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.nodes.graph import relative_name
-from lidar_perception.nodes.runtime import (
-    JUMP_NS,
-    LATCHED,
-    MARKERS,
-    RELIABLE,
-    SENSOR_DATA,
-    LidarNode,
-)
+from lidar_perception.nodes.runtime import JUMP_NS, LATCHED, MARKERS, RELIABLE, SENSOR_DATA, LidarNode
 from lidar_perception.robot.poses import invert_pose, transform_boxes, transform_points
 from lidar_perception.robot.transform_tree import MissingTransform
 from lidar_perception.types import PEDESTRIAN, InputError
@@ -48,10 +41,8 @@ class CameraInput:
         self.transforms: dict[tuple[str, str], Any] = {}
         # A latched subscription gets earlier messages, but none of a camera driver, which publishes
         # volatile and often best effort.
-        node.input("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED,
-                   SENSOR_DATA)
-        node.input("extrinsics", "geometry_msgs/msg/TransformStamped", self._on_transform,
-                   LATCHED, SENSOR_DATA)
+        node.input("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED, SENSOR_DATA)
+        node.input("extrinsics", "geometry_msgs/msg/TransformStamped", self._on_transform, LATCHED, SENSOR_DATA)
 
     def _on_info(self, msg: Any) -> None:
         self.info = msg
@@ -64,12 +55,13 @@ class CameraInput:
         params = self.node.params.view
         if not params.enabled or self.get(cloud.header, params) is not None:
             return None
-        info, extrinsics = map(self.node.resolve_topic_name, (
-            "~/input/camera_info", "~/input/extrinsics"))
+        info, extrinsics = map(self.node.resolve_topic_name, ("~/input/camera_info", "~/input/extrinsics"))
         return "the camera's calibration: " + (
-            f"no CameraInfo on {info}" if self.info is None else
-            f"neither {extrinsics} nor TF connects the cloud's '{cloud.header.frame_id}' with the "
-            f"CameraInfo's '{self.info.header.frame_id}'")
+            f"no CameraInfo on {info}"
+            if self.info is None
+            else f"neither {extrinsics} nor TF connects the cloud's '{cloud.header.frame_id}' with the "
+            f"CameraInfo's '{self.info.header.frame_id}'"
+        )
 
     def get(self, header: Any, params: ViewParams) -> Camera | None:
         """Return the camera for the points of a cloud in the level frame, or None.
@@ -90,8 +82,7 @@ class CameraInput:
                 self.node.transforms.subscribe_to_tf()
                 return None
             result = make_calibration(self.info, pose).camera()
-        return result if level is None else replace(
-            result, projection=result.projection @ invert_pose(level))
+        return result if level is None else replace(result, projection=result.projection @ invert_pose(level))
 
 
 class StampMatcher:
@@ -106,8 +97,9 @@ class StampMatcher:
         on_drop: called with the number of dropped clouds.
     """
 
-    def __init__(self, deliver: Callable[[Any, Any], None], capacity: int = 5,
-                 on_drop: Callable[[int], None] = lambda _: None):
+    def __init__(
+        self, deliver: Callable[[Any, Any], None], capacity: int = 5, on_drop: Callable[[int], None] = lambda _: None
+    ):
         self.deliver, self.capacity, self.on_drop = deliver, capacity, on_drop
         self.clouds: OrderedDict[int, Any] = OrderedDict()
         self.partners: OrderedDict[int, Any] = OrderedDict()
@@ -162,8 +154,7 @@ class SeedInput:
         self.loaded_templates: tuple[str, tuple[Seed, ...]] | None = None
         self.matcher = StampMatcher(self._deliver_with_truth, on_drop=self._count_dropped)
         node.input("ground_truth", MARKERS, self._on_truth, RELIABLE)
-        node.input(relative_name(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE,
-                   private=False)
+        node.input(relative_name(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE, private=False)
         node.inputs.append(self)
         if self.params.source in ("file", "automatic"):
             self._load_templates()  # reports a missing file before the first cloud
@@ -194,14 +185,17 @@ class SeedInput:
 
     def _make_file_seeds(self, segmented: SegmentedCloud) -> tuple[Seed, ...]:
         templates = self._load_templates()
-        return templates if self.params.source == "file" else make_automatic_source(
-            templates, self.node.params)(segmented)
+        return (
+            templates if self.params.source == "file" else make_automatic_source(templates, self.node.params)(segmented)
+        )
 
     def _on_truth(self, msg: Any) -> None:
         objects = from_marker_array(msg)
         if not objects.stamp_ns:
-            raise InputError("labels without a header.stamp match no cloud; for a frame without "
-                             "objects send a DELETEALL with its header")
+            raise InputError(
+                "labels without a header.stamp match no cloud; for a frame without "
+                "objects send a DELETEALL with its header"
+            )
         self.matcher.add_partner(objects.stamp_ns, to_truth(objects))
 
     def _count_dropped(self, dropped: int) -> None:
@@ -209,13 +203,16 @@ class SeedInput:
 
     def _deliver_with_truth(self, cloud: Any, truth: Any) -> None:
         if truth is None:
-            self.deliver(cloud, _raise_missing("no ground truth with the stamp of this cloud; is "
-                                               "it published, with the same header.stamp?"))
+            self.deliver(
+                cloud,
+                _raise_missing(
+                    "no ground truth with the stamp of this cloud; is it published, with the same header.stamp?"
+                ),
+            )
         else:
             people = truth.of_class(PEDESTRIAN)
             level = self.node.transforms.find_placement(cloud.header).level
-            self.deliver(cloud, make_truth_source(people if level is None
-                                                  else transform_boxes(people, level)))
+            self.deliver(cloud, make_truth_source(people if level is None else transform_boxes(people, level)))
 
     def _on_click(self, msg: Any) -> None:
         self.new_clicks.append(msg)
@@ -232,10 +229,12 @@ class SeedInput:
             else:
                 self.clicked_seeds = (*self.clicked_seeds, seed)
             self.new_clicks.popleft()
-        self.clicked_seeds = self.clicked_seeds[-self.params.bank:]
+        self.clicked_seeds = self.clicked_seeds[-self.params.bank :]
         if not self.clicked_seeds:
-            raise InputError("no seed yet: click a pedestrian (a PointStamped on "
-                             f"{relative_name(CLICK)}, as RViz and Foxglove publish it)")
+            raise InputError(
+                "no seed yet: click a pedestrian (a PointStamped on "
+                f"{relative_name(CLICK)}, as RViz and Foxglove publish it)"
+            )
         return self.clicked_seeds
 
     def _make_clicked_seed(self, click: Any, header: Any, segmented: SegmentedCloud) -> Seed:
@@ -243,17 +242,19 @@ class SeedInput:
         try:
             pose = self.node.transforms.to_level(header, frame_id)
         except MissingTransform as error:
-            raise InputError(f"the clicked point is in frame '{frame_id}' but the cloud in "
-                             f"'{header.frame_id}' ({error}); set that as the fixed frame and "
-                             "click again") from None
+            raise InputError(
+                f"the clicked point is in frame '{frame_id}' but the cloud in "
+                f"'{header.frame_id}' ({error}); set that as the fixed frame and "
+                "click again"
+            ) from None
         point = transform_points(np.array([[p.x, p.y, p.z]]), pose)[0]
-        seed, = make_click_source(point, self.params)(segmented)
-        self.node.get_logger().info(f"seed selected at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), "
-                                    f"height {seed.height:.2f} m")
+        (seed,) = make_click_source(point, self.params)(segmented)
+        self.node.get_logger().info(f"seed selected at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), height {seed.height:.2f} m")
         return seed
 
 
 def _raise_missing(reason: str) -> SeedSource:
     def source(segmented: SegmentedCloud) -> tuple[Seed, ...]:
         raise InputError(reason)
+
     return source

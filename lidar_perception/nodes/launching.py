@@ -7,7 +7,6 @@ then from the other arguments; later values override earlier ones.
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -37,73 +36,113 @@ from lidar_perception.nodes.graph import (
     relative_name,
     runs_in_one_process,
 )
-from lidar_perception.nodes.node_parameters import find_node_parameters
-from lidar_perception.nodes.param_files import (
-    EVERY_NODE,
-    describe_unknown_nodes,
-    is_for,
-    read_sections,
+from lidar_perception.nodes.launch_parameters import (
+    CONFIGS,
+    add_arguments,
+    list_argument_parameters,
+    list_parameter_files,
+    split_detectors,
+    write_section,
 )
+from lidar_perception.nodes.node_parameters import find_node_parameters
+from lidar_perception.nodes.param_files import EVERY_NODE, describe_unknown_nodes, is_for, read_sections
 from lidar_perception.param_fields import flatten
 from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
 from lidar_perception.types import InputError, unknown_name
 from lidar_perception.wire.topics import ODOMETRY, POINTS
-
-CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet",
-           "fused": "fused"}
 
 LAUNCH_ARGUMENTS = ("launch-prefix", "launch-prefix-filter")  # arguments of launch itself
 RESPAWN_DELAY_S = 2.0  # keeps a node that cannot start from filling the log
 
 SWITCHES: dict[str, Any] = dict(default_value="false", choices=["true", "false"])
 ARGUMENTS: dict[str, dict[str, Any]] = {
-    "namespace": dict(default_value="", description="Namespace of all nodes and topics, for one of "
-                      "several sensors; /diagnostics, /tf and /clock stay global."),
+    "namespace": dict(
+        default_value="",
+        description="Namespace of all nodes and topics, for one of "
+        "several sensors; /diagnostics, /tf and /clock stay global.",
+    ),
     "name_prefix": dict(default_value="", description="Prefix of all node names."),
     "points": dict(default_value=relative_name(POINTS), description="Topic of the clouds."),
-    "reliability": dict(default_value="", description="Parameter input.reliability: auto, reliable "
-                        "or best_effort; empty: as in the parameter file."),
-    "base_frame": dict(default_value="", description="Parameter base_frame: the mounting comes "
-                       "from TF; empty: as in the parameter file."),
-    "target_frame": dict(default_value="", description="Parameter target_frame: frame of the "
-                         "published boxes; empty: as in the parameter file."),
-    "deskew": dict(default_value="", choices=["", "off", "odometry", "tf"], description="Parameter "
-                   "input.deskew: motion compensation of the clouds; empty: as in the parameter "
-                   "file."),
-    "ahead": dict(default_value="", description="Parameter input.ahead: viewing direction of the "
-                  "detectors, degrees from the x axis of the clouds; empty: as in the parameter "
-                  "file."),
-    "range": dict(default_value="", choices=["", "auto", "ahead", "around"],
-                  description="Parameter range of fused and pointpillars: detection range; empty: "
-                  "as in the parameter file."),
-    "config": dict(default_value="", description="Comma-separated parameter files for all nodes, "
-                   "loaded after config/*.param.yaml of each detector."),
-    "experts": dict(default_value="", description="Parameters of ground and clusters: name of the "
-                    "detector whose config/*.param.yaml they use (empty: the first one), or a "
-                    "parameter file that is loaded last."),
-    "weights": dict(default_value="", description="Checkpoint of the network, NAME=FILE,NAME=FILE "
-                    "for several networks; empty: as in the parameter file, or the packaged one."),
-    "device": dict(default_value="", description="Device of the networks: auto, cpu, cuda or "
-                   "cuda:N; empty: as in the parameter file."),
-    "tracking": dict(**SWITCHES, description="Track the detections of each detector, in a tracker "
-                     "node; with `single` in the process of the detector."),
-    "odometry": dict(default_value=relative_name(ODOMETRY), description="Topic of the odometry for "
-                     "the trackers and deskew."),
-    "single": dict(**SWITCHES, description="Run each detector in one process that finds ground and "
-                   "clusters itself."),
-    "processes": dict(default_value="auto", choices=["auto", "true", "false"], description="true: "
-                      "one process for each node; false: one process for all nodes, which saves "
-                      "memory; auto: one process on machines with up to four cores."),
-    "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
-                      "lifecycle manager configures and activates the nodes."),
-    "respawn": dict(**SWITCHES, description="Restart a node that has ended, for example after a "
-                    "crash; with autostart:=false it is not configured then."),
-    "rviz": dict(**SWITCHES, description="Start RViz with config/lidar_perception.rviz in the "
-                 "same namespace."),
-    "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: velodyne, as "
-                       "in the RViz file."),
-    "use_sim_time": dict(default_value="", choices=["", "true", "false"], description="Take the "
-                         "time from /clock; empty: as in the parameter file, else false."),
+    "reliability": dict(
+        default_value="",
+        description="Parameter input.reliability: auto, reliable or best_effort; empty: as in the parameter file.",
+    ),
+    "base_frame": dict(
+        default_value="",
+        description="Parameter base_frame: the mounting comes from TF; empty: as in the parameter file.",
+    ),
+    "target_frame": dict(
+        default_value="",
+        description="Parameter target_frame: frame of the published boxes; empty: as in the parameter file.",
+    ),
+    "deskew": dict(
+        default_value="",
+        choices=["", "off", "odometry", "tf"],
+        description="Parameter input.deskew: motion compensation of the clouds; empty: as in the parameter file.",
+    ),
+    "ahead": dict(
+        default_value="",
+        description="Parameter input.ahead: viewing direction of the "
+        "detectors, degrees from the x axis of the clouds; empty: as in the parameter "
+        "file.",
+    ),
+    "range": dict(
+        default_value="",
+        choices=["", "auto", "ahead", "around"],
+        description="Parameter range of fused and pointpillars: detection range; empty: as in the parameter file.",
+    ),
+    "config": dict(
+        default_value="",
+        description="Comma-separated parameter files for all nodes, loaded after config/*.param.yaml of each detector.",
+    ),
+    "experts": dict(
+        default_value="",
+        description="Parameters of ground and clusters: name of the "
+        "detector whose config/*.param.yaml they use (empty: the first one), or a "
+        "parameter file that is loaded last.",
+    ),
+    "weights": dict(
+        default_value="",
+        description="Checkpoint of the network, NAME=FILE,NAME=FILE "
+        "for several networks; empty: as in the parameter file, or the packaged one.",
+    ),
+    "device": dict(
+        default_value="",
+        description="Device of the networks: auto, cpu, cuda or cuda:N; empty: as in the parameter file.",
+    ),
+    "tracking": dict(
+        **SWITCHES,
+        description="Track the detections of each detector, in a tracker "
+        "node; with `single` in the process of the detector.",
+    ),
+    "odometry": dict(
+        default_value=relative_name(ODOMETRY), description="Topic of the odometry for the trackers and deskew."
+    ),
+    "single": dict(**SWITCHES, description="Run each detector in one process that finds ground and clusters itself."),
+    "processes": dict(
+        default_value="auto",
+        choices=["auto", "true", "false"],
+        description="true: "
+        "one process for each node; false: one process for all nodes, which saves "
+        "memory; auto: one process on machines with up to four cores.",
+    ),
+    "autostart": dict(
+        default_value="true",
+        choices=["true", "false"],
+        description="false: a lifecycle manager configures and activates the nodes.",
+    ),
+    "respawn": dict(
+        **SWITCHES,
+        description="Restart a node that has ended, for example after a "
+        "crash; with autostart:=false it is not configured then.",
+    ),
+    "rviz": dict(**SWITCHES, description="Start RViz with config/lidar_perception.rviz in the same namespace."),
+    "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: velodyne, as in the RViz file."),
+    "use_sim_time": dict(
+        default_value="",
+        choices=["", "true", "false"],
+        description="Take the time from /clock; empty: as in the parameter file, else false.",
+    ),
     "log_level": dict(default_value="info", description="debug, info, ..."),
 }
 
@@ -120,22 +159,24 @@ def make_launch_description(config_folder: Path, detectors: str) -> LaunchDescri
 
     def nodes(context: Any) -> list[Any]:
         reject_unknown_arguments(given, context, ["detectors", *ARGUMENTS])
-        value = {k: context.perform_substitution(LaunchConfiguration(k))
-                 for k in ("detectors", *ARGUMENTS)}
+        value = {k: context.perform_substitution(LaunchConfiguration(k)) for k in ("detectors", *ARGUMENTS)}
         processes = create_nodes(value, config_folder)
         files = list_parameter_files(value["config"], value["experts"])
-        lines = [f"warning: {line}" for file in files
-                 for line in describe_unknown_nodes(file, _graph(value))]
+        lines = [f"warning: {line}" for file in files for line in describe_unknown_nodes(file, _graph(value))]
         lines += describe_conflicts(value, config_folder)
         return [*(LogInfo(msg=line) for line in lines), *processes]
 
-    return LaunchDescription([
-        DeclareLaunchArgument("detectors", default_value=detectors,
-                              description="Comma-separated detectors: "
-                              f"{', '.join(DETECTOR_NODES)}."),
-        *(DeclareLaunchArgument(name, **what) for name, what in ARGUMENTS.items()),
-        OpaqueFunction(function=nodes),
-    ])
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument(
+                "detectors",
+                default_value=detectors,
+                description=f"Comma-separated detectors: {', '.join(DETECTOR_NODES)}.",
+            ),
+            *(DeclareLaunchArgument(name, **what) for name, what in ARGUMENTS.items()),
+            OpaqueFunction(function=nodes),
+        ]
+    )
 
 
 def find_given_arguments() -> list[Any]:
@@ -157,69 +198,70 @@ def find_given_arguments() -> list[Any]:
 def reject_unknown_arguments(given: list[Any], context: Any, known: Collection[str]) -> None:
     """Raise InputError for the first name that is not an argument, with the closest valid name."""
     for parts in given:
-        name = "".join(part if isinstance(part, str) else context.perform_substitution(part)
-                       for part in (parts if isinstance(parts, list | tuple) else [parts]))
+        name = "".join(
+            part if isinstance(part, str) else context.perform_substitution(part)
+            for part in (parts if isinstance(parts, list | tuple) else [parts])
+        )
         if name in known or name in LAUNCH_ARGUMENTS:
             continue
         if nodes := [node for node in NODES if name in find_node_parameters(node)]:
-            raise InputError(f"'{name}' is not a launch argument but a parameter of "
-                             f"{', '.join(nodes)}; set it in a parameter file, config:=FILE")
+            raise InputError(
+                f"'{name}' is not a launch argument but a parameter of "
+                f"{', '.join(nodes)}; set it in a parameter file, config:=FILE"
+            )
         raise unknown_name("launch argument", name, sorted(known))
-
-
-def list_parameter_files(config: str, experts: str = "") -> list[str]:
-    """Return the parameter files among the values of `config` and `experts`.
-
-    Raises:
-        InputError: a file does not exist.
-    """
-    files = [config] if Path(config).is_file() else [f for f in config.split(",") if f]
-    if missing := [file for file in files if not Path(file).is_file()]:
-        raise InputError(f"config: no such parameter file: {missing[0]}")
-    if experts and experts not in CONFIGS:
-        if not Path(experts).is_file():
-            raise InputError(f"experts: {experts} is neither a parameter file nor a detector "
-                             f"({', '.join(CONFIGS)})")
-        files.append(experts)
-    return files
 
 
 def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
     """Return the launch nodes, one for each process, for the values of the arguments."""
     graph, detectors, single = _graph(value), _detectors(value), value["single"] == "true"
     prefix, users = value["name_prefix"], list_parameter_files(value["config"])
-    files = {node: [_locate_own_file(name, config_folder), *users] for name in detectors
-             for node in (SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[name]}
+    files = {
+        node: [_locate_own_file(name, config_folder), *users]
+        for name in detectors
+        for node in (SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[name]
+    }
     files |= {node: _list_expert_files(value, config_folder) for node in EXPERTS}
-    files |= {node: [str(config_folder / f"{TRACKER}.param.yaml"), *users]
-              for node in find_trackers(detectors)}
+    files |= {node: [str(config_folder / f"{TRACKER}.param.yaml"), *users] for node in find_trackers(detectors)}
     topics = {relative_name(POINTS): value["points"], relative_name(ODOMETRY): value["odometry"]}
     viewer = [_viewer(value, config_folder)] if value["rviz"] == "true" else []
-    common = {"package": "lidar_perception", "namespace": value["namespace"] or None,
-              "output": "screen", "ros_arguments": ["--log-level", value["log_level"]],
-              "respawn": value["respawn"] == "true", "respawn_delay": RESPAWN_DELAY_S}
-    nodes: list[dict[str, Any]] = [dict(
-        executable=find_executable(base := node.removeprefix(prefix)), name=node,
-        parameters=[*add_arguments(files[base], node, _argument_parameters(value, base, detectors)),
-                    *(_list_expert_range(value, files) if base == "ground_segmentation" else ())],
-        # A parameter file may make any node read odometry; for the others the remapping is void.
-        remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_INPUT}.items()],
-    ) for node, remap in graph.items()]
+    common = {
+        "package": "lidar_perception",
+        "namespace": value["namespace"] or None,
+        "output": "screen",
+        "ros_arguments": ["--log-level", value["log_level"]],
+        "respawn": value["respawn"] == "true",
+        "respawn_delay": RESPAWN_DELAY_S,
+    }
+    nodes: list[dict[str, Any]] = [
+        dict(
+            executable=find_executable(base := node.removeprefix(prefix)),
+            name=node,
+            parameters=[
+                *add_arguments(files[base], node, list_argument_parameters(value, base, detectors)),
+                *(_list_expert_range(value, files) if base == "ground_segmentation" else ()),
+            ],
+            # A parameter file may make any node read odometry; for the others the remapping is void.
+            remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_INPUT}.items()],
+        )
+        for node, remap in graph.items()
+    ]
     if len(nodes) > 1 and runs_in_one_process(value["processes"]):
         words = [word for node in nodes for word in (SEPARATOR, *_list_arguments(**node))]
-        return [*viewer, Node(executable=words[1], arguments=[*words[2:], SEPARATOR],
-                              exec_name="graph", **common)]
+        return [*viewer, Node(executable=words[1], arguments=[*words[2:], SEPARATOR], exec_name="graph", **common)]
     return viewer + [Node(**node, **common) for node in nodes]
 
 
-def _list_arguments(executable: str, name: str, parameters: list[Any],
-                    remappings: list[tuple[str, str]]) -> list[str]:
+def _list_arguments(executable: str, name: str, parameters: list[Any], remappings: list[tuple[str, str]]) -> list[str]:
     """Return the arguments of a node in a process with others, see nodes.main.run."""
     rules = [("__node", name), *remappings]
-    files = [each if isinstance(each, str) else _write_section(EVERY_NODE, values=each)
-             for each in parameters]
-    return [executable, "--ros-args", *(word for rule in rules for word in ("-r", ":=".join(rule))),
-            *(word for file in files for word in ("--params-file", file))]
+    files = [each if isinstance(each, str) else write_section(EVERY_NODE, values=each) for each in parameters]
+    return [
+        executable,
+        "--ros-args",
+        *(word for rule in rules for word in ("-r", ":=".join(rule))),
+        *(word for file in files for word in ("--params-file", file)),
+    ]
 
 
 def _graph(value: dict[str, str]) -> dict[str, dict[str, str]]:
@@ -228,43 +270,28 @@ def _graph(value: dict[str, str]) -> dict[str, dict[str, str]]:
     return add_node_prefix(build_graph(detectors, single, tracking), value["name_prefix"])
 
 
-def add_arguments(files: list[str], node: str, given: dict[str, Any]) -> list[Any]:
-    """Return the parameters of a launch node: its files, overridden by the values `given`."""
-    # launch writes `given` under /**, but rcl prefers sections that name the node.
-    named = [section for file in files for section in read_sections(file)
-             if section != EVERY_NODE and is_for(section, node)]
-    if not given or not named:
-        return [*files, *filter(None, [given])]
-    return [*files, given, _write_section(*named, values=given)]
-
-
-def _write_section(*names: str, values: dict[str, Any]) -> str:
-    """Write a parameter file with these values in each section; return its path."""
-    with tempfile.NamedTemporaryFile("w", prefix="launch_params_", suffix=".yaml",
-                                     delete=False) as file:
-        yaml.safe_dump({name: {"ros__parameters": values} for name in names}, file)
-    return file.name
-
-
 def describe_conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
     """Return a line for each detector whose own file has other parameters of ground and clusters
     than the file in use; none if the user has chosen that file."""
     detectors, given = _detectors(value), value["experts"]
     if value["single"] == "true":
-        return ["experts has no effect: with single:=true each detector finds ground and "
-                "clusters itself"] if given else []
+        return (
+            ["experts has no effect: with single:=true each detector finds ground and clusters itself"] if given else []
+        )
     if given not in ("", *CONFIGS):
         return []
     chosen, users = given or detectors[0], list_parameter_files(value["config"])
-    numbers = {name: _read_expert_parameters([_locate_own_file(name, config_folder), *users])
-               for name in (chosen, *detectors)}
+    numbers = {
+        name: _read_expert_parameters([_locate_own_file(name, config_folder), *users]) for name in (chosen, *detectors)
+    }
     lines = []
     for name in detectors:
-        others = [f"{key} {number}" for key, number in numbers[name].items()
-                  if number != numbers[chosen][key]]
+        others = [f"{key} {number}" for key, number in numbers[name].items() if number != numbers[chosen][key]]
         if others:
-            lines.append(f"ground and clusters use the parameters of {chosen}; {name} has other "
-                         f"ones: {', '.join(others)}. Choose with experts:=NAME or experts:=FILE")
+            lines.append(
+                f"ground and clusters use the parameters of {chosen}; {name} has other "
+                f"ones: {', '.join(others)}. Choose with experts:=NAME or experts:=FILE"
+            )
     return lines
 
 
@@ -281,11 +308,19 @@ def _list_expert_files(value: dict[str, str], config_folder: Path) -> list[str]:
 
 def _read_expert_parameters(files: list[str]) -> dict[str, Any]:
     """Return the parameters of ground and clusters with these files."""
-    known = {key: list(v) if isinstance(v, tuple) else v
-             for group in (GroundNodeParams(), ClusteringNodeParams())
-             for key, v in flatten(group).items() if key.startswith(("ground.", "clustering."))}
-    given = {key: number for file in files for section, values in read_sections(file).items()
-             if any(is_for(section, node) for node in EXPERTS) for key, number in values.items()}
+    known = {
+        key: list(v) if isinstance(v, tuple) else v
+        for group in (GroundNodeParams(), ClusteringNodeParams())
+        for key, v in flatten(group).items()
+        if key.startswith(("ground.", "clustering."))
+    }
+    given = {
+        key: number
+        for file in files
+        for section, values in read_sections(file).items()
+        if any(is_for(section, node) for node in EXPERTS)
+        for key, number in values.items()
+    }
     return known | {k: v for k, v in given.items() if k in known}
 
 
@@ -294,16 +329,21 @@ def _list_expert_range(value: dict[str, str], files: dict[str, list[str]]) -> li
 
     files: parameter files of each node.
     """
+
     def read(node: str) -> dict[str, Any]:
         sections = [item for file in files[node] for item in read_sections(file).items()]
-        return {key: given for section, values in sections
-                if is_for(section, value["name_prefix"] + node) for key, given in values.items()}
+        return {
+            key: given
+            for section, values in sections
+            if is_for(section, value["name_prefix"] + node)
+            for key, given in values.items()
+        }
 
     params, detectors = read("ground_segmentation"), _detectors(value)
     if "range" in params:
         return []
     for node in [f"{name}_detector" for name in detectors if name in NETWORKS]:
-        params |= read(node) | _argument_parameters(value, node, detectors)
+        params |= read(node) | list_argument_parameters(value, node, detectors)
     chosen = find_expert_range(detectors, params)
     return [] if chosen == "all" else [{"range": chosen}]
 
@@ -312,31 +352,29 @@ def _detectors(value: dict[str, str]) -> list[str]:
     return split_detectors(value["detectors"])
 
 
-def split_detectors(text: str) -> list[str]:
-    """Return the names in a comma-separated list; raise InputError if it is empty."""
-    detectors = [name.strip() for name in text.split(",") if name.strip()]
-    if not detectors:
-        raise InputError(f"detectors is empty; give one or more of {','.join(DETECTOR_NODES)}")
-    return detectors
-
-
 def _viewer(value: dict[str, str], config_folder: Path) -> Node:
     """Return the RViz node, with the same topic names as the other nodes."""
     file = config_folder / "lidar_perception.rviz"
     frame = ["-f", value["rviz_frame"]] if value["rviz_frame"] else []
     renamed = {topic: _rename_rviz_topic(topic, value) for _, topic in read_rviz_topics(file)}
     return Node(
-        package="rviz2", executable="rviz2", name=value["name_prefix"] + "rviz",
-        namespace=value["namespace"] or None, arguments=["-d", str(file), *frame], output="screen",
+        package="rviz2",
+        executable="rviz2",
+        name=value["name_prefix"] + "rviz",
+        namespace=value["namespace"] or None,
+        arguments=["-d", str(file), *frame],
+        output="screen",
         parameters=[{"use_sim_time": value["use_sim_time"] == "true"}],
-        remappings=[(a, b) for a, b in renamed.items() if a != b])
+        remappings=[(a, b) for a, b in renamed.items() if a != b],
+    )
 
 
 def read_rviz_topics(file: Path) -> list[tuple[str, str]]:
     """Return (class, topic) of each display and tool of an RViz file that has a topic."""
     manager = yaml.safe_load(file.read_text())["Visualization Manager"]
-    return [(item["Class"], item["Topic"]["Value"])
-            for item in [*manager["Displays"], *manager["Tools"]] if "Topic" in item]
+    return [
+        (item["Class"], item["Topic"]["Value"]) for item in [*manager["Displays"], *manager["Tools"]] if "Topic" in item
+    ]
 
 
 def _rename_rviz_topic(topic: str, value: dict[str, str]) -> str:
@@ -345,56 +383,8 @@ def _rename_rviz_topic(topic: str, value: dict[str, str]) -> str:
     if topic == relative_name(POINTS):
         return value["points"]
     if node == TRACKER:  # of the first detector
-        node = next(iter(SINGLE_PROCESS_NODES[detectors[0]] if single
-                         else find_trackers(detectors)))
+        node = next(iter(SINGLE_PROCESS_NODES[detectors[0]] if single else find_trackers(detectors)))
     elif single and node in STAGES:
         node = next(iter(SINGLE))
     ours = node in {*build_graph([*DETECTOR_NODES]), *find_trackers(detectors), *SINGLE}
     return (value["name_prefix"] if ours else "") + node + slash + rest
-
-
-def _argument_parameters(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, Any]:
-    """Return the parameters of a node that are set by launch arguments."""
-    given: dict[str, Any] = {}
-    if value["use_sim_time"]:
-        given["use_sim_time"] = value["use_sim_time"] == "true"
-    if value["tracking"] == value["single"] == "true":
-        given["tracking.enabled"] = True
-    if value["autostart"] == "false":
-        given["autostart"] = False
-    if value["reliability"]:
-        given["input.reliability"] = value["reliability"]
-    if value["deskew"]:
-        given["input.deskew"] = value["deskew"]
-    if value["ahead"]:
-        given["input.ahead"] = _degrees(value["ahead"])
-    given |= {name: value[name] for name in ("base_frame", "target_frame") if value[name]}
-    detector = node.removesuffix("_detector")
-    if detector in NETWORKS:
-        weights = _weights(value["weights"], [d for d in detectors if d in NETWORKS])
-        for name, chosen in (("weights", weights.get(detector)), ("device", value["device"])):
-            if chosen:
-                given[f"{detector}.{name}"] = chosen
-        if value["range"] and detector != "pointnet":
-            given[f"{detector}.range"] = value["range"]
-    return given
-
-
-def _degrees(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f"ahead:={text} is not a number of degrees") from None
-
-
-def _weights(text: str, networks: list[str]) -> dict[str, str]:
-    """Parse FILE or NAME=FILE,NAME=FILE to the file of each network."""
-    if not text:
-        return {}
-    if len(networks) == 1 and not text.startswith(f"{networks[0]}="):
-        return {networks[0]: text}
-    pairs = dict(part.partition("=")[::2] for part in text.split(","))
-    if unknown := [name for name in pairs if name not in networks]:
-        raise InputError(f"weights: '{unknown[0]}' is not one of {', '.join(networks)}; with "
-                         "several networks give NAME=FILE,NAME=FILE")
-    return pairs

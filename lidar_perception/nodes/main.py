@@ -30,8 +30,8 @@ def help_text(name: str) -> str:
     """Return the text of --help: usage and parameters of a node."""
     from lidar_perception.nodes.node_parameters import find_node_parameters
     from lidar_perception.param_fields import describe_fields
-    lines = [f"Usage: {name} --ros-args [-p PARAMETER:=VALUE] [-r FROM:=TO] [--params-file YAML]",
-             "", "Parameters:"]
+
+    lines = [f"Usage: {name} --ros-args [-p PARAMETER:=VALUE] [-r FROM:=TO] [--params-file YAML]", "", "Parameters:"]
     return "\n".join([*lines, *describe_fields(find_node_parameters(name))])
 
 
@@ -50,9 +50,11 @@ def run(name: str, arguments: list[str]) -> int:
     begin = perf_counter()
     from lidar_perception.runs.memory import keep_freed_memory
     from lidar_perception.runs.threads import default_to_one_thread
+
     default_to_one_thread()  # nodes share the cores
     keep_freed_memory()
     from lidar_perception.nodes.stopping import Stop
+
     stop = Stop(STOP_SIGNALS)
     if {"-h", "--help"} & set(arguments[1:]):
         try:
@@ -62,8 +64,10 @@ def run(name: str, arguments: list[str]) -> int:
         return 0
     nodes, shared = split_arguments(arguments)
     from lidar_perception.nodes.shared_memory import is_fed_by_driver, use_large_shared_memory
+
     use_large_shared_memory(any(map(is_fed_by_driver, nodes)))
     from lidar_perception.types import InputError
+
     try:
         require_rclpy()
     except InputError as error:
@@ -72,6 +76,7 @@ def run(name: str, arguments: list[str]) -> int:
     from rclpy.logging import get_logger
 
     from lidar_perception.runs.compiling import report_compilation
+
     say = get_logger(_logger_name(nodes[0])).info
     with report_compilation(say):
         classes = [load_node_class(each[0]) for each in nodes]
@@ -83,6 +88,7 @@ def run(name: str, arguments: list[str]) -> int:
 def split_arguments(arguments: list[str]) -> tuple[list[list[str]], list[str]]:
     """Return the arguments of each node, and those of the process."""
     from lidar_perception.nodes.graph import SEPARATOR
+
     parts: list[list[str]] = [[]]
     for word in arguments:
         if word == SEPARATOR:
@@ -98,8 +104,11 @@ def _logger_name(arguments: list[str]) -> str:
 
     It is the remapped name of the node, or that of the executable, with the namespace.
     """
-    rules = [b.rpartition(":__")[2].removeprefix("__").partition(":=")
-             for a, b in pairwise(arguments) if a in ("-r", "--remap")]
+    rules = [
+        b.rpartition(":__")[2].removeprefix("__").partition(":=")
+        for a, b in pairwise(arguments)
+        if a in ("-r", "--remap")
+    ]
     given = {key: value for key, _, value in rules if re.fullmatch(r"[A-Za-z_/][\w/]*", value)}
     name = given.get("node") or given.get("name") or arguments[0]
     return ".".join([*filter(None, given.get("ns", "").split("/")), name])
@@ -109,6 +118,7 @@ def _find_misspelt_sections(arguments: list[str], node: str) -> list[str]:
     """Return a line for each section of the parameter files whose name is close to this node's."""
     from lidar_perception.nodes.param_files import describe_unknown_nodes
     from lidar_perception.types import InputError
+
     lines = []
     for path in [b for a, b in pairwise(arguments) if a == "--params-file"]:
         with suppress(InputError):  # for example too large for us; rcl has read it
@@ -119,6 +129,7 @@ def _find_misspelt_sections(arguments: list[str], node: str) -> list[str]:
 def _exit_process(nodes: list[LidarNode]) -> None:
     """End the process while its work, such as a compilation, still runs."""
     import rclpy
+
     with suppress(Exception):
         for node in nodes:
             node.destroy_node()
@@ -134,20 +145,23 @@ def _spin(node_class: type, arguments: list[str], begin: float, stop: Stop) -> i
     return _run_nodes([(node_class, arguments, {})], arguments, begin, stop)
 
 
-def _spin_together(nodes: list[tuple[type, list[str]]], shared: list[str], begin: float,
-                   stop: Stop) -> int:
+def _spin_together(nodes: list[tuple[type, list[str]]], shared: list[str], begin: float, stop: Stop) -> int:
     """Create linked nodes and spin each in its own thread; return the exit code.
 
     shared: arguments for ROS that are not of one of the nodes.
     """
     from lidar_perception.nodes.links import Links
+
     links = Links()
-    return _run_nodes([(node_class, arguments, {"cli_args": arguments[1:], "links": links})
-                       for node_class, arguments in nodes], shared, begin, stop)
+    return _run_nodes(
+        [(node_class, arguments, {"cli_args": arguments[1:], "links": links}) for node_class, arguments in nodes],
+        shared,
+        begin,
+        stop,
+    )
 
 
-def _run_nodes(given: list[tuple[type, list[str], dict[str, Any]]], shared: list[str],
-               begin: float, stop: Stop) -> int:
+def _run_nodes(given: list[tuple[type, list[str], dict[str, Any]]], shared: list[str], begin: float, stop: Stop) -> int:
     """Create nodes of these classes, arguments and options, spin them, and return the exit code."""
     import rclpy
     from rclpy.exceptions import NameValidationException, ParameterException
@@ -183,8 +197,9 @@ def _run_nodes(given: list[tuple[type, list[str], dict[str, Any]]], shared: list
             _spin_node(nodes[0], given[0][1], begin)
         else:
             with ThreadPoolExecutor(len(nodes)) as pool:
-                spinning = [pool.submit(_spin_node, node, arguments, begin)
-                            for node, (_, arguments, _) in zip(nodes, given)]
+                spinning = [
+                    pool.submit(_spin_node, node, arguments, begin) for node, (_, arguments, _) in zip(nodes, given)
+                ]
                 if any(future.exception() for future in wait(spinning, None, FIRST_EXCEPTION).done):
                     end()
             for node, future in zip(nodes, spinning):
@@ -219,16 +234,15 @@ def _spin_node(node: LidarNode, arguments: list[str], begin: float) -> None:
 
     from lidar_perception.nodes.node_parameters import describe_misspelt_parameters
     from lidar_perception.nodes.rclpy_compat import parameter_overrides
+
     undeclared = [name for name in parameter_overrides(node) if not node.has_parameter(name)]
-    for line in [*describe_misspelt_parameters(undeclared),
-                 *_find_misspelt_sections(arguments, node.get_name())]:
+    for line in [*describe_misspelt_parameters(undeclared), *_find_misspelt_sections(arguments, node.get_name())]:
         node.get_logger().warning(line)  # before any long work
     if not node.stop.done():
         node.start()
     if not node.stop.done():
         if node.is_ready():
-            node.get_logger().info("ready: code loaded and warmed up in "
-                                   f"{perf_counter() - begin:.1f} s")
+            node.get_logger().info(f"ready: code loaded and warmed up in {perf_counter() - begin:.1f} s")
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.spin(executor)

@@ -32,9 +32,13 @@ RETRY_FACTOR = 10.0  # retry period over the duration of an attempt
 MANAGER_TIMEOUT_S = 10.0  # after the start, for the first request of a lifecycle manager
 UNCONFIGURED, INACTIVE = "not configured", "not active"
 ENTITIES: dict[str, Any] = {
-    "publishers": Node.destroy_publisher, "subscriptions": Node.destroy_subscription,
-    "clients": Node.destroy_client, "services": Node.destroy_service,
-    "timers": Node.destroy_timer, "guards": Node.destroy_guard_condition}
+    "publishers": Node.destroy_publisher,
+    "subscriptions": Node.destroy_subscription,
+    "clients": Node.destroy_client,
+    "services": Node.destroy_service,
+    "timers": Node.destroy_timer,
+    "guards": Node.destroy_guard_condition,
+}
 
 
 class ManagedNode(LifecycleNodeMixin, LidarNode):
@@ -79,13 +83,13 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
 
     def start(self) -> None:
         if not self.node_params.autostart:
-            self.get_logger().info(f"{UNCONFIGURED}: waiting for a lifecycle manager, because "
-                                   "autostart is false")
+            self.get_logger().info(f"{UNCONFIGURED}: waiting for a lifecycle manager, because autostart is false")
             self._unmanaged_since = monotonic()
             return
         begin = monotonic()
         if (self.state_label() == "inactive" or self.trigger_configure() == SUCCESS) and (
-                self.trigger_activate() == SUCCESS):
+            self.trigger_activate() == SUCCESS
+        ):
             if self._retry_at is not None:
                 self.get_logger().info("ready")
             self._retry_at = None
@@ -107,10 +111,12 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         if not (published := [topic for topic in topics if self.count_publishers(topic)]):
             return OK, UNCONFIGURED
         name = self.get_fully_qualified_name()
-        return WARN, (f"{UNCONFIGURED} by any lifecycle manager, but there is a publisher on "
-                      f"{published[0]}: a manager does not notice that a node was restarted; "
-                      f"restart the manager, or run `ros2 lifecycle set {name} configure`, then "
-                      "activate")
+        return WARN, (
+            f"{UNCONFIGURED} by any lifecycle manager, but there is a publisher on "
+            f"{published[0]}: a manager does not notice that a node was restarted; "
+            f"restart the manager, or run `ros2 lifecycle set {name} configure`, then "
+            "activate"
+        )
 
     def _change(self, change: Callable, request: Any, response: Any) -> Any:
         """Refuse a transition that the current state does not allow; rclpy would end the node."""
@@ -119,9 +125,13 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
             self._retry_at = None
             return change(request, response)
         self.get_logger().error(
-            f"transition {transition} is not possible: the node is {self.state_label()}" + (
+            f"transition {transition} is not possible: the node is {self.state_label()}"
+            + (
                 "; set the parameter autostart to false for use with a lifecycle manager"
-                if self.node_params.autostart else ""))
+                if self.node_params.autostart
+                else ""
+            )
+        )
         response.success = False
         return response
 

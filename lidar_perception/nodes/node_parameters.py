@@ -12,7 +12,7 @@ from lidar_perception.nodes import NODES
 from lidar_perception.param_fields import collect_fields
 
 MIN_SIMILARITY = 0.85  # 0..1, ratio of difflib above which a name is a misspelling
-MAX_NAMES = 200        # that are checked
+MAX_NAMES = 200  # that are checked
 
 
 def find_node_parameters(name: str) -> dict[str, Any]:
@@ -38,6 +38,8 @@ def describe_misspelt_parameters(names: Iterable[str]) -> list[str]:
     for name in names:
         matches = get_close_matches(name, known, 1, MIN_SIMILARITY)
         if name not in known and (matches or (name.partition(".")[0] in groups and "." in name)):
-            lines.append(f"no node has a parameter {name[:80]!r}, so it changes nothing"
-                         + (f"; is '{matches[0]}' meant?" if matches else "; --help lists all"))
+            lines.append(
+                f"no node has a parameter {name[:80]!r}, so it changes nothing"
+                + (f"; is '{matches[0]}' meant?" if matches else "; --help lists all")
+            )
     return lines

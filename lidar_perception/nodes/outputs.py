@@ -13,12 +13,7 @@ from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import classify_by_diagonal
 from lidar_perception.ground.obstacles import find_obstacles
 from lidar_perception.nodes.runtime import CLOUD, MARKERS, OK, RELIABLE, WARN, LidarNode
-from lidar_perception.nodes.track_outputs import (
-    DETECTIONS_3D,
-    TrackOutputs,
-    find_marker_lifetime_ns,
-    has_detections_3d,
-)
+from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, find_marker_lifetime_ns, has_detections_3d
 from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.array_codec import encode_detection_array
@@ -53,16 +48,19 @@ class ClusterBoxes:
         if self.publisher.get_subscription_count():
             header, output = to_output_frame(self.node, header, boxes())
             ids = range(1, len(output) + 1)  # as in the column cluster_id
-            rows = make_marker_rows(output, ["cluster"] * len(output), ids=ids,
-                                    previous=self.marker_keys, extras=_marker_texts(output, ids))
+            rows = make_marker_rows(
+                output, ["cluster"] * len(output), ids=ids, previous=self.marker_keys, extras=_marker_texts(output, ids)
+            )
             self.marker_keys = list_marker_keys(rows)
             self.publisher.publish(MarkerRows(rows, header, find_marker_lifetime_ns(self.node)))
 
 
 def _marker_texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
     """Return the text of each marker: the id, and the class by length and width alone."""
-    return [{"id": i, **({"size_class": CLASSES[c]} if c >= 0 else {})}
-            for i, c in zip(ids, classify_by_diagonal(boxes), strict=True)]
+    return [
+        {"id": i, **({"size_class": CLASSES[c]} if c >= 0 else {})}
+        for i, c in zip(ids, classify_by_diagonal(boxes), strict=True)
+    ]
 
 
 class Obstacles:
@@ -87,11 +85,12 @@ class Obstacles:
         if self.publisher.get_subscription_count():
             placement = self.node.transforms.find_placement(msg.header)
             params = self.node.transforms.with_mounting(self.node.params, placement)
-            chosen = find_obstacles(xyz, ground, self.node.node_params.obstacles,
-                                    params.ground.sensor_pose)
-            self.publisher.publish(make_xyz_cloud(
-                msg, placement.to_cloud_frame(xyz.compress(chosen, axis=0)),
-                indices.compress(chosen), bag_message))
+            chosen = find_obstacles(xyz, ground, self.node.node_params.obstacles, params.ground.sensor_pose)
+            self.publisher.publish(
+                make_xyz_cloud(
+                    msg, placement.to_cloud_frame(xyz.compress(chosen, axis=0)), indices.compress(chosen), bag_message
+                )
+            )
 
 
 class DetectionMarkers:
@@ -101,8 +100,7 @@ class DetectionMarkers:
         self.node, self.publisher = node, node.output(topic, MARKERS)
         self.marker_keys: Any = ()
 
-    def publish(self, header: Any, detections: Detections,
-                clusters: np.ndarray | None = None) -> None:
+    def publish(self, header: Any, detections: Detections, clusters: np.ndarray | None = None) -> None:
         """Publish detections that are in the frame of the header."""
         rows = make_detection_rows(detections, self.marker_keys, clusters)
         self.marker_keys = list_marker_keys(rows)
@@ -119,15 +117,23 @@ class DetectionOutputs:
         self.detections_3d = None
         if has_detections_3d():
             self.detections_3d = node.create_publisher(
-                load_message_class(DETECTIONS_3D), "~/output/detections_3d", RELIABLE)
-        self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE)
-                           for step in steps}
-        self.tracks = (TrackOutputs(node, lambda: node.node_params, clouds=True)
-                       if node.node_params.tracking.enabled else None)
+                load_message_class(DETECTIONS_3D), "~/output/detections_3d", RELIABLE
+            )
+        self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE) for step in steps}
+        self.tracks = (
+            TrackOutputs(node, lambda: node.node_params, clouds=True) if node.node_params.tracking.enabled else None
+        )
 
-    def publish(self, header: Any, detections: Detections, ms: Mapping[str, float],
-                xyz: np.ndarray, *, weak: Detections | None = None,
-                clusters: np.ndarray | None = None) -> str | None:
+    def publish(
+        self,
+        header: Any,
+        detections: Detections,
+        ms: Mapping[str, float],
+        xyz: np.ndarray,
+        *,
+        weak: Detections | None = None,
+        clusters: np.ndarray | None = None,
+    ) -> str | None:
         """Publish detections in the level frame, and their tracks in the frame of the cloud.
 
         Args:
@@ -146,8 +152,9 @@ class DetectionOutputs:
         detections = replace(detections, boxes=boxes)
         self.markers.publish(header, detections, clusters)
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
-            self.detections_3d.publish(encode_detection_array(
-                detections.boxes, detections.labels, detections.scores, header=header))
+            self.detections_3d.publish(
+                encode_detection_array(detections.boxes, detections.labels, detections.scores, header=header)
+            )
         for step, publisher in self.step_times.items():
             if step in ms:
                 publisher.publish(Float64(data=ms[step]))
@@ -155,8 +162,7 @@ class DetectionOutputs:
             return None
         placement = self.node.transforms.find_placement(cloud_header)
         if placement.level is not None:
-            tracked = replace(
-                tracked, boxes=transform_boxes(tracked.boxes, invert_pose(placement.level)))
+            tracked = replace(tracked, boxes=transform_boxes(tracked.boxes, invert_pose(placement.level)))
         return self.tracks.publish(cloud_header, tracked, placement.to_cloud_frame(xyz))
 
 
@@ -165,12 +171,10 @@ class CandidateOutputs:
 
     def __init__(self, node: LidarNode, steps: tuple[str, ...] = ("height", "stm", "cpa")):
         self.node = node
-        self.stages = {stage: DetectionMarkers(node, f"~/debug/{stage}")
-                       for stage in ("stage1", "stage2")}
+        self.stages = {stage: DetectionMarkers(node, f"~/debug/{stage}") for stage in ("stage1", "stage2")}
         self.final = DetectionOutputs(node, steps)
 
-    def publish(self, header: Any, xyz: np.ndarray, find: Callable[[], Candidates],
-                problem: str | None = None) -> None:
+    def publish(self, header: Any, xyz: np.ndarray, find: Callable[[], Candidates], problem: str | None = None) -> None:
         """Publish the candidates of find().
 
         Args:
@@ -188,8 +192,9 @@ class CandidateOutputs:
                 detections = getattr(candidates, stage)
                 output_header, boxes = to_output_frame(self.node, header, detections.boxes)
                 markers.publish(output_header, replace(detections, boxes=boxes))
-        tracking_problem = self.final.publish(header, candidates.final, candidates.ms, xyz,
-                                              clusters=candidates.clusters)
+        tracking_problem = self.final.publish(
+            header, candidates.final, candidates.ms, xyz, clusters=candidates.clusters
+        )
         self._diagnose(candidates, problem or tracking_problem)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:
@@ -199,7 +204,8 @@ class CandidateOutputs:
         elif len(candidates.stage1) == 0:
             self.node.report(WARN, "no cluster has the seed's height")
         elif len(candidates.final) == 0:
-            self.node.report(WARN, f"none of {len(candidates.stage1)} clusters of the seed's "
-                             "height looks like the seed")
+            self.node.report(
+                WARN, f"none of {len(candidates.stage1)} clusters of the seed's height looks like the seed"
+            )
         else:
             self.node.report(OK, "detecting")

@@ -15,7 +15,7 @@ from lidar_perception.types import InputError, closest_name
 
 MAX_BYTES = 10**6
 MAX_KEYS = 10_000  # as YAML anchors can nest a group in itself
-MAX_LINES = 20     # of messages for one file
+MAX_LINES = 20  # of messages for one file
 EVERY_NODE = "/**"
 
 
@@ -45,8 +45,9 @@ def read_sections(path: str | Path) -> dict[str, dict[str, Any]]:
     return sections
 
 
-def _iterate_leaves(path: str | Path, group: dict, visited: Iterator[int], separator: str,
-                    prefix: str = "", stop: str | None = None) -> Iterator[tuple[str, Any]]:
+def _iterate_leaves(
+    path: str | Path, group: dict, visited: Iterator[int], separator: str, prefix: str = "", stop: str | None = None
+) -> Iterator[tuple[str, Any]]:
     """Yield the joined name and the value of each leaf, or of each key `stop`."""
     for key, value in group.items():
         if next(visited) >= MAX_KEYS:
@@ -54,8 +55,7 @@ def _iterate_leaves(path: str | Path, group: dict, visited: Iterator[int], separ
         if key == stop:
             yield prefix.removesuffix(separator), value
         elif isinstance(value, dict):
-            yield from _iterate_leaves(path, value, visited, separator,
-                                       f"{prefix}{key}{separator}", stop)
+            yield from _iterate_leaves(path, value, visited, separator, f"{prefix}{key}{separator}", stop)
         elif stop is None:
             yield f"{prefix}{key}", value
 
@@ -65,8 +65,7 @@ def is_for(section: str, node: str) -> bool:
     return section.rpartition("/")[2] in ("*", "**", node)
 
 
-def describe_unknown_nodes(path: str | Path, nodes: Collection[str],
-                           only_similar: bool = False) -> list[str]:
+def describe_unknown_nodes(path: str | Path, nodes: Collection[str], only_similar: bool = False) -> list[str]:
     """Return a line for each section of a parameter file that applies to no node.
 
     Sections for other nodes of this package, also with a prefix, are accepted, as several graphs
@@ -83,6 +82,8 @@ def describe_unknown_nodes(path: str | Path, nodes: Collection[str],
             continue
         guess = closest_name(name, [*nodes, *NODES])
         if guess in nodes or not only_similar:
-            lines.append(f"{path}: no node here is called {name[:80]!r}, so its parameters change "
-                         "nothing" + (f"; did you mean {guess!r}?" if guess else ""))
+            lines.append(
+                f"{path}: no node here is called {name[:80]!r}, so its parameters change "
+                "nothing" + (f"; did you mean {guess!r}?" if guess else "")
+            )
     return [*islice(lines, MAX_LINES)]

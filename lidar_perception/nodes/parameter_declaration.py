@@ -11,10 +11,13 @@ from rclpy.parameter import Parameter
 from lidar_perception.nodes.rclpy_compat import parameter_overrides, store_empty_list
 from lidar_perception.param_fields import collect_fields, with_values
 
-TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE,
-         str: Parameter.Type.STRING}
-LISTS = {int: Parameter.Type.INTEGER_ARRAY, float: Parameter.Type.DOUBLE_ARRAY,
-         str: Parameter.Type.STRING_ARRAY}
+TYPES = {
+    bool: Parameter.Type.BOOL,
+    int: Parameter.Type.INTEGER,
+    float: Parameter.Type.DOUBLE,
+    str: Parameter.Type.STRING,
+}
+LISTS = {int: Parameter.Type.INTEGER_ARRAY, float: Parameter.Type.DOUBLE_ARRAY, str: Parameter.Type.STRING_ARRAY}
 # (given type, declared type) -> conversion of the value.
 TO_FLOATS: dict[tuple[Any, Any], Any] = {
     (Parameter.Type.INTEGER, Parameter.Type.DOUBLE): float,
@@ -41,8 +44,7 @@ def declare_parameters(node: Node, params: Any) -> Any:
                 value = []
             else:
                 overrides[name] = given
-        declared[name] = node.declare_parameter(name, kind if value == [] else value,
-                                                _descriptor(f, kind)).value
+        declared[name] = node.declare_parameter(name, kind if value == [] else value, _descriptor(f, kind)).value
         if declared[name] is None:
             store_empty_list(node, name, kind)
             declared[name] = []
@@ -52,8 +54,9 @@ def declare_parameters(node: Node, params: Any) -> Any:
 def convert_to_declared_type(given: Parameter, kind: Parameter.Type) -> Parameter:
     """Return a parameter with integers converted to float where the declared type is float, and
     with an empty list, which has no type, converted to the declared type."""
-    if kind in LISTS.values() and (given.type_ == Parameter.Type.NOT_SET or (
-            given.type_.name.endswith("_ARRAY") and len(given.value) == 0)):
+    if kind in LISTS.values() and (
+        given.type_ == Parameter.Type.NOT_SET or (given.type_.name.endswith("_ARRAY") and len(given.value) == 0)
+    ):
         return Parameter(given.name, kind, [])
     convert = TO_FLOATS.get((given.type_, kind))
     return Parameter(given.name, kind, convert(given.value)) if convert else given
@@ -67,16 +70,23 @@ def _descriptor(f: Any, kind: Parameter.Type) -> ParameterDescriptor:
     limits = f.metadata
     unit = f" [{limits['unit']}]" if limits["unit"] else ""
     choices = f"one of {', '.join(limits['choices'])}" if limits["choices"] else ""
-    descriptor = ParameterDescriptor(description=limits["doc"] + unit, read_only=limits["fixed"],
-                                     type=kind.value, additional_constraints=choices)
+    descriptor = ParameterDescriptor(
+        description=limits["doc"] + unit, read_only=limits["fixed"], type=kind.value, additional_constraints=choices
+    )
     low, high = limits["low"], limits["high"]
     if low is not None or high is not None:
         if kind == Parameter.Type.DOUBLE:
-            descriptor.floating_point_range = [FloatingPointRange(
-                from_value=float(-1e300 if low is None else low),
-                to_value=float(1e300 if high is None else high), step=0.0)]
+            descriptor.floating_point_range = [
+                FloatingPointRange(
+                    from_value=float(-1e300 if low is None else low),
+                    to_value=float(1e300 if high is None else high),
+                    step=0.0,
+                )
+            ]
         elif kind == Parameter.Type.INTEGER:
-            descriptor.integer_range = [IntegerRange(
-                from_value=-2**62 if low is None else low,
-                to_value=2**62 if high is None else high, step=0)]
+            descriptor.integer_range = [
+                IntegerRange(
+                    from_value=-(2**62) if low is None else low, to_value=2**62 if high is None else high, step=0
+                )
+            ]
     return descriptor

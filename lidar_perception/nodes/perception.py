@@ -45,15 +45,20 @@ class Perception(ManagedNode):
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable, params = self.sensor.read_frame(msg)
             segmented = segment_cloud(frame, self.camera.get(msg.header, params.view), params)
-            problem = (diagnose_empty(len(frame), segmented.ground, segmented.cluster_ids)
-                       or self.sensor.find_problem(frame, params))
-            self.outputs.publish(msg.header, frame.xyz,
-                                 lambda: refine_segmented(segmented, source, params), problem)
+            problem = diagnose_empty(len(frame), segmented.ground, segmented.cluster_ids) or self.sensor.find_problem(
+                frame, params
+            )
+            self.outputs.publish(msg.header, frame.xyz, lambda: refine_segmented(segmented, source, params), problem)
         indices = usable.take(segmented.indices)
         if self.points.get_subscription_count():
-            self.points.publish(add_columns(
-                msg, bag_message, ground=scatter_values(segmented.ground, indices, msg, "u1"),
-                in_view=scatter_values(1, indices, msg, "u1"),
-                cluster_id=scatter_values(segmented.cluster_ids, indices, msg, "u4")))
+            self.points.publish(
+                add_columns(
+                    msg,
+                    bag_message,
+                    ground=scatter_values(segmented.ground, indices, msg, "u1"),
+                    in_view=scatter_values(1, indices, msg, "u1"),
+                    cluster_id=scatter_values(segmented.cluster_ids, indices, msg, "u4"),
+                )
+            )
         self.boxes.publish(msg.header, lambda: segmented.boxes)
         self.obstacles.publish(msg, segmented.xyz, segmented.ground, indices)

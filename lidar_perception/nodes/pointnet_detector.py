@@ -22,14 +22,14 @@ class PointNetNode(DetectorNode):
     steps = STEPS
 
     def __init__(self, **options: Any):
-        super().__init__("pointnet_detector", PointNetDetectorParams(),
-                         DetectionNodeParams(), **options)
+        super().__init__("pointnet_detector", PointNetDetectorParams(), DetectionNodeParams(), **options)
 
     def weights(self) -> Path:
         return weights_file(self.params.pointnet)
 
     def load(self, weights: Path, device: str) -> PointNetDetector:
         from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
+
         return load_pointnet_detector(weights, device, self.params)
 
     def describe_network(self, config: PointNetConfig) -> str:

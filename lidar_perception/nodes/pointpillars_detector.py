@@ -22,14 +22,14 @@ class PointPillarsNode(DetectorNode):
     steps = STEPS
 
     def __init__(self, **options: Any):
-        super().__init__("pointpillars_detector", DetectorParams(),
-                         DetectionNodeParams(), **options)
+        super().__init__("pointpillars_detector", DetectorParams(), DetectionNodeParams(), **options)
 
     def weights(self) -> Path:
         return weights_file(self.params.pointpillars)
 
     def load(self, weights: Path, device: str) -> PointPillarsDetector:
         from lidar_perception.detectors.pointpillars.detector import load_detector
+
         return load_detector(weights, device, self.params)
 
     def describe_network(self, config: NetworkConfig) -> str:

@@ -67,8 +67,7 @@ def state_label(node: Any) -> str:
 
 def allowed_transitions(node: Any) -> set[int | str]:
     """Return the ids and labels of the transitions that the current state allows."""
-    return {key for number, label, *_ in node._state_machine.available_transitions
-            for key in (number, label)}
+    return {key for number, label, *_ in node._state_machine.available_transitions for key in (number, label)}
 
 
 def wrap_change_state(node: Any, wrapper: Callable[[Callable, Any, Any], Any]) -> None:

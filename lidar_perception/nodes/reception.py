@@ -22,20 +22,23 @@ from lidar_perception.params import ReceptionParams
 
 WARN, ERROR, STALE = DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
-MAX_HOLD_S = 1.0        # for which newer clouds do not replace a waiting one
-RETRY_PERIOD_S = 5.0    # between attempts to wait again after waiting has timed out
+MAX_HOLD_S = 1.0  # for which newer clouds do not replace a waiting one
+RETRY_PERIOD_S = 5.0  # between attempts to wait again after waiting has timed out
 RETRY_DURATION_S = 0.3  # of such an attempt
 # Periods without a cloud before the state is ERROR and STALE, respectively.
 SILENT_PERIODS, STALE_PERIODS = 3.0, 6.0
 # Kind of publisher -> what to check when no clouds arrive, and when too few do.
 QUESTIONS = {
     "sensor": ("is the sensor{} running, and connected?", "is the sensor{} overloaded?"),
-    "detector": ("is the detector{} running, and does it get clouds?",
-                 "is the detector{} overloaded, or does it get fewer clouds?"),
-    "node": ("is the node{} running, and does it get clouds?",
-             "is the node{} overloaded, or does it get fewer clouds?"),
-    "player": ("has the player{} reached the end of its bag, or is it paused?",
-               "does the player{} play more slowly?"),
+    "detector": (
+        "is the detector{} running, and does it get clouds?",
+        "is the detector{} overloaded, or does it get fewer clouds?",
+    ),
+    "node": (
+        "is the node{} running, and does it get clouds?",
+        "is the node{} overloaded, or does it get fewer clouds?",
+    ),
+    "player": ("has the player{} reached the end of its bag, or is it paused?", "does the player{} play more slowly?"),
 }
 FASTDDS_PROFILE = files("lidar_perception.nodes") / "fastdds.xml"
 
@@ -64,15 +67,20 @@ class Reception:
         what: name of one message in diagnostics.
     """
 
-    def __init__(self, node: Any, kind: type, name: str,
-                 deliver: Callable[[Any, bool], str | None],
-                 params: Callable[[], ReceptionParams], what: str = "cloud"):
+    def __init__(
+        self,
+        node: Any,
+        kind: type,
+        name: str,
+        deliver: Callable[[Any, bool], str | None],
+        params: Callable[[], ReceptionParams],
+        what: str = "cloud",
+    ):
         self.node, self.kind, self.deliver, self.params = node, kind, deliver, params
         self.links: Links | None = getattr(node, "links", None)
         self.what = what
         self.topic = node.resolve_topic_name(name)
-        self.fixed = (f"qos_overrides.{self.topic}.subscription.reliability"
-                      in parameter_overrides(node))
+        self.fixed = f"qos_overrides.{self.topic}.subscription.reliability" in parameter_overrides(node)
         self.reliability = BEST_EFFORT if params().reliability == "best_effort" else RELIABLE
         self.waiting: deque[Any] = deque()
         self.linked: deque[tuple[Any, dict]] = deque()  # messages of a link, see _receive
@@ -135,14 +143,20 @@ class Reception:
     def _subscribe(self) -> None:
         """Subscribe with a queue in the middleware for clouds that arrive during work."""
         kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH]
-        events = SubscriptionEventCallbacks(matched=lambda _: self.adapt_trigger.trigger(),
-                                            incompatible_qos=lambda _: self.adapt_trigger.trigger())
+        events = SubscriptionEventCallbacks(
+            matched=lambda _: self.adapt_trigger.trigger(), incompatible_qos=lambda _: self.adapt_trigger.trigger()
+        )
         on_message: Any = self._on_message  # the annotation of rclpy lacks the message info
         profile = QoSProfile(depth=max(DEPTH, self.params().queue), reliability=self.reliability)
         self.subscription = self.node.create_subscription(
-            self.kind, self.topic, on_message, profile, raw=True, event_callbacks=events,
-            qos_overriding_options=QoSOverridingOptions(
-                [*kinds, QoSPolicyKind.RELIABILITY] if self.fixed else kinds))
+            self.kind,
+            self.topic,
+            on_message,
+            profile,
+            raw=True,
+            event_callbacks=events,
+            qos_overriding_options=QoSOverridingOptions([*kinds, QoSPolicyKind.RELIABILITY] if self.fixed else kinds),
+        )
         self.arrivals.depth = self.subscription.qos_profile.depth
 
     def publishers(self) -> list[Any]:
@@ -167,8 +181,7 @@ class Reception:
         if wanted == "auto" and offered:
             chosen = RELIABLE if offered == {RELIABLE} else BEST_EFFORT
         else:
-            chosen = {"reliable": RELIABLE, "best_effort": BEST_EFFORT}.get(
-                wanted, self.reliability)
+            chosen = {"reliable": RELIABLE, "best_effort": BEST_EFFORT}.get(wanted, self.reliability)
         if self.fixed or chosen == self.reliability:
             return
         self.reliability = chosen
@@ -250,10 +263,13 @@ class Reception:
         if not self.is_open:
             return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped}
         rate, expected = self.arrivals.measure_rate(), self.expected_rate()
-        return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped,
-                "reliability": self._reliability_label(),
-                **({"rate_hz": f"{rate:.1f}"} if rate else {}),
-                **({"expected_rate_hz": f"{expected:.1f}"} if expected else {})}
+        return {
+            "lost": self.arrivals.lost,
+            "dropped": self.arrivals.dropped,
+            "reliability": self._reliability_label(),
+            **({"rate_hz": f"{rate:.1f}"} if rate else {}),
+            **({"expected_rate_hz": f"{expected:.1f}"} if expected else {}),
+        }
 
     def expected_rate(self) -> float | None:
         """Return input.rate or the rate of the first clouds in Hz; None after too few clouds."""
@@ -267,29 +283,47 @@ class Reception:
         publishers = self.publishers()
         if len(publishers) > 1:
             names = ", ".join(sorted(_name(p) for p in publishers))
-            problems.append(("publishers", WARN, f"{len(publishers)} publishers on {self.topic} "
-                             f"({names}): their {self.what}s are mixed; remap all but one"))
+            problems.append(
+                (
+                    "publishers",
+                    WARN,
+                    f"{len(publishers)} publishers on {self.topic} "
+                    f"({names}): their {self.what}s are mixed; remap all but one",
+                )
+            )
         if unheard := self._find_unheard_publisher(publishers):
             problems.append(unheard)
         if self.waiting and self.needs is not None:
-            return [*problems, ("waiting", WARN, f"the {self.what} on {self.topic} waits for "
-                                f"{self.needs}")]
+            return [*problems, ("waiting", WARN, f"the {self.what} on {self.topic} waits for {self.needs}")]
         if silence := self._find_silence():
             return [*problems, silence]
         expected, rate = self.expected_rate(), self.arrivals.measure_rate()
         if expected and rate and rate < params.min_rate * expected:
-            problems.append(("rate", WARN, f"{rate:.1f} Hz on {self.topic} where {expected:.1f} Hz "
-                             f"are expected (input.rate): {self._list_questions()[1]}"))
+            problems.append(
+                (
+                    "rate",
+                    WARN,
+                    f"{rate:.1f} Hz on {self.topic} where {expected:.1f} Hz "
+                    f"are expected (input.rate): {self._list_questions()[1]}",
+                )
+            )
         sent, lost, dropped = self.arrivals.count_recent()
         total = max(sent, WINDOW)  # so that one lost cloud of the first two is not a half
         if lost > params.max_lost * total:
             remedy = self._suggest_remedy(publishers or self.last_publishers)
-            problems.append(("lost", WARN, f"{lost} of the last {sent} {self.what}s on "
-                             f"{self.topic} were lost on the way; {remedy}"))
+            problems.append(
+                ("lost", WARN, f"{lost} of the last {sent} {self.what}s on {self.topic} were lost on the way; {remedy}")
+            )
         if dropped > params.max_dropped * total:
-            problems.append(("dropped", WARN, f"{dropped} of the last {sent} {self.what}s on "
-                             f"{self.topic} were dropped for newer ones: processing takes longer "
-                             "than their period on this machine, or they wait for poses"))
+            problems.append(
+                (
+                    "dropped",
+                    WARN,
+                    f"{dropped} of the last {sent} {self.what}s on "
+                    f"{self.topic} were dropped for newer ones: processing takes longer "
+                    "than their period on this machine, or they wait for poses",
+                )
+            )
         return problems
 
     def _find_silence(self) -> Problem | None:
@@ -302,8 +336,11 @@ class Reception:
         if silent <= error:
             return None
         kind, level, limit = ("stale", STALE, stale) if silent > stale else ("silent", ERROR, error)
-        return (kind, level, f"no {self.what} on {self.topic} for more than {round(limit, 1):g} s: "
-                f"{self._list_questions()[0]}")
+        return (
+            kind,
+            level,
+            f"no {self.what} on {self.topic} for more than {round(limit, 1):g} s: {self._list_questions()[0]}",
+        )
 
     def _list_questions(self) -> list[str]:
         """Return the questions of QUESTIONS for the current publishers."""
@@ -314,33 +351,42 @@ class Reception:
             kind = "detector"
         else:  # nodes of this package publish NODE/output/points
             kind = "node" if self.topic.endswith("/output/points") else "sensor"
-        return [question.format(f" {', '.join(names)}" if names else "")
-                for question in QUESTIONS[kind]]
+        return [question.format(f" {', '.join(names)}" if names else "") for question in QUESTIONS[kind]]
 
     def _find_unheard_publisher(self, publishers: list[Any]) -> Problem | None:
         """Return a problem for best-effort publishers that adapt() may not adapt to."""
         names = [_name(p) for p in publishers if p.qos_profile.reliability == BEST_EFFORT]
         adapts = not self.fixed and self.params().reliability != "reliable"
-        if not names or adapts or self.output is not None or (
-                self.subscription.qos_profile.reliability != RELIABLE):
+        if not names or adapts or self.output is not None or (self.subscription.qos_profile.reliability != RELIABLE):
             return None
-        remedy = (f"set qos_overrides.{self.topic}.subscription.reliability to best_effort"
-                  if self.fixed else "set input.reliability to auto")
-        return ("unheard", WARN, f"{', '.join(sorted(names))} on {self.topic} offers best effort "
-                f"but the subscription is reliable, so no messages arrive: {remedy}, or let it "
-                "publish reliable")
+        remedy = (
+            f"set qos_overrides.{self.topic}.subscription.reliability to best_effort"
+            if self.fixed
+            else "set input.reliability to auto"
+        )
+        return (
+            "unheard",
+            WARN,
+            f"{', '.join(sorted(names))} on {self.topic} offers best effort "
+            f"but the subscription is reliable, so no messages arrive: {remedy}, or let it "
+            "publish reliable",
+        )
 
     def _suggest_remedy(self, publishers: list[Any]) -> str:
         offered = {p.qos_profile.reliability for p in publishers}
         if BEST_EFFORT in offered:
-            sysctl = (f", or set net.core.rmem_max to {4 * SOCKET_BUFFER} (sysctl) and start this "
-                      "node again") if read_socket_buffer_size() < SOCKET_BUFFER else ""
-            return (f"let {_name(publishers[0])} publish reliable, or start it with "
-                    f"FASTRTPS_DEFAULT_PROFILES_FILE={FASTDDS_PROFILE}{sysctl}")
+            sysctl = (
+                (f", or set net.core.rmem_max to {4 * SOCKET_BUFFER} (sysctl) and start this node again")
+                if read_socket_buffer_size() < SOCKET_BUFFER
+                else ""
+            )
+            return (
+                f"let {_name(publishers[0])} publish reliable, or start it with "
+                f"FASTRTPS_DEFAULT_PROFILES_FILE={FASTDDS_PROFILE}{sysctl}"
+            )
         if self.output is None and self.subscription.qos_profile.reliability == BEST_EFFORT:
             return "receive it reliable: input.reliability auto, and no qos_overrides"
-        return ("raise the depth of the publisher's queue; between machines also net.core.rmem_max "
-                "(sysctl)")
+        return "raise the depth of the publisher's queue; between machines also net.core.rmem_max (sysctl)"
 
 
 def _trigger(guard: Any) -> None:

@@ -26,10 +26,7 @@ from rclpy.task import Future
 from std_msgs.msg import Float64
 
 from lidar_perception.nodes.links import Links, Output
-from lidar_perception.nodes.parameter_declaration import (
-    convert_to_declared_type,
-    declare_parameters,
-)
+from lidar_perception.nodes.parameter_declaration import convert_to_declared_type, declare_parameters
 from lidar_perception.nodes.rclpy_compat import UnknownParameterError, parameter_names
 from lidar_perception.nodes.reception import Problem, Reception
 from lidar_perception.param_fields import flatten, with_values
@@ -47,7 +44,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 JUMP_NS = 10**9  # a stamp that is earlier by more than this means that a bag has restarted
 WAITING = "waiting for input"
-LOG_PERIOD_S = 60.0     # before the same problem is logged again
+LOG_PERIOD_S = 60.0  # before the same problem is logged again
 MAX_LOGGED_KINDS = 1000  # kinds of messages with a remembered time
 
 
@@ -67,8 +64,7 @@ class LidarNode(Node):
     transforms: Any = None  # of type Transforms for nodes that subscribe to clouds
     writes_files: ClassVar[bool] = False  # True: after a signal the work is finished, for close()
 
-    def __init__(self, name: str, params: Any, node_params: Any = None,
-                 links: Links | None = None, **options: Any):
+    def __init__(self, name: str, params: Any, node_params: Any = None, links: Links | None = None, **options: Any):
         super().__init__(name, **options)
         self.links = links
         self._outputs: list[Output] = []
@@ -84,8 +80,7 @@ class LidarNode(Node):
         self._logged: dict[str, float] = {}  # kind of message -> time of its last log line
         self._last_logged = ""
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
-        self._processing_time = self.create_publisher(Float64, "~/debug/processing_time_ms",
-                                                      RELIABLE)
+        self._processing_time = self.create_publisher(Float64, "~/debug/processing_time_ms", RELIABLE)
         self.add_steady_timer(1.0, self._tick)
 
     def reset_state(self) -> None:
@@ -117,24 +112,32 @@ class LidarNode(Node):
     def _before_set(self, changes: list[Parameter]) -> list[Parameter]:
         if unknown := [c.name for c in changes if not self.has_parameter(c.name)]:
             guess = closest_name(unknown[0], parameter_names(self))
-            raise UnknownParameterError(f"{self.get_fully_qualified_name()} has no parameter "
-                                        f"{unknown[0][:80]!r}" + (f"; did you mean {guess!r}?"
-                                                                  if guess else ""))
+            raise UnknownParameterError(
+                f"{self.get_fully_qualified_name()} has no parameter "
+                f"{unknown[0][:80]!r}" + (f"; did you mean {guess!r}?" if guess else "")
+            )
         return [convert_to_declared_type(c, self.get_parameter(c.name).type_) for c in changes]
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            params, node_params = (group and with_values(
-                group, {c.name: c.value for c in changes if c.name in flatten(group)})
-                                   for group in (self.params, self.node_params))
+            params, node_params = (
+                group and with_values(group, {c.name: c.value for c in changes if c.name in flatten(group)})
+                for group in (self.params, self.node_params)
+            )
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         self.params, self.node_params = params, node_params
         return SetParametersResult(successful=True)
 
-    def input(self, topic: str, type_name: str, callback: Callable,
-              *qos: QoSProfile, private: bool = True,
-              needs: Callable[[Any], str | None] = lambda _: None) -> None:
+    def input(
+        self,
+        topic: str,
+        type_name: str,
+        callback: Callable,
+        *qos: QoSProfile,
+        private: bool = True,
+        needs: Callable[[Any], str | None] = lambda _: None,
+    ) -> None:
         """Subscribe to a topic.
 
         Args:
@@ -165,8 +168,11 @@ class LidarNode(Node):
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {error}")
             except Exception as error:
                 self.get_logger().error(traceback.format_exc())
-                self.report(ERROR, f"{self.resolve_topic_name(name)}: {type(error).__name__}: "
-                            f"{error}; this is a bug, please report it with the message")
+                self.report(
+                    ERROR,
+                    f"{self.resolve_topic_name(name)}: {type(error).__name__}: "
+                    f"{error}; this is a bug, please report it with the message",
+                )
             if qos:
                 for reception in self._receptions():
                     reception.retry()
@@ -179,25 +185,31 @@ class LidarNode(Node):
             if len(qos) > 1:
                 return  # another profile matches
             topic = self.resolve_topic_name(name)
-            remedy = ("let it publish transient local (ros2 bag play: --qos-profile-overrides-path)"
-                      if event.last_policy_kind == QoSPolicyKind.DURABILITY else
-                      "let it publish reliable, or set "
-                      f"qos_overrides.{topic}.subscription.reliability to best_effort")
-            self.report(WARN, f"a publisher on {topic} offers an incompatible QoS, so none of its "
-                        f"messages arrive: {remedy}")
+            remedy = (
+                "let it publish transient local (ros2 bag play: --qos-profile-overrides-path)"
+                if event.last_policy_kind == QoSPolicyKind.DURABILITY
+                else f"let it publish reliable, or set qos_overrides.{topic}.subscription.reliability to best_effort"
+            )
+            self.report(
+                WARN, f"a publisher on {topic} offers an incompatible QoS, so none of its messages arrive: {remedy}"
+            )
 
-        events = SubscriptionEventCallbacks(message_lost=self.count_lost,
-                                            incompatible_qos=report_incompatible)
+        events = SubscriptionEventCallbacks(message_lost=self.count_lost, incompatible_qos=report_incompatible)
 
         def subscribe(profile: QoSProfile) -> Any:
             return self.create_subscription(
-                kind, name, untyped_receive, profile, raw=True, event_callbacks=events,
-                qos_overriding_options=QoSOverridingOptions.with_default_policies()
-                if profile is qos[0] else None)
+                kind,
+                name,
+                untyped_receive,
+                profile,
+                raw=True,
+                event_callbacks=events,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies() if profile is qos[0] else None,
+            )
 
-        inputs: list[Any] = (
-            [MessageInput(self, partial(subscribe, profile)) for profile in qos]
-            or [Reception(self, kind, name, receive, lambda: self.node_params.input, what)])
+        inputs: list[Any] = [MessageInput(self, partial(subscribe, profile)) for profile in qos] or [
+            Reception(self, kind, name, receive, lambda: self.node_params.input, what)
+        ]
         self.inputs += inputs
         if self.active:
             for new_input in inputs:
@@ -207,9 +219,15 @@ class LidarNode(Node):
         """Create a publisher of ~/output/TOPIC, or of any name that starts with ~ or /."""
         name = topic if topic[0] in "~/" else f"~/output/{topic}"
         _warm_up_type(type_name)
-        output = Output(self.create_publisher(
-            load_message_class(type_name), name, qos,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies()), self.links)
+        output = Output(
+            self.create_publisher(
+                load_message_class(type_name),
+                name,
+                qos,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            ),
+            self.links,
+        )
         self._outputs.append(output)
         return output
 
@@ -229,8 +247,7 @@ class LidarNode(Node):
         """Log a problem at most once in LOG_PERIOD_S, and an OK state unless it was logged last, so
         that the log always ends with the current state."""
         now = monotonic()
-        if (kind != self._last_logged if level == OK else
-            now - self._logged.get(kind, -LOG_PERIOD_S) >= LOG_PERIOD_S):
+        if kind != self._last_logged if level == OK else now - self._logged.get(kind, -LOG_PERIOD_S) >= LOG_PERIOD_S:
             if len(self._logged) > MAX_LOGGED_KINDS:
                 self._logged.clear()
             self._logged[kind], self._last_logged = now, kind
@@ -249,9 +266,11 @@ class LidarNode(Node):
         """Count and time the work on one cloud, and detect stamps that jump back."""
         if stamp_ns < self.last_stamp_ns - JUMP_NS:
             self.counts["time_went_back"] = self.counts.get("time_went_back", 0) + 1
-            self.get_logger().info("time jumped back, as when a bag restarts; pending data is "
-                                   "dropped (logged once, counted in /diagnostics)",
-                                   once=True)
+            self.get_logger().info(
+                "time jumped back, as when a bag restarts; pending data is "
+                "dropped (logged once, counted in /diagnostics)",
+                once=True,
+            )
         self.last_stamp_ns = stamp_ns
         begin = perf_counter()
         yield
@@ -276,9 +295,13 @@ class LidarNode(Node):
         if problems := self._problems():
             level = max(level, *(p[1] for p in problems))
             message = f"{'; '.join(p[2] for p in problems)} (state: {message})"
-        status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name().lstrip("/"),
-                                  message=message, hardware_id=self._hardware_id(),
-                                  values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])
+        status = DiagnosticStatus(
+            level=level,
+            name=self.get_fully_qualified_name().lstrip("/"),
+            message=message,
+            hardware_id=self._hardware_id(),
+            values=[KeyValue(key=k, value=str(v)) for k, v in values.items()],
+        )
         array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         if rclpy.ok(context=self.context):
@@ -296,9 +319,15 @@ class LidarNode(Node):
         found = [p for source in self._sources() for p in source.problems()]
         name, namespace = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count((name, namespace)) > 1:
-            found.append(("name", WARN, f"another node is called {self.get_fully_qualified_name()} "
-                          "too, so topics and parameters of both are mixed; end one, or give it "
-                          "another namespace"))
+            found.append(
+                (
+                    "name",
+                    WARN,
+                    f"another node is called {self.get_fully_qualified_name()} "
+                    "too, so topics and parameters of both are mixed; end one, or give it "
+                    "another namespace",
+                )
+            )
         before, self._present = self._present, {kind for kind, _, _ in found}
         for kind, level, message in found:
             if kind not in before:

@@ -30,8 +30,7 @@ class SensorCheck:
         self.heights: list[float | None] = []
         self.scale = StreamScale()
 
-    def read_frame(self, msg: Any, with_intensity: bool = False
-                   ) -> tuple[PointCloud, np.ndarray, Any]:
+    def read_frame(self, msg: Any, with_intensity: bool = False) -> tuple[PointCloud, np.ndarray, Any]:
         """Convert a cloud to a cropped frame, in the level frame if there is a base_frame.
 
         Args:
@@ -44,8 +43,7 @@ class SensorCheck:
         """
         params = self.node.params
         reads_intensity = with_intensity or params.ground.method == "patchwork"
-        frame, indices = to_point_cloud(
-            msg, params.input.intensity_max if reads_intensity else None, self.scale)
+        frame, indices = to_point_cloud(msg, params.input.intensity_max if reads_intensity else None, self.scale)
         placement = self.node.transforms.find_placement(msg.header)
         params = self.node.transforms.with_mounting(params, placement)
         self.node.counts.pop("cropped", None)
@@ -57,8 +55,7 @@ class SensorCheck:
 
     def find_problem(self, frame: PointCloud, params: Any) -> str | None:
         """Return what contradicts the parameters of read_frame(), with the remedy, or None."""
-        return (self.check_height(frame, params.ground.sensor_pose)
-                or find_scale_problem(frame.intensity))
+        return self.check_height(frame, params.ground.sensor_pose) or find_scale_problem(frame.intensity)
 
     def check_height(self, frame: PointCloud, pose: SensorPoseParams) -> str | None:
         """Return a problem if the measured sensor height differs from that in pose, or None."""

@@ -37,9 +37,12 @@ def use_large_shared_memory(from_driver: bool = False) -> None:
     free = memory.f_bavail * memory.f_frsize
     profile = next((name for needed, name in PROFILES.items() if free >= needed), None)
     if profile != "fastdds.xml":
-        print(f"/dev/shm has only {free / 2**20:.0f} MB free, so clouds above "
-              f"{3 if profile else 0} MB may get lost between processes; start the container with "
-              "--shm-size=1g", file=sys.stderr)
+        print(
+            f"/dev/shm has only {free / 2**20:.0f} MB free, so clouds above "
+            f"{3 if profile else 0} MB may get lost between processes; start the container with "
+            "--shm-size=1g",
+            file=sys.stderr,
+        )
     if from_driver and profile == "fastdds.xml" and read_socket_buffer_size() >= SOCKET_BUFFER:
         profile = DRIVER_PROFILE
     if profile:
@@ -71,8 +74,10 @@ def remove_dead_segments(folder: Path = SHARED_MEMORY) -> None:
         except OSError:  # in use, or already removed by another node
             continue
     if removed:
-        print(f"removed {removed} shared-memory segments ({size / 1e6:.0f} MB) that killed "
-              f"processes left in {folder}", file=sys.stderr)
+        print(
+            f"removed {removed} shared-memory segments ({size / 1e6:.0f} MB) that killed processes left in {folder}",
+            file=sys.stderr,
+        )
 
 
 def read_socket_buffer_size() -> int:

@@ -41,10 +41,10 @@ class Stop:
         # A descriptor, because a thread in sigwait(3) does not block the signals.
         mask = sum(1 << number - 1 for number in signals).to_bytes(128, "little")  # sigset_t
         arrived, loaded = ctypes.CDLL(None).signalfd(-1, mask, os.O_CLOEXEC), threading.Event()
-        listener = threading.Thread(target=_relay_first_signal, args=(arrived, loaded, pipe),
-                                    daemon=True)
+        listener = threading.Thread(target=_relay_first_signal, args=(arrived, loaded, pipe), daemon=True)
         listener.start()
         from lidar_perception.nodes import guard  # takes seconds, as it imports NumPy and Numba
+
         loaded.set()
         listener.join()
         self._state = guard.start_guard(arrived, pipe)

@@ -26,8 +26,8 @@ from msg_utils.stamps import SECOND_NS, to_ns
 
 DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
 MIN_LIFETIME_PERIODS = 2.5  # lifetime of markers in periods of the input
-MAX_LIFETIME_S = 1e6        # messages have 32 bits for the seconds
-RATE_WINDOW_S = 10.0        # for the rates of new and ended tracks
+MAX_LIFETIME_S = 1e6  # messages have 32 bits for the seconds
+RATE_WINDOW_S = 10.0  # for the rates of new and ended tracks
 
 
 class TrackOutputs:
@@ -39,8 +39,7 @@ class TrackOutputs:
         clouds: the node subscribes to clouds, see EgoInput.
     """
 
-    def __init__(self, node: LidarNode,
-                 params: Callable[[], DetectionNodeParams | TrackerNodeParams], clouds: bool):
+    def __init__(self, node: LidarNode, params: Callable[[], DetectionNodeParams | TrackerNodeParams], clouds: bool):
         self.node, self.params = node, params
         with lock_compilation(node.get_logger().info):
             warm_up()
@@ -51,12 +50,14 @@ class TrackOutputs:
         self.frame_id: str | None = None
         self.marker_keys: Any = ()
         self.markers = node.output("tracks", MARKERS)
-        self.array = node.create_publisher(load_message_class(DETECTIONS_3D), "~/output/tracks_3d",
-                                           RELIABLE) if has_detections_3d() else None
+        self.array = (
+            node.create_publisher(load_message_class(DETECTIONS_3D), "~/output/tracks_3d", RELIABLE)
+            if has_detections_3d()
+            else None
+        )
         self.count_history: deque[tuple[float, int, int]] = deque()  # seconds, born, ended
 
-    def publish(self, header: Any, detections: Detections,
-                xyz: np.ndarray | None = None) -> str | None:
+    def publish(self, header: Any, detections: Detections, xyz: np.ndarray | None = None) -> str | None:
         """Track the detections of one frame and publish the tracks.
 
         Nothing is published for a frame that is not newer than the last one.
@@ -88,24 +89,37 @@ class TrackOutputs:
         if before in (None, frame_id):
             return None
         self.tracker.reset()
-        return (f"detections in '{before}' and in '{frame_id}' are mixed, and tracks end at every "
-                "change; start one tracker for each sensor")
+        return (
+            f"detections in '{before}' and in '{frame_id}' are mixed, and tracks end at every "
+            "change; start one tracker for each sensor"
+        )
 
     def _send(self, header: Any, stamp: int, tracks: Tracks) -> None:
         output = self.node.node_params.output
         trails = self.trails(tracks, self.tracker.pose, stamp, output.trail)
         rows = make_track_rows(
-            tracks.ids, tracks.detections, tracks.velocities, tracks.moving, trails,
-            previous=self.marker_keys, extras=[
-                {"seen": bool(seen), "age": round(float(age), 3)}
-                for seen, age in zip(tracks.seen, tracks.ages)])
+            tracks.ids,
+            tracks.detections,
+            tracks.velocities,
+            tracks.moving,
+            trails,
+            previous=self.marker_keys,
+            extras=[{"seen": bool(seen), "age": round(float(age), 3)} for seen, age in zip(tracks.seen, tracks.ages)],
+        )
         self.marker_keys = list_marker_keys(rows)
         self.markers.publish(MarkerRows(rows, header, find_marker_lifetime_ns(self.node)))
         if self.array is not None and self.array.get_subscription_count():
             detections = tracks.detections
-            self.array.publish(encode_detection_array(
-                detections.boxes, detections.labels, detections.scores, header=header,
-                ids=tracks.ids, covariances=tracks.to_pose_covariances()))
+            self.array.publish(
+                encode_detection_array(
+                    detections.boxes,
+                    detections.labels,
+                    detections.scores,
+                    header=header,
+                    ids=tracks.ids,
+                    covariances=tracks.to_pose_covariances(),
+                )
+            )
 
     def _count(self, stamp: int, reported: int) -> None:
         tracker, now = self.tracker, stamp / 1e9
@@ -115,8 +129,9 @@ class TrackOutputs:
         while now - self.count_history[0][0] > RATE_WINDOW_S or len(self.count_history) > 1000:
             self.count_history.popleft()
         before, born, ended = self.count_history[0]
-        self.node.counts.update(ego=self.ego.source, tracks=reported, alive=tracker.alive,
-                                born=tracker.started, ended=tracker.ended)
+        self.node.counts.update(
+            ego=self.ego.source, tracks=reported, alive=tracker.alive, born=tracker.started, ended=tracker.ended
+        )
         if now > before:
             self.node.counts["born_per_s"] = f"{(tracker.started - born) / (now - before):.2f}"
             self.node.counts["ended_per_s"] = f"{(tracker.ended - ended) / (now - before):.2f}"
@@ -128,8 +143,7 @@ def find_marker_lifetime_ns(node: LidarNode) -> int:
     It is at least MIN_LIFETIME_PERIODS periods of the input, for slow sensors.
     """
     seconds = node.node_params.output.marker_lifetime
-    rates = [rate for reception in node._receptions()
-             if (rate := reception.expected_rate())]
+    rates = [rate for reception in node._receptions() if (rate := reception.expected_rate())]
     if seconds and rates:
         seconds = max(seconds, min(MIN_LIFETIME_PERIODS / min(rates), MAX_LIFETIME_S))
     return int(seconds * SECOND_NS)

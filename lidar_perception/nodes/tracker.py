@@ -30,19 +30,23 @@ class TrackerNode(ManagedNode):
 
     def configure(self) -> None:
         self.tracks = TrackOutputs(self, lambda: self.params, clouds=False)
-        self.input("detections", MARKERS, self.on_markers,
-                   needs=self._find_missing_pose)
+        self.input("detections", MARKERS, self.on_markers, needs=self._find_missing_pose)
         if has_detections_3d():
-            self.input("detections_3d", DETECTIONS_3D, self.on_detections,
-                       needs=lambda m: self.tracks.ego.find_missing_pose(m.header))
+            self.input(
+                "detections_3d",
+                DETECTIONS_3D,
+                self.on_detections,
+                needs=lambda m: self.tracks.ego.find_missing_pose(m.header),
+            )
 
     def _find_missing_pose(self, msg: Any) -> str | None:
         return self.tracks.ego.find_missing_pose(find_header(msg)) if msg.markers else None
 
     def on_markers(self, msg: Any) -> None:
         if not msg.markers:
-            raise InputError("ignored an array without a marker, which has no stamp; send a "
-                             "DELETEALL with the header of the frame")
+            raise InputError(
+                "ignored an array without a marker, which has no stamp; send a DELETEALL with the header of the frame"
+            )
         self._track(find_header(msg), from_marker_array(msg))
 
     def on_detections(self, msg: Any) -> None:
@@ -54,7 +58,9 @@ class TrackerNode(ManagedNode):
             problem = self.tracks.publish(header, to_detections(objects))
         problems = [problem] if problem else []
         if unknown := find_unknown_classes(objects.labels):
-            problems.append(f"detections of the classes {', '.join(unknown)[:80]} are tracked as "
-                            f"Misc: name them {', '.join(DETECTED)} in the ns of the markers or in "
-                            "class_id")
+            problems.append(
+                f"detections of the classes {', '.join(unknown)[:80]} are tracked as "
+                f"Misc: name them {', '.join(DETECTED)} in the ns of the markers or in "
+                "class_id"
+            )
         self.report(WARN if problems else OK, "; ".join(problems) or "tracking")

@@ -27,14 +27,7 @@ from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.point_times import deskew_points, read_point_times, replace_points
 from lidar_perception.wire.topics import TF, TF_STATIC
-from lidar_perception.wire.transforms import (
-    FIXED,
-    MOVING,
-    ODOMETRY_MESSAGE,
-    TF_MESSAGE,
-    add_odometry,
-    add_transforms,
-)
+from lidar_perception.wire.transforms import FIXED, MOVING, ODOMETRY_MESSAGE, TF_MESSAGE, add_odometry, add_transforms
 from msg_utils.stamps import SECOND_NS, to_ns
 
 TF_QOS = QoSProfile(depth=100)
@@ -83,8 +76,7 @@ class Transforms:
     @property
     def is_used(self) -> bool:
         """True if a parameter of the node depends on the frame of the clouds."""
-        return bool(self.base_frame or self.target_frame
-                    or self.node.node_params.input.deskew != "off")
+        return bool(self.base_frame or self.target_frame or self.node.node_params.input.deskew != "off")
 
     def subscribe_to_tf(self) -> None:
         """Subscribe to /tf, in addition to /tf_static, once."""
@@ -101,8 +93,7 @@ class Transforms:
             self.node.input("odometry", ODOMETRY_MESSAGE, self.on_odometry, ODOMETRY_QOS)
 
     def _subscribe(self, topic: str, qos: QoSProfile, static: bool) -> None:
-        self.node.input(topic, TF_MESSAGE, lambda m: self.on_tf(m, static), qos,
-                        private=False)
+        self.node.input(topic, TF_MESSAGE, lambda m: self.on_tf(m, static), qos, private=False)
 
     def on_tf(self, msg: Any, static: bool) -> None:
         """Add a tf2_msgs/TFMessage to the tree. Invalid transforms are skipped and reported."""
@@ -114,15 +105,15 @@ class Transforms:
     def on_odometry(self, msg: Any) -> None:
         """Add a nav_msgs/Odometry. If several with different frames share the topic, the first one
         is used as long as it arrives."""
-        now, child, frame = (monotonic(), msg.child_frame_id.lstrip("/"),
-                             msg.header.frame_id.lstrip("/"))
+        now, child, frame = (monotonic(), msg.child_frame_id.lstrip("/"), msg.header.frame_id.lstrip("/"))
         if (child, frame) != (self.odometry_child, self.odometry_frame):
             if now - self.odometry_arrival < ODOMETRY_TIMEOUT_S:
                 self.ignored_arrival = now
                 self.problem_by_source["odometry"] = (
                     f"two odometries on {self.node.resolve_topic_name('~/input/odometry')}: that "
                     f"of '{child}' in '{frame}' is ignored, that of '{self.odometry_child}' in "
-                    f"'{self.odometry_frame}' is used; publish them on separate topics")
+                    f"'{self.odometry_frame}' is used; publish them on separate topics"
+                )
                 return
             self.odometry = TransformTree()
         add_odometry(self.odometry, msg)
@@ -140,7 +131,8 @@ class Transforms:
     def find_missing_input(self, cloud: Any) -> str | None:
         """Return what a cloud waits for and may still arrive, or None."""
         return self._find_missing_frame(cloud) or next(
-            filter(None, (need(cloud.header) for need in self.more_needs)), None)
+            filter(None, (need(cloud.header) for need in self.more_needs)), None
+        )
 
     def _find_missing_frame(self, cloud: Any) -> str | None:
         if not self.is_used:
@@ -165,8 +157,7 @@ class Transforms:
         try:
             self.tree.lookup(frame, frame_id, stamp)
         except MissingTransform as error:
-            is_new = ((frame, frame_id) not in self._connected_pairs
-                      and "TF" not in self.problem_by_source)
+            is_new = (frame, frame_id) not in self._connected_pairs and "TF" not in self.problem_by_source
             raise MissingTransform(str(error), error.late or is_new) from None
         self._connected_pairs.add((frame, frame_id))
 
@@ -197,7 +188,8 @@ class Transforms:
         if base is not None and not 0.0 <= base[2, 3] <= 50.0:
             self.problem_by_source["base_frame"] = (
                 f"'{frame_id}' is {base[2, 3]:.2f} m above '{self.base_frame}', which must be on "
-                "the ground (as base_footprint is); ground.sensor_pose is used")
+                "the ground (as base_footprint is); ground.sensor_pose is used"
+            )
             base = None
         ahead = np.radians(self.node.node_params.input.ahead)
         upright = base
@@ -208,8 +200,7 @@ class Transforms:
         target = self._look_up("target_frame", self.target_frame, frame_id, stamp_ns)
         if target is None:
             return Placement(frame_id, base, level, None if level is None else invert_pose(level))
-        return Placement(self.target_frame, base, level,
-                         target if level is None else target @ invert_pose(level))
+        return Placement(self.target_frame, base, level, target if level is None else target @ invert_pose(level))
 
     def _look_up(self, what: str, frame: str, frame_id: str, stamp_ns: int) -> np.ndarray | None:
         """Return the pose of frame_id in the frame that the parameter `what` names, or None.
@@ -222,8 +213,9 @@ class Transforms:
         try:
             return self.tree.lookup(frame, frame_id, stamp_ns)
         except MissingTransform as error:
-            fallback = {"base_frame": "ground.sensor_pose is used",
-                        "target_frame": f"results are in '{frame_id}'"}[what]
+            fallback = {"base_frame": "ground.sensor_pose is used", "target_frame": f"results are in '{frame_id}'"}[
+                what
+            ]
             self.problem_by_source[what] = f"{what} '{frame}': {error}; {fallback}"
             return None
 
@@ -237,12 +229,10 @@ class Transforms:
             height = float(placement.base[2, 3])
             self.diagnostic_values["mount"] = f"{height:.3f} m above '{self.base_frame}'"
         if placement.base is not None or placement.level is not None:
-            params = replace(params, ground=replace(
-                params.ground, sensor_pose=SensorPoseParams(height=height)))
+            params = replace(params, ground=replace(params.ground, sensor_pose=SensorPoseParams(height=height)))
         return params
 
-    def crop_frame(self, frame: PointCloud, crop: CropParams, placement: Placement
-                   ) -> tuple[np.ndarray, PointCloud]:
+    def crop_frame(self, frame: PointCloud, crop: CropParams, placement: Placement) -> tuple[np.ndarray, PointCloud]:
         """Crop a frame, see robot.crop.crop_frame.
 
         The body of the robot is not cropped while base_frame has no transform.
@@ -250,13 +240,13 @@ class Transforms:
         self.problem_by_source.pop("crop.body", None)
         if crop.body and self.base_frame:
             if placement.base is None:
-                self.problem_by_source["crop.body"] = (
-                    "crop.body is not cropped: the pose in base_frame is unknown")
+                self.problem_by_source["crop.body"] = "crop.body is not cropped: the pose in base_frame is unknown"
                 crop = replace(crop, body=())
             elif crop.body[5] <= 0.0:
                 self.problem_by_source["crop.body"] = (
                     f"crop.body ends {-crop.body[5]:.2f} m below the ground of '{self.base_frame}'"
-                    "; give it in that frame, as the file of `setup` does")
+                    "; give it in that frame, as the file of `setup` does"
+                )
         level = placement.level
         pose = None if placement.base is not None else self._configured_pose()
         if level is None and pose is not None:
@@ -277,8 +267,7 @@ class Transforms:
 
     # Motion of the sensor
 
-    def sensor_poses(self, source: str, frame_id: str, at: np.ndarray,
-                     max_gap: float | None = None) -> np.ndarray:
+    def sensor_poses(self, source: str, frame_id: str, at: np.ndarray, max_gap: float | None = None) -> np.ndarray:
         """Return the poses of a frame of the robot in a fixed frame.
 
         Args:
@@ -314,8 +303,9 @@ class Transforms:
         except MissingTransform as error:
             reason = str(error).replace(FIXED, self.odometry_frame)
             reason = reason.replace(MOVING, self.odometry_child)
-            raise MissingTransform(f"{self.node.resolve_topic_name('~/input/odometry')}: {reason}",
-                                   error.late) from None
+            raise MissingTransform(
+                f"{self.node.resolve_topic_name('~/input/odometry')}: {reason}", error.late
+            ) from None
 
     def _find_child_poses(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
         """Return the (M or 1, 4, 4) poses of a frame in the child frame of the odometry."""
@@ -323,16 +313,14 @@ class Transforms:
             return np.eye(4)[None]
         if not self.odometry_child:
             topic = self.node.resolve_topic_name("~/input/odometry")
-            raise MissingTransform(f"the odometry on {topic} has an empty child_frame_id; "
-                                   "set it in the publisher")
+            raise MissingTransform(f"the odometry on {topic} has an empty child_frame_id; set it in the publisher")
         try:
             return self.tree.lookup_many(self.odometry_child, frame_id, at, max_gap)
         except MissingTransform as error:
             self.subscribe_to_tf()
             pose = self._configured_pose() if self.odometry_child == self.base_frame else None
             if pose is None:
-                raise MissingTransform(f"the odometry is of '{self.odometry_child}': {error}",
-                                       error.late) from None
+                raise MissingTransform(f"the odometry is of '{self.odometry_child}': {error}", error.late) from None
             return pose[None]
 
     def is_connected_to_odometry(self, frame_id: str) -> bool:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
-Color = tuple[int, int, int]   # r g b, 0..255
-DASH, GAP = 7.0, 5.0           # pixels of a dashed line
-MAX_RADIUS = 4                 # pixels of a point
-OUTLINE_COLOR = (10, 14, 22)   # of texts
+Color = tuple[int, int, int]  # r g b, 0..255
+DASH, GAP = 7.0, 5.0  # pixels of a dashed line
+MAX_RADIUS = 4  # pixels of a point
+OUTLINE_COLOR = (10, 14, 22)  # of texts
 DEPTH_STEPS = np.uint16(65535)  # points are sorted by their rounded depth
 
 
@@ -47,8 +47,7 @@ class Canvas:
         self.pixels = np.empty((height, width, 3), np.uint8)
         self.pixels[:] = color
 
-    def draw_points(self, at: np.ndarray, depth: np.ndarray, colors: np.ndarray,
-                    radius: np.ndarray) -> None:
+    def draw_points(self, at: np.ndarray, depth: np.ndarray, colors: np.ndarray, radius: np.ndarray) -> None:
         """Draw points as squares, near points over far ones.
 
         Args:
@@ -59,8 +58,9 @@ class Canvas:
         """
         reach = MAX_RADIUS
         column, row = np.floor(at).T
-        order = np.flatnonzero((column >= -reach) & (column < self.width + reach) & (row >= -reach)
-                               & (row < self.height + reach))
+        order = np.flatnonzero(
+            (column >= -reach) & (column < self.width + reach) & (row >= -reach) & (row < self.height + reach)
+        )
         if len(order) == 0:
             return
         depth = depth[order] - depth[order].min()
@@ -85,8 +85,9 @@ class Canvas:
             flat[np.clip(spread, 0, len(flat) - 1)] = values[rows, None]
         self.pixels = np.ascontiguousarray(image[reach:-reach, reach:-reach, :3])
 
-    def draw_lines(self, segments: ArrayLike, colors: ArrayLike, width: float = 1.5,
-                   alpha: ArrayLike = 1.0, dashed: bool = False) -> None:
+    def draw_lines(
+        self, segments: ArrayLike, colors: ArrayLike, width: float = 1.5, alpha: ArrayLike = 1.0, dashed: bool = False
+    ) -> None:
         """Draw antialiased lines.
 
         Args:
@@ -104,15 +105,15 @@ class Canvas:
         direction = end - start
         steep = np.abs(direction[:, 1]) > np.abs(direction[:, 0])
         # One sample per column (per row of a steep line), and several pixels across the line.
-        main = np.where(steep[:, None], np.stack([start[:, 1], end[:, 1]], axis=1),
-                        np.stack([start[:, 0], end[:, 0]], axis=1))
+        main = np.where(
+            steep[:, None], np.stack([start[:, 1], end[:, 1]], axis=1), np.stack([start[:, 0], end[:, 0]], axis=1)
+        )
         cells = np.floor(main).astype(np.int64)
         count = np.abs(cells[:, 1] - cells[:, 0]) + 1
         owner = np.repeat(np.arange(len(kept)), count)
         step = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
         cell = cells.min(axis=1)[owner] + step
-        share = (cell + 0.5 - main[owner, 0]) / np.where(
-            direction.any(axis=1), main[:, 1] - main[:, 0], 1.0)[owner]
+        share = (cell + 0.5 - main[owner, 0]) / np.where(direction.any(axis=1), main[:, 1] - main[:, 0], 1.0)[owner]
         share = np.clip(share, 0.0, 1.0)[:, None]
         at = start[owner] + share * direction[owner]
         length = np.maximum(np.hypot(*direction.T), 1e-9)
@@ -124,18 +125,15 @@ class Canvas:
         reach = int(np.ceil(width)) + 1
         across = np.where(steep[owner], at[:, 0], at[:, 1])
         pixels = np.floor(across)[:, None] + np.arange(-reach, reach + 1)
-        cover = np.clip(width / 2 + 0.5 - np.abs(pixels + 0.5 - across[:, None]) * cosine[:, None],
-                        0.0, 1.0)
+        cover = np.clip(width / 2 + 0.5 - np.abs(pixels + 0.5 - across[:, None]) * cosine[:, None], 0.0, 1.0)
         column = np.where(steep[owner, None], pixels, cell[:, None])
         row = np.where(steep[owner, None], cell[:, None], pixels)
         self._blend(column, row, cover * opacity[owner, None], np.asarray(colors)[owner])
 
-    def _blend(self, column: np.ndarray, row: np.ndarray, cover: np.ndarray,
-               colors: np.ndarray) -> None:
+    def _blend(self, column: np.ndarray, row: np.ndarray, cover: np.ndarray, colors: np.ndarray) -> None:
         """Blend colors (M, 3) into the pixels at column and row (M, P) with opacity cover (M, P).
         The most opaque value of a pixel counts."""
-        use = ((cover > 0) & (column >= 0) & (column < self.width) & (row >= 0)
-               & (row < self.height))
+        use = (cover > 0) & (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
         index = (row[use] * self.width + column[use]).astype(np.int64)
         opaque, owner = cover[use], np.nonzero(use)[0]
         order = np.argsort(opaque, kind="stable")
@@ -147,8 +145,7 @@ class Canvas:
         where, share = index[chosen], opaque[chosen, None]
         flat[where] = np.round(flat[where] * (1 - share) + colors[owner[chosen]] * share)
 
-    def _clip(self, segments: np.ndarray, width: float
-              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _clip(self, segments: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the indices of the K segments that touch the image, and start and end (K, 2) of
         their parts in it (Liang and Barsky, 1984)."""
         low = np.array([-width - 1.0] * 2)
@@ -159,10 +156,12 @@ class Canvas:
         outside = (direction == 0) & ((start < low) | (start > high))
         enter = np.where(direction == 0, 0.0, np.minimum(a, b)).max(axis=1).clip(0.0)
         leave = np.where(direction == 0, 1.0, np.maximum(a, b)).min(axis=1).clip(max=1.0)
-        kept = np.flatnonzero((enter < leave) & ~outside.any(axis=1)
-                              & np.isfinite(segments).all(axis=(1, 2)))
-        return (kept, start[kept] + enter[kept, None] * direction[kept],
-                start[kept] + leave[kept, None] * direction[kept])
+        kept = np.flatnonzero((enter < leave) & ~outside.any(axis=1) & np.isfinite(segments).all(axis=(1, 2)))
+        return (
+            kept,
+            start[kept] + enter[kept, None] * direction[kept],
+            start[kept] + leave[kept, None] * direction[kept],
+        )
 
     def fill_polygon(self, corners: np.ndarray, color: ArrayLike, alpha: float = 1.0) -> None:
         """Fill a convex polygon with corners (C, 2)."""
@@ -175,16 +174,17 @@ class Canvas:
             return
         x = np.arange(low[0], high[0]) + 0.5
         y = np.arange(low[1], high[1])[:, None] + 0.5
-        sides = [(b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
-                 for a, b in zip(corners, np.roll(corners, -1, axis=0))]
-        inside = np.all([side >= 0 for side in sides], axis=0) | np.all(
-            [side <= 0 for side in sides], axis=0)
-        part = self.pixels[low[1]:high[1], low[0]:high[0]]
+        sides = [
+            (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
+            for a, b in zip(corners, np.roll(corners, -1, axis=0))
+        ]
+        inside = np.all([side >= 0 for side in sides], axis=0) | np.all([side <= 0 for side in sides], axis=0)
+        part = self.pixels[low[1] : high[1], low[0] : high[0]]
         part[inside] = np.round(part[inside] * (1 - alpha) + np.asarray(color) * alpha)
 
     def paste(self, other: Canvas, column: int, row: int) -> None:
         """Copy another canvas onto this one, with its top left corner at column and row."""
-        self.pixels[row:row + other.height, column:column + other.width] = other.pixels
+        self.pixels[row : row + other.height, column : column + other.width] = other.pixels
 
     def draw_texts(self, items: Sequence[Text]) -> None:
         """Draw texts with a dark outline."""
@@ -193,8 +193,15 @@ class Canvas:
         image = Image.fromarray(self.pixels)
         draw = ImageDraw.Draw(image)
         for at, text, color, size, anchor in items:
-            draw.text((float(at[0]), float(at[1])), text, fill=color, font=load_font(size),
-                      anchor=anchor, stroke_width=max(1, size // 9), stroke_fill=OUTLINE_COLOR)
+            draw.text(
+                (float(at[0]), float(at[1])),
+                text,
+                fill=color,
+                font=load_font(size),
+                anchor=anchor,
+                stroke_width=max(1, size // 9),
+                stroke_fill=OUTLINE_COLOR,
+            )
         self.pixels = np.array(image)
 
 
@@ -202,4 +209,5 @@ class Canvas:
 def load_font(size: int) -> Any:
     """Load DejaVu Sans, which comes with matplotlib."""
     import matplotlib
+
     return ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", size)

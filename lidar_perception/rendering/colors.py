@@ -16,15 +16,27 @@ GRID = (38, 47, 64)
 DETECTED_COLORS = dict(zip(DETECTED, ((64, 186, 255), (255, 104, 80), (255, 212, 66))))
 # Metres above the ground: dull at the ground, light at the height of roofs.
 HEIGHTS = (-0.3, 0.15, 0.9, 1.8, 3.5, 7.0)
-HEIGHT_COLORS = np.array([[46, 66, 106], [70, 96, 142], [76, 140, 166], [126, 190, 184],
-                          [206, 216, 190], [224, 200, 210]], np.float32)
+HEIGHT_COLORS = np.array(
+    [[46, 66, 106], [70, 96, 142], [76, 140, 166], [126, 190, 184], [206, 216, 190], [224, 200, 210]], np.float32
+)
 GROUND_COLOR, UNCLUSTERED_COLOR = np.array([[92, 120, 158], [140, 153, 173]], np.uint8)
-CLUSTER_COLORS = np.array([  # muted, so that boxes stand out
-    [143, 120, 219], [84, 166, 158], [209, 143, 168], [128, 173, 97], [97, 143, 217],
-    [204, 166, 107], [173, 107, 173], [107, 179, 204], [194, 128, 112], [148, 158, 117]], np.uint8)
+CLUSTER_COLORS = np.array(
+    [  # muted, so that boxes stand out
+        [143, 120, 219],
+        [84, 166, 158],
+        [209, 143, 168],
+        [128, 173, 97],
+        [97, 143, 217],
+        [204, 166, 107],
+        [173, 107, 173],
+        [107, 179, 204],
+        [194, 128, 112],
+        [148, 158, 117],
+    ],
+    np.uint8,
+)
 INTENSITIES = (0.0, 0.15, 0.4, 1.0)
-INTENSITY_COLORS = np.array([[38, 52, 84], [74, 104, 150], [140, 180, 190], [250, 246, 220]],
-                            np.float32)
+INTENSITY_COLORS = np.array([[38, 52, 84], [74, 104, 150], [140, 180, 190], [250, 246, 220]], np.float32)
 
 
 def color_by_height(heights: np.ndarray) -> np.ndarray:

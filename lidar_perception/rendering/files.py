@@ -17,9 +17,9 @@ from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError
 
 VIDEO_SUFFIXES, ANIMATION_SUFFIXES = (".mp4", ".mkv", ".mov"), (".gif", ".webp")
-ANIMATED_WIDTH = 960   # pixels
-MAX_ANIMATED = 300     # pictures of an animation, which is held in memory
-TICKS = 1000           # per second
+ANIMATED_WIDTH = 960  # pixels
+MAX_ANIMATED = 300  # pictures of an animation, which is held in memory
+TICKS = 1000  # per second
 PNG_KEY, PNG_LEVEL = "lidar_perception", 3
 QUALITY = {"crf": "20", "preset": "veryfast"}
 
@@ -55,14 +55,18 @@ class Film(Protocol):
 def check_film(path: Path, count: int) -> None:
     """Raise InputError if a film of `count` pictures cannot be written to a path."""
     if path.suffix not in (*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES):
-        raise InputError(f"{path} is not a film: its name must end in one of "
-                         f"{', '.join((*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES))}")
+        raise InputError(
+            f"{path} is not a film: its name must end in one of {', '.join((*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES))}"
+        )
     if path.suffix in VIDEO_SUFFIXES and importlib.util.find_spec("av") is None:
-        raise InputError(f"{path} needs PyAV: pip install 'lidar_perception[video]', or use a "
-                         "name that ends in .gif or .webp")
+        raise InputError(
+            f"{path} needs PyAV: pip install 'lidar_perception[video]', or use a name that ends in .gif or .webp"
+        )
     if path.suffix in ANIMATION_SUFFIXES and count > MAX_ANIMATED:
-        raise InputError(f"{path} would have {count} pictures, and {path.suffix} files have at "
-                         f"most {MAX_ANIMATED}; use --limit, or a name that ends in .mp4")
+        raise InputError(
+            f"{path} would have {count} pictures, and {path.suffix} files have at "
+            f"most {MAX_ANIMATED}; use --limit, or a name that ends in .mp4"
+        )
 
 
 @contextmanager
@@ -76,8 +80,7 @@ def open_film(path: Path, size: tuple[int, int]) -> Iterator[Film]:
     partial = path.with_name(f".{path.stem}.incomplete{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        writer: Any = (_Video(partial, size) if path.suffix in VIDEO_SUFFIXES
-                       else _Animation(partial))
+        writer: Any = _Video(partial, size) if path.suffix in VIDEO_SUFFIXES else _Animation(partial)
         yield writer
         if writer.ticks:
             writer.close()
@@ -93,6 +96,7 @@ class _Video:
 
     def __init__(self, path: Path, size: tuple[int, int]) -> None:
         import av
+
         self.video = av
         self.container = av.open(str(path), "w")
         self.stream = self.container.add_stream("libx264", rate=30, options=QUALITY)
@@ -102,8 +106,9 @@ class _Video:
         self.ticks = 0
 
     def add(self, picture: np.ndarray, seconds: float) -> None:
-        frame = self.video.VideoFrame.from_ndarray(np.ascontiguousarray(
-            picture[:self.stream.height, :self.stream.width]), format="rgb24")
+        frame = self.video.VideoFrame.from_ndarray(
+            np.ascontiguousarray(picture[: self.stream.height, : self.stream.width]), format="rgb24"
+        )
         frame.pts, frame.time_base = self.ticks, Fraction(1, TICKS)
         self.ticks += max(1, round(seconds * TICKS))
         self.container.mux(self.stream.encode(frame))
@@ -132,5 +137,6 @@ class _Animation:
 
     def close(self) -> None:
         first, *others = self.pictures
-        first.save(self.path, save_all=True, append_images=others, duration=self.durations, loop=0,
-                   quality=80)  # ignored by GIF
+        first.save(
+            self.path, save_all=True, append_images=others, duration=self.durations, loop=0, quality=80
+        )  # ignored by GIF

@@ -22,20 +22,21 @@ from lidar_perception.rendering.colors import (
 from lidar_perception.rendering.views import NEAR, BirdsEye, Perspective, View, project_lines
 from lidar_perception.types import CLASSES, PointCloud
 
-EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4],
-                  [0, 4], [1, 5], [2, 6], [3, 7]])  # of box_corners
+EDGES = np.array(
+    [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]]
+)  # of box_corners
 FRONT, FLOOR = [0, 3, 7, 4], [0, 1, 2, 3]  # corners of the front and the bottom face
 OTHER_FACES = [[1, 2, 6, 5], [0, 1, 5, 4], [2, 3, 7, 6], [4, 5, 6, 7]]
 RING_POINTS = 180
 MIN_RANGE, MAX_RANGE_AHEAD, MAX_RANGE_AROUND = 6.0, 55.0, 45.0  # metres that a picture shows
 POINT_SHARE = 5e-4  # radius of a point, as a share of the range
-FOV = 60.0          # degrees
+FOV = 60.0  # degrees
 FAR_PERCENTILE = 98  # of the ranges of the points; it sets the range of a picture
-BEV_SHARE = 0.375   # of the width, for the bird's-eye view
-CLASS_SHARE = 0.5   # of the class colour in the colour of points in boxes
-ARROW_S = 1.0       # seconds of motion that an arrow shows
-SCALE_WIDTH = 110   # pixels of the colour scale
-MIN_SPEED = 0.5     # m/s; slower boxes have no arrow
+BEV_SHARE = 0.375  # of the width, for the bird's-eye view
+CLASS_SHARE = 0.5  # of the class colour in the colour of points in boxes
+ARROW_S = 1.0  # seconds of motion that an arrow shows
+SCALE_WIDTH = 110  # pixels of the colour scale
+MIN_SPEED = 0.5  # m/s; slower boxes have no arrow
 NO_BOXES = np.zeros((0, 7))
 
 
@@ -78,8 +79,9 @@ class Stage:
     height: int = 720
 
     @staticmethod
-    def of(scan: PointCloud, sensor_height: float, ahead: bool, color: str = "height",
-           size: tuple[int, int] = (1280, 720)) -> Stage:
+    def of(
+        scan: PointCloud, sensor_height: float, ahead: bool, color: str = "height", size: tuple[int, int] = (1280, 720)
+    ) -> Stage:
         """Return the stage for a film whose first scan is given."""
         far = np.percentile(horizontal_range(scan.xyz), FAR_PERCENTILE) if len(scan) else MIN_RANGE
         reach = float(np.clip(far, MIN_RANGE, MAX_RANGE_AHEAD if ahead else MAX_RANGE_AROUND))
@@ -91,12 +93,18 @@ class Stage:
         r, right = self.reach, round(self.width * BEV_SHARE)
         left = self.width - right
         if self.ahead:
-            behind = Perspective((-0.2 * r, -0.045 * r, 0.12 * r),
-                                 (0.24 * r, 0.01 * r, self.ground), FOV, left, self.height,
-                                 POINT_SHARE * r)
+            behind = Perspective(
+                (-0.2 * r, -0.045 * r, 0.12 * r),
+                (0.24 * r, 0.01 * r, self.ground),
+                FOV,
+                left,
+                self.height,
+                POINT_SHARE * r,
+            )
             return behind, BirdsEye((0.44 * r, 0.0), self.height / (1.14 * r), right, self.height)
-        behind = Perspective((-0.5 * r, -0.1 * r, 0.4 * r), (0.02 * r, 0.0, self.ground),
-                             FOV, left, self.height, POINT_SHARE * r)
+        behind = Perspective(
+            (-0.5 * r, -0.1 * r, 0.4 * r), (0.02 * r, 0.0, self.ground), FOV, left, self.height, POINT_SHARE * r
+        )
         return behind, BirdsEye((0.0, 0.0), self.height / (2.1 * r), right, self.height)
 
     @property
@@ -112,8 +120,15 @@ class Stage:
         return color_by_height(scan.xyz[:, 2] - np.float32(self.ground))
 
 
-def draw_frame(stage: Stage, scan: PointCloud, found: Boxes, labels: np.ndarray = NO_BOXES,
-               title: str = "", time: str = "", colors: np.ndarray | None = None) -> np.ndarray:
+def draw_frame(
+    stage: Stage,
+    scan: PointCloud,
+    found: Boxes,
+    labels: np.ndarray = NO_BOXES,
+    title: str = "",
+    time: str = "",
+    colors: np.ndarray | None = None,
+) -> np.ndarray:
     """Draw a frame as an image (height, width, 3) uint8 [r g b].
 
     Args:
@@ -143,13 +158,20 @@ def highlight_points(colors: np.ndarray, xyz: np.ndarray, found: Boxes) -> np.nd
     colors = colors.copy()
     rows, first = points_in_boxes(xyz, found.boxes, 0.1)
     for k, class_id in enumerate(found.class_ids):
-        inside = rows[first[k]:first[k + 1]]
+        inside = rows[first[k] : first[k + 1]]
         colors[inside] = CLASS_SHARE * np.array(get_class_color(class_id)) + (1 - CLASS_SHARE) * 240
     return colors
 
 
-def draw_view(canvas: Canvas, view: View, stage: Stage, xyz: np.ndarray, colors: np.ndarray,
-              found: Boxes, labels: np.ndarray = NO_BOXES) -> list[Text]:
+def draw_view(
+    canvas: Canvas,
+    view: View,
+    stage: Stage,
+    xyz: np.ndarray,
+    colors: np.ndarray,
+    found: Boxes,
+    labels: np.ndarray = NO_BOXES,
+) -> list[Text]:
     """Draw points (N, 3) in colors (N, 3), boxes and labels in one view; return its texts."""
     texts = _draw_rings(canvas, view, stage)
     pixels, depth = view.project(xyz)
@@ -159,10 +181,8 @@ def draw_view(canvas: Canvas, view: View, stage: Stage, xyz: np.ndarray, colors:
     tints = np.array([get_class_color(c) for c in found.class_ids], float).reshape(-1, 3)
     boxes = found.boxes.astype(float)
     _draw_trails(canvas, view, found, tints)
-    _draw_edges(canvas, view, labels.astype(float), np.tile(LABEL, (len(labels), 1)), 1.2,
-                dashed=True)
-    faces = [(FLOOR, 0.25)] if isinstance(view, BirdsEye) else [
-        *((face, 0.05) for face in OTHER_FACES), (FRONT, 0.3)]
+    _draw_edges(canvas, view, labels.astype(float), np.tile(LABEL, (len(labels), 1)), 1.2, dashed=True)
+    faces = [(FLOOR, 0.25)] if isinstance(view, BirdsEye) else [*((face, 0.05) for face in OTHER_FACES), (FRONT, 0.3)]
     ends, far = view.project(box_corners(boxes))
     for k in np.flatnonzero((far > NEAR).all(axis=1)):
         for face, alpha in faces:
@@ -179,11 +199,12 @@ def _draw_rings(canvas: Canvas, view: View, stage: Stage) -> list[Text]:
     arcs = np.stack([circle[:-1], circle[1:]], axis=1)
     circles = stage.rings[:, None, None, None] * arcs + [0, 0, stage.ground]
     canvas.draw_lines(project_lines(view, circles.reshape(-1, 2, 3)), GRID, 1.2)
-    places = np.stack([stage.rings * 0.8, stage.rings * -0.6,
-                       np.full(len(stage.rings), stage.ground)], axis=1)
-    return [Text(at, f"{radius:g} m", DIM, 11)
-            for at, far, radius in zip(*view.project(places), stage.rings)
-            if far > NEAR and _has_room(view, at)]
+    places = np.stack([stage.rings * 0.8, stage.rings * -0.6, np.full(len(stage.rings), stage.ground)], axis=1)
+    return [
+        Text(at, f"{radius:g} m", DIM, 11)
+        for at, far, radius in zip(*view.project(places), stage.rings)
+        if far > NEAR and _has_room(view, at)
+    ]
 
 
 def _draw_sensor(canvas: Canvas, view: View, stage: Stage) -> None:
@@ -204,12 +225,12 @@ def _draw_trails(canvas: Canvas, view: View, found: Boxes, tints: np.ndarray) ->
         lines.append(np.stack([low[:-1], low[1:]], axis=1))
         colors.append(np.tile(tint, (len(low) - 1, 1)))
         alphas.append(np.linspace(0.1, 0.9, len(low) - 1))
-    canvas.draw_lines(project_lines(view, np.concatenate(lines)), np.concatenate(colors), 2.5,
-                      np.concatenate(alphas))
+    canvas.draw_lines(project_lines(view, np.concatenate(lines)), np.concatenate(colors), 2.5, np.concatenate(alphas))
 
 
-def _draw_edges(canvas: Canvas, view: View, boxes: np.ndarray, colors: np.ndarray, width: float,
-                dashed: bool = False) -> None:
+def _draw_edges(
+    canvas: Canvas, view: View, boxes: np.ndarray, colors: np.ndarray, width: float, dashed: bool = False
+) -> None:
     """Draw the edges of boxes (K, 7) in colors (K, 3). In the bird's-eye view: the bottom edges,
     and a line from the centre to the front."""
     corners = box_corners(boxes)
@@ -231,19 +252,23 @@ def _draw_arrows(canvas: Canvas, view: View, found: Boxes, tints: np.ndarray) ->
     ahead = np.pad(found.velocities[moving] / speed, ((0, 0), (0, 1)))
     sideways = ahead[:, [1, 0, 2]] * [-1, 1, 0]
     end, size = start + ahead * speed * ARROW_S, np.minimum(0.8, 0.4 * speed)
-    lines = np.stack([np.stack([start, end], axis=1), *(
-        np.stack([end, end - size * (ahead + 0.5 * side * sideways)], axis=1) for side in (-1, 1))])
-    canvas.draw_lines(project_lines(view, lines.reshape(-1, 2, 3)),
-                      np.tile(tints[moving], (3, 1)), 1.7)
+    lines = np.stack(
+        [
+            np.stack([start, end], axis=1),
+            *(np.stack([end, end - size * (ahead + 0.5 * side * sideways)], axis=1) for side in (-1, 1)),
+        ]
+    )
+    canvas.draw_lines(project_lines(view, lines.reshape(-1, 2, 3)), np.tile(tints[moving], (3, 1)), 1.7)
 
 
 def _make_box_texts(view: View, found: Boxes) -> list[Text]:
     """Return the texts of the boxes, placed above them in the picture."""
     pixels, depth = view.project(box_corners(found.boxes.astype(float)))
-    return [Text((ends[:, 0].mean(), ends[:, 1].min() - 2), text, get_class_color(class_id), 12,
-                 "mb")
-            for ends, far, text, class_id in zip(pixels, depth, found.texts, found.class_ids)
-            if text and (far > NEAR).all() and _has_room(view, ends.mean(axis=0))]
+    return [
+        Text((ends[:, 0].mean(), ends[:, 1].min() - 2), text, get_class_color(class_id), 12, "mb")
+        for ends, far, text, class_id in zip(pixels, depth, found.texts, found.class_ids)
+        if text and (far > NEAR).all() and _has_room(view, ends.mean(axis=0))
+    ]
 
 
 def _has_room(view: View, at: np.ndarray) -> bool:
@@ -256,13 +281,14 @@ def _make_heading(stage: Stage, title: str, time: str) -> list[Text]:
     return [Text((16, 14), title, TEXT, 15, "lt"), Text((left - 16, 14), time, DIM, 15, "rt")]
 
 
-def _draw_legend(canvas: Canvas, stage: Stage, found: Boxes, labels: np.ndarray,
-                 scale: bool) -> list[Text]:
+def _draw_legend(canvas: Canvas, stage: Stage, found: Boxes, labels: np.ndarray, scale: bool) -> list[Text]:
     """Draw the colours of classes with their numbers of boxes, the line of labels, and the colour
     scale of the points; return the texts."""
     items, x, y = [], 18.0, stage.height - 20.0
-    entries = [(f"{CLASSES[c]} {np.count_nonzero(found.class_ids == c)}", get_class_color(c), False)
-               for c in np.unique(found.class_ids).tolist()]
+    entries = [
+        (f"{CLASSES[c]} {np.count_nonzero(found.class_ids == c)}", get_class_color(c), False)
+        for c in np.unique(found.class_ids).tolist()
+    ]
     if len(labels):
         entries.append((f"label {len(labels)}", LABEL, True))
     for text, color, dashed in entries:
@@ -275,6 +301,9 @@ def _draw_legend(canvas: Canvas, stage: Stage, found: Boxes, labels: np.ndarray,
     low, high, unit = (0, 1, "") if stage.color == "intensity" else (0, 4, " m")
     values = np.linspace(low, high, SCALE_WIDTH)
     bar = color_by_intensity(values) if stage.color == "intensity" else color_by_height(values)
-    canvas.pixels[top:top + 8, right - SCALE_WIDTH:right] = bar
-    return [*items, Text((right - SCALE_WIDTH - 6, y), f"{stage.color} {low}", DIM, 12, "rm"),
-            Text((right + 6, y), f"{high}{unit}", DIM, 12, "lm")]
+    canvas.pixels[top : top + 8, right - SCALE_WIDTH : right] = bar
+    return [
+        *items,
+        Text((right - SCALE_WIDTH - 6, y), f"{stage.color} {low}", DIM, 12, "rm"),
+        Text((right + 6, y), f"{high}{unit}", DIM, 12, "lm"),
+    ]

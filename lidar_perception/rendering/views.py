@@ -89,8 +89,7 @@ class BirdsEye:
     above: float = 1000.0
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        middle = [self.width / 2 + self.centre[1] * self.scale,
-                  self.height / 2 + self.centre[0] * self.scale]
+        middle = [self.width / 2 + self.centre[1] * self.scale, self.height / 2 + self.centre[0] * self.scale]
         pixels = np.array(middle, xyz.dtype) - xyz[..., 1::-1] * xyz.dtype.type(self.scale)
         return pixels, self.above - xyz[..., 2]
 

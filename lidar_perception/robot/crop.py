@@ -9,8 +9,9 @@ from lidar_perception.robot.poses import transform_points
 from lidar_perception.types import PointCloud
 
 
-def select_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None = None,
-                  level: np.ndarray | None = None) -> np.ndarray:
+def select_points(
+    xyz: np.ndarray, params: CropParams, base: np.ndarray | None = None, level: np.ndarray | None = None
+) -> np.ndarray:
     """Select the points (N, 3) in the sensor's frame that the crop keeps.
 
     A point on a limit of range or body is kept; a point on the edge of a sector is removed. Points
@@ -44,8 +45,9 @@ def select_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None =
     return kept
 
 
-def crop_frame(frame: PointCloud, params: CropParams, base: np.ndarray | None = None,
-               level: np.ndarray | None = None) -> tuple[np.ndarray, PointCloud]:
+def crop_frame(
+    frame: PointCloud, params: CropParams, base: np.ndarray | None = None, level: np.ndarray | None = None
+) -> tuple[np.ndarray, PointCloud]:
     """Crop a frame; base and level are those of select_points.
 
     Returns:

@@ -37,8 +37,9 @@ def deskew(xyz: np.ndarray, seconds: np.ndarray, poses: PoseLookup) -> np.ndarra
     which = np.zeros(len(xyz), np.intp)
     if count > 1:
         which = np.rint((seconds - low) * ((count - 1) / (high - low))).astype(np.intp)
-    return (np.einsum("nij,nj->ni", to_stamp[:, :3, :3].take(which, axis=0), xyz)
-            + to_stamp[:, :3, 3].take(which, axis=0))
+    return np.einsum("nij,nj->ni", to_stamp[:, :3, :3].take(which, axis=0), xyz) + to_stamp[:, :3, 3].take(
+        which, axis=0
+    )
 
 
 def skew(xyz: np.ndarray, seconds: np.ndarray, poses: PoseLookup) -> np.ndarray:
@@ -46,9 +47,11 @@ def skew(xyz: np.ndarray, seconds: np.ndarray, poses: PoseLookup) -> np.ndarray:
 
     xyz (N, 3) are in the sensor's frame at the stamp; point i is measured at seconds[i].
     """
+
     def invert_poses(at: np.ndarray) -> np.ndarray:
         found = poses(at)
         return invert_pose(invert_pose(found[-1]) @ found)
+
     return deskew(xyz, seconds, invert_poses)
 
 
@@ -63,9 +66,9 @@ def make_constant_motion(velocity: np.ndarray, rotation: np.ndarray) -> PoseLook
     def poses(at: np.ndarray) -> np.ndarray:
         found = np.tile(np.eye(4), (len(at), 1, 1))
         found[:, :3, :3] = Rotation.from_rotvec(at[:, None] * rotation).as_matrix()
-        found[:, :3, 3] = np.einsum("mij,j->mi", _mean_rotation(at, rotation),
-                                    velocity) * at[:, None]
+        found[:, :3, 3] = np.einsum("mij,j->mi", _mean_rotation(at, rotation), velocity) * at[:, None]
         return found
+
     return poses
 
 
@@ -83,4 +86,4 @@ def _mean_rotation(at: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     small = np.abs(at * speed) < 1e-4
     first = np.where(small, at * speed / 2, (1 - np.cos(angle)) / angle)
     second = np.where(small, (at * speed) ** 2 / 6, 1 - np.sin(angle) / angle)
-    return (np.eye(3) + first[:, None, None] * axis + second[:, None, None] * (axis @ axis))
+    return np.eye(3) + first[:, None, None] * axis + second[:, None, None] * (axis @ axis)

@@ -30,8 +30,7 @@ class Placement:
 
     def level_frame(self, frame: PointCloud) -> PointCloud:
         """Return the cloud in the level frame; the cloud itself if it is level already."""
-        return frame if self.level is None else replace(
-            frame, xyz=transform_points(frame.xyz, self.level))
+        return frame if self.level is None else replace(frame, xyz=transform_points(frame.xyz, self.level))
 
     def to_cloud_frame(self, xyz: np.ndarray) -> np.ndarray:
         """Transform points (N, 3) from the level frame to the cloud's frame."""
@@ -40,16 +39,16 @@ class Placement:
 
 def find_roll_pitch(base: np.ndarray) -> tuple[float, float]:
     """Return roll and pitch of a pose (4, 4) in an upright frame, in radians as in a URDF's rpy."""
-    return (float(np.arctan2(base[2, 1], base[2, 2])),
-            float(np.arctan2(-base[2, 0], np.hypot(base[2, 1], base[2, 2]))))
+    return (float(np.arctan2(base[2, 1], base[2, 2])), float(np.arctan2(-base[2, 0], np.hypot(base[2, 1], base[2, 2]))))
 
 
 def make_tilted_pose(roll: float, pitch: float, height: float = 0.0) -> np.ndarray:
     """Return the pose (4, 4) of a sensor at (0, 0, height), rotated by roll about x, then by pitch
     about y, in radians."""
     (sr, sp), (cr, cp) = np.sin([roll, pitch]), np.cos([roll, pitch])
-    return np.array([[cp, sp * sr, sp * cr, 0.0], [0.0, cr, -sr, 0.0],
-                     [-sp, cp * sr, cp * cr, height], [0.0, 0.0, 0.0, 1.0]])
+    return np.array(
+        [[cp, sp * sr, sp * cr, 0.0], [0.0, cr, -sr, 0.0], [-sp, cp * sr, cp * cr, height], [0.0, 0.0, 0.0, 1.0]]
+    )
 
 
 def find_level_transform(base: np.ndarray, ahead: float = 0.0) -> np.ndarray | None:

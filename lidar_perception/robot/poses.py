@@ -20,14 +20,14 @@ def make_pose(translation: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     """Make poses (..., 4, 4) of translations (..., 3) and quaternions (..., 4) [x y z w]."""
     translation = np.asarray(translation, np.float64)
     pose = np.zeros((*translation.shape[:-1], 4, 4))
-    pose[..., :3, :3] = Rotation.from_quat(np.reshape(quaternion, (-1, 4))).as_matrix().reshape(
-        *translation.shape[:-1], 3, 3)
+    pose[..., :3, :3] = (
+        Rotation.from_quat(np.reshape(quaternion, (-1, 4))).as_matrix().reshape(*translation.shape[:-1], 3, 3)
+    )
     pose[..., :3, 3], pose[..., 3, 3] = translation, 1.0
     return pose
 
 
-def check_pose(translation: ArrayLike, quaternion: ArrayLike,
-               what: str) -> tuple[np.ndarray, np.ndarray]:
+def check_pose(translation: ArrayLike, quaternion: ArrayLike, what: str) -> tuple[np.ndarray, np.ndarray]:
     """Return translation (3,) and quaternion (4,) [x y z w] as float64, normalised.
 
     Raises:
@@ -36,8 +36,7 @@ def check_pose(translation: ArrayLike, quaternion: ArrayLike,
     offset, rotation = np.asarray(translation, np.float64), np.asarray(quaternion, np.float64)
     length = np.linalg.norm(rotation)
     if not np.isfinite(offset).all() or not abs(length - 1.0) < UNIT_TOLERANCE:
-        raise InputError(f"{what} has no unit quaternion, or is not finite; its publisher is "
-                         "wrong")
+        raise InputError(f"{what} has no unit quaternion, or is not finite; its publisher is wrong")
     return offset, rotation / length
 
 
@@ -51,8 +50,9 @@ def invert_pose(pose: np.ndarray) -> np.ndarray:
     return inverse
 
 
-def interpolate_poses(times: np.ndarray, translations: np.ndarray, quaternions: np.ndarray,
-                      at: np.ndarray) -> np.ndarray:
+def interpolate_poses(
+    times: np.ndarray, translations: np.ndarray, quaternions: np.ndarray, at: np.ndarray
+) -> np.ndarray:
     """Interpolate poses (M, 4, 4) at times at (M,) int.
 
     Translations are interpolated linearly, quaternions on the shorter arc (slerp, Shoemake 1985).
@@ -70,8 +70,10 @@ def interpolate_poses(times: np.ndarray, translations: np.ndarray, quaternions: 
     share = ((at - times[first]) / (times[first + 1] - times[first]))[:, None]
     offsets, rotations = np.asarray(translations), Rotation.from_quat(quaternions)
     steps = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
-    return make_pose(offsets[first] + share * (offsets[first + 1] - offsets[first]),
-                     (rotations[first] * Rotation.from_rotvec(share * steps[first])).as_quat())
+    return make_pose(
+        offsets[first] + share * (offsets[first + 1] - offsets[first]),
+        (rotations[first] * Rotation.from_rotvec(share * steps[first])).as_quat(),
+    )
 
 
 def transform_points(xyz: np.ndarray, pose: np.ndarray) -> np.ndarray:

@@ -13,12 +13,14 @@ from lidar_perception.types import InputError
 
 SECOND_NS = 10**9
 KEPT_NS = 10 * SECOND_NS  # history of each transform, as in tf2
-MAX_KEPT = 10_000         # poses of each transform, at any rate
-MAX_FRAMES = 10_000       # bounds the memory if a publisher makes a new name for every message
-JUMP_NS = SECOND_NS       # a stamp this far before the last one means that a bag started again
-MAX_LAG_S = 10.0          # a longer gap between a stamp and a transform is hardly a lag
-CLOCKS = ("are they stamped by different clocks? Let the driver stamp clouds with the computer's "
-          "time, synchronise the sensor (PTP), or set use_sim_time everywhere")
+MAX_KEPT = 10_000  # poses of each transform, at any rate
+MAX_FRAMES = 10_000  # bounds the memory if a publisher makes a new name for every message
+JUMP_NS = SECOND_NS  # a stamp this far before the last one means that a bag started again
+MAX_LAG_S = 10.0  # a longer gap between a stamp and a transform is hardly a lag
+CLOCKS = (
+    "are they stamped by different clocks? Let the driver stamp clouds with the computer's "
+    "time, synchronise the sensor (PTP), or set use_sim_time everywhere"
+)
 
 
 class MissingTransform(InputError):
@@ -60,8 +62,7 @@ class _Link:
 
     def interpolate(self, at: np.ndarray, name: str, max_gap: float | None) -> np.ndarray:
         """Return poses (M, 4, 4) at times (M,) ns, as TransformTree.lookup_many describes."""
-        chosen = slice(0, 1) if self.static else self._select(int(at.min()), int(at.max()), name,
-                                                              max_gap)
+        chosen = slice(0, 1) if self.static else self._select(int(at.min()), int(at.max()), name, max_gap)
         values = np.array(self.values[chosen])
         return interpolate_poses(np.array(self.times[chosen]), values[:, :3], values[:, 3:], at)
 
@@ -73,14 +74,20 @@ class _Link:
         """
         times, ago = self.times, (end - self.times[-1]) / SECOND_NS
         if ago > 0 and (max_gap is None or ago > max_gap or len(times) == 1):
-            why = (f"has its publisher stopped? If not, {CLOCKS}" if ago > MAX_LAG_S else
-                   "is its publisher late, or has it stopped?")
-            raise MissingTransform(f"the newest transform of {name} is {ago:.3f} s older than "
-                                   f"needed; {why}", late=ago < 1.0)
+            why = (
+                f"has its publisher stopped? If not, {CLOCKS}"
+                if ago > MAX_LAG_S
+                else "is its publisher late, or has it stopped?"
+            )
+            raise MissingTransform(
+                f"the newest transform of {name} is {ago:.3f} s older than needed; {why}", late=ago < 1.0
+            )
         early = (times[0] - begin) / SECOND_NS
         if early > 0 and (max_gap is None or early > max_gap or len(times) == 1):
-            raise MissingTransform(f"the oldest transform of {name} is {early:.3f} s newer than "
-                                   "needed" + (f"; {CLOCKS}" if early > MAX_LAG_S else ""))
+            raise MissingTransform(
+                f"the oldest transform of {name} is {early:.3f} s newer than "
+                "needed" + (f"; {CLOCKS}" if early > MAX_LAG_S else "")
+            )
         first, last = bisect_right(times, begin) - 1, bisect_left(times, end)
         if early > 0:
             first, last = 0, max(last, 1)
@@ -89,8 +96,7 @@ class _Link:
         chosen = slice(first, last + 1)
         gap = max((b - a for a, b in pairwise(times[chosen])), default=0) / SECOND_NS
         if max_gap is not None and gap > max_gap:
-            raise MissingTransform(f"two transforms of {name} are {gap:.3f} s apart at the time "
-                                   "needed")
+            raise MissingTransform(f"two transforms of {name} are {gap:.3f} s apart at the time needed")
         return chosen
 
 
@@ -108,8 +114,15 @@ class TransformTree:
         self._keeps_all = keeps_all
         self.jumps = 0
 
-    def set(self, parent: str, child: str, stamp_ns: int, translation: Sequence[float] | np.ndarray,
-            quaternion: Sequence[float] | np.ndarray, static: bool = False) -> None:
+    def set(
+        self,
+        parent: str,
+        child: str,
+        stamp_ns: int,
+        translation: Sequence[float] | np.ndarray,
+        quaternion: Sequence[float] | np.ndarray,
+        static: bool = False,
+    ) -> None:
         """Set the pose of child in parent at a time, or at all times if it is static.
 
         A child that gets another parent leaves the first.
@@ -141,8 +154,7 @@ class TransformTree:
         self._links = {child: link for child, link in self._links.items() if link.static}
         self.jumps += 1
 
-    def lookup(self, target: str, source: str, stamp_ns: int,
-               max_gap: float | None = None) -> np.ndarray:
+    def lookup(self, target: str, source: str, stamp_ns: int, max_gap: float | None = None) -> np.ndarray:
         """Return the pose (4, 4) of source in target at a time: it transforms source to target.
 
         Raises:
@@ -150,8 +162,7 @@ class TransformTree:
         """
         return self.lookup_many(target, source, np.array([stamp_ns]), max_gap)[0]
 
-    def lookup_many(self, target: str, source: str, at: np.ndarray,
-                    max_gap: float | None = None) -> np.ndarray:
+    def lookup_many(self, target: str, source: str, at: np.ndarray, max_gap: float | None = None) -> np.ndarray:
         """Return the poses (M, 4, 4) of source in target at times (M,) int ns, M > 0.
 
         max_gap: seconds by which moving transforms are extrapolated before their first and after
@@ -164,10 +175,11 @@ class TransformTree:
         up, down = self.find_chain(source), self.find_chain(target)
         common = next((frame for frame in up if frame in set(down)), None)
         if common is None:
-            raise MissingTransform(f"TF does not connect '{source}' with '{target}': "
-                                   f"{self._describe(source, up)}, {self._describe(target, down)}")
-        return (invert_pose(self._compose(down, common, at, max_gap))
-                @ self._compose(up, common, at, max_gap))
+            raise MissingTransform(
+                f"TF does not connect '{source}' with '{target}': "
+                f"{self._describe(source, up)}, {self._describe(target, down)}"
+            )
+        return invert_pose(self._compose(down, common, at, max_gap)) @ self._compose(up, common, at, max_gap)
 
     def is_fixed(self, frame: str) -> bool:
         """Return True if a frame does not move in its parent, or has none."""
@@ -184,8 +196,9 @@ class TransformTree:
         while (link := self._links.get(chain[-1])) is not None:
             chain.append(link.parent)
             if link.parent in chain[:-1]:
-                raise MissingTransform(f"TF has a loop: {' -> '.join(chain)}; two nodes publish "
-                                       "contradicting transforms")
+                raise MissingTransform(
+                    f"TF has a loop: {' -> '.join(chain)}; two nodes publish contradicting transforms"
+                )
         return chain
 
     def _describe(self, frame: str, chain: list[str]) -> str:
@@ -194,10 +207,9 @@ class TransformTree:
         parents = {link.parent for link in self._links.values()}
         return f"'{frame}' is " + ("the root of a tree" if frame in parents else "not in TF")
 
-    def _compose(self, chain: list[str], common: str, at: np.ndarray,
-                 max_gap: float | None) -> np.ndarray:
+    def _compose(self, chain: list[str], common: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
         pose = np.broadcast_to(np.eye(4), (len(at), 4, 4))
-        for child in chain[:chain.index(common)]:
+        for child in chain[: chain.index(common)]:
             link = self._links[child]
             pose = link.interpolate(at, f"'{link.parent}' -> '{child}'", max_gap) @ pose
         return pose

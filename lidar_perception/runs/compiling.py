@@ -17,12 +17,11 @@ from pathlib import Path
 from time import perf_counter, sleep
 from typing import Any
 
-REPORT_AFTER_S = 1.0      # shorter compilations and waits are not reported
+REPORT_AFTER_S = 1.0  # shorter compilations and waits are not reported
 REPORT_INTERVAL_S = 10.0  # compilation time between two reports
 POLL_INTERVAL_S = 0.1
 
-COMPILING_MESSAGE = ("compiling numeric code for this machine, once: about a minute on a free "
-                     "core; the result is cached")
+COMPILING_MESSAGE = "compiling numeric code for this machine, once: about a minute on a free core; the result is cached"
 WAITING_MESSAGE = "waiting for another process to compile, or to load compiled code"
 
 
@@ -71,8 +70,7 @@ class _Compilation:
 
 
 @contextmanager
-def report_compilation(report: Callable[[str], object] | None = None,
-                       whole_detector: bool = False) -> Iterator[None]:
+def report_compilation(report: Callable[[str], object] | None = None, whole_detector: bool = False) -> Iterator[None]:
     """Report when Numba compiles for more than REPORT_AFTER_S within the block.
 
     Args:
@@ -88,8 +86,10 @@ def report_compilation(report: Callable[[str], object] | None = None,
         yield
         return
     from numba.core import event
+
     if report is None:
         from lidar_perception.runs.terminal import errors
+
         report = errors.print
     event.Listener.register(_Compilation)  # a base class would load numba at import
     _Compilation.current = compilation = _Compilation(report)
@@ -112,6 +112,7 @@ def report_compilation(report: Callable[[str], object] | None = None,
 def _is_cached() -> bool:
     """Return True if Numba's cache of a function that all detectors use is up to date."""
     from lidar_perception import geometry
+
     function: Any = geometry.counting_sort
     source = Path(geometry.__file__)
     if not hasattr(function, "stats"):  # NUMBA_DISABLE_JIT

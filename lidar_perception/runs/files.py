@@ -45,14 +45,14 @@ def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES, what: str = "")
         with open(check_regular(path), "rb") as stream:
             content = stream.read(max_bytes + 1)
         if len(content) > max_bytes:
-            raise InputError(f"{path} has more than {max_bytes} bytes, too many for a file of this "
-                             "kind; give another one")
+            raise InputError(
+                f"{path} has more than {max_bytes} bytes, too many for a file of this kind; give another one"
+            )
         return content.decode("utf-8-sig")  # editors on Windows write a byte order mark
     except OSError as error:
         raise InputError(f"cannot read {named}: {error.strerror or error}") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"cannot read {named}: it is not UTF-8 text ({error.reason} at byte "
-                         f"{error.start})") from None
+        raise InputError(f"cannot read {named}: it is not UTF-8 text ({error.reason} at byte {error.start})") from None
 
 
 @contextmanager
@@ -69,7 +69,7 @@ def convert_os_errors() -> Iterator[None]:
 def shorten_error(error: BaseException, length: int = 200) -> str:
     """Return the first line of an error's message, at most `length` characters, or its type."""
     line = (str(error).strip().splitlines() or [type(error).__name__])[0]
-    return line if len(line) <= length else f"{line[:length - 3]}..."
+    return line if len(line) <= length else f"{line[: length - 3]}..."
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -122,10 +122,13 @@ def refuse_other_files(folder: Path, ours: Iterable[str]) -> None:
     They would be removed together with the others.
     """
     ours = [*ours, "*.tmp"]
-    if others := sorted(path.name for path in folder.iterdir()
-                        if not any(fnmatch(path.name, pattern) for pattern in ours)):
-        raise InputError(f"{folder} has other files too ({len(others)}, such as {others[0]}), "
-                         "which would be removed; move them away, or give another name")
+    if others := sorted(
+        path.name for path in folder.iterdir() if not any(fnmatch(path.name, pattern) for pattern in ours)
+    ):
+        raise InputError(
+            f"{folder} has other files too ({len(others)}, such as {others[0]}), "
+            "which would be removed; move them away, or give another name"
+        )
 
 
 @contextmanager
@@ -146,8 +149,10 @@ def write_folder(path: Path, force: bool = False) -> Iterator[Path]:
         new = {file.relative_to(hidden) for file in hidden.rglob("*") if not file.is_dir()}
         old = {file.relative_to(path) for file in path.rglob("*") if not file.is_dir()}
         if left := sorted(old - new):
-            raise InputError(f"{path} has files that would not be replaced ({len(left)}, such as "
-                             f"{left[0]}); remove the folder yourself, or give another name")
+            raise InputError(
+                f"{path} has files that would not be replaced ({len(left)}, such as "
+                f"{left[0]}); remove the folder yourself, or give another name"
+            )
         if not path.exists():
             hidden.rename(path)
         for file in sorted(new if hidden.exists() else ()):

@@ -25,8 +25,7 @@ SYNC_S = 1.0  # longest time whose records are lost when the machine stops
 class Journal:
     """Open journal. lines: name of a finished frame -> its record as JSON."""
 
-    def __init__(self, path: Path, plan: dict[str, Any], lines: dict[str, str],
-                 stream: BufferedWriter) -> None:
+    def __init__(self, path: Path, plan: dict[str, Any], lines: dict[str, str], stream: BufferedWriter) -> None:
         self.path, self.plan, self.lines = path, plan, lines
         self._stream, self._synced = stream, monotonic()
 
@@ -39,8 +38,10 @@ class Journal:
             if monotonic() - self._synced > SYNC_S:
                 self.sync()
         except OSError as error:
-            raise InputError(f"cannot write {self.path}: {error.strerror}; finished frames are "
-                             "kept, and the same command resumes the run") from None
+            raise InputError(
+                f"cannot write {self.path}: {error.strerror}; finished frames are "
+                "kept, and the same command resumes the run"
+            ) from None
 
     def sync(self) -> None:
         """Flush the file to disk."""
@@ -56,9 +57,13 @@ class Journal:
 
 
 @contextmanager
-def open_journal(folder: Path, plan: dict[str, Any], *, force: bool = False,
-                 list_files: Callable[[Path], Iterable[Path]] = lambda folder: ()
-                 ) -> Iterator[Journal]:
+def open_journal(
+    folder: Path,
+    plan: dict[str, Any],
+    *,
+    force: bool = False,
+    list_files: Callable[[Path], Iterable[Path]] = lambda folder: (),
+) -> Iterator[Journal]:
     """Open the journal of a run in a folder, which is created if needed.
 
     It does not contain frames that were skipped before, so that they are tried again.
@@ -109,8 +114,10 @@ def _read_records(folder: Path, plan: dict[str, Any]) -> dict[str, str]:
     path = folder / JOURNAL_NAME
     if not path.exists():
         if any(not old.name.startswith(f".{JOURNAL_NAME}.") for old in folder.iterdir()):
-            raise InputError(f"{folder} exists already and has no run of this command; give "
-                             "another name, or --force to write into it")
+            raise InputError(
+                f"{folder} exists already and has no run of this command; give "
+                "another name, or --force to write into it"
+            )
         return {}
     try:
         head, *rest = path.read_text(errors="replace").split("\n")
@@ -118,8 +125,9 @@ def _read_records(folder: Path, plan: dict[str, Any]) -> dict[str, str]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"cannot read {path}: {error!r}; --force starts again") from None
     if different := find_differences(before, json.loads(json.dumps(plan))):
-        raise InputError(f"{folder} was begun with {'; '.join(different)}; give another name, or "
-                         "start again with --force")
+        raise InputError(
+            f"{folder} was begun with {'; '.join(different)}; give another name, or start again with --force"
+        )
     return {record["frame"]: line for line in rest if (record := _parse_record(line))}
 
 

@@ -30,8 +30,9 @@ EXIT_TIMEOUT_S = 30.0  # for processes that have been asked to end
 RUNS_PER_PROCESS = 16  # of consecutive items, which often share work (scans of one street)
 
 
-def run_in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, jobs: int,
-                     what: str, *, apart: bool = False) -> Generator:
+def run_in_processes(
+    start: Callable[[], Callable[[Any], Any]], items: Sequence, jobs: int, what: str, *, apart: bool = False
+) -> Generator:
     """Yield start()(item) of all items, in the order in which they are finished.
 
     Processes are forked from a process that has only imported the modules of `start`. Several
@@ -55,8 +56,7 @@ def run_in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence,
     try:
         for j in range(jobs):
             receiver, sender = context.Pipe(duplex=False)
-            running[receiver] = _start_process(context, _run_items, start,
-                                               deal_items(items, jobs, j), jobs > 1, sender)
+            running[receiver] = _start_process(context, _run_items, start, deal_items(items, jobs, j), jobs > 1, sender)
         while running:
             for receiver in cast(list[Connection], wait(list(running))):
                 yield from _receive_result(receiver, running, what)
@@ -70,12 +70,12 @@ def deal_items(items: Sequence, jobs: int, job: int) -> list:
     The shares differ by one run at most, which is at most 1 / RUNS_PER_PROCESS of a share.
     """
     run = max(1, len(items) // (jobs * RUNS_PER_PROCESS))
-    return [item for first in range(job * run, len(items), jobs * run)
-            for item in items[first:first + run]]
+    return [item for first in range(job * run, len(items), jobs * run) for item in items[first : first + run]]
 
 
-def run_in_order(start: Callable[[], Callable[[Any], Any]], items: Iterable, jobs: int, ahead: int,
-                 what: str) -> Generator:
+def run_in_order(
+    start: Callable[[], Callable[[Any], Any]], items: Iterable, jobs: int, ahead: int, what: str
+) -> Generator:
     """Yield start()(item) of all items, which may be endless, in their order.
 
     As run_in_processes, but a single job also gets a new process of one thread. Each process works
@@ -137,14 +137,12 @@ def _find_modules(work: Any) -> set[str]:
     An object may name in `later_imports` the modules that its methods will import.
     """
     if isinstance(work, partial):
-        return set[str]().union(*map(_find_modules,
-                                     (work.func, *work.args, *work.keywords.values())))
+        return set[str]().union(*map(_find_modules, (work.func, *work.args, *work.keywords.values())))
     later = getattr(getattr(work, "__self__", work), "later_imports", ())
     return {getattr(work, "__module__", "builtins"), *later}
 
 
-def _receive_result(receiver: Connection, running: dict[Connection, ForkServerProcess],
-                    what: str) -> Iterator:
+def _receive_result(receiver: Connection, running: dict[Connection, ForkServerProcess], what: str) -> Iterator:
     """Yield the next result, or nothing if the process has ended normally.
 
     Raises:
@@ -156,9 +154,10 @@ def _receive_result(receiver: Connection, running: dict[Connection, ForkServerPr
         process = running.pop(receiver)
         process.join()
         if process.exitcode:
-            raise InputError(f"a process that {what} ended with exit code {process.exitcode}"
-                             + (", perhaps out of memory: try fewer --jobs"
-                                if process.exitcode == -signal.SIGKILL else "")) from None
+            raise InputError(
+                f"a process that {what} ended with exit code {process.exitcode}"
+                + (", perhaps out of memory: try fewer --jobs" if process.exitcode == -signal.SIGKILL else "")
+            ) from None
         return
     if error is not None:
         raise InputError(error)

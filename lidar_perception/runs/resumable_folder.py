@@ -15,12 +15,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lidar_perception.runs.files import (
-    refuse_other_files,
-    remove_temporaries,
-    write_bytes,
-    write_text,
-)
+from lidar_perception.runs.files import refuse_other_files, remove_temporaries, write_bytes, write_text
 from lidar_perception.runs.resuming import find_differences, lock_folder
 from lidar_perception.types import InputError
 
@@ -33,9 +28,9 @@ def is_finished(folder: Path) -> bool:
 
 
 @contextmanager
-def make_resumable_folder(folder: Path, settings: dict, names: Iterable[str], *,
-                          resume: bool = False,
-                          force: bool = False) -> Iterator[list[int]]:
+def make_resumable_folder(
+    folder: Path, settings: dict, names: Iterable[str], *, resume: bool = False, force: bool = False
+) -> Iterator[list[int]]:
     """Yield the numbers of the frames that are still to be written.
 
     The caller ends each frame with finish_frame(). After the block, the folder is complete; after
@@ -80,17 +75,14 @@ def _begin(folder: Path, settings: dict, names: Iterable[str], resume: bool, for
     exists = any(folder.iterdir())
     ours = (folder / INCOMPLETE_NAME).is_file() or (folder / RECORD_NAME).is_file()
     if exists and not (resume or force):
-        raise InputError(f"{folder} exists already; give another name"
-                         + (", --resume or --force" if ours else ""))
+        raise InputError(f"{folder} exists already; give another name" + (", --resume or --force" if ours else ""))
     if exists and not ours:
-        raise InputError(f"{folder} is not a simulated data set, so it is left as it is; give "
-                         "another name")
+        raise InputError(f"{folder} is not a simulated data set, so it is left as it is; give another name")
     if exists and resume:
         _check_settings(folder, settings)
         return
     refuse_other_files(folder, (*names, INCOMPLETE_NAME, RECORD_NAME, PARTS_NAME))
-    write_text(folder / INCOMPLETE_NAME,
-               "{}")  # a stop while files are removed leaves what only force takes
+    write_text(folder / INCOMPLETE_NAME, "{}")  # a stop while files are removed leaves what only force takes
     for old in folder.iterdir():
         if old.is_dir() and not old.is_symlink():
             shutil.rmtree(old)
@@ -107,11 +99,12 @@ def _check_settings(folder: Path, settings: dict) -> None:
     except (OSError, ValueError, AttributeError) as error:
         raise InputError(f"cannot read {path}: {error}; --force starts again") from None
     if not before:
-        raise InputError(f"{folder} was stopped while --force removed what was there; start again "
-                         "with --force")
+        raise InputError(f"{folder} was stopped while --force removed what was there; start again with --force")
     if different:
-        raise InputError(f"{folder} was begun with {'; '.join(different)}; resume it with the same "
-                         "arguments, or start again with --force")
+        raise InputError(
+            f"{folder} was begun with {'; '.join(different)}; resume it with the same "
+            "arguments, or start again with --force"
+        )
 
 
 def _join(folder: Path, frames: int) -> None:
@@ -121,8 +114,7 @@ def _join(folder: Path, frames: int) -> None:
         try:
             shares = json.loads(_part_path(folder, i).read_text())
         except (OSError, ValueError) as error:
-            raise InputError(f"cannot read {_part_path(folder, i)}: {error}; remove it and "
-                             "--resume") from None
+            raise InputError(f"cannot read {_part_path(folder, i)}: {error}; remove it and --resume") from None
         for name, text in shares.items():
             whole.setdefault(name, []).append(text)
     for name, texts in whole.items():

@@ -65,6 +65,7 @@ MAX_WIDTH = 100_000  # characters, wider than any table
 console = Terminal()
 errors = Terminal(stderr=True)
 
+
 @contextmanager
 def show_input_warnings() -> Iterator[None]:
     """Print each InputWarning once, as one line on standard error."""
@@ -72,8 +73,7 @@ def show_input_warnings() -> Iterator[None]:
         warnings.filterwarnings("once", category=InputWarning)
         show = warnings.showwarning
 
-        def print_line(message: Warning | str, category: type[Warning], *args: Any,
-                       **kwargs: Any) -> None:
+        def print_line(message: Warning | str, category: type[Warning], *args: Any, **kwargs: Any) -> None:
             if issubclass(category, InputWarning):
                 errors.print(Text("warning", "yellow") + f": {message}")
             else:
@@ -93,9 +93,16 @@ def make_progress() -> Progress:
     same information every LOG_INTERVAL_S seconds.
     """
     return (Progress if errors.is_terminal else _LineProgress)(
-        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
-        TimeElapsedColumn(), TimeRemainingColumn(), console=errors, transient=True,
-        auto_refresh=errors.is_terminal, disable=not errors.is_terminal)
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=errors,
+        transient=True,
+        auto_refresh=errors.is_terminal,
+        disable=not errors.is_terminal,
+    )
 
 
 class _LineProgress(Progress):
@@ -125,13 +132,14 @@ class _LineProgress(Progress):
             return
         total = "" if task.total is None else f" of {task.total:.0f}"
         left = task.time_remaining
-        errors.print(f"{task.description}: {task.completed:.0f}{total}"
-                     + ("" if left is None else f", {format_duration(left)} left"))
+        errors.print(
+            f"{task.description}: {task.completed:.0f}{total}"
+            + ("" if left is None else f", {format_duration(left)} left")
+        )
 
 
 def show_scanning(path: Path) -> Status:
-    """Show a status line while the times of all frames are read, which may take minutes for a bag.
-    """
+    """Show a status line while the times of all frames are read, which may take minutes for a bag."""
     return errors.status(Text(f"looking through {path}"))
 
 
@@ -156,5 +164,10 @@ def show_progress(items: Iterable, description: str, total: int) -> Iterator:
 
 def format_duration(seconds: float) -> str:
     """Format a duration for reading: 40 s, 12 min, 1.5 h."""
-    return (f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min" if seconds < 5400
-            else f"{seconds / 3600:.1f} h")
+    return (
+        f"{seconds:.0f} s"
+        if seconds < 90
+        else f"{seconds / 60:.0f} min"
+        if seconds < 5400
+        else f"{seconds / 3600:.1f} h"
+    )

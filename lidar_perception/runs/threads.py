@@ -33,8 +33,7 @@ def thread_count() -> int:
     """Return the number of threads of networks: as set, or as OMP_NUM_THREADS says, or one per
     core."""
     by_environment = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
-    return _thread_count or (int(by_environment) if by_environment.isdigit() else 0) or (
-        count_cores())
+    return _thread_count or (int(by_environment) if by_environment.isdigit() else 0) or (count_cores())
 
 
 def use_passive_waiting() -> None:
@@ -69,6 +68,7 @@ def limit_to_one_thread() -> None:
     threads for matrices in each.
     """
     from threadpoolctl import threadpool_limits  # imported here to keep commands fast
+
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     threadpool_limits(1)
     set_thread_count(1)

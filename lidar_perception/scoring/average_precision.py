@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
-STEPS = 40            # of recall from 0 to 1
-MIN_OBJECTS = STEPS + 1       # objects needed to fill all points
+STEPS = 40  # of recall from 0 to 1
+MIN_OBJECTS = STEPS + 1  # objects needed to fill all points
 
 
 def choose_thresholds(scores: np.ndarray, objects: int) -> np.ndarray:
@@ -45,7 +45,7 @@ def sample_curve(values: np.ndarray, objects: int, official: bool = False) -> np
     best = np.maximum.accumulate(values[::-1])[::-1]
     curve = np.zeros(MIN_OBJECTS)
     if objects >= MIN_OBJECTS or official:
-        curve[:len(best)] = best
+        curve[: len(best)] = best
         return curve
     # the first true positive that reaches the recall
     index = np.maximum((np.arange(MIN_OBJECTS) * objects + STEPS - 1) // STEPS - 1, 0)

@@ -13,12 +13,7 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.data.kitti.results import (
-    choose_calibration,
-    find_result_folder,
-    read_results,
-    write_results,
-)
+from lidar_perception.data.kitti.results import choose_calibration, find_result_folder, read_results, write_results
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.runs import journal
 from lidar_perception.types import Detections, GroundTruth, InputError, PointCloud, RunError
@@ -62,8 +57,9 @@ def draw_subset(count: int, share: float, name: str) -> np.ndarray:
     return np.random.default_rng(zlib.crc32(name.encode())).random(count) < share
 
 
-def run_detector(detector: Detector, frame: Frame, truth: GroundTruth | None,
-                 calibration: Calibration | None, keep: float = 1.0) -> FrameDetections[Detections]:
+def run_detector(
+    detector: Detector, frame: Frame, truth: GroundTruth | None, calibration: Calibration | None, keep: float = 1.0
+) -> FrameDetections[Detections]:
     """Run a detector on a share `keep` of the points of a frame.
 
     Raises InputError if the scan cannot be read.
@@ -75,15 +71,13 @@ def run_detector(detector: Detector, frame: Frame, truth: GroundTruth | None,
     except RunError:
         raise
     except InputError as error:
-        return FrameDetections(frame.name, truth, Detections.none(), calibration,
-                               problem=str(error))
-    return FrameDetections(frame.name, truth, found.detections, calibration,
-                           (perf_counter() - begin) * 1e3)
+        return FrameDetections(frame.name, truth, Detections.none(), calibration, problem=str(error))
+    return FrameDetections(frame.name, truth, found.detections, calibration, (perf_counter() - begin) * 1e3)
 
 
-def measure_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
-                     recording: Recording
-                     ) -> Callable[[Frame], FrameDetections[Detections] | None]:
+def measure_detector(
+    open_: Callable[[], Detector], keep: float, folder: Path | None, recording: Recording
+) -> Callable[[Frame], FrameDetections[Detections] | None]:
     """Make a function that runs the detector of open_() on each labelled frame.
 
     partial(measure_detector, open_, keep, folder) is a Start of scoring.run.
@@ -101,16 +95,15 @@ def measure_detector(open_: Callable[[], Detector], keep: float, folder: Path | 
         result = run_detector(detector, frame, truth, calibration, keep)
         if folder is not None:
             try:
-                write_results(folder / f"{frame.name}.txt", result.detections,
-                              choose_calibration(frame)[0])
+                write_results(folder / f"{frame.name}.txt", result.detections, choose_calibration(frame)[0])
             except InputError as error:  # disk error, or values that are not finite
                 raise RunError(str(error)) from None
         return result
+
     return measure
 
 
-def measure_result_files(folder: Path, recording: Recording
-                         ) -> Callable[[Frame], FrameDetections[GroundTruth] | None]:
+def measure_result_files(folder: Path, recording: Recording) -> Callable[[Frame], FrameDetections[GroundTruth] | None]:
     """Make a function that reads the KITTI result file folder/NAME.txt of each labelled frame.
 
     folder may be a run of `detect`; frames that the run skipped are skipped.
@@ -126,9 +119,9 @@ def measure_result_files(folder: Path, recording: Recording
         if frame.name in skipped:
             raise InputError(skipped[frame.name])
         try:
-            found = read_results(files / f"{frame.name}.txt",
-                                 choose_calibration(frame)[0].lidar_to_camera)
+            found = read_results(files / f"{frame.name}.txt", choose_calibration(frame)[0].lidar_to_camera)
         except InputError as error:
             raise RunError(str(error)) from None
         return FrameDetections(frame.name, truth, found, calibration)
+
     return measure

@@ -31,12 +31,16 @@ def group_frames(names: Sequence[str], follow: bool = False) -> list[np.ndarray]
         drives.setdefault(name.rpartition("/")[0] or ("" if follow else f"/{i}"), []).append(i)
     if len(drives) >= MIN_DRIVES:
         return [*map(np.array, drives.values())]
-    return [np.array(frames[i:i + BLOCK_FRAMES]) for frames in drives.values()
-            for i in range(0, len(frames), BLOCK_FRAMES)]
+    return [
+        np.array(frames[i : i + BLOCK_FRAMES])
+        for frames in drives.values()
+        for i in range(0, len(frames), BLOCK_FRAMES)
+    ]
 
 
-def compute_interval(score: Callable[[np.ndarray], float | None], parts: Sequence[np.ndarray],
-                     count: int) -> list[float] | None:
+def compute_interval(
+    score: Callable[[np.ndarray], float | None], parts: Sequence[np.ndarray], count: int
+) -> list[float] | None:
     """Return [low, high] of score(frames) over `count` draws of the groups in parts.
 
     frames (F,) are indices. Returns None for fewer than two groups, or if no draw has a score.

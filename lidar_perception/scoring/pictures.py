@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 def save_picture(path: str | Path, figure: Figure, **options) -> None:
     """Write a figure as PNG and close it. Raise InputError if it cannot be written."""
     import matplotlib.pyplot as plt
+
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -33,8 +33,13 @@ def read_results(path: Path, *topics: str) -> list[list[RecordedResult]]:
     found = read_objects_by_stamp(opened.bag(), (*topics, TRUTH))
     truth = found[TRUTH]
     poses = BagPoses(opened, next((each.frame_id for each in truth.values()), ""))
-    return [[RecordedResult(stamp, truth[stamp], poses.to_cloud_frame(found[topic][stamp], topic))
-             for stamp in sorted(found[topic].keys() & truth.keys())] for topic in topics]
+    return [
+        [
+            RecordedResult(stamp, truth[stamp], poses.to_cloud_frame(found[topic][stamp], topic))
+            for stamp in sorted(found[topic].keys() & truth.keys())
+        ]
+        for topic in topics
+    ]
 
 
 def read_objects_by_stamp(bag: Bag, topics: Iterable[str]) -> dict[str, dict[int, MarkedObjects]]:

@@ -31,7 +31,7 @@ from lidar_perception.types import InputError, RunError
 Start = Callable[[Recording], Callable[[Frame], Any]]
 
 CONNECT_S = 20.0  # timeout for a Dask scheduler and its first worker
-TASKS_PER_THREAD = 2         # on a Dask cluster
+TASKS_PER_THREAD = 2  # on a Dask cluster
 
 
 class Report(Protocol):
@@ -50,8 +50,16 @@ class Skipped(str):
     """Reason why a frame was not measured."""
 
 
-def fill(report: Report, recording: Recording, start: Start, *, limit: int | None = None,
-         jobs: int = 1, dask: str | None = None, title: str = "evaluating") -> None:
+def fill(
+    report: Report,
+    recording: Recording,
+    start: Start,
+    *,
+    limit: int | None = None,
+    jobs: int = 1,
+    dask: str | None = None,
+    title: str = "evaluating",
+) -> None:
     """Update a report with the results of a recording under a progress bar.
 
     Skipped frames are added to report.skipped. Without a limit these include labels whose scan is
@@ -75,8 +83,16 @@ def fill(report: Report, recording: Recording, start: Start, *, limit: int | Non
         report.skipped.extend(reason for _, reason in recording.missing_scans)
 
 
-def fill_journal(journal: Journal, recording: Recording, start: Start, names: Sequence[str], *,
-                 jobs: int = 1, dask: str | None = None, title: str) -> None:
+def fill_journal(
+    journal: Journal,
+    recording: Recording,
+    start: Start,
+    names: Sequence[str],
+    *,
+    jobs: int = 1,
+    dask: str | None = None,
+    title: str,
+) -> None:
     """Measure frames and add each result to a journal as soon as it is complete.
 
     Frames that are already in the journal are not measured again. measure() returns a JSON object
@@ -93,12 +109,12 @@ def fill_journal(journal: Journal, recording: Recording, start: Start, names: Se
     found = measure_frames(recording, start, missing, jobs=jobs, dask=dask)
     with closing(found):
         for i, line in show_progress(found, title, len(missing)):
-            journal.add(json.dumps({"frame": names[i], "skipped": str(line)})
-                        if isinstance(line, Skipped) else line)
+            journal.add(json.dumps({"frame": names[i], "skipped": str(line)}) if isinstance(line, Skipped) else line)
 
 
-def measure_frames(recording: Recording, start: Start, numbers: Sequence[int] | None = None, *,
-                   jobs: int = 1, dask: str | None = None) -> Generator[tuple[int, Any]]:
+def measure_frames(
+    recording: Recording, start: Start, numbers: Sequence[int] | None = None, *, jobs: int = 1, dask: str | None = None
+) -> Generator[tuple[int, Any]]:
     """Yield (i, result of frame i, or Skipped) in the order of the frames.
 
     Args:
@@ -119,8 +135,7 @@ def measure_frames(recording: Recording, start: Start, numbers: Sequence[int] | 
     return _measure_in_process(recording, start, numbers)
 
 
-def sort_results(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]
-                 ) -> Generator[tuple[int, Any]]:
+def sort_results(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]) -> Generator[tuple[int, Any]]:
     """Yield pairs (number, value) in the order of `numbers`, each as early as possible."""
     waiting: dict[int, Any] = {}
     wanted = iter(numbers)
@@ -132,8 +147,7 @@ def sort_results(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]
             following = next(wanted, None)
 
 
-def _measure_in_process(recording: Recording, start: Start,
-                        numbers: Sequence[int]) -> Generator[tuple[int, Any]]:
+def _measure_in_process(recording: Recording, start: Start, numbers: Sequence[int]) -> Generator[tuple[int, Any]]:
     measure, wanted = start(recording), set(numbers)
     for i, frame in enumerate(islice(recording, max(wanted, default=-1) + 1)):
         if i in wanted:
@@ -168,40 +182,42 @@ def _make_worker(reopen: Callable[[], Recording], start: Start) -> Callable[[int
 _get_worker = functools.lru_cache(maxsize=1)(lambda run, reopen, start: _make_worker(reopen, start))
 
 
-def _measure_on_cluster(run: str, reopen: Callable[[], Recording], start: Start,
-                        i: int) -> tuple[int, Any]:
+def _measure_on_cluster(run: str, reopen: Callable[[], Recording], start: Start, i: int) -> tuple[int, Any]:
     """Measure a frame in a process that other runs may share."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # for libraries that are loaded later
     with threadpool_limits(1):
         return _get_worker(run, reopen, start)(i)
 
 
-def _measure_on_dask(address: str, recording: Recording, start: Start,
-                     numbers: Sequence[int]) -> Iterator[tuple[int, Any]]:
+def _measure_on_dask(
+    address: str, recording: Recording, start: Start, numbers: Sequence[int]
+) -> Iterator[tuple[int, Any]]:
     """Yield results in the order in which the workers of a Dask cluster finish."""
     try:
         import distributed
         from distributed.comm import CommClosedError
     except ImportError:
-        raise InputError("--dask needs the package distributed; run pip install "
-                         "'lidar_perception[distributed]'") from None
+        raise InputError(
+            "--dask needs the package distributed; run pip install 'lidar_perception[distributed]'"
+        ) from None
     work = functools.partial(_measure_on_cluster, uuid4().hex, _require_reopen(recording), start)
     try:
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
         client.wait_for_workers(1, timeout=CONNECT_S)
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot reach a Dask scheduler with workers at {address}: "
-                         f"{str(error) or repr(error)}") from None
+        raise InputError(
+            f"cannot reach a Dask scheduler with workers at {address}: {str(error) or repr(error)}"
+        ) from None
     with client:
         ahead = TASKS_PER_THREAD * sum(client.nthreads().values())
         waiting = iter(numbers)
-        running = distributed.as_completed(client.map(work, [*islice(waiting, ahead)], pure=False),
-                                           loop=client.loop)
+        running = distributed.as_completed(client.map(work, [*islice(waiting, ahead)], pure=False), loop=client.loop)
         try:
             for future in running:
                 yield future.result()
                 for number in islice(waiting, 1):
                     running.add(client.submit(work, number, pure=False))
         except (distributed.KilledWorker, CommClosedError, CancelledError) as error:
-            raise InputError(f"the Dask cluster at {address} failed: {error}; finished frames are "
-                             "kept, and the same command resumes") from None
+            raise InputError(
+                f"the Dask cluster at {address} failed: {error}; finished frames are kept, and the same command resumes"
+            ) from None

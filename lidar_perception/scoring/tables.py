@@ -52,5 +52,4 @@ def print_skipped(lines: list[str], console: Console) -> None:
     for line in lines[:MAX_SHOWN]:
         console.print(Text("skipped", "yellow") + f": {line}")
     if len(lines) > MAX_SHOWN:
-        console.print(Text("skipped", "yellow")
-                      + f": {len(lines) - MAX_SHOWN} more, see the JSON file")
+        console.print(Text("skipped", "yellow") + f": {len(lines) - MAX_SHOWN} more, see the JSON file")

@@ -17,7 +17,7 @@ from lidar_perception.simulation.trajectory import Trajectory
 
 HEAD_ROOM_M = 2.2  # higher parts do not block anyone
 SIGHT_M, FAR_SIGHT_M = 80.0, 120.0  # farther things are left out of a moment; the latter for
-LARGE_M = 5.0                       # things of this size
+LARGE_M = 5.0  # things of this size
 STEP_S = 0.1  # between the positions of a robot that others keep clear of
 
 
@@ -51,9 +51,18 @@ class Actor:
         y0, y1 = min(y0, -width / 2), max(y1, width / 2)
         x, y = (x0 + x1) / 2, (y0 + y1) / 2
         ahead, aside = cos(self.heading), sin(self.heading)
-        return np.array([self.x + ahead * x - aside * y, self.y + aside * x + ahead * y,
-                         self.heading, (x1 - x0) / 2, (y1 - y0) / 2, self.speed, self.start,
-                         self.stop])
+        return np.array(
+            [
+                self.x + ahead * x - aside * y,
+                self.y + aside * x + ahead * y,
+                self.heading,
+                (x1 - x0) / 2,
+                (y1 - y0) / 2,
+                self.speed,
+                self.start,
+                self.stop,
+            ]
+        )
 
 
 # A footprint is a row [x y heading, half length, half width, speed, start, stop]: the rectangle
@@ -67,8 +76,7 @@ def _touches_any(one, many, reach, seconds, gap):
     far = _max_reach(one, seconds) + gap
     for m in range(len(many)):
         x, y, near = many[m, X] - one[X], many[m, Y] - one[Y], far + reach[m]
-        if 0 <= near and x * x + y * y <= near * near and footprints_touch(
-                one, many[m], seconds, gap):
+        if 0 <= near and x * x + y * y <= near * near and footprints_touch(one, many[m], seconds, gap):
             return True
     return False
 
@@ -120,10 +128,10 @@ def _compute_offset(one, other, t):
     """Return the vector from the centre of one to that of the other at time t."""
     way = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
     other_way = other[SPEED] * min(max(t - other[START], 0.0), other[STOP] - other[START])
-    return (other[X] + math.cos(other[HEADING]) * other_way
-            - one[X] - math.cos(one[HEADING]) * way,
-            other[Y] + math.sin(other[HEADING]) * other_way
-            - one[Y] - math.sin(one[HEADING]) * way)
+    return (
+        other[X] + math.cos(other[HEADING]) * other_way - one[X] - math.cos(one[HEADING]) * way,
+        other[Y] + math.sin(other[HEADING]) * other_way - one[Y] - math.sin(one[HEADING]) * way,
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -137,8 +145,9 @@ def _touches_trajectory(one, way, radius):
         t, last = way[k, 0], way[max(k - 1, 0)]
         moved = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
         x, y = way[k, 1] - one[X] - cos * moved, way[k, 2] - one[Y] - sin * moved
-        outside = math.hypot(max(abs(cos * x + sin * y) - one[LENGTH], 0.0),
-                             max(abs(cos * y - sin * x) - one[WIDTH], 0.0))
+        outside = math.hypot(
+            max(abs(cos * x + sin * y) - one[LENGTH], 0.0), max(abs(cos * y - sin * x) - one[WIDTH], 0.0)
+        )
         covered = one[SPEED] * (t - last[0]) + math.hypot(way[k, 1] - last[1], way[k, 2] - last[2])
         if outside < radius + covered / 2:
             return True
@@ -148,8 +157,13 @@ def _touches_trajectory(one, way, radius):
 class ActorSet:
     """Actors of a scene, to which others are admitted if they never touch them."""
 
-    def __init__(self, seconds: float, keep_clear: np.ndarray | None = None,
-                 trajectory: Trajectory | None = None, radius: float = 0.0):
+    def __init__(
+        self,
+        seconds: float,
+        keep_clear: np.ndarray | None = None,
+        trajectory: Trajectory | None = None,
+        radius: float = 0.0,
+    ):
         """Start without actors.
 
         Args:
@@ -159,8 +173,7 @@ class ActorSet:
             radius: Radius of the robot, m.
         """
         self.seconds = seconds
-        self._path = (np.empty((0, 3)) if trajectory is None
-                      else trajectory.sampled(seconds, STEP_S))
+        self._path = np.empty((0, 3)) if trajectory is None else trajectory.sampled(seconds, STEP_S)
         self._radius = radius
         self.actors: list[Actor] = []
         self._taken, self._reach, self._used = np.empty((64, 8)), np.empty(64), 0
@@ -168,14 +181,15 @@ class ActorSet:
             self._take(row)
 
     def admit(self, *group: Actor, gap: float = 0.1) -> bool:
-        """Add a group if it never comes within gap of other actors or the robot, or touches itself.
-        """
+        """Add a group if it never comes within gap of other actors or the robot, or touches itself."""
         before = self._used
         for actor in group:
             row, own = actor.footprint, slice(before, self._used)
-            if (_touches_trajectory(row, self._path, self._radius + gap)
-                    or _touches_any(row, self._taken[:before], self._reach, self.seconds, gap)
-                    or _touches_any(row, self._taken[own], self._reach[own], self.seconds, 0.0)):
+            if (
+                _touches_trajectory(row, self._path, self._radius + gap)
+                or _touches_any(row, self._taken[:before], self._reach, self.seconds, gap)
+                or _touches_any(row, self._taken[own], self._reach[own], self.seconds, 0.0)
+            ):
                 self._used = before
                 return False
             self._take(row)

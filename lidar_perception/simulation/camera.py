@@ -26,8 +26,7 @@ def turn_camera(yaw: float) -> Calibration:
 
 def find_labelled(truth: GroundTruth) -> np.ndarray:
     """Return (K,) bool: enough of the simulated object is visible for a label."""
-    return np.array([e["visible"] >= MIN_VISIBLE and e["num_points"] >= MIN_POINTS
-                     for e in truth.extras], bool)
+    return np.array([e["visible"] >= MIN_VISIBLE and e["num_points"] >= MIN_POINTS for e in truth.extras], bool)
 
 
 def select_labels_in_view(truth: GroundTruth) -> GroundTruth:
@@ -49,13 +48,15 @@ def make_kitti_labels(truth: GroundTruth, camera: Calibration = FORWARD_CAMERA) 
     """
     in_image = keep_visible_objects(truth, camera)
     labelled = find_labelled(in_image)
-    notes = [("DontCare", {**DONT_CARE, "bbox": extra["bbox"]})
-             for extra, known in zip(in_image.extras, labelled) if not known]
+    notes = [
+        ("DontCare", {**DONT_CARE, "bbox": extra["bbox"]})
+        for extra, known in zip(in_image.extras, labelled)
+        if not known
+    ]
     kept = _select(in_image, labelled)
     return GroundTruth.of(kept.boxes, kept.class_ids, kept.extras, notes)
 
 
 def _select(truth: GroundTruth, mask: np.ndarray) -> GroundTruth:
     indices = np.flatnonzero(mask)
-    return GroundTruth.of(truth.boxes[indices], truth.class_ids[indices],
-                          [truth.extras[i] for i in indices])
+    return GroundTruth.of(truth.boxes[indices], truth.class_ids[indices], [truth.extras[i] for i in indices])

@@ -17,12 +17,7 @@ from lidar_perception.simulation.shapes.cyclists import make_bicycle, make_cycli
 from lidar_perception.simulation.shapes.people import make_sitting_person
 from lidar_perception.simulation.shapes.vehicles import make_car, make_van
 from lidar_perception.simulation.terrain import PAVEMENT, Ground
-from lidar_perception.simulation.trajectory import (
-    DRIVE_SECONDS,
-    ROBOT_RADIUS_M,
-    Trajectory,
-    draw_trajectory,
-)
+from lidar_perception.simulation.trajectory import DRIVE_SECONDS, ROBOT_RADIUS_M, Trajectory, draw_trajectory
 
 SHOULDER_M = 0.6  # from a path to benches and lamps
 
@@ -35,45 +30,75 @@ class CampusKind:
     court is laid out around the trajectory of the robot.
     """
 
-    share: float                    # of the scenes
-    left: tuple[float, float]       # from the trajectory to what lines the court
+    share: float  # of the scenes
+    left: tuple[float, float]  # from the trajectory to what lines the court
     right: tuple[float, float]
-    fronts: dict[str, float]        # weights of these, see FRONTS and CAMPUS_FRONTS
-    turn: float                     # largest heading of the robot to both sides, rad
-    lane: float = 0.0               # chance of a lane for cars to the right
-    path: bool = False              # a path through grass
-    things: float = 0.5             # on 100 square metres
-    edge: float = 18.0              # things along the edges, on 100 m
-    seats: float = 5.0              # benches along the edges, on 100 m
-    racks: float = 1.5              # rows of bicycles along the edges, on 100 m
-    along: float = 0.0              # groups who walk along x, on 100 m
-    across: float = 0.0             # groups who walk anywhere, on 100 square metres
-    standers: float = 8.0           # groups who stand, on 100 m
-    riders: float = 3.0             # cyclists on 100 m
+    fronts: dict[str, float]  # weights of these, see FRONTS and CAMPUS_FRONTS
+    turn: float  # largest heading of the robot to both sides, rad
+    lane: float = 0.0  # chance of a lane for cars to the right
+    path: bool = False  # a path through grass
+    things: float = 0.5  # on 100 square metres
+    edge: float = 18.0  # things along the edges, on 100 m
+    seats: float = 5.0  # benches along the edges, on 100 m
+    racks: float = 1.5  # rows of bicycles along the edges, on 100 m
+    along: float = 0.0  # groups who walk along x, on 100 m
+    across: float = 0.0  # groups who walk anywhere, on 100 square metres
+    standers: float = 8.0  # groups who stand, on 100 m
+    riders: float = 3.0  # cyclists on 100 m
     ends: tuple[float, float] = (25.0, 60.0)  # of the court behind and ahead of the trajectory
-    stands: float = 0.15            # chance that the robot stands
+    stands: float = 0.15  # chance that the robot stands
     speed: tuple[float, float] = (0.5, 1.5)
 
 
 CAMPUS_KINDS = {
-    "forecourt": CampusKind(0.4, (4.0, 16.0), (3.0, 12.0), {
-        "entrance": 0.5, "facade": 0.25, "verge": 0.15, "square": 0.1}, 0.5, lane=0.8,
-        along=10.0, across=0.9, standers=14.0),
-    "square": CampusKind(0.25, (8.0, 25.0), (8.0, 25.0), {
-        "facade": 0.4, "square": 0.3, "entrance": 0.3}, 0.7, things=0.7, across=0.8,
-        standers=22.0),
-    "path": CampusKind(0.35, (1.0, 2.6), (1.0, 2.6), {
-        "verge": 0.55, "garden": 0.15, "hedge": 0.3}, 0.15, path=True, things=0.0, along=26.0,
-        standers=5.0, riders=4.0, seats=3.0, edge=6.0),
+    "forecourt": CampusKind(
+        0.4,
+        (4.0, 16.0),
+        (3.0, 12.0),
+        {"entrance": 0.5, "facade": 0.25, "verge": 0.15, "square": 0.1},
+        0.5,
+        lane=0.8,
+        along=10.0,
+        across=0.9,
+        standers=14.0,
+    ),
+    "square": CampusKind(
+        0.25,
+        (8.0, 25.0),
+        (8.0, 25.0),
+        {"facade": 0.4, "square": 0.3, "entrance": 0.3},
+        0.7,
+        things=0.7,
+        across=0.8,
+        standers=22.0,
+    ),
+    "path": CampusKind(
+        0.35,
+        (1.0, 2.6),
+        (1.0, 2.6),
+        {"verge": 0.55, "garden": 0.15, "hedge": 0.3},
+        0.15,
+        path=True,
+        things=0.0,
+        along=26.0,
+        standers=5.0,
+        riders=4.0,
+        seats=3.0,
+        edge=6.0,
+    ),
 }
 
 
-def make_campus(rng: np.random.Generator, kind: CampusKind,
-                people: float) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
+def make_campus(
+    rng: np.random.Generator, kind: CampusKind, people: float
+) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
     """Make a court with its surroundings, things and people, and a robot's trajectory."""
     trajectory = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
-    court = Court.around(trajectory.sampled(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2),
-                         np.array([rng.uniform(*kind.right), rng.uniform(*kind.left)]))
+    court = Court.around(
+        trajectory.sampled(DRIVE_SECONDS, 1.0)[:, 1:],
+        rng.uniform(*kind.ends, 2),
+        np.array([rng.uniform(*kind.right), rng.uniform(*kind.left)]),
+    )
     lane = rng.uniform(5.0, 7.0) if rng.random() < kind.lane else 0.0
     ground = _draw_ground(rng, kind, court, lane)
     actors = ActorSet(DRIVE_SECONDS, trajectory=trajectory, radius=ROBOT_RADIUS_M)
@@ -87,23 +112,28 @@ def make_campus(rng: np.random.Generator, kind: CampusKind,
     if lane:
         actors.admit_each(_fill_lane(rng, right, lane), gap=0.3)
     for side in (left, right):
-        actors.admit_each(_furnish_edge(rng, side, kind, kerb=lane > 0 and side == right),
-                          gap=0.25)
+        actors.admit_each(_furnish_edge(rng, side, kind, kerb=lane > 0 and side == right), gap=0.25)
         for along in scatter(rng, side.length, kind.seats):
             out = SHOULDER_M if kind.path else -rng.uniform(0.5, 1.5)
             seat, *sitters = crowd.place_bench(rng, side, along, out, people)
             if actors.admit(seat, gap=0.5):
                 actors.add(*sitters)
         for along in scatter(rng, side.length, kind.racks):
-            actors.admit_each(_place_rack(
-                rng, side, along, SHOULDER_M + 0.5 if kind.path else -1.4), gap=0.0)
+            actors.admit_each(_place_rack(rng, side, along, SHOULDER_M + 0.5 if kind.path else -1.4), gap=0.0)
     for first, *others in _place_things(rng, court.inner(1.5), kind, people):
         if actors.admit(first, gap=0.3):
             actors.add(*others)
     for along in scatter(rng, court.floor.length, kind.riders * people):
-        actors.admit(court.floor.put(
-            make_cyclist(rng), along, rng.uniform(0.6, max(court.floor.walk - 0.6, 0.7)),
-            np.pi * rng.integers(2) + rng.normal(0, 0.03), speed=rng.uniform(2.0, 4.5)), gap=0.2)
+        actors.admit(
+            court.floor.put(
+                make_cyclist(rng),
+                along,
+                rng.uniform(0.6, max(court.floor.walk - 0.6, 0.7)),
+                np.pi * rng.integers(2) + rng.normal(0, 0.03),
+                speed=rng.uniform(2.0, 4.5),
+            ),
+            gap=0.2,
+        )
     crowd.fill_court(rng, actors, court, people, kind.along, kind.across, kind.standers)
     return ground, tuple(actors.actors), trajectory
 
@@ -111,16 +141,27 @@ def make_campus(rng: np.random.Generator, kind: CampusKind,
 def _draw_ground(rng, kind: CampusKind, court: Court, lane: float) -> Ground:
     """Draw pavement, with a lane beyond its edge, or a path through mown grass."""
     slopes = np.tan(np.radians(rng.normal(0.0, 0.7, 2))).tolist()
-    look = dict(slope_x=slopes[0], slope_y=slopes[1], wave=rng.uniform(0.0, 0.06),
-                wavelength=rng.uniform(15, 40), road=rng.uniform(0.23, 0.38),
-                sidewalk=rng.uniform(0.3, 0.5), grass=rng.uniform(0.3, 0.4),
-                curb_height=rng.uniform(0.0, 0.15), rough=rng.uniform(0.05, 0.25))
+    look = dict(
+        slope_x=slopes[0],
+        slope_y=slopes[1],
+        wave=rng.uniform(0.0, 0.06),
+        wavelength=rng.uniform(15, 40),
+        road=rng.uniform(0.23, 0.38),
+        sidewalk=rng.uniform(0.3, 0.5),
+        grass=rng.uniform(0.3, 0.4),
+        curb_height=rng.uniform(0.0, 0.15),
+        rough=rng.uniform(0.05, 0.25),
+    )
     if kind.path:
-        return Ground(**{**look, "curb_height": rng.uniform(0.0, 0.04)}, curb_left=court.y1,
-                      curb_right=court.y0, walk=0.0, camber=rng.uniform(0.0, 0.02))
+        return Ground(
+            **{**look, "curb_height": rng.uniform(0.0, 0.04)},
+            curb_left=court.y1,
+            curb_right=court.y0,
+            walk=0.0,
+            camber=rng.uniform(0.0, 0.02),
+        )
     if lane:
-        return Ground(**look, curb_left=court.y0, curb_right=court.y0 - lane,
-                      camber=rng.uniform(0.0, 0.02))
+        return Ground(**look, curb_left=court.y0, curb_right=court.y0 - lane, camber=rng.uniform(0.0, 0.02))
     return PAVEMENT._replace(**{**look, "curb_height": 0.0})
 
 
@@ -135,9 +176,12 @@ def _build_entrance(rng, side: Side) -> Iterator[Actor]:
                 wide = rng.uniform(3.0, 0.7 * long)
                 yield side.put(furniture.make_stairs(rng, wide), along + long / 2, line - 2.4)
         else:
-            yield from FRONTS["square"](rng, side._replace(
-                x=side.x + np.cos(side.heading) * along, y=side.y + np.sin(side.heading) * along,
-                length=long))
+            yield from FRONTS["square"](
+                rng,
+                side._replace(
+                    x=side.x + np.cos(side.heading) * along, y=side.y + np.sin(side.heading) * along, length=long
+                ),
+            )
         along += long + rng.uniform(0.5, 6)
 
 
@@ -162,8 +206,7 @@ def _fill_lane(rng, side: Side, lane: float) -> Iterator[Actor]:
         thing = make(rng, driver=bool(rng.random() < 0.5))
         yield side.put(thing, along, 0.3 + thing.size[1] / 2, np.pi)
     for along in scatter(rng, side.length, 1.5):
-        yield side.put(make_car(rng), along, lane - 1.4, np.pi * rng.integers(2),
-                       speed=rng.uniform(1.5, 5.0))
+        yield side.put(make_car(rng), along, lane - 1.4, np.pi * rng.integers(2), speed=rng.uniform(1.5, 5.0))
 
 
 def _furnish_edge(rng, side: Side, kind: CampusKind, kerb: bool) -> Iterator[Actor]:
@@ -173,14 +216,12 @@ def _furnish_edge(rng, side: Side, kind: CampusKind, kerb: bool) -> Iterator[Act
         bollard, gap = make_prop(furniture.make_bollard(rng)), rng.uniform(1.4, 2.5)
         yield from (side.put(bollard, along, -0.3) for along in np.arange(1.0, side.length, gap))
         out = -1.6
-    for made, chance in ((furniture.make_lamp, 0.8), (vegetation.make_tree, 0.5),
-                         (furniture.make_bollard, 0.2)):
+    for made, chance in ((furniture.make_lamp, 0.8), (vegetation.make_tree, 0.5), (furniture.make_bollard, 0.2)):
         if rng.random() < chance:
             for along in space_evenly(rng, side.length, rng.uniform(7, 20)):
                 yield side.put(made(rng), along, out + rng.normal(0, 0.1), -np.pi / 2)
     if not kind.path:
-        yield from place_against(rng, side, (*furniture.PERSON_SIZED, furniture.make_pole),
-                                 kind.edge)
+        yield from place_against(rng, side, (*furniture.PERSON_SIZED, furniture.make_pole), kind.edge)
         return
     for along in scatter(rng, side.length, kind.edge):
         yield side.put(make_clutter(rng), along, rng.uniform(0.6, 1.2), rng.uniform(-np.pi, np.pi))
@@ -191,8 +232,12 @@ def _place_rack(rng, side: Side, along: float, out: float) -> Iterator[Actor]:
     for i in range(rng.integers(2, 9)):
         yield side.put(furniture.make_bicycle_stand(rng), along + 0.9 * i, out, np.pi / 2)
         if rng.random() < 0.75:
-            yield side.put(make_bicycle(rng), along + 0.9 * i + 0.42, out + rng.normal(0, 0.1),
-                           np.pi / 2 + np.pi * rng.integers(2) + rng.normal(0, 0.06))
+            yield side.put(
+                make_bicycle(rng),
+                along + 0.9 * i + 0.42,
+                out + rng.normal(0, 0.1),
+                np.pi / 2 + np.pi * rng.integers(2) + rng.normal(0, 0.06),
+            )
 
 
 def _place_things(rng, court: Court, kind: CampusKind, people: float) -> Iterator[list[Actor]]:
@@ -203,8 +248,7 @@ def _place_things(rng, court: Court, kind: CampusKind, people: float) -> Iterato
             yield [Actor(make_prop(vegetation.make_tree(rng, rng.uniform(4.0, 8.0))), x, y)]
         elif pick < 0.35:
             is_person = rng.random() < 0.3 * people
-            yield [Actor(make_sitting_person(rng) if is_person else
-                         make_prop(furniture.make_parasol(rng)), x, y, turn)]
+            yield [Actor(make_sitting_person(rng) if is_person else make_prop(furniture.make_parasol(rng)), x, y, turn)]
         elif pick < 0.5:
             yield crowd.place_bench(rng, Side(x, y, turn, 0.0, 0.0, ""), 0.0, 0.0, people)
         else:

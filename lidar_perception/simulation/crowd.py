@@ -9,12 +9,7 @@ import numpy as np
 from lidar_perception.simulation.actors import Actor, ActorSet
 from lidar_perception.simulation.places import Court, Side, scatter
 from lidar_perception.simulation.shapes import furniture
-from lidar_perception.simulation.shapes.people import (
-    CARRIED,
-    make_pedestrian,
-    make_sitting_person,
-    make_wheelchair,
-)
+from lidar_perception.simulation.shapes.people import CARRIED, make_pedestrian, make_sitting_person, make_wheelchair
 from lidar_perception.simulation.shapes.thing import Thing
 
 # Chances of groups of 1, 2, ... people.
@@ -32,12 +27,15 @@ def make_person(rng, speed: float = 0.0) -> Thing:
 def place_standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
     """Yield people who wait, and groups who face each other."""
     for along in scatter(rng, side.length, rate):
-        out, many = rng.uniform(0.4, max(side.walk - 0.4, 1.0)), rng.choice([1, 2, 3, 4],
-                                                                            p=STANDING_CHANCES)
+        out, many = rng.uniform(0.4, max(side.walk - 0.4, 1.0)), rng.choice([1, 2, 3, 4], p=STANDING_CHANCES)
         first, wide = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 0.7) * (many > 1)
         angles = first + 2 * np.pi / many * np.arange(many)
-        yield [side.put(make_person(rng), along + wide * np.cos(a), out + wide * np.sin(a),
-                        a + np.pi + rng.normal(0, 0.15)) for a in angles]
+        yield [
+            side.put(
+                make_person(rng), along + wide * np.cos(a), out + wide * np.sin(a), a + np.pi + rng.normal(0, 0.15)
+            )
+            for a in angles
+        ]
 
 
 def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Actor]]:
@@ -54,8 +52,10 @@ def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Act
         out = rng.uniform(low, max(side.walk - 0.5, low + 0.5))
         moves = _draw_moves(rng, speed, 0.2)
         many = rng.choice([1, 2, 3], p=WALKING_CHANCES)
-        yield [side.put(make_person(rng, speed), along + rng.uniform(-0.2, 0.2),
-                        out + 0.85 * i, turn, **moves) for i in range(many)]
+        yield [
+            side.put(make_person(rng, speed), along + rng.uniform(-0.2, 0.2), out + 0.85 * i, turn, **moves)
+            for i in range(many)
+        ]
 
 
 def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
@@ -67,8 +67,10 @@ def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
         speed, turn = _draw_speed(rng), rng.uniform(-np.pi, np.pi)
         moves = _draw_moves(rng, speed, 0.5)
         many = rng.choice([1, 2, 3], p=WALKING_CHANCES)
-        yield [Actor(make_person(rng, speed), x - 0.85 * i * np.sin(turn),
-                     y + 0.85 * i * np.cos(turn), turn, **moves) for i in range(many)]
+        yield [
+            Actor(make_person(rng, speed), x - 0.85 * i * np.sin(turn), y + 0.85 * i * np.cos(turn), turn, **moves)
+            for i in range(many)
+        ]
 
 
 def _draw_moves(rng, speed: float, chance: float) -> dict[str, float]:
@@ -85,19 +87,21 @@ def _draw_speed(rng) -> float:
     return float(np.clip(rng.normal(1.35, 0.25), 0.6, 2.0) if rng.random() < 0.97 else 2.7)
 
 
-def fill_court(rng, actors: ActorSet, court: Court, people: float, along: float, across: float,
-               standers: float) -> None:
+def fill_court(
+    rng, actors: ActorSet, court: Court, people: float, along: float, across: float, standers: float
+) -> None:
     """Add people on foot to a court.
 
     along, standers: groups who walk along x, and who stand, per 100 m; across: groups who walk
     anywhere, per 100 square metres. All are multiplied by people and by how busy the place is.
     """
     people *= rng.choice(BUSYNESS)
-    for groups in (place_standing(rng, court.floor, standers * people),
-                   place_walking(rng, court.floor, along * people, roam=False),
-                   place_wheelchairs(rng, court.floor,
-                                     WHEELCHAIR_SHARE * (along + standers) * people),
-                   place_strolling(rng, court.inner(0.4), across * people)):
+    for groups in (
+        place_standing(rng, court.floor, standers * people),
+        place_walking(rng, court.floor, along * people, roam=False),
+        place_wheelchairs(rng, court.floor, WHEELCHAIR_SHARE * (along + standers) * people),
+        place_strolling(rng, court.inner(0.4), across * people),
+    ):
         for group in groups:
             actors.admit(*group)
 
@@ -105,14 +109,22 @@ def fill_court(rng, actors: ActorSet, court: Court, people: float, along: float,
 def place_wheelchairs(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
     """Yield people in wheelchairs along a side."""
     for along in scatter(rng, side.length, rate):
-        yield [side.put(make_wheelchair(rng), along, rng.uniform(0.5, max(side.walk - 0.5, 0.6)),
-                        np.pi * rng.integers(2) + rng.normal(0, 0.1),
-                        speed=rng.choice((0.0, rng.uniform(0.5, 1.3))))]
+        yield [
+            side.put(
+                make_wheelchair(rng),
+                along,
+                rng.uniform(0.5, max(side.walk - 0.5, 0.6)),
+                np.pi * rng.integers(2) + rng.normal(0, 0.1),
+                speed=rng.choice((0.0, rng.uniform(0.5, 1.3))),
+            )
+        ]
 
 
-def place_bench(rng, side: Side, along: float, out: float, people: float,
-                share: float = 0.25) -> list[Actor]:
+def place_bench(rng, side: Side, along: float, out: float, people: float, share: float = 0.25) -> list[Actor]:
     """Return a bench with its back to the outside of a side, and people on a share of its seats."""
-    sitters = [side.put(make_sitting_person(rng, chair=False), along + aside, out, -np.pi / 2)
-               for aside in (-0.45, 0.45) if rng.random() < min(share * people, 0.8)]
+    sitters = [
+        side.put(make_sitting_person(rng, chair=False), along + aside, out, -np.pi / 2)
+        for aside in (-0.45, 0.45)
+        if rng.random() < min(share * people, 0.8)
+    ]
     return [side.put(furniture.make_bench(rng), along, out, -np.pi / 2), *sitters]

@@ -46,8 +46,7 @@ class DatasetPlan:
         self.scenes.scene_types()
         most = longest_drive(self.sensor)
         if not 1 <= self.streets_of <= most:
-            raise InputError(f"streets-of = {self.streets_of} must be 1 .. {most}, the scans of "
-                             "one drive")
+            raise InputError(f"streets-of = {self.streets_of} must be 1 .. {most}, the scans of one drive")
 
 
 def write_frame(folder: Path, plan: DatasetPlan, number: int) -> int:
@@ -70,8 +69,9 @@ def write_frame(folder: Path, plan: DatasetPlan, number: int) -> int:
         else:
             name = f"{sequence:04}"
             write_kitti.write_velodyne(folder / f"training/velodyne/{name}/{moment:06}.bin", cloud)
-            shares = {f"training/label_02/{name}.txt":
-                      write_kitti.format_tracking_labels(moment, truth, FORWARD_CAMERA)}
+            shares = {
+                f"training/label_02/{name}.txt": write_kitti.format_tracking_labels(moment, truth, FORWARD_CAMERA)
+            }
             if moment == 0:
                 calibration = write_kitti.format_calibration(FORWARD_CAMERA)
                 shares[f"training/calib/{name}.txt"] = calibration
@@ -79,15 +79,22 @@ def write_frame(folder: Path, plan: DatasetPlan, number: int) -> int:
     return number
 
 
-def _write_semantickitti(folder: Path, plan: DatasetPlan, sequence: int, moment: int,
-                         scan: SimulatedScan, cloud: np.ndarray,
-                         order: np.ndarray) -> dict[str, str]:
+def _write_semantickitti(
+    folder: Path,
+    plan: DatasetPlan,
+    sequence: int,
+    moment: int,
+    scan: SimulatedScan,
+    cloud: np.ndarray,
+    order: np.ndarray,
+) -> dict[str, str]:
     digits = max(2, len(str((plan.frames - 1) // plan.streets_of)))
     name = f"sequences/{sequence:0{digits}}"
-    semantickitti.write_scan(folder / name, moment, cloud, scan.semantic[order],
-                             scan.instance[order])
-    shares = {f"{name}/poses.txt": semantickitti.format_pose(scan.pose, FORWARD_CAMERA),
-              f"{name}/times.txt": f"{moment / plan.sensor.rate:.6e}\n"}
+    semantickitti.write_scan(folder / name, moment, cloud, scan.semantic[order], scan.instance[order])
+    shares = {
+        f"{name}/poses.txt": semantickitti.format_pose(scan.pose, FORWARD_CAMERA),
+        f"{name}/times.txt": f"{moment / plan.sensor.rate:.6e}\n",
+    }
     if moment == 0:
         shares[f"{name}/calib.txt"] = semantickitti.format_calibration(FORWARD_CAMERA)
     return shares
@@ -101,5 +108,4 @@ def write_frames(folder: Path, plan: DatasetPlan, numbers: list[int], jobs: int)
     Raises:
         InputError: A process failed.
     """
-    return run_in_processes(partial(partial, write_frame, folder, plan), numbers, jobs,
-                            "wrote frames")
+    return run_in_processes(partial(partial, write_frame, folder, plan), numbers, jobs, "wrote frames")

@@ -56,8 +56,9 @@ def choose_drive_frame(moment: int, moments: int, sensor: Sensor) -> int:
     return moment * longest_drive(sensor) // moments
 
 
-def simulate_drive(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
-                   scenes: Scenes = ALL_STREETS) -> Iterator[SimulatedScan]:
+def simulate_drive(
+    seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E, scenes: Scenes = ALL_STREETS
+) -> Iterator[SimulatedScan]:
     """Simulate a drive through make_scene(seed, *scenes); the same for the same arguments.
 
     Points and boxes are in the sensor's frame at the stamp, compensated for motion. Objects without
@@ -81,17 +82,23 @@ def simulate_scan(seed: int, i: int, sensor: Sensor, scenes: Scenes = ALL_STREET
     # Wandering beams also differ between scenes, of which there may be only one scan each.
     scene, sensor = _make_cached_scene(seed, scenes), sensor.at_turn(seed + i)
     moment = scene.at(i / sensor.rate, sensor.height)
-    hits = cast_rays(moment.solids, scene.ground, moment.position, sensor, moment.motion,
-                     (seed << 20) + i, moment.heading)
+    hits = cast_rays(
+        moment.solids, scene.ground, moment.position, sensor, moment.motion, (seed << 20) + i, moment.heading
+    )
     got = make_returns(hits, sensor, moment.motion, np.random.default_rng([seed, i]))
     stamp = START_NS + round(i * 10**9 / sensor.rate)
     first, pose = (scene.sensor_pose(t, sensor.height) for t in (0.0, i / sensor.rate))
     pose[:3, 3] -= first[:3, 3]
     pose[:3] = first[:3, :3].T @ pose[:3]
     return SimulatedScan(
-        PointCloud(got.xyz, got.intensity, stamp, LIDAR_FRAME), label_scan(moment, hits, got.owner),
-        _mark_moving(moment, got.owner, got.semantic), got.owner.astype(np.uint16), got.ring,
-        got.time, pose)
+        PointCloud(got.xyz, got.intensity, stamp, LIDAR_FRAME),
+        label_scan(moment, hits, got.owner),
+        _mark_moving(moment, got.owner, got.semantic),
+        got.owner.astype(np.uint16),
+        got.ring,
+        got.time,
+        pose,
+    )
 
 
 def label_scan(moment: SceneMoment, hits: Hits, owner: np.ndarray) -> GroundTruth:
@@ -103,10 +110,10 @@ def label_scan(moment: SceneMoment, hits: Hits, owner: np.ndarray) -> GroundTrut
     share = np.minimum(visible / np.maximum(hits.reached[moment.track_ids], 1), 1.0)
     occluded = (share < 0.8).astype(int) + (share < 0.4)
     keep = (points > 0) & (np.hypot(*moment.boxes[:, :2].T) <= LABEL_RANGE_M)
-    extras = [{"track_id": int(track), "truncated": 0.0, "occluded": int(level),
-               "num_points": int(n), "visible": float(part)}
-              for track, level, n, part in zip(moment.track_ids[keep], occluded[keep],
-                                               points[keep], share[keep])]
+    extras = [
+        {"track_id": int(track), "truncated": 0.0, "occluded": int(level), "num_points": int(n), "visible": float(part)}
+        for track, level, n, part in zip(moment.track_ids[keep], occluded[keep], points[keep], share[keep])
+    ]
     return GroundTruth.of(moment.boxes[keep], moment.class_ids[keep], extras)
 
 

@@ -71,12 +71,15 @@ def merge_hits(one, other, pulse, key):
     share = hash_uniform(5, key)  # of the energy on the other hit
     first, second = one.brightness * (1 - share), other.brightness * share
     if one.range < np.inf and other.range < np.inf and abs(one.range - other.range) < pulse:
-        return RayHit(one.range * (1 - share) + other.range * share, first + second,
-                      one.cosine * (1 - share) + other.cosine * share,
-                      one.owner if one.owner == other.owner else 0,
-                      one.semantic if one.semantic == other.semantic else OUTLIER,
-                      other.solid if share > 0.5 else one.solid)
+        return RayHit(
+            one.range * (1 - share) + other.range * share,
+            first + second,
+            one.cosine * (1 - share) + other.cosine * share,
+            one.owner if one.owner == other.owner else 0,
+            one.semantic if one.semantic == other.semantic else OUTLIER,
+            other.solid if share > 0.5 else one.solid,
+        )
     # An empty ray has no power: 0 / inf.
-    if second / other.range ** 2 > first / one.range ** 2:
+    if second / other.range**2 > first / one.range**2:
         return RayHit(other.range, second, other.cosine, other.owner, other.semantic, other.solid)
     return RayHit(one.range, first, one.cosine, one.owner, one.semantic, one.solid)

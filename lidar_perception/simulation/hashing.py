@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-GOLDEN, FIRST, SECOND = (np.uint64(n) for n in (
-    0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
+GOLDEN, FIRST, SECOND = (np.uint64(n) for n in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 
 
 @njit(cache=True, nogil=True)
@@ -16,7 +15,7 @@ def hash_uniform(seed, key):
     The finalizer is that of splitmix64 (Steele, Lea and Flood, OOPSLA 2014).
     """
     bits = mix_bits(mix_bits(key) + np.uint64(seed) * GOLDEN) >> np.uint64(12)
-    return (np.float64(bits) + 0.5) * 2.0 ** -52
+    return (np.float64(bits) + 0.5) * 2.0**-52
 
 
 @njit(cache=True, nogil=True)

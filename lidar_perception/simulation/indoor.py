@@ -14,12 +14,7 @@ from lidar_perception.simulation.roadside import FRONTS
 from lidar_perception.simulation.shapes import furniture, interiors
 from lidar_perception.simulation.shapes.people import make_sitting_person
 from lidar_perception.simulation.terrain import PAVEMENT, Ground
-from lidar_perception.simulation.trajectory import (
-    DRIVE_SECONDS,
-    ROBOT_RADIUS_M,
-    Trajectory,
-    draw_trajectory,
-)
+from lidar_perception.simulation.trajectory import DRIVE_SECONDS, ROBOT_RADIUS_M, Trajectory, draw_trajectory
 
 WINDOW_VIEW_M = 4.0  # from windows to the plants outside
 SEAT_WIDTH_M = 0.65  # of a table, per person
@@ -33,52 +28,95 @@ class IndoorKind:
     walls are laid out around the trajectory of the robot.
     """
 
-    share: float                  # of the scenes
-    wide: tuple[float, float]     # from the trajectory to the side walls
-    ends: tuple[float, float]     # and to the walls behind and ahead
+    share: float  # of the scenes
+    wide: tuple[float, float]  # from the trajectory to the side walls
+    ends: tuple[float, float]  # and to the walls behind and ahead
     height: tuple[float, float]
-    walls: dict[str, float]       # weights of their pieces, see WALLS
-    fill: tuple[str, ...]         # furniture, see FILLS
-    turn: float                   # largest heading of the robot to both sides, rad
-    outer: float = 0.0            # chance that a side is all windows
-    at_walls: float = 12.0        # things on 100 m
-    things: float = 0.3           # things on 100 square metres
-    along: float = 0.0            # groups who walk along x, on 100 m
-    across: float = 0.0           # groups who walk anywhere, on 100 square metres
-    standers: float = 5.0         # groups who stand, on 100 m
-    stands: float = 0.15          # chance that the robot stands
+    walls: dict[str, float]  # weights of their pieces, see WALLS
+    fill: tuple[str, ...]  # furniture, see FILLS
+    turn: float  # largest heading of the robot to both sides, rad
+    outer: float = 0.0  # chance that a side is all windows
+    at_walls: float = 12.0  # things on 100 m
+    things: float = 0.3  # things on 100 square metres
+    along: float = 0.0  # groups who walk along x, on 100 m
+    across: float = 0.0  # groups who walk anywhere, on 100 square metres
+    standers: float = 5.0  # groups who stand, on 100 m
+    stands: float = 0.15  # chance that the robot stands
     speed: tuple[float, float] = (0.5, 1.5)
 
 
 INDOOR_KINDS = {
-    "corridor": IndoorKind(0.35, (0.7, 1.7), (8.0, 35.0), (2.4, 3.2), {
-        "wall": 0.42, "door": 0.38, "glazing": 0.1, "passage": 0.1}, (), 0.25, along=45.0,
-        standers=8.0, things=0.6, at_walls=22.0),
-    "hall": IndoorKind(0.3, (5.0, 14.0), (6.0, 20.0), (3.5, 8.0), {
-        "wall": 0.4, "door": 0.2, "glazing": 0.2, "passage": 0.2}, ("columns", "benches", "tables"),
-        0.7, outer=0.4, across=2.2, standers=16.0),
-    "canteen": IndoorKind(0.2, (3.0, 9.0), (6.0, 14.0), (2.7, 4.5), {
-        "wall": 0.6, "door": 0.15, "glazing": 0.15, "passage": 0.1}, ("columns", "many tables"),
-        0.3, outer=0.35, across=2.0, standers=14.0, along=12.0),
-    "store": IndoorKind(0.15, (4.0, 10.0), (6.0, 14.0), (2.8, 5.5), {
-        "wall": 0.8, "door": 0.15, "glazing": 0.05}, ("shelves",), 0.1, across=2.0, along=18.0,
-        standers=16.0, things=0.5),
+    "corridor": IndoorKind(
+        0.35,
+        (0.7, 1.7),
+        (8.0, 35.0),
+        (2.4, 3.2),
+        {"wall": 0.42, "door": 0.38, "glazing": 0.1, "passage": 0.1},
+        (),
+        0.25,
+        along=45.0,
+        standers=8.0,
+        things=0.6,
+        at_walls=22.0,
+    ),
+    "hall": IndoorKind(
+        0.3,
+        (5.0, 14.0),
+        (6.0, 20.0),
+        (3.5, 8.0),
+        {"wall": 0.4, "door": 0.2, "glazing": 0.2, "passage": 0.2},
+        ("columns", "benches", "tables"),
+        0.7,
+        outer=0.4,
+        across=2.2,
+        standers=16.0,
+    ),
+    "canteen": IndoorKind(
+        0.2,
+        (3.0, 9.0),
+        (6.0, 14.0),
+        (2.7, 4.5),
+        {"wall": 0.6, "door": 0.15, "glazing": 0.15, "passage": 0.1},
+        ("columns", "many tables"),
+        0.3,
+        outer=0.35,
+        across=2.0,
+        standers=14.0,
+        along=12.0,
+    ),
+    "store": IndoorKind(
+        0.15,
+        (4.0, 10.0),
+        (6.0, 14.0),
+        (2.8, 5.5),
+        {"wall": 0.8, "door": 0.15, "glazing": 0.05},
+        ("shelves",),
+        0.1,
+        across=2.0,
+        along=18.0,
+        standers=16.0,
+        things=0.5,
+    ),
 }
 WALLS = {  # maker, and smallest and largest length
-    "wall": (interiors.make_wall, 1.0, 7.0), "door": (interiors.make_door, 1.2, 1.7),
-    "glazing": (interiors.make_glazing, 2.0, 6.0), "passage": (interiors.make_passage, 1.8, 3.2),
-    "window": (interiors.make_window, 3.0, 9.0)}
-THINGS = (*interiors.PERSON_SIZED, furniture.make_planter, furniture.make_litter_bin,
-          furniture.make_cabinet)
+    "wall": (interiors.make_wall, 1.0, 7.0),
+    "door": (interiors.make_door, 1.2, 1.7),
+    "glazing": (interiors.make_glazing, 2.0, 6.0),
+    "passage": (interiors.make_passage, 1.8, 3.2),
+    "window": (interiors.make_window, 3.0, 9.0),
+}
+THINGS = (*interiors.PERSON_SIZED, furniture.make_planter, furniture.make_litter_bin, furniture.make_cabinet)
 
 
-def make_interior(rng: np.random.Generator, kind: IndoorKind,
-                  people: float) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
+def make_interior(
+    rng: np.random.Generator, kind: IndoorKind, people: float
+) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
     """Make a level floor with walls, ceiling, furniture and people, and a robot's trajectory."""
     trajectory = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
     actors = ActorSet(DRIVE_SECONDS, trajectory=trajectory, radius=ROBOT_RADIUS_M)
-    court = Court.around(trajectory.sampled(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2),
-                         rng.uniform(*kind.wide, 2))
+    court = Court.around(
+        trajectory.sampled(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2), rng.uniform(*kind.wide, 2)
+    )
     height = rng.uniform(*kind.height)
     for side in court.sides():
         actors.add(*_build_walls(rng, side, kind, height))
@@ -132,8 +170,9 @@ def _place_benches(rng, court: Court, height: float, people: float) -> Iterator[
             if rng.random() < 0.6:
                 yield crowd.place_bench(rng, side, along, -rng.uniform(0.4, 1.0), people)
         if rng.random() < 0.4:
-            yield [side.put(interiors.make_counter(rng), rng.uniform(0, side.length),
-                            -rng.uniform(1.2, 2.5), -np.pi / 2)]
+            yield [
+                side.put(interiors.make_counter(rng), rng.uniform(0, side.length), -rng.uniform(1.2, 2.5), -np.pi / 2)
+            ]
 
 
 def _scatter_tables(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
@@ -149,8 +188,9 @@ def _line_up_tables(rng, court: Court, height: float, people: float) -> Iterator
     for x in np.arange(court.x0 + 1.3, court.x1 - 1.2, dx):
         for y in np.arange(court.y0 + 1.3, court.y1 - 1.2, dy):
             if rng.random() < 0.85:
-                yield _set_table(rng, x + rng.normal(0, 0.1), y + rng.normal(0, 0.1),
-                                 turn + rng.normal(0, 0.05), people)
+                yield _set_table(
+                    rng, x + rng.normal(0, 0.1), y + rng.normal(0, 0.1), turn + rng.normal(0, 0.05), people
+                )
 
 
 def _set_table(rng, x: float, y: float, turn: float, people: float) -> list[Actor]:
@@ -165,8 +205,7 @@ def _set_table(rng, x: float, y: float, turn: float, people: float) -> list[Acto
             if pick < min(0.35 * people, 0.8):
                 around.append(line.put(make_sitting_person(rng), along, out, -side * np.pi / 2))
             elif pick < 0.85:
-                around.append(line.put(interiors.make_chair(rng), along, out,
-                                       -side * np.pi / 2 + rng.normal(0, 0.3)))
+                around.append(line.put(interiors.make_chair(rng), along, out, -side * np.pi / 2 + rng.normal(0, 0.3)))
     return [table, *around]
 
 
@@ -182,5 +221,10 @@ def _place_shelves(rng, court: Court, height: float, people: float) -> Iterator[
         y += 0.7 + aisle
 
 
-FILLS = {"columns": _place_columns, "benches": _place_benches, "tables": _scatter_tables,
-         "many tables": _line_up_tables, "shelves": _place_shelves}
+FILLS = {
+    "columns": _place_columns,
+    "benches": _place_benches,
+    "tables": _scatter_tables,
+    "many tables": _line_up_tables,
+    "shelves": _place_shelves,
+}

@@ -48,13 +48,22 @@ def compile_solids(solids: Solids, motion: Motion, salt: np.uint64) -> CompiledS
     matrix = np.swapaxes(solids.axes, 1, 2) / solids.half[:, :, None]
     slides = np.asarray(motion.velocity, np.float64) - solids.velocity
     # Copies, since Numba compiles again for read-only arrays and other memory layouts.
-    density, transmission, reflectance = (np.array(part, np.float64) for part in (
-        solids.density, solids.transmission, solids.reflectance))
+    density, transmission, reflectance = (
+        np.array(part, np.float64) for part in (solids.density, solids.transmission, solids.reflectance)
+    )
     return CompiledSolids(
-        np.array(matrix, order="C"), -np.einsum("pij,pj->pi", matrix, solids.centre),
-        np.einsum("pij,pj->pi", matrix, slides), np.array(solids.kind), density, transmission,
-        reflectance, reflectance.view(np.uint64), np.array(solids.owner), np.array(solids.semantic),
-        (np.arange(len(solids), dtype=np.uint64) << np.uint64(32)) + salt)
+        np.array(matrix, order="C"),
+        -np.einsum("pij,pj->pi", matrix, solids.centre),
+        np.einsum("pij,pj->pi", matrix, slides),
+        np.array(solids.kind),
+        density,
+        transmission,
+        reflectance,
+        reflectance.view(np.uint64),
+        np.array(solids.owner),
+        np.array(solids.semantic),
+        (np.arange(len(solids), dtype=np.uint64) << np.uint64(32)) + salt,
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -64,12 +73,17 @@ def to_unit_frame(shapes, s, way, since, lift):
     since: seconds after the stamp; lift: height of its start above the sensor's origin, m.
     """
     m, o, v = shapes.matrix[s], shapes.offset[s], shapes.drift[s]
-    start = (o[0] + m[0, 2] * lift + v[0] * since, o[1] + m[1, 2] * lift + v[1] * since,
-             o[2] + m[2, 2] * lift + v[2] * since)
+    start = (
+        o[0] + m[0, 2] * lift + v[0] * since,
+        o[1] + m[1, 2] * lift + v[1] * since,
+        o[2] + m[2, 2] * lift + v[2] * since,
+    )
     x, y, z = way
-    return start, (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
-                   m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
-                   m[2, 0] * x + m[2, 1] * y + m[2, 2] * z)
+    return start, (
+        m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
+        m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
+        m[2, 0] * x + m[2, 1] * y + m[2, 2] * z,
+    )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -112,11 +126,12 @@ def find_stop_range(shapes, s, start, way, enter, leave, number, filled):
     key = shapes.salt[s] + np.uint64(number)
     if shapes.density[s] < np.inf:
         m = shapes.matrix[s]
-        half = (1 / math.sqrt(m[0, 0] ** 2 + m[0, 1] ** 2 + m[0, 2] ** 2),
-                1 / math.sqrt(m[1, 0] ** 2 + m[1, 1] ** 2 + m[1, 2] ** 2),
-                1 / math.sqrt(m[2, 0] ** 2 + m[2, 1] ** 2 + m[2, 2] ** 2))
-        t = trace_foliage(start, way, half, enter, leave, shapes.density[s], shapes.plant[s], key,
-                          filled)
+        half = (
+            1 / math.sqrt(m[0, 0] ** 2 + m[0, 1] ** 2 + m[0, 2] ** 2),
+            1 / math.sqrt(m[1, 0] ** 2 + m[1, 1] ** 2 + m[1, 2] ** 2),
+            1 / math.sqrt(m[2, 0] ** 2 + m[2, 1] ** 2 + m[2, 2] ** 2),
+        )
+        t = trace_foliage(start, way, half, enter, leave, shapes.density[s], shapes.plant[s], key, filled)
     if shapes.transmission[s] > 0 and hash_uniform(2, key) < shapes.transmission[s]:
         return np.inf
     return t
@@ -133,13 +148,18 @@ def shade_hit(shapes, s, way, since, lift, number):
         return compute_brightness(reflectance, 0.5) * (0.5 + scatter), 1.0
     start, along = to_unit_frame(shapes, s, way, since, lift)
     enter, _ = intersect_shape(shapes.kind[s], start, along)
-    x, y, z = _normal(shapes.kind[s], start[0] + enter * along[0], start[1] + enter * along[1],
-                      start[2] + enter * along[2])
+    x, y, z = _normal(
+        shapes.kind[s], start[0] + enter * along[0], start[1] + enter * along[1], start[2] + enter * along[2]
+    )
     m = shapes.matrix[s]
-    out = (m[0, 0] * x + m[1, 0] * y + m[2, 0] * z, m[0, 1] * x + m[1, 1] * y + m[2, 1] * z,
-           m[0, 2] * x + m[1, 2] * y + m[2, 2] * z)
+    out = (
+        m[0, 0] * x + m[1, 0] * y + m[2, 0] * z,
+        m[0, 1] * x + m[1, 1] * y + m[2, 1] * z,
+        m[0, 2] * x + m[1, 2] * y + m[2, 2] * z,
+    )
     cosine = abs(out[0] * way[0] + out[1] * way[1] + out[2] * way[2]) / math.sqrt(
-        out[0] ** 2 + out[1] ** 2 + out[2] ** 2)
+        out[0] ** 2 + out[1] ** 2 + out[2] ** 2
+    )
     return compute_brightness(reflectance, cosine), cosine
 
 

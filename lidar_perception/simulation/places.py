@@ -31,16 +31,16 @@ class Side(NamedTuple):
     front: str
     parking: float = 0.0
 
-    def put(self, thing: Thing | np.ndarray, along: float, out: float, turn: float = 0.0,
-            **moves) -> Actor:
+    def put(self, thing: Thing | np.ndarray, along: float, out: float, turn: float = 0.0, **moves) -> Actor:
         """Return an actor `along` the curb and `out` from it (m), turned against the line (rad).
 
         Parts (P,) PART become a thing without a label.
         """
         thing = make_prop(thing) if isinstance(thing, np.ndarray) else thing
         cos, sin = math.cos(self.heading), math.sin(self.heading)
-        return Actor(thing, self.x + cos * along - sin * out, self.y + sin * along + cos * out,
-                     self.heading + turn, **moves)
+        return Actor(
+            thing, self.x + cos * along - sin * out, self.y + sin * along + cos * out, self.heading + turn, **moves
+        )
 
 
 class Court(NamedTuple):
@@ -73,10 +73,12 @@ class Court(NamedTuple):
     def sides(self, walk: float = 0.0, front: str = "") -> tuple[Side, Side, Side, Side]:
         """Return the edges at y1, x0, y0, x1 as lines with the outside to their left."""
         long, wide = self.x1 - self.x0, self.y1 - self.y0
-        return (Side(self.x0, self.y1, 0.0, long, walk, front),
-                Side(self.x0, self.y0, np.pi / 2, wide, walk, front),
-                Side(self.x1, self.y0, np.pi, long, walk, front),
-                Side(self.x1, self.y1, -np.pi / 2, wide, walk, front))
+        return (
+            Side(self.x0, self.y1, 0.0, long, walk, front),
+            Side(self.x0, self.y0, np.pi / 2, wide, walk, front),
+            Side(self.x1, self.y0, np.pi, long, walk, front),
+            Side(self.x1, self.y1, -np.pi / 2, wide, walk, front),
+        )
 
     def inner(self, margin: float) -> Court:
         """Return the rectangle without a margin, m."""
@@ -89,8 +91,7 @@ class Court(NamedTuple):
             yield rng.uniform(self.x0, self.x1), rng.uniform(self.y0, self.y1)
 
 
-def place_against(rng: np.random.Generator, side: Side, makers: Sequence[Callable],
-                  rate: float) -> Iterator[Actor]:
+def place_against(rng: np.random.Generator, side: Side, makers: Sequence[Callable], rate: float) -> Iterator[Actor]:
     """Yield things inside a side with their backs to it, rate per 100 m, made by random makers."""
     for along in scatter(rng, side.length, rate):
         made = makers[int(rng.integers(len(makers)))](rng)

@@ -69,8 +69,15 @@ class Turn(NamedTuple):
     lift: np.ndarray
 
 
-def cast_rays(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sensor,
-              motion: Motion = NO_MOTION, seed: int = 0, heading: float = 0.0) -> Hits:
+def cast_rays(
+    solids: Solids,
+    ground: Ground,
+    position: np.ndarray,
+    sensor: Sensor,
+    motion: Motion = NO_MOTION,
+    seed: int = 0,
+    heading: float = 0.0,
+) -> Hits:
     """Cast all rays of one turn of a sensor.
 
     Args:
@@ -86,15 +93,27 @@ def cast_rays(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sens
     made = make_rays(sensor, motion)
     turn = Turn(made.direction, made.since, sensor.origins()[:, 2].copy())
     seen = find_windows(solids, sensor, motion, sensor.divergence / 2)
-    scene = (compile_solids(solids, motion, salt), seen,
-             np.lexsort((seen.near, solids.owner, solids.owner == 0)), to_compiled(ground),
-             np.array(position, np.float64), np.array(motion.velocity, np.float64),
-             (math.cos(heading), math.sin(heading)),
-             float(sensor.max_range), foliage.LEAF_SHARE)
+    scene = (
+        compile_solids(solids, motion, salt),
+        seen,
+        np.lexsort((seen.near, solids.owner, solids.owner == 0)),
+        to_compiled(ground),
+        np.array(position, np.float64),
+        np.array(motion.velocity, np.float64),
+        (math.cos(heading), math.sin(heading)),
+        float(sensor.max_range),
+        foliage.LEAF_SHARE,
+    )
     shape = (sensor.columns, sensor.rings)
-    hits = Hits(np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape, np.int32),
-                np.empty(shape, np.uint16), np.empty(shape, np.int32),
-                np.zeros(int(solids.owner.max(initial=0)) + 1, np.int64))
+    hits = Hits(
+        np.empty(shape),
+        np.empty(shape),
+        np.empty(shape),
+        np.empty(shape, np.int32),
+        np.empty(shape, np.uint16),
+        np.empty(shape, np.int32),
+        np.zeros(int(solids.owner.max(initial=0)) + 1, np.int64),
+    )
     _cast_first(hits, turn, np.ones(shape, bool), *scene, True)
     if sensor.divergence:
         edge, other = find_edges(hits.solid), Hits(*(np.empty_like(grid) for grid in hits))
@@ -105,8 +124,7 @@ def cast_rays(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sens
 
 
 @njit(cache=True, nogil=True)
-def _cast_first(hits, turn, only, shapes, seen, order, ground, position, velocity, facing,
-                max_range, filled, counting):
+def _cast_first(hits, turn, only, shapes, seen, order, ground, position, velocity, facing, max_range, filled, counting):
     """Fill the hits of the rays in only, (columns, rings) bool, and reached if counting.
 
     order: solids owner by owner, then those without an owner from near to far.
@@ -127,22 +145,22 @@ def _cast_first(hits, turn, only, shapes, seen, order, ground, position, velocit
                 if not far < min_ground_range(ground, start, down):
                     met = cast_ground(ground, start, down, max_range)
                     if s < 0 or np.float32(met.range) < np.float32(far):
-                        _write_hit(hits, column, ring, RayHit(
-                            met.range, met.brightness, met.cosine, 0, met.semantic, -1))
+                        _write_hit(
+                            hits, column, ring, RayHit(met.range, met.brightness, met.cosine, 0, met.semantic, -1)
+                        )
                         continue
                 if s >= 0:
-                    brightness, cosine = shade_hit(shapes, s, way, since, turn.lift[ring],
-                                                   ring * columns + column)
-                    _write_hit(hits, column, ring, RayHit(far, brightness, cosine, shapes.owner[s],
-                                                          shapes.semantic[s], s))
+                    brightness, cosine = shade_hit(shapes, s, way, since, turn.lift[ring], ring * columns + column)
+                    _write_hit(
+                        hits, column, ring, RayHit(far, brightness, cosine, shapes.owner[s], shapes.semantic[s], s)
+                    )
                 else:
                     _write_hit(hits, column, ring, RayHit(np.inf, 0.0, 0.0, 0, 0, -1))
 
 
 @njit(cache=True, nogil=True)
 def _to_world(vector, facing):
-    """Turn a vector (x, y, z) from the sensor's frame to the world. facing: cos and sin of heading.
-    """
+    """Turn a vector (x, y, z) from the sensor's frame to the world. facing: cos and sin of heading."""
     cos, sin = facing
     return cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]
 
@@ -173,14 +191,11 @@ def _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, count
                 far = hits.range[column, ring]
                 if near > far and not counts:
                     continue
-                start, way = to_unit_frame(shapes, s, _way(turn, column, ring), turn.since[column],
-                                           turn.lift[ring])
+                start, way = to_unit_frame(shapes, s, _way(turn, column, ring), turn.since[column], turn.lift[ring])
                 enter, leave = intersect_shape(shapes.kind[s], start, way)
-                if not (enter <= leave and leave > 0) or (
-                        np.float32(enter) > np.float32(far) and not counts):
+                if not (enter <= leave and leave > 0) or (np.float32(enter) > np.float32(far) and not counts):
                     continue
-                t = find_stop_range(shapes, s, start, way, enter, leave, ring * columns + column,
-                                    filled)
+                t = find_stop_range(shapes, s, start, way, enter, leave, ring * columns + column, filled)
                 if not t < leave or t > max_range:
                     continue
                 if counts and latest[column, ring] != owner:
@@ -201,8 +216,8 @@ def _turn_into_footprints(direction, only, divergence, salt):
             if only[column, ring]:
                 way = direction[column, ring]
                 way[0], way[1], way[2] = draw_in_footprint(
-                    (way[0], way[1], way[2]), divergence,
-                    salt + np.uint64(ring * columns + column))
+                    (way[0], way[1], way[2]), divergence, salt + np.uint64(ring * columns + column)
+                )
 
 
 @njit(cache=True, nogil=True)
@@ -212,17 +227,29 @@ def _merge_edges(hits, other, only, pulse, salt):
     for column in range(columns):
         for ring in range(rings):
             if only[column, ring]:
-                _write_hit(hits, column, ring, merge_hits(
-                    _read_hit(hits, column, ring), _read_hit(other, column, ring), pulse,
-                    salt + np.uint64(ring * columns + column)))
+                _write_hit(
+                    hits,
+                    column,
+                    ring,
+                    merge_hits(
+                        _read_hit(hits, column, ring),
+                        _read_hit(other, column, ring),
+                        pulse,
+                        salt + np.uint64(ring * columns + column),
+                    ),
+                )
 
 
 @njit(cache=True, nogil=True)
 def _read_hit(hits, column, ring):
-    return RayHit(hits.range[column, ring], hits.brightness[column, ring],
-                  hits.cosine[column, ring],
-                  np.int64(hits.owner[column, ring]), np.int64(hits.semantic[column, ring]),
-                  np.int64(hits.solid[column, ring]))
+    return RayHit(
+        hits.range[column, ring],
+        hits.brightness[column, ring],
+        hits.cosine[column, ring],
+        np.int64(hits.owner[column, ring]),
+        np.int64(hits.semantic[column, ring]),
+        np.int64(hits.solid[column, ring]),
+    )
 
 
 @njit(cache=True, nogil=True)

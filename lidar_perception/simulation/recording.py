@@ -22,8 +22,14 @@ class SimulatedFrames(ComputedFrames):
     not all scenes have a camera, they have labels all around.
     """
 
-    def __init__(self, seed: int, frames: int, sensor: Sensor = HDL64E,
-                 frames_per_drive: int | None = None, scenes: Scenes = ALL_STREETS) -> None:
+    def __init__(
+        self,
+        seed: int,
+        frames: int,
+        sensor: Sensor = HDL64E,
+        frames_per_drive: int | None = None,
+        scenes: Scenes = ALL_STREETS,
+    ) -> None:
         """Each of the scenes seed, seed + 1, ... has frames_per_drive frames, by default as many
         as fit into a drive."""
         self._seed, self._frames, self._sensor, self._scenes = seed, frames, sensor, scenes
@@ -34,27 +40,37 @@ class SimulatedFrames(ComputedFrames):
         return self._frames
 
     def compute_frame(self, number: int) -> Frame:
-        camera, labels = ((FORWARD_CAMERA, select_labels_in_view) if self._has_camera else
-                          (None, select_labels))
+        camera, labels = (FORWARD_CAMERA, select_labels_in_view) if self._has_camera else (None, select_labels)
         scene, moment = divmod(number, self._per_drive)
         drive_ns = DRIVE_GAP_NS + round(self._per_drive * 10**9 / self._sensor.rate)
         scan = simulate_scan(self._seed + scene, moment, self._sensor, self._scenes)
         frame = replace(scan.frame, stamp_ns=scan.frame.stamp_ns + scene * drive_ns)
-        return Frame.of(f"{scene:04}/{moment:06}", frame, labels(scan.truth), camera,
-                        pose=scan.pose.copy, sequence=f"{scene:04}", index=moment,
-                        sensor_height=self._sensor.height)
+        return Frame.of(
+            f"{scene:04}/{moment:06}",
+            frame,
+            labels(scan.truth),
+            camera,
+            pose=scan.pose.copy,
+            sequence=f"{scene:04}",
+            index=moment,
+            sensor_height=self._sensor.height,
+        )
 
 
-def simulate_frames(seed: int, frames: int, sensor: Sensor = HDL64E,
-                    streets_of: int | None = None, scenes: Scenes = ALL_STREETS) -> Iterator[Frame]:
+def simulate_frames(
+    seed: int, frames: int, sensor: Sensor = HDL64E, streets_of: int | None = None, scenes: Scenes = ALL_STREETS
+) -> Iterator[Frame]:
     """Yield the frames of SimulatedFrames, with streets_of frames of each scene."""
     yield from SimulatedFrames(seed, frames, sensor, streets_of, scenes)
 
 
-def simulate_recording(seed: int, frames: int, sensor: Sensor = HDL64E,
-                       scenes: Scenes = ALL_STREETS) -> Recording:
+def simulate_recording(seed: int, frames: int, sensor: Sensor = HDL64E, scenes: Scenes = ALL_STREETS) -> Recording:
     """Return simulated drives as a recording that no file holds."""
     has = {BOXES, POSES} | ({CAMERA} if scenes.camera else set())
-    return Recording(Path("simulation"), f"simulated {scenes.scene}",
-                     SimulatedFrames(seed, frames, sensor, None, scenes), frozenset(has),
-                     has_times=True)
+    return Recording(
+        Path("simulation"),
+        f"simulated {scenes.scene}",
+        SimulatedFrames(seed, frames, sensor, None, scenes),
+        frozenset(has),
+        has_times=True,
+    )

@@ -44,8 +44,9 @@ class Returns(NamedTuple):
     time: np.ndarray
 
 
-def make_returns(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator,
-                 compensated: bool = True) -> Returns:
+def make_returns(
+    hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator, compensated: bool = True
+) -> Returns:
     """Return the points that the sensor reports.
 
     A return is lost if its power, which is proportional to brightness over range squared, is below
@@ -61,10 +62,13 @@ def make_returns(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Gene
     if sensor.offsets:
         noisy += np.asarray(sensor.offsets)
     with np.errstate(divide="ignore", invalid="ignore"):  # no range over infinite reach: NaN
-        power = (np.log(hits.brightness / 0.1) + GRAZING_EXPONENT * np.log(hits.cosine)
-                 - 2 * np.log(hits.range / sensor.reach))
+        power = (
+            np.log(hits.brightness / 0.1)
+            + GRAZING_EXPONENT * np.log(hits.cosine)
+            - 2 * np.log(hits.range / sensor.reach)
+        )
     scatter = rng.normal(0.0, POWER_SCATTER, (-(-shape[0] // SCATTER_COLUMNS), shape[1]))
-    keep = power > np.repeat(scatter, SCATTER_COLUMNS, axis=0)[:shape[0]]
+    keep = power > np.repeat(scatter, SCATTER_COLUMNS, axis=0)[: shape[0]]
     keep &= (rng.random(shape) >= sensor.dropout) & sensor.open_rays()
     # Slightly within the limits, so that rounding to float32 does not exceed them.
     keep &= (noisy > sensor.min_range + 1e-4) & (noisy < sensor.max_range - 1e-4)
@@ -82,6 +86,11 @@ def make_returns(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Gene
     if sensor.biases:
         intensity += np.asarray(sensor.biases)[ring]
     intensity = np.where(weak, 0.0, np.round(np.clip(intensity, 0.0, 1.0), 2))
-    return Returns(xyz.astype(np.float32), intensity.astype(np.float32), hits.owner.ravel()[ray],
-                   hits.semantic.ravel()[ray], ring.astype(np.uint16),
-                   (sensor.times() - motion.stamp / sensor.rate)[column].astype(np.float32))
+    return Returns(
+        xyz.astype(np.float32),
+        intensity.astype(np.float32),
+        hits.owner.ravel()[ray],
+        hits.semantic.ravel()[ray],
+        ring.astype(np.uint16),
+        (sensor.times() - motion.stamp / sensor.rate)[column].astype(np.float32),
+    )

@@ -17,8 +17,7 @@ PLANT_CLASSES = {70, 71}  # of SemanticKITTI
 BORDERS = (*[vegetation.make_hedge] * 3, *[furniture.make_fence] * 2, furniture.make_wall)
 # Bushes and trees per 100 m, and the depth of their strip in m: a wood, a hedgerow, fields.
 WILD_FRONTS = ((110, 60, 4.0), (130, 12, 1.2), (8, 3, 15.0))
-RURAL_CLUTTER = (furniture.make_sign, furniture.make_beacon, furniture.make_bollard,
-                 furniture.make_pole)
+RURAL_CLUTTER = (furniture.make_sign, furniture.make_beacon, furniture.make_bollard, furniture.make_pole)
 
 
 def furnish(rng: np.random.Generator, street: Street, actors: ActorSet) -> None:
@@ -52,8 +51,7 @@ def _build_facade(rng, side: Side) -> Iterator[Actor]:
     storeys = rng.integers(2, 6)
     while along < side.length - CORNER_WALK_M - 5:
         length = min(rng.uniform(8, 22), side.length - CORNER_WALK_M - along)
-        house = make_building(rng, length, rng.uniform(9, 13),
-                              max(storeys + rng.integers(-1, 2), 2))
+        house = make_building(rng, length, rng.uniform(9, 13), max(storeys + rng.integers(-1, 2), 2))
         yield side.put(house, along + length / 2, line + rng.choice([0.0, 0.0, 0.3]))
         along += length + (0.15 if rng.random() < 0.6 else rng.uniform(3, 12))
     for along in scatter(rng, side.length, 14.0):
@@ -66,8 +64,7 @@ def _build_yard(rng, side: Side, line: float) -> Iterator[Actor]:
     for along in scatter(rng, side.length, 22):
         yield side.put(_make_tree(rng), along, line + rng.uniform(0, 30))
     for along in scatter(rng, side.length, 15):
-        yield side.put(vegetation.make_bush(rng), along, line + rng.uniform(0, 25),
-                       rng.uniform(-3, 3))
+        yield side.put(vegetation.make_bush(rng), along, line + rng.uniform(0, 25), rng.uniform(-3, 3))
 
 
 def _build_garden(rng, side: Side) -> Iterator[Actor]:
@@ -83,13 +80,15 @@ def _build_garden(rng, side: Side) -> Iterator[Actor]:
             yield side.put(border(rng, lot - drive - 0.2), along + drive + (lot - drive) / 2, line)
         back = line + rng.uniform(2.5, 8)
         house = lot - drive - rng.uniform(0.5, 3)
-        yield side.put(make_building(rng, house, rng.uniform(8, 11), rng.integers(1, 4)),
-                       along + drive + house / 2, back)
+        yield side.put(
+            make_building(rng, house, rng.uniform(8, 11), rng.integers(1, 4)), along + drive + house / 2, back
+        )
         for at in scatter(rng, lot - drive, 20):
             yield side.put(_make_tree(rng), along + drive + at, rng.uniform(line + 1.2, back))
         for at in scatter(rng, lot - drive, 70):
-            yield side.put(vegetation.make_bush(rng), along + drive + at,
-                           rng.uniform(line + 1, back), rng.uniform(-3, 3))
+            yield side.put(
+                vegetation.make_bush(rng), along + drive + at, rng.uniform(line + 1, back), rng.uniform(-3, 3)
+            )
         along += lot
     yield from _build_yard(rng, side, line + 19)
 
@@ -99,17 +98,19 @@ def _build_verge(rng, side: Side) -> Iterator[Actor]:
     deep = rng.uniform(4, 14)
     for along in space_evenly(rng, side.length, rng.uniform(7, 14)):
         yield side.put(_make_tree(rng), along, side.walk + rng.uniform(1.2, 1.8))
-    shrubs, depth = ((150, 0.35 * deep) if rng.random() < 0.7 else (rng.uniform(2, 50), deep))
+    shrubs, depth = (150, 0.35 * deep) if rng.random() < 0.7 else (rng.uniform(2, 50), deep)
     for along in scatter(rng, side.length, shrubs):
-        yield side.put(vegetation.make_bush(rng), along, side.walk + rng.uniform(1.0, 1.0 + depth),
-                       rng.uniform(-3, 3))
+        yield side.put(vegetation.make_bush(rng), along, side.walk + rng.uniform(1.0, 1.0 + depth), rng.uniform(-3, 3))
     along = CORNER_WALK_M
     while along < side.length - 10:
         length = min(rng.uniform(12, 35), side.length - along - 1)
         pick = rng.random()
         if pick < 0.45:
-            yield side.put(make_building(rng, length, rng.uniform(10, 20), rng.integers(1, 6)),
-                           along + length / 2, side.walk + deep + rng.uniform(0, 4))
+            yield side.put(
+                make_building(rng, length, rng.uniform(10, 20), rng.integers(1, 6)),
+                along + length / 2,
+                side.walk + deep + rng.uniform(0, 4),
+            )
         elif pick < 0.8:
             border = BORDERS[rng.integers(len(BORDERS))]
             yield side.put(border(rng, length), along + length / 2, side.walk + deep)
@@ -122,16 +123,18 @@ def _build_wild(rng, side: Side) -> Iterator[Actor]:
     near = side.walk + rng.uniform(1.5, 4.0)
     bushes, trees, deep = WILD_FRONTS[rng.choice(len(WILD_FRONTS), p=(0.4, 0.4, 0.2))]
     for along in scatter(rng, side.length, bushes):
-        yield side.put(vegetation.make_bush(rng), along, near + rng.exponential(deep),
-                       rng.uniform(-3, 3))
+        yield side.put(vegetation.make_bush(rng), along, near + rng.exponential(deep), rng.uniform(-3, 3))
     for along in scatter(rng, side.length, trees):
         yield side.put(_make_tree(rng), along, near + 1 + rng.gamma(1.5, deep))
     if rng.random() < 0.3:
         for along in np.arange(0, side.length - 12, 12.0):
             yield side.put(furniture.make_fence(rng, 11.7), along + 6, near - 0.3)
     for along in scatter(rng, side.length, 0.8):
-        yield side.put(make_building(rng, rng.uniform(8, 20), rng.uniform(8, 14),
-                                     rng.integers(1, 3)), along, near + rng.uniform(12, 40))
+        yield side.put(
+            make_building(rng, rng.uniform(8, 20), rng.uniform(8, 14), rng.integers(1, 3)),
+            along,
+            near + rng.uniform(12, 40),
+        )
 
 
 def _build_square(rng, side: Side) -> Iterator[Actor]:
@@ -141,12 +144,16 @@ def _build_square(rng, side: Side) -> Iterator[Actor]:
     for along in space_evenly(rng, side.length, rng.uniform(6, 10)):
         yield side.put(_make_tree(rng), along, side.walk + deep * 0.5)
     for along in scatter(rng, side.length, 8):
-        yield side.put(make_clutter(rng), along, side.walk + rng.uniform(0, deep),
-                       rng.uniform(-3, 3))
+        yield side.put(make_clutter(rng), along, side.walk + rng.uniform(0, deep), rng.uniform(-3, 3))
 
 
-FRONTS = {"facade": _build_facade, "garden": _build_garden, "verge": _build_verge,
-          "wild": _build_wild, "square": _build_square}
+FRONTS = {
+    "facade": _build_facade,
+    "garden": _build_garden,
+    "verge": _build_verge,
+    "wild": _build_wild,
+    "square": _build_square,
+}
 
 
 def _place_furniture(rng, side: Side, kind: StreetKind) -> Iterator[Actor]:

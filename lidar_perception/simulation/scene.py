@@ -43,20 +43,23 @@ class Scenes(NamedTuple):
     scene: str = "street"
 
     def scene_types(self) -> list[SceneType]:
-        """Return the scene types in their order. Raise InputError for a value that is not allowed.
-        """
+        """Return the scene types in their order. Raise InputError for a value that is not allowed."""
         if not 0 <= self.people <= MAX_PEOPLE:
             raise InputError(f"people = {self.people} must be 0 .. {MAX_PEOPLE}, such as 1")
         names = self.scene.split(",")
         if unknown := [name for name in names if name not in SCENE_TYPES]:
-            raise InputError(f"unknown scene {unknown[0]!r}: must be one of "
-                             f"{', '.join(SCENE_TYPES)}, or several separated by commas"
-                             f"{did_you_mean(unknown[0], SCENE_TYPES)}")
+            raise InputError(
+                f"unknown scene {unknown[0]!r}: must be one of "
+                f"{', '.join(SCENE_TYPES)}, or several separated by commas"
+                f"{did_you_mean(unknown[0], SCENE_TYPES)}"
+            )
         for name in names:
             if self.kind is not None and self.kind not in SCENE_TYPES[name].kinds:
-                raise InputError(f"kind = {self.kind!r} must be one of "
-                                 f"{', '.join(SCENE_TYPES[name].kinds)} where scene is {name}"
-                                 f"{did_you_mean(self.kind, SCENE_TYPES[name].kinds)}")
+                raise InputError(
+                    f"kind = {self.kind!r} must be one of "
+                    f"{', '.join(SCENE_TYPES[name].kinds)} where scene is {name}"
+                    f"{did_you_mean(self.kind, SCENE_TYPES[name].kinds)}"
+                )
         return [SCENE_TYPES[name] for name in names]
 
     @property
@@ -112,8 +115,7 @@ class Scene:
         along, pose = self.trajectory.at(t), np.eye(4)
         cos, sin = math.cos(along.heading), math.sin(along.heading)
         pose[:2, :2] = (cos, -sin), (sin, cos)
-        pose[:3, 3] = (along.x, along.y,
-                       surface_height(self.ground, along.x, along.y) + sensor_height)
+        pose[:3, 3] = (along.x, along.y, surface_height(self.ground, along.x, along.y) + sensor_height)
         return pose
 
     def at(self, t: float, sensor_height: float) -> SceneMoment:
@@ -134,16 +136,16 @@ class Scene:
 
         made = [self.actors[i].thing.parts(s) for i, s in zip(near.tolist(), travelled.tolist())]
         whose = np.repeat(np.arange(len(made)), [len(m) for m in made])
-        solids = place_parts(_join_parts(made), base[whose], heading[whose], a["track"][whose],
-                             velocity[whose])
+        solids = place_parts(_join_parts(made), base[whose], heading[whose], a["track"][whose], velocity[whose])
 
         known = np.flatnonzero(a["track"])
         boxes = np.column_stack([base, a["size"], heading])[known]
         boxes[:, 2] += boxes[:, 5] / 2
         moved = (self._add_climb(np.array([along.velocity])) @ turned)[0]
         motion = Motion(tuple(moved.tolist()), along.yaw_rate)
-        return SceneMoment(solids, sensor, along.heading, boxes, a["class"][known],
-                           a["track"][known], speed[known], motion)
+        return SceneMoment(
+            solids, sensor, along.heading, boxes, a["class"][known], a["track"][known], speed[known], motion
+        )
 
     @cached_property
     def _table(self) -> np.ndarray:
@@ -157,14 +159,37 @@ class Scene:
             x0, y0, z0, x1, y1, z1 = compute_hull(a.thing.parts(0.0))
             level, span = math.hypot(x1 - x0, y1 - y0), max(x1 - x0, y1 - y0, z1 - z0)
             label = a.thing.label
-            rows.append(((a.x, a.y), a.heading, (math.cos(a.heading), math.sin(a.heading)),
-                         a.speed, a.start, a.stop, a.thing.size,
-                         CLASSES.index(label) if label else -1, 0,
-                         level / 2 + (FAR_SIGHT_M if span > LARGE_M else SIGHT_M), np.nan))
-        table = np.array(rows, [
-            ("xy", float, 2), ("heading", float), ("forward", float, 2), ("speed", float),
-            ("start", float), ("stop", float), ("size", float, 3), ("class", np.int32),
-            ("track", np.int32), ("sight", float), ("feet", float)])
+            rows.append(
+                (
+                    (a.x, a.y),
+                    a.heading,
+                    (math.cos(a.heading), math.sin(a.heading)),
+                    a.speed,
+                    a.start,
+                    a.stop,
+                    a.thing.size,
+                    CLASSES.index(label) if label else -1,
+                    0,
+                    level / 2 + (FAR_SIGHT_M if span > LARGE_M else SIGHT_M),
+                    np.nan,
+                )
+            )
+        table = np.array(
+            rows,
+            [
+                ("xy", float, 2),
+                ("heading", float),
+                ("forward", float, 2),
+                ("speed", float),
+                ("start", float),
+                ("stop", float),
+                ("size", float, 3),
+                ("class", np.int32),
+                ("track", np.int32),
+                ("sight", float),
+                ("feet", float),
+            ],
+        )
         known = table["class"] >= 0
         table["track"] = np.where(known, np.cumsum(known), 0)
         fixed = np.flatnonzero((table["speed"] == 0) & ~known)
@@ -193,12 +218,13 @@ def _compute_corners(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return x and y (A, 4) of the corners of footprints (A, 8) at time 0."""
     x, y, heading, length, width = f[:, :5, None].transpose(1, 0, 2)
     ahead, aside = length * np.array([1, 1, -1, -1]), width * np.array([1, -1, 1, -1])
-    return (x + np.cos(heading) * ahead - np.sin(heading) * aside,
-            y + np.sin(heading) * ahead + np.cos(heading) * aside)
+    return (
+        x + np.cos(heading) * ahead - np.sin(heading) * aside,
+        y + np.sin(heading) * ahead + np.cos(heading) * aside,
+    )
 
 
-def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0,
-               scene: str = "street") -> Scene:
+def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0, scene: str = "street") -> Scene:
     """Make the scene of a seed.
 
     Things that would ever touch those placed before them are dropped.
@@ -223,8 +249,9 @@ def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0,
     return Scene(*chosen.make(rng, chosen.kinds[kind], people), kind)
 
 
-def _make_street(rng: np.random.Generator, kind: StreetKind,
-                 people: float) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
+def _make_street(
+    rng: np.random.Generator, kind: StreetKind, people: float
+) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
     """Make a street along x, on which a car drives at y = 0."""
     street = draw_street(rng, kind, DRIVE_SECONDS)
     ego = [0.0, 0.0, 0.0, *EGO_HALF_SIZE_M, street.speed, 0.0, np.inf]
@@ -248,7 +275,8 @@ class SceneType(NamedTuple):
     camera: bool = False
 
 
-SCENE_TYPES = {"street": SceneType(STREET_KINDS, _make_street, camera=True),
-               "campus": SceneType(campus.CAMPUS_KINDS, campus.make_campus),
-               "indoor": SceneType(indoor.INDOOR_KINDS, indoor.make_interior)}
-
+SCENE_TYPES = {
+    "street": SceneType(STREET_KINDS, _make_street, camera=True),
+    "campus": SceneType(campus.CAMPUS_KINDS, campus.make_campus),
+    "indoor": SceneType(indoor.INDOOR_KINDS, indoor.make_interior),
+}

@@ -18,7 +18,7 @@ _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, if 
 MAX_BYTES = 1 << 20  # of a sensor file
 GOLDEN_RATIO = 0.6180339887498949
 MAX_RATE = 1000.0  # turns a second
-MAX_NOISE = 1.0    # metres
+MAX_NOISE = 1.0  # metres
 MAX_BEAMS = 1 << 16  # rings are uint16
 MAX_RAYS = 5_000_000  # in a turn; the densest sensors have 0.5 million. Each takes some 100 bytes
 
@@ -33,18 +33,18 @@ class Sensor:
     """
 
     elevations: tuple[float, ...]  # one per beam, descending; ring 0 is the highest
-    azimuth_step: float            # between firings; rounded to a whole number in a turn
+    azimuth_step: float  # between firings; rounded to a whole number in a turn
     height: float = SENSOR_HEIGHT  # above the road
     min_range: float = 0.9
     max_range: float = 120.0
-    range_noise: float = 0.02      # standard deviation
-    rate: float = 10.0             # turns per second
-    reach: float = 50.0            # where half of the returns of brightness 0.1 are lost
-    silent: float = 0.0            # share of returns whose intensity is 0
-    floor: float = 0.0             # intensities below this are 0
-    dropout: float = 0.005         # share of the returns lost at random
-    divergence: float = 2e-3       # full angle of a beam
-    pulse: float = 0.75            # two surfaces closer than this give one return between them
+    range_noise: float = 0.02  # standard deviation
+    rate: float = 10.0  # turns per second
+    reach: float = 50.0  # where half of the returns of brightness 0.1 are lost
+    silent: float = 0.0  # share of returns whose intensity is 0
+    floor: float = 0.0  # intensities below this are 0
+    dropout: float = 0.005  # share of the returns lost at random
+    divergence: float = 2e-3  # full angle of a beam
+    pulse: float = 0.75  # two surfaces closer than this give one return between them
     lifts: tuple[float, ...] = ()  # where each beam starts on the z axis; empty: all at 0
     offsets: tuple[float, ...] = ()  # what each beam adds to the range; empty: nothing
     biases: tuple[float, ...] = ()  # what each beam adds to the intensity; empty: nothing
@@ -52,41 +52,57 @@ class Sensor:
     blocked: tuple[tuple[float, float, float], ...] = ()  # by the vehicle: (first ring, from, to),
     #                                for it and all lower rings, degrees counter-clockwise; 0 to 360
     #                                is all around
-    wander: float = 0.0            # beams are lower by up to this, differently in every turn
+    wander: float = 0.0  # beams are lower by up to this, differently in every turn
 
     def __post_init__(self) -> None:
         up = np.asarray(self.elevations, np.float64)
         for wrong, what in (
-                (not len(up), "elevations must name one beam at least"),
-                (len(up) > MAX_BEAMS, f"elevations must name {MAX_BEAMS} beams at most"),
-                (not (np.abs(up) < np.pi / 2).all() or not (np.diff(up) < 0).all(),
-                 "elevations must descend, within 90 degrees of level"),
-                *((len(each) not in (0, len(up)) or not np.isfinite(each).all(),
-                   f"{name} must be empty or finite, one for each beam")
-                  for name, each in (("lifts", self.lifts), ("offsets", self.offsets),
-                                     ("biases", self.biases))),
-                (not np.isfinite([*self.fade, *np.ravel(self.blocked)]).all(),
-                 "fade and blocked must be finite"),
-                (not 0 < self.azimuth_step <= np.pi / 2,
-                 "azimuth_step must be above 0, at most 90 degrees"),
-                (len(up) * 2 * np.pi > MAX_RAYS * self.azimuth_step,
-                 f"a turn must have at most {MAX_RAYS} rays; give a larger step or fewer beams"),
-                (not 0 < self.height < np.inf, "height must be positive"),
-                (not 0 <= self.min_range < self.max_range < np.inf,
-                 "max_range must be finite and exceed min_range, which must not be negative"),
-                (not 0 < self.rate <= MAX_RATE, f"rate must be above 0, at most {MAX_RATE:g}"),
-                (not 0 < self.reach <= np.inf, "reach must be positive"),
-                (not all(0 <= x <= 1 for x in (self.dropout, self.silent, self.floor)),
-                 "dropout, silent and floor must be in 0 .. 1"),
-                (self.dropout == 1, "with dropout 1 nothing would come back"),
-                (self.divergence > np.pi / 2, "divergence must be at most 90 degrees"),
-                (not all(0 <= row[0] < max(1, len(up)) for row in self.blocked),
-                 "blocked must begin with a beam, 0 or more"),
-                (not all(0 <= x < np.inf for x in (self.range_noise, self.divergence, self.pulse)),
-                 "range_noise, divergence and pulse must not be negative"),
-                (self.range_noise > MAX_NOISE, f"range_noise must be up to {MAX_NOISE:g} m"),
-                (len(up) and not (0 <= self.wander < np.pi / 2 + up.min()),
-                 "wander must not be negative, nor take beams beyond straight down")):
+            (not len(up), "elevations must name one beam at least"),
+            (len(up) > MAX_BEAMS, f"elevations must name {MAX_BEAMS} beams at most"),
+            (
+                not (np.abs(up) < np.pi / 2).all() or not (np.diff(up) < 0).all(),
+                "elevations must descend, within 90 degrees of level",
+            ),
+            *(
+                (
+                    len(each) not in (0, len(up)) or not np.isfinite(each).all(),
+                    f"{name} must be empty or finite, one for each beam",
+                )
+                for name, each in (("lifts", self.lifts), ("offsets", self.offsets), ("biases", self.biases))
+            ),
+            (not np.isfinite([*self.fade, *np.ravel(self.blocked)]).all(), "fade and blocked must be finite"),
+            (not 0 < self.azimuth_step <= np.pi / 2, "azimuth_step must be above 0, at most 90 degrees"),
+            (
+                len(up) * 2 * np.pi > MAX_RAYS * self.azimuth_step,
+                f"a turn must have at most {MAX_RAYS} rays; give a larger step or fewer beams",
+            ),
+            (not 0 < self.height < np.inf, "height must be positive"),
+            (
+                not 0 <= self.min_range < self.max_range < np.inf,
+                "max_range must be finite and exceed min_range, which must not be negative",
+            ),
+            (not 0 < self.rate <= MAX_RATE, f"rate must be above 0, at most {MAX_RATE:g}"),
+            (not 0 < self.reach <= np.inf, "reach must be positive"),
+            (
+                not all(0 <= x <= 1 for x in (self.dropout, self.silent, self.floor)),
+                "dropout, silent and floor must be in 0 .. 1",
+            ),
+            (self.dropout == 1, "with dropout 1 nothing would come back"),
+            (self.divergence > np.pi / 2, "divergence must be at most 90 degrees"),
+            (
+                not all(0 <= row[0] < max(1, len(up)) for row in self.blocked),
+                "blocked must begin with a beam, 0 or more",
+            ),
+            (
+                not all(0 <= x < np.inf for x in (self.range_noise, self.divergence, self.pulse)),
+                "range_noise, divergence and pulse must not be negative",
+            ),
+            (self.range_noise > MAX_NOISE, f"range_noise must be up to {MAX_NOISE:g} m"),
+            (
+                len(up) and not (0 <= self.wander < np.pi / 2 + up.min()),
+                "wander must not be negative, nor take beams beyond straight down",
+            ),
+        ):
             if wrong:
                 raise InputError(f"impossible sensor: {what}")
 
@@ -145,8 +161,7 @@ def _directions(elevations: tuple[float, ...], columns: int) -> np.ndarray:
     azimuth = np.arange(columns)[:, None] * (2 * np.pi / columns)
     elevation = np.asarray(elevations)
     flat = np.cos(elevation)
-    return np.stack(np.broadcast_arrays(
-        np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)), axis=-1)
+    return np.stack(np.broadcast_arrays(np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)), axis=-1)
 
 
 class Motion(NamedTuple):
@@ -193,8 +208,9 @@ def make_rays(sensor: Sensor, motion: Motion = NO_MOTION) -> Rays:
     return Rays(moved[:, None] + sensor.origins(), direction, since)
 
 
-def make_generic_sensor(beams: int, lowest: float, highest: float, azimuth_step: float, rate: float,
-                        **fields: Any) -> Sensor:
+def make_generic_sensor(
+    beams: int, lowest: float, highest: float, azimuth_step: float, rate: float, **fields: Any
+) -> Sensor:
     """Return a sensor with evenly spaced beams.
 
     Angles are in degrees, the rate in turns per second. Other fields of Sensor are given by name.
@@ -206,8 +222,12 @@ def make_generic_sensor(beams: int, lowest: float, highest: float, azimuth_step:
         raise InputError(f"impossible sensor: {beams} beams must be {MAX_BEAMS} at most")
     if beams > 1 and not lowest < highest:
         raise InputError(f"impossible sensor: lowest {lowest} must be below highest {highest}")
-    return Sensor(tuple(np.radians(np.linspace(highest, lowest, max(beams, 0))).tolist()),
-                  float(np.radians(azimuth_step)), rate=rate, **fields)
+    return Sensor(
+        tuple(np.radians(np.linspace(highest, lowest, max(beams, 0))).tolist()),
+        float(np.radians(azimuth_step)),
+        rate=rate,
+        **fields,
+    )
 
 
 def load_sensor(path: str | Path) -> Sensor:
@@ -231,8 +251,7 @@ def load_sensor(path: str | Path) -> Sensor:
     values = {key: value for key, value in content.items() if key != "name"}
     known = {field.name for field in fields(Sensor)}
     if unknown := [key for key in values if key not in known]:
-        raise InputError(f"{path}: a sensor has no {unknown[0]!r}; known are name, "
-                         f"{', '.join(sorted(known))}")
+        raise InputError(f"{path}: a sensor has no {unknown[0]!r}; known are name, {', '.join(sorted(known))}")
     if missing := [key for key in ("elevations", "azimuth_step", "rate") if key not in values]:
         raise InputError(f"{path}: {missing[0]} is missing; {remedy}")
     try:
@@ -241,8 +260,14 @@ def load_sensor(path: str | Path) -> Sensor:
         raise InputError(f"{path}: {error}") from None
 
 
-FIELD_SHAPES = {"elevations": (0,), "lifts": (0,), "offsets": (0,), "biases": (0,), "fade": (2,),
-                "blocked": (0, 3)}  # of fields that are lists; 0: any length
+FIELD_SHAPES = {
+    "elevations": (0,),
+    "lifts": (0,),
+    "offsets": (0,),
+    "biases": (0,),
+    "fade": (2,),
+    "blocked": (0, 3),
+}  # of fields that are lists; 0: any length
 DEGREE_FIELDS = ("elevations", "azimuth_step", "divergence", "wander")
 
 
@@ -255,10 +280,17 @@ def _convert_field(key: str, value: Any) -> Any:
         numbers = np.array(None if isinstance(value, (bool, str)) else value, np.float64)
     except (TypeError, ValueError, OverflowError):
         numbers = np.full((0,) * 9, np.nan)
-    if numbers.ndim != len(shape) or any(n not in (0, m) for n, m in zip(shape, numbers.shape)) or (
-            np.isnan(numbers).any()) or (len(shape) == 2 and not _are_whole(numbers[:, 0])):
-        what = "a number" if not shape else "a list of " + (
-            f"{shape[0] or ''} numbers".strip() if len(shape) == 1 else "[ring, from, to]")
+    if (
+        numbers.ndim != len(shape)
+        or any(n not in (0, m) for n, m in zip(shape, numbers.shape))
+        or (np.isnan(numbers).any())
+        or (len(shape) == 2 and not _are_whole(numbers[:, 0]))
+    ):
+        what = (
+            "a number"
+            if not shape
+            else "a list of " + (f"{shape[0] or ''} numbers".strip() if len(shape) == 1 else "[ring, from, to]")
+        )
         raise InputError(f"{key} = {reprlib.repr(value)[:60]} must be {what}")
     rows = (np.radians(numbers) if key in DEGREE_FIELDS else numbers).tolist()
     if not shape:
@@ -275,8 +307,9 @@ def _normalize_name(name: str) -> str:
     return "".join(c for c in name.lower() if c.isalnum())
 
 
-PRESET_FILES = {_normalize_name(path.stem): path for path in sorted(
-    (Path(__file__).parent / "sensors").glob("*.yaml"))}  # files of the package
+PRESET_FILES = {
+    _normalize_name(path.stem): path for path in sorted((Path(__file__).parent / "sensors").glob("*.yaml"))
+}  # files of the package
 
 
 @cache
@@ -315,13 +348,14 @@ def _find_by_name(name: str) -> Sensor:
         except (TypeError, ValueError, OverflowError) as error:
             if isinstance(error, InputError):
                 raise
-            raise InputError(f"sensor {name!r} must be {GENERIC_FORMAT}, such as "
-                             "generic:32,-25,15,0.2,10") from None
+            raise InputError(f"sensor {name!r} must be {GENERIC_FORMAT}, such as generic:32,-25,15,0.2,10") from None
     if name.endswith((".yaml", ".yml")):
         return load_sensor(name)
     if name in SENSORS:
         return SENSORS[name]
     if _normalize_name(name) not in PRESET_FILES:
-        raise InputError(f"unknown sensor {name!r}: must be one of {', '.join(SENSOR_NAMES)}, a "
-                         f".yaml file, or {GENERIC_FORMAT}{did_you_mean(name, SENSOR_NAMES)}")
+        raise InputError(
+            f"unknown sensor {name!r}: must be one of {', '.join(SENSOR_NAMES)}, a "
+            f".yaml file, or {GENERIC_FORMAT}{did_you_mean(name, SENSOR_NAMES)}"
+        )
     return _load_preset(_normalize_name(name))

@@ -20,9 +20,19 @@ BOX, ELLIPSOID, CYLINDER = 0, 1, 2  # a cylinder stands along its z axis
 # density: 1/m; inf is solid; a beam passes through foliage for 1 / density metres in the mean.
 # transmission: share of the beams that pass, as through glass.
 RETROREFLECTOR = 1.0
-PART = np.dtype([("kind", np.int8), ("centre", np.float64, 3), ("half", np.float64, 3),
-                 ("pitch", np.float64), ("yaw", np.float64), ("reflectance", np.float64),
-                 ("semantic", np.uint16), ("density", np.float64), ("transmission", np.float64)])
+PART = np.dtype(
+    [
+        ("kind", np.int8),
+        ("centre", np.float64, 3),
+        ("half", np.float64, 3),
+        ("pitch", np.float64),
+        ("yaw", np.float64),
+        ("reflectance", np.float64),
+        ("semantic", np.uint16),
+        ("density", np.float64),
+        ("transmission", np.float64),
+    ]
+)
 
 
 class Surface(TypedDict, total=False):
@@ -32,9 +42,18 @@ class Surface(TypedDict, total=False):
     transmission: float
 
 
-def part(kind: int, centre: tuple, half: tuple, *, pitch: float = 0.0, yaw: float = 0.0,
-         reflectance: float = 0.3, semantic: int = 0, density: float = np.inf,
-         transmission: float = 0.0) -> tuple:
+def part(
+    kind: int,
+    centre: tuple,
+    half: tuple,
+    *,
+    pitch: float = 0.0,
+    yaw: float = 0.0,
+    reflectance: float = 0.3,
+    semantic: int = 0,
+    density: float = np.inf,
+    transmission: float = 0.0,
+) -> tuple:
     """Return a row of PART; semantic 0 takes the class of its thing."""
     return kind, centre, half, pitch, yaw, reflectance, semantic, density, transmission
 
@@ -80,8 +99,9 @@ class Solids:
         return Solids(*(getattr(self, f.name)[places] for f in fields(self)))
 
 
-def place_parts(made: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: np.ndarray,
-                velocity: np.ndarray) -> Solids:
+def place_parts(
+    made: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: np.ndarray, velocity: np.ndarray
+) -> Solids:
     """Place parts in the frame of the sensor.
 
     Args:
@@ -92,15 +112,29 @@ def place_parts(made: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: 
     cos, sin = np.cos(made["yaw"] + heading), np.sin(made["yaw"] + heading)
     down, nose = np.cos(made["pitch"]), np.sin(made["pitch"])
     zero = np.zeros(len(made))
-    axes = np.stack([np.stack([cos * down, sin * down, -nose], axis=1),
-                     np.stack([-sin, cos, zero], axis=1),
-                     np.stack([cos * nose, sin * nose, down], axis=1)], axis=2)
+    axes = np.stack(
+        [
+            np.stack([cos * down, sin * down, -nose], axis=1),
+            np.stack([-sin, cos, zero], axis=1),
+            np.stack([cos * nose, sin * nose, down], axis=1),
+        ],
+        axis=2,
+    )
     x, y, z = made["centre"].T
     ahead, aside = np.cos(heading), np.sin(heading)
     centre = base + np.stack([ahead * x - aside * y, aside * x + ahead * y, z], axis=1)
-    return Solids(made["kind"], centre, made["half"].copy(), axes, made["reflectance"].copy(),
-                  made["semantic"].copy(), made["density"].copy(), made["transmission"].copy(),
-                  np.asarray(owner, np.int32), np.asarray(velocity, np.float64))
+    return Solids(
+        made["kind"],
+        centre,
+        made["half"].copy(),
+        axes,
+        made["reflectance"].copy(),
+        made["semantic"].copy(),
+        made["density"].copy(),
+        made["transmission"].copy(),
+        np.asarray(owner, np.int32),
+        np.asarray(velocity, np.float64),
+    )
 
 
 def compute_extents(made: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -132,22 +166,21 @@ def _hull(made, below):
     for p in range(len(made)):
         c, reach = made[p].centre, _reach(made[p])
         if c[2] - reach[2] < below:
-            low = (min(low[0], c[0] - reach[0]), min(low[1], c[1] - reach[1]),
-                   min(low[2], c[2] - reach[2]))
-            high = (max(high[0], c[0] + reach[0]), max(high[1], c[1] + reach[1]),
-                    max(high[2], c[2] + reach[2]))
+            low = (min(low[0], c[0] - reach[0]), min(low[1], c[1] - reach[1]), min(low[2], c[2] - reach[2]))
+            high = (max(high[0], c[0] + reach[0]), max(high[1], c[1] + reach[1]), max(high[2], c[2] + reach[2]))
     return (*low, *high)
 
 
 @njit(cache=True, nogil=True)
 def _reach(one):
     """Return how far a part reaches along x, y and z from its centre."""
-    cos, sin, down, nose = (math.cos(one.yaw), math.sin(one.yaw), math.cos(one.pitch),
-                            math.sin(one.pitch))
+    cos, sin, down, nose = (math.cos(one.yaw), math.sin(one.yaw), math.cos(one.pitch), math.sin(one.pitch))
     a, b, c = one.half[0], one.half[1], one.half[2]
-    return (_along(one.kind, a * cos * down, b * sin, c * cos * nose),
-            _along(one.kind, a * sin * down, b * cos, c * sin * nose),
-            _along(one.kind, a * nose, 0.0, c * down))
+    return (
+        _along(one.kind, a * cos * down, b * sin, c * cos * nose),
+        _along(one.kind, a * sin * down, b * cos, c * sin * nose),
+        _along(one.kind, a * nose, 0.0, c * down),
+    )
 
 
 @njit(cache=True, nogil=True)

@@ -19,10 +19,10 @@ from lidar_perception.simulation.solids import RETROREFLECTOR
 
 ROAD, PARKING, SIDEWALK, GRASS = 40, 44, 48, 72  # SemanticKITTI
 GRAIN_M = 0.25  # m between the bumps of a rough surface
-PATCH = 10    # bumps from one rough patch to the next
-BARE_SHARE = 0.45         # approximate share of the ground between the patches
-PATCH_STEEPNESS = 3.0     # of the edges of patches
-BARE_HEIGHT_SHARE = 0.1   # height of bumps between the patches, as a share of that in patches
+PATCH = 10  # bumps from one rough patch to the next
+BARE_SHARE = 0.45  # approximate share of the ground between the patches
+PATCH_STEEPNESS = 3.0  # of the edges of patches
+BARE_HEIGHT_SHARE = 0.1  # height of bumps between the patches, as a share of that in patches
 ROAD_HEIGHT_SHARE = 0.06  # height of bumps on the road, in the same way
 MAX_TUFT_DISTANCE_M, TUFT_STEPS = 6.0, 8  # length of a grazing ray that is searched for tufts
 
@@ -38,16 +38,16 @@ class Ground(NamedTuple):
     slope_y: float = 0.0
     wave: float = 0.0
     wavelength: float = 25.0
-    camber: float = 0.0       # fall per metre from the centre line to both curbs
-    curb_left: float = 1e9    # y of the curbs
+    camber: float = 0.0  # fall per metre from the centre line to both curbs
+    curb_left: float = 1e9  # y of the curbs
     curb_right: float = -1e9
     curb_height: float = 0.0
-    walk: float = 1e9         # width of the sidewalk beyond each curb; grass beyond
+    walk: float = 1e9  # width of the sidewalk beyond each curb; grass beyond
     crossings: tuple[tuple[float, float], ...] = ()  # x intervals of side streets, without a curb
-    parking: float = 0.0      # width of the parking strip inside each curb
-    rough: float = 0.0        # greatest height of tufts; ROAD_HEIGHT_SHARE of it on the road
-    litter: float = 0.0       # greatest height of bumps on sidewalks and parking strips
-    road: float = 0.3         # reflectances
+    parking: float = 0.0  # width of the parking strip inside each curb
+    rough: float = 0.0  # greatest height of tufts; ROAD_HEIGHT_SHARE of it on the road
+    litter: float = 0.0  # greatest height of bumps on sidewalks and parking strips
+    road: float = 0.3  # reflectances
     sidewalk: float = 0.4
     grass: float = 0.35
 
@@ -79,8 +79,10 @@ def compute_brightness(reflectance, cosine):
 
 def to_compiled(ground: Ground) -> Ground:
     """Return the ground for compiled code, with crossings as an array (C, 2)."""
-    return Ground._make(np.array(value, np.float64).reshape(-1, 2) if name == "crossings"
-                        else float(value) for name, value in ground._asdict().items())
+    return Ground._make(
+        np.array(value, np.float64).reshape(-1, 2) if name == "crossings" else float(value)
+        for name, value in ground._asdict().items()
+    )
 
 
 def surface_height(ground: Ground, x, y) -> np.ndarray:
@@ -150,8 +152,7 @@ def _stays_on_road(ground, start, way, t):
 @njit(cache=True, nogil=True)
 def _relief(ground, x, y):
     """Return height and slopes along x and y at x, y, without curbs."""
-    middle, half = (ground.curb_left + ground.curb_right) / 2, (
-        ground.curb_left - ground.curb_right) / 2
+    middle, half = (ground.curb_left + ground.curb_right) / 2, (ground.curb_left - ground.curb_right) / 2
     aside = y - middle
     height = ground.slope_x * x + ground.slope_y * y - ground.camber * min(abs(aside), half)
     slope_x, slope_y = ground.slope_x, ground.slope_y
@@ -230,8 +231,7 @@ def _intersect_tufts(ground, start, way, t, cosine):
         back = k * step
         if back >= t:
             continue  # behind the sensor
-        top = tuft_height(ground, start[0] + (t - back) * way[0], start[1] + (t - back) * way[1],
-                          back * cosine)
+        top = tuft_height(ground, start[0] + (t - back) * way[0], start[1] + (t - back) * way[1], back * cosine)
         above = top / cosine  # the ray has this height at this distance before t
         if above > back:
             return max(t - min(above, back + step), 0.0)
@@ -244,8 +244,7 @@ def tuft_height(ground, x, y, least):
 
     0 if it is certainly not above least.
     """
-    patch = min(max((_bumps(x / PATCH, y / PATCH) - BARE_SHARE) * PATCH_STEEPNESS,
-                    BARE_HEIGHT_SHARE), 1.0)
+    patch = min(max((_bumps(x / PATCH, y / PATCH) - BARE_SHARE) * PATCH_STEEPNESS, BARE_HEIGHT_SHARE), 1.0)
     if not patch * max(ground.rough, ground.litter) > least:
         return 0.0
     semantic, _ = _surface(ground, x, y)
@@ -274,6 +273,5 @@ def _bumps(x, y):
     a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
     far = np.int64(1) << 32
     near = hash_uniform(0, np.uint64(place)) * (1 - b) + hash_uniform(0, np.uint64(place + 1)) * b
-    next = (hash_uniform(0, np.uint64(place + far)) * (1 - b)
-            + hash_uniform(0, np.uint64(place + far + 1)) * b)
+    next = hash_uniform(0, np.uint64(place + far)) * (1 - b) + hash_uniform(0, np.uint64(place + far + 1)) * b
     return near * (1 - a) + next * a

@@ -9,24 +9,13 @@ import numpy as np
 from lidar_perception.simulation.actors import SIGHT_M, Actor, ActorSet
 from lidar_perception.simulation.crowd import place_bench, place_standing, place_walking
 from lidar_perception.simulation.places import Side, scatter
-from lidar_perception.simulation.shapes.cyclists import (
-    make_bicycle,
-    make_cyclist,
-    make_motorcycle,
-    make_motorcyclist,
-)
+from lidar_perception.simulation.shapes.cyclists import make_bicycle, make_cyclist, make_motorcycle, make_motorcyclist
 from lidar_perception.simulation.shapes.heavy_vehicles import make_bus, make_tram, make_truck
 from lidar_perception.simulation.shapes.people import make_sitting_person
 from lidar_perception.simulation.shapes.thing import Thing, block, disc, make_rigid
 from lidar_perception.simulation.shapes.vehicles import make_car, make_van
 from lidar_perception.simulation.solids import parts
-from lidar_perception.simulation.street import (
-    CORNER_WALK_M,
-    PARALLEL_STRIP_M,
-    Lane,
-    Street,
-    parking_width,
-)
+from lidar_perception.simulation.street import CORNER_WALK_M, PARALLEL_STRIP_M, Lane, Street, parking_width
 
 DRAWBAR_M = 0.8  # between a car and its trailer
 FREE_CORNER_M = 5.0  # without parked vehicles, at a crossing
@@ -74,8 +63,10 @@ def make_trailer(rng) -> Thing:
     """Make a closed single-axle trailer."""
     length, width, height = size = tuple(rng.uniform((1.8, 1.3, 0.9), (3.8, 1.9, 2.3)).tolist())
     x, y = length / 2, width / 2
-    rows = [block((-x, -y, 0.35), (x, y, height), reflectance=rng.uniform(0.1, 0.5)),
-            *(disc((0, s * (y - 0.1), 0.3), 0.3, 0.1, reflectance=0.06) for s in (-1, 1))]
+    rows = [
+        block((-x, -y, 0.35), (x, y, height), reflectance=rng.uniform(0.1, 0.5)),
+        *(disc((0, s * (y - 0.1), 0.3), 0.3, 0.1, reflectance=0.06) for s in (-1, 1)),
+    ]
     return make_rigid(parts(rows, OTHER_VEHICLE), size, "Misc")
 
 
@@ -94,14 +85,12 @@ def _queue_vehicles(rng, lane: Lane, street: Street, seconds: float) -> Iterator
         group = _draw_vehicles(rng, lane.use)
         length = sum(t.size[0] for t in group) + DRAWBAR_M * (len(group) - 1)
         least = 1.2 + lane.speed
-        x += least + rng.exponential(street.kind.headway * lane.speed + 1.0) * (
-            2.0 if lane.use == "rail" else 1.0)
+        x += least + rng.exponential(street.kind.headway * lane.speed + 1.0) * (2.0 if lane.use == "rail" else 1.0)
         if x + length > last:
             return
         back, front = (x, x + length) if way > 0 else (x + length, x)
         x += length
-        if lane.speed == 0.0 and not any(0 < (line - front) * way < waiting
-                                         for line in stop_lines):
+        if lane.speed == 0.0 and not any(0 < (line - front) * way < waiting for line in stop_lines):
             continue
         if ours and min(back, front) - 2.5 < least and max(back, front) + 2.5 > -least:
             continue
@@ -130,12 +119,12 @@ def _fill_side_street(rng, crossing: tuple[float, float], ground) -> Iterator[Ac
             y += up * (thing.size[0] + rng.uniform(1, 3))
         for chance, far in ((0.25, rng.uniform(5, 50)), (0.3, -rng.uniform(15, 100))):
             if rng.random() < chance:
-                yield Actor(_draw_vehicles(rng, "road")[0], going, curb + up * far, up * np.pi / 2,
-                            rng.uniform(3, 9))
+                yield Actor(_draw_vehicles(rng, "road")[0], going, curb + up * far, up * np.pi / 2, rng.uniform(3, 9))
 
 
 def _park_vehicles(rng, side: Side, taken: float) -> Iterator[Actor]:
     """Yield rows along the curb, cars in driveways, and some car parks behind the sidewalk."""
+
     def vehicle():
         pick = rng.random()
         if pick < 0.965:
@@ -156,13 +145,16 @@ def _park_vehicles(rng, side: Side, taken: float) -> Iterator[Actor]:
         thing = vehicle()
         if rng.random() < taken:
             turn = np.pi * (rng.random() < 0.95) + rng.normal(0, 0.025)
-            yield side.put(thing, along + thing.size[0] / 2,
-                           -0.25 - thing.size[1] / 2 + rng.normal(0, 0.06), turn)
+            yield side.put(thing, along + thing.size[0] / 2, -0.25 - thing.size[1] / 2 + rng.normal(0, 0.06), turn)
         along += thing.size[0] + rng.uniform(0.7, 1.8)
     if side.front == "garden":
         for along in scatter(rng, side.length, 6.0):
-            yield side.put(make_car(rng, driver=False), along, side.walk + rng.uniform(3, 6),
-                           rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.04))
+            yield side.put(
+                make_car(rng, driver=False),
+                along,
+                side.walk + rng.uniform(3, 6),
+                rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.04),
+            )
     if side.front == "verge" and rng.random() < 0.35:
         yield from across(side.walk + rng.uniform(5, 9), 1.57)
 
@@ -174,8 +166,7 @@ def _place_seats(rng, side: Side, rate: float, people: float) -> Iterator[list[A
     for along in scatter(rng, side.length, rate * people):
         out = side.walk - rng.uniform(0.8, 2.5)
         for aside in rng.uniform((-0.9, 0.5), (-0.5, 0.9)):
-            yield [side.put(make_sitting_person(rng), along + aside, out,
-                            np.pi * (aside > 0) + rng.normal(0, 0.2))]
+            yield [side.put(make_sitting_person(rng), along + aside, out, np.pi * (aside > 0) + rng.normal(0, 0.2))]
 
 
 def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterator[Actor]:
@@ -184,19 +175,23 @@ def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterato
     lanes = [lane for lane in street.lanes if lane.use == "cycle"]
     places = [(lane.y, lane.direction) for lane in lanes] or [
         (ground.curb_right + ground.parking + 0.6, 1),
-        (ground.curb_left - ground.parking - 0.6, -1)]
+        (ground.curb_left - ground.parking - 0.6, -1),
+    ]
     for y, way in places:
         speed = rng.uniform(3.5, 5.5)
         first = street.start - (street.speed * seconds if way > 0 else 0.0)
-        for x in first + scatter(rng, street.end - first, kind.riders * people
-                                 * (2.0 if lanes else 1.0)):
+        for x in first + scatter(rng, street.end - first, kind.riders * people * (2.0 if lanes else 1.0)):
             make = make_motorcyclist if rng.random() < MOTORCYCLIST_SHARE else make_cyclist
-            yield Actor(make(rng), x, y + rng.normal(0, 0.1), np.pi * (way < 0),
-                        speed * rng.uniform(0.95, 1.05))
+            yield Actor(make(rng), x, y + rng.normal(0, 0.1), np.pi * (way < 0), speed * rng.uniform(0.95, 1.05))
     for side in (*street.blocks, *_find_crosswalks(street)):
         for along in scatter(rng, side.length, kind.riders * people * 0.5):
-            yield side.put(make_cyclist(rng), along, max(side.walk, 1.0) * rng.uniform(0.5, 0.7),
-                           np.pi * rng.integers(2), speed=rng.uniform(2.0, 4.5))
+            yield side.put(
+                make_cyclist(rng),
+                along,
+                max(side.walk, 1.0) * rng.uniform(0.5, 0.7),
+                np.pi * rng.integers(2),
+                speed=rng.uniform(2.0, 4.5),
+            )
     for side in street.blocks:
         for along in scatter(rng, side.length, kind.clutter / 6 if side.walk else 0.0):
             out, turn = rng.choice([0.9, max(side.walk - 1.0, 0.9)]), rng.normal(np.pi / 2, 0.2)
@@ -208,5 +203,8 @@ def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterato
 def _find_crosswalks(street: Street) -> list[Side]:
     """Return the sidewalks of the side streets, continued across the street."""
     far = 40.0
-    return [Side(x, land * far, -land * np.pi / 2, 2 * far, CORNER_WALK_M, "")
-            for crossing in street.ground.crossings for x, land in zip(crossing, (-1, 1))]
+    return [
+        Side(x, land * far, -land * np.pi / 2, 2 * far, CORNER_WALK_M, "")
+        for crossing in street.ground.crossings
+        for x, land in zip(crossing, (-1, 1))
+    ]

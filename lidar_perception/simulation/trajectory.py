@@ -38,10 +38,9 @@ class Trajectory(NamedTuple):
             sin, cos = math.sin(rate * t + phase), math.cos(rate * t + phase)
             y, aside = y + reach * sin, aside + reach * rate * cos
             turning -= reach * rate * rate * sin
-        square = self.speed ** 2 + aside ** 2
+        square = self.speed**2 + aside**2
         yaw_rate = self.speed * turning / square if square else 0.0
-        return TrajectoryPoint(self.speed * t, y, math.atan2(aside, self.speed),
-                               (self.speed, aside), yaw_rate)
+        return TrajectoryPoint(self.speed * t, y, math.atan2(aside, self.speed), (self.speed, aside), yaw_rate)
 
     def sampled(self, seconds: float, step: float) -> np.ndarray:
         """Return (T, 3) float64 rows [t x y] from 0 to seconds, every step seconds."""
@@ -49,8 +48,7 @@ class Trajectory(NamedTuple):
         return np.array([(t, *self.at(t)[:2]) for t in times])
 
 
-def draw_trajectory(rng: np.random.Generator, speed: tuple[float, float], stands: float,
-                    turn: float) -> Trajectory:
+def draw_trajectory(rng: np.random.Generator, speed: tuple[float, float], stands: float, turn: float) -> Trajectory:
     """Draw a trajectory that stands still or sways in 8 to 25 s.
 
     Args:

@@ -50,8 +50,7 @@ class Grid(NamedTuple):
     fall: np.ndarray
 
 
-def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION,
-                 margin: float = 0.0) -> Windows:
+def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION, margin: float = 0.0) -> Windows:
     """Find the windows of solids in the sensor's frame at the stamp.
 
     Args:
@@ -63,18 +62,26 @@ def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION,
     relative = solids.velocity - np.asarray(motion.velocity, np.float64)
     since = sensor.times() - motion.stamp / sensor.rate
     elevations, limit = np.asarray(sensor.elevations), np.pi / 2 - 1e-6
-    rise, fall = (np.tan(np.clip(elevations + m, -limit, limit))
-                  for m in (margin + 1e-9, -margin - 1e-9))
-    grid = Grid(sensor.columns, float(sensor.rate), float(motion.stamp), float(motion.yaw_rate),
-                float(since.min()), float(since.max()),
-                float(margin / np.cos(np.abs(elevations).max())),
-                float(sensor.max_range), bool(relative.any() or motion.yaw_rate),
-                sensor.origins()[:, 2].copy(), rise, fall)
+    rise, fall = (np.tan(np.clip(elevations + m, -limit, limit)) for m in (margin + 1e-9, -margin - 1e-9))
+    grid = Grid(
+        sensor.columns,
+        float(sensor.rate),
+        float(motion.stamp),
+        float(motion.yaw_rate),
+        float(since.min()),
+        float(since.max()),
+        float(margin / np.cos(np.abs(elevations).max())),
+        float(sensor.max_range),
+        bool(relative.any() or motion.yaw_rate),
+        sensor.origins()[:, 2].copy(),
+        rise,
+        fall,
+    )
     count = len(solids)
-    found = Windows(np.empty(count, np.int64), np.empty(count, np.int64),
-                    np.empty((count, sensor.rings), bool), np.empty(count))
-    shapes = (np.array(part, float, order="C")
-              for part in (solids.centre, solids.half, solids.axes, relative))
+    found = Windows(
+        np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, sensor.rings), bool), np.empty(count)
+    )
+    shapes = (np.array(part, float, order="C") for part in (solids.centre, solids.half, solids.axes, relative))
     _fill_windows(found, grid, np.array(solids.kind), *shapes)
     return found
 
@@ -87,8 +94,7 @@ def _fill_windows(found, grid, kind, centre, half, axes, relative):
         begin, end = (grid.begin, grid.end) if grid.moves else (0.0, 0.0)
         for _ in range(3 if grid.moves else 1):
             ahead = _find_direction(centre[p], relative[p], (begin + end) / 2)
-            _fill_corners(corners, facing, reach, kind[p], centre[p], half[p], axes[p],
-                          relative[p], ahead, begin, end)
+            _fill_corners(corners, facing, reach, kind[p], centre[p], half[p], axes[p], relative[p], ahead, begin, end)
             first, count = _find_columns(corners, grid, begin, end)
             latest = grid.columns // 2 - first
             earliest = latest - count + 1
@@ -129,8 +135,7 @@ def _fill_corners(corners, facing, reach, kind, centre, half, axes, relative, ah
                 a += facing[j, i] * axes[j, 0] * half[0]
                 b += facing[j, i] * axes[j, 1] * half[1]
                 c += facing[j, i] * axes[j, 2] * half[2]
-            reach[i] = math.sqrt(a * a + b * b + (c * c)) if kind == ELLIPSOID else (
-                math.sqrt(a * a + b * b) + abs(c))
+            reach[i] = math.sqrt(a * a + b * b + (c * c)) if kind == ELLIPSOID else (math.sqrt(a * a + b * b) + abs(c))
     for n in range(16):
         since = begin if n < 8 else end
         for i in range(3):
@@ -163,8 +168,7 @@ def _find_columns(corners, grid, begin, end):
 
 @njit(cache=True, nogil=True)
 def _fill_beams(corners, facing, ahead, grid, beams):
-    """Fill which beams (rings,) reach the height of the box; return its distance from the z axis.
-    """
+    """Fill which beams (rings,) reach the height of the box; return its distance from the z axis."""
     near, far, bottom, top = 0.0, 0.0, np.inf, -np.inf
     for side in range(3):  # horizontal directions: two sides of the box, and towards it
         x, y = ahead if side == 2 else (facing[0, side], facing[1, side])

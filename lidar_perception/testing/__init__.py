@@ -29,5 +29,13 @@ from lidar_perception.testing.fixtures import (
     shared_processes,
 )
 
-__all__ = ["domain", "drive_bag", "make_bag", "peer", "processes", "pytest_runtest_makereport",
-           "shared_peer", "shared_processes"]
+__all__ = [
+    "domain",
+    "drive_bag",
+    "make_bag",
+    "peer",
+    "processes",
+    "pytest_runtest_makereport",
+    "shared_peer",
+    "shared_processes",
+]

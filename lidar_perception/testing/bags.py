@@ -22,9 +22,14 @@ START_NS = 1_700_000_000 * 10**9
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 
 
-def make_frames(clouds: Iterable[Any], labels: Iterable[Any] | None = None, *,
-                frame_id: str = LIDAR_FRAME, hz: float = 10.0, start_ns: int = START_NS
-                ) -> list[Frame]:
+def make_frames(
+    clouds: Iterable[Any],
+    labels: Iterable[Any] | None = None,
+    *,
+    frame_id: str = LIDAR_FRAME,
+    hz: float = 10.0,
+    start_ns: int = START_NS,
+) -> list[Frame]:
     """Make frames of clouds.
 
     Args:
@@ -44,9 +49,13 @@ def make_frames(clouds: Iterable[Any], labels: Iterable[Any] | None = None, *,
         if cloud.ndim != 2 or cloud.shape[1] not in (3, 4):
             raise InputError(f"cloud {i} has shape {cloud.shape}; it must be (N, 3) or (N, 4)")
         intensity = cloud[:, 3].copy() if cloud.shape[1] == 4 else None
-        frames.append(Frame.of(str(i), PointCloud(
-            np.ascontiguousarray(cloud[:, :3]), intensity, start_ns + round(i * 1e9 / hz),
-            frame_id), truth))
+        frames.append(
+            Frame.of(
+                str(i),
+                PointCloud(np.ascontiguousarray(cloud[:, :3]), intensity, start_ns + round(i * 1e9 / hz), frame_id),
+                truth,
+            )
+        )
     return frames
 
 
@@ -61,8 +70,9 @@ def _to_truth(given: Any) -> GroundTruth | None:
     return GroundTruth.of(objects.boxes, [CLASSES.index(name) for name in objects.labels])
 
 
-def write_rosbags_bag(path: Path, frames: Iterable[Frame], storage: str = "mcap",
-                      names: Mapping[str, str] = {}) -> Path:
+def write_rosbags_bag(
+    path: Path, frames: Iterable[Frame], storage: str = "mcap", names: Mapping[str, str] = {}
+) -> Path:
     """Write frames as a bag by rosbags; return its path.
 
     Args:
@@ -81,18 +91,19 @@ def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = 
     """Copy a bag by rosbags; arguments and errors are those of write_rosbags_bag."""
     if storage not in STORAGES:
         raise InputError(f"storage '{storage}' is none of {', '.join(STORAGES)}")
-    with Bag(source) as recorded, Writer(path, version=9,
-                                         storage_plugin=STORAGES[storage]) as bag:
-        copies = {topic: bag.add_connection(
-            names.get(topic, topic), kind, typestore=load_typestore(),
-            offered_qos_profiles=recorded.qos(topic)) for topic, kind in recorded.topics.items()}
+    with Bag(source) as recorded, Writer(path, version=9, storage_plugin=STORAGES[storage]) as bag:
+        copies = {
+            topic: bag.add_connection(
+                names.get(topic, topic), kind, typestore=load_typestore(), offered_qos_profiles=recorded.qos(topic)
+            )
+            for topic, kind in recorded.topics.items()
+        }
         for topic, stamp, data in recorded.raw_messages():
             bag.write(copies[topic], stamp, data)
     return path
 
 
-def to_frames(given: Sequence[Any] | Iterable[Frame], labels: Any = None, **options: Any
-              ) -> list[Frame]:
+def to_frames(given: Sequence[Any] | Iterable[Frame], labels: Any = None, **options: Any) -> list[Frame]:
     """Return frames as they are, or make_frames() of clouds.
 
     Raises:
@@ -102,6 +113,8 @@ def to_frames(given: Sequence[Any] | Iterable[Frame], labels: Any = None, **opti
     if not given or not isinstance(given[0], Frame):
         return make_frames(given, labels, **options)
     if refused := [*(() if labels is None else ("labels",)), *options]:
-        raise InputError(f"frames already have labels, times and a frame_id, so they take no "
-                         f"{' and no '.join(refused)}; give arrays instead")
+        raise InputError(
+            f"frames already have labels, times and a frame_id, so they take no "
+            f"{' and no '.join(refused)}; give arrays instead"
+        )
     return given

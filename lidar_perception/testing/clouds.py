@@ -14,8 +14,7 @@ from msg_utils.stamps import make_header
 FIELDS = ("x", "y", "z", "intensity")
 
 
-def make_cloud_message(points: Any, stamp_ns: int = 1, frame_id: str = "lidar",
-                       **columns: np.ndarray) -> Any:
+def make_cloud_message(points: Any, stamp_ns: int = 1, frame_id: str = "lidar", **columns: np.ndarray) -> Any:
     """Make a PointCloud2.
 
     Args:

@@ -61,18 +61,26 @@ def _from_pairs(pairs: Any) -> Objects:
         for row, (_, box) in zip(boxes, pairs):
             if len(box) not in (3, 7):
                 raise ValueError
-            row[:len(box)] = box
+            row[: len(box)] = box
     except (TypeError, ValueError):
-        raise InputError(f"{type(pairs).__name__} is not a MarkerArray, Detection3DArray, "
-                         "Detections, GroundTruth or list of (class name, [x y z l w h yaw] or "
-                         "[x y z])") from None
+        raise InputError(
+            f"{type(pairs).__name__} is not a MarkerArray, Detection3DArray, "
+            "Detections, GroundTruth or list of (class name, [x y z l w h yaw] or "
+            "[x y z])"
+        ) from None
     return Objects(boxes, labels, np.ones(len(boxes)))
 
 
-def assert_detections(found: Any, expected: Any, *, max_distance: float = MAX_CENTRE_DISTANCE,
-                      min_iou: float | None = None, same_class: bool = True,
-                      max_missing: int = 0, max_extra: int | None = 0
-                      ) -> list[tuple[int, int]]:
+def assert_detections(
+    found: Any,
+    expected: Any,
+    *,
+    max_distance: float = MAX_CENTRE_DISTANCE,
+    min_iou: float | None = None,
+    same_class: bool = True,
+    max_missing: int = 0,
+    max_extra: int | None = 0,
+) -> list[tuple[int, int]]:
     """Assert that the detections match the expected objects, both as to_objects() takes them.
 
     Detections and objects are paired one to one: as many pairs as possible, then the closest.
@@ -105,18 +113,21 @@ def assert_detections(found: Any, expected: Any, *, max_distance: float = MAX_CE
     missing = sorted(set(range(len(b.boxes))) - set(columns.tolist()))
     extra = sorted(set(range(len(a.boxes))) - set(rows.tolist()))
     if len(missing) > max_missing or (max_extra is not None and len(extra) > max_extra):
-        rule = (f"centres at most {max_distance:g} m apart" if min_iou is None else
-                f"3D IoU at least {min_iou:g}")
-        raise AssertionError("\n".join([
-            f"{len(rows)} of {len(b.boxes)} expected objects were found, {len(extra)} more were "
-            f"found ({rule}{', of the same class' if same_class else ''})",
-            *_list_objects("missing", b, missing, a, distance.T),
-            *_list_objects("extra", a, extra, b, distance)]))
+        rule = f"centres at most {max_distance:g} m apart" if min_iou is None else f"3D IoU at least {min_iou:g}"
+        raise AssertionError(
+            "\n".join(
+                [
+                    f"{len(rows)} of {len(b.boxes)} expected objects were found, {len(extra)} more were "
+                    f"found ({rule}{', of the same class' if same_class else ''})",
+                    *_list_objects("missing", b, missing, a, distance.T),
+                    *_list_objects("extra", a, extra, b, distance),
+                ]
+            )
+        )
     return list(zip(rows.tolist(), columns.tolist()))
 
 
-def _list_objects(word: str, objects: Objects, rows: Sequence[int], others: Objects,
-                  distance: np.ndarray) -> list[str]:
+def _list_objects(word: str, objects: Objects, rows: Sequence[int], others: Objects, distance: np.ndarray) -> list[str]:
     """Return a line for each of the rows, with the nearest of the others."""
     lines = []
     for i in rows[:MAX_LISTED]:
@@ -127,8 +138,9 @@ def _list_objects(word: str, objects: Objects, rows: Sequence[int], others: Obje
             j = int(np.argmin(np.nan_to_num(distance[i], nan=np.inf)))
             nearest = f"; nearest: {others.labels[j]}, {distance[i, j]:.2f} m away"
         score = f", score {objects.scores[i]:.2f}" if word == "extra" else ""
-        lines.append(f"  {word}: {objects.labels[i]} at ({box[0]:.2f}, {box[1]:.2f}, "
-                     f"{box[2]:.2f}){size}{score}{nearest}")
+        lines.append(
+            f"  {word}: {objects.labels[i]} at ({box[0]:.2f}, {box[1]:.2f}, {box[2]:.2f}){size}{score}{nearest}"
+        )
     if len(rows) > MAX_LISTED:
         lines.append(f"  ... and {len(rows) - MAX_LISTED} more {word}")
     return lines

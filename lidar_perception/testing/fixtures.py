@@ -22,6 +22,7 @@ def domain() -> Iterator[int]:
     from lidar_perception.candidates.warm_up import warm_up
     from lidar_perception.nodes.graph import reserve_domain
     from lidar_perception.nodes.shared_memory import use_large_shared_memory
+
     with pytest.MonkeyPatch.context() as patch:
         number = reserve_domain()
         patch.setenv("ROS_DOMAIN_ID", str(number))
@@ -34,12 +35,14 @@ def domain() -> Iterator[int]:
 def _processes(domain: int, folder: Path) -> Iterator[Any]:
     pytest.importorskip("rclpy", reason=NEEDS_ROS)
     from lidar_perception.testing.processes import NodesUnderTest
+
     with NodesUnderTest(folder, domain) as running:
         yield running
 
 
 def _peer(domain: int, processes: Any) -> Iterator[Any]:
     from lidar_perception.testing.peer import Peer
+
     with Peer(domain, processes) as peer:
         yield peer
 
@@ -74,13 +77,17 @@ def make_bag(tmp_path_factory) -> Callable[..., Path]:
 
     clouds and labels are those of bags.make_frames, or clouds are frames, such as simulated ones.
     """
-    def make(frames: Any, labels: Any = None, *, storage: str = "mcap", points: str = "/points",
-             **options: Any) -> Path:
+
+    def make(
+        frames: Any, labels: Any = None, *, storage: str = "mcap", points: str = "/points", **options: Any
+    ) -> Path:
         from lidar_perception.testing.bags import to_frames, write_rosbags_bag
         from lidar_perception.wire.topics import POINTS
-        return write_rosbags_bag(tmp_path_factory.mktemp("bag") / "bag",
-                                 to_frames(frames, labels, **options),
-                                 storage, {POINTS: points})
+
+        return write_rosbags_bag(
+            tmp_path_factory.mktemp("bag") / "bag", to_frames(frames, labels, **options), storage, {POINTS: points}
+        )
+
     return make
 
 
@@ -89,6 +96,7 @@ def drive_bag(make_bag) -> Path:
     """A simulated drive among people: eight clouds of 64 beams, with labels and a camera."""
     from lidar_perception.simulation.recording import simulate_frames
     from lidar_perception.simulation.scene import CROWDED_ZONES
+
     return make_bag(simulate_frames(33, FRAMES, scenes=CROWDED_ZONES))
 
 

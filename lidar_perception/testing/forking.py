@@ -19,8 +19,7 @@ class ForkedNode:
     def __init__(self, arguments: Sequence[str], environment: Mapping[str, str], log: Path):
         self.args = list(arguments)
         log.write_text("")
-        self.process = CONTEXT.Process(target=_run_node, args=(self.args, dict(environment), log),
-                                       daemon=True)
+        self.process = CONTEXT.Process(target=_run_node, args=(self.args, dict(environment), log), daemon=True)
         self.process.start()
         self.pid = self.process.pid
 
@@ -55,4 +54,5 @@ def _run_node(arguments: list[str], environment: dict[str, str], log: Path) -> N
     os.dup2(file, 1)
     os.dup2(file, 2)
     from lidar_perception.nodes.main import run
+
     sys.exit(run(arguments[0], arguments))

@@ -33,16 +33,20 @@ def include_launch_file(name: str = "detectors", **arguments: Any) -> Any:
     try:
         share = Path(get_package_share_directory("lidar_perception"))
     except PackageNotFoundError:
-        raise InputError("ROS does not find the package lidar_perception; source the workspace it "
-                         "was built in, or add where pip installed it to AMENT_PREFIX_PATH"
-                         ) from None
+        raise InputError(
+            "ROS does not find the package lidar_perception; source the workspace it "
+            "was built in, or add where pip installed it to AMENT_PREFIX_PATH"
+        ) from None
     path = share / "launch" / f"{name}.launch.py"
     if not path.is_file():
         have = ", ".join(sorted(p.name.split(".")[0] for p in path.parent.glob("*.launch.py")))
         raise InputError(f"there is no launch file '{name}'; there are {have}")
-    return IncludeLaunchDescription(PythonLaunchDescriptionSource(str(path)), launch_arguments=[
-        (key, str(value).lower() if isinstance(value, bool) else str(value))
-        for key, value in arguments.items()])
+    return IncludeLaunchDescription(
+        PythonLaunchDescriptionSource(str(path)),
+        launch_arguments=[
+            (key, str(value).lower() if isinstance(value, bool) else str(value)) for key, value in arguments.items()
+        ],
+    )
 
 
 def make_description(*actions: Any) -> Any:
@@ -59,8 +63,7 @@ def make_description(*actions: Any) -> Any:
         from launch_testing.actions import ReadyToTest
     except ModuleNotFoundError as error:
         raise _missing_package_error(error) from None
-    os.environ.update(ROS_DOMAIN_ID=str(reserve_domain()),
-                      ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
+    os.environ.update(ROS_DOMAIN_ID=str(reserve_domain()), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
     use_large_shared_memory()
     warm_up()  # on a fresh machine, compilation in a node could take longer than a wait
     return LaunchDescription([*actions, ReadyToTest()])
@@ -68,5 +71,7 @@ def make_description(*actions: Any) -> Any:
 
 def _missing_package_error(error: ModuleNotFoundError) -> InputError:
     package = str(error.name).partition(".")[0].replace("_", "-")
-    return InputError(f"{error.name} is not installed; it comes with ROS 2 (ros-jazzy-{package}); "
-                      "with pytest alone see docs/how-to/test-your-stack.md")
+    return InputError(
+        f"{error.name} is not installed; it comes with ROS 2 (ros-jazzy-{package}); "
+        "with pytest alone see docs/how-to/test-your-stack.md"
+    )

@@ -47,12 +47,15 @@ class Peer(ExternalNode):
         """Subscribe to a topic; return a list that grows with the serialized messages."""
         return self._listen(topic, _resolve_type(kind)[1], bytes, qos)
 
-    def _listen(self, topic: str, cls: type, read: Callable[[bytes], Any] | None,
-                qos: QoSProfile) -> list:
+    def _listen(self, topic: str, cls: type, read: Callable[[bytes], Any] | None, qos: QoSProfile) -> list:
         received: list = []
         self.node.create_subscription(
-            cls, topic, (lambda data: received.append(read(data))) if read else received.append,
-            qos, raw=read is not None)
+            cls,
+            topic,
+            (lambda data: received.append(read(data))) if read else received.append,
+            qos,
+            raw=read is not None,
+        )
         self.received.append((self.node.resolve_topic_name(topic), received))
         return received
 
@@ -79,8 +82,7 @@ class Peer(ExternalNode):
 
         self.wait(condition, what)
 
-    def wait(self, condition: Callable[[], Any], what: str | Callable[[], str],
-             timeout: float = TIMEOUT_S) -> None:
+    def wait(self, condition: Callable[[], Any], what: str | Callable[[], str], timeout: float = TIMEOUT_S) -> None:
         """Spin until condition() holds; `what` describes it.
 
         Raises:
@@ -112,40 +114,38 @@ class Peer(ExternalNode):
         def missing() -> list[str]:
             return [name for name in names if not self.node.count_publishers(name)]
 
-        self.wait(lambda: not missing(), lambda: "publishers of " + ", ".join(missing()),
-                  timeout)
+        self.wait(lambda: not missing(), lambda: "publishers of " + ", ".join(missing()), timeout)
 
-    def wait_for_messages(self, topic: str, kind: str | type, count: int = 1,
-                          qos: QoSProfile = RELIABLE, timeout: float = TIMEOUT_S) -> list:
+    def wait_for_messages(
+        self, topic: str, kind: str | type, count: int = 1, qos: QoSProfile = RELIABLE, timeout: float = TIMEOUT_S
+    ) -> list:
         """Subscribe to a topic and wait for `count` messages; the list continues to grow."""
         received = self.listen(topic, kind, qos)
         self.wait(lambda: len(received) >= count, f"{count} messages on {topic}", timeout)
         return received
 
-    def wait_for_diagnostics(self, node: str, words: str = "", level: int | None = None,
-                             timeout: float = TIMEOUT_S) -> Any:
+    def wait_for_diagnostics(
+        self, node: str, words: str = "", level: int | None = None, timeout: float = TIMEOUT_S
+    ) -> Any:
         """Wait until the node's diagnostic has these words and this level; return the status.
 
         level: 0 OK, 1 WARN, 2 ERROR, 3 STALE; None for any.
         """
+
         def matches() -> bool:
             status = self.diagnostics.get(node)
-            return (status is not None and words in status.message
-                    and level in (None, ord(status.level)))
+            return status is not None and words in status.message and level in (None, ord(status.level))
 
-        wanted = ("" if level is None else f" of level {LEVELS[level]}") + (
-            f" with '{words}'" if words else "")
+        wanted = ("" if level is None else f" of level {LEVELS[level]}") + (f" with '{words}'" if words else "")
         self.wait(matches, f"a diagnostic of {node}{wanted}", timeout)
         return self.diagnostics[node]
 
     def wait_for_graph(self, graph: Graph, timeout: float = TIMEOUT_S) -> None:
         """Wait until all nodes of a graph, as start_graph() returns it, are connected."""
         outputs = find_connected_outputs(graph)
-        self.wait(lambda: self.is_connected(outputs), f"{', '.join(graph)} to find each other",
-                  timeout)
+        self.wait(lambda: self.is_connected(outputs), f"{', '.join(graph)} to find each other", timeout)
 
-    def wait_for_subscribers(self, node: str, topic: str, others: int = 0,
-                             timeout: float = TIMEOUT_S) -> None:
+    def wait_for_subscribers(self, node: str, topic: str, others: int = 0, timeout: float = TIMEOUT_S) -> None:
         """Wait until a node of this package has discovered all subscribers of its topic.
 
         These are the peer's own subscribers and `others`, by the node's diagnostics. They miss
@@ -153,18 +153,25 @@ class Peer(ExternalNode):
         """
         name = self.node.resolve_topic_name(topic)
         wanted = others + sum(name == subscribed for subscribed, _ in self.received)
-        self.wait(lambda: int(self.get_value(node, f"subscribers of {name}") or 0) >= wanted,
-                  f"{wanted} subscribers of {name}", timeout)
+        self.wait(
+            lambda: int(self.get_value(node, f"subscribers of {name}") or 0) >= wanted,
+            f"{wanted} subscribers of {name}",
+            timeout,
+        )
 
     def describe(self) -> str:
         """Describe the diagnostics of the nodes and the messages received so far."""
-        diagnostics = "; ".join(f"{name} {LEVELS[ord(status.level)]} '{status.message}'"
-                                for name, status in sorted(self.diagnostics.items()))
+        diagnostics = "; ".join(
+            f"{name} {LEVELS[ord(status.level)]} '{status.message}'"
+            for name, status in sorted(self.diagnostics.items())
+        )
         received = "; ".join(
-            f"{topic} {len(messages)} messages" if messages else f"{topic} nothing from "
-            f"{self.node.count_publishers(topic)} publishers" for topic, messages in self.received)
-        return f"diagnostics: {diagnostics or 'none'}" + (
-            f"; received: {received}" if received else "")
+            f"{topic} {len(messages)} messages"
+            if messages
+            else f"{topic} nothing from {self.node.count_publishers(topic)} publishers"
+            for topic, messages in self.received
+        )
+        return f"diagnostics: {diagnostics or 'none'}" + (f"; received: {received}" if received else "")
 
     def call(self, service: str, kind: type, request: Any) -> Any:
         """Call a service and return its answer."""
@@ -178,7 +185,8 @@ class Peer(ExternalNode):
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> list[str]:
         """Set parameters of a node one by one; return its reasons for those that it refuses."""
         request = SetParameters.Request(
-            parameters=[parameter.to_parameter_msg() for parameter in to_parameters(values)])
+            parameters=[parameter.to_parameter_msg() for parameter in to_parameters(values)]
+        )
         results = self.call(f"{node}/set_parameters", SetParameters, request).results
         return [r.reason or "no reason is given" for r in results if not r.successful]
 

@@ -15,4 +15,5 @@ for module in ("nodes.stopping", "detectors.open"):
         import_module(f"lidar_perception.{module}")
 with suppress(ImportError):
     from lidar_perception.candidates.warm_up import warm_up
+
     warm_up()

@@ -41,8 +41,15 @@ class NodesUnderTest(Processes):
         else:
             self.running[name] = ForkedNode(arguments, self.environment, self.logs / f"{name}.log")
 
-    def start_graph(self, detectors: Sequence[str], params: Any = None, *, single: bool = False,
-                    points: str = relative_name(POINTS), namespace: str = "") -> Graph:
+    def start_graph(
+        self,
+        detectors: Sequence[str],
+        params: Any = None,
+        *,
+        single: bool = False,
+        points: str = relative_name(POINTS),
+        namespace: str = "",
+    ) -> Graph:
         """Start the nodes of one or several detectors, as the launch files do.
 
         Args:
@@ -54,11 +61,11 @@ class NodesUnderTest(Processes):
         Returns:
             node -> remappings.
         """
-        values = {} if params is None else (
-            params if isinstance(params, Mapping) else flatten(params))
-        graph = {node: {a: points if b == CLOUDS["~/input/points"] else b
-                        for a, b in remap.items()}
-                 for node, remap in build_graph(detectors, single).items()}
+        values = {} if params is None else (params if isinstance(params, Mapping) else flatten(params))
+        graph = {
+            node: {a: points if b == CLOUDS["~/input/points"] else b for a, b in remap.items()}
+            for node, remap in build_graph(detectors, single).items()
+        }
         for node, remap in graph.items():
             self.start(node, remap, values, namespace)
         return graph
@@ -73,8 +80,11 @@ class NodesUnderTest(Processes):
         """
         if "bag_player" in self.running:
             self.end("bag_player")
-        self.start("bag_player", {}, {"bag": str(bag), "wait_timeout": 120.0,
-                                      "follow_timeout": 60.0, "follow": list(follow), **params})
+        self.start(
+            "bag_player",
+            {},
+            {"bag": str(bag), "wait_timeout": 120.0, "follow_timeout": 60.0, "follow": list(follow), **params},
+        )
 
     def end(self, name: str, timeout: float = 15.0) -> int:
         """End a process by SIGINT if it still runs; return its exit code."""
@@ -102,7 +112,6 @@ def collect_logs() -> list[tuple[str, str]]:
             lines = processes.read_log(name).splitlines()
             note = ""
             if len(lines) > MAX_LOG_LINES:
-                note = (f"(the last {MAX_LOG_LINES} of {len(lines)} lines, all in "
-                        f"{processes.logs})\n")
+                note = f"(the last {MAX_LOG_LINES} of {len(lines)} lines, all in {processes.logs})\n"
             logs.append((f"{name}, which {state}", note + "\n".join(lines[-MAX_LOG_LINES:])))
     return logs

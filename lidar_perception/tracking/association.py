@@ -35,9 +35,16 @@ class Pairs(NamedTuple):
         return Pairs(*(column[wanted] for column in self))
 
 
-def find_pairs(tracks: np.ndarray, spread: np.ndarray, kinds: np.ndarray, reach: np.ndarray,
-               boxes: np.ndarray, box_kinds: np.ndarray, params: AssociationParams,
-               seconds: float = NOMINAL_PERIOD_S) -> Pairs:
+def find_pairs(
+    tracks: np.ndarray,
+    spread: np.ndarray,
+    kinds: np.ndarray,
+    reach: np.ndarray,
+    boxes: np.ndarray,
+    box_kinds: np.ndarray,
+    params: AssociationParams,
+    seconds: float = NOMINAL_PERIOD_S,
+) -> Pairs:
     """Find the detections that can belong to each track, and the cost of assigning them.
 
     Args:
@@ -52,9 +59,9 @@ def find_pairs(tracks: np.ndarray, spread: np.ndarray, kinds: np.ndarray, reach:
     widest = params.max_gate * max(1.0, seconds / NOMINAL_PERIOD_S)
     gate = np.minimum(np.maximum(params.sigmas * spread, reach), widest)
     order = np.argsort(boxes[:, 0], kind="stable")
-    i, j, distance, iou = _find_pairs_in_gates(np.ascontiguousarray(tracks), gate,
-                                               np.ascontiguousarray(boxes), order,
-                                               params.overlap > 0)
+    i, j, distance, iou = _find_pairs_in_gates(
+        np.ascontiguousarray(tracks), gate, np.ascontiguousarray(boxes), order, params.overlap > 0
+    )
     cost = (1.0 - params.overlap) * distance / gate[i]
     if params.overlap > 0:
         cost += params.overlap * (1.0 - iou)

@@ -36,13 +36,12 @@ class DriveTracker:
         has_pose: True if the last frame had a pose, or if ego is "none".
     """
 
-    def __init__(self, recording: Recording, params: TrackingParams = TrackingParams(),
-                 ego: str = "auto") -> None:
+    def __init__(self, recording: Recording, params: TrackingParams = TrackingParams(), ego: str = "auto") -> None:
         self.ego = choose_ego_source(recording, ego)
         self.tracker, self._read_pose = Tracker(params), make_pose_reader(self.ego)
         self.drive, self.has_pose = "", True
         self._last = "", -1  # sequence and stamp of the previous frame
-        self._number = 0     # of the drive
+        self._number = 0  # of the drive
 
     def __call__(self, frame: Frame, detections: Detections) -> Tracks:
         """Return the tracks after a frame, in its LiDAR frame.
@@ -50,8 +49,7 @@ class DriveTracker:
         Raises InputError if the pose of the frame cannot be read.
         """
         sequence, stamp_ns = self._last
-        if frame.sequence != sequence or not (
-                frame.sequence or is_same_drive(stamp_ns, frame.stamp_ns)):
+        if frame.sequence != sequence or not (frame.sequence or is_same_drive(stamp_ns, frame.stamp_ns)):
             self.tracker.reset()
             self._read_pose = make_pose_reader(self.ego)
             self._number += 1
@@ -70,8 +68,10 @@ def choose_ego_source(recording: Recording, wanted: str = "auto") -> str:
     """
     if wanted != "auto":
         return wanted
-    return choose_recorded_source(POSES in recording.has and (
-        not has_odometry() or any(map(has_valid_pose, islice(recording.frames, MAX_POSE_CHECKS)))))
+    return choose_recorded_source(
+        POSES in recording.has
+        and (not has_odometry() or any(map(has_valid_pose, islice(recording.frames, MAX_POSE_CHECKS))))
+    )
 
 
 def has_valid_pose(frame: Frame) -> bool:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from lidar_perception.data.frame import Frame
 from lidar_perception.types import InputError
 
-MAX_SPEED = 100.0   # m/s; a faster pose change is a jump
+MAX_SPEED = 100.0  # m/s; a faster pose change is a jump
 MAX_ROTATION_ERROR = 1e-2  # largest element of R R^T - I in a valid pose
 SOURCES = ("recording", "odometry", "tf", "kiss_icp")  # of poses, best first
 NO_SOURCE = "none"
@@ -55,8 +55,7 @@ def is_valid_pose(pose: np.ndarray | None) -> bool:
     if pose is None or np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
         return False
     rotation = np.asarray(pose, float)[:3, :3]
-    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < MAX_ROTATION_ERROR
-                and np.linalg.det(rotation) > 0)
+    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() < MAX_ROTATION_ERROR and np.linalg.det(rotation) > 0)
 
 
 def advance_ego(ego: Ego, pose: np.ndarray | None, seconds: float, max_gap: float) -> Ego:
@@ -72,11 +71,11 @@ def advance_ego(ego: Ego, pose: np.ndarray | None, seconds: float, max_gap: floa
             return Ego(pose, ego.velocity, ego.rotation, 0.0, True)
         start = ego.pose @ np.linalg.inv(_compute_step(ego, min(ego.missing_s, max_gap)))
         step = np.linalg.inv(start) @ pose
-        return Ego(pose, step[:3, 3] / since,
-                   Rotation.from_matrix(step[:3, :3]).as_rotvec() / since, 0.0, True)
+        return Ego(pose, step[:3, 3] / since, Rotation.from_matrix(step[:3, :3]).as_rotvec() / since, 0.0, True)
     moving_s = max(min(seconds, max_gap - ego.missing_s), 0.0)
-    return Ego(ego.pose @ _compute_step(ego, moving_s), ego.velocity, ego.rotation,
-               ego.missing_s + seconds, ego.has_pose)
+    return Ego(
+        ego.pose @ _compute_step(ego, moving_s), ego.velocity, ego.rotation, ego.missing_s + seconds, ego.has_pose
+    )
 
 
 def _compute_step(ego: Ego, seconds: float) -> np.ndarray:
@@ -97,8 +96,7 @@ def choose_source(wanted: str, available: Collection[str]) -> str:
 
     Returns NO_SOURCE if the wanted source is not available.
     """
-    return next((name for name in SOURCES if name in available and wanted in ("auto", name)),
-                NO_SOURCE)
+    return next((name for name in SOURCES if name in available and wanted in ("auto", name)), NO_SOURCE)
 
 
 def choose_recorded_source(has_poses: bool, wanted: str = "auto") -> str:
@@ -106,8 +104,7 @@ def choose_recorded_source(has_poses: bool, wanted: str = "auto") -> str:
 
     A source other than "auto" is assumed to be available; it reports itself if it is not.
     """
-    return choose_source(
-        wanted, {wanted, *["recording"] * has_poses, *["kiss_icp"] * has_odometry()})
+    return choose_source(wanted, {wanted, *["recording"] * has_poses, *["kiss_icp"] * has_odometry()})
 
 
 def make_pose_reader(source: str) -> Callable[[Frame], np.ndarray | None]:
@@ -141,8 +138,9 @@ class Odometry:
             from kiss_icp.kiss_icp import KissICP
             from kiss_icp.voxelization import voxel_down_sample
         except ImportError:
-            raise InputError("ego motion from scans needs kiss-icp; run pip install "
-                             "'lidar_perception[odometry]'") from None
+            raise InputError(
+                "ego motion from scans needs kiss-icp; run pip install 'lidar_perception[odometry]'"
+            ) from None
         config = KISSConfig()
         config.mapping.voxel_size, config.data.deskew = voxel, False
         config.registration.max_num_threads = 1

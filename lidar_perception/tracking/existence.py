@@ -38,8 +38,7 @@ def discount_observations(count: np.ndarray, correlation: float) -> np.ndarray:
     return count / (1.0 + np.maximum(count - 1.0, 0.0) * correlation)
 
 
-def compute_validity(total: np.ndarray, count: np.ndarray, moving: np.ndarray,
-                     params: ExistenceParams) -> np.ndarray:
+def compute_validity(total: np.ndarray, count: np.ndarray, moving: np.ndarray, params: ExistenceParams) -> np.ndarray:
     """Compute the log odds (N,) that tracks are real objects of their class.
 
     Args:
@@ -48,12 +47,14 @@ def compute_validity(total: np.ndarray, count: np.ndarray, moving: np.ndarray,
         moving: (N,) probability of motion; above 0.5 it counts as evidence for an object.
     """
     mean = total / np.maximum(count, 1e-9)
-    return (params.prior + mean * discount_observations(count, params.correlation)
-            + params.moves * np.maximum(2.0 * moving - 1.0, 0.0))
+    return (
+        params.prior
+        + mean * discount_observations(count, params.correlation)
+        + params.moves * np.maximum(2.0 * moving - 1.0, 0.0)
+    )
 
 
-def compute_miss_penalty(hits: np.ndarray, tries: np.ndarray, seconds: float,
-                         params: ExistenceParams) -> np.ndarray:
+def compute_miss_penalty(hits: np.ndarray, tries: np.ndarray, seconds: float, params: ExistenceParams) -> np.ndarray:
     """Compute how much a miss lowers the log odds of presence, (N,).
 
     The penalty is large for tracks with a high hit rate, hits (N,) of tries (N,), but at most

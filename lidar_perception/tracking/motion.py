@@ -15,11 +15,17 @@ from lidar_perception.geometry import wrap_angle, wrap_line
 X, Y, VX, VY, HEADING, TURN = range(6)
 MEASURED = np.array([X, Y, HEADING])
 MIN_OPPOSING_SCORE = 1.0  # sum of scores of opposite measured headings that flips a heading
-MIN_TURN_RAD = 1e-4       # per step; a smaller turn uses the series of sin(a) / a
+MIN_TURN_RAD = 1e-4  # per step; a smaller turn uses the series of sin(a) / a
 
 
-def predict(means: np.ndarray, covariances: np.ndarray, seconds: float, acceleration: np.ndarray,
-            turning: np.ndarray, wandering: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def predict(
+    means: np.ndarray,
+    covariances: np.ndarray,
+    seconds: float,
+    acceleration: np.ndarray,
+    turning: np.ndarray,
+    wandering: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Predict means and covariances `seconds` (0 or more) ahead.
 
     acceleration, turning and wandering (N,) are the noise densities of MotionParams.
@@ -50,10 +56,9 @@ def predict(means: np.ndarray, covariances: np.ndarray, seconds: float, accelera
     f[:, VX, TURN], f[:, VY, TURN] = -t * later[:, VY], t * later[:, VX]
     f[:, HEADING, TURN] = t
     predicted = f @ covariances @ f.transpose(0, 2, 1)
-    for place, speed, density in ((X, VX, acceleration), (Y, VY, acceleration),
-                                  (HEADING, TURN, turning)):
+    for place, speed, density in ((X, VX, acceleration), (Y, VY, acceleration), (HEADING, TURN, turning)):
         square = density * density
-        predicted[:, place, place] += square * t ** 3 / 3
+        predicted[:, place, place] += square * t**3 / 3
         predicted[:, place, speed] += square * t * t / 2
         predicted[:, speed, place] += square * t * t / 2
         predicted[:, speed, speed] += square * t
@@ -61,8 +66,9 @@ def predict(means: np.ndarray, covariances: np.ndarray, seconds: float, accelera
     return later, predicted
 
 
-def update(means: np.ndarray, covariances: np.ndarray, measured: np.ndarray,
-           noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def update(
+    means: np.ndarray, covariances: np.ndarray, measured: np.ndarray, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Update with measured (N, 3) [x y heading] of standard deviations noise (N, 3).
 
     The measured heading or its opposite is used, whichever is nearer to the state's: detectors
@@ -74,12 +80,10 @@ def update(means: np.ndarray, covariances: np.ndarray, measured: np.ndarray,
     spread = against[:, MEASURED]
     spread[:, range(3), range(3)] += noise * noise
     gain = np.linalg.solve(spread, against.transpose(0, 2, 1)).transpose(0, 2, 1)
-    return _normalize(means + (gain @ innovation[:, :, None])[:, :, 0],
-                      covariances - gain @ against.transpose(0, 2, 1))
+    return _normalize(means + (gain @ innovation[:, :, None])[:, :, 0], covariances - gain @ against.transpose(0, 2, 1))
 
 
-def constrain_to_heading(means: np.ndarray, covariances: np.ndarray,
-                         slip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def constrain_to_heading(means: np.ndarray, covariances: np.ndarray, slip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Update with a lateral speed of 0, of standard deviations slip (N,).
 
     Wheels and feet go forward, so this couples the heading and the direction of motion.
@@ -92,12 +96,12 @@ def constrain_to_heading(means: np.ndarray, covariances: np.ndarray,
     spread = (slope * against).sum(axis=1) + slip * slip
     gain = against / spread[:, None]
     across = cos * vy - sin * vx
-    return _normalize(means - gain * across[:, None],
-                      covariances - gain[:, :, None] * against[:, None, :])
+    return _normalize(means - gain * across[:, None], covariances - gain[:, :, None] * against[:, None, :])
 
 
-def flip_reversed_headings(means: np.ndarray, agreement: np.ndarray,
-                           backwards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def flip_reversed_headings(
+    means: np.ndarray, agreement: np.ndarray, backwards: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Reverse the headings that point backwards.
 
     A heading is reversed if the object moves backwards faster than backwards (N,) m/s, or if it
@@ -106,10 +110,8 @@ def flip_reversed_headings(means: np.ndarray, agreement: np.ndarray,
 
     Returns the new means and agreements.
     """
-    forward = (np.cos(means[:, HEADING]) * means[:, VX]
-               + np.sin(means[:, HEADING]) * means[:, VY])
-    wrong = ((forward < -backwards)
-             | (agreement < -MIN_OPPOSING_SCORE) & (forward <= backwards))
+    forward = np.cos(means[:, HEADING]) * means[:, VX] + np.sin(means[:, HEADING]) * means[:, VY]
+    wrong = (forward < -backwards) | (agreement < -MIN_OPPOSING_SCORE) & (forward <= backwards)
     flipped = means.copy()
     flipped[:, HEADING] = wrap_angle(means[:, HEADING] + np.pi * wrong)
     return flipped, np.where(wrong, -agreement, agreement)
@@ -121,8 +123,7 @@ def _normalize(means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, 
     return means, (covariances + covariances.transpose(0, 2, 1)) / 2
 
 
-def rotate_covariances(covariances: np.ndarray, cos: float, sin: float,
-                       side: float = 1.0) -> np.ndarray:
+def rotate_covariances(covariances: np.ndarray, cos: float, sin: float, side: float = 1.0) -> np.ndarray:
     """Express covariances in axes in which the old x axis is [cos sin].
 
     The old y axis points to the left of the old x axis, or with side -1, for an upside-down frame,

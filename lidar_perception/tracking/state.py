@@ -61,17 +61,14 @@ class States:
 
     def append(self, others: States) -> States:
         """Return these tracks followed by the others."""
-        return States(*(np.concatenate([getattr(self, f.name), getattr(others, f.name)])
-                        for f in fields(self)))
+        return States(*(np.concatenate([getattr(self, f.name), getattr(others, f.name)]) for f in fields(self)))
 
     @staticmethod
     def none() -> States:
         """Return the state without tracks."""
-        shapes = {"means": (6,), "covariances": (6, 6), "sizes": (3,),
-                  "class_evidence": (len(CLASSES),)}
+        shapes = {"means": (6,), "covariances": (6, 6), "sizes": (3,), "class_evidence": (len(CLASSES),)}
         kinds = {"ids": np.int64, "class_ids": np.int32}
-        return States(*(np.zeros((0, *shapes.get(f.name, ())), kinds.get(f.name, np.float64))
-                        for f in fields(States)))
+        return States(*(np.zeros((0, *shapes.get(f.name, ())), kinds.get(f.name, np.float64)) for f in fields(States)))
 
     def to_boxes(self) -> np.ndarray:
         """Return the boxes (N, 7) float64 [x y z l w h yaw]."""

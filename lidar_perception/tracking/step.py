@@ -17,11 +17,11 @@ from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams
 from lidar_perception.tracking.state import States
 from lidar_perception.types import CLASSES, PEDESTRIAN
 
-HEIGHT_NOISE = 0.2      # m, standard deviation of a measured z
-HEIGHT_DRIFT = 0.3      # m/s^0.5, noise density of the z of an object
+HEIGHT_NOISE = 0.2  # m, standard deviation of a measured z
+HEIGHT_DRIFT = 0.3  # m/s^0.5, noise density of the z of an object
 MAX_SIZE_WEIGHT = 20.0  # sum of scores
-CLASS_LEAD = 0.5        # lead in evidence at which a track changes its class
-HIT_MEMORY = 20.0       # frames, time constant of hits and headings
+CLASS_LEAD = 0.5  # lead in evidence at which a track changes its class
+HIT_MEMORY = 20.0  # frames, time constant of hits and headings
 DECAY = 1.0 - 1.0 / HIT_MEMORY
 KIND_IDS = np.array(KIND_OF_CLASS)
 MAX_REVERSE_SPEED = np.array([2.0, 0.3, 1.0])  # m/s by KIND_IDS; a faster object is not reversing
@@ -30,19 +30,29 @@ MAX_REVERSE_SPEED = np.array([2.0, 0.3, 1.0])  # m/s by KIND_IDS; a faster objec
 def predict(states: States, seconds: float, params: TrackingParams) -> States:
     """Predict the tracks `seconds` ahead."""
     kinds = KIND_IDS[states.class_ids]
-    means, covariances = motion.predict(states.means, states.covariances, seconds,
-                                        *(_collect_by_kind(params, name)[kinds] for name in
-                                          ("acceleration", "turning", "wandering")))
+    means, covariances = motion.predict(
+        states.means,
+        states.covariances,
+        seconds,
+        *(_collect_by_kind(params, name)[kinds] for name in ("acceleration", "turning", "wandering")),
+    )
     fade = np.exp(-seconds / params.existence.memory)
-    return replace(states, means=means, covariances=covariances, ages=states.ages + seconds,
-                   unseen=states.unseen + seconds, total=states.total * fade,
-                   observations=states.observations * fade,
-                   class_evidence=states.class_evidence * fade,
-                   height_variances=states.height_variances + HEIGHT_DRIFT**2 * seconds)
+    return replace(
+        states,
+        means=means,
+        covariances=covariances,
+        ages=states.ages + seconds,
+        unseen=states.unseen + seconds,
+        total=states.total * fade,
+        observations=states.observations * fade,
+        class_evidence=states.class_evidence * fade,
+        height_variances=states.height_variances + HEIGHT_DRIFT**2 * seconds,
+    )
 
 
-def match(states: States, boxes: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
-          params: TrackingParams, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+def match(
+    states: States, boxes: np.ndarray, class_ids: np.ndarray, scores: np.ndarray, params: TrackingParams, seconds: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Match tracks and detections `seconds` after the previous frame.
 
     Strong detections are matched first, weak ones with the remaining tracks (Zhang et al.,
@@ -50,18 +60,33 @@ def match(states: States, boxes: np.ndarray, class_ids: np.ndarray, scores: np.n
     """
     kinds = KIND_IDS[states.class_ids]
     noise = _collect_by_kind(params, "position")[kinds]
-    spread = np.sqrt(np.maximum(states.covariances[:, 0, 0], states.covariances[:, 1, 1])
-                     + noise * noise)
-    pairs = find_pairs(states.to_boxes(), spread, kinds, _collect_by_kind(params, "reach")[kinds],
-                       boxes, KIND_IDS[class_ids], params.association, seconds)
+    spread = np.sqrt(np.maximum(states.covariances[:, 0, 0], states.covariances[:, 1, 1]) + noise * noise)
+    pairs = find_pairs(
+        states.to_boxes(),
+        spread,
+        kinds,
+        _collect_by_kind(params, "reach")[kinds],
+        boxes,
+        KIND_IDS[class_ids],
+        params.association,
+        seconds,
+    )
     strong = (scores >= params.association.strong)[pairs.boxes]
     i, j = assign(pairs.select(strong))
     rest, weak = assign(pairs.select(~strong & ~np.isin(pairs.tracks, i)))
     return np.concatenate([i, rest]), np.concatenate([j, weak])
 
 
-def update(states: States, i: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
-           scores: np.ndarray, params: TrackingParams, fixed: bool, seconds: float) -> States:
+def update(
+    states: States,
+    i: np.ndarray,
+    boxes: np.ndarray,
+    class_ids: np.ndarray,
+    scores: np.ndarray,
+    params: TrackingParams,
+    fixed: bool,
+    seconds: float,
+) -> States:
     """Update the tracks with a frame `seconds` after the previous one.
 
     Tracks i (P,) are matched with boxes (P, 7), the others are missed. fixed is True if the frame
@@ -69,32 +94,31 @@ def update(states: States, i: np.ndarray, boxes: np.ndarray, class_ids: np.ndarr
     """
     new = states.copy()
     kinds = KIND_IDS[states.class_ids[i]]
-    noise = np.column_stack([*[_collect_by_kind(params, "position")[kinds]] * 2,
-                             _collect_by_kind(params, "heading")[kinds]])
-    means, covariances = motion.update(states.means[i], states.covariances[i],
-                                       boxes[:, [0, 1, 6]], noise)
+    noise = np.column_stack(
+        [*[_collect_by_kind(params, "position")[kinds]] * 2, _collect_by_kind(params, "heading")[kinds]]
+    )
+    means, covariances = motion.update(states.means[i], states.covariances[i], boxes[:, [0, 1, 6]], noise)
     if fixed:
-        means, covariances = motion.constrain_to_heading(means, covariances,
-                                                         _collect_by_kind(params, "slip")[kinds])
-    agreement = states.heading_agreement[i] * DECAY + scores * np.sign(
-        np.cos(boxes[:, 6] - means[:, motion.HEADING]))
+        means, covariances = motion.constrain_to_heading(means, covariances, _collect_by_kind(params, "slip")[kinds])
+    agreement = states.heading_agreement[i] * DECAY + scores * np.sign(np.cos(boxes[:, 6] - means[:, motion.HEADING]))
     new.means[i], new.heading_agreement[i] = motion.flip_reversed_headings(
-        means, agreement, MAX_REVERSE_SPEED[kinds] if fixed else np.full(len(i), np.inf))
+        means, agreement, MAX_REVERSE_SPEED[kinds] if fixed else np.full(len(i), np.inf)
+    )
     new.covariances[i] = covariances
-    gain = states.height_variances[i] / (states.height_variances[i] + HEIGHT_NOISE ** 2)
+    gain = states.height_variances[i] / (states.height_variances[i] + HEIGHT_NOISE**2)
     new.heights[i] += gain * (boxes[:, 2] - states.heights[i])
     new.height_variances[i] *= 1.0 - gain
     weight = scores / (states.size_weights[i] + scores)
     new.sizes[i] += weight[:, None] * (boxes[:, 3:6] - states.sizes[i])
     new.size_weights[i] = np.minimum(states.size_weights[i] + scores, MAX_SIZE_WEIGHT)
-    new.moving[:] = compute_moving_probability(new.means, new.covariances,
-                                               params.moving_speed)
+    new.moving[:] = compute_moving_probability(new.means, new.covariances, params.moving_speed)
     _add_evidence(new, i, class_ids, scores, params, seconds)
     return new
 
 
-def _add_evidence(new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
-                  params: TrackingParams, seconds: float) -> None:
+def _add_evidence(
+    new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.ndarray, params: TrackingParams, seconds: float
+) -> None:
     """Add the evidence of one frame to the arrays of new, in place."""
     own = params.existence
     missed = np.ones(len(new), bool)
@@ -105,8 +129,7 @@ def _add_evidence(new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.
     new.class_evidence[i, class_ids] += scores
     best = new.class_evidence.argmax(axis=1)
     rows = np.arange(len(new))
-    ahead = new.class_evidence[rows, best] > (
-        new.class_evidence[rows, new.class_ids] + CLASS_LEAD)
+    ahead = new.class_evidence[rows, best] > (new.class_evidence[rows, new.class_ids] + CLASS_LEAD)
     new.class_ids[ahead] = best[ahead]
     lost = existence.compute_miss_penalty(new.hits, new.tries, seconds, own)
     new.present[missed] -= lost[missed]
@@ -118,36 +141,49 @@ def _add_evidence(new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.
     new.unseen[i] = 0.0
 
 
-def start_tracks(first_id: int, boxes: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
-                 params: TrackingParams) -> States:
+def start_tracks(
+    first_id: int, boxes: np.ndarray, class_ids: np.ndarray, scores: np.ndarray, params: TrackingParams
+) -> States:
     """Start a track for each detection (K, 7), with zero velocity."""
     count, kinds = len(boxes), KIND_IDS[class_ids]
-    noise, heading, speed, turning = (_collect_by_kind(params, name)[kinds] for name in (
-        "position", "heading", "first_speed", "turning"))
+    noise, heading, speed, turning = (
+        _collect_by_kind(params, name)[kinds] for name in ("position", "heading", "first_speed", "turning")
+    )
     means = np.zeros((count, 6))
     means[:, motion.MEASURED] = boxes[:, [0, 1, 6]]
-    variances = np.column_stack([noise, noise, speed, speed, heading,
-                                 np.where(turning > 0, 0.3, 0.0)]) ** 2
+    variances = np.column_stack([noise, noise, speed, speed, heading, np.where(turning > 0, 0.3, 0.0)]) ** 2
     covariances = np.einsum("ni,ij->nij", variances, np.eye(6))
     own, zeros, ones = params.existence, np.zeros(count), np.ones(count)
     votes = np.zeros((count, len(CLASSES)))
     votes[np.arange(count), class_ids] = scores
-    return States(first_id + np.arange(count), means, covariances, boxes[:, 2].copy(),
-                  np.full(count, HEIGHT_NOISE**2), boxes[:, 3:6].copy(), scores.copy(), votes,
-                  class_ids.astype(np.int32), existence.compute_evidence(scores, own), ones,
-                  np.full(count, own.seen / 2), ones.copy(), ones.copy(),
-                  compute_moving_probability(means, covariances, params.moving_speed), zeros.copy(),
-                  zeros.copy(), scores.copy())
+    return States(
+        first_id + np.arange(count),
+        means,
+        covariances,
+        boxes[:, 2].copy(),
+        np.full(count, HEIGHT_NOISE**2),
+        boxes[:, 3:6].copy(),
+        scores.copy(),
+        votes,
+        class_ids.astype(np.int32),
+        existence.compute_evidence(scores, own),
+        ones,
+        np.full(count, own.seen / 2),
+        ones.copy(),
+        ones.copy(),
+        compute_moving_probability(means, covariances, params.moving_speed),
+        zeros.copy(),
+        zeros.copy(),
+        scores.copy(),
+    )
 
 
 def prune(states: States, params: TrackingParams, fixed: bool) -> States:
     """Remove tracks that are probably gone, and the less probable of overlapping tracks."""
-    states = states.take(np.flatnonzero(
-        existence.to_probability(states.present) >= params.existence.end))
+    states = states.take(np.flatnonzero(existence.to_probability(states.present) >= params.existence.end))
     rank = compute_probabilities(states, params, fixed)
-    kept = rotated_nms(states.to_boxes(), rank, states.class_ids, params.overlap,
-                       across_classes=True)
-    return states.take(np.sort(kept[:params.max_tracks]))
+    kept = rotated_nms(states.to_boxes(), rank, states.class_ids, params.overlap, across_classes=True)
+    return states.take(np.sort(kept[: params.max_tracks]))
 
 
 def compute_probabilities(states: States, params: TrackingParams, fixed: bool) -> np.ndarray:
@@ -156,8 +192,7 @@ def compute_probabilities(states: States, params: TrackingParams, fixed: bool) -
     fixed is True if the frame is fixed to the ground; only then is motion evidence.
     """
     own, still = params.existence, np.zeros(len(states))
-    validity = existence.compute_validity(states.total, states.observations,
-                                          states.moving if fixed else still, own)
+    validity = existence.compute_validity(states.total, states.observations, states.moving if fixed else still, own)
     if fixed:
         riding = compute_moving_probability(states.means, states.covariances, own.walking)
         riding *= KIND_IDS[states.class_ids] == KIND_OF_CLASS[PEDESTRIAN]
@@ -165,15 +200,12 @@ def compute_probabilities(states: States, params: TrackingParams, fixed: bool) -
     return existence.to_probability(validity) * existence.to_probability(states.present)
 
 
-def compute_moving_probability(means: np.ndarray, covariances: np.ndarray,
-                               speed: float) -> np.ndarray:
+def compute_moving_probability(means: np.ndarray, covariances: np.ndarray, speed: float) -> np.ndarray:
     """Compute the probability (N,) that objects move faster than speed, m/s."""
     vx, vy = means[:, motion.VX], means[:, motion.VY]
     speeds = np.hypot(vx, vy)
-    ux, uy = (np.divide(v, speeds, out=np.full_like(v, np.sqrt(0.5)), where=speeds > 1e-6)
-              for v in (vx, vy))
-    variance = (ux * ux * covariances[:, 2, 2] + 2 * ux * uy * covariances[:, 2, 3]
-                + uy * uy * covariances[:, 3, 3])
+    ux, uy = (np.divide(v, speeds, out=np.full_like(v, np.sqrt(0.5)), where=speeds > 1e-6) for v in (vx, vy))
+    variance = ux * ux * covariances[:, 2, 2] + 2 * ux * uy * covariances[:, 2, 3] + uy * uy * covariances[:, 3, 3]
     return ndtr((speeds - speed) / np.sqrt(np.maximum(variance, 1e-12)))
 
 

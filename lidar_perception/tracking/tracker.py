@@ -14,14 +14,7 @@ from lidar_perception.tracking.ego import Ego, advance_ego, is_jump, is_valid_po
 from lidar_perception.tracking.existence import to_probability
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.state import States, Tracks
-from lidar_perception.tracking.step import (
-    compute_probabilities,
-    match,
-    predict,
-    prune,
-    start_tracks,
-    update,
-)
+from lidar_perception.tracking.step import compute_probabilities, match, predict, prune, start_tracks, update
 from lidar_perception.types import CLASSES, MAX_RANGE, Detections, InputError
 
 
@@ -60,8 +53,7 @@ class Tracker:
         self.ended += len(self._states)
         self._states, self._ego, self._stamp = States.none(), Ego.unknown(), None
 
-    def __call__(self, detections: Detections, stamp_ns: int = 0,
-                 pose: np.ndarray | None = None) -> Tracks:
+    def __call__(self, detections: Detections, stamp_ns: int = 0, pose: np.ndarray | None = None) -> Tracks:
         """Update the tracks with one frame and return them.
 
         Boxes that are not finite or have no size are ignored. A frame with the stamp of the
@@ -80,9 +72,11 @@ class Tracker:
             InputError: detections is not a Detections object.
         """
         if not isinstance(detections, Detections):
-            raise InputError(f"a tracker takes Detections, not {type(detections).__name__}; give "
-                             "detector(cloud).detections, or Detections.of(boxes, class_ids, "
-                             "scores) with boxes (K, 7)")
+            raise InputError(
+                f"a tracker takes Detections, not {type(detections).__name__}; give "
+                "detector(cloud).detections, or Detections.of(boxes, class_ids, "
+                "scores) with boxes (K, 7)"
+            )
         self.problem = None
         seconds = self._find_elapsed(int(stamp_ns))
         self.frame_used = seconds is not None
@@ -93,14 +87,12 @@ class Tracker:
         boxes = transform_boxes(boxes, self._ego.pose)
         states = predict(self._states, seconds, self.params)
         i, j = match(states, boxes, class_ids, scores, self.params, seconds)
-        states = update(states, i, boxes[j], class_ids[j], scores[j], self.params,
-                        self._ego.has_pose, seconds)
+        states = update(states, i, boxes[j], class_ids[j], scores[j], self.params, self._ego.has_pose, seconds)
         free = np.ones(len(boxes), bool)
         free[j] = False
         new = np.flatnonzero(free & (scores >= self.params.association.strong))
         before = len(states)
-        states = states.append(start_tracks(self._next_id, boxes[new], class_ids[new],
-                                            scores[new], self.params))
+        states = states.append(start_tracks(self._next_id, boxes[new], class_ids[new], scores[new], self.params))
         self._next_id += len(new)
         seen = np.zeros(len(states), bool)
         seen[i], seen[before:] = True, True
@@ -150,60 +142,76 @@ class Tracker:
 
     def _move_ego(self, pose: np.ndarray | None, seconds: float) -> None:
         valid = pose if is_valid_pose(pose) else None
-        if valid is not None and len(self._states) and (
-                not self._ego.has_pose or is_jump(self._ego, valid, seconds)):
+        if valid is not None and len(self._states) and (not self._ego.has_pose or is_jump(self._ego, valid, seconds)):
             stamp, had_pose = self._stamp, self._ego.has_pose
             self.reset()
             self._stamp = stamp
-            self.problem = ("the sensor's pose jumped: all tracks ended" if had_pose else
-                            "the first pose arrived: all tracks ended and start again in the "
-                            "fixed frame")
+            self.problem = (
+                "the sensor's pose jumped: all tracks ended"
+                if had_pose
+                else "the first pose arrived: all tracks ended and start again in the fixed frame"
+            )
         if valid is None and (pose is not None or self._ego.has_pose):
-            self.problem = ("the pose is missing or not rigid: the sensor is assumed to keep its "
-                            f"velocity for {self.params.max_ego_gap:g} s and then to stand; check "
-                            "that odometry or TF is published, and often enough")
+            self.problem = (
+                "the pose is missing or not rigid: the sensor is assumed to keep its "
+                f"velocity for {self.params.max_ego_gap:g} s and then to stand; check "
+                "that odometry or TF is published, and often enough"
+            )
         self._ego = advance_ego(self._ego, valid, seconds, self.params.max_ego_gap)
 
     def _select_valid(self, detections: Detections) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return boxes (K, 7), class ids (K,) and scores (K,), at most max_detections of them."""
         boxes, scores = detections.boxes.astype(np.float64), detections.scores.astype(np.float64)
         with np.errstate(invalid="ignore"):
-            valid = (np.isfinite(boxes).all(axis=1) & np.isfinite(scores)
-                     & (boxes[:, 3:6] > 0).all(axis=1)
-                     & (np.abs(boxes[:, :6]) <= MAX_RANGE).all(axis=1)
-                     & (detections.class_ids >= 0) & (detections.class_ids < len(CLASSES)))
+            valid = (
+                np.isfinite(boxes).all(axis=1)
+                & np.isfinite(scores)
+                & (boxes[:, 3:6] > 0).all(axis=1)
+                & (np.abs(boxes[:, :6]) <= MAX_RANGE).all(axis=1)
+                & (detections.class_ids >= 0)
+                & (detections.class_ids < len(CLASSES))
+            )
         if not valid.all():
-            self.problem = (f"{(~valid).sum()} of {len(valid)} detections are ignored: not finite, "
-                            f"without a size, or more than {MAX_RANGE / 1e3:g} km from the origin "
-                            "of their frame; publish them in a frame nearby")
+            self.problem = (
+                f"{(~valid).sum()} of {len(valid)} detections are ignored: not finite, "
+                f"without a size, or more than {MAX_RANGE / 1e3:g} km from the origin "
+                "of their frame; publish them in a frame nearby"
+            )
         indices = np.flatnonzero(valid & (scores >= self.params.min_score))
         if len(indices) > self.params.max_detections:
-            self.problem = (f"{len(indices)} detections are too many; only the best "
-                            f"{self.params.max_detections} are used")
-            indices = np.sort(indices[np.argsort(-scores[indices], kind="stable")[
-                :self.params.max_detections]])
+            self.problem = (
+                f"{len(indices)} detections are too many; only the best {self.params.max_detections} are used"
+            )
+            indices = np.sort(indices[np.argsort(-scores[indices], kind="stable")[: self.params.max_detections]])
         return boxes[indices], detections.class_ids[indices], np.clip(scores[indices], 0.0, 1.0)
 
     def _report(self, seen: np.ndarray) -> Tracks:
         return _to_sensor_frame(self._states, self._ego, seen, self.params)
 
 
-def _to_sensor_frame(states: States, ego: Ego, seen: np.ndarray,
-                     params: TrackingParams) -> Tracks:
+def _to_sensor_frame(states: States, ego: Ego, seen: np.ndarray, params: TrackingParams) -> Tracks:
     """Return the tracks to publish, in the sensor's frame."""
     scores = compute_probabilities(states, params, ego.has_pose)
-    indices = np.flatnonzero((scores >= params.report) & (
-        seen | (to_probability(states.present) >= params.report_unseen)))
+    indices = np.flatnonzero(
+        (scores >= params.report) & (seen | (to_probability(states.present) >= params.report_unseen))
+    )
     chosen, back = states.take(indices), np.linalg.inv(ego.pose)
     cos, sin = (back[:2, 0] / max(np.hypot(*back[:2, 0]), 1e-9)).tolist()
     side = -1.0 if back[2, 2] < 0 else 1.0  # upside-down sensor
     covariances = motion.rotate_covariances(chosen.covariances, cos, sin, side)
     velocities = chosen.means[:, 2:4] @ np.array([[cos, sin], [-side * sin, side * cos]])
-    detections = Detections.of(transform_boxes(chosen.to_boxes(), back), chosen.class_ids,
-                               scores[indices])
-    return Tracks(chosen.ids, detections, velocities, chosen.moving, covariances,
-                  side * chosen.means[:, 5],
-                  chosen.height_variances, seen[indices], chosen.ages)
+    detections = Detections.of(transform_boxes(chosen.to_boxes(), back), chosen.class_ids, scores[indices])
+    return Tracks(
+        chosen.ids,
+        detections,
+        velocities,
+        chosen.moving,
+        covariances,
+        side * chosen.means[:, 5],
+        chosen.height_variances,
+        seen[indices],
+        chosen.ages,
+    )
 
 
 def warm_up() -> None:

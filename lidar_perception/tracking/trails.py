@@ -17,8 +17,7 @@ class Trails:
     def __init__(self) -> None:
         self._trails: dict[int, deque[tuple[int, np.ndarray]]] = {}
 
-    def __call__(self, tracks: Tracks, pose: np.ndarray, stamp_ns: int,
-                 seconds: float) -> list[np.ndarray]:
+    def __call__(self, tracks: Tracks, pose: np.ndarray, stamp_ns: int, seconds: float) -> list[np.ndarray]:
         """Return the trail of each of K tracks over the last `seconds`.
 
         A trail is an array (N, 3) float64 with N from 1 to TRAIL_POINTS, oldest position first and
@@ -44,5 +43,7 @@ class Trails:
             trail.append((stamp_ns, centre))
             self._trails[number] = trail
         back = np.linalg.inv(pose)
-        return [np.array([position for _, position in trail]) @ back[:3, :3].T + back[:3, 3]
-                for trail in self._trails.values()]
+        return [
+            np.array([position for _, position in trail]) @ back[:3, :3].T + back[:3, 3]
+            for trail in self._trails.values()
+        ]

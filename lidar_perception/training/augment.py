@@ -12,12 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidar_perception.geometry import bev_iou, elevation_angles, is_within, to_box_frame, wrap_angle
-from lidar_perception.training.params import (
-    AugmentParams,
-    IntensityParams,
-    NoiseParams,
-    ThingParams,
-)
+from lidar_perception.training.params import AugmentParams, IntensityParams, NoiseParams, ThingParams
 from lidar_perception.training.pasting import MIN_RANGE_M, find_points_in_box
 from lidar_perception.types import SENSOR_HEIGHT
 
@@ -48,8 +43,7 @@ class TrainingScene:
     height: float = SENSOR_HEIGHT
 
 
-def augment_scene(scene: TrainingScene, params: AugmentParams,
-                  rng: np.random.Generator) -> TrainingScene:
+def augment_scene(scene: TrainingScene, params: AugmentParams, rng: np.random.Generator) -> TrainingScene:
     """Apply every change except those of turn_and_crop and database.paste_objects."""
     scene = move_objects(scene, params.object_turn, params.object_shift, rng)
     if rng.random() < params.flip:
@@ -57,15 +51,18 @@ def augment_scene(scene: TrainingScene, params: AugmentParams,
     scene = replace(scene, points=add_range_noise(scene.points, params, rng))
     scene = scale_scene(scene, 1 + rng.uniform(-params.scale, params.scale))
     scene = drop_points(scene, rng.uniform(0, params.dropout), rng)
-    scene = change_intensity(scene, 1 + rng.uniform(-params.intensity, params.intensity),
-                             rng.uniform(-params.intensity, params.intensity) / 2)
+    scene = change_intensity(
+        scene,
+        1 + rng.uniform(-params.intensity, params.intensity),
+        rng.uniform(-params.intensity, params.intensity) / 2,
+    )
     scene = replace(scene, points=distort_intensity(scene.points, params, rng))
-    return raise_scene(scene, rng.uniform(-params.height, params.height),
-                       rng.uniform(-params.tilt, params.tilt, 2))
+    return raise_scene(scene, rng.uniform(-params.height, params.height), rng.uniform(-params.tilt, params.tilt, 2))
 
 
-def turn_and_crop(scene: TrainingScene, params: AugmentParams, low: np.ndarray, high: np.ndarray,
-                  rng: np.random.Generator) -> TrainingScene:
+def turn_and_crop(
+    scene: TrainingScene, params: AugmentParams, low: np.ndarray, high: np.ndarray, rng: np.random.Generator
+) -> TrainingScene:
     """Turn the scene, and keep what the other changes can move between low and high (3,), in m.
 
     Done first, since most of a scan is elsewhere.
@@ -83,8 +80,13 @@ def crop_scene(scene: TrainingScene, low: np.ndarray, high: np.ndarray) -> Train
     for axis in range(3):
         kept &= (scene.points[:, axis] >= low[axis]) & (scene.points[:, axis] < high[axis])
     inside = is_within(scene.boxes, low, high)
-    return replace(scene, points=scene.points[kept], boxes=scene.boxes[inside],
-                   class_ids=scene.class_ids[inside], wanted=scene.wanted[inside])
+    return replace(
+        scene,
+        points=scene.points[kept],
+        boxes=scene.boxes[inside],
+        class_ids=scene.class_ids[inside],
+        wanted=scene.wanted[inside],
+    )
 
 
 def flip_scene(scene: TrainingScene) -> TrainingScene:
@@ -129,8 +131,7 @@ def change_intensity(scene: TrainingScene, factor: float, offset: float) -> Trai
     return replace(scene, points=points)
 
 
-def distort_intensity(points: np.ndarray, params: IntensityParams,
-                      rng: np.random.Generator) -> np.ndarray:
+def distort_intensity(points: np.ndarray, params: IntensityParams, rng: np.random.Generator) -> np.ndarray:
     """Change or remove the intensities of points (N, 4), as other sensors report them.
 
     Removed intensities are 0, and an intensity of 0 stays 0. Gain and gamma need no change, since
@@ -162,8 +163,9 @@ def add_reflector(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return points
 
 
-def vary_thing(points: np.ndarray, foot: np.ndarray, params: ThingParams,
-               rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def vary_thing(
+    points: np.ndarray, foot: np.ndarray, params: ThingParams, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Stretch one background thing about its foot and change its intensity, at random.
 
     Args:
@@ -185,15 +187,12 @@ def vary_thing(points: np.ndarray, foot: np.ndarray, params: ThingParams,
     return points, factors
 
 
-def add_range_noise(points: np.ndarray, params: NoiseParams,
-                    rng: np.random.Generator) -> np.ndarray:
+def add_range_noise(points: np.ndarray, params: NoiseParams, rng: np.random.Generator) -> np.ndarray:
     """Shift points (N, 4) along their rays by random errors within the limits of params."""
-    return blur_ranges(points, rng.uniform(0, params.beam_noise),
-                       rng.uniform(0, params.range_noise), rng)
+    return blur_ranges(points, rng.uniform(0, params.beam_noise), rng.uniform(0, params.range_noise), rng)
 
 
-def blur_ranges(points: np.ndarray, beam: float, point: float,
-                rng: np.random.Generator) -> np.ndarray:
+def blur_ranges(points: np.ndarray, beam: float, point: float, rng: np.random.Generator) -> np.ndarray:
     """Shift points (N, 4) along their rays by an error of their beam and one of each point.
 
     Real beams do not agree: on KITTI the points of one pole scatter by 0.07 to 0.1 m in depth, the
@@ -213,8 +212,7 @@ def blur_ranges(points: np.ndarray, beam: float, point: float,
     return moved
 
 
-def raise_scene(scene: TrainingScene, height: float,
-                slopes: ArrayLike = (0.0, 0.0)) -> TrainingScene:
+def raise_scene(scene: TrainingScene, height: float, slopes: ArrayLike = (0.0, 0.0)) -> TrainingScene:
     """Raise the scene, as if the sensor were lower, and slope the ground.
 
     Boxes stay upright, so points may leave their box if the slopes are not 0.
@@ -229,8 +227,7 @@ def raise_scene(scene: TrainingScene, height: float,
     return replace(scene, points=points, boxes=boxes)
 
 
-def move_objects(scene: TrainingScene, turn: float, shift: float,
-                 rng: np.random.Generator) -> TrainingScene:
+def move_objects(scene: TrainingScene, turn: float, shift: float, rng: np.random.Generator) -> TrainingScene:
     """Turn and shift each object with its points, unless it touches another one before or after.
 
     Args:

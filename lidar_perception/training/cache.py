@@ -48,9 +48,13 @@ def file_fingerprint(file: Path) -> tuple[str, int, int]:
     return str(file.resolve()), stat.st_size, stat.st_mtime_ns
 
 
-def load_or_make(path: Path | None, make: Callable[[], Content], read: Callable[[Any], Content],
-                 to_arrays: Callable[[Content], dict[str, Any]],
-                 max_gb: float = np.inf) -> Content:
+def load_or_make(
+    path: Path | None,
+    make: Callable[[], Content],
+    read: Callable[[Any], Content],
+    to_arrays: Callable[[Content], dict[str, Any]],
+    max_gb: float = np.inf,
+) -> Content:
     """Return the content of a cache file; make and write it if it is missing or damaged.
 
     Args:
@@ -99,8 +103,7 @@ def find_missing(source: Any, numbers: Sequence[int]) -> list[int]:
     return [i for i in numbers if (path := source.path(i)) is not None and not path.is_file()]
 
 
-def fill_cache(sources: Sequence[Any], numbers: Sequence[Sequence[int]], jobs: int,
-               title: str) -> None:
+def fill_cache(sources: Sequence[Any], numbers: Sequence[Sequence[int]], jobs: int, title: str) -> None:
     """Cache scenes of several sources in several processes, each missing file once.
 
     Scenes that cannot be read are skipped here and reported when training reads them.
@@ -112,13 +115,12 @@ def fill_cache(sources: Sequence[Any], numbers: Sequence[Sequence[int]], jobs: i
     Raises:
         CacheError: A file cannot be written.
     """
-    items = [(k, i) for k, (source, some) in enumerate(zip(sources, numbers))
-             for i in find_missing(source, some)]
+    items = [(k, i) for k, (source, some) in enumerate(zip(sources, numbers)) for i in find_missing(source, some)]
     if not items:
         return
-    for _ in show_progress(run_in_processes(partial(_make_keeper, tuple(sources)), items, jobs,
-                                            title), title,
-                           len(items)):
+    for _ in show_progress(
+        run_in_processes(partial(_make_keeper, tuple(sources)), items, jobs, title), title, len(items)
+    ):
         pass
 
 
@@ -130,4 +132,5 @@ def _make_keeper(sources: tuple[Any, ...]) -> Callable[[tuple[int, int]], None]:
             raise
         except InputError:
             return
+
     return keep

@@ -20,8 +20,13 @@ def compute_ramps(values: np.ndarray, knots: tuple[float, ...]) -> np.ndarray:
     return np.nan_to_num(np.clip((values[:, None] - low) / (high - low), 0.0, 1.0))
 
 
-def fit_curves(features: Mapping[str, np.ndarray], hit: np.ndarray, weight: np.ndarray,
-               knots: Mapping[str, tuple[float, ...]], rising: Mapping[str, int] = {}) -> dict:
+def fit_curves(
+    features: Mapping[str, np.ndarray],
+    hit: np.ndarray,
+    weight: np.ndarray,
+    knots: Mapping[str, tuple[float, ...]],
+    rising: Mapping[str, int] = {},
+) -> dict:
     """Fit one curve to each feature, by penalised logistic regression on its steps between knots.
 
     The penalty keeps curves level where samples are missing.
@@ -49,14 +54,22 @@ def fit_curves(features: Mapping[str, np.ndarray], hit: np.ndarray, weight: np.n
     def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
         margin = sign * (design @ x[1:] + x[0])
         slope = -weight * sign * expit(-margin)
-        return (weight @ np.logaddexp(0, -margin) + PENALTY / 2 * x[1:] @ x[1:],
-                np.concatenate([[slope.sum()], slope @ design + PENALTY * x[1:]]))
+        return (
+            weight @ np.logaddexp(0, -margin) + PENALTY / 2 * x[1:] @ x[1:],
+            np.concatenate([[slope.sum()], slope @ design + PENALTY * x[1:]]),
+        )
 
-    x = minimize(loss, np.zeros(design.shape[1] + 1), jac=True, method="L-BFGS-B",
-                 bounds=[(None, None), *bounds], options={"maxiter": 5000, "maxfun": 10000}).x
+    x = minimize(
+        loss,
+        np.zeros(design.shape[1] + 1),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(None, None), *bounds],
+        options={"maxiter": 5000, "maxfun": 10000},
+    ).x
     curves: dict[str, dict] = {}
     for (name, own), steps in zip(knots.items(), np.split(x[1:], np.cumsum(parts)[:-1])):
-        rises = steps[:len(own) - 1]
+        rises = steps[: len(own) - 1]
         curves[name] = {"knots": own, "values": [0.0, *np.round(np.cumsum(rises), 3).tolist()]}
         if len(steps) > len(rises):
             curves[name]["unknown"] = round(float(steps[-1]), 3)

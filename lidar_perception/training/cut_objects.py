@@ -26,11 +26,11 @@ from lidar_perception.training.pasting import find_points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, PointCloud
 
 # A thing resembles a standing person if
-MAX_WIDTH_M = 1.2                # its sides are at most this long,
+MAX_WIDTH_M = 1.2  # its sides are at most this long,
 MIN_TOP_M, MAX_TOP_M = 0.6, 4.5  # its top is this high above the ground,
-MAX_GAP_M = 0.8                  # its lowest point is this near to the ground,
-MIN_DISTANCE_M = 0.3             # and every labelled box is farther away.
-MAX_THINGS = 20                  # from a scene
+MAX_GAP_M = 0.8  # its lowest point is this near to the ground,
+MIN_DISTANCE_M = 0.3  # and every labelled box is farther away.
+MAX_THINGS = 20  # from a scene
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,12 @@ class CutObjects:
         return load_or_make(
             self.path(i),
             lambda: cut_objects(self.scenes.scene(i), self.classes, self.min_points, i),
-            lambda arrays: Database(**arrays), vars)
+            lambda arrays: Database(**arrays),
+            vars,
+        )
 
 
-def cut_objects(scene: TrainingScene, classes: tuple[str, ...], min_points: int,
-                seed: int = 0) -> Database:
+def cut_objects(scene: TrainingScene, classes: tuple[str, ...], min_points: int, seed: int = 0) -> Database:
     """Cut the wanted objects of some classes that have min_points and overlap no other box.
 
     With pedestrians also things that resemble people, see find_things. The seed draws among many.
@@ -79,7 +80,7 @@ def cut_objects(scene: TrainingScene, classes: tuple[str, ...], min_points: int,
     for i in np.flatnonzero(scene.wanted & isolated & np.isin(scene.class_ids, chosen)):
         own = scene.points[find_points_in_box(scene.points, scene.boxes[i], 0.0)]
         if len(own) >= min_points:
-            boxes.append(scene.boxes[i:i + 1])
+            boxes.append(scene.boxes[i : i + 1])
             class_ids.append(scene.class_ids[i])
             points.append(own)
     if PEDESTRIAN in chosen:
@@ -88,23 +89,31 @@ def cut_objects(scene: TrainingScene, classes: tuple[str, ...], min_points: int,
         class_ids.extend([THING] * len(things))
         points.extend(thing_points)
     sizes = [len(own) for own in points[1:]]
-    return Database(np.concatenate(boxes), np.array(class_ids, np.int32), np.concatenate(points),
-                    np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
+    return Database(
+        np.concatenate(boxes),
+        np.array(class_ids, np.int32),
+        np.concatenate(points),
+        np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+    )
 
 
 def join_databases(parts: Sequence[Database]) -> Database:
     """Return one database with the objects of all parts, empty without any."""
-    parts = [Database(np.zeros((0, 7)), np.zeros(0, np.int32), np.zeros((0, 4), np.float32),
-                      np.zeros(1, np.int64)), *parts]
+    parts = [
+        Database(np.zeros((0, 7)), np.zeros(0, np.int32), np.zeros((0, 4), np.float32), np.zeros(1, np.int64)),
+        *parts,
+    ]
     ends = np.cumsum([part.first[-1] for part in parts])
     first = [parts[0].first, *(part.first[1:] + end for part, end in zip(parts[1:], ends))]
-    return Database(np.concatenate([part.boxes for part in parts]),
-                    np.concatenate([part.class_ids for part in parts]),
-                    np.concatenate([part.points for part in parts]), np.concatenate(first))
+    return Database(
+        np.concatenate([part.boxes for part in parts]),
+        np.concatenate([part.class_ids for part in parts]),
+        np.concatenate([part.points for part in parts]),
+        np.concatenate(first),
+    )
 
 
-def find_things(scene: TrainingScene, min_points: int,
-                rng: np.random.Generator) -> tuple[np.ndarray, list[np.ndarray]]:
+def find_things(scene: TrainingScene, min_points: int, rng: np.random.Generator) -> tuple[np.ndarray, list[np.ndarray]]:
     """Find clusters that resemble a standing person and touch no labelled box.
 
     Args:
@@ -115,8 +124,7 @@ def find_things(scene: TrainingScene, min_points: int,
         Boxes (K, 7) float64, along the axes and from the ground up, and the points (N, 4) of each.
     """
     xyz = np.ascontiguousarray(scene.points[:, :3])
-    ground = segment_ground(PointCloud(xyz), replace(
-        EXPERT_GROUND, sensor_pose=SensorPoseParams(height=scene.height)))
+    ground = segment_ground(PointCloud(xyz), replace(EXPERT_GROUND, sensor_pose=SensorPoseParams(height=scene.height)))
     ids = cluster_obstacles(xyz, ground, EXPERT_CLUSTERING)
     low, high, sizes = find_extents(xyz, ids, int(ids.max(initial=0)))
     boxes = np.zeros((len(sizes), 7))
@@ -125,11 +133,14 @@ def find_things(scene: TrainingScene, min_points: int,
     floor = find_ground_heights(xyz[ground], boxes[:, :2])
     boxes[:, 5] = high[:, 2] - floor
     boxes[:, 2] = floor + boxes[:, 5] / 2
-    kept = ((sizes >= min_points) & (boxes[:, 3:5].max(axis=1, initial=0) <= MAX_WIDTH_M)
-            & (boxes[:, 5] >= MIN_TOP_M) & (boxes[:, 5] <= MAX_TOP_M)
-            & (low[:, 2] - floor <= MAX_GAP_M))
+    kept = (
+        (sizes >= min_points)
+        & (boxes[:, 3:5].max(axis=1, initial=0) <= MAX_WIDTH_M)
+        & (boxes[:, 5] >= MIN_TOP_M)
+        & (boxes[:, 5] <= MAX_TOP_M)
+        & (low[:, 2] - floor <= MAX_GAP_M)
+    )
     kept = np.flatnonzero(kept)
-    kept = kept[~bev_iou(enlarge_boxes(boxes[kept]),
-                         enlarge_boxes(scene.boxes, MIN_DISTANCE_M)).any(axis=1)]
+    kept = kept[~bev_iou(enlarge_boxes(boxes[kept]), enlarge_boxes(scene.boxes, MIN_DISTANCE_M)).any(axis=1)]
     kept = rng.permutation(kept)[:MAX_THINGS]
     return boxes[kept], [scene.points[ids == k + 1] for k in kept]

@@ -144,8 +144,7 @@ def load_items(items: Any, numbers: Iterator[list[int]], jobs: int) -> Iterator[
     if jobs == 0:
         yield from map(_make_loader(items), numbers)
     else:
-        yield from run_in_order(partial(_make_loader, items), numbers, jobs, PREFETCH,
-                                "prepared scenes")
+        yield from run_in_order(partial(_make_loader, items), numbers, jobs, PREFETCH, "prepared scenes")
 
 
 def _make_loader(items: Any) -> Callable[[list[int]], list[Any]]:

@@ -10,26 +10,20 @@ import numpy as np
 
 from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN
 from lidar_perception.geometry import bev_iou, is_within
-from lidar_perception.training.augment import (
-    BOX_MARGIN_M,
-    TrainingScene,
-    enlarge_boxes,
-    turn_scene,
-    vary_thing,
-)
+from lidar_perception.training.augment import BOX_MARGIN_M, TrainingScene, enlarge_boxes, turn_scene, vary_thing
 from lidar_perception.training.cache import write_arrays
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pasting import estimate_floor, paste_object
 from lidar_perception.types import InputError
 
 FLOOR_REACH_M = 3.0  # points this near, along both axes, show the ground under an object
-FLOOR_SHARE = 0.1    # of them are lower than the ground
-MAX_STEP_M = 1.0     # between the ground in both scenes
+FLOOR_SHARE = 0.1  # of them are lower than the ground
+MAX_STEP_M = 1.0  # between the ground in both scenes
 BLOCKING_HEIGHTS_M = (0.63, 2.23)  # above the ground: not ground, and hides people
-SECTORS = 720        # of a turn
+SECTORS = 720  # of a turn
 MAX_DIRECTIONS = 64  # drawn for each object
-MAX_TRIES = 3        # objects tried for each missing one
-THING = -1           # class of background things, see cut_objects.py
+MAX_TRIES = 3  # objects tried for each missing one
+THING = -1  # class of background things, see cut_objects.py
 MAX_HIDDEN_SHARE = 0.3  # scene points in front of an object, as a share of its points
 
 
@@ -54,7 +48,7 @@ class Database:
 
     def get_points(self, i: int) -> np.ndarray:
         """Return the (N, 4) points of an object, in the frame of its scene."""
-        return self.points[self.first[i]:self.first[i + 1]]
+        return self.points[self.first[i] : self.first[i + 1]]
 
     def save(self, path: Path) -> None:
         """Write an .npz file."""
@@ -67,12 +61,19 @@ class Database:
             with np.load(path) as arrays:
                 return Database(**arrays)
         except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
-            raise InputError(f"cannot read the objects {path}: {error}; remove the file, and it is "
-                             "made again") from None
+            raise InputError(
+                f"cannot read the objects {path}: {error}; remove the file, and it is made again"
+            ) from None
 
 
-def paste_objects(scene: TrainingScene, database: Database, params: AugmentParams,
-                  low: np.ndarray, high: np.ndarray, rng: np.random.Generator) -> TrainingScene:
+def paste_objects(
+    scene: TrainingScene,
+    database: Database,
+    params: AugmentParams,
+    low: np.ndarray,
+    high: np.ndarray,
+    rng: np.random.Generator,
+) -> TrainingScene:
     """Paste objects into a scene until it has the number of each class that params give.
 
     At most MAX_TRIES objects are tried for each missing one. An object keeps its distance from the
@@ -87,11 +88,15 @@ def paste_objects(scene: TrainingScene, database: Database, params: AugmentParam
     points, boxes = scene.points, scene.boxes
     class_ids = []
     free = _free_depths(points, scene.height)
-    for class_id, number in ((CAR, params.cars), (PEDESTRIAN, params.pedestrians),
-                             (CYCLIST, params.cyclists), (THING, params.things)):
+    for class_id, number in (
+        (CAR, params.cars),
+        (PEDESTRIAN, params.pedestrians),
+        (CYCLIST, params.cyclists),
+        (THING, params.things),
+    ):
         candidates = np.flatnonzero(database.class_ids == class_id)
         missing = number - int((scene.class_ids == class_id).sum())
-        for i in rng.permutation(candidates)[:max(MAX_TRIES * missing, 0)]:
+        for i in rng.permutation(candidates)[: max(MAX_TRIES * missing, 0)]:
             if missing == 0:
                 break
             box, own = database.boxes[i], database.get_points(i)
@@ -104,14 +109,18 @@ def paste_objects(scene: TrainingScene, database: Database, params: AugmentParam
                 missing -= 1
     new = np.array(class_ids, scene.class_ids.dtype)
     objects = new != THING
-    return replace(scene, points=points,
-                   boxes=np.concatenate([scene.boxes, boxes[len(scene.boxes):][objects]]),
-                   class_ids=np.concatenate([scene.class_ids, new[objects]]),
-                   wanted=np.concatenate([scene.wanted, np.ones(objects.sum(), bool)]))
+    return replace(
+        scene,
+        points=points,
+        boxes=np.concatenate([scene.boxes, boxes[len(scene.boxes) :][objects]]),
+        class_ids=np.concatenate([scene.class_ids, new[objects]]),
+        wanted=np.concatenate([scene.wanted, np.ones(objects.sum(), bool)]),
+    )
 
 
-def vary_boxed_thing(box: np.ndarray, points: np.ndarray, params: AugmentParams,
-                     rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def vary_boxed_thing(
+    box: np.ndarray, points: np.ndarray, params: AugmentParams, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Vary a thing's box (7,) and points (N, 4) about the centre of its foot, see vary_thing."""
     foot = box[:3] - [0, 0, box[5] / 2]
     points, factors = vary_thing(points, foot, params, rng)
@@ -121,8 +130,7 @@ def vary_boxed_thing(box: np.ndarray, points: np.ndarray, params: AugmentParams,
     return box, points
 
 
-def _paste(box, own, points, boxes, free, low, high,
-           rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
+def _paste(box, own, points, boxes, free, low, high, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
     """Return points and boxes of the scene with one more object, or None if it does not fit."""
     turn = _draw_turn(box, free, low, high, rng)
     if turn is None:
@@ -144,8 +152,7 @@ def _free_depths(points: np.ndarray, height: float) -> np.ndarray:
     above = points[:, 2] + height
     things = points[(above > BLOCKING_HEIGHTS_M[0]) & (above < BLOCKING_HEIGHTS_M[1])]
     free = np.full(SECTORS, np.inf)
-    np.minimum.at(free, _to_sectors(np.arctan2(things[:, 1], things[:, 0])),
-                  np.hypot(things[:, 0], things[:, 1]))
+    np.minimum.at(free, _to_sectors(np.arctan2(things[:, 1], things[:, 0])), np.hypot(things[:, 0], things[:, 1]))
     return free
 
 
@@ -153,8 +160,9 @@ def _to_sectors(angles: np.ndarray) -> np.ndarray:
     return ((angles + np.pi) * (SECTORS / (2 * np.pi))).astype(np.int64) % SECTORS
 
 
-def _draw_turn(box: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.ndarray,
-               rng: np.random.Generator) -> float | None:
+def _draw_turn(
+    box: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.ndarray, rng: np.random.Generator
+) -> float | None:
     """Draw an angle about the sensor that turns a box (7,) into the region and into free view."""
     distance, half = np.hypot(box[0], box[1]), np.hypot(box[3], box[4]) / 2
     turns = rng.uniform(-np.pi, np.pi, MAX_DIRECTIONS)
@@ -166,8 +174,7 @@ def _draw_turn(box: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.ndar
     return float(turns[fits.argmax()]) if fits.any() else None
 
 
-def _turn_about_sensor(box: np.ndarray, points: np.ndarray,
-                       angle: float) -> tuple[np.ndarray, np.ndarray]:
+def _turn_about_sensor(box: np.ndarray, points: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
     """Turn a box and its points (N, 4) about the sensor."""
     scene = TrainingScene(points, box[None], np.zeros(1, int), np.ones(1, bool))
     scene = turn_scene(scene, angle)

@@ -37,8 +37,7 @@ class LabelledFrames:
 
     def to_scenes(self, view: bool = True) -> RecordedScenes:
         """Return the frames as a source of scenes. view: see RecordedScenes."""
-        return RecordedScenes(self.path, tuple(frame.name for frame in self.frames), view,
-                              self.height)
+        return RecordedScenes(self.path, tuple(frame.name for frame in self.frames), view, self.height)
 
     def exclude(self, others: Iterable[LabelledFrames], purpose: str) -> LabelledFrames:
         """Return the frames that others do not contain, under any path.
@@ -49,9 +48,11 @@ class LabelledFrames:
         excluded = {key for other in others for frame in other.frames for key in _frame_keys(frame)}
         left = tuple(frame for frame in self.frames if excluded.isdisjoint(_frame_keys(frame)))
         if not left:
-            raise InputError(f"{self.path}: no frame is left to {purpose}, as no frame may be "
-                             "trained on and validated on; give other frames, or leave --val out "
-                             "to hold some out")
+            raise InputError(
+                f"{self.path}: no frame is left to {purpose}, as no frame may be "
+                "trained on and validated on; give other frames, or leave --val out "
+                "to hold some out"
+            )
         return replace(self, frames=left)
 
     def split(self, share: float, seed: int) -> tuple[LabelledFrames, LabelledFrames]:
@@ -64,20 +65,21 @@ class LabelledFrames:
         """
         if self.drives:
             labelled = [frame for frame in self.frames if may_have_labels(frame)] or self.frames
-            runs = [[labelled[i] for i in run] for several in split_drives(labelled).values()
-                    for run in several]
+            runs = [[labelled[i] for i in run] for several in split_drives(labelled).values() for run in several]
             names = {frame.name for frame in draw_drives(runs, share, seed)}
         else:
             names = {frame.name for frame in draw_items(self.frames, share, seed)}
         if not 0 < len(names) < len(self.frames):
             raise InputError(TOO_FEW)
-        parts = [tuple(frame for frame in self.frames if (frame.name in names) == held_out)
-                 for held_out in (False, True)]
+        parts = [
+            tuple(frame for frame in self.frames if (frame.name in names) == held_out) for held_out in (False, True)
+        ]
         return replace(self, frames=parts[0]), replace(self, frames=parts[1])
 
 
-def open_labelled_frames(path: Path, split: Path | None = None, height: float = 0.0,
-                         mixed: bool = False) -> LabelledFrames:
+def open_labelled_frames(
+    path: Path, split: Path | None = None, height: float = 0.0, mixed: bool = False
+) -> LabelledFrames:
     """Return the frames of a recording.
 
     Args:
@@ -92,8 +94,9 @@ def open_labelled_frames(path: Path, split: Path | None = None, height: float = 
     """
     recording = open_recording(path, split=split)
     recording.require(BOXES, "train")
-    return LabelledFrames(path, tuple(recording.frames[:]), recording.is_sequential,
-                          _find_height(recording, height, mixed))
+    return LabelledFrames(
+        path, tuple(recording.frames[:]), recording.is_sequential, _find_height(recording, height, mixed)
+    )
 
 
 def _find_height(recording: Recording, height: float, mixed: bool) -> float | None:
@@ -127,8 +130,7 @@ def draw_items(items: Sequence[T], share: float, seed: int) -> list[T]:
     Raises:
         InputError: There are fewer than two items.
     """
-    chosen = np.random.default_rng(seed).choice(len(items), _count_held_out(len(items), share),
-                                                replace=False)
+    chosen = np.random.default_rng(seed).choice(len(items), _count_held_out(len(items), share), replace=False)
     return [items[i] for i in np.sort(chosen)]
 
 

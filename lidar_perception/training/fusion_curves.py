@@ -59,18 +59,23 @@ class Samples:
 
     def take(self, chosen: np.ndarray) -> Samples:
         """Return the proposals of a mask or of indices."""
-        return Samples(self.class_ids[chosen], self.right[chosen], self.scans[chosen],
-                       {name: odds[chosen] for name, odds in self.evidence.items()})
+        return Samples(
+            self.class_ids[chosen],
+            self.right[chosen],
+            self.scans[chosen],
+            {name: odds[chosen] for name, odds in self.evidence.items()},
+        )
 
     @staticmethod
     def concatenate(parts: Sequence[Samples]) -> Samples:
         """Return the proposals of all parts, one at least."""
         join = np.concatenate
-        return Samples(join([part.class_ids for part in parts]),
-                       join([part.right for part in parts]),
-                       join([part.scans for part in parts]),
-                       {name: join([part.evidence[name] for part in parts])
-                        for name in parts[0].evidence})
+        return Samples(
+            join([part.class_ids for part in parts]),
+            join([part.right for part in parts]),
+            join([part.scans for part in parts]),
+            {name: join([part.evidence[name] for part in parts]) for name in parts[0].evidence},
+        )
 
 
 class CurveScore(NamedTuple):
@@ -96,8 +101,9 @@ class ClassFit(NamedTuple):
     after: CurveScore | None
 
 
-def fit_fusion(weights: Path | None, classifier: Path | None, out: Path, params: FusedTraining,
-               jobs: int = 1) -> dict[str, ClassFit]:
+def fit_fusion(
+    weights: Path | None, classifier: Path | None, out: Path, params: FusedTraining, jobs: int = 1
+) -> dict[str, ClassFit]:
     """Fit the curves of two networks to simulated scans, and write a fusion file.
 
     Args:
@@ -111,8 +117,9 @@ def fit_fusion(weights: Path | None, classifier: Path | None, out: Path, params:
     Raises:
         InputError: Something cannot be used. Raised before a scan is simulated.
     """
-    own = FusedParams(weights=str(weights or ""), classifier=str(classifier or ""),
-                      range=params.range, threads=1, warm_up=False)
+    own = FusedParams(
+        weights=str(weights or ""), classifier=str(classifier or ""), range=params.range, threads=1, warm_up=False
+    )
     detector = load_fused_detector("", "cpu", FusedDetectorParams(fused=own))
     header, other = detector.proposer.header, detector.classifier.header
     params = fill_from_header(params, header)
@@ -120,18 +127,28 @@ def fit_fusion(weights: Path | None, classifier: Path | None, out: Path, params:
     scenes = Scenes(None, params.people, params.scene)
     scenes.scene_types()  # raises InputError for an unknown one
     around = detector.range == "around"
-    errors.print(f"{params.scans} {params.scene} scans of {params.sensor} at {sensor.height:g} m, "
-                 f"{'all around' if around else 'ahead'}")
+    errors.print(
+        f"{params.scans} {params.scene} scans of {params.sensor} at {sensor.height:g} m, "
+        f"{'all around' if around else 'ahead'}"
+    )
     for network in header, other:
         if warning := network.find_height_mismatch(sensor.height):
             errors.print(f"{NETWORKS[network.network][0]}: {warning}")
     source = SimulatedScenes(FIRST_FITTED_SCENE, params.scans, sensor, scenes, around=around)
-    models, fits = fit_classes(simulate_samples(FusedDetectorParams(fused=own), source, jobs),
-                               load_shipped_models())
-    write_fusion(out, (weights, classifier), models, {
-        "sensor": params.sensor, "height": sensor.height, "scene": params.scene,
-        "scans": params.scans, "range": "around" if around else "ahead",
-        "proposals, hits": {name: [fit.proposals, fit.right] for name, fit in fits.items()}})
+    models, fits = fit_classes(simulate_samples(FusedDetectorParams(fused=own), source, jobs), load_shipped_models())
+    write_fusion(
+        out,
+        (weights, classifier),
+        models,
+        {
+            "sensor": params.sensor,
+            "height": sensor.height,
+            "scene": params.scene,
+            "scans": params.scans,
+            "range": "around" if around else "ahead",
+            "proposals, hits": {name: [fit.proposals, fit.right] for name, fit in fits.items()},
+        },
+    )
     return fits
 
 
@@ -144,12 +161,14 @@ def fill_from_header(params: FusedTraining, header: Header) -> FusedTraining:
     sensor, trained = _read_sensor(header), header.training.get("params")
     name = sensor.get("name") or DEFAULT_SENSOR
     if not params.sensor and Path(name).suffix in (".yaml", ".yml") and not Path(name).is_file():
-        raise InputError(f"the weights are for the sensor {name}, which is missing; give its path, "
-                         "or another sensor, with --sensor")
+        raise InputError(
+            f"the weights are for the sensor {name}, which is missing; give its path, or another sensor, with --sensor"
+        )
     return replace(
-        params, sensor=params.sensor or name,
-        scene=params.scene or (trained.get("scene") if isinstance(trained, dict) else "")
-        or DEFAULT_SCENE)
+        params,
+        sensor=params.sensor or name,
+        scene=params.scene or (trained.get("scene") if isinstance(trained, dict) else "") or DEFAULT_SCENE,
+    )
 
 
 def _find_trained_height(header: Header) -> float:
@@ -190,8 +209,12 @@ def collect_samples(frame: Frame, proposals: Proposals, scan: int) -> Samples:
             kept.append(i)
             right.append(len(free) > 0)
     chosen = np.array(kept, np.int64)
-    return Samples(found.class_ids[chosen], np.array(right, bool), np.full(len(chosen), scan),
-                   {name: odds[chosen] for name, odds in proposals.evidence.items()})
+    return Samples(
+        found.class_ids[chosen],
+        np.array(right, bool),
+        np.full(len(chosen), scan),
+        {name: odds[chosen] for name, odds in proposals.evidence.items()},
+    )
 
 
 def _match_boxes(boxes: np.ndarray, objects: np.ndarray, name: str) -> np.ndarray:
@@ -204,21 +227,27 @@ def _match_boxes(boxes: np.ndarray, objects: np.ndarray, name: str) -> np.ndarra
 
 def simulate_samples(params: FusedDetectorParams, scenes: SimulatedScenes, jobs: int) -> Samples:
     """Return the proposals in all scans; the same for any number of processes."""
-    parts = sorted(show_progress(run_in_processes(partial(_make_sampler, params, scenes),
-                                                  range(len(scenes)),
-                                                  jobs, "detected in simulated scans"),
-                                 "simulating and detecting", len(scenes)), key=lambda part: part[0])
+    parts = sorted(
+        show_progress(
+            run_in_processes(
+                partial(_make_sampler, params, scenes), range(len(scenes)), jobs, "detected in simulated scans"
+            ),
+            "simulating and detecting",
+            len(scenes),
+        ),
+        key=lambda part: part[0],
+    )
     return Samples.concatenate([part for _, part in parts])
 
 
-def _make_sampler(params: FusedDetectorParams,
-                  scenes: SimulatedScenes) -> Callable[[int], tuple[int, Samples]]:
+def _make_sampler(params: FusedDetectorParams, scenes: SimulatedScenes) -> Callable[[int], tuple[int, Samples]]:
     detector: FusedDetector = load_fused_detector("", "cpu", params)
 
     def sample_scan(i: int) -> tuple[int, Samples]:
         frame = scenes.frame(i)
         proposals = detector.with_sensor_height(frame.sensor_height).propose(frame.load())
         return i, collect_samples(frame, proposals, i)
+
     return sample_scan
 
 
@@ -234,10 +263,12 @@ def fit_classes(samples: Samples, before: Models) -> tuple[Models, dict[str, Cla
         if has_enough_samples(own):
             models[name] = fit_class(name, own)
             after = _cross_validate(name, own)
-        fits[name] = ClassFit(len(own.right), int(own.right.sum()),
-                              _score(own, compute_probabilities(before, own.class_ids,
-                                                                own.evidence)),
-                              after)
+        fits[name] = ClassFit(
+            len(own.right),
+            int(own.right.sum()),
+            _score(own, compute_probabilities(before, own.class_ids, own.evidence)),
+            after,
+        )
     return models, fits
 
 
@@ -249,11 +280,9 @@ def has_enough_samples(own: Samples) -> bool:
 
 def fit_class(name: str, own: Samples) -> dict:
     """Return the model of a class, fitted to its proposals."""
-    knots = {source: k for source, k in KNOTS.items()
-             if (source, name) != ("silhouette", CLASSES[CAR])}
+    knots = {source: k for source, k in KNOTS.items() if (source, name) != ("silhouette", CLASSES[CAR])}
     features = {source: own.evidence[source] for source in knots}
-    return fit_curves(features, own.right, np.ones(len(own.right)), knots,
-                      dict.fromkeys(knots, 1))
+    return fit_curves(features, own.right, np.ones(len(own.right)), knots, dict.fromkeys(knots, 1))
 
 
 def _cross_validate(name: str, own: Samples) -> CurveScore:
@@ -271,5 +300,8 @@ def _score(own: Samples, scores: np.ndarray) -> CurveScore:
         return CurveScore(0.0, 0, 0)
     likelihood = np.where(own.right, scores, 1 - scores)
     passed = scores >= ScoreParams().get(CLASSES[own.class_ids[0]])
-    return CurveScore(float(-np.log(np.maximum(likelihood, MIN_PROBABILITY)).mean()),
-                      int((passed & own.right).sum()), int((passed & ~own.right).sum()))
+    return CurveScore(
+        float(-np.log(np.maximum(likelihood, MIN_PROBABILITY)).mean()),
+        int((passed & own.right).sum()),
+        int((passed & ~own.right).sum()),
+    )

@@ -22,8 +22,7 @@ class Table:
         rows = _read_rows(path)
         if rows:
             self.columns = rows[0]
-            kept = [rows[0]] + [row for row in rows[1:]
-                                if len(row) == len(rows[0]) and int(row[0]) <= step]
+            kept = [rows[0]] + [row for row in rows[1:] if len(row) == len(rows[0]) and int(row[0]) <= step]
             text = io.StringIO()
             csv.writer(text, lineterminator="\n").writerows(kept)
             write_text(path, text.getvalue())
@@ -69,8 +68,7 @@ class Log:
     """The logs in a folder: log.csv (losses), validation.csv (metrics) and TensorBoard events."""
 
     def __init__(self, folder: Path, step: int):
-        self.tables = {"loss": Table(folder / "log.csv", step),
-                       "validation": Table(folder / "validation.csv", step)}
+        self.tables = {"loss": Table(folder / "log.csv", step), "validation": Table(folder / "validation.csv", step)}
         self.board = None
         try:
             from torch.utils.tensorboard import SummaryWriter

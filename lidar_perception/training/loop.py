@@ -23,12 +23,7 @@ import torch
 from lidar_perception.runs.files import make_folder, write_bytes
 from lidar_perception.runs.resuming import find_differences
 from lidar_perception.runs.terminal import errors, make_progress, pause_progress
-from lidar_perception.training.distributed import (
-    find_minimum,
-    get_rank,
-    is_true_anywhere,
-    wait_for_all,
-)
+from lidar_perception.training.distributed import find_minimum, get_rank, is_true_anywhere, wait_for_all
 from lidar_perception.training.log import Log
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.run import Progress, Run, Task
@@ -37,11 +32,18 @@ from lidar_perception.types import InputError
 
 WARM_UP_S = 60.0  # until the duration of a step is known
 MEMORY_S = 600.0  # after which the duration of a step counts 1 / e in the mean
-SPARE_STEPS = 2   # whose time is kept free, as durations vary
+SPARE_STEPS = 2  # whose time is kept free, as durations vary
 
 
-def train(task: Task, params: LoopParams, out: Path, device: torch.device = torch.device("cpu"),
-          resume: bool = False, until: float = math.inf, validation: float = 0.0) -> Progress:
+def train(
+    task: Task,
+    params: LoopParams,
+    out: Path,
+    device: torch.device = torch.device("cpu"),
+    resume: bool = False,
+    until: float = math.inf,
+    validation: float = 0.0,
+) -> Progress:
     """Train until the steps are done, the time is over, or SIGINT or SIGTERM arrives.
 
     The state is saved at the end. If fewer steps fit into the time, the learning rate falls
@@ -73,8 +75,7 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
     pace, warned = Pace(until, run.validate_steps, validation), False
     try:
         with _catch_signals() as stop, make_progress() as bar:
-            line = bar.add_task("training", total=run.steps, completed=int(run.position),
-                                visible=get_rank() == 0)
+            line = bar.add_task("training", total=run.steps, completed=int(run.position), visible=get_rank() == 0)
             batches = iter(task.batches(run.progress.step))
             while True:
                 if is_true_anywhere(stop.is_set(), device):
@@ -82,8 +83,7 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
                     _save_state(path, run)
                     break
                 run.progress.late = is_true_anywhere(pace.is_over(), device) and not run.done
-                due = run.is_validation_due() and (
-                    run.done or not is_true_anywhere(pace.is_over(2), device))
+                due = run.is_validation_due() and (run.done or not is_true_anywhere(pace.is_over(2), device))
                 if due or (run.progress.late and run.progress.step > run.progress.validated):
                     _save_state(path, run)  # as validation takes a while
                     with pace.time_validation(), pause_progress(bar):
@@ -99,16 +99,17 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
                     run.shorten_schedule(fit - step)
                     if fit < 0.9 * run.steps and not warned and get_rank() == 0:
                         warned = True
-                        errors.print(f"slower than planned, {pace.step_duration:.2g} s a step: "
-                                     f"about {fit:.0f} of {run.steps} steps fit into the budget, "
-                                     "so the learning rate falls faster")
+                        errors.print(
+                            f"slower than planned, {pace.step_duration:.2g} s a step: "
+                            f"about {fit:.0f} of {run.steps} steps fit into the budget, "
+                            "so the learning rate falls faster"
+                        )
                 run.progress.seconds = time.monotonic() - begun
                 bar.update(line, completed=run.position)
                 if row is not None:
                     bar.update(line, description=f"loss {row['loss']:.3f} lr {row['lr']:.1e}")
                     if log is not None and step % params.log_steps == 0:
-                        log.add("loss", step, {**row, "skipped": run.progress.skipped,
-                                               "seconds": run.progress.seconds})
+                        log.add("loss", step, {**row, "skipped": run.progress.skipped, "seconds": run.progress.seconds})
                 if step % params.save_steps == 0 and not run.is_validation_due():
                     _save_state(path, run)
     finally:
@@ -152,8 +153,7 @@ class Pace:
         since = step % self.validate_steps
         left = self.until - now - self.validation + since * self.step_duration
         whole, rest = divmod(left, self.validate_steps * self.step_duration + self.validation)
-        return (whole * self.validate_steps + min(rest / self.step_duration, self.validate_steps)
-                - since - SPARE_STEPS)
+        return whole * self.validate_steps + min(rest / self.step_duration, self.validate_steps) - since - SPARE_STEPS
 
     @contextmanager
     def time_validation(self) -> Iterator[None]:
@@ -174,8 +174,7 @@ def _validate(run: Run, log: Log | None) -> None:
         shown = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
         errors.print(f"step {progress.step}: {shown}")
         if np.isnan(metrics["score"]):
-            errors.print("the validation frames contain no object, so the latest weights count as "
-                         "the best")
+            errors.print("the validation frames contain no object, so the latest weights count as the best")
         better = progress.best is None or not metrics["score"] <= progress.best
         if better:
             progress.best, progress.best_step = metrics["score"], progress.step
@@ -221,8 +220,10 @@ def _read_state(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"cannot read {path}: {reason}; remove it to start again") from None
     if different := find_differences(before, settings):
-        raise InputError(f"{path} is of a run with {'; '.join(different[:3])}; resume it with the "
-                         "same settings, or give another --out")
+        raise InputError(
+            f"{path} is of a run with {'; '.join(different[:3])}; resume it with the "
+            "same settings, or give another --out"
+        )
     return state
 
 

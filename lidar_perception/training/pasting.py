@@ -28,13 +28,15 @@ def find_points_in_box(points: np.ndarray, box: np.ndarray, margin: float) -> np
 @njit(inline="always")
 def _is_in_box(point, box, half, cos, sin):
     dx, dy = point[0] - box[0], point[1] - box[1]
-    return (abs(cos * dx + sin * dy) <= half[0] and abs(cos * dy - sin * dx) <= half[1]
-            and abs(point[2] - box[2]) <= half[2])
+    return (
+        abs(cos * dx + sin * dy) <= half[0]
+        and abs(cos * dy - sin * dx) <= half[1]
+        and abs(point[2] - box[2]) <= half[2]
+    )
 
 
 @njit(cache=True, nogil=True)
-def paste_object(points: np.ndarray, own: np.ndarray, box: np.ndarray, margin: float,
-                 max_hidden: float) -> np.ndarray:
+def paste_object(points: np.ndarray, own: np.ndarray, box: np.ndarray, margin: float, max_hidden: float) -> np.ndarray:
     """Add the points of an object to a scene, and drop the points that it replaces or hides.
 
     Args:
@@ -52,8 +54,7 @@ def paste_object(points: np.ndarray, own: np.ndarray, box: np.ndarray, margin: f
     least, greatest = np.full(3, np.inf), np.full(3, -np.inf)  # depth, slopes aside and upwards
     for i in range(len(own)):
         depth = max(cos * own[i, 0] + sin * own[i, 1], MIN_RANGE_M)
-        for k, value in enumerate((depth, (cos * own[i, 1] - sin * own[i, 0]) / depth,
-                                   own[i, 2] / depth)):
+        for k, value in enumerate((depth, (cos * own[i, 1] - sin * own[i, 0]) / depth, own[i, 2] / depth)):
             least[k], greatest[k] = min(least[k], value), max(greatest[k], value)
     half, yaw_cos, yaw_sin = box[3:6] / 2 + margin, np.cos(box[6]), np.sin(box[6])
     out = np.empty((len(points) + len(own), 4), np.float32)
@@ -62,8 +63,10 @@ def paste_object(points: np.ndarray, own: np.ndarray, box: np.ndarray, margin: f
         depth = cos * points[i, 0] + sin * points[i, 1]
         if depth > 0 and not least[0] <= depth <= greatest[0]:
             aside = cos * points[i, 1] - sin * points[i, 0]
-            if (least[1] * depth <= aside <= greatest[1] * depth
-                    and least[2] * depth <= points[i, 2] <= greatest[2] * depth):
+            if (
+                least[1] * depth <= aside <= greatest[1] * depth
+                and least[2] * depth <= points[i, 2] <= greatest[2] * depth
+            ):
                 if depth > greatest[0]:
                     continue
                 in_front += 1
@@ -73,8 +76,8 @@ def paste_object(points: np.ndarray, own: np.ndarray, box: np.ndarray, margin: f
             count += 1
     if in_front > max_hidden:
         return out[:0]
-    out[count:count + len(own)] = own
-    return out[:count + len(own)]
+    out[count : count + len(own)] = own
+    return out[: count + len(own)]
 
 
 @njit(cache=True, nogil=True)

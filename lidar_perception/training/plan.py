@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 
 from lidar_perception.types import InputError
 
-RESERVE_SHARE = 0.1         # of the budget, for everything that was not measured
-STARTUP_S = 20.0            # until the processes run
+RESERVE_SHARE = 0.1  # of the budget, for everything that was not measured
+STARTUP_S = 20.0  # until the processes run
 MAX_PREPARATION_SHARE = 0.25  # of the time, to make scenes
-VALIDATION_SHARE = 0.12     # of the time, to validate
+VALIDATION_SHARE = 0.12  # of the time, to validate
 SCANS_RANGE, VAL_SCANS_RANGE = (24, 3000), (16, 200)
 MAX_VALIDATIONS = 6
-PASSES_RANGE = 4, 80        # over the scenes: fewer show each too rarely, more teach nothing new
-FULL_RANGE_STEPS = 12_000   # from this many steps on, training covers the whole detection range
-MIN_STEPS = 20              # fewer steps teach nothing
+PASSES_RANGE = 4, 80  # over the scenes: fewer show each too rarely, more teach nothing new
+FULL_RANGE_STEPS = 12_000  # from this many steps on, training covers the whole detection range
+MIN_STEPS = 20  # fewer steps teach nothing
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,7 @@ class Data:
     most_cuts: int
 
 
-def fit_plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(),
-             epochs: float = 0.0) -> Plan:
+def fit_plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(), epochs: float = 0.0) -> Plan:
     """Return the plan that makes the best use of a time budget.
 
     It has as many scans as can be seen four times, in at most a quarter of the time. The steps get
@@ -98,39 +97,41 @@ def fit_plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = P
     enough = hours
     while _fit_any(enough, cores, speed, data, given, epochs).steps < MIN_STEPS:
         enough = 1.2 * enough
-    raise InputError(f"a budget of {hours:g} h is too short for {MIN_STEPS} steps on this "
-                     f"machine: give --budget {1.05 * enough:.2g} or more, or fewer --data-scans "
-                     "and --data-val-scans")
+    raise InputError(
+        f"a budget of {hours:g} h is too short for {MIN_STEPS} steps on this "
+        f"machine: give --budget {1.05 * enough:.2g} or more, or fewer --data-scans "
+        "and --data-val-scans"
+    )
 
 
-def _fit_any(hours: float, cores: int, speed: Speed, data: Data, given: Plan,
-             epochs: float) -> Plan:
+def _fit_any(hours: float, cores: int, speed: Speed, data: Data, given: Plan, epochs: float) -> Plan:
     """Fit a plan whose number of steps may be too small."""
     time = 3600 * hours * (1 - RESERVE_SHARE) - STARTUP_S
     scans, val, steps = given.scans, given.val_scans, given.steps
     if data.simulated and not scans:
         preparation = (speed.scan + speed.cut) / cores
-        scans = _clip(min(MAX_PREPARATION_SHARE * time / preparation,
-                          (1 - VALIDATION_SHARE) * time / (
-                              preparation + PASSES_RANGE[0] * speed.step / data.batch)),
-                      SCANS_RANGE)
+        scans = _clip(
+            min(
+                MAX_PREPARATION_SHARE * time / preparation,
+                (1 - VALIDATION_SHARE) * time / (preparation + PASSES_RANGE[0] * speed.step / data.batch),
+            ),
+            SCANS_RANGE,
+        )
         scans = min(scans, steps * data.batch) if steps else scans
     scenes = (scans if data.simulated else 0) + data.recorded
     if data.val_simulated and not val:
-        val = _clip(min(scenes / 8, VALIDATION_SHARE * time / MAX_VALIDATIONS / speed.frame),
-                    VAL_SCANS_RANGE)
+        val = _clip(min(scenes / 8, VALIDATION_SHARE * time / MAX_VALIDATIONS / speed.frame), VAL_SCANS_RANGE)
     epoch = max(1, round(scenes / data.batch))
     steps = steps or (max(1, round(epochs * epoch)) if epochs else 0)
-    unstepped = Plan(scans, val, given.cuts or min(scenes, data.most_cuts), steps,
-                     given.validate_steps)
+    unstepped = Plan(scans, val, given.cuts or min(scenes, data.most_cuts), steps, given.validate_steps)
     validation = speed.frame * (val + data.val_recorded)
     validations = max(1, min(MAX_VALIDATIONS, int(VALIDATION_SHARE * time / validation)))
     left = time - preparation_duration(unstepped, cores, speed) - validations * validation
     part = given.part and left / speed.whole < FULL_RANGE_STEPS
-    steps = steps or max(0, min(int(left / (speed.step if part else speed.whole)),
-                                PASSES_RANGE[1] * epoch))
-    return replace(unstepped, part=part, steps=steps,
-                   validate_steps=given.validate_steps or max(1, -(-steps // validations)))
+    steps = steps or max(0, min(int(left / (speed.step if part else speed.whole)), PASSES_RANGE[1] * epoch))
+    return replace(
+        unstepped, part=part, steps=steps, validate_steps=given.validate_steps or max(1, -(-steps // validations))
+    )
 
 
 def preparation_duration(plan: Plan, cores: int, speed: Speed) -> float:
@@ -141,8 +142,10 @@ def preparation_duration(plan: Plan, cores: int, speed: Speed) -> float:
 def training_durations(plan: Plan, speed: Speed, data: Data) -> tuple[float, float]:
     """Return the durations of all steps and of all validations, in seconds."""
     validations = -(-plan.steps // plan.validate_steps)
-    return (plan.steps * (speed.step if plan.part else speed.whole),
-            validations * validation_duration(plan, speed, data))
+    return (
+        plan.steps * (speed.step if plan.part else speed.whole),
+        validations * validation_duration(plan, speed, data),
+    )
 
 
 def validation_duration(plan: Plan, speed: Speed, data: Data) -> float:

@@ -19,14 +19,7 @@ from lidar_perception.runs.terminal import errors, format_duration
 from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.training.data import Item, SceneReader
 from lidar_perception.training.distributed import get_world_size
-from lidar_perception.training.plan import (
-    Data,
-    Plan,
-    Speed,
-    fit_plan,
-    preparation_duration,
-    training_durations,
-)
+from lidar_perception.training.plan import Data, Plan, Speed, fit_plan, preparation_duration, training_durations
 from lidar_perception.training.request import TrainingRequest
 from lidar_perception.training.run_directory import PlannedRun
 from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
@@ -67,10 +60,15 @@ class Planner:
             errors.print("measuring this machine with a few scenes ...")
             speed = self.measure_speed(sources, held_out)
         data = self.describe_scenes(sources, held_out)
-        given = Plan(params.data.scans, params.data.val_scans, 0, params.steps,
-                     params.validate_steps, bool(self.trainer.reduced_range(params)))
-        plan = fit_plan(self.request.budget or DEFAULT_BUDGET_H, count_cores(), speed, data, given,
-                        params.epochs)
+        given = Plan(
+            params.data.scans,
+            params.data.val_scans,
+            0,
+            params.steps,
+            params.validate_steps,
+            bool(self.trainer.reduced_range(params)),
+        )
+        plan = fit_plan(self.request.budget or DEFAULT_BUDGET_H, count_cores(), speed, data, given, params.epochs)
         if params.validate_epochs and not params.validate_steps:
             epoch = max(1, round((plan.scans + data.recorded) / data.batch))
             plan = replace(plan, validate_steps=params.validation_steps(epoch))
@@ -80,16 +78,28 @@ class Planner:
 
     def describe_scenes(self, sources: Sequence[Any], held_out: Sequence[Any]) -> Data:
         """Return the numbers of the scenes of open_few_scenes()."""
-        return Data(has_simulated(sources), has_simulated(held_out), _count_recorded(sources),
-                    _count_recorded(held_out), self.params.batch * get_world_size(),
-                    self.trainer.max_cuts(self.params))
+        return Data(
+            has_simulated(sources),
+            has_simulated(held_out),
+            _count_recorded(sources),
+            _count_recorded(held_out),
+            self.params.batch * get_world_size(),
+            self.trainer.max_cuts(self.params),
+        )
 
     def apply_plan(self, plan: Plan) -> Any:
         """Return the parameters with the numbers of a plan."""
         part = self.trainer.reduced_range(self.params) if plan.part else {}
-        return with_values(self.params, {
-            "steps": plan.steps, "validate_steps": plan.validate_steps,
-            "data.scans": plan.scans, "data.val_scans": plan.val_scans, **part})
+        return with_values(
+            self.params,
+            {
+                "steps": plan.steps,
+                "validate_steps": plan.validate_steps,
+                "data.scans": plan.scans,
+                "data.val_scans": plan.val_scans,
+                **part,
+            },
+        )
 
     def open_few_scenes(self) -> tuple[Sequence[Any], Sequence[Any]]:
         """Return sources to train on and to validate on, with few simulated scans and no cache."""
@@ -99,39 +109,60 @@ class Planner:
         """Measure this machine with the sources of open_few_scenes()."""
         scenes, scan, scan_mb = _time_scans((*sources, *held_out))
         cut, step, whole, frame = self.trainer.measure_speed(
-            limit_to_few_scans(self.params), scenes, held_out, self.device)
+            limit_to_few_scans(self.params), scenes, held_out, self.device
+        )
         return Speed(scan, cut, step, whole, frame, scan_mb)
 
     def _print_plan(self, plan: Plan, speed: Speed, data: Data, height: float | None) -> None:
         params = self.params
         at_height = "" if height is None else f" at {height:g} m"
-        scenes = " and ".join(text for count, text in (
-            (plan.scans, f"{plan.scans} {params.scene} scans of {params.sensor} at "
-             f"{self.sensor.height:g} m"),
-            (data.recorded, f"{data.recorded} recorded scenes{at_height}")) if count)
+        scenes = " and ".join(
+            text
+            for count, text in (
+                (plan.scans, f"{plan.scans} {params.scene} scans of {params.sensor} at {self.sensor.height:g} m"),
+                (data.recorded, f"{data.recorded} recorded scenes{at_height}"),
+            )
+            if count
+        )
         part = self.trainer.reduced_range(params) if plan.part else {}
         region = f" up to {part['ahead']:g} m ahead and {part['aside']:g} m aside" if part else ""
-        often = (f"every {plan.validate_steps} steps" if plan.validate_steps < plan.steps
-                 else "at the end")
-        errors.print(f"{self.trainer.name}: {scenes}, {plan.steps} steps of {data.batch} scenes"
-                     f"{region}, validated {often} on "
-                     f"{plan.val_scans + data.val_recorded} other scenes")
+        often = f"every {plan.validate_steps} steps" if plan.validate_steps < plan.steps else "at the end"
+        errors.print(
+            f"{self.trainer.name}: {scenes}, {plan.steps} steps of {data.batch} scenes"
+            f"{region}, validated {often} on "
+            f"{plan.val_scans + data.val_recorded} other scenes"
+        )
         steps, validations = training_durations(plan, speed, data)
         cutting = preparation_duration(replace(plan, scans=0, val_scans=0), count_cores(), speed)
-        parts = {"simulating": preparation_duration(plan, count_cores(), speed) - cutting,
-                 self.trainer.cutting: cutting, "steps": steps, "validation": validations}
-        errors.print(f"about {format_duration(sum(parts.values()))} on {count_cores()} cores at "
-                     f"their present load, torch with {torch.get_num_threads()} threads: "
-                     + ", ".join(f"{name} {format_duration(value)}"
-                                 for name, value in parts.items()))
+        parts = {
+            "simulating": preparation_duration(plan, count_cores(), speed) - cutting,
+            self.trainer.cutting: cutting,
+            "steps": steps,
+            "validation": validations,
+        }
+        errors.print(
+            f"about {format_duration(sum(parts.values()))} on {count_cores()} cores at "
+            f"their present load, torch with {torch.get_num_threads()} threads: "
+            + ", ".join(f"{name} {format_duration(value)}" for name, value in parts.items())
+        )
         errors.print(f"cache: {params.data.cache}; an interrupted run continues with --resume")
 
 
 def open_scenes(request: TrainingRequest, params: Any, sensor: Sensor) -> tuple[tuple, tuple]:
     """Return the sources of scenes to train on and to validate on."""
     around = getattr(params, "range", "") == "around"
-    return open_sources(request.data, request.val, request.split, request.val_split, params.data,
-                        params.seed, sensor, around, params.scene, params.mount_height)
+    return open_sources(
+        request.data,
+        request.val,
+        request.split,
+        request.val_split,
+        params.data,
+        params.seed,
+        sensor,
+        around,
+        params.scene,
+        params.mount_height,
+    )
 
 
 def limit_to_few_scans(params: Any) -> Any:
@@ -167,10 +198,12 @@ def _time_scans(sources: Sequence[Any]) -> tuple[Iterable[Item], float, float]:
             count = source.per_scene
             source.scene(0)  # compiles the simulator
             begun = time.perf_counter()
-            scenes = [source.scene(i)
-                      for i in range(count, count + min(count, MAX_TIMED_SCENES))]
-            return ([Item(scene) for scene in scenes],
-                    (time.perf_counter() - begun) / len(scenes), scenes[0].points.nbytes * 1.02e-6)
+            scenes = [source.scene(i) for i in range(count, count + min(count, MAX_TIMED_SCENES))]
+            return (
+                [Item(scene) for scene in scenes],
+                (time.perf_counter() - begun) / len(scenes),
+                scenes[0].points.nbytes * 1.02e-6,
+            )
     recorded = SceneReader(tuple(sources), lambda source, i: source.scene(i))
     return (recorded[n] for n in range(len(recorded))), 0.0, 0.0
 
@@ -179,5 +212,7 @@ def _require_disk_space(cache: Path, max_gb: float, plan: Plan, speed: Speed) ->
     needed = min((plan.scans + plan.val_scans) * speed.scan_mb / 1e3, max_gb)
     free = shutil.disk_usage(cache).free / 1e9
     if needed + MIN_FREE_GB > free:
-        raise InputError(f"{cache} needs {needed:.1f} GB for scans, and {free:.1f} GB are free: "
-                         "give fewer --data-scans, a smaller --data-cache-gb or another --out")
+        raise InputError(
+            f"{cache} needs {needed:.1f} GB for scans, and {free:.1f} GB are free: "
+            "give fewer --data-scans, a smaller --data-cache-gb or another --out"
+        )

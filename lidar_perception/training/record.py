@@ -11,13 +11,7 @@ import numpy as np
 from torch import nn
 
 from lidar_perception import __version__
-from lidar_perception.detectors.checkpoint import (
-    Config,
-    Header,
-    Net,
-    copy_matching_weights,
-    save_checkpoint,
-)
+from lidar_perception.detectors.checkpoint import Config, Header, Net, copy_matching_weights, save_checkpoint
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors
 from lidar_perception.scoring.kitti.protocol import Comparison
@@ -29,19 +23,26 @@ from lidar_perception.training.run import Validation
 from lidar_perception.types import InputError
 
 
-def make_save(out: Path, config: Any, params: LoopParams, batches: Batches,
-              about: dict[str, Any],
-              commit: str) -> Callable[[str, nn.Module, dict[str, Any]], None]:
-    """Return the save function of a Task, which writes out/name.safetensors.
-    """
+def make_save(
+    out: Path, config: Any, params: LoopParams, batches: Batches, about: dict[str, Any], commit: str
+) -> Callable[[str, nn.Module, dict[str, Any]], None]:
+    """Return the save function of a Task, which writes out/name.safetensors."""
+
     def save(name: str, module: nn.Module, record: dict[str, Any]) -> None:
         training = {
-            **about, "seed": params.seed, "steps": record["step"],
-            "seconds": round(record["seconds"]), "steps_skipped": record["skipped"],
-            "scenes_skipped": len(batches.skipped), "batch": params.batch * batches.world,
-            "params": flatten(params), "version": __version__}
-        header = Header(config, training, round_metrics(record.get("metrics", {})), commit,
-                        record.get("calibration", {}))
+            **about,
+            "seed": params.seed,
+            "steps": record["step"],
+            "seconds": round(record["seconds"]),
+            "steps_skipped": record["skipped"],
+            "scenes_skipped": len(batches.skipped),
+            "batch": params.batch * batches.world,
+            "params": flatten(params),
+            "version": __version__,
+        }
+        header = Header(
+            config, training, round_metrics(record.get("metrics", {})), commit, record.get("calibration", {})
+        )
         save_checkpoint(out / f"{name}.safetensors", module, header)
 
     return save
@@ -71,8 +72,7 @@ def report_skipped(skipped: Sequence[str], left: int, reported: set[str]) -> Non
             errors.print(f"validation: {reason}")
     reported.update(skipped)
     if left == 0:
-        raise InputError("no frame to validate on can be used "
-                         f"({next(iter(skipped), 'there is none')})")
+        raise InputError(f"no frame to validate on can be used ({next(iter(skipped), 'there is none')})")
 
 
 def round_metrics(metrics: dict[str, float]) -> dict[str, float | None]:
@@ -82,12 +82,13 @@ def round_metrics(metrics: dict[str, float]) -> dict[str, float | None]:
 
 def summarize_report(report: DetectionReport, score: str, classes: Sequence[str]) -> Validation:
     """Return metrics and calibration, as Task.validate does, of a network's own scores."""
-    return (select_metrics(report.compute(), score, classes),
-            fit_calibrations(Comparison.of(report.frames)) if report.frames else {})
+    return (
+        select_metrics(report.compute(), score, classes),
+        fit_calibrations(Comparison.of(report.frames)) if report.frames else {},
+    )
 
 
-def select_metrics(content: dict[str, Any], score: str,
-                   classes: Sequence[str]) -> dict[str, float]:
+def select_metrics(content: dict[str, Any], score: str, classes: Sequence[str]) -> dict[str, float]:
     """Return each class's AP at the relaxed BEV and strict 3D overlaps (moderate, R40).
 
     Args:

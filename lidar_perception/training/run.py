@@ -86,14 +86,17 @@ class Run:
         self.module = task.module
         self.average = WeightAverage(self.module, params.ema)
         # Norm statistics begin as means over all steps, so that the initial values do not count.
-        self.norms = [(m, m.momentum) for m in self.module.modules()
-                      if isinstance(m, nn.modules.batchnorm._BatchNorm) and m.momentum is not None]
+        self.norms = [
+            (m, m.momentum)
+            for m in self.module.modules()
+            if isinstance(m, nn.modules.batchnorm._BatchNorm) and m.momentum is not None
+        ]
         self.wrapped: nn.Module = self.module
         if get_world_size() > 1:
             self.wrapped = nn.parallel.DistributedDataParallel(
-                self.module, device_ids=[device] if device.type == "cuda" else None)
-        self.optimizer = torch.optim.AdamW(self.module.parameters(), lr=params.lr,
-                                           weight_decay=params.weight_decay)
+                self.module, device_ids=[device] if device.type == "cuda" else None
+            )
+        self.optimizer = torch.optim.AdamW(self.module.parameters(), lr=params.lr, weight_decay=params.weight_decay)
         self.format = choose_dtype(params.amp, device)
         self.scaler = torch.amp.GradScaler(device.type, enabled=self.format is torch.float16)
         self.progress = Progress()
@@ -117,21 +120,26 @@ class Run:
     def is_validation_due(self) -> bool:
         """Return True if the weights are to be validated after the last step."""
         step = self.progress.step
-        return step > self.progress.validated and (
-            step % self.validate_steps == 0 or self.done)
+        return step > self.progress.validated and (step % self.validate_steps == 0 or self.done)
 
     def settings(self) -> dict[str, Any]:
         """Return everything that a resumed run must have in common."""
-        return {**self.params.fixed_settings(), **self.task.about, "steps": self.steps,
-                "processes": get_world_size()}
+        return {**self.params.fixed_settings(), **self.task.about, "steps": self.steps, "processes": get_world_size()}
 
     def state(self) -> dict[str, Any]:
         """Return everything needed to resume, for torch.save."""
         cuda = torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
-        return {"module": self.module.state_dict(), "average": self.average.module.state_dict(),
-                "updates": self.average.updates, "optimizer": self.optimizer.state_dict(),
-                "scaler": self.scaler.state_dict(), "progress": vars(self.progress).copy(),
-                "random": torch.get_rng_state(), "cuda": cuda, "asked": self.settings()}
+        return {
+            "module": self.module.state_dict(),
+            "average": self.average.module.state_dict(),
+            "updates": self.average.updates,
+            "optimizer": self.optimizer.state_dict(),
+            "scaler": self.scaler.state_dict(),
+            "progress": vars(self.progress).copy(),
+            "random": torch.get_rng_state(),
+            "cuda": cuda,
+            "asked": self.settings(),
+        }
 
     def load(self, state: dict[str, Any]) -> None:
         """Restore what state() returned."""
@@ -154,8 +162,7 @@ class Run:
         Raises:
             InputError: Too many steps in a row were not finite.
         """
-        rate, beta = compute_one_cycle(self.position, self.steps, self.params.lr,
-                                       self.params.warm_share)
+        rate, beta = compute_one_cycle(self.position, self.steps, self.params.lr, self.params.warm_share)
         for group in self.optimizer.param_groups:
             group["lr"], group["betas"] = rate, (beta, group["betas"][1])
         for norm, momentum in self.norms:
@@ -163,7 +170,7 @@ class Run:
         # A batch that is not finite changes the norm statistics even if its step is skipped.
         buffers = [(buffer, buffer.clone()) for buffer in self.module.buffers()]
         self.wrapped.train()
-        with (torch.autocast(self.device.type, self.format) if self.format else nullcontext()):
+        with torch.autocast(self.device.type, self.format) if self.format else nullcontext():
             total, parts = self.task.loss(self.wrapped, batch)
         gradient_norm = self._descend(total)
         self.progress.step += 1
@@ -173,14 +180,20 @@ class Run:
             self.progress.skipped += 1
             self.progress.in_a_row += 1
             if self.progress.in_a_row >= self.params.max_skipped:
-                raise InputError(f"the loss or its gradient was not finite in "
-                                 f"{self.progress.in_a_row} steps in a row, up to step "
-                                 f"{self.progress.step}; lower --lr or check the data")
+                raise InputError(
+                    f"the loss or its gradient was not finite in "
+                    f"{self.progress.in_a_row} steps in a row, up to step "
+                    f"{self.progress.step}; lower --lr or check the data"
+                )
             return None
         self.progress.in_a_row = 0
         self.average.update(self.module)
-        return {"loss": total.item(), **{name: float(part) for name, part in parts.items()},
-                "gradient": gradient_norm, "lr": rate}
+        return {
+            "loss": total.item(),
+            **{name: float(part) for name, part in parts.items()},
+            "gradient": gradient_norm,
+            "lr": rate,
+        }
 
     def _descend(self, total: Tensor) -> float:
         """Step along the gradient. Returns its norm, not finite if the step was skipped."""
@@ -189,8 +202,7 @@ class Run:
         self.optimizer.zero_grad(set_to_none=True)
         self.scaler.scale(total).backward()
         self.scaler.unscale_(self.optimizer)
-        norm = nn.utils.clip_grad_norm_(self.module.parameters(),
-                                        self.params.clip or math.inf).item()
+        norm = nn.utils.clip_grad_norm_(self.module.parameters(), self.params.clip or math.inf).item()
         if math.isfinite(norm):
             self.scaler.step(self.optimizer)
         self.scaler.update()

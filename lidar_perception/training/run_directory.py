@@ -11,21 +11,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lidar_perception.runs.files import (
-    check_writable_folder,
-    read_text,
-    remove_temporaries,
-    write_text,
-)
+from lidar_perception.runs.files import check_writable_folder, read_text, remove_temporaries, write_text
 from lidar_perception.runs.resuming import find_differences, lock_folder
 from lidar_perception.training.distributed import get_rank
 from lidar_perception.training.plan import Data, Plan, Speed
 from lidar_perception.types import InputError
 
-RUN = "run.json"   # settings, measured speed and plan of the first start
+RUN = "run.json"  # settings, measured speed and plan of the first start
 STATE = "last.pt"  # what a resumed run needs
 WEIGHTS = "best.safetensors", "last.safetensors"
-SCANS = "scans"    # the cache, unless another one is given
+SCANS = "scans"  # the cache, unless another one is given
 WRITTEN = (RUN, STATE, *WEIGHTS, "objects.npz", "log.csv", "validation.csv")
 MAX_RUN_BYTES = 10**6
 
@@ -67,8 +62,10 @@ class RunDirectory:
             self._require_absent(file, resume)
         for name in WEIGHTS:
             if not any(file.exists() for file in files) and (self.path / name).exists():
-                raise InputError(f"{self.path / name} belongs to no run that could be resumed, and "
-                                 "would be replaced; give another --out")
+                raise InputError(
+                    f"{self.path / name} belongs to no run that could be resumed, and "
+                    "would be replaced; give another --out"
+                )
 
     def require_no_state(self, resume: bool) -> None:
         """Raise InputError as require_no_run does, for the state alone."""
@@ -77,8 +74,7 @@ class RunDirectory:
     def _require_absent(self, file: Path, resume: bool) -> None:
         check_writable_folder(self.path)
         if file.exists() and not resume:
-            raise InputError(f"{self.path} holds a training run already; give --resume to resume "
-                             "it, or another --out")
+            raise InputError(f"{self.path} holds a training run already; give --resume to resume it, or another --out")
 
     @contextmanager
     def lock(self) -> Iterator[None]:
@@ -98,9 +94,13 @@ class RunDirectory:
 
     def write_plan(self, run: PlannedRun) -> None:
         """Write the plan file."""
-        write_text(self.plan_file, json.dumps({
-            "asked": run.settings, "plan": asdict(run.plan), "speed": asdict(run.speed),
-            "data": asdict(run.data)}, indent=1))
+        write_text(
+            self.plan_file,
+            json.dumps(
+                {"asked": run.settings, "plan": asdict(run.plan), "speed": asdict(run.speed), "data": asdict(run.data)},
+                indent=1,
+            ),
+        )
 
     def read_plan(self, settings: dict[str, Any]) -> PlannedRun:
         """Read the plan file.
@@ -111,15 +111,17 @@ class RunDirectory:
         text = read_text(self.plan_file, MAX_RUN_BYTES)
         try:
             content = json.loads(text)
-            run = PlannedRun(content["asked"], Plan(**content["plan"]), Speed(**content["speed"]),
-                             Data(**content["data"]))
+            run = PlannedRun(
+                content["asked"], Plan(**content["plan"]), Speed(**content["speed"]), Data(**content["data"])
+            )
             different = find_differences(run.settings, json.loads(json.dumps(settings)))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(f"cannot read {self.plan_file}: {error!r}; give another --out"
-                             ) from None
+            raise InputError(f"cannot read {self.plan_file}: {error!r}; give another --out") from None
         if different:
-            raise InputError(f"{self.path} holds a run with {'; '.join(different[:3])}; resume it "
-                             "with the same settings, or give another --out")
+            raise InputError(
+                f"{self.path} holds a run with {'; '.join(different[:3])}; resume it "
+                "with the same settings, or give another --out"
+            )
         return run
 
 
@@ -129,8 +131,10 @@ def _interrupt_on_sigterm() -> Iterator[None]:
 
     Only in the main thread, and only if there is no other handler.
     """
-    if (threading.current_thread() is not threading.main_thread()
-        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL):
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    ):
         yield
         return
     signal.signal(signal.SIGTERM, signal.default_int_handler)

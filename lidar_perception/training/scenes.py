@@ -66,8 +66,9 @@ class RecordedScenes:
     def key(self, i: int) -> str:
         """Return a cache key of scene i, which changes when one of its files is written."""
         frame = self._frames[self.names[i]]
-        return repr((*map(file_fingerprint, frame.files), split_topic(self.path)[1], frame.name,
-                     self.view, frame.sensor_height))
+        return repr(
+            (*map(file_fingerprint, frame.files), split_topic(self.path)[1], frame.name, self.view, frame.sensor_height)
+        )
 
     def scene(self, i: int) -> TrainingScene:
         """Return scene i to train on. Raise InputError, naming the file, if it is broken."""
@@ -76,8 +77,9 @@ class RecordedScenes:
         points = scan.points()
         if self.view and camera is not None:
             points = points[camera.in_view(scan.xyz)]
-        return TrainingScene(points, truth.boxes, truth.class_ids, np.ones(len(truth), bool),
-                             camera is None, frame.sensor_height)
+        return TrainingScene(
+            points, truth.boxes, truth.class_ids, np.ones(len(truth), bool), camera is None, frame.sensor_height
+        )
 
     def frame(self, i: int) -> Frame:
         """Return the whole scan to validate on. Raise InputError if it has no labels."""
@@ -136,8 +138,9 @@ class SimulatedScenes:
     def scene(self, i: int) -> TrainingScene:
         """Return scene i to train on, with labels all around."""
         frame, truth = self.scan(i)
-        return TrainingScene(frame.points(), truth.boxes, truth.class_ids, find_labelled(truth),
-                             True, self.sensor.height)
+        return TrainingScene(
+            frame.points(), truth.boxes, truth.class_ids, find_labelled(truth), True, self.sensor.height
+        )
 
     def frame(self, i: int) -> Frame:
         """Return scan i to validate on.
@@ -148,16 +151,19 @@ class SimulatedScenes:
         scan, truth = self.scan(i)
         scene, part = self.locate(i)
         if not self.scenes.camera:
-            return Frame.of(f"scene {scene} frame {part}", scan, select_labels(truth),
-                            sensor_height=self.sensor.height)
+            return Frame.of(f"scene {scene} frame {part}", scan, select_labels(truth), sensor_height=self.sensor.height)
         camera = turn_camera(np.pi / 2 * (i % 4)) if self.around else FORWARD_CAMERA
-        return Frame.of(f"street {scene} frame {part}", scan, make_kitti_labels(truth, camera),
-                        camera, sensor_height=self.sensor.height)
+        return Frame.of(
+            f"street {scene} frame {part}",
+            scan,
+            make_kitti_labels(truth, camera),
+            camera,
+            sensor_height=self.sensor.height,
+        )
 
     def scan(self, i: int) -> tuple[PointCloud, GroundTruth]:
         """Return scan i with all its objects, from the cache if possible."""
-        return load_or_make(self.path(i), lambda: self._simulate(i), _read_scan, _scan_arrays,
-                            self.cache_gb)
+        return load_or_make(self.path(i), lambda: self._simulate(i), _read_scan, _scan_arrays, self.cache_gb)
 
     def keep(self, i: int) -> None:
         """Put scan i into the cache, if there is room."""
@@ -176,12 +182,13 @@ def _scan_arrays(scan: tuple[PointCloud, GroundTruth]) -> dict[str, np.ndarray]:
     frame, truth = scan
     assert frame.intensity is not None  # simulated scans always have it
     extras = {name: np.array([e[name] for e in truth.extras]) for name in EXTRAS}
-    return dict(xyz=frame.xyz, intensity=frame.intensity, boxes=truth.boxes,
-                class_ids=truth.class_ids, **extras)
+    return dict(xyz=frame.xyz, intensity=frame.intensity, boxes=truth.boxes, class_ids=truth.class_ids, **extras)
 
 
 def _read_scan(arrays: Any) -> tuple[PointCloud, GroundTruth]:
     columns = [arrays[name].tolist() for name in EXTRAS]
     extras = [dict(zip(EXTRAS, row)) for row in zip(*columns)]
-    return (PointCloud(arrays["xyz"], arrays["intensity"]),
-            GroundTruth.of(arrays["boxes"], arrays["class_ids"], extras))
+    return (
+        PointCloud(arrays["xyz"], arrays["intensity"]),
+        GroundTruth.of(arrays["boxes"], arrays["class_ids"], extras),
+    )

@@ -12,8 +12,7 @@ START_DIVISOR, END_DIVISOR = 10.0, 1e4  # the first rate is lr / 10, the last lr
 SLOW_MOMENTUM, FAST_MOMENTUM = 0.95, 0.85  # at the lowest and the highest rate
 
 
-def compute_one_cycle(step: float, steps: int, lr: float,
-                      warm_share: float) -> tuple[float, float]:
+def compute_one_cycle(step: float, steps: int, lr: float, warm_share: float) -> tuple[float, float]:
     """Return learning rate and momentum of a step in 0 .. steps - 1 (one-cycle, Smith 2018).
 
     The rate rises to lr during the share warm_share of the steps, then falls, both along cosines.
@@ -22,8 +21,7 @@ def compute_one_cycle(step: float, steps: int, lr: float,
     top = warm_share * steps - 1
     if step <= top:
         share = _cosine_ramp(step / top) if top > 0 else 1.0  # a single rising step is the top
-        return (first + (lr - first) * share,
-                SLOW_MOMENTUM + (FAST_MOMENTUM - SLOW_MOMENTUM) * share)
+        return (first + (lr - first) * share, SLOW_MOMENTUM + (FAST_MOMENTUM - SLOW_MOMENTUM) * share)
     share = _cosine_ramp((step - top) / (steps - 1 - top)) if steps - 1 > top else 1.0
     return lr + (last - lr) * share, FAST_MOMENTUM + (SLOW_MOMENTUM - FAST_MOMENTUM) * share
 

@@ -19,10 +19,18 @@ SIM = "sim"  # stands for simulated scenes instead of a path
 FIRST_SCENE, FIRST_VALIDATION_SCENE, FIRST_FITTED_SCENE = 10_000_000, 20_000_000, 30_000_000
 
 
-def open_sources(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
-                 val_split: Path | None, params: DataParams, seed: int,
-                 sensor: Sensor = HDL64E, around: bool = False,
-                 scene: str = "street", height: float = 0.0) -> tuple[tuple, tuple]:
+def open_sources(
+    data: tuple[str, ...],
+    val: tuple[str, ...],
+    split: Path | None,
+    val_split: Path | None,
+    params: DataParams,
+    seed: int,
+    sensor: Sensor = HDL64E,
+    around: bool = False,
+    scene: str = "street",
+    height: float = 0.0,
+) -> tuple[tuple, tuple]:
     """Return the sources to train on and those to validate on, which share no frame.
 
     Args:
@@ -46,8 +54,7 @@ def open_sources(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
     mixed = SIM in (*data, *val)
     training = [open_labelled_frames(folder, split, height, mixed) for folder in folders]
     if val or val_split is not None:
-        held_out = [open_labelled_frames(folder, val_split, height, mixed)
-                    for folder in val_folders]
+        held_out = [open_labelled_frames(folder, val_split, height, mixed) for folder in val_folders]
     else:
         pairs = [frames.split(params.val_share, seed) for frames in training]
         training, held_out = [first for first, _ in pairs], [second for _, second in pairs]
@@ -55,19 +62,26 @@ def open_sources(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
         held_out = [frames.exclude(training, "validate on") for frames in held_out]
     else:
         training = [frames.exclude(held_out, "train on") for frames in training]
-    sources: list[RecordedScenes | SimulatedScenes] = [
-        frames.to_scenes(params.view) for frames in training]
-    val_sources: list[RecordedScenes | SimulatedScenes] = [
-        frames.to_scenes(params.view) for frames in held_out]
-    simulate = partial(SimulatedScenes, sensor=sensor, cache_gb=params.cache_gb,
-                       cache=Path(params.cache) if params.cache else None)
+    sources: list[RecordedScenes | SimulatedScenes] = [frames.to_scenes(params.view) for frames in training]
+    val_sources: list[RecordedScenes | SimulatedScenes] = [frames.to_scenes(params.view) for frames in held_out]
+    simulate = partial(
+        SimulatedScenes, sensor=sensor, cache_gb=params.cache_gb, cache=Path(params.cache) if params.cache else None
+    )
     if SIM in (*data, *val):
         Scenes(None, params.people, scene).scene_types()  # raises InputError before any work
     if SIM in data:
-        sources.append(simulate(FIRST_SCENE, params.scans,
-                                scenes=Scenes(None, params.people, scene),
-                                per_scene=min(params.street_scans, longest_drive(sensor))))
+        sources.append(
+            simulate(
+                FIRST_SCENE,
+                params.scans,
+                scenes=Scenes(None, params.people, scene),
+                per_scene=min(params.street_scans, longest_drive(sensor)),
+            )
+        )
     if SIM in (val or data):
-        val_sources.append(simulate(FIRST_VALIDATION_SCENE, params.val_scans,
-                                    scenes=Scenes(None, params.val_people, scene), around=around))
+        val_sources.append(
+            simulate(
+                FIRST_VALIDATION_SCENE, params.val_scans, scenes=Scenes(None, params.val_people, scene), around=around
+            )
+        )
     return tuple(sources), tuple(val_sources)

@@ -22,12 +22,7 @@ from lidar_perception.runs.terminal import errors
 from lidar_perception.simulation.sensor import Sensor, find_sensor
 from lidar_perception.training.cache import fill_cache
 from lidar_perception.training.data import Batches
-from lidar_perception.training.distributed import (
-    get_rank,
-    get_world_size,
-    join_process_group,
-    wait_for_all,
-)
+from lidar_perception.training.distributed import get_rank, get_world_size, join_process_group, wait_for_all
 from lidar_perception.training.loop import train
 from lidar_perception.training.plan import Speed, validation_duration
 from lidar_perception.training.planning import (
@@ -54,8 +49,9 @@ class TrainingResult(NamedTuple):
     batches: Batches
 
 
-def start_training(trainer: Trainer, request: TrainingRequest, params: Any,
-                   commit: str = "", speed: Speed | None = None) -> TrainingResult | None:
+def start_training(
+    trainer: Trainer, request: TrainingRequest, params: Any, commit: str = "", speed: Speed | None = None
+) -> TrainingResult | None:
     """Train a network, or resume a run.
 
     The first start measures this machine, makes a plan and keeps it in the run's folder; a resumed
@@ -105,15 +101,19 @@ def start_training(trainer: Trainer, request: TrainingRequest, params: Any,
         wait_for_all()
         stream, validation = trainer.make_streams(params, sources, held_out, cuts, request.out)
         batches = Batches(stream, params.batch, request.jobs, get_rank(), get_world_size())
-        about = {"data": list(request.data), "scenes": len(stream),
-                 "validation": list(request.val) or "held out",
-                 "validation_scenes": sum(map(len, held_out)), "init": str(request.init or ""),
-                 "sensor": _describe_sensor(params, sensor, sources)}
-        task = trainer.make_task(params, batches, validation, request.out, device, about, commit,
-                                 init)
+        about = {
+            "data": list(request.data),
+            "scenes": len(stream),
+            "validation": list(request.val) or "held out",
+            "validation_scenes": sum(map(len, held_out)),
+            "init": str(request.init or ""),
+            "sensor": _describe_sensor(params, sensor, sources),
+        }
+        task = trainer.make_task(params, batches, validation, request.out, device, about, commit, init)
         until = math.inf if hours is None else begun + 3600 * hours
-        progress = train(task, params, request.out, device, request.resume, until,
-                         validation_duration(run.plan, run.speed, run.data))
+        progress = train(
+            task, params, request.out, device, request.resume, until, validation_duration(run.plan, run.speed, run.data)
+        )
         return TrainingResult(progress, params.steps, batches) if get_rank() == 0 else None
 
 
@@ -143,15 +143,15 @@ def _make_plan(planner: Planner, directory: RunDirectory, settings: dict[str, An
         directory.write_plan(planner.make_plan(settings))
 
 
-def _prepare_scenes(trainer: Trainer, request: TrainingRequest, sources: Sequence[Any],
-                    held_out: Sequence[Any], cuts: Cuts) -> None:
+def _prepare_scenes(
+    trainer: Trainer, request: TrainingRequest, sources: Sequence[Any], held_out: Sequence[Any], cuts: Cuts
+) -> None:
     simulated = [s for s in (*sources, *held_out) if isinstance(s, SimulatedScenes)]
     fill_cache(simulated, [range(len(s)) for s in simulated], request.jobs, "simulating")
     fill_cache(*cuts, request.jobs, trainer.cutting)
 
 
-def _collect_settings(request: TrainingRequest, params: Any, sensor: Sensor,
-                      init: Path | None) -> dict[str, Any]:
+def _collect_settings(request: TrainingRequest, params: Any, sensor: Sensor, init: Path | None) -> dict[str, Any]:
     """Return everything that a resumed run must have in common.
 
     Files are represented by their content, since a split may name other frames later and weights
@@ -159,10 +159,18 @@ def _collect_settings(request: TrainingRequest, params: Any, sensor: Sensor,
     """
     sources, held_out = open_scenes(request, limit_to_few_scans(params), sensor)
     weights = sha256(init.read_bytes()).hexdigest()[:12] if init else ""
-    return {**params.fixed_settings(), "data": list(request.data), "val": list(request.val),
-            "split": str(request.split or ""), "val_split": str(request.val_split or ""),
-            "frame_names": _digest_names(sources), "val_frame_names": _digest_names(held_out),
-            "init": str(request.init or ""), "init_weights": weights, "sensor": asdict(sensor)}
+    return {
+        **params.fixed_settings(),
+        "data": list(request.data),
+        "val": list(request.val),
+        "split": str(request.split or ""),
+        "val_split": str(request.val_split or ""),
+        "frame_names": _digest_names(sources),
+        "val_frame_names": _digest_names(held_out),
+        "init": str(request.init or ""),
+        "init_weights": weights,
+        "sensor": asdict(sensor),
+    }
 
 
 def _digest_names(sources: Sequence[Any]) -> list[str]:

@@ -49,13 +49,11 @@ def select_usable_scenes(scenes: Iterable[Item], prepare: Callable[[Any], Any]) 
         if len(chosen) == MAX_TIMED_SCENES:
             break
     if not chosen:
-        raise InputError("no scene to train on can be used "
-                         f"({next(iter(reasons), 'there is none')})")
+        raise InputError(f"no scene to train on can be used ({next(iter(reasons), 'there is none')})")
     return chosen
 
 
-def find_readable_frame(scenes: SceneReader,
-                        is_typical: Callable[[Any], bool] = lambda _: True) -> Any:
+def find_readable_frame(scenes: SceneReader, is_typical: Callable[[Any], bool] = lambda _: True) -> Any:
     """Return the first validation frame that can be read and is typical, else the first readable.
 
     Raises:
@@ -70,13 +68,13 @@ def find_readable_frame(scenes: SceneReader,
             return sample
         fallback = sample if fallback is None else fallback
     if fallback is None:
-        raise InputError("no frame to validate on can be used "
-                         f"({next(iter(reasons), 'there is none')})")
+        raise InputError(f"no frame to validate on can be used ({next(iter(reasons), 'there is none')})")
     return fallback
 
 
-def measure_step(module: nn.Module, loss: Callable, prepare: Callable[[], Sequence[Any]],
-                 params: LoopParams, device: torch.device) -> float:
+def measure_step(
+    module: nn.Module, loss: Callable, prepare: Callable[[], Sequence[Any]], params: LoopParams, device: torch.device
+) -> float:
     """Return the duration of one training step in seconds, with its share of sample preparation.
 
     Args:

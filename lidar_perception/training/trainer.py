@@ -48,27 +48,36 @@ class Trainer(Protocol):
         Empty if there is no such choice.
         """
 
-    def measure_speed(self, params: Any, scenes: Iterable[Item], held_out: Sequence[Any],
-                      device: torch.device) -> StepSpeed:
+    def measure_speed(
+        self, params: Any, scenes: Iterable[Item], held_out: Sequence[Any], device: torch.device
+    ) -> StepSpeed:
         """Measure durations on the first usable scenes. Raise InputError if none can be used."""
 
     def packaged_weights(self, params: Any) -> Path:
         """Return the weights that ship with the package. Raise InputError if there are none."""
 
-    def make_cuts(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any],
-                  cache: Path) -> Cuts:
+    def make_cuts(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any], cache: Path) -> Cuts:
         """Return the objects or clusters to cut from the scenes; nothing is cut yet."""
 
     def collect_cuts(self, params: Any, cuts: Cuts, out: Path) -> None:
         """Write the cut objects or clusters into out, in the form that training reads."""
 
-    def make_streams(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any],
-                     cuts: Cuts, out: Path) -> tuple[Stream, SceneReader]:
+    def make_streams(
+        self, params: Any, sources: Sequence[Any], held_out: Sequence[Any], cuts: Cuts, out: Path
+    ) -> tuple[Stream, SceneReader]:
         """Return the samples to train on and the scenes to validate on."""
 
-    def make_task(self, params: Any, batches: Batches, held_out: SceneReader, out: Path,
-                  device: torch.device, about: dict[str, Any], commit: str,
-                  init: Path | None) -> Task:
+    def make_task(
+        self,
+        params: Any,
+        batches: Batches,
+        held_out: SceneReader,
+        out: Path,
+        device: torch.device,
+        about: dict[str, Any],
+        commit: str,
+        init: Path | None,
+    ) -> Task:
         """Return the task of the training loop.
 
         Args:

@@ -41,8 +41,7 @@ def encode_markers(rows: Sequence[MarkerRow], header: Any, lifetime_ns: int = 0)
         _align(out, 4)
         out += IDS.pack(row.id, row.type, row.action)
         _align(out, 8)
-        out += BODY.pack(*row.position, 0.0, 0.0, *row.quaternion, *row.scale, *row.color,
-                         *lifetime, False)
+        out += BODY.pack(*row.position, 0.0, 0.0, *row.quaternion, *row.scale, *row.color, *lifetime, False)
         _align(out, 4)
         if row.points is None or not len(row.points):
             out += LENGTH.pack(0)
@@ -57,10 +56,15 @@ def encode_markers(rows: Sequence[MarkerRow], header: Any, lifetime_ns: int = 0)
     return ENCAPSULATION + bytes(out)
 
 
-def encode_detection_array(boxes: np.ndarray, labels: Sequence[str],
-                           scores: Sequence[float] | np.ndarray, *, header: Any,
-                           ids: Iterable[int] | None = None,
-                           covariances: np.ndarray | None = None) -> bytes:
+def encode_detection_array(
+    boxes: np.ndarray,
+    labels: Sequence[str],
+    scores: Sequence[float] | np.ndarray,
+    *,
+    header: Any,
+    ids: Iterable[int] | None = None,
+    covariances: np.ndarray | None = None,
+) -> bytes:
     """Return the CDR of the vision_msgs/Detection3DArray of boxes; the arguments are those of
     msg_utils.detections.to_detection_array."""
     head = _header(header)
@@ -68,10 +72,10 @@ def encode_detection_array(boxes: np.ndarray, labels: Sequence[str],
     out = bytearray(head)
     _align(out, 4)
     out += LENGTH.pack(len(numbers))
-    spread = (np.zeros((len(numbers), 36)) if covariances is None
-              else np.asarray(covariances, "<f8").reshape(-1, 36))
-    for i, box, label, score, square in zip(range(len(numbers)) if ids is None else ids, numbers,
-                                            labels, scores, spread, strict=True):
+    spread = np.zeros((len(numbers), 36)) if covariances is None else np.asarray(covariances, "<f8").reshape(-1, 36)
+    for i, box, label, score, square in zip(
+        range(len(numbers)) if ids is None else ids, numbers, labels, scores, spread, strict=True
+    ):
         half = box[6] / 2
         pose = POSE.pack(*box[:3], 0.0, 0.0, math.sin(half), math.cos(half))
         _align(out, 4)

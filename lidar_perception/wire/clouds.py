@@ -66,8 +66,7 @@ def find_cloud_topics(topics: Mapping[str, str]) -> list[str]:
     topics: types by name.
     """
     clouds = {topic for topic, kind in topics.items() if kind in CLOUD_TYPES}
-    return sorted(topic for topic in clouds
-                  if topics[topic] != COMPRESSED or topic.rpartition("/")[0] not in clouds)
+    return sorted(topic for topic in clouds if topics[topic] != COMPRESSED or topic.rpartition("/")[0] not in clouds)
 
 
 def diagnose_packets(topics: Mapping[str, str]) -> str | None:
@@ -78,21 +77,27 @@ def diagnose_packets(topics: Mapping[str, str]) -> str | None:
     for topic, kind in sorted(topics.items()):
         package, _, name = kind.replace("/msg/", "/").partition("/")
         if driver := DRIVER_BY_PACKAGE.get(package):
-            return (f"{kind} on {topic} carries raw packets of a sensor, which cannot be read: "
-                    f"play the bag to {driver} and record the clouds that it publishes")
+            return (
+                f"{kind} on {topic} carries raw packets of a sensor, which cannot be read: "
+                f"play the bag to {driver} and record the clouds that it publishes"
+            )
         if package == "sensor_msgs" and name in ("PointCloud", "LaserScan"):
-            return (f"{kind} on {topic} cannot be read: record its scans as PointCloud2, with "
-                    f"{'laser_geometry' if name == 'LaserScan' else 'point_cloud_converter'}")
+            return (
+                f"{kind} on {topic} cannot be read: record its scans as PointCloud2, with "
+                f"{'laser_geometry' if name == 'LaserScan' else 'point_cloud_converter'}"
+            )
     return None
 
 
 def _check_compression(msg: Any) -> str:
     name: str = msg.format.strip().lower()
     if name not in COMPRESSIONS:
-        raise InputError(f"cloud compression '{name}' is not supported; supported are "
-                         f"{' and '.join(COMPRESSIONS)}: play the bag to 'ros2 run "
-                         "point_cloud_transport republish --ros-args -p in_transport:="
-                         f"{name or 'NAME'} -p out_transport:=raw' and record its output")
+        raise InputError(
+            f"cloud compression '{name}' is not supported; supported are "
+            f"{' and '.join(COMPRESSIONS)}: play the bag to 'ros2 run "
+            "point_cloud_transport republish --ros-args -p in_transport:="
+            f"{name or 'NAME'} -p out_transport:=raw' and record its output"
+        )
     return name
 
 
@@ -102,7 +107,11 @@ def _decompress(msg: Any) -> Any:
         data = decompress(msg.compressed_data.tobytes(), compression, None)
     except Exception as error:  # zlib and zstandard raise their own types
         raise InputError(f"a {compression}-compressed cloud is damaged ({error})") from None
-    return bag_message(POINT_CLOUD, data=np.frombuffer(data, np.uint8), **{
-        name: getattr(msg, name) for name in (
-            "header", "height", "width", "fields", "is_bigendian", "point_step", "row_step",
-            "is_dense")})
+    return bag_message(
+        POINT_CLOUD,
+        data=np.frombuffer(data, np.uint8),
+        **{
+            name: getattr(msg, name)
+            for name in ("header", "height", "width", "fields", "is_bigendian", "point_step", "row_step", "is_dense")
+        },
+    )

@@ -15,26 +15,23 @@ from lidar_perception.types import InputError
 # Types that rosbags lacks: Jazzy's vision_msgs, and clouds of other packages.
 LIVOX_PACKAGES = ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces")
 LIVOX = {
-    "CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\n"
-                   "uint8 tag\nuint8 line",
+    "CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line",
     "CustomMsg": "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\n"
-                 "uint8[3] rsvd\nCustomPoint[] points",
+    "uint8[3] rsvd\nCustomPoint[] points",
 }
 MORE_TYPES = {
     **{f"{package}/msg/{name}": text for package in LIVOX_PACKAGES for name, text in LIVOX.items()},
-    "point_cloud_interfaces/msg/CompressedPointCloud2":
-        "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n"
-        "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] compressed_data\n"
-        "bool is_dense\nstring format",
+    "point_cloud_interfaces/msg/CompressedPointCloud2": "std_msgs/Header header\nuint32 height\n"
+    "uint32 width\nsensor_msgs/PointField[] fields\n"
+    "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] compressed_data\n"
+    "bool is_dense\nstring format",
     "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
     "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score",
-    "vision_msgs/msg/ObjectHypothesisWithPose":
-        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
-    "vision_msgs/msg/Detection3D":
-        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-        "vision_msgs/BoundingBox3D bbox\nstring id",
-    "vision_msgs/msg/Detection3DArray":
-        "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+    "vision_msgs/msg/ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\n"
+    "geometry_msgs/PoseWithCovariance pose",
+    "vision_msgs/msg/Detection3D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+    "vision_msgs/BoundingBox3D bbox\nstring id",
+    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
 }
 
 

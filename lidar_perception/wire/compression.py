@@ -24,8 +24,7 @@ def decompress(data: bytes, compression: str, size: int | None) -> bytes:
     """
     limit = MAX_BYTES if size is None else size
     if limit > MAX_BYTES:
-        raise ValueError(f"a chunk declares a decompressed size of {size} bytes; at most "
-                         f"{MAX_BYTES} are allowed")
+        raise ValueError(f"a chunk declares a decompressed size of {size} bytes; at most {MAX_BYTES} are allowed")
     if compression == "":
         result = data
     elif compression == "zstd":

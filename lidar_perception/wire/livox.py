@@ -16,8 +16,7 @@ from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import SECOND_NS, make_header
 
-FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1",
-          "line": "u1"}
+FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
 PACKED = np.dtype([(name, f"<{kind}") for name, kind in FIELDS.items()])  # layout in ROS 1
 OFFSETS = [0, 4, 8, 12, 16, 17, 18]  # of the fields in a point, in bytes
 POINT_BYTES = 20  # in CDR, where each point starts at a multiple of 4
@@ -29,32 +28,41 @@ def decode_livox(data: bytes) -> Any:
     try:
         order = "<" if data[1] & 1 else ">"
         seconds, nanoseconds, size = struct.unpack_from(f"{order}iII", data, 4)
-        frame_id = bytes(data[16:16 + size]).rstrip(b"\0").decode(errors="replace")
+        frame_id = bytes(data[16 : 16 + size]).rstrip(b"\0").decode(errors="replace")
         offset = 4 + _aligned(12 + size) + FIXED_BYTES
-        count, = struct.unpack_from(f"{order}I", data, offset)
-        points = bytes(data[offset + 4:])
+        (count,) = struct.unpack_from(f"{order}I", data, offset)
+        points = bytes(data[offset + 4 :])
     except (struct.error, IndexError) as error:
         raise InputError(f"{len(data)} bytes are not a valid Livox CustomMsg ({error})") from None
     if len(points) < count * POINT_BYTES - 1:  # no padding after the last point
-        raise InputError(f"the Livox CustomMsg is truncated: {count} points need "
-                         f"{count * POINT_BYTES - 1} bytes, the message has {len(points)}")
-    kind = np.dtype({"names": [*FIELDS], "formats": [f"{order}{code}" for code in FIELDS.values()],
-                     "offsets": OFFSETS, "itemsize": POINT_BYTES})
+        raise InputError(
+            f"the Livox CustomMsg is truncated: {count} points need "
+            f"{count * POINT_BYTES - 1} bytes, the message has {len(points)}"
+        )
+    kind = np.dtype(
+        {
+            "names": [*FIELDS],
+            "formats": [f"{order}{code}" for code in FIELDS.values()],
+            "offsets": OFFSETS,
+            "itemsize": POINT_BYTES,
+        }
+    )
     header = make_header(seconds * SECOND_NS + nanoseconds, frame_id, bag_message)
     return from_array(np.frombuffer(points + b"\0", kind, count), header, bag_message)
 
 
 def livox_ros1_to_cdr(data: bytes) -> bytes:
     """Convert a serialized ROS 1 CustomMsg to CDR. ValueError or struct.error if damaged."""
-    size, = struct.unpack_from("<I", data, 12)  # after seq and stamp of the header
+    (size,) = struct.unpack_from("<I", data, 12)  # after seq and stamp of the header
     start = 16 + size
-    count, = struct.unpack_from("<I", data, start + FIXED_BYTES)
+    (count,) = struct.unpack_from("<I", data, start + FIXED_BYTES)
     packed = np.frombuffer(data, PACKED, count, start + FIXED_BYTES + 4)
     padded = np.zeros((count, POINT_BYTES), np.uint8)
-    padded[:, :PACKED.itemsize] = packed.view(np.uint8).reshape(count, PACKED.itemsize)
+    padded[:, : PACKED.itemsize] = packed.view(np.uint8).reshape(count, PACKED.itemsize)
     head = data[4:12] + struct.pack("<I", size + 1) + data[16:start] + b"\0"
-    return b"".join((b"\0\1\0\0", head.ljust(_aligned(len(head)), b"\0"),
-                     data[start:start + FIXED_BYTES + 4], padded.tobytes()))
+    return b"".join(
+        (b"\0\1\0\0", head.ljust(_aligned(len(head)), b"\0"), data[start : start + FIXED_BYTES + 4], padded.tobytes())
+    )
 
 
 def _aligned(size: int) -> int:

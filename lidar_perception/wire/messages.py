@@ -12,30 +12,11 @@ from scipy.spatial.transform import Rotation
 from lidar_perception.camera import Calibration
 from lidar_perception.classes import ID_BY_ALIAS
 from lidar_perception.groups import renumber_ids
-from lidar_perception.intensity import (
-    INTENSITY_FIELDS,
-    find_scale_problem,
-    infer_full_scale,
-    to_unit,
-)
+from lidar_perception.intensity import INTENSITY_FIELDS, find_scale_problem, infer_full_scale, to_unit
 from lidar_perception.robot import poses
-from lidar_perception.types import (
-    CLASSES,
-    Detections,
-    GroundTruth,
-    InputError,
-    PointCloud,
-    class_ids,
-    usable_returns,
-)
+from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError, PointCloud, class_ids, usable_returns
 from lidar_perception.wire.topics import CAMERA_FRAME
-from msg_utils.markers import (
-    MarkedObjects,
-    MarkerRow,
-    make_marker_rows,
-    rows_to_message,
-    to_marker_array,
-)
+from msg_utils.markers import MarkedObjects, MarkerRow, make_marker_rows, rows_to_message, to_marker_array
 from msg_utils.point_cloud2 import CloudError, from_array, read_columns, read_xyz, to_array
 from msg_utils.stamps import to_ns
 
@@ -45,8 +26,9 @@ MAX_ID = 2**31  # marker ids are int32
 FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.infer_full_scale
 
 
-def to_point_cloud(msg: Any, intensity_max: float | None = None,
-                   scale: FullScale = infer_full_scale) -> tuple[PointCloud, np.ndarray]:
+def to_point_cloud(
+    msg: Any, intensity_max: float | None = None, scale: FullScale = infer_full_scale
+) -> tuple[PointCloud, np.ndarray]:
     """Convert a PointCloud2 to a PointCloud of its usable points.
 
     If the cloud has a column `in_view`, points where it is 0 are left out.
@@ -113,12 +95,10 @@ def diagnose_recorded_intensity(source: Any, clouds: Sequence[PointCloud]) -> st
     """
     intensities = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
     problem = find_scale_problem(np.concatenate(intensities)) if intensities else None
-    return problem and (f"{source}: {problem}; for a bag or cloud files, set it with "
-                        "convert --robot")
+    return problem and (f"{source}: {problem}; for a bag or cloud files, set it with convert --robot")
 
 
-def scatter_values(values: np.ndarray | int, indices: np.ndarray, msg: Any,
-                   dtype: str) -> np.ndarray:
+def scatter_values(values: np.ndarray | int, indices: np.ndarray, msg: Any, dtype: str) -> np.ndarray:
     """Return a column for all points of a cloud, with values (N,) at indices (N,), 0 elsewhere."""
     column = np.zeros(msg.height * msg.width, dtype)
     column[indices] = values
@@ -188,13 +168,15 @@ def read_calibration(info: Any, transform: Any) -> Calibration:
         InputError: P is empty, or the frame names of the two messages do not match.
     """
     t, q = transform.transform.translation, transform.transform.rotation
-    lidar_to_camera = poses.make_pose(*poses.check_pose(
-        (t.x, t.y, t.z), (q.x, q.y, q.z, q.w), "the LiDAR-to-camera transform"))
+    lidar_to_camera = poses.make_pose(
+        *poses.check_pose((t.x, t.y, t.z), (q.x, q.y, q.z, q.w), "the LiDAR-to-camera transform")
+    )
     parent, child = transform.header.frame_id, transform.child_frame_id
     if info.header.frame_id != parent:  # it is the camera's pose in the LiDAR frame: invert it
         if info.header.frame_id != child:
-            raise InputError(f"CameraInfo is in frame '{info.header.frame_id}' but the transform "
-                             f"links '{parent}' and '{child}'")
+            raise InputError(
+                f"CameraInfo is in frame '{info.header.frame_id}' but the transform links '{parent}' and '{child}'"
+            )
         lidar_to_camera = poses.invert_pose(lidar_to_camera)
     return make_calibration(info, lidar_to_camera)
 
@@ -206,17 +188,26 @@ def make_calibration(info: Any, lidar_to_camera: np.ndarray) -> Calibration:
     """
     intrinsics = np.asarray(info.p, float).reshape(3, 4)
     if intrinsics[0, 0] <= 0 or info.width == 0 or info.height == 0:
-        raise InputError("CameraInfo has no projection matrix P or no image size; calibrate the "
-                         "camera or set view.enabled to false")
+        raise InputError(
+            "CameraInfo has no projection matrix P or no image size; calibrate the camera or set view.enabled to false"
+        )
     return Calibration(intrinsics, lidar_to_camera, int(info.width), int(info.height))
 
 
 def make_camera_info(calibration: Calibration, header: Any, make: Any) -> Any:
     """Make the CameraInfo of a rectified image, without distortion."""
     p = calibration.intrinsics
-    return make("sensor_msgs/msg/CameraInfo", header=header, height=calibration.height,
-                width=calibration.width, distortion_model="plumb_bob", d=np.zeros(5),
-                k=p[:, :3].ravel().copy(), r=np.eye(3).ravel(), p=p.ravel().copy())
+    return make(
+        "sensor_msgs/msg/CameraInfo",
+        header=header,
+        height=calibration.height,
+        width=calibration.width,
+        distortion_model="plumb_bob",
+        d=np.zeros(5),
+        k=p[:, :3].ravel().copy(),
+        r=np.eye(3).ravel(),
+        p=p.ravel().copy(),
+    )
 
 
 def make_extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
@@ -224,11 +215,16 @@ def make_extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
     rotation, translation = calibration.pose
     x, y, z = map(float, translation)
     qx, qy, qz, qw = map(float, rotation)
-    return make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=CAMERA_FRAME,
-                transform=make("geometry_msgs/msg/Transform",
-                               translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-                               rotation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz,
-                                             w=qw)))
+    return make(
+        "geometry_msgs/msg/TransformStamped",
+        header=header,
+        child_frame_id=CAMERA_FRAME,
+        transform=make(
+            "geometry_msgs/msg/Transform",
+            translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            rotation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+        ),
+    )
 
 
 def make_truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()) -> Any:
@@ -236,14 +232,19 @@ def make_truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any
 
     Marker ids are track ids if these are unique. Unknown classes keep their names (see to_truth).
     """
-    labels = [str(extra.get("class_name", label))
-              for label, extra in zip(truth.labels, truth.extras)]
+    labels = [str(extra.get("class_name", label)) for label, extra in zip(truth.labels, truth.extras)]
     tracks: list[Any] = [extra.get("track_id") for extra in truth.extras]
-    unique = (all(t is not None and 0 <= t < MAX_ID for t in tracks)
-              and len(set(zip(labels, tracks))) == len(tracks))
-    return to_marker_array(truth.boxes, labels, header=header, make=make,
-                           ids=tracks if unique else None,
-                           extras=truth.extras, notes=truth.notes, previous=previous)
+    unique = all(t is not None and 0 <= t < MAX_ID for t in tracks) and len(set(zip(labels, tracks))) == len(tracks)
+    return to_marker_array(
+        truth.boxes,
+        labels,
+        header=header,
+        make=make,
+        ids=tracks if unique else None,
+        extras=truth.extras,
+        notes=truth.notes,
+        previous=previous,
+    )
 
 
 def to_class_ids(names: Iterable[str]) -> list[int]:
@@ -258,19 +259,21 @@ def find_unknown_classes(names: Iterable[str]) -> list[str]:
 
 def to_truth(objects: MarkedObjects) -> GroundTruth:
     """Convert markers to labels; unknown classes become Misc, with extras["class_name"]."""
-    extras = [{"class_name": label, **extra} if label not in CLASSES else extra
-              for label, extra in zip(objects.labels, objects.extras)]
+    extras = [
+        {"class_name": label, **extra} if label not in CLASSES else extra
+        for label, extra in zip(objects.labels, objects.extras)
+    ]
     return GroundTruth.of(objects.boxes, class_ids(objects.labels), extras, objects.notes)
 
 
 def to_detections(objects: MarkedObjects) -> Detections:
     """Convert markers to detections; objects of an unknown class become Misc."""
-    return Detections.of(objects.boxes, np.array(to_class_ids(objects.labels), np.int32),
-                         objects.scores)
+    return Detections.of(objects.boxes, np.array(to_class_ids(objects.labels), np.int32), objects.scores)
 
 
-def make_detection_rows(detections: Detections, previous: Any = (),
-                        clusters: np.ndarray | None = None) -> list[MarkerRow]:
+def make_detection_rows(
+    detections: Detections, previous: Any = (), clusters: np.ndarray | None = None
+) -> list[MarkerRow]:
     """Return the markers of K detections.
 
     The text of each marker is JSON with the id, the probabilities by source, and `cluster_id`, as
@@ -284,19 +287,26 @@ def make_detection_rows(detections: Detections, previous: Any = (),
     texts: list[dict[str, Any]] = [{"id": i} for i in range(len(detections))]
     if detections.sources:
         for i, text in enumerate(texts):
-            text["sources"] = {name: round(float(scores[i]), 3) for name, scores
-                               in detections.sources.items() if np.isfinite(scores[i])}
+            text["sources"] = {
+                name: round(float(scores[i]), 3)
+                for name, scores in detections.sources.items()
+                if np.isfinite(scores[i])
+            }
     for text, cluster in zip(texts, () if clusters is None else clusters):
         text["cluster_id"] = int(cluster)
-    return make_marker_rows(detections.boxes, labels, detections.scores, extras=texts,
-                            previous=previous)
+    return make_marker_rows(detections.boxes, labels, detections.scores, extras=texts, previous=previous)
 
 
-def make_detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
-                           lifetime_ns: int = 0, clusters: np.ndarray | None = None) -> Any:
+def make_detection_markers(
+    detections: Detections,
+    header: Any,
+    make: Any,
+    previous: Any = (),
+    lifetime_ns: int = 0,
+    clusters: np.ndarray | None = None,
+) -> Any:
     """Make the MarkerArray of K detections; for the arguments see make_detection_rows."""
-    return rows_to_message(make_detection_rows(detections, previous, clusters), header, make,
-                           lifetime_ns)
+    return rows_to_message(make_detection_rows(detections, previous, clusters), header, make, lifetime_ns)
 
 
 def make_odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -> Any:
@@ -306,5 +316,9 @@ def make_odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -
     position = make("geometry_msgs/msg/Point", x=x, y=y, z=z)
     orientation = make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw)
     message = make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
-    return make("nav_msgs/msg/Odometry", header=header, child_frame_id=moving_frame,
-                pose=make("geometry_msgs/msg/PoseWithCovariance", pose=message))
+    return make(
+        "nav_msgs/msg/Odometry",
+        header=header,
+        child_frame_id=moving_frame,
+        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=message),
+    )

@@ -11,17 +11,24 @@ from lidar_perception.param_fields import Params, param
 class InputParams(Params):
     """Reading of the fields of a cloud."""
 
-    intensity_max: float = param(0.0, "Intensity of a full reflection: 1 for KITTI, 255 for "
-                                 "Velodyne and nuScenes. 0: 255 for fields of 8 bits; otherwise "
-                                 "the smallest of 1 (floats), 100 (floats with fractions), 255, "
-                                 "1023, 4095 and 65535 that is not exceeded in all clouds so far.",
-                                 low=0.0, high=1e9)
+    intensity_max: float = param(
+        0.0,
+        "Intensity of a full reflection: 1 for KITTI, 255 for "
+        "Velodyne and nuScenes. 0: 255 for fields of 8 bits; otherwise "
+        "the smallest of 1 (floats), 100 (floats with fractions), 255, "
+        "1023, 4095 and 65535 that is not exceeded in all clouds so far.",
+        low=0.0,
+        high=1e9,
+    )
 
 
 @dataclass(frozen=True)
 class ViewParams(Params):
     """Crop of the cloud to the camera's field of view (paper A, Section 3.2)."""
 
-    enabled: bool = param(False, "Keep only points in the camera's view. Needs the camera's "
-                          "calibration: CameraInfo and the transform from the LiDAR, both "
-                          "latched.")
+    enabled: bool = param(
+        False,
+        "Keep only points in the camera's view. Needs the camera's "
+        "calibration: CameraInfo and the transform from the LiDAR, both "
+        "latched.",
+    )

@@ -16,9 +16,9 @@ from msg_utils.stamps import SECOND_NS, to_ns
 NAMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
 UNITS_NS = (10**9, 10**6, 10**3, 1)
 LIVOX_COLUMN, LIVOX_UNIT_NS = ("offset_time", True), 1  # integers: Livox documents the unit
-SWEEP_S = 2e-3, 1.0   # limits of the duration of a turn, from which the unit is inferred
+SWEEP_S = 2e-3, 1.0  # limits of the duration of a turn, from which the unit is inferred
 SINCE_1970_NS = 1e18  # larger values count from 1970
-MAX_OFFSET_S = 1.0    # between a point and the stamp of its cloud
+MAX_OFFSET_S = 1.0  # between a point and the stamp of its cloud
 
 
 class PointTimes(NamedTuple):
@@ -52,8 +52,9 @@ def read_point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     names = points.dtype.names or ()
     name = next((n for n in NAMES if n in names), None)
     if name is None:
-        raise InputError(f"the cloud has no time column ({', '.join(NAMES)}); its columns are: "
-                         f"{', '.join(names) or 'none'}")
+        raise InputError(
+            f"the cloud has no time column ({', '.join(NAMES)}); its columns are: {', '.join(names) or 'none'}"
+        )
     if points.dtype[name].shape:
         raise InputError(f"field '{name}' has count > 1; it must have one number per point")
     is_integer = points[name].dtype.kind in "iu"
@@ -66,16 +67,17 @@ def read_point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     counts[indices] = True
     turn_values = column[counts & finite]
     low, span = finite_values.min(), turn_values.max() - turn_values.min()
-    unit = (LIVOX_UNIT_NS if (name, is_integer) == LIVOX_COLUMN
-            else _unit_ns(float(span), is_integer, float(low)))
+    unit = LIVOX_UNIT_NS if (name, is_integer) == LIVOX_COLUMN else _unit_ns(float(span), is_integer, float(low))
     stamp = to_ns(msg.header.stamp)
     since_stamp = abs(float(low)) * unit <= abs(float(low) * unit - stamp)
     at_stamp = 0 if since_stamp else stamp // unit if is_integer else stamp / unit
     seconds = (values - at_stamp) * (unit * 1e-9)
     largest = max(float(np.nanmin(seconds)), float(np.nanmax(seconds)), key=abs)
     if abs(largest) > MAX_OFFSET_S:
-        raise InputError(f"the times in '{name}' are {largest:.3f} s from header.stamp; are the "
-                         "clocks of sensor and computer synchronised?")
+        raise InputError(
+            f"the times in '{name}' are {largest:.3f} s from header.stamp; are the "
+            "clocks of sensor and computer synchronised?"
+        )
     return PointTimes(name, seconds, at_stamp)
 
 
@@ -90,8 +92,9 @@ def _unit_ns(span: float, is_integer: bool, low: float) -> int:
     return 1 if is_integer else 10**9  # a cloud shorter than SWEEP_S
 
 
-def deskew_points(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLookup
-                  ) -> tuple[np.ndarray, np.ndarray, PointTimes] | None:
+def deskew_points(
+    msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLookup
+) -> tuple[np.ndarray, np.ndarray, PointTimes] | None:
     """Correct the motion of the sensor: transform points to its pose at the stamp.
 
     Args:
@@ -113,8 +116,9 @@ def deskew_points(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseL
     if len(timed) < len(frame):
         times = times._replace(seconds=times.seconds.take(timed))
         xyz = xyz.take(timed, axis=0)
-    moved = deskew(xyz, times.seconds, lambda seconds: poses(
-        frame.stamp_ns + np.rint(seconds * SECOND_NS).astype(np.int64)))
+    moved = deskew(
+        xyz, times.seconds, lambda seconds: poses(frame.stamp_ns + np.rint(seconds * SECOND_NS).astype(np.int64))
+    )
     return timed, moved, times
 
 
@@ -128,8 +132,7 @@ def deskew_frame(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLo
     return replace(frame, xyz=xyz)
 
 
-def replace_points(msg: Any, make: Any, indices: np.ndarray, moved: np.ndarray,
-                   times: PointTimes) -> Any:
+def replace_points(msg: Any, make: Any, indices: np.ndarray, moved: np.ndarray, times: PointTimes) -> Any:
     """Return the message with new coordinates `moved` (N, 3) of the points at indices (N,).
 
     All times are set to the stamp, so that a second motion correction has no effect.

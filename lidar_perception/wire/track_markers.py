@@ -9,15 +9,7 @@ import numpy as np
 
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.messages import MAX_ID
-from msg_utils.markers import (
-    ADD,
-    COLORS,
-    OTHER_COLOR,
-    MarkerRow,
-    list_marker_keys,
-    make_marker_rows,
-    rows_to_message,
-)
+from msg_utils.markers import ADD, COLORS, OTHER_COLOR, MarkerRow, list_marker_keys, make_marker_rows, rows_to_message
 
 ARROW, LINE_STRIP, TEXT = 0, 4, 9
 # Namespaces in addition to those named after the classes.
@@ -25,10 +17,16 @@ VELOCITY, TRAIL, NUMBER = EXTRA_NAMESPACES = "velocity", "trail", "number"
 MIN_ARROW_PROBABILITY = 0.5  # of motion; a track with less has no velocity arrow
 
 
-def make_track_rows(ids: np.ndarray, detections: Detections, velocities: np.ndarray,
-                    moving: np.ndarray, trails: Sequence[np.ndarray], *,
-                    extras: Sequence[dict[str, Any]] | None = None,
-                    previous: Iterable[tuple[str, int]] = ()) -> list[MarkerRow]:
+def make_track_rows(
+    ids: np.ndarray,
+    detections: Detections,
+    velocities: np.ndarray,
+    moving: np.ndarray,
+    trails: Sequence[np.ndarray],
+    *,
+    extras: Sequence[dict[str, Any]] | None = None,
+    previous: Iterable[tuple[str, int]] = (),
+) -> list[MarkerRow]:
     """Return the markers of K tracks.
 
     Boxes are as in make_detection_rows, with velocity, probability of motion and extras in their
@@ -45,9 +43,15 @@ def make_track_rows(ids: np.ndarray, detections: Detections, velocities: np.ndar
     """
     numbers: list[int] = (np.asarray(ids) % MAX_ID).tolist()
     labels, boxes = [CLASSES[i] for i in detections.class_ids], detections.boxes.astype(float)
-    texts = [{"id": i, "velocity": [round(float(v), 3) for v in velocity],
-              "moving": round(float(p), 3), **(extras[k] if extras is not None else {})}
-             for k, (i, velocity, p) in enumerate(zip(numbers, velocities, moving))]
+    texts = [
+        {
+            "id": i,
+            "velocity": [round(float(v), 3) for v in velocity],
+            "moving": round(float(p), 3),
+            **(extras[k] if extras is not None else {}),
+        }
+        for k, (i, velocity, p) in enumerate(zip(numbers, velocities, moving))
+    ]
     tops = boxes[:, :3] + boxes[:, 5:6] / 2 * [[0.0, 0.0, 1.0]]
     ahead = tops + np.pad(np.reshape(velocities, (-1, 2)), ((0, 0), (0, 1)))
     captions = (tops + [0.0, 0.0, 0.5]).tolist()
@@ -55,28 +59,48 @@ def make_track_rows(ids: np.ndarray, detections: Detections, velocities: np.ndar
     for k, (i, label, p, trail) in enumerate(zip(numbers, labels, moving, trails, strict=True)):
         color, has_arrow = (*COLORS.get(label, OTHER_COLOR), 1.0), p >= MIN_ARROW_PROBABILITY
         speed = f"  {np.hypot(*velocities[k]):.1f} m/s" if has_arrow else ""
-        extra_rows.append(MarkerRow(NUMBER, i, type=TEXT, text=f"{i}{speed}", color=color,
-                                    position=captions[k], scale=(0.0, 0.0, 0.6)))
+        extra_rows.append(
+            MarkerRow(
+                NUMBER, i, type=TEXT, text=f"{i}{speed}", color=color, position=captions[k], scale=(0.0, 0.0, 0.6)
+            )
+        )
         if has_arrow:
-            extra_rows.append(MarkerRow(VELOCITY, i, type=ARROW, scale=(0.1, 0.25, 0.3),
-                                        color=color, points=np.stack([tops[k], ahead[k]])))
+            extra_rows.append(
+                MarkerRow(
+                    VELOCITY, i, type=ARROW, scale=(0.1, 0.25, 0.3), color=color, points=np.stack([tops[k], ahead[k]])
+                )
+            )
         if len(trail) > 1:
-            extra_rows.append(MarkerRow(TRAIL, i, type=LINE_STRIP, scale=(0.08, 0.0, 0.0),
-                                        color=color, points=trail))
+            extra_rows.append(MarkerRow(TRAIL, i, type=LINE_STRIP, scale=(0.08, 0.0, 0.0), color=color, points=trail))
     shown = list_marker_keys(extra_rows)
-    return make_marker_rows(boxes, labels, detections.scores, ids=numbers, extras=texts,
-                            previous=set(previous) - shown) + extra_rows
+    return (
+        make_marker_rows(boxes, labels, detections.scores, ids=numbers, extras=texts, previous=set(previous) - shown)
+        + extra_rows
+    )
 
 
-def make_track_markers(ids: np.ndarray, detections: Detections, velocities: np.ndarray,
-                       moving: np.ndarray, trails: Sequence[np.ndarray], header: Any, make: Any, *,
-                       lifetime_ns: int = 0, **more: Any) -> Any:
+def make_track_markers(
+    ids: np.ndarray,
+    detections: Detections,
+    velocities: np.ndarray,
+    moving: np.ndarray,
+    trails: Sequence[np.ndarray],
+    header: Any,
+    make: Any,
+    *,
+    lifetime_ns: int = 0,
+    **more: Any,
+) -> Any:
     """Make the MarkerArray of K tracks; for the arguments see make_track_rows."""
-    return rows_to_message(make_track_rows(ids, detections, velocities, moving, trails, **more),
-                           header, make, lifetime_ns)
+    return rows_to_message(
+        make_track_rows(ids, detections, velocities, moving, trails, **more), header, make, lifetime_ns
+    )
 
 
 def read_trails(msg: Any) -> dict[int, np.ndarray]:
     """Return the trails (N, 3) float64 in a MarkerArray, by track id."""
-    return {int(m.id): np.array([[p.x, p.y, p.z] for p in m.points], np.float64)
-            for m in msg.markers if m.ns == TRAIL and m.action == ADD}
+    return {
+        int(m.id): np.array([[p.x, p.y, p.z] for p in m.points], np.float64)
+        for m in msg.markers
+        if m.ns == TRAIL and m.action == ADD
+    }

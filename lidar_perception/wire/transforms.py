@@ -20,8 +20,14 @@ def add_transforms(tree: TransformTree, msg: Any, static: bool) -> None:
     for stamped in msg.transforms:
         t, q = stamped.transform.translation, stamped.transform.rotation
         try:
-            tree.set(stamped.header.frame_id, stamped.child_frame_id, to_ns(stamped.header.stamp),
-                     (t.x, t.y, t.z), (q.x, q.y, q.z, q.w), static)
+            tree.set(
+                stamped.header.frame_id,
+                stamped.child_frame_id,
+                to_ns(stamped.header.stamp),
+                (t.x, t.y, t.z),
+                (q.x, q.y, q.z, q.w),
+                static,
+            )
         except InputError as error:
             problem = error
     if problem is not None:

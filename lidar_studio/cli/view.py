@@ -28,29 +28,58 @@ WEIGHTS = (".safetensors", ".onnx", ".json")
 @data_argument(required=False)
 @click.option("--live", is_flag=True, help="Show the running graph instead of a recording.")
 @detectors_options
-@click.option("--results", multiple=True, type=click.Path(path_type=Path), metavar="FOLDER",
-              help="KITTI result files, FOLDER/NAME.txt, such as `detect --format kitti "
-              "--out FOLDER` writes. May be given several times.")
-@click.option("--points", "--topic", "points", metavar="TOPIC", help="Topic of the clouds of a bag "
-              "or of the running graph. Default: clustered ones, else /points, else the only cloud "
-              "topic.")
-@click.option("--detections", multiple=True, metavar="TOPIC", help="With --live: a topic of boxes, "
-              "MarkerArray or Detection3DArray. Default: all */output/detections that belong to "
-              "the clouds. May be given several times.")
-@click.option("--namespace", default="", metavar="NAME", help="With --live: show the nodes in "
-              "this namespace, / for those without one, if several graphs run.")
-@click.option("--sequence", metavar="NAME", help="The drive of DATA to show, if it has "
-              "several.")
+@click.option(
+    "--results",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="KITTI result files, FOLDER/NAME.txt, such as `detect --format kitti "
+    "--out FOLDER` writes. May be given several times.",
+)
+@click.option(
+    "--points",
+    "--topic",
+    "points",
+    metavar="TOPIC",
+    help="Topic of the clouds of a bag "
+    "or of the running graph. Default: clustered ones, else /points, else the only cloud "
+    "topic.",
+)
+@click.option(
+    "--detections",
+    multiple=True,
+    metavar="TOPIC",
+    help="With --live: a topic of boxes, "
+    "MarkerArray or Detection3DArray. Default: all */output/detections that belong to "
+    "the clouds. May be given several times.",
+)
+@click.option(
+    "--namespace",
+    default="",
+    metavar="NAME",
+    help="With --live: show the nodes in this namespace, / for those without one, if several graphs run.",
+)
+@click.option("--sequence", metavar="NAME", help="The drive of DATA to show, if it has several.")
 @port_option
 @browser_option
-@click.option("--frame", type=click.IntRange(0), default=0, show_default=True, metavar="N",
-              help="First frame to show.")
-@click.option("--theme", type=Choice(["auto", "light", "dark"]), default="auto",
-              show_default=True, help="Colours of the page.")
-def view(data: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
-         results: tuple[Path, ...], points: str | None, detections: tuple[str, ...],
-         namespace: str, sequence: str | None, port: int, browser: bool, frame: int,
-         theme: str) -> None:
+@click.option("--frame", type=click.IntRange(0), default=0, show_default=True, metavar="N", help="First frame to show.")
+@click.option(
+    "--theme", type=Choice(["auto", "light", "dark"]), default="auto", show_default=True, help="Colours of the page."
+)
+def view(
+    data: Path | None,
+    live: bool,
+    detectors: tuple[DetectorChoice, ...],
+    results: tuple[Path, ...],
+    points: str | None,
+    detections: tuple[str, ...],
+    namespace: str,
+    sequence: str | None,
+    port: int,
+    browser: bool,
+    frame: int,
+    theme: str,
+) -> None:
     """Show a recording and its results on a page in the browser: clouds with ground and
     clusters, labels, detections by source and score, missed and false ones, tracks. DATA is a
     bag, such as the result bag of the demo, or the folder of a data set; --live shows the newest
@@ -71,17 +100,20 @@ def view(data: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
 
     if (data is None) != live:
         raise click.UsageError("give DATA, the path of a recording, or --live")
-    excluded = ({"--weights": detectors, "--results": results, "--sequence": sequence} if live
-                else {"--detections": detections, "--namespace": namespace})
+    excluded = (
+        {"--weights": detectors, "--results": results, "--sequence": sequence}
+        if live
+        else {"--detections": detections, "--namespace": namespace}
+    )
     if wrong_options := [name for name, value in excluded.items() if value]:
-        raise click.UsageError(f"{', '.join(wrong_options)}: "
-                               f"{'not with' if live else 'only with'} --live")
+        raise click.UsageError(f"{', '.join(wrong_options)}: {'not with' if live else 'only with'} --live")
 
     def started(url: str) -> None:
         url += f"&frame={frame}&theme={theme}"
         console.print(url)
         if browser:
             webbrowser.open(url)
+
     if data is None:
         with _open_live_content(namespace, points or "", detections) as content:
             asyncio.run(serve(content, port, started))
@@ -93,8 +125,7 @@ def view(data: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
 
 
 @contextmanager
-def _open_live_content(namespace: str, points: str,
-                       detections: tuple[str, ...]) -> Iterator[PageContent]:
+def _open_live_content(namespace: str, points: str, detections: tuple[str, ...]) -> Iterator[PageContent]:
     from lidar_perception.nodes import require_rclpy
     from lidar_perception.nodes.shared_memory import is_fed_by_driver, use_large_shared_memory
     from lidar_studio.live_graph import LiveGraph
@@ -103,15 +134,20 @@ def _open_live_content(namespace: str, points: str,
     require_rclpy()
     use_large_shared_memory(points != "" and is_fed_by_driver([points]))
     from lidar_studio.live_view import run_live_view  # after the profile is set
-    name = "/".join(filter(None, (f"ROS domain {os.environ.get('ROS_DOMAIN_ID') or 0}",
-                                  namespace.strip("/"))))
+
+    name = "/".join(filter(None, (f"ROS domain {os.environ.get('ROS_DOMAIN_ID') or 0}", namespace.strip("/"))))
     live = LiveGraph(name)
     with run_live_view(live, None, namespace, points, detections):
         yield PageContent(live, layers=live.layers, tracks=live.list_tracks)
 
 
-def _open_content(path: Path, detectors: tuple[DetectorChoice, ...], results: tuple[Path, ...],
-                  points: str | None, sequence: str | None) -> PageContent:
+def _open_content(
+    path: Path,
+    detectors: tuple[DetectorChoice, ...],
+    results: tuple[Path, ...],
+    points: str | None,
+    sequence: str | None,
+) -> PageContent:
     from lidar_perception.data.bag_frames import is_layout
     from lidar_perception.data.open import split_topic
     from lidar_studio import results as result_sources
@@ -131,15 +167,15 @@ def _open_content(path: Path, detectors: tuple[DetectorChoice, ...], results: tu
     found = result_sources.Results()
     if is_bag:
         drive = replace(drive, scan=result_sources.read_recorded_scan)
-        found = result_sources.read_recorded_results(recording.frames.poses,
-                                                     [f.stamp_ns for f in drive.frames])
+        found = result_sources.read_recorded_results(recording.frames.poses, [f.stamp_ns for f in drive.frames])
     height = drive.frames[0].sensor_height
-    sources = {Path(choice.weights): result_sources.make_detector_source(
-        choice.open(sensor_height=height)) for choice in detectors}
+    sources = {
+        Path(choice.weights): result_sources.make_detector_source(choice.open(sensor_height=height))
+        for choice in detectors
+    }
     sources |= {folder.absolute(): result_sources.make_file_source(folder) for folder in results}
     names = make_short_names(list(sources), found.sources)
-    found = result_sources.Results({**found.sources, **dict(zip(names, sources.values()))},
-                                   found.tracks)
+    found = result_sources.Results({**found.sources, **dict(zip(names, sources.values()))}, found.tracks)
     return PageContent(drive, layers=found.bind_layers(drive), tracks=lambda: found.tracks)
 
 
@@ -151,6 +187,14 @@ def make_short_names(paths: list[Path], used_names: Collection[str] = ()) -> lis
     for i, own in enumerate(parts):
         ends = (own[-k:] for k in range(1, len(own) + 1))
         others = [other for j, other in enumerate(parts) if j != i]
-        names.append(next(("/".join(end) for end in ends if "/".join(end) not in used_names and all(
-            other[-len(end):] != end for other in others)), str(paths[i])))
+        names.append(
+            next(
+                (
+                    "/".join(end)
+                    for end in ends
+                    if "/".join(end) not in used_names and all(other[-len(end) :] != end for other in others)
+                ),
+                str(paths[i]),
+            )
+        )
     return names

@@ -13,11 +13,7 @@ from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.params import HeightParams, PipelineParams, SeedParams, StmParams
 from lidar_perception.candidates.pipeline import find_candidates, refine_segmented, segment_cloud
 from lidar_perception.candidates.refine import refine_clusters, select_by_height
-from lidar_perception.candidates.seed_sources import (
-    make_click_source,
-    make_fixed_source,
-    make_truth_source,
-)
+from lidar_perception.candidates.seed_sources import make_click_source, make_fixed_source, make_truth_source
 from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.candidates.segmented_cloud import snap_to_ground
 from lidar_perception.clustering.shapes import fit_boxes
@@ -47,33 +43,29 @@ def test_snapping_lowers_bottoms_to_the_plane_and_keeps_tops(seed, a, b, c):
     bottom, top = (before[:, 2] + s * before[:, 5] / 2 for s in (-1, 1))
     ground = a * before[:, 0] + b * before[:, 1] + c
     np.testing.assert_allclose(snapped[:, 2] + snapped[:, 5] / 2, top, rtol=0, atol=2e-5)
-    np.testing.assert_allclose(snapped[:, 2] - snapped[:, 5] / 2, np.minimum(bottom, ground),
-                               rtol=0, atol=2e-5)
+    np.testing.assert_allclose(snapped[:, 2] - snapped[:, 5] / 2, np.minimum(bottom, ground), rtol=0, atol=2e-5)
     np.testing.assert_array_equal(snapped[:, [0, 1, 3, 4, 6]], before[:, [0, 1, 3, 4, 6]])
     np.testing.assert_array_equal(boxes, before)  # the input is not modified
     np.testing.assert_array_equal(snap_to_ground(boxes, None), before)
-    np.testing.assert_allclose(snap_to_ground(snapped, np.array([a, b, c])), snapped, rtol=0,
-                               atol=2e-5)
+    np.testing.assert_allclose(snap_to_ground(snapped, np.array([a, b, c])), snapped, rtol=0, atol=2e-5)
 
 
 def test_the_height_filter_includes_the_tolerance():
     boxes = np.zeros((5, 7), np.float32)
     boxes[:, 5] = [1.25, 1.5, 1.75, 2.0, 2.25]
-    assert select_by_height(boxes, 1.75, HeightParams(tolerance=0.25)).tolist() == [
-        False, True, True, True, False]
-    assert select_by_height(boxes, 1.75, HeightParams(tolerance=0.0)).tolist() == [
-        False, False, True, False, False]
+    assert select_by_height(boxes, 1.75, HeightParams(tolerance=0.25)).tolist() == [False, True, True, True, False]
+    assert select_by_height(boxes, 1.75, HeightParams(tolerance=0.0)).tolist() == [False, False, True, False, False]
 
 
 @given(seeds)
 def test_group_points_keeps_the_given_order_of_clusters(seed):
     xyz, labels = make_labelled_points(seed)
     rng = np.random.default_rng(seed)
-    wanted = rng.permutation(np.arange(1, labels.max() + 1))[:rng.integers(0, labels.max() + 1)]
+    wanted = rng.permutation(np.arange(1, labels.max() + 1))[: rng.integers(0, labels.max() + 1)]
     points, start = group_points(xyz, labels, wanted)
     assert len(start) == len(wanted) + 1 and start[0] == 0 and start[-1] == len(points)
     for i, k in enumerate(wanted):  # each cluster's points are in the order of the input
-        np.testing.assert_array_equal(points[start[i]:start[i + 1]], xyz[labels == k])
+        np.testing.assert_array_equal(points[start[i] : start[i + 1]], xyz[labels == k])
 
 
 def rows(detections):
@@ -86,7 +78,7 @@ def with_threshold(threshold):
 
 def test_stages_are_subsets_of_the_first_stage():
     s = segment_cloud(PointCloud(scene()))
-    seed, = make_truth_source(boxes_at(PEOPLE))(s)
+    (seed,) = make_truth_source(boxes_at(PEOPLE))(s)
     tall = select_by_height(s.boxes, seed.height, HeightParams())
     assert 3 < tall.sum() < len(s.boxes)
     for threshold in (0.0, 0.4, 0.7, 0.9, 1.0):
@@ -135,8 +127,7 @@ def test_the_threshold_applies_to_each_stages_own_scores():
 
 
 def test_people_are_found_and_other_objects_are_not():
-    _, found = find_candidates(PointCloud(scene()), make_truth_source(boxes_at(PEOPLE)),
-                               params=with_threshold(0.75))
+    _, found = find_candidates(PointCloud(scene()), make_truth_source(boxes_at(PEOPLE)), params=with_threshold(0.75))
     order = np.argsort(found.final.boxes[:, 0])
     np.testing.assert_allclose(found.final.boxes[order, :2], PEOPLE + [0.05, 0], atol=0.1)
     bottoms = found.final.boxes[:, 2] - found.final.boxes[:, 5] / 2
@@ -162,7 +153,7 @@ def test_the_seeds_own_cluster_passes_every_stage():
         s = segment_cloud(frame.load())
         click = make_click_source(truth[np.hypot(*truth[:, :2].T).argmin(), :3], SeedParams())
         try:
-            seed, = click(s)
+            (seed,) = click(s)
         except InputError:
             continue
         found = refine_segmented(s, click, PipelineParams())
@@ -187,13 +178,17 @@ def test_candidates_keep_the_ids_of_a_foreign_clustering():
         np.testing.assert_array_equal(found.clusters, foreign[expected.clusters - 1])
 
 
-@pytest.mark.parametrize("params", [with_threshold(0.0), with_values(BEST, {
-    "view.enabled": False, "confidence.threshold": 0.0, "height.tolerance": 0.3})])
+@pytest.mark.parametrize(
+    "params",
+    [
+        with_threshold(0.0),
+        with_values(BEST, {"view.enabled": False, "confidence.threshold": 0.0, "height.tolerance": 0.3}),
+    ],
+)
 def test_bank_of_seeds_takes_the_best_score_of_each_cluster(params):
     s = segment_cloud(PointCloud(scene()), params=params)
     sizes = np.bincount(s.cluster_ids)[1:]
-    seeds = [seed_from_points(s.xyz[s.cluster_ids == k + 1], s.boxes[k])
-             for k in np.argsort(-sizes)[:4]]
+    seeds = [seed_from_points(s.xyz[s.cluster_ids == k + 1], s.boxes[k]) for k in np.argsort(-sizes)[:4]]
     best = {}
     for seed in seeds:
         alone = refine_segmented(s, make_fixed_source(seed), params)

@@ -21,11 +21,7 @@ from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams, StmParams
 from lidar_perception.candidates.pipeline import refine_segmented, segment_cloud
 from lidar_perception.candidates.refine import refine_clusters
-from lidar_perception.candidates.seed_sources import (
-    make_automatic_source,
-    make_fixed_source,
-    make_truth_source,
-)
+from lidar_perception.candidates.seed_sources import make_automatic_source, make_fixed_source, make_truth_source
 from lidar_perception.candidates.seeds import find_seed_cluster, load_seed, seed_from_points
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
@@ -42,8 +38,7 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.types import PEDESTRIAN, PointCloud
 
 seeds = st.integers(0, 2**32 - 1)
-METRIC = with_values(PipelineParams(), {"stm.window": "metric", "stm.spread": True,
-                                        "stm.dilations": 0})
+METRIC = with_values(PipelineParams(), {"stm.window": "metric", "stm.spread": True, "stm.dilations": 0})
 FLOOR = -1.7
 STEP = np.radians([METRIC.resolution.azimuth_step, METRIC.resolution.elevation_step])
 
@@ -51,7 +46,7 @@ STEP = np.radians([METRIC.resolution.azimuth_step, METRIC.resolution.elevation_s
 def board(distance, width=0.5, height=1.7, bearing=0.0, offset=0.3):
     """Return points of an upright board at this distance, sampled with METRIC's resolution."""
     step = distance * STEP
-    y = (np.arange(-width / 2, width / 2, step[0])[:, None] + offset * step[0])
+    y = np.arange(-width / 2, width / 2, step[0])[:, None] + offset * step[0]
     z = FLOOR + np.arange(0, height, step[1])[None] + offset * step[1]
     y, z = (a.ravel() for a in np.broadcast_arrays(y, z))
     keep = (np.abs(y) <= width / 2) & (z <= FLOOR + height)
@@ -61,8 +56,7 @@ def board(distance, width=0.5, height=1.7, bearing=0.0, offset=0.3):
 
 
 def draw(xyz, params=METRIC, floor=FLOOR):
-    return draw_silhouettes(xyz, np.array([0, len(xyz)]), np.ones((1, 1)), np.array([floor]),
-                            params)[0]
+    return draw_silhouettes(xyz, np.array([0, len(xyz)]), np.ones((1, 1)), np.array([floor]), params)[0]
 
 
 def make_box(distance, width=0.5, height=1.7):
@@ -78,10 +72,8 @@ def test_a_board_has_its_size_at_every_range(distance, width, height):
     pixels = to_pixels(draw(board(distance, width, height)))
     rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
     cell = distance * STEP
-    assert np.ptp(columns) + 1 == pytest.approx(width / WINDOW_WIDTH_M * COLUMNS,
-                                                abs=2 + cell[0] * 20)
-    assert np.ptp(rows) + 1 == pytest.approx(height / WINDOW_HEIGHT_M * ROWS,
-                                             abs=2 + cell[1] / WINDOW_HEIGHT_M * ROWS)
+    assert np.ptp(columns) + 1 == pytest.approx(width / WINDOW_WIDTH_M * COLUMNS, abs=2 + cell[0] * 20)
+    assert np.ptp(rows) + 1 == pytest.approx(height / WINDOW_HEIGHT_M * ROWS, abs=2 + cell[1] / WINDOW_HEIGHT_M * ROWS)
     assert pixels[np.ix_(rows, columns)].mean() > 0.99  # no gaps
 
 
@@ -119,12 +111,11 @@ def test_shifts_take_the_best_of_the_shifted_images(seed, shifts):
     for columns in range(-shifts, shifts + 1):
         moved = np.zeros_like(pixels)
         if columns >= 0:
-            moved[:, columns:] = pixels[:, :COLUMNS - columns]
+            moved[:, columns:] = pixels[:, : COLUMNS - columns]
         else:
             moved[:, :columns] = pixels[:, -columns:]
         best = max(best, (moved & template).sum() / np.sqrt(pixels.sum() * template.sum()))
-    found = compute_similarity(from_pixels(pixels)[None], from_pixels(template),
-                               StmParams(shifts=shifts))
+    found = compute_similarity(from_pixels(pixels)[None], from_pixels(template), StmParams(shifts=shifts))
     assert found[0] == pytest.approx(best, abs=1e-12)
 
 
@@ -133,8 +124,7 @@ def test_hidden_legs_do_not_matter_with_seen_only():
     legs = whole[:, 2] < FLOOR + 0.8
     head = whole[~legs]
     seen = with_values(METRIC, {"stm.seen_only": True})
-    alike = [compute_similarity(draw(head)[None], draw(whole), params.stm)[0]
-             for params in (METRIC, seen)]
+    alike = [compute_similarity(draw(head)[None], draw(whole), params.stm)[0] for params in (METRIC, seen)]
     assert alike[0] < 0.85 and alike[1] > 0.99
     again = compute_similarity(draw(whole)[None], draw(head), seen.stm)[0]
     assert again == pytest.approx(alike[1], abs=1e-12)  # whichever of the two is hidden
@@ -144,19 +134,21 @@ def test_pca_axis_corrects_a_tilt_and_yaw_does_not():
     rng = np.random.default_rng(0)
     upright = rng.normal(size=(600, 3)) * [0.05, 0.2, 0.6] + [10, 0, 0]
     angle = 0.5
-    tilt = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)],
-                     [0, np.sin(angle), np.cos(angle)]])
+    tilt = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
     tilted = (upright - [10, 0, 0]) @ tilt.T + [10, 0, 0]
-    images = {axis: [draw(xyz.astype(np.float32), with_values(PipelineParams(), {"stm.axis": axis}))
-                     for xyz in (upright, tilted)] for axis in ("yaw", "pca")}
+    images = {
+        axis: [
+            draw(xyz.astype(np.float32), with_values(PipelineParams(), {"stm.axis": axis})) for xyz in (upright, tilted)
+        ]
+        for axis in ("yaw", "pca")
+    }
     alike = {axis: compute_similarity(a[None], b)[0] for axis, (a, b) in images.items()}
     assert alike["pca"] > 0.97 > 0.9 > alike["yaw"]
 
 
 def test_every_dilation_adds_pixels():
     xyz = board(15.0)
-    images = [to_pixels(draw(xyz, with_values(PipelineParams(), {"stm.dilations": n})))
-              for n in range(4)]
+    images = [to_pixels(draw(xyz, with_values(PipelineParams(), {"stm.dilations": n}))) for n in range(4)]
     for small, large in pairwise(images):
         assert (large[small]).all() and large.sum() >= small.sum()
 
@@ -170,8 +162,7 @@ def features_of(clusters, boxes):
 
 
 def test_features_of_a_board_are_its_dimensions():
-    shape = {k: v[0] for k,
-             v in features_of([board(12.0, 0.6, 1.7)], [make_box(12.0, 0.6)]).items()}
+    shape = {k: v[0] for k, v in features_of([board(12.0, 0.6, 1.7)], [make_box(12.0, 0.6)]).items()}
     assert set(shape) == set(SHAPE_KNOTS)
     assert shape["range_m"] == pytest.approx(12.0, abs=0.05)
     assert shape["height_m"] == pytest.approx(1.7, abs=12 * STEP[1])
@@ -198,15 +189,13 @@ def test_features_do_not_depend_on_other_clusters(seed):
 
 
 def test_no_clusters_give_empty_features():
-    none = compute_shape_features(np.zeros((0, 3), np.float32), np.array([0]), np.zeros((0, 7)),
-                                  BEST)
+    none = compute_shape_features(np.zeros((0, 3), np.float32), np.array([0]), np.zeros((0, 7)), BEST)
     assert all(v.shape == (0,) for v in none.values()) and compute_confidence(none).shape == (0,)
 
 
 def test_a_single_point_has_finite_features():
     shape = features_of([np.float32([[9, 0, -1]])], [make_box(9.0)])
-    assert all(np.isfinite(v).all()
-               for v in shape.values()) and np.isfinite(compute_confidence(shape))[0]
+    assert all(np.isfinite(v).all() for v in shape.values()) and np.isfinite(compute_confidence(shape))[0]
 
 
 def test_models_have_every_curve_and_rise_with_similarity():
@@ -230,11 +219,11 @@ def two_people():
 
 def test_seed_cluster_is_found_by_the_seeds_points():
     xyz, start, boxes = two_people()
-    seed = seed_from_points(xyz[:start[1]], boxes[0])
+    seed = seed_from_points(xyz[: start[1]], boxes[0])
     assert find_seed_cluster(seed, xyz, start).tolist() == [True, False]
-    most = seed_from_points(xyz[:int(0.6 * start[1])], boxes[0])
+    most = seed_from_points(xyz[: int(0.6 * start[1])], boxes[0])
     assert find_seed_cluster(most, xyz, start).tolist() == [True, False]
-    elsewhere = seed_from_points(xyz[:start[1]] + np.float32(1e-3), boxes[0])
+    elsewhere = seed_from_points(xyz[: start[1]] + np.float32(1e-3), boxes[0])
     assert not find_seed_cluster(elsewhere, xyz, start).any()
     assert find_seed_cluster(seed, np.zeros((0, 3), np.float32), np.array([0])).shape == (0,)
 
@@ -245,13 +234,16 @@ def test_seed_confidence_is_1_if_certain_else_by_shape(certain):
     boxes[1, 1] += 3.0
     ids = np.repeat(np.int32([1, 2]), np.diff(start))
     params = with_values(BEST, {"confidence.threshold": 0.0})
-    seed = seed_from_points(xyz[:start[1]], boxes[0], certain)
+    seed = seed_from_points(xyz[: start[1]], boxes[0], certain)
     scores = refine_clusters(xyz, ids, boxes, [seed], params).final.scores
     shape = compute_confidence(compute_shape_features(xyz, start, boxes, BEST))
     assert scores[0] == pytest.approx(1.0 if certain else shape[0], abs=1e-6)
-    assert scores[1] == pytest.approx(refine_clusters(
-        xyz, ids, boxes, [seed_from_points(xyz[:start[1]] + np.float32([0, 0.5, 0]), boxes[0])],
-        params).final.scores[1], abs=0.05)
+    assert scores[1] == pytest.approx(
+        refine_clusters(
+            xyz, ids, boxes, [seed_from_points(xyz[: start[1]] + np.float32([0, 0.5, 0]), boxes[0])], params
+        ).final.scores[1],
+        abs=0.05,
+    )
 
 
 # --- the configuration ---------------------------------------------------------------------
@@ -261,17 +253,16 @@ def test_stages_of_best_are_accepted_by_confidence():
     people = [board(8.0), board(16.0), board(11.0, width=1.8)]
     xyz = np.concatenate([p + np.float32([0, 6 * i - 6, 0]) for i, p in enumerate(people)])
     rng = np.random.default_rng(0)
-    flat = np.column_stack([rng.uniform(2, 30, 6000), rng.uniform(-20, 20, 6000),
-                            np.full(6000, FLOOR)]).astype(np.float32)
+    flat = np.column_stack([rng.uniform(2, 30, 6000), rng.uniform(-20, 20, 6000), np.full(6000, FLOOR)]).astype(
+        np.float32
+    )
     params = with_values(BEST, {"view.enabled": False, "confidence.threshold": 0.0})
     s = segment_cloud(PointCloud(np.concatenate([xyz, flat])), params=params)
-    seed = seed_from_points(people[0] + np.float32([0, -6, 0]),
-                            make_box(8.0)[0] + np.float32([0, -6, 0, 0, 0, 0, 0]))
+    seed = seed_from_points(people[0] + np.float32([0, -6, 0]), make_box(8.0)[0] + np.float32([0, -6, 0, 0, 0, 0, 0]))
     all_ = refine_segmented(s, make_fixed_source(seed), params).final
     assert len(all_) >= 3
     limit = float(np.sort(all_.scores)[-2:].mean())
-    some = refine_segmented(s, make_fixed_source(seed),
-                            with_values(params, {"confidence.threshold": limit})).final
+    some = refine_segmented(s, make_fixed_source(seed), with_values(params, {"confidence.threshold": limit})).final
     assert 0 < len(some) < len(all_)
     assert sorted(some.scores) == sorted(all_.scores[all_.scores >= np.float32(limit)])
 
@@ -281,12 +272,19 @@ def test_automatic_seed_is_the_likeliest_cluster_or_template():
     params = with_values(BEST, {"view.enabled": False})
     empty = segment_cloud(PointCloud(np.zeros((0, 3), np.float32)), params=params)
     assert make_automatic_source([template], params)(empty) == (template,)
-    one = segment_cloud(PointCloud(np.concatenate([
-        board(9.0, 0.55), np.float32([[x, y, FLOOR] for x in np.arange(3, 20, 0.4)
-                                      for y in np.arange(-8, 8, 0.4)])])), params=params)
-    assert make_automatic_source([template], with_values(params, {"seed.min_confidence": 1.0}))(
-        one) == (template,)
-    own, = make_automatic_source([template], with_values(params, {"seed.min_confidence": 0.0}))(one)
+    one = segment_cloud(
+        PointCloud(
+            np.concatenate(
+                [
+                    board(9.0, 0.55),
+                    np.float32([[x, y, FLOOR] for x in np.arange(3, 20, 0.4) for y in np.arange(-8, 8, 0.4)]),
+                ]
+            )
+        ),
+        params=params,
+    )
+    assert make_automatic_source([template], with_values(params, {"seed.min_confidence": 1.0}))(one) == (template,)
+    (own,) = make_automatic_source([template], with_values(params, {"seed.min_confidence": 0.0}))(one)
     assert own is not template and np.hypot(*own.xyz[:, :2].mean(axis=0)) == pytest.approx(9, abs=1)
 
 

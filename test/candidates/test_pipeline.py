@@ -23,13 +23,14 @@ from lidar_perception.wire.params import ViewParams
 
 
 def template():
-    return make_fixed_source(seed_from_points(person(7, 2).astype(np.float32),
-                                              boxes_at([[7, 2]])[0]))
+    return make_fixed_source(seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0]))
 
 
-@pytest.mark.parametrize("xyz", [np.zeros((0, 3)), np.float32([[5, 0, -1]]),
-                                 np.float32([[5, 0, -1.7]]), floor()],
-                         ids=["empty", "one point", "one low point", "only ground"])
+@pytest.mark.parametrize(
+    "xyz",
+    [np.zeros((0, 3)), np.float32([[5, 0, -1]]), np.float32([[5, 0, -1.7]]), floor()],
+    ids=["empty", "one point", "one low point", "only ground"],
+)
 def test_clouds_without_objects_give_empty_results(xyz):
     s, found = find_candidates(PointCloud(xyz.astype(np.float32)), template())
     assert isinstance(s, SegmentedCloud)
@@ -72,8 +73,7 @@ def test_the_view_equals_the_pipeline_on_the_points_in_view():
     np.testing.assert_array_equal(cropped.xyz, alone.xyz)
     np.testing.assert_array_equal(cropped.cluster_ids, alone.cluster_ids)
     np.testing.assert_array_equal(found.final.boxes, expected.final.boxes)
-    empty, _ = find_candidates(PointCloud(np.zeros((0, 3), np.float32)), template(), camera,
-                               WITH_VIEW)
+    empty, _ = find_candidates(PointCloud(np.zeros((0, 3), np.float32)), template(), camera, WITH_VIEW)
     assert empty.xyz.shape == (0, 3)
 
 
@@ -99,12 +99,13 @@ def test_ground_points_have_no_cluster_and_ids_match_boxes():
     assert np.unique(s.cluster_ids).tolist() == list(range(len(s.boxes) + 1))
 
 
-@pytest.mark.parametrize("xyz", [np.zeros((0, 3)), floor(), person(6, 0, count=9)],
-                         ids=["empty", "only ground", "nine points"])
+@pytest.mark.parametrize(
+    "xyz", [np.zeros((0, 3)), floor(), person(6, 0, count=9)], ids=["empty", "only ground", "nine points"]
+)
 @pytest.mark.parametrize("min_confidence", [0.0, 0.5])
 def test_the_automatic_seed_falls_back_to_the_template(xyz, min_confidence):
-    params = with_values(PipelineParams(), {"seed.min_confidence": min_confidence,
-                                            "clustering.dbscan.min_samples": 3})
+    params = with_values(PipelineParams(), {"seed.min_confidence": min_confidence, "clustering.dbscan.min_samples": 3})
     given = seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0])
-    assert make_automatic_source([given], params)(segment_cloud(PointCloud(xyz.astype(np.float32)),
-                                                                params=params)) == (given,)
+    assert make_automatic_source([given], params)(segment_cloud(PointCloud(xyz.astype(np.float32)), params=params)) == (
+        given,
+    )

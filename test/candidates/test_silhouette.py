@@ -95,8 +95,7 @@ def test_silhouettes_of_real_clusters_equal_the_plain_ones():
     assert len(ids) > 20
     for points in (found.xyz[found.cluster_ids == k] for k in ids):
         for scales in ((1.0,), (1.0, 0.9, 0.8)):
-            np.testing.assert_array_equal(to_pixels(silhouette(points, scales)),
-                                          draw_plainly(points, scales))
+            np.testing.assert_array_equal(to_pixels(silhouette(points, scales)), draw_plainly(points, scales))
 
 
 def test_the_window_fits_the_cluster_and_row_0_is_its_top():
@@ -205,16 +204,17 @@ def test_scales_are_the_papers_from_15_to_30_metres_else_1():
 
 def test_scales_fall_by_the_decrement_down_to_min_scale():
     scales = compute_cpa_scales(np.array([20.0]), CpaParams(steps=11))[0]
-    np.testing.assert_allclose(scales, [1, .9, .8, .7, .6, .5, .4, .3, .2, .2, .2, .2], rtol=0,
-                               atol=1e-12)
+    np.testing.assert_allclose(scales, [1, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.2, 0.2, 0.2], rtol=0, atol=1e-12)
     np.testing.assert_allclose(
         compute_cpa_scales(np.array([20.0]), CpaParams(steps=3, decrement=0.4, min_scale=0.0))[0],
-        [1, 0.6, 0.2, 0.0], rtol=0, atol=1e-12)
+        [1, 0.6, 0.2, 0.0],
+        rtol=0,
+        atol=1e-12,
+    )
 
 
 def test_no_steps_and_no_clusters_give_the_right_shapes():
-    np.testing.assert_array_equal(compute_cpa_scales(np.array([5.0, 20.0]), CpaParams(steps=0)),
-                                  np.ones((2, 1)))
+    np.testing.assert_array_equal(compute_cpa_scales(np.array([5.0, 20.0]), CpaParams(steps=0)), np.ones((2, 1)))
     assert compute_cpa_scales(np.zeros(0), CpaParams()).shape == (0, 3)
     none = draw_silhouettes(np.zeros((0, 3), np.float32), np.array([0]), np.ones((0, 3)))
     assert none.shape == (0, ROWS) and none.dtype == np.uint32
@@ -230,16 +230,14 @@ def test_coincident_points_set_the_top_left_pixel(at, scales):
 
 
 def test_a_vertical_line_fills_the_first_column():
-    line = np.float32([8, 2, 0]) + np.linspace(-1.5, 0.5, 400, dtype=np.float32)[:, None] * \
-        np.float32([0, 0, 1])
+    line = np.float32([8, 2, 0]) + np.linspace(-1.5, 0.5, 400, dtype=np.float32)[:, None] * np.float32([0, 0, 1])
     pixels = to_pixels(silhouette(line))
     assert pixels[:, :2].all() and not pixels[:, 2:].any()
     np.testing.assert_array_equal(pixels, draw_plainly(line))
 
 
 def test_a_horizontal_line_fills_the_first_row():
-    line = np.float32([8, 0, -1]) + np.linspace(-1, 1, 200, dtype=np.float32)[:, None] * \
-        np.float32([0, 1, 0])
+    line = np.float32([8, 0, -1]) + np.linspace(-1, 1, 200, dtype=np.float32)[:, None] * np.float32([0, 1, 0])
     pixels = to_pixels(silhouette(line))
     assert pixels[:2].all() and not pixels[2:].any()
 

@@ -27,7 +27,9 @@ people = rng.uniform(-0.3, 0.3, (900, 3)) * [1, 1, 3] + (
     [[15, 0, -0.8], [30, 5, -0.8], [9, -4, -0.8]] * 300)
 cloud = PointCloud(np.concatenate([walls, spread, dense, people]).astype(np.float32))
 """
-NODES = COUNT + """
+NODES = (
+    COUNT
+    + """
 from lidar_perception.candidates.warm_up import (
     warm_up_candidates, warm_up_clustering, warm_up_ground)
 from lidar_perception.candidates.params import PipelineParams
@@ -48,14 +50,20 @@ ground = segment_ground(cloud, params.ground)
 assert cluster_obstacles(cloud.xyz, ground, params.clustering).max() > 0
 assert compiled() == before, {k: v for k, v in compiled().items() if before.get(k) != v}
 """
-DETECTOR = COUNT + """
+)
+DETECTOR = (
+    COUNT
+    + """
 import lidar_perception
 detector = lidar_perception.load_detector(sys.argv[1], device="cpu")
 before = compiled()
 detector(cloud)
 assert compiled() == before, {k: v for k, v in compiled().items() if before.get(k) != v}
 """
-TRACKER = COUNT + """
+)
+TRACKER = (
+    COUNT
+    + """
 from lidar_perception.tracking.tracker import Tracker, warm_up
 from lidar_perception.types import Detections
 
@@ -67,6 +75,7 @@ for frame in range(1, 9):
             frame * 10**8)
 assert before and compiled() == before, {k: v for k, v in compiled().items() if before.get(k) != v}
 """
+)
 needs_numba = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="Numba compiles nothing")
 
 

@@ -92,9 +92,12 @@ def test_convert_replaces_a_bag_only_by_force(kitti, tmp_path, monkeypatch, caps
     monkeypatch.setenv("COLUMNS", "300")
     out = tmp_path / "run [/final]"  # which is no markup
     command = ("convert", kitti, "--out", out, "--limit", 1)
-    assert [exit_of(monkeypatch, *command), exit_of(monkeypatch, *command),
-            exit_of(monkeypatch, *command, "--force"), exit_of(monkeypatch, "info", out)
-            ] == [0, 2, 0, 0]
+    assert [
+        exit_of(monkeypatch, *command),
+        exit_of(monkeypatch, *command),
+        exit_of(monkeypatch, *command, "--force"),
+        exit_of(monkeypatch, "info", out),
+    ] == [0, 2, 0, 0]
     assert capsys.readouterr().out.replace("\n", "").count("run [/final]") == 3
 
 
@@ -113,8 +116,7 @@ def test_info_folds_names_on_narrow_terminals_only(bag, monkeypatch):
     monkeypatch.setattr(info, "console", narrow)
     run("info", bag)
     text = narrow.file.getvalue()
-    columns = [[cell.strip() for cell in line.split("│")[1:3]] for line in text.splitlines()
-               if line.startswith("│")]
+    columns = [[cell.strip() for cell in line.split("│")[1:3]] for line in text.splitlines() if line.startswith("│")]
     assert "…" not in text and max(map(len, text.splitlines())) <= 60
     for names, cells in zip((topics, kinds), zip(*columns)):
         assert all(name in "".join(cells) for name in names)
@@ -123,8 +125,9 @@ def test_info_folds_names_on_narrow_terminals_only(bag, monkeypatch):
 @pytest.mark.parametrize("wide", [False, True])
 def test_a_table_in_a_pipe_is_not_cut_whatever_its_width(wide, monkeypatch):
     monkeypatch.setenv("COLUMNS", "20")
-    table = make_table("a title that is wider than its table" * (1 + 20 * wide), "", "score",
-                       "another" * (1 + 30 * wide))
+    table = make_table(
+        "a title that is wider than its table" * (1 + 20 * wide), "", "score", "another" * (1 + 30 * wide)
+    )
     table.add_row("a name of a detector", "100.0", "200.0")
     pipe = Terminal(file=io.StringIO())
     pipe.print(table)
@@ -137,7 +140,8 @@ def test_info_as_json_has_what_the_table_has(bag, kitti):
     content = json.loads(run("info", "--json", bag))
     with Bag(bag) as opened:
         assert {row["topic"]: (row["type"], row["messages"]) for row in content["topics"]} == {
-            topic: (kind, opened.counts[topic]) for topic, kind in opened.topics.items()}
+            topic: (kind, opened.counts[topic]) for topic, kind in opened.topics.items()
+        }
     assert content["seconds"] == pytest.approx(0.1)
     folder = json.loads(run("info", kitti, "--json"))
     assert (folder["frames"], folder["layout"]) == (2, "KITTI object data")
@@ -148,13 +152,11 @@ def test_bag_problem_is_one_line_and_command_continues(bag, tmp_path):
     shutil.copytree(bag, tmp_path / "bag")
     text = (bag / "metadata.yaml").read_text().replace("message_count: 2", "message_count: 9")
     (tmp_path / "bag/metadata.yaml").write_text(text)
-    for command in (["info", tmp_path / "bag"],
-                    ["convert", tmp_path / "bag", "--out", tmp_path / "out"]):
+    for command in (["info", tmp_path / "bag"], ["convert", tmp_path / "bag", "--out", tmp_path / "out"]):
         result = CliRunner().invoke(cli, [*map(str, command)], catch_exceptions=False)
         assert result.exit_code == 0
-        warned, = [line for line in result.stderr.splitlines() if "warning" in line]
-        assert warned.startswith(
-            f"warning: {tmp_path}/bag/metadata.yaml does not match the bag: it declares 9")
+        (warned,) = [line for line in result.stderr.splitlines() if "warning" in line]
+        assert warned.startswith(f"warning: {tmp_path}/bag/metadata.yaml does not match the bag: it declares 9")
 
 
 def test_info_lists_topics_that_are_not_read(tmp_path):
@@ -198,8 +200,7 @@ def test_the_scores_are_those_of_the_two_pedestrians(kitti, tmp_path):
             row = content[stage][r]
             assert row["tp"] + row["fn"] == content["ground_truth_by_range"][r]
     for count in ("tp", "fp", "fn"):
-        assert all(content[s]["all"][count] == sum(content[s][r][count] for r in RANGES)
-                   for s in STAGES)
+        assert all(content[s]["all"][count] == sum(content[s][r][count] for r in RANGES) for s in STAGES)
     assert content["final"]["0-15"]["recall"] == 1  # the seed is the pedestrian itself
     assert content["final"]["0-15"]["centre_error_m"] < WALKER[3]
     assert content["ms"]["total"] > 0 and all(ms >= 0 for ms in content["ms"].values())
@@ -216,16 +217,22 @@ def test_evaluate_prints_what_it_writes(bag, tmp_path, monkeypatch):
     assert (tmp_path / "a/picture.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("words", [
-    words for words, command in LEAVES
-    if {"data", "data_option"} <= {p.name for p in command.params}], ids=" ".join)
+@pytest.mark.parametrize(
+    "words",
+    [words for words, command in LEAVES if {"data", "data_option"} <= {p.name for p in command.params}],
+    ids=" ".join,
+)
 def test_data_is_an_argument_and_data_option_is_the_same(words, tmp_path, monkeypatch, capsys):
     needs_out = "detect", "setup", "train", "seed"
     out = ("--out", tmp_path / "out") if words[0] in needs_out else ()
     results = ("--results", tmp_path / "r.json") if words[-1] == "nuscenes" else ()
     said = {}
-    for name, value in {"argument": ["none"], "option": ["--data", "none"],
-                        "both": ["none", "--data", "none"], "neither": []}.items():
+    for name, value in {
+        "argument": ["none"],
+        "option": ["--data", "none"],
+        "both": ["none", "--data", "none"],
+        "neither": [],
+    }.items():
         if name == "neither" and words[0] in ("demo", "view"):
             continue
         assert exit_of(monkeypatch, *words, *value, *out, *results) == 2
@@ -257,7 +264,7 @@ def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
     write(root / "training/velodyne/000001.bin", b"123")
     content = evaluate(tmp_path, "--data", root)
     assert content["frames"] == 2
-    line, = content["skipped"]
+    (line,) = content["skipped"]
     assert "000001.bin" in line
 
 
@@ -275,14 +282,19 @@ def test_real_scans_are_scored_alike_from_folder_and_bag(data, tmp_path):
 @pytest.mark.parametrize("command", [["demo"], ["run", "perception"]])
 def test_without_rclpy_the_remedy_is_said_before_any_work(command, tmp_path):
     write(tmp_path / "rclpy/__init__.py", "raise ImportError('not for this Python')")
-    end = subprocess.run([sys.executable, "-m", "lidar_perception.cli.main", *command],
-                         capture_output=True, text=True, cwd=tmp_path,
-                         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(
-                             None, sys.path)])})
+    end = subprocess.run(
+        [sys.executable, "-m", "lidar_perception.cli.main", *command],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])},
+    )
     assert end.returncode == 2
-    assert end.stderr.strip().splitlines()[-1].endswith(
-        "cannot load rclpy (not for this Python): source ROS 2 Jazzy, or pip install "
-        "'lidar_perception[ros]'")
+    assert (
+        end.stderr.strip()
+        .splitlines()[-1]
+        .endswith("cannot load rclpy (not for this Python): source ROS 2 Jazzy, or pip install 'lidar_perception[ros]'")
+    )
     assert not (tmp_path / "out").exists()
 
 

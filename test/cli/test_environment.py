@@ -21,9 +21,16 @@ TEST = f"{BASE} test docs benchmark distributed onnx video"
 
 def stamp(extras=TEST):
     """Return the text by which ./lidar knows that its environment is up to date."""
-    return subprocess.run(["cksum"], input=b"".join(
-        (ROOT / name).read_bytes() for name in ("constraints.txt", "setup.py", "setup.cfg")),
-        capture_output=True, check=True).stdout.decode() + extras + "\n"
+    return (
+        subprocess.run(
+            ["cksum"],
+            input=b"".join((ROOT / name).read_bytes() for name in ("constraints.txt", "setup.py", "setup.cfg")),
+            capture_output=True,
+            check=True,
+        ).stdout.decode()
+        + extras
+        + "\n"
+    )
 
 
 PREFIX = Path(sys.prefix)
@@ -45,16 +52,16 @@ def test_executable_starts_the_node_of_its_name(name, tmp_path):
     """Also in a folder with modules of the same names as ours."""
     for module in "numpy", "signal", "lidar_perception":
         write(tmp_path / f"{module}.py", "raise SystemExit(3)")
-    done = subprocess.run([INSTALLED / name, "--help"], cwd=tmp_path,
-                          capture_output=True, text=True)
+    done = subprocess.run([INSTALLED / name, "--help"], cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(f"Usage: {name} --ros-args")
 
 
 def test_a_reader_of_the_help_may_stop_reading():
     command = [sys.executable, "-m", "lidar_perception.nodes.main", "perception", "--help"]
-    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True,
-                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    with subprocess.Popen(
+        command, env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
         process.stdout.close()
         assert process.stderr.read() == ""
     assert process.returncode == 0
@@ -66,9 +73,13 @@ def test_concurrent_first_calls_make_one_environment(tmp_path):
     write(venv / "bin/lidar-perception", "#!/bin/sh\necho ran $1\n").chmod(0o755)
     with open(venv / "lidar-lock", "w") as lock:  # the one
         fcntl.flock(lock, fcntl.LOCK_EX)
-        other = subprocess.Popen([ROOT / "lidar", "info"], text=True, stdout=subprocess.PIPE,
-                                 stderr=subprocess.PIPE, env={
-            **os.environ, "LIDAR_VENV": str(venv), "LIDAR_PYTHON": "/bin/false"})
+        other = subprocess.Popen(
+            [ROOT / "lidar", "info"],
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env={**os.environ, "LIDAR_VENV": str(venv), "LIDAR_PYTHON": "/bin/false"},
+        )
         assert "another call is making" in other.stderr.readline()
         write(venv / "lidar-setup", stamp())
     assert other.communicate() == ("ran info\n", "") and other.returncode == 0
@@ -80,18 +91,30 @@ def test_a_sourced_ros_is_not_seen_while_the_environment_is_made(tmp_path):
     seen = tmp_path / "seen"
     python = write(tmp_path / "python", f"#!/bin/sh\necho ${{PYTHONPATH-unset}} >>{seen}\n")
     python.chmod(0o755)
-    done = subprocess.run([ROOT / "lidar", "info"], text=True, capture_output=True, env={
-        **os.environ, "PYTHONPATH": "/opt/ros/jazzy/lib", "LIDAR_VENV": str(tmp_path / "venv"),
-        "LIDAR_PYTHON": str(python)})
+    done = subprocess.run(
+        [ROOT / "lidar", "info"],
+        text=True,
+        capture_output=True,
+        env={
+            **os.environ,
+            "PYTHONPATH": "/opt/ros/jazzy/lib",
+            "LIDAR_VENV": str(tmp_path / "venv"),
+            "LIDAR_PYTHON": str(python),
+        },
+    )
     assert done.returncode == 1 and "installing failed" in done.stderr  # this python makes none
     assert seen.read_text().split() == ["unset", "unset"]
 
 
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
-@pytest.mark.parametrize("words, ran", [
-    ("test -k tracker -x", f"python {ROOT}/scripts/run_tests.py -k tracker -x\n"),
-    ("benchmark --help", "python -m benchmark --help\n"),
-    ("info drive.bag", "lidar-perception info drive.bag\n")])
+@pytest.mark.parametrize(
+    "words, ran",
+    [
+        ("test -k tracker -x", f"python {ROOT}/scripts/run_tests.py -k tracker -x\n"),
+        ("benchmark --help", "python -m benchmark --help\n"),
+        ("info drive.bag", "lidar-perception info drive.bag\n"),
+    ],
+)
 def test_lidar_runs_tests_and_benchmark_from_the_checkout(words, ran, environment):
     assert environment(words) == ran
 
@@ -108,32 +131,44 @@ def environment(tmp_path):
     for name in ("python", "lidar-perception"):
         write(tmp_path / "bin" / name, f"#!/bin/sh\necho {name} $*\n").chmod(0o755)
     write(tmp_path / "lidar-setup", stamp())
-    return lambda words: subprocess.run(
-        [ROOT / "lidar", *words.split()], text=True, capture_output=True, check=True,
-        env={**os.environ, "LIDAR_VENV": str(tmp_path)}).stdout
+    return lambda words: (
+        subprocess.run(
+            [ROOT / "lidar", *words.split()],
+            text=True,
+            capture_output=True,
+            check=True,
+            env={**os.environ, "LIDAR_VENV": str(tmp_path)},
+        ).stdout
+    )
 
 
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
-@pytest.mark.parametrize("words, before, after", [
-    ("info a.bag", BASE, BASE),
-    ("test -x", BASE, TEST),
-    ("benchmark", f"{BASE} video", f"{BASE} benchmark video"),
-    ("export onnx w.safetensors", BASE, f"{BASE} onnx"),
-    ("detect a.bag --video a.mp4 --dask tcp://a", TEST, TEST)])
+@pytest.mark.parametrize(
+    "words, before, after",
+    [
+        ("info a.bag", BASE, BASE),
+        ("test -x", BASE, TEST),
+        ("benchmark", f"{BASE} video", f"{BASE} benchmark video"),
+        ("export onnx w.safetensors", BASE, f"{BASE} onnx"),
+        ("detect a.bag --video a.mp4 --dask tcp://a", TEST, TEST),
+    ],
+)
 def test_lidar_installs_what_a_command_needs(words, before, after, environment, tmp_path):
     write(tmp_path / "lidar-setup", stamp(before))
     environment(words)
     assert (tmp_path / "lidar-setup").read_text() == stamp(after)
     log = tmp_path / "setup.log"
-    assert not log.exists() if after == before else log.read_text() == (
-        f"python {ROOT}/scripts/set_up.py {after}\n")
+    assert not log.exists() if after == before else log.read_text() == (f"python {ROOT}/scripts/set_up.py {after}\n")
 
 
 def test_uv_gets_the_configuration_of_pip(tmp_path, monkeypatch):
     set_up = runpy.run_path(str(ROOT / "scripts/set_up.py"))
-    write(tmp_path / "pip.conf", "[global]\nindex-url = https://a/simple\nretries = 3\n"
-          "find-links = /never\nextra-index-url =\n  https://b/simple\n  https://c/simple\n"
-          "[install]\nconstraint = /d.txt\ntimeout = 9\n[freeze]\ntimeout = 10\n")
+    write(
+        tmp_path / "pip.conf",
+        "[global]\nindex-url = https://a/simple\nretries = 3\n"
+        "find-links = /never\nextra-index-url =\n  https://b/simple\n  https://c/simple\n"
+        "[install]\nconstraint = /d.txt\ntimeout = 9\n[freeze]\ntimeout = 10\n",
+    )
     for name in [name for name in os.environ if name.startswith("PIP_")]:
         monkeypatch.delenv(name)
     monkeypatch.setenv("PIP_CONFIG_FILE", str(tmp_path / "pip.conf"))
@@ -142,9 +177,13 @@ def test_uv_gets_the_configuration_of_pip(tmp_path, monkeypatch):
     settings = set_up["read_pip_settings"]()
     options, variables = set_up["find_uv_options"](settings)
     pairs = [*zip(options[::2], options[1::2])]
-    assert {*pairs} >= {("--default-index", "https://a/simple"), ("--find-links", "/wheels"),
-                        ("--index", "https://b/simple"), ("--index", "https://c/simple"),
-                        ("--constraint", "/d.txt")}
+    assert {*pairs} >= {
+        ("--default-index", "https://a/simple"),
+        ("--find-links", "/wheels"),
+        ("--index", "https://b/simple"),
+        ("--index", "https://c/simple"),
+        ("--constraint", "/d.txt"),
+    }
     assert ("--find-links", "/never") not in pairs
     assert variables == {"SSL_CERT_FILE": "/ca.crt", "UV_HTTP_TIMEOUT": "9"}
     assert set_up["find_uv_options"]({"no-index": "true"})[0][2:] == ["--no-index"]

@@ -19,12 +19,17 @@ from lidar_perception.param_fields import collect_fields, with_values
 from lidar_perception.types import InputError
 
 
-@pytest.mark.parametrize(("words", "names"), [
-    (("evaluate", "candidates"), ["stm.threshold (default 0.4)", "ground.method (default 'thr"]),
-    (("evaluate", "detection", "--weights", "pointnet"), ["pointnet.scores.car (default 0.4)"]),
-    (("evaluate", "clusters"), ["ground.method (default 'cloth')"]),
-    (("evaluate", "tracking"), ["fused.same_place (default 0.6 m)", "tracking.min_score (defa"]),
-    (("demo", "--detector=candidates"), ["view.enabled (default True)"])], ids=str)
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        (("evaluate", "candidates"), ["stm.threshold (default 0.4)", "ground.method (default 'thr"]),
+        (("evaluate", "detection", "--weights", "pointnet"), ["pointnet.scores.car (default 0.4)"]),
+        (("evaluate", "clusters"), ["ground.method (default 'cloth')"]),
+        (("evaluate", "tracking"), ["fused.same_place (default 0.6 m)", "tracking.min_score (defa"]),
+        (("demo", "--detector=candidates"), ["view.enabled (default True)"]),
+    ],
+    ids=str,
+)
 def test_set_help_lists_the_parameters_of_what_runs(words, names):
     for spelling in ["--set", "help"], ["--set=help"]:
         text = run(*words, *spelling)
@@ -33,15 +38,22 @@ def test_set_help_lists_the_parameters_of_what_runs(words, names):
 
 def test_set_help_of_candidates_describes_every_parameter():
     text = run("evaluate", "candidates", "--set", "help")
-    assert all(f"{name} (default" in text and f.metadata["doc"] in text
-               for name, f in collect_fields(PAPER).items() if not name.startswith("input."))
+    assert all(
+        f"{name} (default" in text and f.metadata["doc"] in text
+        for name, f in collect_fields(PAPER).items()
+        if not name.startswith("input.")
+    )
 
 
-@pytest.mark.parametrize("flags", [
-    ("clustering.dbscan.min_samples=100000",), ("height.tolerance=0", "seed.source=file"),
-    ("clustering.dbscan.eps=0.001,0.001,0.001",),
-    ("view.enabled=false", "ground.threshold.max_height:=-10",
-     "clustering.dbscan.range_limits=[5, 7]")])
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("clustering.dbscan.min_samples=100000",),
+        ("height.tolerance=0", "seed.source=file"),
+        ("clustering.dbscan.eps=0.001,0.001,0.001",),
+        ("view.enabled=false", "ground.threshold.max_height:=-10", "clustering.dbscan.range_limits=[5, 7]"),
+    ],
+)
 def test_parameters_reach_the_pipeline(bag, tmp_path, flags):
     changed = scores(evaluate(tmp_path, "--data", bag, *given(*flags)))
     assert changed["ground_truth"] == 2
@@ -51,24 +63,35 @@ def test_parameters_reach_the_pipeline(bag, tmp_path, flags):
 @pytest.mark.no_cover
 def test_a_config_says_the_same_as_set_and_set_wins(bag, tmp_path):
     few, many = (given(f"clustering.dbscan.min_samples={n}") for n in (10, 100_000))
-    file = write(tmp_path / "p.yaml",
-                 "/**:\n  ros__parameters:\n    clustering.dbscan.min_samples: 100000\n")
+    file = write(tmp_path / "p.yaml", "/**:\n  ros__parameters:\n    clustering.dbscan.min_samples: 100000\n")
     no_clusters = scores(evaluate(tmp_path, "--data", bag, *many))
     assert scores(evaluate(tmp_path, "--data", bag, "--config", file)) == no_clusters
     assert scores(evaluate(tmp_path, "--data", bag, "--config", file, *few)) == scores(
-        evaluate(tmp_path, "--data", bag))
+        evaluate(tmp_path, "--data", bag)
+    )
 
 
-@pytest.mark.parametrize("section, words", [
-    ("stm: 5", "'stm' is a group, not a value; it holds stm.threshold"),
-    ("stm: {threshold: {of: 5}}", "'stm.threshold.of' is below a parameter"),
-    ("5: 6", "5 is no name of a parameter"), ("{stm: {on: 1}}", "True is no name of a parameter"),
-    ("[" * 700, "cannot read the parameter file"), ("a: 2001-99-99", "cannot read the param"),
-    ("\n    ".join(["a0: &a0 {x: 1}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}"
-                                         for i in range(40)]), "more than 10000 parameters"),
-    ("\n    ".join(["a0: &a0 {}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}"
-                                     for i in range(40)]), "more than 10000 parameters"),
-    ("&a {b: *a}", "more than 20 others")], ids=range(9))
+@pytest.mark.parametrize(
+    "section, words",
+    [
+        ("stm: 5", "'stm' is a group, not a value; it holds stm.threshold"),
+        ("stm: {threshold: {of: 5}}", "'stm.threshold.of' is below a parameter"),
+        ("5: 6", "5 is no name of a parameter"),
+        ("{stm: {on: 1}}", "True is no name of a parameter"),
+        ("[" * 700, "cannot read the parameter file"),
+        ("a: 2001-99-99", "cannot read the param"),
+        (
+            "\n    ".join(["a0: &a0 {x: 1}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}" for i in range(40)]),
+            "more than 10000 parameters",
+        ),
+        (
+            "\n    ".join(["a0: &a0 {}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}" for i in range(40)]),
+            "more than 10000 parameters",
+        ),
+        ("&a {b: *a}", "more than 20 others"),
+    ],
+    ids=range(9),
+)
 def test_a_parameter_file_says_nothing_that_is_passed_over(tmp_path, section, words):
     file = write(tmp_path / "p.yaml", f"/**:\n  ros__parameters:\n    {section}\n")
     with pytest.raises(InputError) as error:
@@ -78,25 +101,29 @@ def test_a_parameter_file_says_nothing_that_is_passed_over(tmp_path, section, wo
 
 def test_a_value_that_is_refused_is_shown_as_far_as_a_line_goes(tmp_path):
     lists = ["a0: &a0 [1, 1]", *(f"a{i + 1}: &a{i + 1} [*a{i}, *a{i}]" for i in range(40))]
-    file = write(tmp_path / "p.yaml", "/**:\n  ros__parameters:\n    " + "\n    ".join(
-        [*lists, "clustering.dbscan.min_samples: *a40"]))
+    file = write(
+        tmp_path / "p.yaml",
+        "/**:\n  ros__parameters:\n    " + "\n    ".join([*lists, "clustering.dbscan.min_samples: *a40"]),
+    )
     with pytest.raises(ValueError, match="must be of type int") as error:
         with_values(PipelineParams(), read_config(file, PipelineParams()))
     assert len(str(error.value)) < 500
 
 
-@pytest.mark.parametrize("file", sorted(Path(__file__).parents[2].glob("config/*.yaml")),
-                         ids=lambda path: path.name)
+@pytest.mark.parametrize("file", sorted(Path(__file__).parents[2].glob("config/*.yaml")), ids=lambda path: path.name)
 def test_our_parameter_files_are_read_whatever_the_command(file, capsys):
     read_config(file, PipelineParams())
     assert not capsys.readouterr().err
 
 
 def test_misspelt_parameter_is_reported(tmp_path, capsys):
-    file = write(tmp_path / "p.yaml", "/**:\n  ros__parameters:\n    other: {ground: 1}\n"
-                 "    input.ahead: 3.0\n    ground: {sensor_pose: {heigth: 0.6}}\n")
+    file = write(
+        tmp_path / "p.yaml",
+        "/**:\n  ros__parameters:\n    other: {ground: 1}\n"
+        "    input.ahead: 3.0\n    ground: {sensor_pose: {heigth: 0.6}}\n",
+    )
     assert read_config(file, PipelineParams()) == {}
-    said, = capsys.readouterr().err.splitlines()
+    (said,) = capsys.readouterr().err.splitlines()
     assert ".heigth', so it changes nothing; is 'ground.sensor_pose.height' meant" in said
 
 
@@ -122,6 +149,7 @@ def chosen(*arguments, tracking=False) -> dict:
     @detector_options(tracking=tracking)
     def verb(**given):
         made.update(given)
+
     verb.main([*map(str, arguments)], standalone_mode=False)
     return made
 
@@ -129,19 +157,21 @@ def chosen(*arguments, tracking=False) -> dict:
 def test_only_the_sections_of_what_runs_are_read(tmp_path, capsys):
     file = write(tmp_path / "p.yaml", SECTIONS)
     made = chosen("--config", file, "--set", "crop.min_range=3", tracking=True)
-    assert made["detector"].settings == {"ground.method": "threshold", "fused.scores.car": 0.7,
-                                         "crop.min_range": 3.0}
+    assert made["detector"].settings == {"ground.method": "threshold", "fused.scores.car": 0.7, "crop.min_range": 3.0}
     assert made["tracking"].min_score == 0.3
     other = chosen("--weights", "pointnet", "--config", file)["detector"]
-    assert other.settings == {"ground.method": "threshold", "crop.min_range": 9.0,
-                              "pointnet.min_points": 5}
+    assert other.settings == {"ground.method": "threshold", "crop.min_range": 9.0, "pointnet.min_points": 5}
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize(("text", "said"), [
-    ("fused_detectr: {ros__parameters: {}}", "no node 'fused_detectr'; did you mean 'fused_detec"),
-    ("/**: {ros__parameters: {fused.score.car: 1}}", "is 'fused.scores.car' meant?"),
-    ("/**: {ros__parameters: {a: 1}}", "p.yaml has no parameter of fused")])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("fused_detectr: {ros__parameters: {}}", "no node 'fused_detectr'; did you mean 'fused_detec"),
+        ("/**: {ros__parameters: {fused.score.car: 1}}", "is 'fused.scores.car' meant?"),
+        ("/**: {ros__parameters: {a: 1}}", "p.yaml has no parameter of fused"),
+    ],
+)
 def test_what_may_be_misspelt_in_a_parameter_file_is_said(text, said, tmp_path, capsys):
     file = write(tmp_path / "p.yaml", text)
     assert chosen("--config", file)["detector"].settings == {}
@@ -149,9 +179,16 @@ def test_what_may_be_misspelt_in_a_parameter_file_is_said(text, said, tmp_path, 
 
 
 def test_settings_of_a_detector_take_effect_and_win():
-    made = chosen("--weights", "pointpillars", *given(
-        "pointpillars.scores.car=0.7", "pointpillars.range=around", "pointpillars.device=cpu",
-        "pointpillars.warm_up=no"))["detector"]
+    made = chosen(
+        "--weights",
+        "pointpillars",
+        *given(
+            "pointpillars.scores.car=0.7",
+            "pointpillars.range=around",
+            "pointpillars.device=cpu",
+            "pointpillars.warm_up=no",
+        ),
+    )["detector"]
     detector = made.open(sensor_height=1.0, min_score=0.001)
     assert detector.min_scores == {"Car": 0.7, "Pedestrian": 0.001, "Cyclist": 0.001}
     assert detector.range == "around" and detector.params.ground.sensor_pose.height == 1.0

@@ -54,8 +54,13 @@ def assert_same(xyz, eps, min_samples):
     np.testing.assert_array_equal(found, reference(xyz, eps, min_samples))
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.floats(0.05, 1.5), st.integers(1, 12),
-       st.sampled_from([0.0, 50.0, 3000.0]))
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 400),
+    st.floats(0.05, 1.5),
+    st.integers(1, 12),
+    st.sampled_from([0.0, 50.0, 3000.0]),
+)
 def test_labels_equal_sklearn_on_random_points(seed, count, eps, min_samples, offset):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform(-2, 2, (count, 3)) * rng.choice([0.1, 1.0, 2.0], 3) + offset
@@ -80,19 +85,22 @@ def test_border_points_join_the_first_cluster(min_samples):
         assert_same(mixed, eps, min_samples)
 
 
-@pytest.mark.parametrize("name, xyz", [
-    ("empty", np.zeros((0, 3))),
-    ("one point", np.ones((1, 3))),
-    ("all equal", np.full((50, 3), 7.3)),
-    ("at the origin", np.zeros((50, 3))),
-    ("two indices", np.repeat([[0.0, 0, 0], [1, 1, 1]], 20, axis=0)),
-    ("two indices within eps", np.repeat([[0.0, 0, 0], [0.25, 0, 0]], 20, axis=0)),
-    ("two clusters at one place", np.concatenate([np.eye(3)] * 10)),
-    ("line", np.linspace(0, 8, 33)[:, None] * [1, 0, 0]),
-    ("slanted line", np.linspace(0, 8, 65)[:, None] * [1, 2, -3]),
-    ("column", np.linspace(0, 8, 129)[:, None] * [0, 0, 1]),
-    ("plane", np.stack([*np.mgrid[0:4:0.25, 0:4:0.25], np.zeros((16, 16))], -1).reshape(-1, 3)),
-])
+@pytest.mark.parametrize(
+    "name, xyz",
+    [
+        ("empty", np.zeros((0, 3))),
+        ("one point", np.ones((1, 3))),
+        ("all equal", np.full((50, 3), 7.3)),
+        ("at the origin", np.zeros((50, 3))),
+        ("two indices", np.repeat([[0.0, 0, 0], [1, 1, 1]], 20, axis=0)),
+        ("two indices within eps", np.repeat([[0.0, 0, 0], [0.25, 0, 0]], 20, axis=0)),
+        ("two clusters at one place", np.concatenate([np.eye(3)] * 10)),
+        ("line", np.linspace(0, 8, 33)[:, None] * [1, 0, 0]),
+        ("slanted line", np.linspace(0, 8, 65)[:, None] * [1, 2, -3]),
+        ("column", np.linspace(0, 8, 129)[:, None] * [0, 0, 1]),
+        ("plane", np.stack([*np.mgrid[0:4:0.25, 0:4:0.25], np.zeros((16, 16))], -1).reshape(-1, 3)),
+    ],
+)
 @pytest.mark.parametrize("min_samples", [1, 2, 3, 10, 100])
 def test_labels_equal_sklearn_on_degenerate_clouds(name, xyz, min_samples):
     for eps in (0.125, 0.25, 0.5):
@@ -134,14 +142,11 @@ def banded_reference(xyz, params):
 def test_distance_aware_equals_sklearn_in_each_band(seed, count, min_samples):
     rng = np.random.default_rng(seed)
     xyz = (rng.uniform(-6, 6, (count, 3)) * [1, 1, 0.2]).astype(np.float32)
-    params = DbscanParams(range_limits=(2.0, 3.5, 5.0), eps=(0.2, 0.5, 0.3, 0.8),
-                          min_samples=min_samples)
-    np.testing.assert_array_equal(distance_aware_dbscan(xyz, params),
-                                  banded_reference(xyz, params))
+    params = DbscanParams(range_limits=(2.0, 3.5, 5.0), eps=(0.2, 0.5, 0.3, 0.8), min_samples=min_samples)
+    np.testing.assert_array_equal(distance_aware_dbscan(xyz, params), banded_reference(xyz, params))
 
 
-@pytest.mark.parametrize("limit, at", [(15.0, [15, 0]), (15.0, [0, -15]), (15.0, [9, 12]),
-                                       (30.0, [-18, 24])])
+@pytest.mark.parametrize("limit, at", [(15.0, [15, 0]), (15.0, [0, -15]), (15.0, [9, 12]), (30.0, [-18, 24])])
 def test_a_point_at_a_range_limit_is_in_the_far_band(limit, at):
     # Points 0.25 m apart form a cluster only beyond the limit, where eps is larger.
     at = np.array([*at, 0], np.float32)
@@ -247,8 +252,7 @@ def test_ids_are_1_to_K_by_first_core_point(seed, count, min_samples):
     assert np.unique(labels[labels > 0]).tolist() == list(range(1, labels.max() + 1))
     firsts = [np.flatnonzero(core & (labels == k))[0] for k in range(1, labels.max() + 1)]
     assert firsts == sorted(firsts)
-    banded = distance_aware_dbscan(xyz, DbscanParams(range_limits=(1.0,), eps=(0.3, 0.6),
-                                                     min_samples=min_samples))
+    banded = distance_aware_dbscan(xyz, DbscanParams(range_limits=(1.0,), eps=(0.3, 0.6), min_samples=min_samples))
     assert np.unique(banded[banded > 0]).tolist() == list(range(1, banded.max() + 1))
 
 
@@ -312,9 +316,13 @@ def test_two_dense_places_within_eps_are_one_cluster():
     assert (dbscan(xyz, 0.15, 10) == 1).all()
 
 
-@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 300),
-       scale=st.sampled_from([0.3, 1.0, 4.0]), eps=st.sampled_from([0.1, 0.25, 0.5]),
-       min_samples=st.integers(1, 12))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(1, 300),
+    scale=st.sampled_from([0.3, 1.0, 4.0]),
+    eps=st.sampled_from([0.1, 0.25, 0.5]),
+    min_samples=st.integers(1, 12),
+)
 def test_both_implementations_equal_sklearn(seed, n, scale, eps, min_samples):
     rng = np.random.default_rng(seed)
     xyz = (rng.random((n, 3)) * scale).astype(np.float32)

@@ -23,8 +23,12 @@ def wall_and_bush(seed=0):
 def plain(xyz, radius, limit):
     xyz = np.float64(xyz)
     near = np.linalg.norm(xyz[:, None] - xyz[None], axis=2) <= radius
-    variation = np.array([np.linalg.eigvalsh(np.cov(xyz[own].T, bias=True))[0]
-                          / max(np.trace(np.cov(xyz[own].T, bias=True)), 1e-30) for own in near])
+    variation = np.array(
+        [
+            np.linalg.eigvalsh(np.cov(xyz[own].T, bias=True))[0] / max(np.trace(np.cov(xyz[own].T, bias=True)), 1e-30)
+            for own in near
+        ]
+    )
     means = np.array([variation[own].mean() for own in near])
     return np.abs(variation - means) <= limit
 
@@ -41,8 +45,7 @@ def test_consistent_points_equal_plain_numpy():
 @pytest.mark.parametrize("max_distances", [2**15, 0], ids=["grid", "tree"])
 def test_growing_stops_where_the_curvature_changes(max_distances):
     wall, bush = wall_and_bush()
-    xyz, params = np.concatenate([wall, bush]), EuclideanParams(threshold="fixed", distance=0.25,
-                                                                gamma=0.0)
+    xyz, params = np.concatenate([wall, bush]), EuclideanParams(threshold="fixed", distance=0.25, gamma=0.0)
     assert len(np.unique(cluster_euclidean(xyz, params, max_distances))) == 1
     labels = cluster_euclidean(xyz, replace(params, curvature=0.02), max_distances)
     of_wall, of_bush = np.bincount(labels[:2000]).argmax(), np.bincount(labels[2000:]).argmax()

@@ -40,16 +40,27 @@ def scan():
 
 def make_scan(elevation_step, azimuth_step, rng):
     """Return a scan with these steps in degrees, of surfaces 2 to 60 m away."""
-    elevation, azimuth = np.radians(np.meshgrid(np.arange(-25.0, 5.0, elevation_step),
-                                                np.arange(-180, 180, azimuth_step)))
+    elevation, azimuth = np.radians(
+        np.meshgrid(np.arange(-25.0, 5.0, elevation_step), np.arange(-180, 180, azimuth_step))
+    )
     distance = rng.uniform(2, 60, elevation.shape)
-    return np.stack([distance * np.cos(elevation) * np.cos(azimuth),
-                     distance * np.cos(elevation) * np.sin(azimuth),
-                     distance * np.sin(elevation)], axis=-1).reshape(-1, 3).astype(np.float32)
+    return (
+        np.stack(
+            [
+                distance * np.cos(elevation) * np.cos(azimuth),
+                distance * np.cos(elevation) * np.sin(azimuth),
+                distance * np.sin(elevation),
+            ],
+            axis=-1,
+        )
+        .reshape(-1, 3)
+        .astype(np.float32)
+    )
 
 
-@pytest.mark.parametrize("elevation_step, azimuth_step", [
-    (0.4, 0.17), (0.5, 0.5), (1.33, 0.33), (2.0, 0.2), (2.0, 2.0)])
+@pytest.mark.parametrize(
+    "elevation_step, azimuth_step", [(0.4, 0.17), (0.5, 0.5), (1.33, 0.33), (2.0, 0.2), (2.0, 2.0)]
+)
 def test_density_is_that_of_the_sensors_steps(elevation_step, azimuth_step):
     # Each beam has 1 / azimuth_step returns per degree of azimuth, at every elevation.
     slant = np.cos(np.radians(np.arange(-25.0, 5.0, elevation_step))).mean()
@@ -119,13 +130,13 @@ def test_points_with_different_radii_cluster_as_if_separate():
     rng = np.random.default_rng(8)
     params = EuclideanParams(gamma=0.0, beta=0.0, min_size=3)
     near, far = (rng.uniform(-6, 6, (600, 3)).astype(np.float32) + [x, 0, 0] for x in (0, 500))
-    together = cluster_euclidean(np.concatenate([near, far]), params,
-                                 radii=np.repeat([0.5, 1.2], 600))
-    one, other = (cluster_euclidean(xyz.astype(np.float32), replace(params, radius=radius))
-                  for xyz, radius in ((near, 0.5), (far, 1.2)))
+    together = cluster_euclidean(np.concatenate([near, far]), params, radii=np.repeat([0.5, 1.2], 600))
+    one, other = (
+        cluster_euclidean(xyz.astype(np.float32), replace(params, radius=radius))
+        for xyz, radius in ((near, 0.5), (far, 1.2))
+    )
     assert one.max() > 3 and other.max() > 3
-    np.testing.assert_array_equal(together, np.concatenate(
-        [one, np.where(other > 0, other + one.max(), 0)]))
+    np.testing.assert_array_equal(together, np.concatenate([one, np.where(other > 0, other + one.max(), 0)]))
 
 
 @pytest.mark.parametrize("params", ADAPTIVE, ids=["PointNet", "experts", "people"])
@@ -133,13 +144,11 @@ def test_clusters_of_an_hdl_64e_ignore_the_density(params, scan):
     ground = np.isin(scan.semantic, (40, 44, 48, 49, 60, 72))
     found = cluster_obstacles(scan.frame.xyz, ground, params)
     assert found.max() > 20
-    np.testing.assert_array_equal(found, cluster_obstacles(scan.frame.xyz, ground,
-                                                           replace(params, density=0.0)))
+    np.testing.assert_array_equal(found, cluster_obstacles(scan.frame.xyz, ground, replace(params, density=0.0)))
 
 
 @needs_data
-@pytest.mark.parametrize("layout", ["kitti_object", "kitti_tracking", "kitti_unlabelled",
-                                    "semantickitti"])
+@pytest.mark.parametrize("layout", ["kitti_object", "kitti_tracking", "kitti_unlabelled", "semantickitti"])
 def test_no_real_scan_of_an_hdl_64e_counts_as_sparse(layout):
     for frame in list(open_recording(DATA / layout))[:5]:
         assert measure_density(frame.load().xyz) > 1.2 * FULL_DENSITY
@@ -160,5 +169,6 @@ def test_objects_stay_whole_with_a_tenth_of_the_points(params, scan):
                 main = np.bincount(inside[inside > 0], minlength=1).argmax() if inside.any() else -1
                 count += (inside == main).sum() > max(len(inside), (ids == main).sum()) / 2
         return count
+
     unadapted = count_whole(replace(params, density=0.0))
     assert count_whole(params) >= 1.5 * unadapted and count_whole(params) >= 5

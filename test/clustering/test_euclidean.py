@@ -16,8 +16,13 @@ from lidar_perception.clustering.params import EuclideanParams
 pytestmark = pytest.mark.no_cover  # other tests cover these lines
 
 LOCAL = EuclideanParams()
-SETTINGS = [LOCAL, replace(LOCAL, gamma=0.0), replace(LOCAL, threshold="global", gamma=0.0),
-            replace(LOCAL, threshold="global", min_size=3), replace(LOCAL, beta=0.0, min_size=1)]
+SETTINGS = [
+    LOCAL,
+    replace(LOCAL, gamma=0.0),
+    replace(LOCAL, threshold="global", gamma=0.0),
+    replace(LOCAL, threshold="global", min_size=3),
+    replace(LOCAL, beta=0.0, min_size=1),
+]
 SETTING_NAMES = ["local", "local, not merged", "global, not merged", "global", "no MinPts"]
 
 
@@ -31,18 +36,19 @@ def blobs(seed, centres, count=200, spread=0.15):
 def scene(seed, count=3000):
     """Return a cloud of dense and sparse clusters, a line and single points."""
     rng = np.random.default_rng(seed)
-    return np.concatenate([
-        blobs(seed, rng.uniform(-20, 20, (8, 3)) * [1, 1, 0.1], count // 10, 0.2),
-        blobs(seed + 1, rng.uniform(-40, 40, (5, 3)) * [1, 1, 0.1], 12, 0.4),
-        np.stack([np.linspace(-10, 10, 100), np.full(100, 5.0), np.zeros(100)], axis=1),
-        rng.uniform(-30, 30, (100, 3)),
-    ]).astype(np.float32)
+    return np.concatenate(
+        [
+            blobs(seed, rng.uniform(-20, 20, (8, 3)) * [1, 1, 0.1], count // 10, 0.2),
+            blobs(seed + 1, rng.uniform(-40, 40, (5, 3)) * [1, 1, 0.1], 12, 0.4),
+            np.stack([np.linspace(-10, 10, 100), np.full(100, 5.0), np.zeros(100)], axis=1),
+            rng.uniform(-30, 30, (100, 3)),
+        ]
+    ).astype(np.float32)
 
 
 def same_partition(a, b):
     pairs = np.unique(np.stack([a, b], axis=1), axis=0)
-    return (len(pairs) == len(np.unique(a)) == len(np.unique(b))
-            and np.array_equal(a == 0, b == 0))
+    return len(pairs) == len(np.unique(a)) == len(np.unique(b)) and np.array_equal(a == 0, b == 0)
 
 
 DEGENERATE = {
@@ -51,12 +57,10 @@ DEGENERATE = {
     "two points": np.array([[0, 0, 0], [1, 0, 0]]),
     "all equal": np.full((500, 3), 3.3),
     "collinear": np.arange(200)[:, None] * [0.1, 0.2, 0.0],
-    "a plane of equal distances": np.stack(np.meshgrid(*[np.arange(20) * 0.25] * 2, [0]),
-                                           axis=-1).reshape(-1, 3),
+    "a plane of equal distances": np.stack(np.meshgrid(*[np.arange(20) * 0.25] * 2, [0]), axis=-1).reshape(-1, 3),
     "coincident clusters": np.repeat(np.array([[0, 0, 0], [5, 0, 0]]), 50, axis=0),
     "far apart": np.array([[0, 0, 0]] * 12 + [[1e6, 0, 0]] * 12 + [[-1e6, 1e6, 100]]),
-    "one dense, one far": np.concatenate([blobs(0, [[0, 0, 0]], 300, 0.01),
-                                          [[3000, 0, 0], [3003, 0, 0]]]),
+    "one dense, one far": np.concatenate([blobs(0, [[0, 0, 0]], 300, 0.01), [[3000, 0, 0], [3003, 0, 0]]]),
 }
 
 
@@ -83,15 +87,15 @@ def test_lattice_clouds_equal_the_plain_implementation(data):
     """On a coarse lattice, equal distances and distances equal to a threshold are common."""
     count = data.draw(st.integers(1, 60))
     step = data.draw(st.sampled_from([0.05, 0.125, 0.3, 2.0]))
-    rows = data.draw(st.lists(st.tuples(*[st.integers(-6, 6)] * 3), min_size=count,
-                              max_size=count))
+    rows = data.draw(st.lists(st.tuples(*[st.integers(-6, 6)] * 3), min_size=count, max_size=count))
     params = EuclideanParams(
         threshold=data.draw(st.sampled_from(["global", "local"])),
         alpha=data.draw(st.sampled_from([0.5, 1.0, 1.2, 3.0])),
         beta=data.draw(st.sampled_from([0.0, 0.5, 1.5])),
         gamma=data.draw(st.sampled_from([0.0, 0.8, 2.0])),
         radius=data.draw(st.sampled_from([0.125, 0.5])),
-        min_size=data.draw(st.integers(1, 6)))
+        min_size=data.draw(st.integers(1, 6)),
+    )
     xyz = (np.array(rows) * step).astype(np.float32)
     np.testing.assert_array_equal(cluster_euclidean(xyz, params), plain(xyz, params))
 
@@ -101,10 +105,10 @@ def test_a_real_scan_equals_the_plain_implementation(threshold, data):
     from lidar_perception.ground.params import GroundParams
     from lidar_perception.ground.segment import segment_ground
     from lidar_perception.types import PointCloud
+
     path = next((data / "kitti_object").rglob("velodyne/*.bin"))
     points = np.fromfile(path, np.float32).reshape(-1, 4)
-    frame = PointCloud(xyz=np.ascontiguousarray(points[:, :3]),
-                       intensity=np.ascontiguousarray(points[:, 3]))
+    frame = PointCloud(xyz=np.ascontiguousarray(points[:, :3]), intensity=np.ascontiguousarray(points[:, 3]))
     ground = segment_ground(frame, GroundParams(method="cloth"))
     xyz = frame.xyz[~ground][::3]
     params = replace(LOCAL, threshold=threshold, gamma=0.0 if threshold == "global" else 0.8)
@@ -156,10 +160,12 @@ def test_min_size_only_drops_small_clusters():
 
 def test_gamma_merges_clusters_nearer_than_their_diameters():
     """The boxes have diagonal 2: centres 1.5 apart are nearer than 0.8 * 2, 1.7 apart are not."""
+
     def walls(distance):
         line = np.linspace(-1, 1, 60)
         one = np.stack([np.zeros(60), line, np.zeros(60)], axis=1)
         return np.concatenate([one, one + [distance, 0, 0]]).astype(np.float32)
+
     params = replace(LOCAL, radius=0.3)
     assert cluster_euclidean(walls(1.5), params).max() == 1
     assert cluster_euclidean(walls(1.7), params).max() == 2
@@ -169,9 +175,11 @@ def test_gamma_merges_clusters_nearer_than_their_diameters():
 def test_local_threshold_adapts_to_the_density():
     """Why Eq. 11 is the default: it finds a wall with points 2 cm apart and, in the same cloud, one
     with points 0.4 m apart, as on a far car. One threshold finds the dense wall only."""
+
     def wall(x, step):
         y, z = np.meshgrid(np.arange(0, 2.01, step), np.arange(0, 1.61, step))
         return np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1)
+
     xyz = np.concatenate([wall(0, 0.02), wall(40, 0.4)]).astype(np.float32)
     labels = cluster_euclidean(xyz, LOCAL)
     assert labels.max() == 2 and (labels == 0).sum() < 5  # corners have few neighbours

@@ -36,8 +36,7 @@ def make_clusters(seed):
         flat = rng.normal(size=(size, 3)) * rng.uniform(0.02, 3, 3)
         if k % 3 == 0:
             flat = np.round(flat * 2) / 2  # ties and coincident points
-        parts.append(np.column_stack([rotate(flat, rng.uniform(-4, 4)) + rng.uniform(-60, 60, 3),
-                                      np.full(size, k)]))
+        parts.append(np.column_stack([rotate(flat, rng.uniform(-4, 4)) + rng.uniform(-60, 60, 3), np.full(size, k)]))
     noise = np.column_stack([rng.uniform(-60, 60, (20, 3)), np.zeros(20)])
     mixed = rng.permutation(np.concatenate([noise, *parts]))
     return mixed[:, :3].astype(np.float32), mixed[:, 3].astype(np.int32)
@@ -66,8 +65,7 @@ def l_shaped_car(rng, yaw, noise=0.01):
     flat = np.column_stack([x, y, rng.uniform(-0.5, 0.5, len(x)) * height])
     flat[:, :2] += rng.uniform(-noise, noise, (len(x), 2))
     centre = rng.uniform(-30, 30, 3)
-    return ((rotate(flat, yaw) + centre).astype(np.float32),
-            np.array([*centre, length, width, height, yaw]))
+    return ((rotate(flat, yaw) + centre).astype(np.float32), np.array([*centre, length, width, height, yaw]))
 
 
 def angle_between(a, b, period=np.pi):
@@ -186,8 +184,7 @@ def test_l_shape_finds_sides_that_min_area_misses():
 def test_the_order_of_the_points_does_not_matter(shape, seed):
     xyz, labels = make_clusters(seed)
     order = np.random.default_rng(seed).permutation(len(xyz))
-    np.testing.assert_array_equal(fit_boxes(xyz[order], labels[order], shape),
-                                  fit_boxes(xyz, labels, shape))
+    np.testing.assert_array_equal(fit_boxes(xyz[order], labels[order], shape), fit_boxes(xyz, labels, shape))
 
 
 @each_shape
@@ -199,17 +196,20 @@ def test_a_cluster_has_the_same_box_alone(shape):
         np.testing.assert_array_equal(ellipse, apply_to_one(fit_ellipses, xyz[labels == k]))
 
 
-@pytest.mark.parametrize("name, xyz, length, yaw", [
-    ("one point", [[3, -4, 1]], 0, 0),
-    ("all equal", np.full((50, 3), 7.3), 0, 0),
-    ("a column", [[3, -4, z] for z in range(9)], 0, 0),
-    ("along x", np.outer(np.linspace(-2, 3, 40), [1, 0, 0]), 5, 0),
-    ("along y", np.outer(np.linspace(-2, 3, 40), [0, 1, 0]), 5, -np.pi / 2),
-    ("zero of either sign", [[0.0, 3, 0], [-0.0, 7, 0], [0.0, 1, 0], [-0.0, 5, 0]], 6, -np.pi / 2),
-    ("almost along y", [[0, 0, 0], [1e-8, 5, 0]], 5, -np.pi / 2),
-    ("slanted", np.outer(np.linspace(0, 7, 2), [np.cos(0.123), np.sin(0.123), 0]), 7, 0.123),
-    ("slanted back", np.outer(np.linspace(0, 7, 333), [0.6, -0.8, 0]), 7, np.arctan2(-4, 3)),
-])
+@pytest.mark.parametrize(
+    "name, xyz, length, yaw",
+    [
+        ("one point", [[3, -4, 1]], 0, 0),
+        ("all equal", np.full((50, 3), 7.3), 0, 0),
+        ("a column", [[3, -4, z] for z in range(9)], 0, 0),
+        ("along x", np.outer(np.linspace(-2, 3, 40), [1, 0, 0]), 5, 0),
+        ("along y", np.outer(np.linspace(-2, 3, 40), [0, 1, 0]), 5, -np.pi / 2),
+        ("zero of either sign", [[0.0, 3, 0], [-0.0, 7, 0], [0.0, 1, 0], [-0.0, 5, 0]], 6, -np.pi / 2),
+        ("almost along y", [[0, 0, 0], [1e-8, 5, 0]], 5, -np.pi / 2),
+        ("slanted", np.outer(np.linspace(0, 7, 2), [np.cos(0.123), np.sin(0.123), 0]), 7, 0.123),
+        ("slanted back", np.outer(np.linspace(0, 7, 333), [0.6, -0.8, 0]), 7, np.arctan2(-4, 3)),
+    ],
+)
 def test_points_at_one_place_or_on_a_line(name, xyz, length, yaw):
     for shape in ("min_area", "l_shape"):
         box = apply_to_one(fit_boxes, xyz, shape)
@@ -257,10 +257,23 @@ def test_an_evenly_filled_ellipse_is_recovered(seed, yaw, ratio):
     assert -QUARTER_TURN <= ellipse[4] < QUARTER_TURN
 
 
-@pytest.mark.parametrize("diagonal, name", [
-    (0, None), (0.39, None), (0.40, "Pedestrian"), (1.71, "Pedestrian"), (1.719, "Pedestrian"),
-    (1.72, "Cyclist"), (2.99, "Cyclist"), (2.999, "Cyclist"), (3.00, "Car"), (6.40, "Car"),
-    (6.41, None), (np.nan, None)])
+@pytest.mark.parametrize(
+    "diagonal, name",
+    [
+        (0, None),
+        (0.39, None),
+        (0.40, "Pedestrian"),
+        (1.71, "Pedestrian"),
+        (1.719, "Pedestrian"),
+        (1.72, "Cyclist"),
+        (2.99, "Cyclist"),
+        (2.999, "Cyclist"),
+        (3.00, "Car"),
+        (6.40, "Car"),
+        (6.41, None),
+        (np.nan, None),
+    ],
+)
 def test_class_by_diagonal_at_the_limits(diagonal, name):
     boxes = np.array([[0, 0, 0, diagonal, 0, 9, 1], [0, 0, 0, 0, diagonal, 9, 1]])
     expected = -1 if name is None else CLASSES.index(name)

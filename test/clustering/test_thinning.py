@@ -30,10 +30,10 @@ def shell(n, gap, seed=0):
 
 METHODS = {
     "dbscan": lambda xyz: dbscan(xyz, REACH, 5),
-    "bands": lambda xyz: distance_aware_dbscan(xyz, DbscanParams(
-        eps=(REACH,) * 3, min_samples=5, join_bands=True)),
+    "bands": lambda xyz: distance_aware_dbscan(xyz, DbscanParams(eps=(REACH,) * 3, min_samples=5, join_bands=True)),
     "euclidean": lambda xyz: cluster_euclidean(
-        xyz, EuclideanParams(threshold="fixed", distance=REACH, gamma=0.0), max_distances=-1),
+        xyz, EuclideanParams(threshold="fixed", distance=REACH, gamma=0.0), max_distances=-1
+    ),
 }
 each_method = pytest.mark.parametrize("method", METHODS)
 
@@ -60,8 +60,7 @@ def test_thinning_connects_no_less_and_little_more(method, seed, always_thin):
     labels = METHODS[method](xyz.astype(np.float32))
     assert (labels > 0).all()
     distance = cdist(xyz, xyz)
-    finest, coarsest = (connected_components(distance <= REACH * factor)[1]
-                        for factor in (1.0, 1.0 + thinning.SLACK))
+    finest, coarsest = (connected_components(distance <= REACH * factor)[1] for factor in (1.0, 1.0 + thinning.SLACK))
     for coarser, finer in ((labels, finest), (coarsest, labels)):
         pairs = np.unique(np.column_stack([finer, coarser]), axis=0)
         assert len(pairs) == len(np.unique(finer))
@@ -90,6 +89,7 @@ def test_work_of_joining_cells_grows_linearly(gap, monkeypatch):
         parent, work = join_cells(*arguments)
         works[-1] += work
         return parent, work
+
     monkeypatch.setattr(dbscan_cells, "_join_cells", count_work)
     for count in (20_000, 80_000):
         works.append(0)

@@ -36,18 +36,19 @@ def sphere(rng, n):
 
 
 # Clouds with many points in one neighbourhood of a grid: rng, n -> (n, 3).
-ARRANGEMENTS = {"a cube": lambda rng, n: rng.random((n, 3)), "equal": lambda rng,
-                n: np.full((n, 3), 0.3), "a line": lambda rng,
-                n: np.linspace(0, 1, n)[:, None] * [1, 2, -1], "a sphere": sphere,
-                "a sphere and its centre": lambda rng,
-                n: np.concatenate([sphere(rng, n // 2), rng.normal(0, 1e-5, (n - n // 2, 3))]),
-                "two blobs out of reach": lambda rng,
-                n: rng.random((n, 3)) * 0.1 + (np.arange(n) % 2)[:, None] * [0, 0, 0.7],
-                "a blob and dust": lambda rng,
-                n: rng.random((n, 3)) * np.where(np.arange(n) % 2, 1e-3, 3)[:, None],
-                "parallel walls": lambda rng,
-                n: np.column_stack([np.arange(n) % 2 * 0.31, rng.random((n, 2))]),
-                "a few indices": lambda rng, n: rng.integers(0, 3, (n, 3)) * 0.25}
+ARRANGEMENTS = {
+    "a cube": lambda rng, n: rng.random((n, 3)),
+    "equal": lambda rng, n: np.full((n, 3), 0.3),
+    "a line": lambda rng, n: np.linspace(0, 1, n)[:, None] * [1, 2, -1],
+    "a sphere": sphere,
+    "a sphere and its centre": lambda rng, n: np.concatenate(
+        [sphere(rng, n // 2), rng.normal(0, 1e-5, (n - n // 2, 3))]
+    ),
+    "two blobs out of reach": lambda rng, n: rng.random((n, 3)) * 0.1 + (np.arange(n) % 2)[:, None] * [0, 0, 0.7],
+    "a blob and dust": lambda rng, n: rng.random((n, 3)) * np.where(np.arange(n) % 2, 1e-3, 3)[:, None],
+    "parallel walls": lambda rng, n: np.column_stack([np.arange(n) % 2 * 0.31, rng.random((n, 2))]),
+    "a few indices": lambda rng, n: rng.integers(0, 3, (n, 3)) * 0.25,
+}
 each_arrangement = pytest.mark.parametrize("arrange", ARRANGEMENTS.values(), ids=ARRANGEMENTS)
 
 
@@ -71,21 +72,22 @@ def test_every_search_agrees_with_all_pairs(data):
     np.testing.assert_array_equal(find_nearest_distances(tree)[0], others.min(axis=1))
     reach2 = rng.choice([0.0, 0.125, 0.25, 0.5], n) ** 2
     for min_points in (1.0, 3.0, 7.5):
-        np.testing.assert_array_equal(find_core_points_in_tree(tree, reach2, min_points)[0],
-                                      (squared <= reach2[:, None]).sum(axis=1) >= min_points)
+        np.testing.assert_array_equal(
+            find_core_points_in_tree(tree, reach2, min_points)[0],
+            (squared <= reach2[:, None]).sum(axis=1) >= min_points,
+        )
     selected = rng.random(n) < 0.7
     for gamma, linked in (
-            (0.0, squared <= np.maximum(reach2[:, None], reach2)),
-            (2.0, np.sqrt(squared) < 2.0 * (reach2[:, None] + reach2) / 2)):
+        (0.0, squared <= np.maximum(reach2[:, None], reach2)),
+        (2.0, np.sqrt(squared) < 2.0 * (reach2[:, None] + reach2) / 2),
+    ):
         found = find_components(tree, reach2, selected, gamma, np.inf)[0]
         sets = connected_components(coo_matrix(linked & selected & selected[:, None]))[1]
         assert (found[~selected] == -1).all() and (found[selected] >= 0).all()
-        np.testing.assert_array_equal(found[selected, None] == found[selected],
-                                      sets[selected, None] == sets[selected])
+        np.testing.assert_array_equal(found[selected, None] == found[selected], sets[selected, None] == sets[selected])
     nearest = find_nearest_core_points(tree, reach2, selected)[0]
     for i in range(n):
-        within = [(squared[i, j], *tree.points[j]) for j in np.flatnonzero(
-            selected & (squared[i] <= reach2))]
+        within = [(squared[i, j], *tree.points[j]) for j in np.flatnonzero(selected & (squared[i] <= reach2))]
         assert (nearest[i] >= 0) == (bool(within) and not selected[i])
         if nearest[i] >= 0:
             assert (squared[i, nearest[i]], *tree.points[nearest[i]]) == min(within)
@@ -107,12 +109,16 @@ def test_touching_labels_are_those_of_all_pairs(data):
 
     def sets(a, b):
         return connected_components(coo_matrix((np.ones(len(a)), (a, b)), (count, count)))[1]
+
     np.testing.assert_array_equal(sets(*pairs.T), sets(label[i], label[j]))
 
 
-SETTINGS = [EuclideanParams(), EuclideanParams(threshold="global"),
-            EuclideanParams(threshold="fixed", distance=0.1),
-            EuclideanParams(alpha=0.5, beta=2.0, gamma=0.2, min_size=1)]
+SETTINGS = [
+    EuclideanParams(),
+    EuclideanParams(threshold="global"),
+    EuclideanParams(threshold="fixed", distance=0.1),
+    EuclideanParams(alpha=0.5, beta=2.0, gamma=0.2, min_size=1),
+]
 
 
 @each_arrangement
@@ -121,8 +127,7 @@ SETTINGS = [EuclideanParams(), EuclideanParams(threshold="global"),
 def test_grid_and_tree_give_the_same_clusters(arrange, params, max_distances):
     """-1 uses the tree only. The plain implementation has no fixed threshold."""
     xyz = make_points(arrange, 700)
-    expected = (cluster_euclidean(xyz, params, 10**9) if params.threshold == "fixed" else
-                plain(xyz, params))
+    expected = cluster_euclidean(xyz, params, 10**9) if params.threshold == "fixed" else plain(xyz, params)
     np.testing.assert_array_equal(cluster_euclidean(xyz, params, max_distances), expected)
 
 
@@ -133,14 +138,16 @@ def count_work(xyz):
     reach2, selected = np.full(n, 0.3**2), np.ones(n, bool)
     tiny = np.full(n, 1e-6**2)
     side = np.arange(n) % 2
-    return {"nearest": find_nearest_distances(tree)[1],
-            "core points": find_core_points_in_tree(tree, reach2, 10.0)[1],
-            "core points, no reach": find_core_points_in_tree(tree, tiny, 10.0)[1],
-            "components": find_components(tree, reach2, selected, 0.0, np.inf)[1],
-            "components, no reach": find_components(tree, tiny, selected, 0.0, np.inf)[1],
-            "nearest core points": find_nearest_core_points(tree, reach2, side == 0)[1],
-            "touching": find_touching_labels(tree, side, side, 0.3**2, np.inf)[1],
-            "touching, no reach": find_touching_labels(tree, side, side, 0.0, np.inf)[1]}
+    return {
+        "nearest": find_nearest_distances(tree)[1],
+        "core points": find_core_points_in_tree(tree, reach2, 10.0)[1],
+        "core points, no reach": find_core_points_in_tree(tree, tiny, 10.0)[1],
+        "components": find_components(tree, reach2, selected, 0.0, np.inf)[1],
+        "components, no reach": find_components(tree, tiny, selected, 0.0, np.inf)[1],
+        "nearest core points": find_nearest_core_points(tree, reach2, side == 0)[1],
+        "touching": find_touching_labels(tree, side, side, 0.3**2, np.inf)[1],
+        "touching, no reach": find_touching_labels(tree, side, side, 0.0, np.inf)[1],
+    }
 
 
 @each_arrangement
@@ -161,14 +168,23 @@ def test_sampling_bounds_the_work_of_local_thresholds(arrange):
         kept = np.diff(sample.start)
         assert kept.min() >= 1 and (kept <= np.diff(cells.start)).all()
         np.testing.assert_allclose(kept * sample.weight, np.diff(cells.start))
-        near = [sum(kept[low:high].sum() for low, high in zip(
-            cells.low[a, :cells.ranges[a]], cells.high[a, :cells.ranges[a]]))
-            for a in range(len(kept))]
+        near = [
+            sum(
+                kept[low:high].sum()
+                for low, high in zip(cells.low[a, : cells.ranges[a]], cells.high[a, : cells.ranges[a]])
+            )
+            for a in range(len(kept))
+        ]
         assert np.diff(cells.start) @ near <= 27 * 50 * count
 
 
-@pytest.mark.parametrize("arrange", [ARRANGEMENTS[name] for name in (
-    "a cube", "equal", "a line", "a sphere", "two blobs out of reach", "a few indices")])
+@pytest.mark.parametrize(
+    "arrange",
+    [
+        ARRANGEMENTS[name]
+        for name in ("a cube", "equal", "a line", "a sphere", "two blobs out of reach", "a few indices")
+    ],
+)
 def test_sampled_means_are_close_and_ignore_the_order(arrange):
     xyz = make_points(arrange, 3000)
     cells = sort_into_cells(xyz, 0.5)
@@ -190,8 +206,9 @@ def test_sampled_means_are_close_and_ignore_the_order(arrange):
 
 def test_joining_a_dense_wall_at_a_limit_takes_little_work():
     rng = np.random.default_rng(0)
-    wall = np.column_stack([rng.normal(15, 0.01, 4000), rng.uniform(-0.7, 0.7, 4000),
-                            rng.uniform(-1.7, 0.7, 4000)]).astype(np.float32)
+    wall = np.column_stack(
+        [rng.normal(15, 0.01, 4000), rng.uniform(-0.7, 0.7, 4000), rng.uniform(-1.7, 0.7, 4000)]
+    ).astype(np.float32)
     params = DbscanParams(eps=(0.15, 0.3, 0.5), join_bands=True)
     assert distance_aware_dbscan(wall, replace(params, join_bands=False)).max() == 2
     assert distance_aware_dbscan(wall, params).max() == 1

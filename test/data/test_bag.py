@@ -54,9 +54,9 @@ def test_recording_returns_the_written_scans(written):
 
 def test_clouds_are_stored_bit_by_bit(tmp_path):
     cloud = np.array([[1, 2, 3, 0.5], [np.nan, -0.0, np.inf, -1], [0, 0, 0, 0]], np.float32)
-    write_bag(tmp_path / "bag", [
-        Frame.of(str(i), cloud_frame(part, STAMP + i))
-        for i, part in enumerate((cloud, cloud[:0]))])
+    write_bag(
+        tmp_path / "bag", [Frame.of(str(i), cloud_frame(part, STAMP + i)) for i, part in enumerate((cloud, cloud[:0]))]
+    )
     with Bag(tmp_path / "bag") as bag:
         full, empty = [to_array(msg) for _, _, msg in bag.messages({POINTS})]
     assert full.dtype.names == ("x", "y", "z", "intensity") and len(empty) == 0
@@ -66,25 +66,23 @@ def test_clouds_are_stored_bit_by_bit(tmp_path):
 def test_missing_parts_of_a_scan_are_not_written(tmp_path):
     write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
     recording = open_recording(tmp_path / "bag")
-    read, = recording
+    (read,) = recording
     assert read.truth() is None and read.camera() is None and read.pose() is None
     with Bag(tmp_path / "bag") as bag:
         assert {t for t, _, _ in bag.raw_messages()} == {POINTS}
 
 
 def test_empty_labels_are_not_missing_labels(tmp_path):
-    write_bag(tmp_path / "bag", [
-        Frame.of("0", cloud_frame(scene(), STAMP), GroundTruth.of([], []))])
-    read, = open_recording(tmp_path / "bag")
+    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP), GroundTruth.of([], []))])
+    (read,) = open_recording(tmp_path / "bag")
     assert len(read.truth()) == 0
 
 
 def test_images_are_stored_byte_by_byte(tmp_path):
     image = write(tmp_path / "image.png", png_header(3, 2) + b"pixels")
-    write_bag(tmp_path / "bag", [
-        Frame.of("0", cloud_frame(scene(), STAMP), image=image)], images=True)
+    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP), image=image)], images=True)
     with Bag(tmp_path / "bag") as bag:
-        (_, stamp, msg), = bag.messages({IMAGE})
+        ((_, stamp, msg),) = bag.messages({IMAGE})
     assert (bytes(msg.data), msg.format, stamp) == (image.read_bytes(), "png", STAMP)
 
 
@@ -109,25 +107,27 @@ def test_rosbags_reads_the_bag(written):
 def test_mcap_reads_the_bag_and_verifies_its_checksums(written):
     with open(written / "drive.mcap", "rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
-        got = [(channel.topic, m.log_time, m.data, channel.message_encoding, schema.encoding)
-               for schema, channel, m in reader.iter_messages(log_time_order=False)]
+        got = [
+            (channel.topic, m.log_time, m.data, channel.message_encoding, schema.encoding)
+            for schema, channel, m in reader.iter_messages(log_time_order=False)
+        ]
         assert reader.get_header().profile == "ros2"
     assert sorted(got) == sorted((*row, "cdr", "ros2msg") for row in message_bytes(written))
 
 
 def test_zstd_chunks_hold_several_clouds(tmp_path):
     cloud = np.random.default_rng(0).random((60_000, 4), np.float32)
-    count = write_bag(tmp_path / "bag", (
-        Frame.of(str(i), cloud_frame(cloud, STAMP + i)) for i in range(12)))
+    count = write_bag(tmp_path / "bag", (Frame.of(str(i), cloud_frame(cloud, STAMP + i)) for i in range(12)))
     with open(tmp_path / "bag/bag.mcap", "rb") as stream:
         chunks = make_reader(stream).get_summary().chunk_indexes
     assert {c.compression for c in chunks} == {"zstd"}
     assert 1 < len(chunks) < count / 2
 
 
-@pytest.mark.parametrize(("compression", "pack"), [
-    ("zstd", lambda data: zstandard.compress(data, level=1)), ("lz4", lz4.frame.compress),
-    ("none", bytes)])
+@pytest.mark.parametrize(
+    ("compression", "pack"),
+    [("zstd", lambda data: zstandard.compress(data, level=1)), ("lz4", lz4.frame.compress), ("none", bytes)],
+)
 def test_bag_is_compressed_as_asked(tmp_path, compression, pack):
     cloud = np.random.default_rng(0).normal(size=(2000, 4)).astype(np.float32)
     data = encode(make_cloud_message(cloud))
@@ -136,8 +136,7 @@ def test_bag_is_compressed_as_asked(tmp_path, compression, pack):
         for i in range(3):
             bag.write(POINTS, STAMP + i, data)
     with open(tmp_path / "bag/bag.mcap", "rb") as stream:
-        chunk, = (record for record in StreamReader(stream, emit_chunks=True).records
-                  if isinstance(record, Chunk))
+        (chunk,) = (record for record in StreamReader(stream, emit_chunks=True).records if isinstance(record, Chunk))
     assert chunk.compression == compression.replace("none", "")
     assert chunk.data == pack(decompress(chunk.data, chunk.compression, None))
     with Bag(tmp_path / "bag") as bag:
@@ -147,22 +146,21 @@ def test_bag_is_compressed_as_asked(tmp_path, compression, pack):
 def test_calibrations_are_latched_and_clouds_are_not(written):
     with Bag(written) as bag:
         for topic in bag.topics:
-            quality, = bag.qos(topic)
+            (quality,) = bag.qos(topic)
             latched = quality.durability.name == "TRANSIENT_LOCAL"
             assert latched == (topic in LATCHED)
             assert quality.reliability.name == "RELIABLE"
     with open(written / "drive.mcap", "rb") as stream:
         channels = make_reader(stream).get_summary().channels.values()
     for channel in channels:
-        quality, = yaml.safe_load(channel.metadata["offered_qos_profiles"])
+        (quality,) = yaml.safe_load(channel.metadata["offered_qos_profiles"])
         assert (quality["durability"] == "transient_local") == (channel.topic in LATCHED)
 
 
 def test_metadata_matches_the_file(written):
     info = yaml.safe_load((written / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     rows = message_bytes(written)
-    counts = {t["topic_metadata"]["name"]: t["message_count"]
-              for t in info["topics_with_message_count"]}
+    counts = {t["topic_metadata"]["name"]: t["message_count"] for t in info["topics_with_message_count"]}
     assert counts == {topic: sum(t == topic for t, _, _ in rows) for topic in counts}
     assert counts[POINTS] == 3 and counts[TRUTH] == 2 and IMAGE not in counts
     assert info["message_count"] == len(rows)
@@ -222,19 +220,17 @@ def test_messages_without_chunks_are_read_one_by_one(written, tmp_path, monkeypa
         writer, channels = Writer(out, use_chunking=False, enable_crcs=False), {}
         writer.start("ros2")
         found = list(make_reader(stream).iter_messages())
-        for schema, channel, message in sorted(found, key=lambda row: row[2].log_time,
-                                               reverse=reverse):
+        for schema, channel, message in sorted(found, key=lambda row: row[2].log_time, reverse=reverse):
             if channel.id not in channels:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(
-                    channel.topic, channel.message_encoding, number, channel.metadata)
-            writer.add_message(channels[channel.id], message.log_time, message.data,
-                               message.publish_time)
+                    channel.topic, channel.message_encoding, number, channel.metadata
+                )
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
         writer.finish()
     assert message_bytes(path) == rows
     read, pread = [], os.pread
-    monkeypatch.setattr(os, "pread", lambda file, size, at: read.append(size) or pread(
-        file, size, at))
+    monkeypatch.setattr(os, "pread", lambda file, size, at: read.append(size) or pread(file, size, at))
     with Bag(path) as bag:
         list(bag.raw_messages())
         read.clear()

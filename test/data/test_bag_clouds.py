@@ -31,8 +31,12 @@ def write_clouds(path, topic, kind, messages):
 @pytest.mark.parametrize("ros", [1, 2])
 def test_livox_bag_has_intensity_and_point_times(tmp_path, kind, ros):
     points = livox_points(50)
-    path = write_clouds(tmp_path / "bag", "/livox/lidar", kind, [
-        livox_message(points, kind.partition("/")[0], STAMP + i * 10**8) for i in range(3)])
+    path = write_clouds(
+        tmp_path / "bag",
+        "/livox/lidar",
+        kind,
+        [livox_message(points, kind.partition("/")[0], STAMP + i * 10**8) for i in range(3)],
+    )
     if ros == 1:
         path = as_ros1(path, tmp_path / "livox.bag")
     recording = open_recording(path)
@@ -51,16 +55,19 @@ def test_livox_bag_has_intensity_and_point_times(tmp_path, kind, ros):
 @pytest.mark.parametrize("packing", ["zlib", "zstd"])
 def test_compressed_clouds_are_read(tmp_path, packing):
     points = np.arange(40, dtype=np.float32).view([(name, "<f4") for name in "xyzi"])
-    path = write_clouds(tmp_path / "bag", f"/points/{packing}", COMPRESSED,
-                        [compressed_message(points, packing)] * 2)
+    path = write_clouds(tmp_path / "bag", f"/points/{packing}", COMPRESSED, [compressed_message(points, packing)] * 2)
     first, second = open_recording(path)
     assert np.array_equal(first.load().xyz, second.load().xyz) and len(first.load()) == 10
 
 
-@pytest.mark.parametrize("kind, words", [
-    (COMPRESSED, "compression .draco. is not supported"),
-    ("sensor_msgs/msg/LaserScan", "LaserScan on /scan cannot be read"),
-    ("velodyne_msgs/msg/VelodyneScan", "VelodyneScan on /scan .*play the bag to velodyne")])
+@pytest.mark.parametrize(
+    "kind, words",
+    [
+        (COMPRESSED, "compression .draco. is not supported"),
+        ("sensor_msgs/msg/LaserScan", "LaserScan on /scan cannot be read"),
+        ("velodyne_msgs/msg/VelodyneScan", "VelodyneScan on /scan .*play the bag to velodyne"),
+    ],
+)
 @pytest.mark.parametrize("points", ["", "/scan"])
 def test_unsupported_sensor_data_is_reported_with_remedy(tmp_path, kind, words, points):
     message = b"\0\1\0\0" + bytes(60)
@@ -69,8 +76,7 @@ def test_unsupported_sensor_data_is_reported_with_remedy(tmp_path, kind, words, 
     with open(tmp_path / "a.mcap", "wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2")
-        channel = writer.register_channel("/scan", "cdr",
-                                          writer.register_schema(kind, "ros2msg", b""))
+        channel = writer.register_channel("/scan", "cdr", writer.register_schema(kind, "ros2msg", b""))
         writer.add_message(channel, 1, message, 1)
         writer.finish()
     with pytest.raises(InputError, match=rf"a\.mcap.*{words}") as error:

@@ -36,8 +36,7 @@ def test_existing_bag_is_replaced_only_with_force(tmp_path):
     assert len(open_recording(path)) == 2
 
 
-@pytest.mark.parametrize("make", [lambda p: write(p / "bag", b"text"),
-                                  lambda p: write(p / "bag/notes.txt", b"text")])
+@pytest.mark.parametrize("make", [lambda p: write(p / "bag", b"text"), lambda p: write(p / "bag/notes.txt", b"text")])
 def test_force_replaces_only_bags(tmp_path, make):
     kept = make(tmp_path)
     with pytest.raises(InputError, match="is not a bag"):
@@ -85,13 +84,11 @@ def limit_file_size():
 
 
 @pytest.mark.no_cover
-def test_messages_written_before_the_disk_was_full_are_readable(tmp_path, monkeypatch,
-                                                                limit_file_size):
+def test_messages_written_before_the_disk_was_full_are_readable(tmp_path, monkeypatch, limit_file_size):
     """The disk may be full in a chunk, in the index, or in metadata.yaml."""
     monkeypatch.setattr(bag_module, "CHUNK_BYTES", 20_000)
     rng = np.random.default_rng(0)
-    drive = [Frame.of(str(i), cloud_frame(rng.random((1000, 4), np.float32), STAMP + i))
-             for i in range(5)]
+    drive = [Frame.of(str(i), cloud_frame(rng.random((1000, 4), np.float32), STAMP + i)) for i in range(5)]
     write_bag(tmp_path / "all", drive)
     whole = message_bytes(tmp_path / "all")
     size = (tmp_path / "all/all.mcap").stat().st_size
@@ -103,7 +100,7 @@ def test_messages_written_before_the_disk_was_full_are_readable(tmp_path, monkey
         limit_file_size(resource.RLIM_INFINITY)
         assert "\n" not in str(error.value) and not (tmp_path / "bag").exists()
         rows = message_bytes(tmp_path / "bag.incomplete")
-        assert rows == whole[:len(rows)]
+        assert rows == whole[: len(rows)]
         read.append(len(rows))
     assert read[0] == 0 and read[-1] == len(whole) and read == sorted(read)
     write_bag(tmp_path / "bag", drive)
@@ -148,18 +145,21 @@ def write_empty_mcap(path, profile):
         writer.finish()
 
 
-@pytest.mark.parametrize("name, make, words", [
-    ("missing", lambda p: None, "does not exist"),
-    ("folder", lambda p: p.mkdir(), "no metadata.yaml and 0 storage files"),
-    ("cloud.bin", lambda p: write(p, b"1234"), "is not a bag"),
-    ("empty.mcap", lambda p: write(p, b""), "truncated or damaged"),
-    ("text.mcap", lambda p: write(p, b"text " * 100), "truncated or damaged"),
-    ("old.mcap", lambda p: write_empty_mcap(p, "ros1"), "ROS 1 messages in MCAP; give the .bag"),
-    ("other.mcap", lambda p: write_empty_mcap(p, ""), "without ROS 2 messages (profile '')"),
-    ("text.db3", lambda p: write(p, b"text " * 100), "truncated or damaged"),
-    ("bag", lambda p: write(p / "metadata.yaml", "text"), "truncated or damaged"),
-    ("bag", lambda p: write(p / "metadata.yaml", "a: [\n"), "truncated or damaged"),
-])
+@pytest.mark.parametrize(
+    "name, make, words",
+    [
+        ("missing", lambda p: None, "does not exist"),
+        ("folder", lambda p: p.mkdir(), "no metadata.yaml and 0 storage files"),
+        ("cloud.bin", lambda p: write(p, b"1234"), "is not a bag"),
+        ("empty.mcap", lambda p: write(p, b""), "truncated or damaged"),
+        ("text.mcap", lambda p: write(p, b"text " * 100), "truncated or damaged"),
+        ("old.mcap", lambda p: write_empty_mcap(p, "ros1"), "ROS 1 messages in MCAP; give the .bag"),
+        ("other.mcap", lambda p: write_empty_mcap(p, ""), "without ROS 2 messages (profile '')"),
+        ("text.db3", lambda p: write(p, b"text " * 100), "truncated or damaged"),
+        ("bag", lambda p: write(p / "metadata.yaml", "text"), "truncated or damaged"),
+        ("bag", lambda p: write(p / "metadata.yaml", "a: [\n"), "truncated or damaged"),
+    ],
+)
 def test_invalid_bag_is_reported_in_one_line(tmp_path, name, make, words):
     make(tmp_path / name)
     with pytest.raises(InputError) as error:
@@ -200,9 +200,9 @@ def read_unless_damaged(path):
 
 
 DAMAGES = {
-    "deleted": lambda raw, at: raw[:at] + raw[at + 1:],
+    "deleted": lambda raw, at: raw[:at] + raw[at + 1 :],
     "inserted": lambda raw, at: raw[:at] + b"\x91" + raw[at:],
-    "flipped": lambda raw, at: raw[:at] + bytes([raw[at] ^ 1 << at % 8]) + raw[at + 1:],
+    "flipped": lambda raw, at: raw[:at] + bytes([raw[at] ^ 1 << at % 8]) + raw[at + 1 :],
 }
 
 
@@ -214,8 +214,7 @@ def test_damaged_byte_is_reported_or_changes_nothing(written, tmp_path, damage):
     path, reported = tmp_path / "drive.mcap", 0
     with open(written / "drive.mcap", "rb") as stream:
         chunk = make_reader(stream).get_summary().chunk_indexes[0].chunk_start_offset
-    offsets = [*range(8, len(raw), len(raw) // 40), *range(chunk, chunk + 60, 3),
-               *range(len(raw) - 4000, len(raw), 41)]
+    offsets = [*range(8, len(raw), len(raw) // 40), *range(chunk, chunk + 60, 3), *range(len(raw) - 4000, len(raw), 41)]
     for at in offsets:
         path.write_bytes(damage(raw, at))
         rows = read_unless_damaged(path)
@@ -230,8 +229,11 @@ def test_index_without_checksum_is_compared_with_the_data(written, tmp_path):
     raw = source.read_bytes()
     with open(source, "rb") as stream:
         index = make_reader(stream).get_summary().chunk_indexes[0]
-    at = raw.index(struct.pack("<QQQQ", index.message_start_time, index.message_end_time,
-                               index.chunk_start_offset, index.chunk_length))
+    at = raw.index(
+        struct.pack(
+            "<QQQQ", index.message_start_time, index.message_end_time, index.chunk_start_offset, index.chunk_length
+        )
+    )
     assert read_unless_damaged(source) == message_bytes(written)
     path = tmp_path / "drive.mcap"
     for byte in range(at, at + 32):
@@ -243,7 +245,7 @@ def test_chunk_that_declares_terabytes_is_rejected(written, tmp_path):
     raw = bytearray((written / "drive.mcap").read_bytes())
     with open(written / "drive.mcap", "rb") as stream:
         at = make_reader(stream).get_summary().chunk_indexes[0].chunk_start_offset
-    raw[at + 9 + 16:at + 9 + 24] = struct.pack("<Q", 2**41)
+    raw[at + 9 + 16 : at + 9 + 24] = struct.pack("<Q", 2**41)
     (tmp_path / "drive.mcap").write_bytes(raw)
     with pytest.raises(InputError, match="size of 2199023255552 bytes"):
         Bag(tmp_path / "drive.mcap")
@@ -255,8 +257,7 @@ def test_bag_without_clouds_lists_its_topics(tmp_path):
         bag.write("/text", 1, bag_message("std_msgs/msg/String", data="hello"))
     with pytest.raises(InputError) as error:
         open_recording(tmp_path / "bag")
-    for word in (str(tmp_path / "bag"), "no sensor_msgs/PointCloud2", "/text (std_msgs/msg/String)",
-                 "driver"):
+    for word in (str(tmp_path / "bag"), "no sensor_msgs/PointCloud2", "/text (std_msgs/msg/String)", "driver"):
         assert word in str(error.value)
 
 

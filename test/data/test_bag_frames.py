@@ -24,8 +24,7 @@ from msg_utils.point_cloud2 import from_array
 
 
 def same_frames(a, b):
-    return (a.name, a.stamp_ns, a.index) == (b.name, b.stamp_ns, b.index) and np.array_equal(
-        a.load().xyz, b.load().xyz)
+    return (a.name, a.stamp_ns, a.index) == (b.name, b.stamp_ns, b.index) and np.array_equal(a.load().xyz, b.load().xyz)
 
 
 def test_indexed_frames_equal_iterated_frames(written, tmp_path):
@@ -58,8 +57,7 @@ def find_scene(frame):
 def test_first_frame_needs_no_scan_of_the_bag(written, monkeypatch):
     """Scanning an hour of clouds takes minutes, and many commands need the first one only."""
     stamped = []
-    monkeypatch.setattr(bag_frames.BagFrames, "_stamp",
-                        lambda self, data, time: stamped.append(time) or time)
+    monkeypatch.setattr(bag_frames.BagFrames, "_stamp", lambda self, data, time: stamped.append(time) or time)
     frames = open_recording(written).frames
     assert frames[0].index == frames[-3].index == 0 and len({*stamped}) == 1
     assert frames[1].index == 1 and len({*stamped}) == 3
@@ -105,8 +103,7 @@ def test_converted_bag_equals_the_recording(tmp_path, kind):
             assert again.labels == truth.labels and len(again.notes) == len(truth.notes)
             for a, b in zip(again.extras, truth.extras, strict=True):
                 assert a.keys() == b.keys()
-                np.testing.assert_equal([a.get("track_id"), a.get("category")],
-                                        [b.get("track_id"), b.get("category")])
+                np.testing.assert_equal([a.get("track_id"), a.get("category")], [b.get("track_id"), b.get("category")])
     with Bag(tmp_path / "made") as converted:  # the calibration is written when it changes
         assert converted.counts[CAMERA_INFO] == (CAMERA in recording.has) * (1 + (kind == "bag"))
 
@@ -128,9 +125,10 @@ def test_scan_with_negative_stamp_is_skipped_and_reported(tmp_path):
     assert "-5" in skipped[0] and open_recording(tmp_path / "bag").frames[0].stamp_ns == 7
 
 
-@pytest.mark.parametrize("stamps, expected", [
-    ([0, 1, 2], [0, 1, 2]), ([0, 0, 2], [0, 0, 2]), ([5, 0, 2], [5, 0, 2]), ([0, 0], [70, 71]),
-    ([0], [70])])
+@pytest.mark.parametrize(
+    "stamps, expected",
+    [([0, 1, 2], [0, 1, 2]), ([0, 0, 2], [0, 0, 2]), ([5, 0, 2], [5, 0, 2]), ([0, 0], [70, 71]), ([0], [70])],
+)
 def test_zero_stamps_are_replaced_only_if_all_are_zero(tmp_path, stamps, expected):
     """Simulated time starts at 0; drivers that set no stamp leave all of them 0."""
     with BagWriter(tmp_path / "bag") as bag:

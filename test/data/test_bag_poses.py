@@ -2,20 +2,7 @@
 
 import numpy as np
 import pytest
-from robot_bags import (
-    CLOUDS,
-    ON_BASE,
-    START,
-    base_at,
-    check,
-    mount,
-    moving,
-    moving_tf,
-    recorded,
-    stamps,
-    tf,
-    transform,
-)
+from robot_bags import CLOUDS, ON_BASE, START, base_at, check, mount, moving, moving_tf, recorded, stamps, tf, transform
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.data.bag_poses import FILTERED, choose_odometry_topic
@@ -39,11 +26,18 @@ def wheel_transforms():
         yield TF, TF_MESSAGE, stamp, tf(transform("base_link", "wheel", stamp, np.eye(4)))
 
 
-@pytest.mark.parametrize("parts", [
-    (moving(ODOMETRY), mount()), (moving(FILTERED), mount()), (moving("/kiss/odometry"), mount()),
-    (moving_tf(), mount()), (moving(ODOMETRY), moving("/wheels", "wheels"), moving_tf(), mount()),
-    (wheel_transforms(), moving_tf(), mount()),
-], ids=["odom", "filtered", "the only one", "TF", "all of them", "late TF"])
+@pytest.mark.parametrize(
+    "parts",
+    [
+        (moving(ODOMETRY), mount()),
+        (moving(FILTERED), mount()),
+        (moving("/kiss/odometry"), mount()),
+        (moving_tf(), mount()),
+        (moving(ODOMETRY), moving("/wheels", "wheels"), moving_tf(), mount()),
+        (wheel_transforms(), moving_tf(), mount()),
+    ],
+    ids=["odom", "filtered", "the only one", "TF", "all of them", "late TF"],
+)
 def test_poses_come_from_odometry_and_tf_at_cloud_times(tmp_path, parts):
     check(recorded(tmp_path / "bag", *map(list, parts)))
 
@@ -60,13 +54,13 @@ def test_odometry_of_another_frame_is_transformed_to_the_sensor(tmp_path):
     """Such as an IMU, or a base_footprint below the base."""
     imu = make_tilted_pose(0.1, 0.2, 0.3)
     mounting = [(TF_STATIC, TF_MESSAGE, START, tf(transform("base_link", "imu", 0, imu)))]
-    check(recorded(tmp_path / "bag", moving(ODOMETRY, "imu"), mount(), mounting),
-          invert_pose(imu) @ ON_BASE)
+    check(recorded(tmp_path / "bag", moving(ODOMETRY, "imu"), mount(), mounting), invert_pose(imu) @ ON_BASE)
 
 
 def test_clouds_in_the_odometry_frame_do_not_move(tmp_path):
-    still = recorded(tmp_path / "bag", moving(ODOMETRY), cloud=lambda stamp: make_cloud_message(
-        np.ones((3, 4)), stamp, "odom"))
+    still = recorded(
+        tmp_path / "bag", moving(ODOMETRY), cloud=lambda stamp: make_cloud_message(np.ones((3, 4)), stamp, "odom")
+    )
     assert all(np.array_equal(frame.pose(), np.eye(4)) for frame in still)
 
 
@@ -98,16 +92,36 @@ def test_no_pose_is_guessed(tmp_path):
     assert POSES not in fixed.has and [frame.pose() for frame in fixed] == [None] * CLOUDS
     two = recorded(tmp_path / "two", moving("/left"), moving("/right"))
     assert POSES not in two.has
-    short = recorded(tmp_path / "short", moving(ODOMETRY, "lidar", seconds=-1),
-                     [(ODOMETRY, ODOMETRY_MESSAGE, START - SECOND_NS, make_odometry(
-                         base_at(START), make_header(START - SECOND_NS, "odom", bag_message),
-                         "lidar", bag_message))])
+    short = recorded(
+        tmp_path / "short",
+        moving(ODOMETRY, "lidar", seconds=-1),
+        [
+            (
+                ODOMETRY,
+                ODOMETRY_MESSAGE,
+                START - SECOND_NS,
+                make_odometry(
+                    base_at(START), make_header(START - SECOND_NS, "odom", bag_message), "lidar", bag_message
+                ),
+            )
+        ],
+    )
     assert [frame.pose() for frame in short] == [None] * CLOUDS  # it ends a second before
-    circle = recorded(tmp_path / "circle", [(TF_STATIC, TF_MESSAGE, START, tf(
-        transform("a", "lidar", 0, np.eye(4)), transform("lidar", "a", 0, np.eye(4))))])
+    circle = recorded(
+        tmp_path / "circle",
+        [
+            (
+                TF_STATIC,
+                TF_MESSAGE,
+                START,
+                tf(transform("a", "lidar", 0, np.eye(4)), transform("lidar", "a", 0, np.eye(4))),
+            )
+        ],
+    )
     assert POSES not in circle.has
-    other = recorded(tmp_path / "other", [(TF, "std_msgs/msg/String", START, bag_message(
-        "std_msgs/msg/String", data="text"))])
+    other = recorded(
+        tmp_path / "other", [(TF, "std_msgs/msg/String", START, bag_message("std_msgs/msg/String", data="text"))]
+    )
     assert POSES not in other.has
 
 

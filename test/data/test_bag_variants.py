@@ -37,8 +37,19 @@ def rows(written):
     return message_bytes(written)
 
 
-def write_mcap(path, bag, rows, *, profile="ros2", encoding="cdr", definition="ros2msg",
-               short_names=False, channels=1, late=False, **options):
+def write_mcap(
+    path,
+    bag,
+    rows,
+    *,
+    profile="ros2",
+    encoding="cdr",
+    definition="ros2msg",
+    short_names=False,
+    channels=1,
+    late=False,
+    **options,
+):
     """Write rows to `channels` channels per topic. With `late`, all channels are defined first."""
     with open(path, "wb") as stream:
         writer = Writer(stream, **options)
@@ -48,8 +59,7 @@ def write_mcap(path, bag, rows, *, profile="ros2", encoding="cdr", definition="r
         def channel(topic, number):
             if (topic, number) not in known:
                 kind = bag.topics[topic]
-                schema = writer.register_schema(kind.replace("/msg", "") if short_names else kind,
-                                                definition, b"")
+                schema = writer.register_schema(kind.replace("/msg", "") if short_names else kind, definition, b"")
                 known[topic, number] = writer.register_channel(topic, encoding, schema, {})
             return known[topic, number]
 
@@ -62,21 +72,46 @@ def write_mcap(path, bag, rows, *, profile="ros2", encoding="cdr", definition="r
     return path
 
 
-NO_SUMMARY = dict(index_types=IndexType.NONE, repeat_channels=False, repeat_schemas=False,
-                  use_statistics=False, use_summary_offsets=False)
+NO_SUMMARY = dict(
+    index_types=IndexType.NONE,
+    repeat_channels=False,
+    repeat_schemas=False,
+    use_statistics=False,
+    use_summary_offsets=False,
+)
 
 
-@pytest.mark.parametrize("options", [
-    {}, dict(chunk_size=1), dict(index_types=IndexType.CHUNK), dict(index_types=IndexType.MESSAGE),
-    dict(index_types=IndexType.NONE), dict(repeat_channels=False), dict(repeat_schemas=False),
-    dict(chunk_size=1, late=True, repeat_channels=False, repeat_schemas=False),
-    dict(use_statistics=False), dict(use_summary_offsets=False), NO_SUMMARY,
-    dict(use_chunking=False), dict(use_chunking=False, **NO_SUMMARY), dict(enable_crcs=False),
-    dict(enable_data_crcs=True), dict(compression=CompressionType.LZ4),
-    dict(compression=CompressionType.NONE, chunk_size=1), dict(profile=""), dict(profile="other"),
-    dict(definition="ros2idl"), dict(definition="unknown"), dict(definition=""),
-    dict(short_names=True), dict(encoding=""), dict(channels=3),
-], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        dict(chunk_size=1),
+        dict(index_types=IndexType.CHUNK),
+        dict(index_types=IndexType.MESSAGE),
+        dict(index_types=IndexType.NONE),
+        dict(repeat_channels=False),
+        dict(repeat_schemas=False),
+        dict(chunk_size=1, late=True, repeat_channels=False, repeat_schemas=False),
+        dict(use_statistics=False),
+        dict(use_summary_offsets=False),
+        NO_SUMMARY,
+        dict(use_chunking=False),
+        dict(use_chunking=False, **NO_SUMMARY),
+        dict(enable_crcs=False),
+        dict(enable_data_crcs=True),
+        dict(compression=CompressionType.LZ4),
+        dict(compression=CompressionType.NONE, chunk_size=1),
+        dict(profile=""),
+        dict(profile="other"),
+        dict(definition="ros2idl"),
+        dict(definition="unknown"),
+        dict(definition=""),
+        dict(short_names=True),
+        dict(encoding=""),
+        dict(channels=3),
+    ],
+    ids=str,
+)
 def test_mcap_file_of_any_writer_is_read(written, rows, tmp_path, options):
     with Bag(written) as bag:
         path = write_mcap(tmp_path / "a.mcap", bag, rows, **options)
@@ -91,11 +126,9 @@ def test_mcap_file_of_any_writer_is_read(written, rows, tmp_path, options):
 def test_messages_inside_and_outside_chunks_are_merged(written, rows, tmp_path):
     """The MCAP specification allows both in one file."""
     with Bag(written) as bag:
-        plain = write_mcap(tmp_path / "a", bag, rows[::2], late=True,
-                           use_chunking=False, **NO_SUMMARY)
-        chunked = write_mcap(tmp_path / "b", bag, rows[1::2], late=True, chunk_size=1,
-                             **NO_SUMMARY)
-    body, end = plain.read_bytes()[:-37 - 13], chunked.read_bytes()
+        plain = write_mcap(tmp_path / "a", bag, rows[::2], late=True, use_chunking=False, **NO_SUMMARY)
+        chunked = write_mcap(tmp_path / "b", bag, rows[1::2], late=True, chunk_size=1, **NO_SUMMARY)
+    body, end = plain.read_bytes()[: -37 - 13], chunked.read_bytes()
     header = 8 + 9 + int.from_bytes(end[9:17], "little")
     (tmp_path / "c.mcap").write_bytes(body + end[header:])
     assert sorted(message_bytes(tmp_path / "c.mcap")) == sorted(rows)
@@ -106,11 +139,11 @@ def test_unreadable_topics_do_not_affect_others(written, rows, tmp_path):
         writer = Writer(stream)
         writer.start(profile="")
         for topic, kind, definition, encoding in (
-                (POINTS, "sensor_msgs/msg/PointCloud2", "ros2msg", "cdr"),
-                ("/state", STATE, "unknown", "cdr"), ("/log", "foxglove.Log", "protobuf",
-                                                      "protobuf")):
-            channel = writer.register_channel(
-                topic, encoding, writer.register_schema(kind, definition, b""))
+            (POINTS, "sensor_msgs/msg/PointCloud2", "ros2msg", "cdr"),
+            ("/state", STATE, "unknown", "cdr"),
+            ("/log", "foxglove.Log", "protobuf", "protobuf"),
+        ):
+            channel = writer.register_channel(topic, encoding, writer.register_schema(kind, definition, b""))
             for name, time, data in rows:
                 if name == POINTS:
                     writer.add_message(channel, time, data, time)
@@ -129,22 +162,19 @@ def test_topic_with_two_types_is_read_as_the_frequent_one(written, rows, tmp_pat
         writer = Writer(stream)
         writer.start(profile="ros2")
         for kind, found in ((STATE, clouds[:1]), ("sensor_msgs/msg/PointCloud2", clouds)):
-            channel = writer.register_channel(POINTS, "cdr",
-                                              writer.register_schema(kind, "ros2msg", b""))
+            channel = writer.register_channel(POINTS, "cdr", writer.register_schema(kind, "ros2msg", b""))
             for _, time, data in found:
                 writer.add_message(channel, time, data, time)
         writer.finish()
-    with pytest.warns(InputWarning, match=f"of several types; only .*PointCloud2 is read, "
-                                          f"not 1 of {STATE}"):
+    with pytest.warns(InputWarning, match=f"of several types; only .*PointCloud2 is read, not 1 of {STATE}"):
         assert message_bytes(tmp_path / "a.mcap") == clouds
 
 
 SCHEMAS = {  # columns of topics by distribution
     "dashing": "id INTEGER PRIMARY KEY, name TEXT, type TEXT",
-    "foxy": "id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, "
-            "offered_qos_profiles TEXT",
+    "foxy": "id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, offered_qos_profiles TEXT",
     "jazzy": "id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, "
-             "offered_qos_profiles TEXT, type_description_hash TEXT",
+    "offered_qos_profiles TEXT, type_description_hash TEXT",
 }
 
 
@@ -155,19 +185,21 @@ def write_sqlite(path, bag, rows, schema="jazzy", mode="DELETE"):
     database.execute("PRAGMA wal_autocheckpoint=0")
     columns = SCHEMAS[schema]
     database.execute(f"CREATE TABLE topics({columns})")
-    database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, "
-                     "timestamp INTEGER, data BLOB)")
-    database.execute("CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT, "
-                     "encoding TEXT, encoded_message_definition TEXT, type_description_hash TEXT)")
+    database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+    database.execute(
+        "CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT, "
+        "encoding TEXT, encoded_message_definition TEXT, type_description_hash TEXT)"
+    )
     ids = {topic: i for i, topic in enumerate(bag.topics, 1)}
     for topic, i in ids.items():
-        values = [i, topic, bag.topics[topic], "cdr", "", ""][:columns.count(",") + 1]
+        values = [i, topic, bag.topics[topic], "cdr", "", ""][: columns.count(",") + 1]
         database.execute(f"INSERT INTO topics VALUES({','.join('?' * len(values))})", values)
-        database.execute("INSERT INTO message_definitions VALUES(?, ?, 'unknown', '', '')",
-                         (i, bag.topics[topic]))
-    for part in (rows[:len(rows) // 2], rows[len(rows) // 2:]):
-        database.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)",
-                             [(ids[topic], time, data) for topic, time, data in part])
+        database.execute("INSERT INTO message_definitions VALUES(?, ?, 'unknown', '', '')", (i, bag.topics[topic]))
+    for part in (rows[: len(rows) // 2], rows[len(rows) // 2 :]):
+        database.executemany(
+            "INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)",
+            [(ids[topic], time, data) for topic, time, data in part],
+        )
         database.commit()
         if part[0] is rows[0]:
             database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -189,7 +221,7 @@ def test_sqlite_wal_is_read_from_a_read_only_folder(written, rows, tmp_path, shm
     with Bag(written) as bag:
         database = write_sqlite(tmp_path / "a.db3", bag, rows, mode="WAL")
     (tmp_path / "bag").mkdir()
-    for end in ("", "-wal", "-shm")[:3 if shm else 2]:
+    for end in ("", "-wal", "-shm")[: 3 if shm else 2]:
         shutil.copy(tmp_path / f"a.db3{end}", tmp_path / "bag")
     database.close()
     files = {file: file.read_bytes() for file in (tmp_path / "bag").iterdir()}
@@ -216,43 +248,54 @@ def update_topics(info, **values):
         topic["topic_metadata"].update(values)
 
 
-@pytest.mark.parametrize("change", [
-    lambda info: info.update(storage_identifier=""),
-    lambda info: info.pop("storage_identifier"),
-    lambda info: info.update(storage_identifier="my_plugin"),
-    lambda info: info.update(version=10),
-    lambda info: info.update(version=1, relative_file_paths=["drive/drive.mcap"]),
-    lambda info: [info.pop(key) for key in ("files", "custom_data", "ros_distro",
-                                            "compression_format", "compression_mode")],
-    lambda info: info.update(files=[]),
-    lambda info: info.update(topics_with_message_count=[]),
-    lambda info: update_topics(info, offered_qos_profiles=""),
-    lambda info: update_topics(info, offered_qos_profiles=[]),
-    lambda info: update_topics(info, offered_qos_profiles="- history: [\n"),
-    lambda info: update_topics(info, offered_qos_profiles="- infinite"),
-    lambda info: update_topics(info, offered_qos_profiles=[{"deadline": "infinite"}]),
-    lambda info: update_topics(info, type_description_hash="RIHS01_0", serialization_format=""),
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda info: info.update(storage_identifier=""),
+        lambda info: info.pop("storage_identifier"),
+        lambda info: info.update(storage_identifier="my_plugin"),
+        lambda info: info.update(version=10),
+        lambda info: info.update(version=1, relative_file_paths=["drive/drive.mcap"]),
+        lambda info: [
+            info.pop(key) for key in ("files", "custom_data", "ros_distro", "compression_format", "compression_mode")
+        ],
+        lambda info: info.update(files=[]),
+        lambda info: info.update(topics_with_message_count=[]),
+        lambda info: update_topics(info, offered_qos_profiles=""),
+        lambda info: update_topics(info, offered_qos_profiles=[]),
+        lambda info: update_topics(info, offered_qos_profiles="- history: [\n"),
+        lambda info: update_topics(info, offered_qos_profiles="- infinite"),
+        lambda info: update_topics(info, offered_qos_profiles=[{"deadline": "infinite"}]),
+        lambda info: update_topics(info, type_description_hash="RIHS01_0", serialization_format=""),
+    ],
+)
 def test_irrelevant_metadata_changes_nothing(written, rows, tmp_path, change):
     path = copy_with_metadata(written, tmp_path / "bag", change)
     assert message_bytes(path) == rows
     assert len(open_recording(path)) == 3
 
 
-@pytest.mark.parametrize("text, durability, depth", [
-    ("- history: 1\n  depth: 7\n  reliability: 2\n  durability: 1", "TRANSIENT_LOCAL", 7),
-    ("- history: keep_last\n  depth: 7\n  reliability: best_effort\n  durability: volatile\n"
-     "  deadline: {sec: 2147483647, nsec: 4294967295}\n  lifespan: infinite", "VOLATILE", 7),
-])
+@pytest.mark.parametrize(
+    "text, durability, depth",
+    [
+        ("- history: 1\n  depth: 7\n  reliability: 2\n  durability: 1", "TRANSIENT_LOCAL", 7),
+        (
+            "- history: keep_last\n  depth: 7\n  reliability: best_effort\n  durability: volatile\n"
+            "  deadline: {sec: 2147483647, nsec: 4294967295}\n  lifespan: infinite",
+            "VOLATILE",
+            7,
+        ),
+    ],
+)
 def test_qos_in_metadata_takes_precedence(written, tmp_path, text, durability, depth):
-    path = copy_with_metadata(written, tmp_path / "bag",
-                              lambda info: update_topics(info, offered_qos_profiles=text))
+    path = copy_with_metadata(written, tmp_path / "bag", lambda info: update_topics(info, offered_qos_profiles=text))
     with Bag(path) as bag:
-        profile, = bag.qos(POINTS)
+        (profile,) = bag.qos(POINTS)
         assert (profile.durability.name, profile.depth) == (durability, depth)
         assert profile.reliability.name == "BEST_EFFORT"
-    path = copy_with_metadata(written, tmp_path / "other",
-                              lambda info: update_topics(info, offered_qos_profiles="nonsense"))
+    path = copy_with_metadata(
+        written, tmp_path / "other", lambda info: update_topics(info, offered_qos_profiles="nonsense")
+    )
     with Bag(path) as bag:
         assert bag.qos(EXTRINSICS)[0].durability.name == "TRANSIENT_LOCAL"
 
@@ -262,29 +305,34 @@ def set_counts(info, count):
         topic["message_count"] = count
 
 
-@pytest.mark.parametrize("change, words", [
-    (lambda info: set_counts(info, 5),
-     "it declares 5 messages on /camera/camera_info, the files have 2.*and 2 more"),
-    (lambda info: set_counts(info, -1), "it declares -1 messages"),
-    (lambda info: set_counts(info, "1,5"), "'1,5' for message_count"),
-    (lambda info: set_counts(info, 2.5), "2.5 for message_count"),
-    (lambda info: update_topics(info, name=3), "topic 3 has the type"),
-    (lambda info: update_topics(info, type=[1]), r"the type \[1\]"),
-    (lambda info: info["duration"].update(nanoseconds=10**8), "a duration of 0.100 s instead of 0"),
-    (lambda info: info["duration"].update(nanoseconds=10**30), "a duration of"),
-    (lambda info: info["starting_time"].update(nanoseconds_since_epoch=0), "a start of 0.000 s"),
-    (lambda info: info.pop("duration"), "KeyError: 'duration'"),
-    (lambda info: info.update(relative_file_paths=["a.mcap", "b.mcap"]),
-     "it names a.mcap, b.mcap instead of drive.mcap"),
-    (lambda info: info.clear(), "KeyError: 'relative_file_paths'"),
-])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (
+            lambda info: set_counts(info, 5),
+            "it declares 5 messages on /camera/camera_info, the files have 2.*and 2 more",
+        ),
+        (lambda info: set_counts(info, -1), "it declares -1 messages"),
+        (lambda info: set_counts(info, "1,5"), "'1,5' for message_count"),
+        (lambda info: set_counts(info, 2.5), "2.5 for message_count"),
+        (lambda info: update_topics(info, name=3), "topic 3 has the type"),
+        (lambda info: update_topics(info, type=[1]), r"the type \[1\]"),
+        (lambda info: info["duration"].update(nanoseconds=10**8), "a duration of 0.100 s instead of 0"),
+        (lambda info: info["duration"].update(nanoseconds=10**30), "a duration of"),
+        (lambda info: info["starting_time"].update(nanoseconds_since_epoch=0), "a start of 0.000 s"),
+        (lambda info: info.pop("duration"), "KeyError: 'duration'"),
+        (
+            lambda info: info.update(relative_file_paths=["a.mcap", "b.mcap"]),
+            "it names a.mcap, b.mcap instead of drive.mcap",
+        ),
+        (lambda info: info.clear(), "KeyError: 'relative_file_paths'"),
+    ],
+)
 def test_wrong_metadata_causes_one_warning(written, rows, tmp_path, change, words):
     path = copy_with_metadata(written, tmp_path / "bag", change)
-    with pytest.warns(InputWarning,
-                      match=f"bag/metadata.yaml does not match the bag: .*{words}") as caught:
+    with pytest.warns(InputWarning, match=f"bag/metadata.yaml does not match the bag: .*{words}") as caught:
         recording = open_recording(path)
-        assert [len(frame.load()) for frame in recording] == [
-            len(frame.load()) for frame in open_recording(written)]
+        assert [len(frame.load()) for frame in recording] == [len(frame.load()) for frame in open_recording(written)]
         recording.frames[2].load()
     assert len(caught) == 1 and "\n" not in str(caught[0].message)
     with pytest.warns(InputWarning), Bag(path) as bag:
@@ -293,8 +341,9 @@ def test_wrong_metadata_causes_one_warning(written, rows, tmp_path, change, word
 
 
 def test_unsupported_compression_is_reported(written, tmp_path):
-    path = copy_with_metadata(written, tmp_path / "bag", lambda info: info.update(
-        compression_mode="FILE", compression_format="lz4"))
+    path = copy_with_metadata(
+        written, tmp_path / "bag", lambda info: info.update(compression_mode="FILE", compression_format="lz4")
+    )
     with pytest.raises(InputError, match=r"compressed by lz4, which is not supported; .*ros2 bag"):
         Bag(path)
 
@@ -315,7 +364,7 @@ def compress(data: bytes) -> bytes:
 @pytest.mark.parametrize("metadata", [True, False])
 def test_compressed_files_are_read(written, rows, tmp_path, storage, metadata):
     path = copy_bag(written, tmp_path / "bag", storage)
-    file, = (file for file in path.iterdir() if file.suffix != ".yaml")
+    (file,) = (file for file in path.iterdir() if file.suffix != ".yaml")
     (path / f"{file.name}.zstd").write_bytes(compress(file.read_bytes()))
     file.unlink()
     text = (path / "metadata.yaml").read_text()
@@ -331,8 +380,7 @@ def test_compressed_files_are_read(written, rows, tmp_path, storage, metadata):
 
 def test_compressed_messages_are_read(written, rows, tmp_path):
     with Bag(written) as bag:
-        path = write_mcap(tmp_path / "a.mcap", bag,
-                          [(topic, time, compress(data)) for topic, time, data in rows])
+        path = write_mcap(tmp_path / "a.mcap", bag, [(topic, time, compress(data)) for topic, time, data in rows])
     assert message_bytes(path) == rows
 
 
@@ -346,10 +394,10 @@ def write_parts(folder, stamps):
         yield folder / f"part{i}"
 
 
-@pytest.mark.parametrize("kind", ["drive_{}.mcap", "drive_{}.db3", "drive_2024-01-01_{}.bag",
-                                  "any{}.bag"])
-@pytest.mark.parametrize("stamps", [([10, 20], [30, 40], [50]), ([50, 60], [30], [10, 20]),
-                                    ([10, 30, 50], [20, 40], [30]), ([], [10], [])])
+@pytest.mark.parametrize("kind", ["drive_{}.mcap", "drive_{}.db3", "drive_2024-01-01_{}.bag", "any{}.bag"])
+@pytest.mark.parametrize(
+    "stamps", [([10, 20], [30, 40], [50]), ([50, 60], [30], [10, 20]), ([10, 30, 50], [20, 40], [30]), ([], [10], [])]
+)
 def test_files_of_a_drive_are_read_in_order_of_time(tmp_path, kind, stamps):
     """Without metadata.yaml, as after a crash or from ROS 1; the files may overlap in time."""
     (tmp_path / "drive").mkdir()
@@ -367,8 +415,7 @@ def test_files_of_a_drive_are_read_in_order_of_time(tmp_path, kind, stamps):
         assert [time for _, time, _ in bag.raw_messages()] == times
         assert bag.counts == {"/text": len(times)}
         assert (bag.start_ns, bag.end_ns) == (times[0], times[-1] + 1)
-        assert [time for _, time, _ in bag.raw_messages(None, 20, 40)] == [
-            time for time in times if 20 <= time < 40]
+        assert [time for _, time, _ in bag.raw_messages(None, 20, 40)] == [time for time in times if 20 <= time < 40]
 
 
 def test_folder_of_ros1_bags_is_one_drive(written, tmp_path):
@@ -382,5 +429,4 @@ def test_folder_of_ros1_bags_is_one_drive(written, tmp_path):
             as_ros1(tmp_path / f"part{i}", tmp_path / f"drive/drive_{i}.bag", "bz2")
     recording, expected = open_recording(tmp_path / "drive"), open_recording(written)
     assert "ROS 1 bag, clouds on /points" in str(recording)
-    assert [(f.stamp_ns, len(f.load())) for f in recording] == [
-        (f.stamp_ns, len(f.load())) for f in expected]
+    assert [(f.stamp_ns, len(f.load())) for f in recording] == [(f.stamp_ns, len(f.load())) for f in expected]

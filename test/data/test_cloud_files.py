@@ -19,13 +19,15 @@ PROPERTIES = {"f4": "float", "f8": "float64", "u1": "uchar", "i2": "int16"}
 
 
 def load(path):
-    frame, = open_recording(path)
+    (frame,) = open_recording(path)
     return frame.load()
 
 
 def header(fields="x y z intensity", types="F F F F", sizes="4 4 4 4", data="binary", more=""):
-    return (f"# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE {sizes}\nTYPE {types}\n{more}"
-            f"WIDTH {len(CLOUD)}\nHEIGHT 1\nPOINTS {len(CLOUD)}\nDATA {data}\n")
+    return (
+        f"# .PCD v0.7\nVERSION 0.7\nFIELDS {fields}\nSIZE {sizes}\nTYPE {types}\n{more}"
+        f"WIDTH {len(CLOUD)}\nHEIGHT 1\nPOINTS {len(CLOUD)}\nDATA {data}\n"
+    )
 
 
 def text(columns=CLOUD, form="{:.6f}"):
@@ -37,30 +39,39 @@ def padded(count0):
     kind = np.dtype([("xyz", "<f4", 3), ("pad", "V4"), ("intensity", "<f4"), ("end", "V2")])
     made = np.zeros(len(CLOUD), kind)
     made["xyz"], made["intensity"] = CLOUD[:, :3], CLOUD[:, 3]
-    return (header(f"x y z _ intensity {count0} _", "F F F U F U U", "4 4 4 1 4 1 1",
-                   more="COUNT 1 1 1 4 1 0 2\n").encode() + made.tobytes())
+    return (
+        header(f"x y z _ intensity {count0} _", "F F F U F U U", "4 4 4 1 4 1 1", more="COUNT 1 1 1 4 1 0 2\n").encode()
+        + made.tobytes()
+    )
 
 
 PCD = {
     "upper-case suffix": ("one.PCD", header().encode() + CLOUD.tobytes()),
-    "upper-case fields": ("one.pcd", header("X Y Z Intensity", sizes="8 8 8 8").encode()
-                          + CLOUD.astype("<f8").tobytes()),
+    "upper-case fields": (
+        "one.pcd",
+        header("X Y Z Intensity", sizes="8 8 8 8").encode() + CLOUD.astype("<f8").tobytes(),
+    ),
     "other names": ("one.pcd", header("x y z scalar_Reflectance").encode() + CLOUD.tobytes()),
-    "COLUMNS": ("one.pcd", (header(data="ascii").replace("FIELDS", "COLUMNS").replace(
-        "0.7", ".5") + text()).encode()),
-    "no TYPE and SIZE": ("one.pcd", ("\n".join(line for line in header(data="ascii").split("\n")
-                                               if line[:4] not in ("TYPE", "SIZE"))
-                                     + text()).encode()),
+    "COLUMNS": ("one.pcd", (header(data="ascii").replace("FIELDS", "COLUMNS").replace("0.7", ".5") + text()).encode()),
+    "no TYPE and SIZE": (
+        "one.pcd",
+        (
+            "\n".join(line for line in header(data="ascii").split("\n") if line[:4] not in ("TYPE", "SIZE")) + text()
+        ).encode(),
+    ),
     "CRLF": ("one.pcd", (header(data="ascii") + text()).replace("\n", "\r\n").encode()),
     "CRLF in the header": ("one.pcd", header().replace("\n", "\r\n").encode() + CLOUD.tobytes()),
-    "byte order mark": ("one.pcd", b"\xef\xbb\xbf" + header(
-        data="ASCII", types="f f f f").encode() + text().encode()),
+    "byte order mark": ("one.pcd", b"\xef\xbb\xbf" + header(data="ASCII", types="f f f f").encode() + text().encode()),
     "COUNT 0": ("one.pcd", padded("ring")),
     "COUNT 0 of padding": ("one.pcd", padded("_")),
-    "stored, not compressed": ("one.pcd", header(data="binary_compressed").encode() + struct.pack(
-        "<II", CLOUD.nbytes, CLOUD.nbytes) + CLOUD.T.tobytes()),
-    "fractions of an integer field": ("one.pcd", (header(
-        types="F F F U", sizes="4 4 4 1", data="ascii") + text()).encode()),
+    "stored, not compressed": (
+        "one.pcd",
+        header(data="binary_compressed").encode() + struct.pack("<II", CLOUD.nbytes, CLOUD.nbytes) + CLOUD.T.tobytes(),
+    ),
+    "fractions of an integer field": (
+        "one.pcd",
+        (header(types="F F F U", sizes="4 4 4 1", data="ascii") + text()).encode(),
+    ),
 }
 
 
@@ -76,8 +87,7 @@ def test_pcd_variants_are_read(tmp_path, case):
 
 def test_integers_with_decimal_point_keep_their_type(tmp_path):
     whole = np.column_stack([CLOUD[:, :3], np.arange(len(CLOUD))])
-    path = write(tmp_path / "one.pcd", header(types="F F F U", sizes="4 4 4 1",
-                                              data="ascii") + text(whole))
+    path = write(tmp_path / "one.pcd", header(types="F F F U", sizes="4 4 4 1", data="ascii") + text(whole))
     assert read_pcd(path).dtype["intensity"] == np.uint8
     assert read_pcd(path)["intensity"].tolist() == list(range(len(CLOUD)))
 
@@ -95,10 +105,14 @@ def ply(form, names=("x", "y", "z", "intensity"), kinds=("f4",) * 4, before="", 
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize("names, kinds", [
-    (("x", "y", "z", "intensity"), ("f4", "f4", "f4", "f4")),
-    (("X", "Y", "Z", "scalar_Intensity"), ("f8", "f8", "f8", "f4")),
-    (("x", "y", "z", "reflectance"), ("f4", "f8", "f4", "f8"))])
+@pytest.mark.parametrize(
+    "names, kinds",
+    [
+        (("x", "y", "z", "intensity"), ("f4", "f4", "f4", "f4")),
+        (("X", "Y", "Z", "scalar_Intensity"), ("f8", "f8", "f8", "f4")),
+        (("x", "y", "z", "reflectance"), ("f4", "f8", "f4", "f8")),
+    ],
+)
 def test_ply_formats_are_read(tmp_path, form, names, kinds):
     frame = load(write(tmp_path / "one.PLY", ply(form, names, kinds)))
     np.testing.assert_allclose(frame.xyz, CLOUD[:, :3], atol=1e-6)
@@ -112,15 +126,23 @@ def test_ply_elements_before_the_vertices_are_skipped(tmp_path):
         np.testing.assert_allclose(load(path).xyz, CLOUD[:, :3], atol=1e-6)
 
 
-@pytest.mark.parametrize("content, words", [
-    (b"", "does not start with ply"), (b"ply\nformat ascii 1.0\n", "end_header is missing"),
-    (b"ply\nformat ascii 1.0\nend_header\n", "element vertex is missing"),
-    (b"ply\nelement vertex 1\nproperty float x\nend_header\n1\n", "line format is missing"),
-    (b"ply\nformat odd 1.0\nend_header\n", "odd"), (ply("ascii")[:900], "it is truncated"),
-    (ply("binary_big_endian")[:900], "it is truncated"),
-    (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1\n",
-     "x of vertex elements is a list"),
-    (ply("ascii", ("x", "y", "w", "v")), "has no field z")])
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        (b"", "does not start with ply"),
+        (b"ply\nformat ascii 1.0\n", "end_header is missing"),
+        (b"ply\nformat ascii 1.0\nend_header\n", "element vertex is missing"),
+        (b"ply\nelement vertex 1\nproperty float x\nend_header\n1\n", "line format is missing"),
+        (b"ply\nformat odd 1.0\nend_header\n", "odd"),
+        (ply("ascii")[:900], "it is truncated"),
+        (ply("binary_big_endian")[:900], "it is truncated"),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n1\n",
+            "x of vertex elements is a list",
+        ),
+        (ply("ascii", ("x", "y", "w", "v")), "has no field z"),
+    ],
+)
 def test_invalid_ply_file_is_reported(tmp_path, content, words):
     write(tmp_path / "one.ply", content)
     with pytest.raises(InputError, match=rf"one\.ply .*{words}") as error:
@@ -128,10 +150,17 @@ def test_invalid_ply_file_is_reported(tmp_path, content, words):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("array, intensity", [
-    (CLOUD, True), (CLOUD[:, :3], False), (CLOUD.astype(np.float64), True),
-    (np.column_stack([CLOUD, CLOUD[:, 0]]), True), (np.asfortranarray(CLOUD), True),
-    (CLOUD.view([(name, "<f4") for name in ("X", "y", "z", "Intensity")]).ravel(), True)])
+@pytest.mark.parametrize(
+    "array, intensity",
+    [
+        (CLOUD, True),
+        (CLOUD[:, :3], False),
+        (CLOUD.astype(np.float64), True),
+        (np.column_stack([CLOUD, CLOUD[:, 0]]), True),
+        (np.asfortranarray(CLOUD), True),
+        (CLOUD.view([(name, "<f4") for name in ("X", "y", "z", "Intensity")]).ravel(), True),
+    ],
+)
 def test_npy_files_are_read(tmp_path, array, intensity):
     np.save(tmp_path / "one.npy", array)
     frame = load(tmp_path)
@@ -139,13 +168,20 @@ def test_npy_files_are_read(tmp_path, array, intensity):
     assert np.array_equal(frame.intensity, CLOUD[:, 3]) if intensity else frame.intensity is None
 
 
-@pytest.mark.parametrize("make", [
-    lambda p: np.save(p, CLOUD.T), lambda p: np.save(p, CLOUD.astype(np.int32)),
-    lambda p: np.save(p, np.array([{}]), allow_pickle=True), lambda p: write(p, b"\x93NUMPY"),
-    lambda p: np.save(p, np.zeros((5, 2), np.float32)), lambda p: write(p, b""),
-    lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(60,(60,"))),
-    lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(9**99,"))),
-    lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(60, 5)")))])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda p: np.save(p, CLOUD.T),
+        lambda p: np.save(p, CLOUD.astype(np.int32)),
+        lambda p: np.save(p, np.array([{}]), allow_pickle=True),
+        lambda p: write(p, b"\x93NUMPY"),
+        lambda p: np.save(p, np.zeros((5, 2), np.float32)),
+        lambda p: write(p, b""),
+        lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(60,(60,"))),
+        lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(9**99,"))),
+        lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(60, 5)"))),
+    ],
+)
 def test_invalid_npy_file_is_reported(tmp_path, make):
     make(tmp_path / "one.npy")
     with pytest.raises(InputError, match=r"one\.npy .*(save it again|expected \(N, 3\))") as error:
@@ -156,8 +192,11 @@ def test_invalid_npy_file_is_reported(tmp_path, make):
 def test_map_coordinates_are_reported_with_remedy(tmp_path):
     far = CLOUD.astype(np.float64) + [513_000, 5_404_000, 300, 0]
     np.save(tmp_path / "one.npy", far)
-    with pytest.raises(InputError, match=r"one\.npy: all points are beyond 100 km.*subtract an "
-                                         "offset, such as 513000 5404000, from x y"):
+    with pytest.raises(
+        InputError,
+        match=r"one\.npy: all points are beyond 100 km.*subtract an "
+        "offset, such as 513000 5404000, from x y",
+    ):
         load(tmp_path)
     far[0, :3] = 1, 2, 3  # with one point in range, the others are invalid returns
     np.save(tmp_path / "one.npy", far)
@@ -169,18 +208,20 @@ def test_map_coordinates_are_reported_with_remedy(tmp_path):
 FIRST = 1_741_286_117
 
 
-@pytest.mark.parametrize("names, expected", [
-    # SECONDS.NANOSECONDS without leading zeros, by old versions of pointcloud_to_pcd
-    ([f"{FIRST}.{i * 10**8 + 11_149_430}" for i in range(10)],
-     [i * 10**8 + 11_149_430 for i in range(10)]),
-    ([f"{FIRST}.{i * 10**8 + 7}" for i in range(3)], [i * 10**8 + 7 for i in range(3)]),
-    ([f"{FIRST}.5000", f"{FIRST}.100005000"], [5000, 100_005_000]),
-    # decimal fractions, padded or as printed floats
-    ([f"{FIRST}.{i * 10**8 + 11_149_430:09}" for i in range(10)],
-     [i * 10**8 + 11_149_430 for i in range(10)]),
-    ([f"{FIRST}.1", f"{FIRST}.2", f"{FIRST}.3000001"], [10**8, 2 * 10**8, 300_000_100]),
-    ([f"{FIRST}.05", f"{FIRST}.123456789"], [5 * 10**7, 123_456_789]),
-    ([f"{FIRST}.1", f"{FIRST}.2", f"{FIRST}.300000001"], [10**8, 2 * 10**8, 300_000_001])])
+@pytest.mark.parametrize(
+    "names, expected",
+    [
+        # SECONDS.NANOSECONDS without leading zeros, by old versions of pointcloud_to_pcd
+        ([f"{FIRST}.{i * 10**8 + 11_149_430}" for i in range(10)], [i * 10**8 + 11_149_430 for i in range(10)]),
+        ([f"{FIRST}.{i * 10**8 + 7}" for i in range(3)], [i * 10**8 + 7 for i in range(3)]),
+        ([f"{FIRST}.5000", f"{FIRST}.100005000"], [5000, 100_005_000]),
+        # decimal fractions, padded or as printed floats
+        ([f"{FIRST}.{i * 10**8 + 11_149_430:09}" for i in range(10)], [i * 10**8 + 11_149_430 for i in range(10)]),
+        ([f"{FIRST}.1", f"{FIRST}.2", f"{FIRST}.3000001"], [10**8, 2 * 10**8, 300_000_100]),
+        ([f"{FIRST}.05", f"{FIRST}.123456789"], [5 * 10**7, 123_456_789]),
+        ([f"{FIRST}.1", f"{FIRST}.2", f"{FIRST}.300000001"], [10**8, 2 * 10**8, 300_000_001]),
+    ],
+)
 def test_times_in_file_names_may_lack_leading_zeros(tmp_path, names, expected):
     for name in names:
         write(tmp_path / f"{name}.BIN", CLOUD.tobytes())
@@ -190,13 +231,21 @@ def test_times_in_file_names_may_lack_leading_zeros(tmp_path, names, expected):
     assert open_clouds(tmp_path).stamps_ns.tolist() == [f.stamp_ns for f in recording]
 
 
-@pytest.mark.parametrize("file, words", [
-    ("scan.LAS", r"format LAS .*pdal"), ("scan.laz", r"format LAZ .*pdal"),
-    ("a.e57", r"format E57 .*pdal"), ("segment-1/x.tfrecord", r"format Waymo .*KITTI"),
-    ("training/lidar/x.parquet", r"format Waymo .*KITTI"),
-    ("val/log/sensors/lidar/1.feather", r"format Argoverse 2 .*av2"),
-    ("drive.pcap", r"sensor packets .*driver"), ("drive.pcapng", "sensor packets"),
-    ("drive.lvx2", "Livox Viewer.*lvx_to_rosbag"), ("drive.osf", "ouster-cli source")])
+@pytest.mark.parametrize(
+    "file, words",
+    [
+        ("scan.LAS", r"format LAS .*pdal"),
+        ("scan.laz", r"format LAZ .*pdal"),
+        ("a.e57", r"format E57 .*pdal"),
+        ("segment-1/x.tfrecord", r"format Waymo .*KITTI"),
+        ("training/lidar/x.parquet", r"format Waymo .*KITTI"),
+        ("val/log/sensors/lidar/1.feather", r"format Argoverse 2 .*av2"),
+        ("drive.pcap", r"sensor packets .*driver"),
+        ("drive.pcapng", "sensor packets"),
+        ("drive.lvx2", "Livox Viewer.*lvx_to_rosbag"),
+        ("drive.osf", "ouster-cli source"),
+    ],
+)
 def test_unsupported_formats_are_reported_with_a_converter(tmp_path, file, words):
     path = write(tmp_path / file, b"LASF")
     for given in (path, tmp_path):

@@ -5,16 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from kitti_samples import LAYOUTS, each_layout, raw_folder, tracking_folder
-from samples import (
-    CALIBRATION,
-    INTRINSICS,
-    LIDAR_TO_CAMERA,
-    calibration_text,
-    object_folder,
-    png_header,
-    scene,
-    write,
-)
+from samples import CALIBRATION, INTRINSICS, LIDAR_TO_CAMERA, calibration_text, object_folder, png_header, scene, write
 
 from lidar_perception.data.kitti.calibration import IMAGE_SIZES, read_calibration
 from lidar_perception.data.kitti.folder import START_NS, read_velodyne
@@ -68,18 +59,15 @@ def test_missing_frame_leaves_a_gap_in_time(tmp_path):
 
 def test_raw_stamps_have_nanosecond_resolution(tmp_path):
     second = 1317042145 * 10**9  # date -u -d '2011-09-26 13:02:25' +%s
-    assert [f.stamp_ns - second for f in open_recording(raw_folder(tmp_path))] == [
-        594360375, 700000000, 1000000001]
+    assert [f.stamp_ns - second for f in open_recording(raw_folder(tmp_path))] == [594360375, 700000000, 1000000001]
 
 
-@pytest.mark.parametrize("inner", ["", "training", "2011_09_26",
-                                   "2011_09_26/2011_09_26_drive_0001_sync"])
+@pytest.mark.parametrize("inner", ["", "training", "2011_09_26", "2011_09_26/2011_09_26_drive_0001_sync"])
 def test_outer_and_inner_folders_are_the_same_recording(tmp_path, inner):
     folders = {layout: make(tmp_path / layout) for layout, make in LAYOUTS.items()}
     for root in folders.values():
         if (root / inner).is_dir():
-            assert [f.points for f in open_recording(root / inner)] == [
-                f.points for f in open_recording(root)]
+            assert [f.points for f in open_recording(root / inner)] == [f.points for f in open_recording(root)]
 
 
 def test_full_scan_is_preferred_to_reduced_one(tmp_path):

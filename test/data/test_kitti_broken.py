@@ -12,7 +12,9 @@ from lidar_perception.types import InputError
 INVALID_FILES = {  # invalid file: its content (None: removed) and words of the error
     "velodyne/000000.bin": [(b"123", "multiple of 16")],
     "calib/000000.txt": [
-        (None, "cannot read"), (b"\xff\xfe\x00", "cannot read"), ("", "no P2"),
+        (None, "cannot read"),
+        (b"\xff\xfe\x00", "cannot read"),
+        ("", "no P2"),
         (calibration_text().replace("P2", "P3"), "no P2 of 12 finite numbers"),
         (calibration_text().replace("R0_rect", "x"), "no R0_rect of 9 finite numbers"),
         (calibration_text().replace("Tr_velo_to_cam", "x"), "no Tr_velo_to_cam of 12 finite"),
@@ -33,8 +35,10 @@ def read(frame):
     return frame.load(), frame.truth(), frame.calibration()
 
 
-@pytest.mark.parametrize("file, content, words", [
-    (file, content, words) for file, cases in INVALID_FILES.items() for content, words in cases])
+@pytest.mark.parametrize(
+    "file, content, words",
+    [(file, content, words) for file, cases in INVALID_FILES.items() for content, words in cases],
+)
 def test_invalid_file_is_reported_for_its_frame_only(tmp_path, file, content, words):
     root = object_folder(tmp_path)
     path = root / "training" / file
@@ -50,19 +54,25 @@ def test_invalid_file_is_reported_for_its_frame_only(tmp_path, file, content, wo
     assert good.name == "000001"
 
 
-@pytest.mark.parametrize("layout, file, content, words", [
-    ("tracking", "training/calib/0000.txt", "", "no P2"),
-    ("tracking", "training/label_02/0000.txt", "0 1 Car", ":1 is not a KITTI label"),
-    ("tracking", "training/label_02/0000.txt", "zero " + TRACKING_LABELS[2:],
-     ":1 is not a tracking label"),
-    ("tracking", "training/label_02/0000.txt", "\n7\n", ":2 is not a tracking label"),
-    ("raw", "2011_09_26/calib_cam_to_cam.txt", "", "no S_rect_02"),
-    ("raw", "2011_09_26/calib_velo_to_cam.txt", "", "no R of 9 finite numbers"),
-    ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml", "<cut", "cannot read"),
-    ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml", "<a/>", "cannot read"),
-    ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml",
-     TRACKLETS.replace("<h>1.8</h>", "<h>tall</h>"), "cannot read"),
-])
+@pytest.mark.parametrize(
+    "layout, file, content, words",
+    [
+        ("tracking", "training/calib/0000.txt", "", "no P2"),
+        ("tracking", "training/label_02/0000.txt", "0 1 Car", ":1 is not a KITTI label"),
+        ("tracking", "training/label_02/0000.txt", "zero " + TRACKING_LABELS[2:], ":1 is not a tracking label"),
+        ("tracking", "training/label_02/0000.txt", "\n7\n", ":2 is not a tracking label"),
+        ("raw", "2011_09_26/calib_cam_to_cam.txt", "", "no S_rect_02"),
+        ("raw", "2011_09_26/calib_velo_to_cam.txt", "", "no R of 9 finite numbers"),
+        ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml", "<cut", "cannot read"),
+        ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml", "<a/>", "cannot read"),
+        (
+            "raw",
+            "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml",
+            TRACKLETS.replace("<h>1.8</h>", "<h>tall</h>"),
+            "cannot read",
+        ),
+    ],
+)
 def test_invalid_file_of_a_sequence_is_reported(tmp_path, layout, file, content, words):
     root = LAYOUTS[layout](tmp_path)
     write(root / file, content)
@@ -81,9 +91,13 @@ def test_invalid_time_stamps_are_reported(tmp_path, text):
         open_recording(tmp_path)
 
 
-@pytest.mark.parametrize("layout, scan", [
-    ("tracking", "training/velodyne/0000/notes.bin"),
-    ("raw", "2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/notes.bin")])
+@pytest.mark.parametrize(
+    "layout, scan",
+    [
+        ("tracking", "training/velodyne/0000/notes.bin"),
+        ("raw", "2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/notes.bin"),
+    ],
+)
 def test_scan_without_number_is_reported(tmp_path, layout, scan):
     root = LAYOUTS[layout](tmp_path)
     write(root / scan, b"")

@@ -12,10 +12,18 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.types import CLASSES, InputError, class_ids
 
 CAR = "Car 0.00 0 -1.50 580.00 160.00 660.00 230.00 1.50 1.60 3.90 0.00 1.65 12.00 -1.57"
-SPELLINGS = {"car": "Car", "CAR": "Car", "dontcare": "DontCare", "Person sitting": "Person_sitting",
-             "person_sitting": "Person_sitting", "PERSON (SITTING)": "Person_sitting",
-             "Person": "Person_sitting", "tram": "Tram", "bus": "bus", "traffic cone":
-             "traffic cone"}
+SPELLINGS = {
+    "car": "Car",
+    "CAR": "Car",
+    "dontcare": "DontCare",
+    "Person sitting": "Person_sitting",
+    "person_sitting": "Person_sitting",
+    "PERSON (SITTING)": "Person_sitting",
+    "Person": "Person_sitting",
+    "tram": "Tram",
+    "bus": "bus",
+    "traffic cone": "traffic cone",
+}
 
 
 @pytest.mark.parametrize("text", SPELLINGS)
@@ -47,8 +55,9 @@ def test_files_of_windows_editors_are_read(tmp_path, make):
         assert (frame.name, frame.stamp_ns) == (original.name, original.stamp_ns)
         assert frame.calibration().equals(original.calibration())
         truth, other = frame.truth(), original.truth()
-        assert truth is other is None or (truth.labels == other.labels and np.array_equal(
-            truth.boxes, other.boxes) and truth.notes == other.notes)
+        assert truth is other is None or (
+            truth.labels == other.labels and np.array_equal(truth.boxes, other.boxes) and truth.notes == other.notes
+        )
     split = write(tmp_path / "split.txt", encode_for_windows(f"{expected[-1].name}\n"))
     assert [f.name for f in open_recording(root, split=split)] == [expected[-1].name]
 
@@ -59,8 +68,9 @@ def test_tracking_labels_without_scan_are_listed(tmp_path):
     (root / "training/velodyne/0000/000002.bin").unlink()
     recording = open_recording(root)
     assert [name for name, _ in recording.missing_scans] == ["0000/000002", "0003/000007"]
-    assert all("has no scan; download it again" in reason and str(root) in reason
-               for _, reason in recording.missing_scans)
+    assert all(
+        "has no scan; download it again" in reason and str(root) in reason for _, reason in recording.missing_scans
+    )
     assert open_recording(root, scans=False).missing_scans == ()
 
 
@@ -102,25 +112,29 @@ def write_exported_drive(root, names=("0000000000", "0000000001", "0000000002"),
     only."""
     for i, name in enumerate(names):
         cloud = scene(i)[:40]
-        write(root / f"velodyne_points/data/{name}.pcd",
-              b"FIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\n"
-              b"POINTS 40\nDATA binary\n" + cloud.tobytes())
+        write(
+            root / f"velodyne_points/data/{name}.pcd",
+            b"FIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 40\nDATA binary\n" + cloud.tobytes(),
+        )
     write(root / "tracklet_labels.xml", TRACKLETS.replace("Pedestrian", "pedestrian"))
     if frame_list:
         write(root / "frame_list.txt", frame_list)
     return root
 
 
-@pytest.mark.parametrize("names, frame_list, indices", [
-    (("0000000000", "0000000001", "0000000002"), "", [0, 1, 2]),
-    (("a", "b", "c"), "# made by a tool\n2 a\n1 sub/c\n\n0 b\n", [0, 1, 2])])
+@pytest.mark.parametrize(
+    "names, frame_list, indices",
+    [
+        (("0000000000", "0000000001", "0000000002"), "", [0, 1, 2]),
+        (("a", "b", "c"), "# made by a tool\n2 a\n1 sub/c\n\n0 b\n", [0, 1, 2]),
+    ],
+)
 def test_exported_drive_with_pcd_scans_has_labels(tmp_path, names, frame_list, indices):
     recording = open_recording(write_exported_drive(tmp_path, names, frame_list))
     assert str(recording).endswith("KITTI raw drives, 3 frames, labelled boxes")
     assert not recording.has_times and [frame.index for frame in recording] == indices
     assert [len(frame.load()) for frame in recording] == [40] * 3
-    assert [frame.truth().labels for frame in recording] == [
-        [], ["Pedestrian"], ["Pedestrian", "Person_sitting"]]
+    assert [frame.truth().labels for frame in recording] == [[], ["Pedestrian"], ["Pedestrian", "Person_sitting"]]
     assert all(frame.calibration() is None for frame in recording)
 
 
@@ -135,18 +149,37 @@ def test_scan_missing_in_frame_list_is_reported(tmp_path):
 
 def tracklet(name, poses, size=(1.5, 1.6, 3.9), more=""):
     h, w, length = size
-    return (f"<item><objectType>{name}</objectType><h>{h}</h><w>{w}</w><l>{length}</l>{more}<poses>"
-            + "".join(f"<item><tx>{x}</tx><ty>0</ty><tz>-1.7</tz><rz>0.1</rz>{rest}</item>"
-                      for x, rest in poses) + "</poses><finished>1</finished></item>")
+    return (
+        f"<item><objectType>{name}</objectType><h>{h}</h><w>{w}</w><l>{length}</l>{more}<poses>"
+        + "".join(f"<item><tx>{x}</tx><ty>0</ty><tz>-1.7</tz><rz>0.1</rz>{rest}</item>" for x, rest in poses)
+        + "</poses><finished>1</finished></item>"
+    )
 
 
 def test_tracklets_of_other_tools_keep_their_class_names(tmp_path):
-    path = write(tmp_path / "tracklet_labels.xml", "<boost_serialization><tracklets>" + "".join((
-        tracklet("CAR", [(12, "<state>2</state><occlusion/>"), (11, "")]),
-        tracklet(" bus ", [(9, "<truncation>2</truncation>")], more="<first_frame>1</first_frame>"),
-        tracklet("car", [(5, ""), (5, "<occlusion>OcclusionStates.OCCLUSION_UNSET</occlusion>"
-                                      "<truncation>TruncationStates.OUT_IMAGE</truncation>")]),
-        tracklet("Van", [(5, "")], size=(0, 1, 2)))) + "</tracklets></boost_serialization>")
+    path = write(
+        tmp_path / "tracklet_labels.xml",
+        "<boost_serialization><tracklets>"
+        + "".join(
+            (
+                tracklet("CAR", [(12, "<state>2</state><occlusion/>"), (11, "")]),
+                tracklet(" bus ", [(9, "<truncation>2</truncation>")], more="<first_frame>1</first_frame>"),
+                tracklet(
+                    "car",
+                    [
+                        (5, ""),
+                        (
+                            5,
+                            "<occlusion>OcclusionStates.OCCLUSION_UNSET</occlusion>"
+                            "<truncation>TruncationStates.OUT_IMAGE</truncation>",
+                        ),
+                    ],
+                ),
+                tracklet("Van", [(5, "")], size=(0, 1, 2)),
+            )
+        )
+        + "</tracklets></boost_serialization>",
+    )
     first, second = read_tracklets(path).values()
     assert first.labels == ["Car", "Car"] and [name for name, _ in first.notes] == ["Van"]
     assert second.labels == ["Car", "Misc"]  # the second car only fills a gap

@@ -5,15 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from kitti_samples import (
-    LAYOUTS,
-    each_layout,
-    format_truth,
-    raw_folder,
-    same,
-    through_markers,
-    tracking_folder,
-)
+from kitti_samples import LAYOUTS, each_layout, format_truth, raw_folder, same, through_markers, tracking_folder
 from samples import AXES, LABELS, LIDAR_TO_CAMERA, object_folder, write
 
 from lidar_perception.data.kitti.labels import parse_label, to_ground_truth, to_labels
@@ -31,12 +23,20 @@ def label_lines(draw) -> str:
     if draw(st.booleans()):
         bbox = [draw(hundredths(0, 120000)) for _ in range(4)]
         return f"DontCare -1 -1 -10 {' '.join(bbox)} -1 -1 -1 -1000 -1000 -1000 -10"
-    return " ".join([
-        draw(st.sampled_from([*CLASSES[:-1], "Unicorn"])), draw(hundredths(0, 100)),
-        str(draw(st.integers(0, 3))),
-        draw(hundredths(-314, 314)), *(draw(hundredths(0, 120000)) for _ in range(4)),
-        *(draw(hundredths(30, 2000)) for _ in range(3)), draw(hundredths(-5000, 5000)),
-        draw(hundredths(-300, 500)), draw(hundredths(100, 8000)), draw(hundredths(-314, 314))])
+    return " ".join(
+        [
+            draw(st.sampled_from([*CLASSES[:-1], "Unicorn"])),
+            draw(hundredths(0, 100)),
+            str(draw(st.integers(0, 3))),
+            draw(hundredths(-314, 314)),
+            *(draw(hundredths(0, 120000)) for _ in range(4)),
+            *(draw(hundredths(30, 2000)) for _ in range(3)),
+            draw(hundredths(-5000, 5000)),
+            draw(hundredths(-300, 500)),
+            draw(hundredths(100, 8000)),
+            draw(hundredths(-314, 314)),
+        ]
+    )
 
 
 @given(st.lists(label_lines(), max_size=6))
@@ -52,7 +52,7 @@ def test_labels_survive_conversion_to_truth_and_markers(lines):
 def test_label_can_be_computed_from_its_box(line):
     label = parse_label(line)
     truth = to_ground_truth([label], LIDAR_TO_CAMERA)
-    again, = to_labels(GroundTruth.of(truth.boxes, truth.class_ids), LIDAR_TO_CAMERA)
+    (again,) = to_labels(GroundTruth.of(truth.boxes, truth.class_ids), LIDAR_TO_CAMERA)
     assert again["class"] == label["class"]
     np.testing.assert_allclose(again["dimensions"], label["dimensions"], atol=1e-9)
     np.testing.assert_allclose(again["location"], label["location"], atol=1e-9)
@@ -104,8 +104,7 @@ def test_tracklets_are_placed_by_their_bottom_face(tmp_path):
     np.testing.assert_allclose(second.boxes, [[8, -1, -0.8, 0.9, 0.5, 1.8, 0.5]])
     assert second.extras[0] == {"track_id": 0, "occluded": 1, "truncated": 0.0}
     assert third.labels == ["Pedestrian", "Person_sitting"]
-    np.testing.assert_allclose(third.boxes, [[9, -1, -0.8, 0.9, 0.5, 1.8, 0.6],
-                                             [5, 2, -1.0, 0.8, 0.6, 1.2, -3]])
+    np.testing.assert_allclose(third.boxes, [[9, -1, -0.8, 0.9, 0.5, 1.8, 0.6], [5, 2, -1.0, 0.8, 0.6, 1.2, -3]])
     assert [e["track_id"] for e in third.extras] == [0, 1]
     assert same(through_markers(third), third)
 

@@ -19,8 +19,7 @@ from lidar_perception.wire.topics import ODOMETRY
 
 ROLL, PITCH, AHEAD = 3.0, -8.0, 130.0  # degrees
 # Rotation from the sensor's axes to level ones with x ahead
-UPRIGHT = Rotation.from_euler("z", -AHEAD, degrees=True) * Rotation.from_euler(
-    "xy", [ROLL, PITCH], degrees=True)
+UPRIGHT = Rotation.from_euler("z", -AHEAD, degrees=True) * Rotation.from_euler("xy", [ROLL, PITCH], degrees=True)
 BODY = np.array([[-0.3, 0.2, -0.4], [0.1, 0.0, 0.5]])
 MOUNT = f"""/**:
   ros__parameters:
@@ -32,9 +31,12 @@ MOUNT = f"""/**:
 LEVEL = np.random.default_rng(0).uniform([-20, -20, -0.9], [20, 20, 2], (500, 3))
 LEVEL = LEVEL[np.linalg.norm(LEVEL, axis=1) > 1]
 PERSON = np.array([9.0, 2.0, -0.05, 0.5, 0.6, 1.7, 0.7])
-CAMERA = Calibration(np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
-                     np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.1], [1, 0, 0, -0.3], [0, 0, 0, 1]]),
-                     1242, 375)
+CAMERA = Calibration(
+    np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
+    np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.1], [1, 0, 0, -0.3], [0, 0, 0, 1]]),
+    1242,
+    375,
+)
 
 
 def pose(i):
@@ -47,23 +49,35 @@ def make_tilted_frames():
     rotation = np.eye(4)
     rotation[:3, :3] = UPRIGHT.as_matrix()
     xyz = np.vstack([BODY, UPRIGHT.inv().apply(LEVEL)])
-    box = np.concatenate([UPRIGHT.inv().apply(PERSON[:3]), PERSON[3:6],
-                          [PERSON[6] + np.radians(AHEAD)]])
-    camera = Calibration(CAMERA.intrinsics, CAMERA.lidar_to_camera @ rotation, CAMERA.width,
-                         CAMERA.height)
+    box = np.concatenate([UPRIGHT.inv().apply(PERSON[:3]), PERSON[3:6], [PERSON[6] + np.radians(AHEAD)]])
+    camera = Calibration(CAMERA.intrinsics, CAMERA.lidar_to_camera @ rotation, CAMERA.width, CAMERA.height)
     numbers = np.arange(len(xyz), dtype=np.uint16)
     for i in range(3):
-        yield Frame.of(str(i), PointCloud.of(xyz, np.linspace(0, 1, len(xyz), dtype=np.float32),
-                                             (i + 1) * 10**8, "front"),
-                       GroundTruth.of(box, [3]), camera, pose=lambda i=i: pose(i) @ rotation,
-                       point_truth=lambda: PointTruth(numbers, numbers))
+        yield Frame.of(
+            str(i),
+            PointCloud.of(xyz, np.linspace(0, 1, len(xyz), dtype=np.float32), (i + 1) * 10**8, "front"),
+            GroundTruth.of(box, [3]),
+            camera,
+            pose=lambda i=i: pose(i) @ rotation,
+            point_truth=lambda: PointTruth(numbers, numbers),
+        )
 
 
 def test_bag_of_tilted_sensor_is_converted_to_level(tmp_path, monkeypatch):
     write_bag(tmp_path / "leaning", make_tilted_frames())
     (tmp_path / "robot.yaml").write_text(MOUNT)
-    assert exit_of(monkeypatch, "convert", tmp_path / "leaning", "--robot", tmp_path / "robot.yaml",
-                   "--out", tmp_path / "level") == 0
+    assert (
+        exit_of(
+            monkeypatch,
+            "convert",
+            tmp_path / "leaning",
+            "--robot",
+            tmp_path / "robot.yaml",
+            "--out",
+            tmp_path / "level",
+        )
+        == 0
+    )
     recording = open_recording(tmp_path / "level")
     assert len(recording) == 3
     for i, frame in enumerate(recording):
@@ -78,13 +92,18 @@ def test_bag_of_tilted_sensor_is_converted_to_level(tmp_path, monkeypatch):
 
 def test_level_sensor_at_another_height_is_rotated(tmp_path, monkeypatch):
     floor = np.random.default_rng(2).uniform([-20, -20, -0.61], [20, 20, -0.59], (3000, 3))
-    write_bag(tmp_path / "drive", [Frame.of(str(i), PointCloud.of(floor, None, (i + 1) * 10**8,
-                                                                  "front")) for i in range(3)])
+    write_bag(
+        tmp_path / "drive", [Frame.of(str(i), PointCloud.of(floor, None, (i + 1) * 10**8, "front")) for i in range(3)]
+    )
     (tmp_path / "robot.yaml").write_text(
-        "/**:\n  ros__parameters:\n    input: {ahead: 90.0}\n"
-        "    ground: {sensor_pose: {height: 0.6}}\n")
-    assert exit_of(monkeypatch, "convert", tmp_path / "drive", "--robot", tmp_path / "robot.yaml",
-                   "--out", tmp_path / "level") == 0
+        "/**:\n  ros__parameters:\n    input: {ahead: 90.0}\n    ground: {sensor_pose: {height: 0.6}}\n"
+    )
+    assert (
+        exit_of(
+            monkeypatch, "convert", tmp_path / "drive", "--robot", tmp_path / "robot.yaml", "--out", tmp_path / "level"
+        )
+        == 0
+    )
     cloud = next(iter(open_recording(tmp_path / "level"))).load()
     np.testing.assert_allclose(cloud.xyz, floor[:, [1, 0, 2]] * [1, -1, 1], atol=1e-4)
 
@@ -95,17 +114,14 @@ WORLD = np.random.default_rng(1).uniform(-20, 20, (400, 3)) + [1, 0, 0]
 def make_moving_cloud(stamp):
     """Return the cloud of static points, measured while the sensor moves for 0.1 s."""
     seconds = np.linspace(0, 0.1, len(WORLD))
-    measured = [invert_pose(base_at(stamp + t * 1e9) @ ON_BASE) @ [*point, 1]
-                for point, t in zip(WORLD, seconds)]
-    return make_cloud_message(np.array(measured)[:, :3], stamp, "lidar",
-                              time=seconds.astype(np.float32))
+    measured = [invert_pose(base_at(stamp + t * 1e9) @ ON_BASE) @ [*point, 1] for point, t in zip(WORLD, seconds)]
+    return make_cloud_message(np.array(measured)[:, :3], stamp, "lidar", time=seconds.astype(np.float32))
 
 
 @pytest.mark.parametrize("moves", [moving(ODOMETRY), moving_tf()], ids=["odometry", "TF"])
 def test_clouds_of_a_bag_are_deskewed(moves, tmp_path, monkeypatch):
     recorded(tmp_path / "robot", list(moves), mount(), cloud=make_moving_cloud)
-    assert exit_of(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out",
-                   tmp_path / "still") == 0
+    assert exit_of(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out", tmp_path / "still") == 0
     for i, frame in enumerate(open_recording(tmp_path / "still")):
         world_to_sensor = invert_pose(base_at(stamps()[i]) @ ON_BASE)
         expected = WORLD @ world_to_sensor[:3, :3].T + world_to_sensor[:3, 3]
@@ -115,36 +131,52 @@ def test_clouds_of_a_bag_are_deskewed(moves, tmp_path, monkeypatch):
     assert i == CLOUDS - 1
 
 
-@pytest.mark.parametrize("parts, cloud, words", [
-    ([moving(ODOMETRY), mount()], point, "no time column"),
-    ([], make_moving_cloud, "neither odometry nor a TF"),
-], ids=["no times", "no poses"])
+@pytest.mark.parametrize(
+    "parts, cloud, words",
+    [([moving(ODOMETRY), mount()], point, "no time column"), ([], make_moving_cloud, "neither odometry nor a TF")],
+    ids=["no times", "no poses"],
+)
 def test_missing_times_or_poses_are_reported(parts, cloud, words, tmp_path, monkeypatch, capsys):
     recorded(tmp_path / "robot", *map(list, parts), cloud=cloud)
-    assert exit_of(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out",
-                   tmp_path / "out") == 2
+    assert exit_of(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out", tmp_path / "out") == 2
     assert words in error_line(capsys) and not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("content, more, words", [
-    (MOUNT.replace("0.9", "-9"), [], "ground.sensor_pose.height"),
-    ("[]", [], "is no parameter file"),
-    ("/**: {ros__parameters: {autostart: true}}", [], "does not describe a mounting"),
-    ("/**: {ros__parameters: {base_frame: base, crop: {body: [-1.0, -1.0, 0.0, 1.0, 1.0, 1.0]}}}",
-     [], "crop.body in 'base'"),
-    (MOUNT, ["--to", "openlabel"], "are for a recording with its clouds"),
-])
+@pytest.mark.parametrize(
+    "content, more, words",
+    [
+        (MOUNT.replace("0.9", "-9"), [], "ground.sensor_pose.height"),
+        ("[]", [], "is no parameter file"),
+        ("/**: {ros__parameters: {autostart: true}}", [], "does not describe a mounting"),
+        (
+            "/**: {ros__parameters: {base_frame: base, crop: {body: [-1.0, -1.0, 0.0, 1.0, 1.0, 1.0]}}}",
+            [],
+            "crop.body in 'base'",
+        ),
+        (MOUNT, ["--to", "openlabel"], "are for a recording with its clouds"),
+    ],
+)
 def test_unusable_parameters_are_reported(content, more, words, tmp_path, monkeypatch, capsys):
     write_bag(tmp_path / "bag", make_tilted_frames())
     (tmp_path / "robot.yaml").write_text(content)
-    assert exit_of(monkeypatch, "convert", tmp_path / "bag", "--robot", tmp_path / "robot.yaml",
-                   "--out", tmp_path / "out", *more) == 2
+    assert (
+        exit_of(
+            monkeypatch,
+            "convert",
+            tmp_path / "bag",
+            "--robot",
+            tmp_path / "robot.yaml",
+            "--out",
+            tmp_path / "out",
+            *more,
+        )
+        == 2
+    )
     assert words in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def test_data_set_is_not_levelled(tmp_path, monkeypatch, capsys):
     root = object_folder(tmp_path / "kitti", walker_label())
     (tmp_path / "robot.yaml").write_text(MOUNT)
-    assert exit_of(monkeypatch, "convert", root, "--robot", tmp_path / "robot.yaml", "--out",
-                   tmp_path / "out") == 2
+    assert exit_of(monkeypatch, "convert", root, "--robot", tmp_path / "robot.yaml", "--out", tmp_path / "out") == 2
     assert "has level clouds" in error_line(capsys)

@@ -19,14 +19,17 @@ def stamps(recording):
 
 # KITTI odometry
 
+
 def test_odometry_has_recorded_times_and_lidar_poses(tmp_path):
     recording = open_recording(odometry_folder(tmp_path))
     assert recording.has_times and stamps(recording) == [
-        START_NS, START_NS + 103_600_000, START_NS + 103_600_000 + GAP_NS]
+        START_NS,
+        START_NS + 103_600_000,
+        START_NS + 103_600_000 + GAP_NS,
+    ]
     for frame in recording:
         np.testing.assert_allclose(frame.pose(), drive(frame.index), atol=1e-9)
-        np.testing.assert_allclose(frame.calibration().lidar_to_camera,
-                                   CALIBRATION.lidar_to_camera, atol=1e-9)
+        np.testing.assert_allclose(frame.calibration().lidar_to_camera, CALIBRATION.lidar_to_camera, atol=1e-9)
 
 
 def test_odometry_can_be_opened_with_any_of_its_files(tmp_path):
@@ -48,13 +51,17 @@ def test_odometry_can_be_opened_with_any_of_its_files(tmp_path):
 def test_times_since_1970_are_stamps(tmp_path):
     path = odometry_folder(tmp_path) / "dataset/sequences/00/times.txt"
     write(path, b"\xef\xbb\xbf1700000000.123456789\r\n1700000000.223456789\r\n")
-    assert stamps(open_recording(tmp_path))[:2] == [
-        1_700_000_000_123_456_789, 1_700_000_000_223_456_789]
+    assert stamps(open_recording(tmp_path))[:2] == [1_700_000_000_123_456_789, 1_700_000_000_223_456_789]
 
 
-@pytest.mark.parametrize("text, words", [
-    ("0\n", "has only 1 lines, but there is a scan 1; download"),
-    ("0\nlater\n", "not a number of seconds"), ("0\nnan\n", "not a number of seconds")])
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("0\n", "has only 1 lines, but there is a scan 1; download"),
+        ("0\nlater\n", "not a number of seconds"),
+        ("0\nnan\n", "not a number of seconds"),
+    ],
+)
 def test_missing_or_invalid_times_are_reported(tmp_path, text, words):
     write(odometry_folder(tmp_path) / "dataset/sequences/00/times.txt", text)
     with pytest.raises(InputError, match=rf"times\.txt .*{words}"):
@@ -76,18 +83,21 @@ def world(i):
 
 def add_calibration(root, poses):
     """Add calibration and poses; `poses` is the name of their file."""
-    to_camera = np.linalg.inv(np.vstack([np.column_stack([RECTIFY, [0, 0, 0]]), [0, 0, 0, 1]])
-                              ) @ LIDAR_TO_CAMERA  # unrectified camera
+    to_camera = (
+        np.linalg.inv(np.vstack([np.column_stack([RECTIFY, [0, 0, 0]]), [0, 0, 0, 1]])) @ LIDAR_TO_CAMERA
+    )  # unrectified camera
     mount = np.vstack([CAM_TO_POSE, [0, 0, 0, 1]])
     write(root / "calibration/calib_cam_to_velo.txt", numbers(np.linalg.inv(to_camera)[:3]))
     write(root / "calibration/calib_cam_to_pose.txt", f"image_00: {numbers(CAM_TO_POSE)}\n")
-    write(root / "calibration/perspective.txt", f"calib_time: now\nS_rect_00: 1408.0 376.0\n"
-          f"P_rect_00: {numbers(INTRINSICS)}\nR_rect_00: {numbers(RECTIFY)}\n")
-    of_file = {"cam0_to_world.txt": lambda i: world(i) @ np.linalg.inv(LIDAR_TO_CAMERA),
-               "poses.txt": lambda i: (world(i) @ np.linalg.inv(to_camera)
-                                       @ np.linalg.inv(mount))[:3]}
-    write(root / f"data_poses/{NAME}/{poses}",
-          "".join(f"{i} {numbers(of_file[poses](i))} \n" for i in (0, 3)))
+    write(
+        root / "calibration/perspective.txt",
+        f"calib_time: now\nS_rect_00: 1408.0 376.0\nP_rect_00: {numbers(INTRINSICS)}\nR_rect_00: {numbers(RECTIFY)}\n",
+    )
+    of_file = {
+        "cam0_to_world.txt": lambda i: world(i) @ np.linalg.inv(LIDAR_TO_CAMERA),
+        "poses.txt": lambda i: (world(i) @ np.linalg.inv(to_camera) @ np.linalg.inv(mount))[:3],
+    }
+    write(root / f"data_poses/{NAME}/{poses}", "".join(f"{i} {numbers(of_file[poses](i))} \n" for i in (0, 3)))
     return root
 
 
@@ -119,12 +129,15 @@ def test_kitti360_has_lidar_poses_and_a_camera(tmp_path, poses):
 
 # OpenPCDet
 
+
 def test_openpcdet_labels_are_boxes_in_the_lidar_frame(tmp_path):
     root = openpcdet_folder(tmp_path)
-    write(root / "labels/000000.txt",
-          b"\xef\xbb\xbf12 0 -0.98 3.9 1.6 1.5 0.1 Vehicle \r\n\r\n"
-          b"1 2 3 0.8 0.6 1.7 -2 pedestrian\r\n"
-          b"5 5 0 1 1 1 0 traffic cone\r\n5 5 0 1 1 1 0 DONTCARE\r\n")
+    write(
+        root / "labels/000000.txt",
+        b"\xef\xbb\xbf12 0 -0.98 3.9 1.6 1.5 0.1 Vehicle \r\n\r\n"
+        b"1 2 3 0.8 0.6 1.7 -2 pedestrian\r\n"
+        b"5 5 0 1 1 1 0 traffic cone\r\n5 5 0 1 1 1 0 DONTCARE\r\n",
+    )
     write(root / "labels/000001.txt", "")
     (root / "labels/000002.txt").unlink()
     write(root / "labels/000007.txt", "")
@@ -136,8 +149,7 @@ def test_openpcdet_labels_are_boxes_in_the_lidar_frame(tmp_path):
     assert len(second.truth()) == 0 and third.truth() is None
     assert [name for name, _ in recording.missing_scans] == ["000007"]
     assert np.array_equal(first.load().xyz, scene(0)[:, :3])
-    assert [f.name for f in open_recording(root, split=root / "ImageSets/train.txt")] == [
-        "000000", "000002"]
+    assert [f.name for f in open_recording(root, split=root / "ImageSets/train.txt")] == ["000000", "000002"]
 
 
 def test_openpcdet_accepts_more_columns_and_no_labels(tmp_path):
@@ -150,8 +162,9 @@ def test_openpcdet_accepts_more_columns_and_no_labels(tmp_path):
     assert np.array_equal(recording.frames[0].load().points(), scene(0))
 
 
-@pytest.mark.parametrize("line", ["1 2 3 4 5 6 7", "1 2 3 4 5 6 left Car", "Car 1 2 3 4 5 6 7",
-                                  "1 2 3 4 0 6 7 Car", "1 nan 3 4 5 6 7 Car"])
+@pytest.mark.parametrize(
+    "line", ["1 2 3 4 5 6 7", "1 2 3 4 5 6 left Car", "Car 1 2 3 4 5 6 7", "1 2 3 4 0 6 7 Car", "1 nan 3 4 5 6 7 Car"]
+)
 def test_invalid_openpcdet_line_is_reported(tmp_path, line):
     root = openpcdet_folder(tmp_path)
     write(root / "labels/000000.txt", f"12 0 0 4 2 1 0 Car\n{line}\n")
@@ -160,11 +173,18 @@ def test_invalid_openpcdet_line_is_reported(tmp_path, line):
     assert BOXES in open_recording(root).has
 
 
-@pytest.mark.parametrize("file, content, words", [
-    ("dataset/poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 nan\n", "is not a rotation"),
-    ("dataset/poses/00.txt", "1 9 0 0 0 1 0 0 0 0 1 0\n", "is not a rotation"),
-    ("dataset/sequences/00/calib.txt", "P2: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 1 0 0 0 1 0 0 0 1 0 0 0\n",
-     "is not a rotation")])
+@pytest.mark.parametrize(
+    "file, content, words",
+    [
+        ("dataset/poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 nan\n", "is not a rotation"),
+        ("dataset/poses/00.txt", "1 9 0 0 0 1 0 0 0 0 1 0\n", "is not a rotation"),
+        (
+            "dataset/sequences/00/calib.txt",
+            "P2: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 1 0 0 0 1 0 0 0 1 0 0 0\n",
+            "is not a rotation",
+        ),
+    ],
+)
 def test_invalid_poses_are_reported(tmp_path, file, content, words):
     write(odometry_folder(tmp_path) / file, content)
     with pytest.raises(InputError, match=words) as error:

@@ -9,11 +9,7 @@ import pytest
 from ground_samples import street
 
 from lidar_perception.data.frame import Recording
-from lidar_perception.data.mount_check import (
-    find_height_problem,
-    find_mount_problem,
-    measure_sensor_height,
-)
+from lidar_perception.data.mount_check import find_height_problem, find_mount_problem, measure_sensor_height
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import level_points
 from lidar_perception.types import PointCloud
@@ -32,8 +28,7 @@ def test_sensor_height_is_measured(height):
 
 def test_dense_vehicle_does_not_outweigh_the_ground():
     xyz, _ = street(5, slope=(0.0, 0.03))
-    roof = np.random.default_rng(0).uniform(
-        (-3, 2.6, -0.35), (3, 4.4, -0.3), (10 * len(xyz), 3)).astype(np.float32)
+    roof = np.random.default_rng(0).uniform((-3, 2.6, -0.35), (3, 4.4, -0.3), (10 * len(xyz), 3)).astype(np.float32)
     assert abs(measure_sensor_height(np.concatenate([xyz, roof])) - 1.73) < 0.05
 
 

@@ -40,10 +40,12 @@ def root(tmp_path_factory):
 @pytest.fixture
 def changed(tmp_path):
     """Return a function that writes the tables after a change, without sweeps."""
+
     def write(change=lambda tables: None, version=folder.VERSION):
         tables = copy.deepcopy(TABLES)
         change(tables)
         return folder.save(tmp_path / "changed", tables, version, sweeps=False)
+
     return write
 
 
@@ -53,9 +55,13 @@ def find_labels(frame):
 
 def same_frames(a, b):
     return [f.native.token for f in a] == [f.native.token for f in b] and all(
-        f.name == g.name and f.points.name == g.points.name and f.stamp_ns == g.stamp_ns
-        and np.array_equal(f.pose(), g.pose()) and np.array_equal(f.truth().boxes, g.truth().boxes)
-        for f, g in zip(a, b))
+        f.name == g.name
+        and f.points.name == g.points.name
+        and f.stamp_ns == g.stamp_ns
+        and np.array_equal(f.pose(), g.pose())
+        and np.array_equal(f.truth().boxes, g.truth().boxes)
+        for f, g in zip(a, b)
+    )
 
 
 def test_key_frames_are_ordered_by_scene_and_time(root):
@@ -85,10 +91,20 @@ def test_sensor_axes_are_rotated_to_those_of_the_vehicle(changed):
     def straight(tables):
         for row in tables["calibrated_sensor"]:
             row["rotation"] = [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)]
+
     frame = open_nuscenes(changed(straight))[0]
     frame.points.parent.mkdir(parents=True)
-    np.array([[0, 10, -1, 51, 4], [3, 5, 0, 255, 31], [0.5, 0.5, 0, 9, 1], [0, 0, 0, 0, 0],
-              [np.nan, 1, 1, 1, 1], [0, -1.5, 0, 0, 7]], np.float32).tofile(frame.points)
+    np.array(
+        [
+            [0, 10, -1, 51, 4],
+            [3, 5, 0, 255, 31],
+            [0.5, 0.5, 0, 9, 1],
+            [0, 0, 0, 0, 0],
+            [np.nan, 1, 1, 1, 1],
+            [0, -1.5, 0, 0, 7],
+        ],
+        np.float32,
+    ).tofile(frame.points)
     scan = frame.load()
     np.testing.assert_allclose(scan.xyz, [[10, 0, -1], [5, -3, 0], [-1.5, 0, 0]], atol=1e-6)
     np.testing.assert_allclose(scan.intensity, [0.2, 1, 0], atol=1e-7)
@@ -112,8 +128,7 @@ def test_pose_transforms_frame_boxes_to_global_labels(root):
         for row, rotation in zip(rows, rotations):
             assert abs(np.dot(row["rotation"], rotation)) > 1 - 1e-3  # the vehicle is tilted
             assert abs(wrap_angle(reference.yaw(row["rotation"]) - reference.yaw(rotation))) < 1e-3
-        assert np.linalg.norm(frame.pose()[:3, 3] - frame.native.ego) == pytest.approx(
-            np.linalg.norm(folder.SENSOR))
+        assert np.linalg.norm(frame.pose()[:3, 3] - frame.native.ego) == pytest.approx(np.linalg.norm(folder.SENSOR))
 
 
 angles = st.floats(-3.1, 3.1)
@@ -125,15 +140,13 @@ def test_global_transform_is_invertible(seed, yaw, pitch, roll):
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_euler("zyx", [yaw, pitch, roll]).as_matrix()
     pose[:3, 3] = rng.uniform(-2000, 2000, 3)
-    boxes = np.column_stack([rng.uniform(-50, 50, (5, 3)), rng.uniform(0.3, 9, (5, 3)),
-                             rng.uniform(-3.1, 3.1, 5)])
+    boxes = np.column_stack([rng.uniform(-50, 50, (5, 3)), rng.uniform(0.3, 9, (5, 3)), rng.uniform(-3.1, 3.1, 5)])
     moved = GlobalBoxes.of(*to_global_boxes(boxes, pose), 0)
     np.testing.assert_allclose(to_local_boxes(moved, pose), boxes, atol=1e-8)
     # The box is transformed rigidly: its corners move as points do.
     corners = box_corners(boxes)
     for box, centre, rotation, own in zip(boxes, moved.centres, moved.rotations, corners):
-        signs = np.array([[x, y, z] for z in (-1, 1) for x, y in ((1, 1), (-1, 1), (-1, -1),
-                                                                  (1, -1))]) / 2
+        signs = np.array([[x, y, z] for z in (-1, 1) for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))]) / 2
         expected = Rotation.from_quat(np.roll(rotation, -1)).apply(signs * box[3:6]) + centre
         np.testing.assert_allclose(own @ pose[:3, :3].T + pose[:3, 3], expected, atol=1e-8)
 
@@ -141,8 +154,7 @@ def test_global_transform_is_invertible(seed, yaw, pitch, roll):
 def test_empty_boxes_are_transformed():
     empty = GlobalBoxes.none()
     assert len(empty) == 0 and to_local_boxes(empty, np.eye(4)).shape == (0, 7)
-    assert [a.shape for a in to_global_boxes(np.zeros((0, 7)), np.eye(4))] == [
-        (0, 3), (0, 3), (0, 4)]
+    assert [a.shape for a in to_global_boxes(np.zeros((0, 7)), np.eye(4))] == [(0, 3), (0, 3), (0, 4)]
     assert len(GlobalBoxes.concatenate([])) == 0
 
 
@@ -173,15 +185,16 @@ def test_labels_have_names_and_attributes(root):
             names = [TABLES["attribute"][int(t[1:])]["name"] for t in row["attribute_tokens"]]
             assert extras["attribute"] == (names[0] if names else None)
             assert extras["points"] == row["num_lidar_pts"] + row["num_radar_pts"]
-            assert tracks.setdefault(row["instance_token"], extras["track_id"]) == extras[
-                "track_id"]
-            expected = {"vehicle.car": "Car", "vehicle.truck": "Truck", "vehicle.bicycle":
-                        "Cyclist" if names == ["cycle.with_rider"] else "Misc"}.get(
-                category, "Pedestrian" if "pedestrian" in category else "Misc")
+            assert tracks.setdefault(row["instance_token"], extras["track_id"]) == extras["track_id"]
+            expected = {
+                "vehicle.car": "Car",
+                "vehicle.truck": "Truck",
+                "vehicle.bicycle": "Cyclist" if names == ["cycle.with_rider"] else "Misc",
+            }.get(category, "Pedestrian" if "pedestrian" in category else "Misc")
             assert label == expected
         assert len(frame.native.labels().bicycle_racks()) == sum(
-            folder.find_category(TABLES, row) == "static_object.bicycle_rack"
-            for row in find_labels(frame))
+            folder.find_category(TABLES, row) == "static_object.bicycle_rack" for row in find_labels(frame)
+        )
     assert len(set(tracks.values())) == len(tracks)
     assert set(CATEGORIES.values()) == set(NAMES) and len(ATTRIBUTES) == 8
 
@@ -192,6 +205,7 @@ def test_order_of_rows_does_not_matter(root, changed):
         for name, rows in tables.items():
             if name not in ("scene", "sample_annotation"):
                 rng.shuffle(rows)
+
     assert same_frames(open_nuscenes(changed(shuffle)), open_nuscenes(root))
 
 
@@ -205,8 +219,7 @@ def test_tables_can_be_read_in_chunks_of_any_size(root, monkeypatch, chunk):
 
 def test_table_may_be_on_one_line_or_empty(tmp_path):
     (tmp_path / "v").mkdir()
-    for text, rows in ('[{"a":1,"b":"x, ] y"},{"b":2,"a":0}]', [(1, "x, ] y"), (0, 2)]), (
-            " [ ] \n", []):
+    for text, rows in ('[{"a":1,"b":"x, ] y"},{"b":2,"a":0}]', [(1, "x, ] y"), (0, 2)]), (" [ ] \n", []):
         (tmp_path / "v/t.json").write_text(text)
         assert list(Tables(tmp_path, "v").rows("t", "a", "b")) == rows
 
@@ -222,6 +235,7 @@ def test_version_without_labels_has_frames(changed):
 def drop(table, token):
     def change(tables):
         tables[table] = [row for row in tables[table] if row["token"] != token]
+
     return change
 
 
@@ -229,33 +243,38 @@ def put(table, **values):
     return lambda tables: tables[table][0].update(values)
 
 
-@pytest.mark.parametrize("change, words", [
-    (lambda t: t.pop("ego_pose"), "ego_pose.json"),
-    (lambda t: t.pop("sample_annotation"), "cannot read the table .*sample_annotation.json"),
-    (lambda t: t["sample"].clear(), "no key frame"),
-    (lambda t: t["sample"][2].pop("timestamp"), "sample.json: row 2 has no timestamp"),
-    (lambda t: t["sample"].insert(1, 7), "sample.json: row 1 has no token"),
-    (put("sample", token="s0k1"), "sample.json has rows with the same token"),
-    (drop("sample_data", "s0k1topTrue"), "no LIDAR_TOP for 1 of 8 key frames, such as s0k1"),
-    (drop("ego_pose", "s0k1topTrue"), "ego_pose.json has no row s0k1topTrue"),
-    (drop("instance", "s0o0"), "the instance s0o0 of s0o0k"),
-    (drop("category", "c0"), "has no category"),
-    (put("sample_annotation", prev="gone"), "the label gone, which another one links to"),
-    (put("sample_annotation", rotation=[0, 0, 0, 0]), "a rotation is not a quaternion"),
-    (put("sample_annotation", rotation=[1e308, 0, 0, 0]), "a rotation is not a quaternion"),
-    (put("ego_pose", rotation=[1e-200, 0, 0, 0]), "a rotation is not a quaternion"),
-    (put("sample_annotation", num_lidar_pts=1e308), "a count of points is not 3 finite numbers"),
-    (put("sample_annotation", attribute_tokens=[[]], size=[1, 2]), "a size is not 3 finite"),
-    (put("sample_annotation", translation=[1, None, 2]), "a translation is not"),
-    (put("ego_pose", translation="x"), "ego_pose.json: a translation is not 3 finite"),
-    (put("ego_pose", rotation=[10**400, 0, 0, 0]), "ego_pose.json: a rotation is not"),
-    *((put("sample", timestamp=time), "sample.json: row 0: timestamp is not a time")
-      for time in (1e38, 10**38, -1, "now", None)),
-    (put("sample_data", filename=7), "sample_data.json: row 0: filename is not a text"),
-    (put("scene", token=[]), "scene.json: row 0: token is not a text"),
-    (put("sample_annotation", attribute_tokens=5), "attribute_tokens is not a list"),
-    (put("calibrated_sensor", rotation=[1, 0, 0, float("nan")]), "a rotation is not"),
-])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda t: t.pop("ego_pose"), "ego_pose.json"),
+        (lambda t: t.pop("sample_annotation"), "cannot read the table .*sample_annotation.json"),
+        (lambda t: t["sample"].clear(), "no key frame"),
+        (lambda t: t["sample"][2].pop("timestamp"), "sample.json: row 2 has no timestamp"),
+        (lambda t: t["sample"].insert(1, 7), "sample.json: row 1 has no token"),
+        (put("sample", token="s0k1"), "sample.json has rows with the same token"),
+        (drop("sample_data", "s0k1topTrue"), "no LIDAR_TOP for 1 of 8 key frames, such as s0k1"),
+        (drop("ego_pose", "s0k1topTrue"), "ego_pose.json has no row s0k1topTrue"),
+        (drop("instance", "s0o0"), "the instance s0o0 of s0o0k"),
+        (drop("category", "c0"), "has no category"),
+        (put("sample_annotation", prev="gone"), "the label gone, which another one links to"),
+        (put("sample_annotation", rotation=[0, 0, 0, 0]), "a rotation is not a quaternion"),
+        (put("sample_annotation", rotation=[1e308, 0, 0, 0]), "a rotation is not a quaternion"),
+        (put("ego_pose", rotation=[1e-200, 0, 0, 0]), "a rotation is not a quaternion"),
+        (put("sample_annotation", num_lidar_pts=1e308), "a count of points is not 3 finite numbers"),
+        (put("sample_annotation", attribute_tokens=[[]], size=[1, 2]), "a size is not 3 finite"),
+        (put("sample_annotation", translation=[1, None, 2]), "a translation is not"),
+        (put("ego_pose", translation="x"), "ego_pose.json: a translation is not 3 finite"),
+        (put("ego_pose", rotation=[10**400, 0, 0, 0]), "ego_pose.json: a rotation is not"),
+        *(
+            (put("sample", timestamp=time), "sample.json: row 0: timestamp is not a time")
+            for time in (1e38, 10**38, -1, "now", None)
+        ),
+        (put("sample_data", filename=7), "sample_data.json: row 0: filename is not a text"),
+        (put("scene", token=[]), "scene.json: row 0: token is not a text"),
+        (put("sample_annotation", attribute_tokens=5), "attribute_tokens is not a list"),
+        (put("calibrated_sensor", rotation=[1, 0, 0, float("nan")]), "a rotation is not"),
+    ],
+)
 def test_invalid_tables_are_reported(changed, change, words):
     with pytest.raises(InputError, match=words) as caught:
         open_nuscenes(changed(change))[0].truth()
@@ -264,16 +283,23 @@ def test_invalid_tables_are_reported(changed, change, words):
 
 def test_invalid_file_name_is_reported(changed):
     with pytest.raises(InputError, match=r"x00b' is not a valid file name"):
-        for frame in open_nuscenes(changed(lambda tables: [
-                row.update(filename="a\0b") for row in tables["sample_data"]])):
+        for frame in open_nuscenes(
+            changed(lambda tables: [row.update(filename="a\0b") for row in tables["sample_data"]])
+        ):
             frame.load()
 
 
-@pytest.mark.parametrize("damage", [
-    lambda text: text[:len(text) // 2], lambda text: "", lambda text: "{}",
-    lambda text: text.replace("token", "tok\x00en", 1), lambda text: text.rstrip("]\n"),
-    lambda text: text.replace("[", "[" * 100_000, 2),
-])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text[: len(text) // 2],
+        lambda text: "",
+        lambda text: "{}",
+        lambda text: text.replace("token", "tok\x00en", 1),
+        lambda text: text.rstrip("]\n"),
+        lambda text: text.replace("[", "[" * 100_000, 2),
+    ],
+)
 def test_damaged_tables_are_reported(changed, damage):
     root = changed()
     path = root / folder.VERSION / "ego_pose.json"
@@ -295,10 +321,11 @@ def test_damage_in_a_large_table_is_found_early(changed, monkeypatch):
 
 def test_wrong_folder_is_reported(root, tmp_path):
     for place, version, words in (
-            (tmp_path / "none", "v1.0-mini", "none is not a folder"),
-            (root, "v1.0-trainval", "no folder v1.0-trainval; its versions are: v1.0-mini"),
-            (root, "", "no folder without a name"),
-            (root / "samples", "v1.0-mini", "give the folder that holds v1.0-mini")):
+        (tmp_path / "none", "v1.0-mini", "none is not a folder"),
+        (root, "v1.0-trainval", "no folder v1.0-trainval; its versions are: v1.0-mini"),
+        (root, "", "no folder without a name"),
+        (root / "samples", "v1.0-mini", "give the folder that holds v1.0-mini"),
+    ):
         with pytest.raises(InputError, match=words):
             open_nuscenes(place, version)
 
@@ -316,7 +343,7 @@ def test_missing_or_truncated_sweep_is_reported(changed):
 
 
 def test_real_sweep_is_read(data, changed):
-    path, = (data / "nuscenes").glob("*.pcd.bin")
+    (path,) = (data / "nuscenes").glob("*.pcd.bin")
     frame = open_nuscenes(changed())[0]
     frame.points.parent.mkdir(parents=True)
     frame.points.symlink_to(path)

@@ -9,14 +9,7 @@ import numpy as np
 import nuscenes_folder
 import pytest
 from bag_samples import cloud_frame
-from recording_samples import (
-    MADE,
-    cloud_folder,
-    drive,
-    each_recording,
-    nuscenes_root,
-    semantic_folder,
-)
+from recording_samples import MADE, cloud_folder, drive, each_recording, nuscenes_root, semantic_folder
 from samples import STAMP, object_folder, scene, write
 
 from lidar_perception.cli.data import open_and_describe
@@ -83,9 +76,12 @@ def test_cloud_files_have_order_and_times_of_their_names(tmp_path):
     folder = cloud_folder(tmp_path / "counted")
     assert [f.name for f in open_recording(folder)] == ["scan1", "scan2", "scan10"]
     assert [f.name for f in open_recording(folder / "scan10.bin")] == ["scan10"]
-    for names in (["1700000000.1", "1700000000.35"], ["1700000000100", "1700000000350"],
-                  ["1700000000100000", "1700000000350000"],
-                  ["1700000000100000000", "1700000000350000000"]):
+    for names in (
+        ["1700000000.1", "1700000000.35"],
+        ["1700000000100", "1700000000350"],
+        ["1700000000100000", "1700000000350000"],
+        ["1700000000100000000", "1700000000350000000"],
+    ):
         timed = tmp_path / names[0]
         for name in names:
             write(timed / f"{name}.bin", scene(0).astype(np.float32).tobytes())
@@ -102,9 +98,15 @@ def test_cloud_topic_of_a_bag_is_found_or_chosen(tmp_path):
             for topic in topics:
                 writer.add_topic(topic, "sensor_msgs/msg/PointCloud2")
                 for i in range(2):
-                    writer.write(topic, STAMP + i, from_array(
-                        scene(i).astype("<f4").view([(n, "<f4") for n in "xyzi"]).ravel(),
-                        make_header(STAMP + i, "lidar", bag_message), bag_message))
+                    writer.write(
+                        topic,
+                        STAMP + i,
+                        from_array(
+                            scene(i).astype("<f4").view([(n, "<f4") for n in "xyzi"]).ravel(),
+                            make_header(STAMP + i, "lidar", bag_message),
+                            bag_message,
+                        ),
+                    )
         return tmp_path / name
 
     assert "on /ouster/points, 2" in str(open_recording(write_clouds("one", "/ouster/points")))
@@ -124,8 +126,7 @@ def test_commands_measure_an_unknown_sensor_height(tmp_path, height, expected):
     rng = np.random.default_rng(0)
     ground = rng.uniform([-20, -20, -0.02], [20, 20, 0.02], (9000, 3)) - [0, 0, height]
     cloud = np.column_stack([ground, np.ones(len(ground))]).astype(np.float32)
-    write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(cloud, STAMP + i * 10**8))
-                                 for i in range(4)])
+    write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(cloud, STAMP + i * 10**8)) for i in range(4)])
     write(tmp_path / "files/0.bin", cloud.tobytes())
     for path in (tmp_path / "bag", tmp_path / "files"):
         recording = open_and_describe(path)
@@ -136,16 +137,23 @@ def test_commands_measure_an_unknown_sensor_height(tmp_path, height, expected):
         assert {f.sensor_height for f in open_recording(path, sensor_height=3.0)} == {3.0}
 
 
-@pytest.mark.parametrize("make, words", [
-    (lambda p: p / "missing", "missing does not exist; give a bag or the folder of a data set"),
-    (lambda p: p, "in a supported format: expected a rosbag2 bag, or the folder of KITTI"),
-    (lambda p: write(p / "notes.txt", b"text"), "not a bag; give the folder of a rosbag2 bag"),
-    (lambda p: write(p / "training/velodyne/x", b"").parents[2], "has no KITTI scans: expected"),
-    (lambda p: write(p / "sequences/00/x", b"").parents[2],
-     "no scans of KITTI odometry or SemanticKITTI: expected"),
-    (lambda p: nuscenes_folder.save(nuscenes_root(p), nuscenes_folder.make_tables(), "v1.0-test",
-                                    False), "several versions; give one of them: .*v1.0-test"),
-])
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda p: p / "missing", "missing does not exist; give a bag or the folder of a data set"),
+        (lambda p: p, "in a supported format: expected a rosbag2 bag, or the folder of KITTI"),
+        (lambda p: write(p / "notes.txt", b"text"), "not a bag; give the folder of a rosbag2 bag"),
+        (lambda p: write(p / "training/velodyne/x", b"").parents[2], "has no KITTI scans: expected"),
+        (
+            lambda p: write(p / "sequences/00/x", b"").parents[2],
+            "no scans of KITTI odometry or SemanticKITTI: expected",
+        ),
+        (
+            lambda p: nuscenes_folder.save(nuscenes_root(p), nuscenes_folder.make_tables(), "v1.0-test", False),
+            "several versions; give one of them: .*v1.0-test",
+        ),
+    ],
+)
 def test_invalid_recording_is_reported_with_remedy(tmp_path, make, words):
     with pytest.raises(InputError, match=words) as error:
         open_recording(make(tmp_path))
@@ -157,13 +165,14 @@ def test_labels_without_scan_are_listed(tmp_path):
     (root / "training/velodyne/000001.bin").unlink()
     recording = open_recording(root)
     assert [f.name for f in recording] == ["000000", "000002"]
-    (name, reason), = recording.missing_scans
+    ((name, reason),) = recording.missing_scans
     assert name == "000001" and "000001.txt has no scan; download it again" in reason
     labels_only = open_recording(root, scans=False)
     assert len(labels_only) == 3 and labels_only.missing_scans == ()
 
 
 # splits
+
 
 @each_recording
 def test_split_selects_frames_in_its_order_once(tmp_path, kind):
@@ -179,15 +188,19 @@ def test_split_selects_frames_in_its_order_once(tmp_path, kind):
         whole.select([names[0], "x"])
 
 
-@pytest.mark.parametrize("kind, sequences", [
-    ("tracking", ("0007", "0000")), ("nuscenes", nuscenes_folder.SCENES[::-1]),
-    ("semantickitti", ("08", "00"))])
+@pytest.mark.parametrize(
+    "kind, sequences",
+    [("tracking", ("0007", "0000")), ("nuscenes", nuscenes_folder.SCENES[::-1]), ("semantickitti", ("08", "00"))],
+)
 def test_split_may_name_sequences(tmp_path, kind, sequences):
     root = MADE[kind][0](tmp_path / kind)
     frames = list(open_recording(root))
     first, second = ([f.name for f in frames if f.sequence == name] for name in sequences)
-    for requested, expected in ((sequences[:1], first), (sequences, first + second),
-                                ((first[-1], *sequences), first[-1:] + first[:-1] + second)):
+    for requested, expected in (
+        (sequences[:1], first),
+        (sequences, first + second),
+        ((first[-1], *sequences), first[-1:] + first[:-1] + second),
+    ):
         split = write(tmp_path / "split.txt", "\n".join(requested) + "\n")
         assert [f.name for f in open_recording(root, split=split)] == expected
 
@@ -196,9 +209,11 @@ def test_split_may_name_sequences(tmp_path, kind, sequences):
 def test_invalid_split_is_reported(tmp_path, written):
     for root in (object_folder(tmp_path / "kitti"), written):
         first = next(iter(open_recording(root))).name
-        for text, words in (("", f"is empty; it needs one frame per line, such as {first}"),
-                            (f"{first}\nx\ny\n", rf"names x \(2 unknown\), .* frame is {first}"),
-                            (b"\xff\xfe\x00", "cannot read the split")):
+        for text, words in (
+            ("", f"is empty; it needs one frame per line, such as {first}"),
+            (f"{first}\nx\ny\n", rf"names x \(2 unknown\), .* frame is {first}"),
+            (b"\xff\xfe\x00", "cannot read the split"),
+        ):
             with pytest.raises(InputError, match=words) as error:
                 open_recording(root, split=write(tmp_path / "split.txt", text))
             assert "\n" not in str(error.value) and "split.txt" in str(error.value)
@@ -207,6 +222,7 @@ def test_invalid_split_is_reported(tmp_path, written):
 
 
 # columns
+
 
 def test_unusable_returns_are_dropped_from_all_columns(tmp_path):
     xyz = scene().astype(np.float64)[:, :3]
@@ -218,15 +234,13 @@ def test_unusable_returns_are_dropped_from_all_columns(tmp_path):
     before = xyz.copy(), intensity.copy()
     frame = PointCloud.of(xyz, intensity, 5, "velodyne")
     assert np.array_equal(frame.xyz, xyz[kept].astype(np.float32))
-    assert np.array_equal(frame.intensity, kept) and (frame.stamp_ns, frame.frame_id) == (
-        5, "velodyne")
+    assert np.array_equal(frame.intensity, kept) and (frame.stamp_ns, frame.frame_id) == (5, "velodyne")
     assert frame.xyz.dtype == np.float32 and frame.xyz.flags.c_contiguous
     assert np.array_equal(before[0], xyz, equal_nan=True) and np.array_equal(before[1], intensity)
     assert PointCloud.of(xyz).intensity is None and len(PointCloud.of(xyz[:0])) == 0
     unit = intensity / np.float32(len(xyz))
-    write_scan(tmp_path / "sequences/00", 0, np.column_stack([xyz, unit]),
-               np.arange(len(xyz)), np.arange(len(xyz)))
-    read, = open_recording(tmp_path)
+    write_scan(tmp_path / "sequences/00", 0, np.column_stack([xyz, unit]), np.arange(len(xyz)), np.arange(len(xyz)))
+    (read,) = open_recording(tmp_path)
     assert np.array_equal(read.load().intensity, unit[read.point_truth().classes])
     assert np.array_equal(read.point_truth().instances, kept)
 
@@ -253,7 +267,10 @@ def test_named_pipe_is_rejected_without_waiting(tmp_path):
     (tmp_path / "bag").mkdir()
     for path in ("bag/bag.mcap", "pipe.bin"):
         os.mkfifo(tmp_path / path)
-    for read in (lambda: open_recording(tmp_path / "bag"), lambda: Bag(tmp_path / "bag/bag.mcap"),
-                 lambda: read_velodyne(tmp_path / "pipe.bin")):
+    for read in (
+        lambda: open_recording(tmp_path / "bag"),
+        lambda: Bag(tmp_path / "bag/bag.mcap"),
+        lambda: read_velodyne(tmp_path / "pipe.bin"),
+    ):
         with pytest.raises(InputError, match="is not a regular file"):
             read()

@@ -15,8 +15,16 @@ from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array, to_array
 from msg_utils.stamps import make_header
 
-LAYOUT = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "u1"), ("ring", "<u2"),
-          ("t", "<u4"), ("normal", "<f4", (3,)), ("stamp", "<u8")]
+LAYOUT = [
+    ("x", "<f4"),
+    ("y", "<f4"),
+    ("z", "<f4"),
+    ("intensity", "u1"),
+    ("ring", "<u2"),
+    ("t", "<u4"),
+    ("normal", "<f4", (3,)),
+    ("stamp", "<u8"),
+]
 
 
 def points(n=200):
@@ -24,8 +32,11 @@ def points(n=200):
     made = np.zeros(n, LAYOUT)
     for name in made.dtype.names:
         part = made[name]
-        part[...] = (rng.normal(0, 10, part.shape) if part.dtype.kind == "f"
-                     else rng.integers(0, np.iinfo(part.dtype).max // 2, part.shape, np.int64))
+        part[...] = (
+            rng.normal(0, 10, part.shape)
+            if part.dtype.kind == "f"
+            else rng.integers(0, np.iinfo(part.dtype).max // 2, part.shape, np.int64)
+        )
     made["ring"] = np.arange(n) // 20  # runs, which compress
     return made
 
@@ -36,17 +47,16 @@ def compress_lzf(data):
 
     def flush():
         for k in range(0, len(literal), 32):
-            out.append(len(literal[k:k + 32]) - 1)
-            out.extend(literal[k:k + 32])
+            out.append(len(literal[k : k + 32]) - 1)
+            out.extend(literal[k : k + 32])
         literal.clear()
 
     while i < len(data):
-        key, length = data[i:i + 3], 0
+        key, length = data[i : i + 3], 0
         back = i - seen.get(key, -1) - 1
         if len(key) == 3 and key in seen and back < 8192:
             start = seen[key]
-            while i + length < len(data) and length < 264 and (
-                    data[start + length] == data[i + length]):
+            while i + length < len(data) and length < 264 and (data[start + length] == data[i + length]):
                 length += 1
             flush()
             short = min(length - 2, 7)
@@ -67,17 +77,30 @@ def compress_lzf(data):
 def pcd(cloud, kind):
     kinds = {"f": "F", "u": "U", "i": "I"}
     parts = [cloud.dtype[name] for name in cloud.dtype.names]
-    head = "\n".join((
-        "# .PCD v0.7", "VERSION 0.7", "FIELDS " + " ".join(cloud.dtype.names),
-        "SIZE " + " ".join(str(p.base.itemsize) for p in parts),
-        "TYPE " + " ".join(kinds[p.base.kind] for p in parts),
-        "COUNT " + " ".join(str(int(np.prod(p.shape, dtype=int))) for p in parts),
-        f"WIDTH {len(cloud)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(cloud)}",
-        f"DATA {kind}", "")).encode()
+    head = "\n".join(
+        (
+            "# .PCD v0.7",
+            "VERSION 0.7",
+            "FIELDS " + " ".join(cloud.dtype.names),
+            "SIZE " + " ".join(str(p.base.itemsize) for p in parts),
+            "TYPE " + " ".join(kinds[p.base.kind] for p in parts),
+            "COUNT " + " ".join(str(int(np.prod(p.shape, dtype=int))) for p in parts),
+            f"WIDTH {len(cloud)}",
+            "HEIGHT 1",
+            "VIEWPOINT 0 0 0 1 0 0 0",
+            f"POINTS {len(cloud)}",
+            f"DATA {kind}",
+            "",
+        )
+    ).encode()
     if kind == "ascii":
-        return head + "\n".join(" ".join(repr(v.item()) for name in cloud.dtype.names
-                                         for v in np.atleast_1d(row[name])) for row in cloud
-                                ).encode()
+        return (
+            head
+            + "\n".join(
+                " ".join(repr(v.item()) for name in cloud.dtype.names for v in np.atleast_1d(row[name]))
+                for row in cloud
+            ).encode()
+        )
     if kind == "binary":
         return head + cloud.tobytes()
     plain = b"".join(np.ascontiguousarray(cloud[name]).tobytes() for name in cloud.dtype.names)
@@ -117,13 +140,22 @@ def test_lzf_data_are_decompressed(data):
 ONE = "FIELDS x\nSIZE 4\nTYPE F\n"
 
 
-@pytest.mark.parametrize("text", [
-    "", "FIELDS x\nDATA binary\n", "no cloud", ONE + "POINTS 999999999999\nDATA binary\n",
-    ONE.replace("F\n", "Q\n") + "POINTS 1\nDATA ascii\n1", ONE + "POINTS 1\nDATA zip\n1",
-    ONE.replace("4", "0") + "POINTS 1\nDATA ascii\n1", *(
-        f"FIELDS n\nSIZE {size}\nTYPE {kind}\nPOINTS 1\nDATA ascii\n{number}"
-        for size, kind, number in ((1, "U", 256), (2, "U", -1), (1, "I", 128), (8, "U", 2**64),
-                                   (8, "I", 2**63)))])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "FIELDS x\nDATA binary\n",
+        "no cloud",
+        ONE + "POINTS 999999999999\nDATA binary\n",
+        ONE.replace("F\n", "Q\n") + "POINTS 1\nDATA ascii\n1",
+        ONE + "POINTS 1\nDATA zip\n1",
+        ONE.replace("4", "0") + "POINTS 1\nDATA ascii\n1",
+        *(
+            f"FIELDS n\nSIZE {size}\nTYPE {kind}\nPOINTS 1\nDATA ascii\n{number}"
+            for size, kind, number in ((1, "U", 256), (2, "U", -1), (1, "I", 128), (8, "U", 2**64), (8, "I", 2**63))
+        ),
+    ],
+)
 def test_invalid_pcd_file_is_reported(tmp_path, text):
     path = tmp_path / "one.pcd"
     path.write_text(text)
@@ -204,9 +236,13 @@ def test_times_in_file_names_are_stamps(tmp_path):
     assert open_clouds(tmp_path).stamps_ns is None
 
 
-@pytest.mark.parametrize("names, timed", [
-    (["1700000000.1", "1700000000.19998", "1700000000.4", "1700000001"], True),  # str(time)
-    (["0000000000", "0000000001", "0000000010"], False)])  # KITTI's frame numbers
+@pytest.mark.parametrize(
+    "names, timed",
+    [
+        (["1700000000.1", "1700000000.19998", "1700000000.4", "1700000001"], True),  # str(time)
+        (["0000000000", "0000000001", "0000000010"], False),
+    ],
+)  # KITTI's frame numbers
 def test_files_are_in_order_of_time_or_number(names, timed, tmp_path):
     for name in reversed(names):
         (tmp_path / f"{name}.pcd").write_bytes(pcd(points(), "ascii"))

@@ -69,23 +69,30 @@ def npy_files(root, clouds):
 
 def pcd_files(root, clouds):
     for i, cloud in clouds:
-        write(root / f"{i}.pcd", (
-            b"VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
-            b"WIDTH 50\nHEIGHT 1\nPOINTS 50\nDATA binary\n") + cloud.tobytes())
+        write(
+            root / f"{i}.pcd",
+            (
+                b"VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+                b"WIDTH 50\nHEIGHT 1\nPOINTS 50\nDATA binary\n"
+            )
+            + cloud.tobytes(),
+        )
 
 
 def bag(root, clouds):
-    write_bag(root / "drive", [Frame.of(str(i), cloud_frame(cloud, STAMP + i * 10**8))
-                               for i, cloud in clouds])
+    write_bag(root / "drive", [Frame.of(str(i), cloud_frame(cloud, STAMP + i * 10**8)) for i, cloud in clouds])
 
 
-LAYOUTS = {each.__name__: each for each in (object_files, tracking_files, raw_files, semantic_files,
-                                            bin_files, npy_files, pcd_files, bag)}
+LAYOUTS = {
+    each.__name__: each
+    for each in (object_files, tracking_files, raw_files, semantic_files, bin_files, npy_files, pcd_files, bag)
+}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("full, whole", [(1, False), (100, False), (255, False), (255, True),
-                                         (1023, True), (65535, True)])
+@pytest.mark.parametrize(
+    "full, whole", [(1, False), (100, False), (255, False), (255, True), (1023, True), (65535, True)]
+)
 def test_scale_is_the_same_for_all_frames_in_any_order(tmp_path, layout, full, whole):
     LAYOUTS[layout](tmp_path, clouds(full, whole))
     path = tmp_path / "drive" if layout == "bag" else tmp_path
@@ -103,10 +110,18 @@ def test_scale_is_the_same_for_all_frames_in_any_order(tmp_path, layout, full, w
         assert np.allclose(given, expected[0] * full / 10)
 
 
-@pytest.mark.parametrize("kind, values, full", [
-    ("u1", [0, 3, 90], 255), ("<u2", [0, 3, 200], 255), ("<u2", [0, 3, 3000], 4095),
-    ("<u2", [0, 3, 60000], 65535), ("<f4", [np.nan, -1, 0.5], 1), ("<f4", [0, 0, 0], 1),
-    ("<f8", [7, 7, 7], 255)])
+@pytest.mark.parametrize(
+    "kind, values, full",
+    [
+        ("u1", [0, 3, 90], 255),
+        ("<u2", [0, 3, 200], 255),
+        ("<u2", [0, 3, 3000], 4095),
+        ("<u2", [0, 3, 60000], 65535),
+        ("<f4", [np.nan, -1, 0.5], 1),
+        ("<f4", [0, 0, 0], 1),
+        ("<f8", [7, 7, 7], 255),
+    ],
+)
 def test_scale_depends_on_the_type_of_the_field(tmp_path, kind, values, full):
     points = np.ones(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("reflectivity", kind)])
     points["reflectivity"] = values
@@ -124,9 +139,13 @@ def test_empty_and_black_clouds_do_not_affect_the_scale(tmp_path):
     xyz = np.ones((50, 3))
     first = [np.zeros((0, 4), np.float32), np.column_stack([xyz, np.zeros(50)])] * 8
     rest = [cloud for _, cloud in clouds(255)]
-    write_bag(tmp_path / "drive", [
-        Frame.of(str(i), cloud_frame(cloud.astype(np.float32), STAMP + i * 10**8))
-        for i, cloud in enumerate([*first, *rest])])
+    write_bag(
+        tmp_path / "drive",
+        [
+            Frame.of(str(i), cloud_frame(cloud.astype(np.float32), STAMP + i * 10**8))
+            for i, cloud in enumerate([*first, *rest])
+        ],
+    )
     frames = open_recording(tmp_path / "drive").frames
     assert not frames[1].load().intensity.any() and frames[-1].load().intensity.max() == 1.0
 
@@ -152,4 +171,3 @@ def test_commands_report_the_scale_and_export_0_to_1(tmp_path, monkeypatch, capf
     assert exit_of(monkeypatch, "convert", tmp_path / "dark", "--out", tmp_path / "dark.bag") == 0
     output = " ".join(capfd.readouterr().err.split())
     assert "intensity goes up to 0.01 where 1 is" in output and "input.intensity_max" in output
-

@@ -31,8 +31,7 @@ def test_ros1_bag_equals_the_ros2_bag(drive_bag, tmp_path, compress):
         np.testing.assert_array_equal(a.truth().boxes, b.truth().boxes)
         assert a.truth().labels == b.truth().labels and (a.camera() is None) == (b.camera() is None)
     by_number = open_clouds(tmp_path / "drive.bag")
-    np.testing.assert_array_equal(by_number.load(len(ours) - 1).data,
-                                  open_clouds(drive_bag).load(len(ours) - 1).data)
+    np.testing.assert_array_equal(by_number.load(len(ours) - 1).data, open_clouds(drive_bag).load(len(ours) - 1).data)
 
 
 def test_folder_named_bag_is_a_ros2_bag(drive_bag, tmp_path):
@@ -51,16 +50,16 @@ def test_old_tf_name_latched_topics_and_unknown_types_are_read(tmp_path):
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
     stamped = tf(transform("a", "b", 0, np.eye(4)))
     with Writer(tmp_path / "old.bag") as bag:
-        for topic, kind, latched in (("/tf", "tf/msg/tfMessage", 0),
-                                     ("/tf_static", "tf2_msgs/msg/TFMessage", 1),
-                                     ("/packets", "driver_msgs/msg/Packet", 0)):
+        for topic, kind, latched in (
+            ("/tf", "tf/msg/tfMessage", 0),
+            ("/tf_static", "tf2_msgs/msg/TFMessage", 1),
+            ("/packets", "driver_msgs/msg/Packet", 0),
+        ):
             connection = bag.add_connection(topic, kind, typestore=store, latching=latched)
             ros2 = stamped.transforms[0]
-            header = store.types["std_msgs/msg/Header"](
-                seq=7, stamp=ros2.header.stamp, frame_id=ros2.header.frame_id)
+            header = store.types["std_msgs/msg/Header"](seq=7, stamp=ros2.header.stamp, frame_id=ros2.header.frame_id)
             ros1 = type(ros2)(header=header, child_frame_id="b", transform=ros2.transform)
-            bag.write(connection, 5, store.serialize_ros1(
-                store.types[kind](transforms=[ros1]), kind))
+            bag.write(connection, 5, store.serialize_ros1(store.types[kind](transforms=[ros1]), kind))
     with Bag(tmp_path / "old.bag") as bag:
         assert set(bag.topics.values()) == {"tf2_msgs/msg/TFMessage"}
         assert bag.counts == {"/tf": 1, "/tf_static": 1}

@@ -80,21 +80,24 @@ def test_any_recording_gives_a_result_of_every_frame(kind, tmp_path, monkeypatch
     found = objects(content)
     for frame, said in zip(open_recording(data), content["frames"]):
         assert {k: said[k] for k in ("sequence", "index", "stamp_ns", "frame_id")} == {
-            "sequence": frame.sequence, "index": frame.index, "stamp_ns": frame.stamp_ns,
-            "frame_id": frame.load().frame_id}
+            "sequence": frame.sequence,
+            "index": frame.index,
+            "stamp_ns": frame.stamp_ns,
+            "frame_id": frame.load().frame_id,
+        }
         expected = MadeDetector()(frame.load()).detections
-        np.testing.assert_array_equal(np.float32(found[frame.name]), np.column_stack([
-            expected.class_ids, expected.scores, expected.boxes]).astype(np.float32))
+        np.testing.assert_array_equal(
+            np.float32(found[frame.name]),
+            np.column_stack([expected.class_ids, expected.scores, expected.boxes]).astype(np.float32),
+        )
         camera = choose_calibration(frame)[0].lidar_to_camera
         back = read_results(out / f"kitti/{frame.name}.txt", camera)
         np.testing.assert_allclose(back.boxes[:, :6], expected.boxes[:, :6], atol=2e-4)
         assert [e["score"] for e in back.extras] == pytest.approx(expected.scores, abs=1e-4)
     table = [*csv.DictReader((out / "detections.csv").open())]
-    assert [(row["frame"], row["class"], row["id"]) for row in table] == [
-        (name, "Pedestrian", "") for name in names]
+    assert [(row["frame"], row["class"], row["id"]) for row in table] == [(name, "Pedestrian", "") for name in names]
     for row in table:
-        assert [float(row[k]) for k in ("score", "x", "yaw")] == [
-            found[row["frame"]][0][k] for k in (1, 2, 8)]
+        assert [float(row[k]) for k in ("score", "x", "yaw")] == [found[row["frame"]][0][k] for k in (1, 2, 8)]
 
 
 def test_all_formats_of_one_run_hold_the_same_boxes(drives, tmp_path, monkeypatch):
@@ -112,33 +115,42 @@ def test_all_formats_of_one_run_hold_the_same_boxes(drives, tmp_path, monkeypatc
     for i, frame in enumerate(bag.frames):
         np.testing.assert_array_equal(frame.load().xyz, frames[i].load().xyz)
         boxes = shown.layers(i, frame, 0.0)["detections"]["made_detector"]
-        np.testing.assert_allclose([row[:7] for row in boxes],
-                                   np.array(found[frames[i].name])[:, 2:], atol=1e-3)
-        assert [row[8] for row in boxes] == pytest.approx([
-            row[1] for row in found[frames[i].name]])
+        np.testing.assert_allclose([row[:7] for row in boxes], np.array(found[frames[i].name])[:, 2:], atol=1e-3)
+        assert [row[8] for row in boxes] == pytest.approx([row[1] for row in found[frames[i].name]])
         assert [row[9] for row in boxes] == [{"a": 0.5}, {}]
 
 
 def seen_by_view(path):
     """A bag as `view` opens it: the recording and its results."""
     recording = open_recording(path, points=choose_points_topic(path))
-    return recording, read_recorded_results(recording.frames.poses,
-                                            [frame.stamp_ns for frame in recording.frames[:]])
+    return recording, read_recorded_results(recording.frames.poses, [frame.stamp_ns for frame in recording.frames[:]])
 
 
 @pytest.mark.parametrize("clouds", [True, False])
 def test_a_bag_holds_what_the_nodes_publish(drives, tmp_path, monkeypatch, clouds):
     out = tmp_path / "out"
-    assert detect(monkeypatch, drives, "--out", out, "--format", "mcap", "--track",
-                  "--ego", "none", *["--no-clouds"] * (not clouds)) == 0
+    assert (
+        detect(
+            monkeypatch,
+            drives,
+            "--out",
+            out,
+            "--format",
+            "mcap",
+            "--track",
+            "--ego",
+            "none",
+            *["--no-clouds"] * (not clouds),
+        )
+        == 0
+    )
     frames = open_recording(drives).frames
     stamps = [frame.stamp_ns for frame in frames]
     with Bag(out / "bag") as bag:
         assert bag.counts.get(POINTS, 0) == clouds * len(frames)
         for topic in "/made_detector/output/detections", "/tracker/output/tracks":
             marked = read_objects_by_stamp(bag, [topic])[topic]
-            arrays = [from_detection_array(message) for _, _, message
-                      in bag.messages([f"{topic}_3d"])]
+            arrays = [from_detection_array(message) for _, _, message in bag.messages([f"{topic}_3d"])]
             assert sorted(marked) == stamps == [array.stamp_ns for array in arrays]
             for array in arrays:
                 np.testing.assert_allclose(array.boxes, marked[array.stamp_ns].boxes, atol=1e-9)
@@ -147,8 +159,7 @@ def test_a_bag_holds_what_the_nodes_publish(drives, tmp_path, monkeypatch, cloud
         assert sum(map(len, marked.values())) > 0
 
 
-def test_bag_with_duplicate_stamps_is_written_without_labels(tmp_path, monkeypatch,
-                                                             capsys):
+def test_bag_with_duplicate_stamps_is_written_without_labels(tmp_path, monkeypatch, capsys):
     """Labels are assigned by stamp, which would be ambiguous."""
     frames = [replace(frame, stamp_ns=STAMP) for frame in scans(3)]
     recording = Recording(tmp_path, "", frames)
@@ -180,8 +191,11 @@ def test_written_results_score_like_the_detector(kitti, tmp_path, monkeypatch, c
 def numbers_in(content):
     """Return all numbers in nested dicts, in their order."""
     inner = content.values() if isinstance(content, dict) else [content]
-    return [number for each in inner for number in (
-        numbers_in(each) if isinstance(each, dict) else [each] * (each is not None))]
+    return [
+        number
+        for each in inner
+        for number in (numbers_in(each) if isinstance(each, dict) else [each] * (each is not None))
+    ]
 
 
 # Tracks
@@ -189,8 +203,7 @@ def numbers_in(content):
 
 def test_tracks_have_ids_and_velocities_that_never_mix(drives, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    assert detect(monkeypatch, drives, "--out", out, "--format", ALL, "--track",
-                  "--ego", "none") == 0
+    assert detect(monkeypatch, drives, "--out", out, "--format", ALL, "--track", "--ego", "none") == 0
     content = read_json(out)
     assert content["ego"] == "none" and content["tracking"]["min_score"] == 0.05
     ids = {}
@@ -206,25 +219,24 @@ def test_tracks_have_ids_and_velocities_that_never_mix(drives, tmp_path, monkeyp
         assert [e["velocity"] for e in each.extra] == [row["velocity"] for row in said["objects"]]
         camera = frame.calibration().lidar_to_camera
         tracks = read_tracking_labels(out / f"kitti/{frame.sequence}.txt", camera)[frame.index]
-        np.testing.assert_allclose(tracks.boxes[:, :3], np.array(
-            objects(content)[frame.name])[:, 2:5], atol=2e-4)
+        np.testing.assert_allclose(tracks.boxes[:, :3], np.array(objects(content)[frame.name])[:, 2:5], atol=2e-4)
         assert [e["track_id"] for e in tracks.extras] == each.track_ids.tolist()
 
 
 def test_written_tracks_score_like_the_tracker(drives, tmp_path, monkeypatch):
-    assert detect(monkeypatch, drives, "--out", tmp_path, "--format", "kitti", "--track",
-                  "--ego", "none", "--force") == 0
+    assert (
+        detect(monkeypatch, drives, "--out", tmp_path, "--format", "kitti", "--track", "--ego", "none", "--force") == 0
+    )
     recording, itself, read = open_recording(drives), TrackingReport(), TrackingReport()
     fill(
-        itself, recording, partial(
-            measure_tracking, lambda: MadeDetector().with_min_score(0.05), TrackingParams(), "none")
+        itself,
+        recording,
+        partial(measure_tracking, lambda: MadeDetector().with_min_score(0.05), TrackingParams(), "none"),
     )
     for frame in recording:
         if (truth := frame.truth()) is not None:
-            found = read_tracking_labels(tmp_path / f"kitti/{frame.sequence}.txt",
-                                          frame.calibration().lidar_to_camera)
-            read.update(observe(frame.sequence, frame.index, truth, found[frame.index],
-                                frame.calibration()))
+            found = read_tracking_labels(tmp_path / f"kitti/{frame.sequence}.txt", frame.calibration().lidar_to_camera)
+            read.update(observe(frame.sequence, frame.index, truth, found[frame.index], frame.calibration()))
     scores = [report.compute()["classes"] for report in (read, itself)]
     assert scores[0].keys() == scores[1].keys() and scores[0]["Pedestrian"]["boxes"] > 0
     assert numbers_in(scores[0]) == pytest.approx(numbers_in(scores[1]), abs=1e-3)
@@ -233,17 +245,14 @@ def test_written_tracks_score_like_the_tracker(drives, tmp_path, monkeypatch):
 def test_drives_of_a_bag_are_tracked_apart(tmp_path, monkeypatch):
     """Drives of a bag have no names, so their files are numbered."""
     stamps = [STAMP + s * 10**8 for s in (0, 1, 100, 101)]
-    write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(scene(i), stamp))
-                                 for i, stamp in enumerate(stamps)])
+    write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(scene(i), stamp)) for i, stamp in enumerate(stamps)])
     out = tmp_path / "out"
-    assert detect(monkeypatch, tmp_path / "bag", "--out", out, "--format", "json,kitti",
-                  "--track") == 0
+    assert detect(monkeypatch, tmp_path / "bag", "--out", out, "--format", "json,kitti", "--track") == 0
     ids = [{row["id"] for row in frame["objects"]} for frame in read_json(out)["frames"]]
     assert ids[0] & ids[1] and ids[2] & ids[3] and not (ids[0] | ids[1]) & (ids[2] | ids[3])
     assert sorted(path.name for path in (out / "kitti").iterdir()) == ["0000.txt", "0001.txt"]
     for name in "0000", "0001":
-        assert [*read_tracking_labels(out / f"kitti/{name}.txt",
-                                       FORWARD_CAMERA.lidar_to_camera)] == [0, 1]
+        assert [*read_tracking_labels(out / f"kitti/{name}.txt", FORWARD_CAMERA.lidar_to_camera)] == [0, 1]
 
 
 # Runs that stop, and other runs
@@ -257,13 +266,13 @@ def test_a_run_that_was_stopped_is_resumed(drives, tmp_path, made):
     def stop(scan):
         if len(made) == 3:
             raise Stopped
+
     recording = open_recording(drives)
     whole, parts = (make_run(recording, tmp_path / name) for name in ("whole", "parts"))
     run_detector(whole, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
     made.clear()
     with pytest.raises(Stopped):
-        run_detector(parts, partial(MadeDetector, fails=stop), [Json], ego="none",
-                     tracking=TrackingParams())
+        run_detector(parts, partial(MadeDetector, fails=stop), [Json], ego="none", tracking=TrackingParams())
     assert len(made) == 3 and not (tmp_path / "parts/detections.json").exists()
     run_detector(parts, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
     assert len(made) == len(recording)  # and none of them twice
@@ -273,13 +282,13 @@ def test_a_run_that_was_stopped_is_resumed(drives, tmp_path, made):
 def test_the_number_of_processes_does_not_change_the_result(drives, tmp_path):
     recording = open_recording(drives)
     for name, jobs in ("one", 1), ("two", 2):
-        run_detector(make_run(recording, tmp_path / name), MadeDetector, [Json],
-                     tracking=TrackingParams(), ego="none", jobs=jobs)
+        run_detector(
+            make_run(recording, tmp_path / name), MadeDetector, [Json], tracking=TrackingParams(), ego="none", jobs=jobs
+        )
     assert read_json(tmp_path / "one") == read_json(tmp_path / "two")
 
 
-def test_other_run_in_folder_is_refused_without_force(kitti, tmp_path, monkeypatch, capsys,
-                                                      made):
+def test_other_run_in_folder_is_refused_without_force(kitti, tmp_path, monkeypatch, capsys, made):
     out = tmp_path / "out"
     assert detect(monkeypatch, kitti, "--out", out, "--format", "kitti,csv", "--limit", 2) == 0
     assert detect(monkeypatch, kitti, "--out", out) == 0  # more frames, another format
@@ -298,8 +307,7 @@ def test_other_run_in_folder_is_refused_without_force(kitti, tmp_path, monkeypat
 # What cannot be used
 
 
-def test_unreadable_frames_are_named_and_others_written(kitti, tmp_path,
-                                                        monkeypatch, capsys, made):
+def test_unreadable_frames_are_named_and_others_written(kitti, tmp_path, monkeypatch, capsys, made):
     cut, out = kitti / "training/velodyne/000001.bin", tmp_path / "out"
     whole = cut.read_bytes()
     write(cut, b"123")
@@ -315,8 +323,7 @@ def test_unreadable_frames_are_named_and_others_written(kitti, tmp_path,
     assert detect(monkeypatch, kitti, "--out", out) == 0 and len(made) == 4
 
 
-def test_unreadable_labels_and_cameras_are_optional(kitti, tmp_path, monkeypatch,
-                                                    capsys):
+def test_unreadable_labels_and_cameras_are_optional(kitti, tmp_path, monkeypatch, capsys):
     write(kitti / "training/label_2/000001.txt", "Car")
     for i in 0, 2, 3:
         (kitti / f"training/calib/{i:06}.txt").unlink()
@@ -330,28 +337,34 @@ def test_unreadable_labels_and_cameras_are_optional(kitti, tmp_path, monkeypatch
 
 
 def test_equal_problems_are_reported_once_with_count(kitti, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(MadeDetector, "__call__", lambda self, frame: DetectionResult(
-        Detections.none(), problem=f"{np.ptp(frame.xyz)} m are not much"))
+    monkeypatch.setattr(
+        MadeDetector,
+        "__call__",
+        lambda self, frame: DetectionResult(Detections.none(), problem=f"{np.ptp(frame.xyz)} m are not much"),
+    )
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out") == 0
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("are not much") == 1 and "in 4 frames" in said
 
 
 def test_numbers_that_are_not_finite_are_not_written(kitti, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(MadeDetector, "__call__", lambda self, frame: DetectionResult(
-        Detections.of(np.full((1, 7), np.nan))))
+    monkeypatch.setattr(
+        MadeDetector, "__call__", lambda self, frame: DetectionResult(Detections.of(np.full((1, 7), np.nan)))
+    )
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out", "--format", ALL) == 1
     assert "not finite" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (["--format", "kiti"], "'kiti' is unknown; did you mean 'kitti'"),
-    (["--ego", "none"], "are for --track"),
-    (["--track"], "do not follow each other"),
-    (["--min-score", 2], "2"),
-])
-def test_options_that_cannot_be_used_are_refused(arguments, words, kitti, tmp_path, monkeypatch,
-                                                 capsys, made):
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--format", "kiti"], "'kiti' is unknown; did you mean 'kitti'"),
+        (["--ego", "none"], "are for --track"),
+        (["--track"], "do not follow each other"),
+        (["--min-score", 2], "2"),
+    ],
+)
+def test_options_that_cannot_be_used_are_refused(arguments, words, kitti, tmp_path, monkeypatch, capsys, made):
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out", *arguments) == 2
     assert words in capsys.readouterr().err and made == [] and not (tmp_path / "out").exists()
 
@@ -361,8 +374,7 @@ def test_options_that_cannot_be_used_are_refused(arguments, words, kitti, tmp_pa
 
 def test_pictures_and_a_film_of_every_frame(drives, tmp_path, monkeypatch, made):
     out, film = tmp_path / "out", tmp_path / "films/drive.gif"
-    assert detect(monkeypatch, drives, "--out", out, "--png", "--video", film, "--track",
-                  "--ego", "none") == 0
+    assert detect(monkeypatch, drives, "--out", out, "--png", "--video", film, "--track", "--ego", "none") == 0
     names = [frame.name for frame in open_recording(drives)]
     images = {name: Image.open(out / f"png/{name}.png") for name in names}
     assert {image.size for image in images.values()} == {(1280, 720)}
@@ -376,13 +388,10 @@ def test_pictures_and_a_film_of_every_frame(drives, tmp_path, monkeypatch, made)
     assert len(made) == len(names)
 
 
-def test_impossible_video_is_refused_before_any_work(drives, tmp_path, monkeypatch,
-                                                     capsys, made):
+def test_impossible_video_is_refused_before_any_work(drives, tmp_path, monkeypatch, capsys, made):
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec",
-                        lambda name, *more: None if name == "av" else find(name, *more))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "av" else find(name, *more))
     for name, words in ("a.mp4", "lidar_perception[video]"), ("a.avi", "is not a film"):
-        line = refused(monkeypatch, capsys, drives, "--out", tmp_path / "out", "--video",
-                       tmp_path / name)
+        line = refused(monkeypatch, capsys, drives, "--out", tmp_path / "out", "--video", tmp_path / name)
         assert words in line
     assert made == [] and not (tmp_path / "out").exists()

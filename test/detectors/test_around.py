@@ -30,8 +30,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def shipped(version="v4", range="auto"):
-    return open_detector(WEIGHTS / f"pointpillars_{version}_compact.safetensors", "cpu",
-                         min_score=0.05, range=range)
+    return open_detector(WEIGHTS / f"pointpillars_{version}_compact.safetensors", "cpu", min_score=0.05, range=range)
 
 
 def columns_of(scan):
@@ -73,8 +72,10 @@ def test_around_equals_single_pass_away_from_border(street):
     detector, columns = shipped(), columns_of(street.frame)
     half = replace(detector.proposer.header, config=replace(detector.proposer.config, **HALF))
     one = make_detector(detector.proposer.network, half, detector.params)
-    apart = [found[np.flatnonzero(found.boxes[:, 0] > 8)] for found in (
-        each(street.frame, **columns).detections for each in (one, detector.with_range("around")))]
+    apart = [
+        found[np.flatnonzero(found.boxes[:, 0] > 8)]
+        for found in (each(street.frame, **columns).detections for each in (one, detector.with_range("around")))
+    ]
     assert len(apart[0]) > 3 and same(*apart)
 
 
@@ -99,14 +100,12 @@ def test_around_with_empty_half_or_empty_cloud(street):
 
 def test_unsupported_range_is_refused():
     config = pointnet_samples.small()
-    pointnet = PointNetDetector(pointnet_samples.make_classifier(
-        pointnet_samples.lively(config), Header(config)))
+    pointnet = PointNetDetector(pointnet_samples.make_classifier(pointnet_samples.lively(config), Header(config)))
     assert pointnet.with_range("around") is pointnet
     with pytest.raises(InputError, match="pointnet always covers all directions"):
         pointnet.with_range("ahead")
     with pytest.raises(InputError, match="does not support the range around: a grid of"):
-        random_detector(low=(0.0, -3.52, -3.0), high=(7.04, 3.52, 1.0),
-                        cell=0.22).with_range("around")
+        random_detector(low=(0.0, -3.52, -3.0), high=(7.04, 3.52, 1.0), cell=0.22).with_range("around")
     exported = make_detector(SimpleNamespace(has_fixed_range=True), Header(tiny()))
     with pytest.raises(InputError, match="use the checkpoint for the range around"):
         exported.with_range("around")

@@ -16,21 +16,14 @@ from pointnet_samples import random_detector as random_pointnet
 from samples import object_folder
 
 from lidar_perception.detectors.calibration import calibrate_scores, to_raw_score
-from lidar_perception.detectors.checkpoint import (
-    Header,
-    read_checkpoint,
-    read_header,
-    save_checkpoint,
-    save_header,
-)
+from lidar_perception.detectors.checkpoint import Header, read_checkpoint, read_header, save_checkpoint, save_header
 from lidar_perception.types import CLASSES, Detections, InputError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 LINES = {"Car": (0.6, 0.5), "Pedestrian": (1.4, -0.8)}
 
 
-@given(st.lists(st.floats(0, 1, width=32), min_size=1, max_size=30), st.floats(0.05, 20),
-       st.floats(-20, 20))
+@given(st.lists(st.floats(0, 1, width=32), min_size=1, max_size=30), st.floats(0.05, 20), st.floats(-20, 20))
 def test_calibration_keeps_order_and_is_invertible(scores, slope, offset):
     lines = {"Car": (slope, offset)}
     scores = np.sort(np.array(scores, np.float32))
@@ -49,8 +42,9 @@ def test_calibration_keeps_order_and_is_invertible(scores, slope, offset):
             assert low - 1e-6 <= score <= high + 1e-6
 
 
-@pytest.mark.parametrize("make", [lambda: random_detector("v4", eager(score=0.0)), random_pointnet],
-                         ids=["PointPillars", "PointNet"])
+@pytest.mark.parametrize(
+    "make", [lambda: random_detector("v4", eager(score=0.0)), random_pointnet], ids=["PointPillars", "PointNet"]
+)
 def test_calibrated_detector_finds_same_boxes(make):
     detector, scan = make().with_min_score(0.0), frame()
     plain = detector(scan).detections
@@ -64,12 +58,21 @@ def test_calibrated_detector_finds_same_boxes(make):
     strict = detector.with_min_score(middle)(scan).detections
     assert 0 < len(strict) <= len(found) and (strict.scores >= np.float32(middle) - 1e-6).all()
     best = detector.with_min_score(1.0)(scan).best
-    assert len(detector.with_min_score(1.0)(scan).detections) == 0 and set(best) == {
-        *detector.classes}
+    assert len(detector.with_min_score(1.0)(scan).detections) == 0 and set(best) == {*detector.classes}
 
 
-@pytest.mark.parametrize("broken", [{"Car": [0, 1]}, {"Car": [1]}, {"Car": [-1, 0]}, {"Car": None},
-                                    {"Lamp": [1, 0]}, {"Car": [1, 1e9]}, {"Car": ["a", 0]}])
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"Car": [0, 1]},
+        {"Car": [1]},
+        {"Car": [-1, 0]},
+        {"Car": None},
+        {"Lamp": [1, 0]},
+        {"Car": [1, 1e9]},
+        {"Car": ["a", 0]},
+    ],
+)
 def test_lines_that_do_not_rise_are_refused(tmp_path, broken):
     header = Header(tiny("v0"), calibration=broken)
     save_checkpoint(tmp_path / "w.safetensors", lively(tiny("v0")), header)
@@ -85,12 +88,10 @@ def test_save_header_keeps_stored_weights(tmp_path, half):
     save_header(path, Header(config, calibration={"Car": (1.0, 0.0)}))
     header, after = read_checkpoint(path, type(config))
     assert header.calibration == {"Car": (1.0, 0.0)} and after.keys() == before.keys()
-    assert all(value.dtype == before[name].dtype and value.equal(before[name])
-               for name, value in after.items())
+    assert all(value.dtype == before[name].dtype and value.equal(before[name]) for name, value in after.items())
     # scans without enough objects give no line, and the file keeps those that it has
     whole = path.read_bytes()
     script = runpy.run_path(str(Path(__file__).parents[2] / "scripts/calibrate_weights.py"))
-    result = CliRunner().invoke(script["main"], [str(object_folder(tmp_path / "scans", count=1)),
-                                                 str(path)])
+    result = CliRunner().invoke(script["main"], [str(object_folder(tmp_path / "scans", count=1)), str(path)])
     assert result.exit_code == 1 and "too few correct or wrong detections of Car" in result.output
     assert path.read_bytes() == whole

@@ -27,24 +27,24 @@ from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, InputError, PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-NAMES = ["STM-CPA paper", "STM-CPA best", "STM-CPA best, auto", "PointPillars v0 compact",
-         "PointNet"]
+NAMES = ["STM-CPA paper", "STM-CPA best", "STM-CPA best, auto", "PointPillars v0 compact", "PointNet"]
 each_name = pytest.mark.parametrize("name", NAMES)
 
 
 @pytest.fixture(scope="module")
 def frame():
     cloud, truth = crowd(1)
-    return Frame.of("crowd", PointCloud(cloud[:, :3].copy(), cloud[:, 3].copy()), truth,
-                    CALIBRATION)
+    return Frame.of("crowd", PointCloud(cloud[:, :3].copy(), cloud[:, 3].copy()), truth, CALIBRATION)
 
 
 @pytest.fixture(scope="module")
 def detectors(frame, tmp_path_factory):
     """Return the detector of every contender by name, with random networks."""
     folder = tmp_path_factory.mktemp("weights")
-    for name, made, config in (("a", detection_samples, detection_samples.tiny()),
-                               ("b", pointnet_samples, pointnet_samples.small())):
+    for name, made, config in (
+        ("a", detection_samples, detection_samples.tiny()),
+        ("b", pointnet_samples, pointnet_samples.small()),
+    ):
         save_checkpoint(folder / name, made.lively(config), Header(config))
     with pytest.MonkeyPatch.context() as patch:
         for module in pointpillars_weights, pointnet_weights:
@@ -63,8 +63,10 @@ def test_detector_has_classes_and_thresholds(detectors, name):
     assert detector.classes and set(detector.classes) <= set(CLASSES)
     assert set(detector.min_scores) == set(detector.classes)
     columns = inspect.signature(detector).parameters
-    assert [p.kind for p in columns.values()] == [inspect.Parameter.POSITIONAL_OR_KEYWORD,
-                                                  *[inspect.Parameter.KEYWORD_ONLY] * 2]
+    assert [p.kind for p in columns.values()] == [
+        inspect.Parameter.POSITIONAL_OR_KEYWORD,
+        *[inspect.Parameter.KEYWORD_ONLY] * 2,
+    ]
     assert [*columns][1:] == ["ground", "cluster_ids"]
 
 
@@ -77,12 +79,10 @@ def test_an_array_is_taken_like_its_frame(detectors, frame, name):
     expected = detector(scan, ground=ground)
     broken = np.insert(cloud, [0, 50], [[np.nan] * 4, [0, 0, 0, 1]], axis=0)
     assert same(detector(broken, ground=np.insert(ground, [0, 50], True)), expected)
-    assert same(detector(broken.tolist(), ground=np.insert(ground, [0, 50], True).tolist()),
-                expected)
+    assert same(detector(broken.tolist(), ground=np.insert(ground, [0, 50], True).tolist()), expected)
     if "STM-CPA" not in name or "auto" in name:  # the others find no seed there
         assert len(detector([]).detections) == 0 and detector(np.full((9, 3), np.nan)).problem
-    for wrong, said in ((np.ones((5, 5)), r"points\[:, :4\]"), (frame, "frame.load"),
-                        (None, "NoneType")):
+    for wrong, said in ((np.ones((5, 5)), r"points\[:, :4\]"), (frame, "frame.load"), (None, "NoneType")):
         with pytest.raises(InputError, match=said):
             detector(wrong)
 
@@ -106,11 +106,9 @@ def test_other_intensity_scale_is_reported_and_normalized(detectors, frame, name
 def test_ego_vehicle_is_dropped_for_any_heading(seed):
     """Dropped are boxes that contain the sensor or a mast of 1 m, and cars below it within 1 m."""
     rng = np.random.default_rng(seed)
-    boxes = np.column_stack([rng.uniform(-4, 4, (50, 3)), rng.uniform(0.5, 5, (50, 3)),
-                             rng.uniform(-4, 4, 50)])
+    boxes = np.column_stack([rng.uniform(-4, 4, (50, 3)), rng.uniform(0.5, 5, (50, 3)), rng.uniform(-4, 4, 50)])
     class_ids = np.arange(50) % len(CLASSES)
-    left = {tuple(box) for box in drop_ego_vehicle(
-        Detections.of(boxes, class_ids), SENSOR_HEIGHT).boxes.tolist()}
+    left = {tuple(box) for box in drop_ego_vehicle(Detections.of(boxes, class_ids), SENSOR_HEIGHT).boxes.tolist()}
     angle = np.linspace(0, 2 * np.pi, 721)
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(721)])
     disc = np.concatenate([ring * share for share in np.linspace(0, 1, 21)])
@@ -124,15 +122,21 @@ def test_ego_vehicle_is_dropped_for_any_heading(seed):
         assert (tuple(box.astype(np.float32).tolist()) in left) != held
 
 
-@pytest.mark.parametrize("pose", [SensorPoseParams(), SensorPoseParams(height=2.4),
-                                  SensorPoseParams(roll=np.pi), SensorPoseParams(height=6.0)])
+@pytest.mark.parametrize(
+    "pose",
+    [SensorPoseParams(), SensorPoseParams(height=2.4), SensorPoseParams(roll=np.pi), SensorPoseParams(height=6.0)],
+)
 def test_ego_vehicle_is_dropped_and_next_car_is_kept(pose):
     """The roof is detected in three parts, as in KITTI, with any mounting up to MAX_MAST_M above
     the car."""
     up = pose.height - SENSOR_HEIGHT
-    roof = np.array([[-0.2, 0.1, up - 1.0, 3.8, 1.6, 1.5, 0.9],
-                     [0.8, -1.7, up - 1.0, 4.0, 1.7, 1.5, -0.1],
-                     [-1.5, -0.2, up - 1.1, 4.0, 1.6, 1.5, 1.6]])
+    roof = np.array(
+        [
+            [-0.2, 0.1, up - 1.0, 3.8, 1.6, 1.5, 0.9],
+            [0.8, -1.7, up - 1.0, 4.0, 1.7, 1.5, -0.1],
+            [-1.5, -0.2, up - 1.1, 4.0, 1.6, 1.5, 1.6],
+        ]
+    )
     other = [0.0, -2.8, up - 1.0, 4.0, 1.6, 1.5, 0.0]
     found = restore_detections(Detections.of([*roof, other], CAR), pose).boxes
     assert len(found) == 1 and abs(found[0, 1]) == np.float32(2.8)
@@ -141,8 +145,7 @@ def test_ego_vehicle_is_dropped_and_next_car_is_kept(pose):
 
 
 def test_every_network_drops_the_ego_vehicle(detectors, frame, monkeypatch):
-    monkeypatch.setattr(normalized_view, "drop_ego_vehicle",
-                        lambda detections, height: detections[:0])
+    monkeypatch.setattr(normalized_view, "drop_ego_vehicle", lambda detections, height: detections[:0])
     for name in NAMES:
         if name.startswith("P"):
             assert len(detectors[name](frame.load()).detections) == 0
@@ -176,8 +179,12 @@ def test_with_min_score_returns_a_copy(detectors, frame, name):
 @each_name
 def test_columns_of_another_length_are_refused_by_name(detectors, frame, name):
     scan = frame.load()
-    for column, values in dict(ground=np.zeros(len(scan) - 1, bool),
-                               cluster_ids=np.zeros(len(scan) + 1, np.int32)).items():
-        with pytest.raises(InputError, match=rf"^{column} has {len(values)} values for {len(scan)} "
-                           "points$"):
+    for column, values in dict(
+        ground=np.zeros(len(scan) - 1, bool), cluster_ids=np.zeros(len(scan) + 1, np.int32)
+    ).items():
+        with pytest.raises(
+            InputError,
+            match=rf"^{column} has {len(values)} values for {len(scan)} "
+            "points$",
+        ):
             detectors[name](scan, **{column: values})

@@ -24,18 +24,51 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.types import InputError
 
 # Others run these lines.
-pytestmark = [pytest.mark.no_cover,
-              pytest.mark.usefixtures("one_thread")]
+pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread")]
 
-ODD = [None, True, 0, 1, -1, 2, 3, 63, 64, 1e-9, 0.5, -1e308, 1e308, math.nan, math.inf, 2**31,
-       2**63, 10**400, "", "1", "Car", "v9", "\x00", "x" * 10_000, [], [1], [1, 2, 3], [0] * 1000,
-       [[[]]], [None], ["Car", "Car"], [[1, 2, 3]] * 3, {}, {"size": [1]}, [{}], {"x": {"y": []}}]
+ODD = [
+    None,
+    True,
+    0,
+    1,
+    -1,
+    2,
+    3,
+    63,
+    64,
+    1e-9,
+    0.5,
+    -1e308,
+    1e308,
+    math.nan,
+    math.inf,
+    2**31,
+    2**63,
+    10**400,
+    "",
+    "1",
+    "Car",
+    "v9",
+    "\x00",
+    "x" * 10_000,
+    [],
+    [1],
+    [1, 2, 3],
+    [0] * 1000,
+    [[[]]],
+    [None],
+    ["Car", "Car"],
+    [[1, 2, 3]] * 3,
+    {},
+    {"size": [1]},
+    [{}],
+    {"x": {"y": []}},
+]
 
 
 def write(path, tensors, header):
     """Write a checkpoint with any text as its header."""
-    path.write_bytes(save({name: value.contiguous() for name, value in tensors.items()},
-                          {KEY: header}))
+    path.write_bytes(save({name: value.contiguous() for name, value in tensors.items()}, {KEY: header}))
 
 
 def places(value, path=()):
@@ -67,12 +100,15 @@ def mutated(header, rng):
 
 
 SMALL = {
-    "pointpillars": (lambda: Header(tiny("v4"), {"steps": 1}, {"map": 0.5}, "abc"), lively,
-                     load_detector, eager()),
-    "pointnet": (lambda: Header(make_pointnet_config(points=16, centroids=8, coarse=4,
-                                                     neighbours=(4, 4, 4), coarse_neighbours=4)),
-                 make_pointnet, load_pointnet_detector,
-                 with_values(PointNetDetectorParams(), {"pointnet.warm_up": False})),
+    "pointpillars": (lambda: Header(tiny("v4"), {"steps": 1}, {"map": 0.5}, "abc"), lively, load_detector, eager()),
+    "pointnet": (
+        lambda: Header(
+            make_pointnet_config(points=16, centroids=8, coarse=4, neighbours=(4, 4, 4), coarse_neighbours=4)
+        ),
+        make_pointnet,
+        load_pointnet_detector,
+        with_values(PointNetDetectorParams(), {"pointnet.warm_up": False}),
+    ),
 }
 
 
@@ -85,8 +121,15 @@ def test_a_mutated_header_is_used_or_refused_with_one_line(kind, tmp_path):
     path, text, rng = tmp_path / "w.safetensors", json.loads(header.to_json()), random.Random(7)
     scan, refused = frame(), 0
     texts = [json.dumps(mutated(text, rng)) for _ in range(60)]
-    texts += ["[" * 100_000, '{"format":' * 50_000, "1" * 5000, "", "null", "\ud83d".encode(
-        "utf-8", "replace").decode(), json.dumps({**text, "format": [1]})]
+    texts += [
+        "[" * 100_000,
+        '{"format":' * 50_000,
+        "1" * 5000,
+        "",
+        "null",
+        "\ud83d".encode("utf-8", "replace").decode(),
+        json.dumps({**text, "format": [1]}),
+    ]
     for one in texts:
         write(path, tensors, one)
         try:
@@ -128,32 +171,42 @@ def test_onnx_files_with_other_inputs_are_refused(tmp_path):
     onnx = pytest.importorskip("onnx", reason="needs the extra [onnx]")
     pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
     from onnx import TensorProto, helper
+
     text = Header(tiny("v0")).to_json()
 
     def model(path, inputs, outputs=("logits", "codes", "directions"), header=text):
-        nodes = [helper.make_node("Constant", [], [name], value=helper.make_tensor(
-            name, TensorProto.FLOAT, [1], [0.0])) for name in outputs]
+        nodes = [
+            helper.make_node("Constant", [], [name], value=helper.make_tensor(name, TensorProto.FLOAT, [1], [0.0]))
+            for name in outputs
+        ]
         graph = helper.make_graph(
-            nodes, "g", [helper.make_tensor_value_info(*i) for i in inputs],
-            [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]) for name in outputs])
+            nodes,
+            "g",
+            [helper.make_tensor_value_info(*i) for i in inputs],
+            [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]) for name in outputs],
+        )
         made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
         helper.set_model_props(made, {KEY: header} if header else {})
         path.write_bytes(made.SerializeToString().replace(b"NO UTF-8", b"\xff" * 8))
 
-    right = [("points", TensorProto.FLOAT, ["n", 4]), ("offsets", TensorProto.FLOAT, ["n", 5]),
-             ("cells", TensorProto.INT64, ["n"])]
+    right = [
+        ("points", TensorProto.FLOAT, ["n", 4]),
+        ("offsets", TensorProto.FLOAT, ["n", 5]),
+        ("cells", TensorProto.INT64, ["n"]),
+    ]
     assert onnx
     path = tmp_path / "n.onnx"
     for change, words in (
-            (dict(inputs=[("pixels", *right[0][1:]), *right[1:]]), "other inputs"),
-            (dict(inputs=right[:2]), "other inputs"),
-            (dict(inputs=[("points", TensorProto.DOUBLE, ["n", 4]), *right[1:]]), "other inputs"),
-            (dict(inputs=[("points", TensorProto.FLOAT, ["n"]), *right[1:]]), "other inputs"),
-            (dict(inputs=right, outputs=("logits",)), "other inputs or outputs"),
-            (dict(inputs=right, header="[" * 99_999), "no header"),
-            (dict(inputs=right, header=""), "no header"),
-            (dict(inputs=right, header="NO UTF-8"), "cannot read"),
-            (dict(inputs=right), "n.onnx")):  # outputs of a shape that no cloud has
+        (dict(inputs=[("pixels", *right[0][1:]), *right[1:]]), "other inputs"),
+        (dict(inputs=right[:2]), "other inputs"),
+        (dict(inputs=[("points", TensorProto.DOUBLE, ["n", 4]), *right[1:]]), "other inputs"),
+        (dict(inputs=[("points", TensorProto.FLOAT, ["n"]), *right[1:]]), "other inputs"),
+        (dict(inputs=right, outputs=("logits",)), "other inputs or outputs"),
+        (dict(inputs=right, header="[" * 99_999), "no header"),
+        (dict(inputs=right, header=""), "no header"),
+        (dict(inputs=right, header="NO UTF-8"), "cannot read"),
+        (dict(inputs=right), "n.onnx"),
+    ):  # outputs of a shape that no cloud has
         model(path, **change)
         with pytest.raises(InputError, match=words) as error:
             load_detector(path, "cpu")(frame())
@@ -164,11 +217,13 @@ def test_tensors_of_other_types_are_refused(tmp_path):
     config = tiny("v4")
     path, state = tmp_path / "w.safetensors", lively(config).state_dict()
     for dtype in torch.bool, torch.int8, torch.complex64:
-        write(path, {name: value.to(dtype) for name, value in state.items()},
-              Header(config).to_json())
+        write(path, {name: value.to(dtype) for name, value in state.items()}, Header(config).to_json())
         with pytest.raises(InputError, match="should be floats of shape"):
             load_detector(path, "cpu", eager())
-    write(path, {name: value.double() if value.is_floating_point() else value
-                 for name, value in state.items()}, Header(config).to_json())
+    write(
+        path,
+        {name: value.double() if value.is_floating_point() else value for name, value in state.items()},
+        Header(config).to_json(),
+    )
     expected = make_detector(TorchNetwork(lively(config)), Header(config), eager())
     assert same(load_detector(path, "cpu", eager(engine="torch"))(frame()), expected(frame()))

@@ -12,8 +12,11 @@ from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import Detections
 
-pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("streets"),
-              pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here")]
+pytestmark = [
+    pytest.mark.no_cover,
+    pytest.mark.usefixtures("streets"),
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here"),
+]
 DETECTORS = [*sorted(WEIGHTS.glob("*.safetensors")), "pointnet", "fused"]
 SURE = 0.3  # a score from which on a detection is in both
 

@@ -81,15 +81,18 @@ def test_cloud_holds_usable_cropped_points(module):
     assert 0 < ahead(cloud).detections.boxes[1, 5] < whole
 
 
-@pytest.mark.parametrize("reference, words", [
-    ("{}:Fixd", "has no class 'Fixd'; did you mean 'Fixed'"),
-    ("{}:value", "is not a class but int"),
-    ("{}:Fails", "cannot be created: OSError: no model"),
-    ("{}:NoCall", "has no method __call__"),
-    ("{}:OddClasses", "did you mean 'Pedestrian'"),
-    ("{}_broken:Fixed", "cannot be imported: ModuleNotFoundError: No module named 'nothing_there'"),
-    ("{}_absent:Fixed", "there is no module"),
-])
+@pytest.mark.parametrize(
+    "reference, words",
+    [
+        ("{}:Fixd", "has no class 'Fixd'; did you mean 'Fixed'"),
+        ("{}:value", "is not a class but int"),
+        ("{}:Fails", "cannot be created: OSError: no model"),
+        ("{}:NoCall", "has no method __call__"),
+        ("{}:OddClasses", "did you mean 'Pedestrian'"),
+        ("{}_broken:Fixed", "cannot be imported: ModuleNotFoundError: No module named 'nothing_there'"),
+        ("{}_absent:Fixed", "there is no module"),
+    ],
+)
 def test_unusable_class_is_refused_in_one_line(module, reference, words):
     with pytest.raises(InputError, match=words) as error:
         open_detector(reference.format(module))

@@ -14,18 +14,10 @@ from hypothesis import strategies as st
 from lidar_perception.detectors.checkpoint import require_same_config
 from lidar_perception.detectors.config_json import parse_config
 from lidar_perception.detectors.pointpillars.anchors import decode
-from lidar_perception.detectors.pointpillars.config import (
-    SIZES,
-    VERSIONS,
-    NetworkConfig,
-    make_config,
-)
+from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, NetworkConfig, make_config
 from lidar_perception.detectors.pointpillars.losses import detection_loss
 from lidar_perception.detectors.pointpillars.network import fuse_norms, make_network
-from lidar_perception.detectors.pointpillars.pillar_batch import (
-    keep_first_per_cell,
-    make_pillar_batch,
-)
+from lidar_perception.detectors.pointpillars.pillar_batch import keep_first_per_cell, make_pillar_batch
 from lidar_perception.detectors.pointpillars.pillars import make_pillars
 from lidar_perception.detectors.pointpillars.targets import assign
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
@@ -34,8 +26,7 @@ from lidar_perception.types import InputError
 
 seeds = st.integers(0, 2**32 - 1)
 # Others run these lines.
-pytestmark = [pytest.mark.no_cover,
-              pytest.mark.usefixtures("one_thread")]
+pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread")]
 each_version = pytest.mark.parametrize("version", VERSIONS)
 
 
@@ -45,15 +36,14 @@ def some_points(config, count=600, seed=0, margin=0.0) -> torch.Tensor:
     low, high = torch.tensor(config.low) - margin, torch.tensor(config.high) + margin
     points = torch.rand(count, config.point_columns, generator=rng)
     points[:, :3] = low + points[:, :3] * (high - low)
-    near = points[:count - count // 2, :2]
-    points[count // 2:, :2] = near + 0.002 * ((low + high)[:2] / 2 - near)
+    near = points[: count - count // 2, :2]
+    points[count // 2 :, :2] = near + 0.002 * ((low + high)[:2] / 2 - near)
     return points
 
 
 def some_map(config, seed=0) -> torch.Tensor | None:
     rng = torch.Generator().manual_seed(seed)
-    return (torch.randint(0, 2, (1, 3, *config.grid), generator=rng, dtype=torch.uint8)
-            if config.pseudo_map else None)
+    return torch.randint(0, 2, (1, 3, *config.grid), generator=rng, dtype=torch.uint8) if config.pseudo_map else None
 
 
 # configs
@@ -68,27 +58,42 @@ def test_a_config_survives_json(version, size):
 
 
 def test_versions_are_those_of_the_paper():
-    switches = {v: [s[k] for k in ("remove_ground", "cluster_ids", "pseudo_map", "neck")]
-                for v, s in VERSIONS.items()}
-    assert switches == {"v0": [False, False, False, "deconv"], "v1": [True, False, False, "fpn"],
-                        "v2": [True, True, False, "fpn"], "v3": [False, True, False, "fpn"],
-                        "v4": [True, False, True, "fpn"]}
+    switches = {v: [s[k] for k in ("remove_ground", "cluster_ids", "pseudo_map", "neck")] for v, s in VERSIONS.items()}
+    assert switches == {
+        "v0": [False, False, False, "deconv"],
+        "v1": [True, False, False, "fpn"],
+        "v2": [True, True, False, "fpn"],
+        "v3": [False, True, False, "fpn"],
+        "v4": [True, False, True, "fpn"],
+    }
 
 
 def test_full_v0_has_as_many_weights_as_pointpillars():
     # 4.8 million: Lang et al. with three classes, six anchors and a direction
     counted = sum(p.numel() for p in make_network(make_config("v0", "full")).parameters())
-    by_hand = (9 * 64 + 2 * 64                                                 # points
-               + sum(9 * a * b + n * 9 * b * b + 2 * b * (n + 1)               # blocks
-                     for a, b, n in ((64, 64, 3), (64, 128, 5), (128, 256, 5)))
-               + sum(c * 128 * s * s + 2 * 128 for c, s in ((64, 1), (128, 2), (256, 4)))
-               + 385 * 6 * (3 + 7 + 2))                                        # head
+    by_hand = (
+        9 * 64
+        + 2 * 64  # points
+        + sum(
+            9 * a * b + n * 9 * b * b + 2 * b * (n + 1)  # blocks
+            for a, b, n in ((64, 64, 3), (64, 128, 5), (128, 256, 5))
+        )
+        + sum(c * 128 * s * s + 2 * 128 for c, s in ((64, 1), (128, 2), (256, 4)))
+        + 385 * 6 * (3 + 7 + 2)
+    )  # head
     assert counted == by_hand
 
 
-@pytest.mark.parametrize("change, words", [
-    (dict(version="v9"), "no 'v9'"), (dict(classes=("Dog",)), "Dog"), (dict(classes=()), "class"),
-    (dict(cell=0.17), "cannot be divided"), (dict(zero_row=True), "max_points")])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (dict(version="v9"), "no 'v9'"),
+        (dict(classes=("Dog",)), "Dog"),
+        (dict(classes=()), "class"),
+        (dict(cell=0.17), "cannot be divided"),
+        (dict(zero_row=True), "max_points"),
+    ],
+)
 def test_a_config_that_cannot_be_is_refused(change, words):
     with pytest.raises(InputError, match=words):
         make_config(**{"version": "v1", **change})
@@ -198,9 +203,14 @@ def test_limited_pillars_equal_padded_pillars(middle_z):
         members = points[(cells == torch.tensor([column, row])).all(1)][:2]
         rows = torch.zeros(2, 9 + middle_z)  # filled up with zeros, which take part in the maximum
         middle = [*(low[:2] + (torch.tensor([column, row]) + 0.5) * config.cell), -1.0]
-        rows[:len(members)] = torch.cat([members, members[:, :3] - members[:, :3].mean(0),
-                                         (members[:, :3] - torch.tensor(middle))[:, :2 + middle_z]],
-                                        dim=1)
+        rows[: len(members)] = torch.cat(
+            [
+                members,
+                members[:, :3] - members[:, :3].mean(0),
+                (members[:, :3] - torch.tensor(middle))[:, : 2 + middle_z],
+            ],
+            dim=1,
+        )
         expected[:, row, column] = torch.relu(net.norm(net.linear(rows))).max(0).values
     torch.testing.assert_close(image, expected, atol=1e-5, rtol=1e-5)
 
@@ -215,8 +225,7 @@ def test_every_version_has_outputs_for_all_anchors(version, changes):
     count = len(anchor_tensors(config)[0])
     assert count == config.head_grid[0] * config.head_grid[1] * 6
     pillars = make_pillar_batch([some_points(config), some_points(config, 9)], config)
-    out = make_network(config)(pillars,
-                               torch.cat([some_map(config)] * 2) if config.pseudo_map else None)
+    out = make_network(config)(pillars, torch.cat([some_map(config)] * 2) if config.pseudo_map else None)
     assert [tuple(t.shape) for t in out] == [(2, count, 3), (2, count, 7), (2, count, 2)]
     assert torch.sigmoid(out.logits).mean().item() == pytest.approx(0.01, rel=0.2)  # untrained
 
@@ -227,10 +236,9 @@ def test_a_batch_of_two_is_two_clouds(version):
     network = lively(config)
     clouds = [some_points(config, 300, 1), some_points(config, 500, 2)]
     maps = [some_map(config, 1), some_map(config, 2)]
-    both = network(make_pillar_batch(clouds, config),
-                   torch.cat(maps) if config.pseudo_map else None)
+    both = network(make_pillar_batch(clouds, config), torch.cat(maps) if config.pseudo_map else None)
     for i in range(2):
-        alone = network(make_pillar_batch(clouds[i:i + 1], config), maps[i])
+        alone = network(make_pillar_batch(clouds[i : i + 1], config), maps[i])
         for one, batch in zip(alone, both):
             torch.testing.assert_close(one[0], batch[i], atol=2e-5, rtol=1e-4)
     assert not torch.allclose(both.logits[0], both.logits[1], atol=1e-3)
@@ -281,9 +289,15 @@ def test_a_tiny_network_learns_two_objects():
     scores = torch.sigmoid(out.logits[0])
     for box, label in zip(BOXES, LABELS):
         best = scores[:, label].argmax()
-        found = torch.from_numpy(decode(*(values[None].numpy() for values in (
-            out.codes[0, best], out.directions[0, best].argmax(), anchors[best])),
-            config.direction_offset)[0])
+        found = torch.from_numpy(
+            decode(
+                *(
+                    values[None].numpy()
+                    for values in (out.codes[0, best], out.directions[0, best].argmax(), anchors[best])
+                ),
+                config.direction_offset,
+            )[0]
+        )
         assert scores[best, label] > 0.9
         torch.testing.assert_close(found[:6], box[:6], atol=0.2, rtol=0)
         assert abs(wrap_angle((found[6] - box[6]).item())) < 0.2
@@ -299,7 +313,7 @@ def test_pillars_of_one_cloud_equal_those_of_several(changes):
     points[:4, 0] = np.nan, np.inf, config.high[0], config.low[0]
     points[4, 3] = np.nan
     points = np.column_stack([points, rng.integers(0, 9, 5000)]).astype(np.float32)
-    cloud = torch.from_numpy(points[:, :config.point_columns].copy())
+    cloud = torch.from_numpy(points[:, : config.point_columns].copy())
     alone = make_pillars(cloud.numpy(), config)
     several = make_pillar_batch([cloud, cloud[:0]], config)
     assert 0 < len(alone.points) < 5000

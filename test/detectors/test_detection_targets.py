@@ -34,8 +34,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def some_boxes(seed, count=20, spread=6.0) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    return np.column_stack([rng.uniform(-spread, spread, (count, 3)),
-                            rng.uniform(0.4, 5, (count, 3)), rng.uniform(-7, 7, count)])
+    return np.column_stack(
+        [rng.uniform(-spread, spread, (count, 3)), rng.uniform(0.4, 5, (count, 3)), rng.uniform(-7, 7, count)]
+    )
 
 
 # anchors and boxes
@@ -46,8 +47,7 @@ def test_anchor_order_is_y_x_class_yaw():
     anchors, kinds = anchor_tensors(config)
     height, width = config.head_grid
     grid = anchors.view(height, width, 3, 2, 7)
-    assert torch.equal(kinds.view(height, width, 3, 2)[2, 3].T,
-                       torch.arange(3).expand(2, 3))
+    assert torch.equal(kinds.view(height, width, 3, 2)[2, 3].T, torch.arange(3).expand(2, 3))
     torch.testing.assert_close(grid[0, :, 0, 0, 0], (torch.arange(width) + 0.5) * 0.64)
     torch.testing.assert_close(grid[:, 0, 0, 0, 1], -5.12 + (torch.arange(height) + 0.5) * 0.64)
     for i, spec in enumerate(ANCHORS):
@@ -55,7 +55,9 @@ def test_anchor_order_is_y_x_class_yaw():
         assert grid[1, 1, i, 0, 2] - spec.size[2] / 2 == pytest.approx(-1.73)  # on the ground
     ends = anchor_tensors(tiny("v0", anchors_at="ends"))[0].view(height, width, 3, 2, 7)
     assert (ends[0, 0, 0, 0, :2].tolist(), ends[-1, -1, 0, 0, :2].tolist()) == (
-        [0.0, pytest.approx(-5.12)], [pytest.approx(10.24), pytest.approx(5.12)])
+        [0.0, pytest.approx(-5.12)],
+        [pytest.approx(10.24), pytest.approx(5.12)],
+    )
 
 
 @given(seeds, st.sampled_from([0.0, np.pi / 4, 0.78539, -np.pi / 2]))
@@ -66,8 +68,7 @@ def test_decoding_undoes_encoding(seed, offset):
     turned = codes.clone()
     turned[:, 6] += np.pi  # the direction is in the bins alone
     for given_codes in codes, turned:
-        back = torch.from_numpy(decode(given_codes.numpy(), bins.numpy(), anchors.numpy(),
-                                       offset))
+        back = torch.from_numpy(decode(given_codes.numpy(), bins.numpy(), anchors.numpy(), offset))
         torch.testing.assert_close(back[:, :6], boxes[:, :6], atol=1e-9, rtol=1e-9)
         away = torch.remainder(back[:, 6] - boxes[:, 6] + np.pi, 2 * np.pi) - np.pi
         assert away.abs().max() < 1e-9 and back[:, 6].abs().max() <= np.pi
@@ -89,17 +90,20 @@ def test_targets_equal_a_plain_implementation():
     rng = np.random.default_rng(3)
     sizes = torch.tensor([a.size for a in config.anchors])
     labels = torch.from_numpy(rng.integers(0, 3, 8))
-    boxes = torch.from_numpy(np.column_stack([
-        rng.uniform(1, 9, 8), rng.uniform(-4, 4, 8), np.full(8, -1.0), np.zeros((8, 3)),
-        rng.uniform(-4, 4, 8)])).float()
+    boxes = torch.from_numpy(
+        np.column_stack(
+            [rng.uniform(1, 9, 8), rng.uniform(-4, 4, 8), np.full(8, -1.0), np.zeros((8, 3)), rng.uniform(-4, 4, 8)]
+        )
+    ).float()
     boxes[:, 3:6] = sizes[labels] * 1.05
     found = assign(anchors, config, boxes, labels)
     overlap = nearest_axis_iou(anchors, boxes).numpy()
     for i in range(len(anchors)):
         spec = config.anchors[classes[i]]
         mine = [j for j in range(8) if labels[j] == classes[i]]
-        forced = [j for j in mine if overlap[i, j] > 0 and
-                  overlap[i, j] == overlap[(classes == labels[j]).numpy(), j].max()]
+        forced = [
+            j for j in mine if overlap[i, j] > 0 and overlap[i, j] == overlap[(classes == labels[j]).numpy(), j].max()
+        ]
         best = max(mine, key=lambda j: overlap[i, j], default=None)
         if forced or (best is not None and overlap[i, best] >= spec.matched):
             target = forced[0] if forced else best
@@ -136,9 +140,12 @@ def test_every_object_has_an_anchor_in_any_order():
     for a, b in zip(there, back):
         assert torch.equal(a, b)
     positive = there.labels[0] >= 0
-    decoded = torch.from_numpy(decode(*(values.numpy() for values in (
-        there.codes[0, positive], there.bins[0, positive], anchors[positive])),
-        config.direction_offset))
+    decoded = torch.from_numpy(
+        decode(
+            *(values.numpy() for values in (there.codes[0, positive], there.bins[0, positive], anchors[positive])),
+            config.direction_offset,
+        )
+    )
     for box, label in zip(BOXES, LABELS):
         near = (decoded - box).abs().amax(1) < 1e-4
         assert near.any() and (there.labels[0, positive][near] == label).all()
@@ -160,8 +167,7 @@ def outputs_of(targets, classes=3, sure=12.0):
     logits = torch.full((*targets.labels.shape, classes), -sure)
     directions = torch.nn.functional.one_hot(targets.bins, 2).float() * 2 * sure
     positive = targets.labels >= 0
-    logits[positive] += torch.nn.functional.one_hot(
-        targets.labels[positive], classes) * 2 * sure
+    logits[positive] += torch.nn.functional.one_hot(targets.labels[positive], classes) * 2 * sure
     return Outputs(logits, targets.codes.clone(), directions)
 
 
@@ -185,8 +191,7 @@ def random_outputs(anchors, clouds=1):
 
 
 def batch(clouds: list[Targets]) -> Targets:
-    return to_dense([to_sparse(cloud) for cloud in clouds], clouds[0].labels.shape[1],
-                    torch.device("cpu"))
+    return to_dense([to_sparse(cloud) for cloud in clouds], clouds[0].labels.shape[1], torch.device("cpu"))
 
 
 def test_sparse_targets_round_trip():
@@ -203,15 +208,13 @@ def test_loss_of_doubled_batch_is_equal_and_skips_ignored():
     anchors, kinds = anchor_tensors(config)
     targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors)
     once = detection_loss(out, targets, kinds)
-    twice = detection_loss(Outputs(*(torch.cat([t, t]) for t in out)), batch([targets, targets]),
-                           kinds)
+    twice = detection_loss(Outputs(*(torch.cat([t, t]) for t in out)), batch([targets, targets]), kinds)
     for a, b in zip(once, twice):
         torch.testing.assert_close(a, b)
     changed = out.logits.clone()
     changed[targets.labels == IGNORED] += 5
     assert (targets.labels == IGNORED).any()
-    torch.testing.assert_close(detection_loss(out._replace(logits=changed), targets, kinds).total,
-                               once.total)
+    torch.testing.assert_close(detection_loss(out._replace(logits=changed), targets, kinds).total, once.total)
 
 
 def test_classes_have_equal_weight_for_any_number_of_anchors():
@@ -222,8 +225,7 @@ def test_classes_have_equal_weight_for_any_number_of_anchors():
     parts = []
     for kind in range(3):
         mine = kinds == kind
-        part = detection_loss(Outputs(*(t[:, mine] for t in out)),
-                              Targets(*(t[:, mine] for t in targets)), kinds[mine])
+        part = detection_loss(Outputs(*(t[:, mine] for t in out)), Targets(*(t[:, mine] for t in targets)), kinds[mine])
         parts.append(part.classes)
     numbers = [int(((targets.labels >= 0) & (kinds == kind)).sum()) for kind in range(3)]
     assert max(numbers) > 2 * min(numbers)
@@ -235,8 +237,8 @@ def test_classes_have_equal_weight_for_any_number_of_anchors():
 
 def reference_iou(a, b):
     (one, first), (two, second) = (
-        (((box[0], box[1]), (box[3], box[4]), np.degrees(box[6])), box[3] * box[4])
-        for box in (a, b))
+        (((box[0], box[1]), (box[3], box[4]), np.degrees(box[6])), box[3] * box[4]) for box in (a, b)
+    )
     kind, region = cv2.rotatedRectangleIntersection(one, two)
     shared = cv2.contourArea(cv2.convexHull(region)) if kind else 0.0
     return shared / (first + second - shared)
@@ -249,8 +251,7 @@ def test_suppression_is_that_of_a_slow_loop(seed, across):
     scores, labels, limit = rng.permutation(30) / 30, rng.integers(0, 3, 30), 0.2
     kept, sure = [], True
     for i in np.argsort(-scores):
-        overlaps = [reference_iou(boxes[i], boxes[j]) for j in kept
-                    if across or labels[i] == labels[j]]
+        overlaps = [reference_iou(boxes[i], boxes[j]) for j in kept if across or labels[i] == labels[j]]
         sure &= all(abs(o - limit) > 1e-3 for o in overlaps)  # the reference is in float32
         if all(o <= limit for o in overlaps):
             kept.append(i)

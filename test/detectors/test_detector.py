@@ -30,6 +30,7 @@ each_version = pytest.mark.parametrize("version", VERSIONS)
 
 # experts
 
+
 @each_version
 def test_given_columns_equal_computed_columns(version):
     detector = random_detector(version)
@@ -60,8 +61,13 @@ def test_versions_see_what_the_paper_says():
     flat = segment_ground(seen, EXPERT_GROUND)
     assert [i.points.shape[1] for i in inputs.values()] == [4, 4, 5, 5, 4]
     assert [i.cluster_map is not None for i in inputs.values()] == [False] * 4 + [True]
-    for version, kept in (("v0", np.ones(len(seen), bool)), ("v1", ~flat), ("v2", ~flat),
-                          ("v3", np.ones(len(seen), bool)), ("v4", ~flat)):
+    for version, kept in (
+        ("v0", np.ones(len(seen), bool)),
+        ("v1", ~flat),
+        ("v2", ~flat),
+        ("v3", np.ones(len(seen), bool)),
+        ("v4", ~flat),
+    ):
         np.testing.assert_array_equal(inputs[version].points[:, :3], seen.xyz[kept])
         np.testing.assert_array_equal(inputs[version].points[:, 3], seen.intensity[kept])
     np.testing.assert_array_equal(inputs["v3"].points[~flat], inputs["v2"].points)
@@ -83,16 +89,17 @@ def test_cluster_map_equals_a_plain_loop_over_cells():
     kinds = classify_by_diagonal(fit_boxes(xyz, ids, "min_area"))
     assert {*kinds} == {-1, *(CLASSES.index(n) for n in MAP_CLASSES)}
     expected = np.zeros((3, *config.grid), np.uint8)
-    y, x = np.meshgrid(*(low + (np.arange(n) + 0.5) * 0.16
-                         for low, n in zip((config.low[1], config.low[0]), config.grid)),
-                       indexing="ij")
+    y, x = np.meshgrid(
+        *(low + (np.arange(n) + 0.5) * 0.16 for low, n in zip((config.low[1], config.low[0]), config.grid)),
+        indexing="ij",
+    )
     for kind, (cx, cy, a, b, yaw) in zip(kinds, fit_ellipses(xyz, ids).astype(float)):
         if kind < 0:
             continue
         u = np.cos(yaw) * (x - cx) + np.sin(yaw) * (y - cy)
         v = np.cos(yaw) * (y - cy) - np.sin(yaw) * (x - cx)
         centre = np.maximum(abs(x - cx), abs(y - cy)) <= 0.08
-        expected[MAP_CLASSES.index(CLASSES[kind])] |= ((u / a)**2 + (v / b)**2 <= 1) | centre
+        expected[MAP_CLASSES.index(CLASSES[kind])] |= ((u / a) ** 2 + (v / b) ** 2 <= 1) | centre
     drawn = draw_clusters(xyz, ids, config)
     assert (drawn != expected).sum() <= 2  # cells whose middle is on the rim
     assert drawn.shape == (3, 64, 64) and all(layer.any() for layer in drawn)
@@ -102,11 +109,11 @@ def test_collinear_cluster_is_drawn_at_its_centre():
     config = tiny("v4")
     xyz = np.float32([[4.1, 1.1, -1], [4.5, 1.1, -0.5], [4.9, 1.1, 0]])
     image = draw_clusters(xyz, np.ones(3, np.int32), config)
-    assert np.argwhere(image).tolist() == [[MAP_CLASSES.index("Pedestrian"), int(6.22 / 0.32),
-                                            int(4.5 / 0.32)]]
+    assert np.argwhere(image).tolist() == [[MAP_CLASSES.index("Pedestrian"), int(6.22 / 0.32), int(4.5 / 0.32)]]
 
 
 # the detector
+
 
 def test_view_does_not_depend_on_sensor_height():
     config, rng = tiny(), np.random.default_rng(0)
@@ -143,8 +150,7 @@ def test_sensor_height_only_shifts_boxes():
     higher = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
     detector.params = with_values(detector.params, {"ground.sensor_pose.height": 2.23})
     moved = detector(higher).detections
-    assert same(replace(moved, boxes=moved.boxes + np.float32([0, 0, 0.5, 0, 0, 0, 0])), found,
-                1e-3)
+    assert same(replace(moved, boxes=moved.boxes + np.float32([0, 0, 0.5, 0, 0, 0, 0])), found, 1e-3)
 
 
 @pytest.mark.parametrize("roll, pitch", [(3.1416, 0.0), (0.0, 0.2), (0.1, -0.1)])
@@ -174,9 +180,14 @@ def test_intensity_is_normalized_and_may_be_left_out():
         assert same(detector(blind), without) and detector(blind).problem is None
 
 
-@pytest.mark.parametrize("xyz, words", [
-    (np.zeros((0, 3)), "empty"), (np.full((5, 3), np.nan), "network's range"),
-    ([[-5, 0, 0], [500, 0, 0]], "network's range")])
+@pytest.mark.parametrize(
+    "xyz, words",
+    [
+        (np.zeros((0, 3)), "empty"),
+        (np.full((5, 3), np.nan), "network's range"),
+        ([[-5, 0, 0], [500, 0, 0]], "network's range"),
+    ],
+)
 @pytest.mark.parametrize("version", ["v0", "v4"])
 def test_empty_cloud_has_no_detections_and_a_problem(version, xyz, words):
     detector = random_detector(version)
@@ -195,8 +206,11 @@ def test_best_scores_are_reported_without_detections():
     detector, scan = random_detector("v4", eager(score=0.0)), frame()
     assert detector(scan).best == {}
     found = detector(scan).detections
-    highest = {name: float(found.scores[found.class_ids == CLASSES.index(name)].max())
-               for name in detector.classes if CLASSES.index(name) in found.class_ids}
+    highest = {
+        name: float(found.scores[found.class_ids == CLASSES.index(name)].max())
+        for name in detector.classes
+        if CLASSES.index(name) in found.class_ids
+    }
     nothing = detector.with_min_score(1.0)(scan)
     assert len(nothing.detections) == 0 and nothing.problem is None
     assert list(nothing.best) == list(detector.classes)
@@ -213,8 +227,11 @@ def test_huge_and_non_finite_clouds_are_handled():
     xyz = np.tile(scan.xyz, (250, 1))
     xyz[:5] = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [1e9, 0, 0], [-np.inf, 0, np.nan]]
     assert len(xyz) > 900_000
-    found = detector(PointCloud(xyz, np.tile(scan.intensity, 250)), ground=np.zeros(len(xyz), bool),
-                     cluster_ids=np.tile(np.arange(len(scan)), 250))
+    found = detector(
+        PointCloud(xyz, np.tile(scan.intensity, 250)),
+        ground=np.zeros(len(xyz), bool),
+        cluster_ids=np.tile(np.arange(len(scan)), 250),
+    )
     assert found.problem is None
 
 
@@ -257,8 +274,9 @@ def test_cpu_fallback_after_out_of_memory_is_reported():
         make_detector(OutOfMemory(lively(config)), Header(config), never, meta)(scan)
 
 
-@pytest.mark.parametrize("name, words", [("tpu", "no device 'tpu'"), ("mps", "no device 'mps'"),
-                                         ("cuda:99", "CUDA device")])
+@pytest.mark.parametrize(
+    "name, words", [("tpu", "no device 'tpu'"), ("mps", "no device 'mps'"), ("cuda:99", "CUDA device")]
+)
 def test_missing_device_is_refused(name, words):
     with pytest.raises(InputError, match=words):
         find_device(name)
@@ -268,6 +286,7 @@ def test_missing_device_is_refused(name, words):
 
 def test_real_scans_of_any_version_go_through(data):
     from lidar_perception.data.open import open_recording
+
     scan = open_recording(data / "kitti_object").frames[0].load()
     for version in VERSIONS:
         config = make_config(version, "compact")

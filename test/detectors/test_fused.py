@@ -25,11 +25,7 @@ from lidar_perception.detectors.boxes import (
 )
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.devices import CPU
-from lidar_perception.detectors.fused.detector import (
-    FusedDetector,
-    load_fused_detector,
-    remove_duplicates,
-)
+from lidar_perception.detectors.fused.detector import FusedDetector, load_fused_detector, remove_duplicates
 from lidar_perception.detectors.fused.evidence import (
     MIN_PROBABILITY,
     compute_max_probabilities,
@@ -38,21 +34,11 @@ from lidar_perception.detectors.fused.evidence import (
 )
 from lidar_perception.detectors.fused.fusion import KNOTS, load_shipped_models
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
-from lidar_perception.detectors.normalized_view import (
-    NormalizedView,
-    drop_ego_vehicle,
-    segment_view_ground,
-)
+from lidar_perception.detectors.normalized_view import NormalizedView, drop_ego_vehicle, segment_view_ground
 from lidar_perception.detectors.pointnet import classifier
 from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
 from lidar_perception.detectors.trained_network import Placement
-from lidar_perception.geometry import (
-    bev_iou,
-    centre_distances,
-    points_in_box,
-    points_in_boxes,
-    wrap_angle,
-)
+from lidar_perception.geometry import bev_iou, centre_distances, points_in_box, points_in_boxes, wrap_angle
 from lidar_perception.param_fields import with_values
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import find_sensor
@@ -60,15 +46,20 @@ from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, PointCloud
 
 # Others run these lines.
-pytestmark = [pytest.mark.no_cover,
-              pytest.mark.usefixtures("one_thread")]
+pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread")]
 SEEDS = st.integers(0, 2**32 - 1)
 EAGER = FusedDetectorParams(fused=FusedParams(warm_up=False))
 
 
 def random_boxes(rng, count: int) -> np.ndarray:
-    return np.column_stack([rng.uniform(-20, 20, (count, 2)), rng.uniform(-1.5, 0, count),
-                            rng.uniform(0.3, 5, (count, 3)), rng.uniform(-4, 4, count)])
+    return np.column_stack(
+        [
+            rng.uniform(-20, 20, (count, 2)),
+            rng.uniform(-1.5, 0, count),
+            rng.uniform(0.3, 5, (count, 3)),
+            rng.uniform(-4, 4, count),
+        ]
+    )
 
 
 @given(SEEDS, st.integers(0, 2000), st.integers(0, 30), st.floats(0, 0.5))
@@ -80,22 +71,22 @@ def test_points_in_boxes_equals_points_in_box(seed, count, boxes, margin):
     indices, first = points_in_boxes(xyz, boxes, margin)
     assert first[0] == 0 and first[-1] == len(indices) and len(first) == len(boxes) + 1
     for k, box in enumerate(boxes):
-        np.testing.assert_array_equal(indices[first[k]:first[k + 1]],
-                                      np.flatnonzero(points_in_box(xyz, box, margin)))
+        np.testing.assert_array_equal(indices[first[k] : first[k + 1]], np.flatnonzero(points_in_box(xyz, box, margin)))
 
 
 def shell(box: np.ndarray, rng, count: int = 400) -> np.ndarray:
     """Return points on the two faces of a box that a sensor at the origin sees."""
-    sensor = np.array([[np.cos(box[6]), np.sin(box[6])], [-np.sin(box[6]), np.cos(box[6])]]) @ (
-        -box[:2])
+    sensor = np.array([[np.cos(box[6]), np.sin(box[6])], [-np.sin(box[6]), np.cos(box[6])]]) @ (-box[:2])
     flat = rng.uniform(-0.5, 0.5, (count, 3)) * box[3:6]
     half = np.arange(count) < count // 2
     for axis, depth in ((0, FRONT), (1, SIDE)):
         own = half == (axis == 0)
         flat[own, axis] = np.sign(sensor[axis]) * (box[3 + axis] / 2 - depth)
     cos, sin = np.cos(box[6]), np.sin(box[6])
-    return (np.column_stack([cos * flat[:, 0] - sin * flat[:, 1],
-                             sin * flat[:, 0] + cos * flat[:, 1], flat[:, 2]]) + box[:3])
+    return (
+        np.column_stack([cos * flat[:, 0] - sin * flat[:, 1], sin * flat[:, 0] + cos * flat[:, 1], flat[:, 2]])
+        + box[:3]
+    )
 
 
 @given(SEEDS)
@@ -103,8 +94,9 @@ def test_move_to_points_corrects_shifted_car_only(seed):
     rng = np.random.default_rng(seed)
     away = rng.uniform(8, 30)
     way = rng.uniform(-np.pi, np.pi)
-    box = np.array([away * np.cos(way), away * np.sin(way), -0.9, 4.0, 1.7, 1.5,
-                    way + rng.choice([-1, 1]) * rng.uniform(0.6, 0.9)])  # two faces are seen
+    box = np.array(
+        [away * np.cos(way), away * np.sin(way), -0.9, 4.0, 1.7, 1.5, way + rng.choice([-1, 1]) * rng.uniform(0.6, 0.9)]
+    )  # two faces are seen
     points = shell(box, rng)
     off = box.copy()
     off[:2] += rng.uniform(-0.2, 0.2, 2)
@@ -173,23 +165,42 @@ def test_probability_increases_with_evidence(seed):
 def test_max_probability_holds_for_any_evidence_and_curve(seed):
     """PointNet skips proposals whose bound is below the threshold."""
     rng = np.random.default_rng(seed)
-    models = {name: {"bias": rng.normal(), "curves": {
-        source: {"knots": [-3.0, -1.0, 1.0, 3.0], "values": rng.normal(0, 2, 4).tolist(),
-                 **({"unknown": rng.normal(0, 2)} if rng.random() < 0.5 else {})}
-        for source in ("network", "classifier")[:rng.integers(1, 3)]}} for name in CLASSES[:2]}
+    models = {
+        name: {
+            "bias": rng.normal(),
+            "curves": {
+                source: {
+                    "knots": [-3.0, -1.0, 1.0, 3.0],
+                    "values": rng.normal(0, 2, 4).tolist(),
+                    **({"unknown": rng.normal(0, 2)} if rng.random() < 0.5 else {}),
+                }
+                for source in ("network", "classifier")[: rng.integers(1, 3)]
+            },
+        }
+        for name in CLASSES[:2]
+    }
     ids, network = rng.integers(0, 3, 6), rng.normal(0, 3, 6)
     bound = compute_max_probabilities(models, ids, {"network": network}, "classifier")
-    answers = [compute_probabilities(models, ids, {"network": network,
-                                                   "classifier": np.full(6, odds)})
-               for odds in (np.nan, -np.inf, np.inf, *np.linspace(-4, 4, 33))]
+    answers = [
+        compute_probabilities(models, ids, {"network": network, "classifier": np.full(6, odds)})
+        for odds in (np.nan, -np.inf, np.inf, *np.linspace(-4, 4, 33))
+    ]
     np.testing.assert_array_equal(bound, np.max(answers, axis=0))
 
 
 def test_remove_duplicates_by_class():
-    boxes = np.array([[10, 0, 0, 0.6, 0.6, 1.8, 0], [10.5, 0.2, 0, 0.6, 0.6, 1.8, 0],
-                      [10, 5, 0, 4, 1.7, 1.5, 0], [10, 6.8, 0, 4, 1.7, 1.5, 0],
-                      [10.3, 5.1, 0, 4, 1.7, 1.5, 0], [10.2, 0, 0, 1.7, 0.6, 1.8, 0],
-                      [14, 5.1, 0, 4, 1.7, 1.5, 0], [10.5, 0.85, 0, 0.6, 0.8, 1.8, 0]])
+    boxes = np.array(
+        [
+            [10, 0, 0, 0.6, 0.6, 1.8, 0],
+            [10.5, 0.2, 0, 0.6, 0.6, 1.8, 0],
+            [10, 5, 0, 4, 1.7, 1.5, 0],
+            [10, 6.8, 0, 4, 1.7, 1.5, 0],
+            [10.3, 5.1, 0, 4, 1.7, 1.5, 0],
+            [10.2, 0, 0, 1.7, 0.6, 1.8, 0],
+            [14, 5.1, 0, 4, 1.7, 1.5, 0],
+            [10.5, 0.85, 0, 0.6, 0.8, 1.8, 0],
+        ]
+    )
     ids = np.array([PEDESTRIAN] * 2 + [CAR] * 3 + [CLASSES.index("Cyclist"), CAR, PEDESTRIAN])
     found = Detections.of(boxes, ids, [0.5, 0.8, 0.9, 0.7, 0.95, 0.4, 0.3, 0.2])
     (car, person), (other, beside) = boxes[[4, 1]], boxes[[6, 7]]  # overlap by 4 % either
@@ -200,8 +211,9 @@ def test_remove_duplicates_by_class():
 
 @pytest.fixture(scope="module")
 def detector():
-    eager = with_values(FusedDetectorParams(), {
-        f"fused.scores.{name}": 0.0 for name in ("car", "pedestrian", "cyclist", "other")})
+    eager = with_values(
+        FusedDetectorParams(), {f"fused.scores.{name}": 0.0 for name in ("car", "pedestrian", "cyclist", "other")}
+    )
     return FusedDetector(random_detector("v4").proposer, random_classifier().classifier, eager)
 
 
@@ -252,8 +264,9 @@ def test_sensor_height_and_given_columns_change_nothing(detector):
 @pytest.mark.parametrize("height", [1.73, 2.5])
 def test_ground_of_experts_in_range_gives_equal_detections(detector, height, use_intensity):
     """The node ground_segmentation segments the range of the detector only, with intensity."""
-    own = detector.with_params(with_values(detector.params, {
-        "fused.use_intensity": use_intensity})).with_sensor_height(height)
+    own = detector.with_params(with_values(detector.params, {"fused.use_intensity": use_intensity})).with_sensor_height(
+        height
+    )
     scan, config = frame(), own.proposer.config
     scan = replace(scan, xyz=scan.xyz - np.array([0, 0, height - 1.73], np.float32))
     view = NormalizedView.of(scan, own.params.ground.sensor_pose, config.low, config.high)
@@ -268,8 +281,10 @@ def test_ignored_intensity_equals_missing_intensity(detector):
     scan, other = frame(), copy.copy(detector)
     other.params = with_values(detector.params, {"fused.use_intensity": False})
     pit = np.random.default_rng(0).uniform([4, -4, -2.81], [9, 4, -2.79], (3000, 3))
-    scan = PointCloud(np.concatenate([scan.xyz, pit.astype(np.float32)]),
-                      np.concatenate([scan.intensity, np.full(3000, 0.5, np.float32)]))
+    scan = PointCloud(
+        np.concatenate([scan.xyz, pit.astype(np.float32)]),
+        np.concatenate([scan.intensity, np.full(3000, 0.5, np.float32)]),
+    )
     without = replace(scan, intensity=None)
     assert "no intensity" in detector(without).problem and other(without).problem is None
     assert same(other(scan), other(without)) and other(scan).problem is None
@@ -283,7 +298,7 @@ def test_max_proposals_keeps_the_best_boxes(detector):
     whole.params, other.params = own, with_values(own, {"fused.max_proposals": 9})
     every = whole.propose(frame()).detections
     few = other.propose(frame()).detections  # without the ego vehicle
-    assert len(every) > 100 and 0 < len(few) <= 9 and same(few, every[:len(few)])
+    assert len(every) > 100 and 0 < len(few) <= 9 and same(few, every[: len(few)])
 
 
 def test_classifier_box_interpolates_between_networks(detector):
@@ -292,6 +307,7 @@ def test_classifier_box_interpolates_between_networks(detector):
         other.params = with_values(detector.params, {"fused.classifier_box": share})
         proposals = other.propose(frame())
         return proposals.detections.boxes, np.isfinite(proposals.evidence["classifier"])
+
     (own, asked), (half, _), (judged, _) = (looked(share) for share in (0.0, 0.5, 1.0))
     assert asked.any() and not asked.all()
     np.testing.assert_array_equal((own != judged).any(axis=1), asked)
@@ -301,11 +317,11 @@ def test_classifier_box_interpolates_between_networks(detector):
 def test_hilly_ground_changes_only_the_height_of_boxes():
     """The networks get the points on flat ground."""
     detector = load_fused_detector("", "cpu", EAGER).with_range("around")
-    scan = SimulatedScenes(7, 1, find_sensor("hdl64e", 0.0), Scenes(None, 3.0, "street"),
-                           around=True).frame(0).load()
+    scan = SimulatedScenes(7, 1, find_sensor("hdl64e", 0.0), Scenes(None, 3.0, "street"), around=True).frame(0).load()
 
     def hills(xy: np.ndarray) -> np.ndarray:
         return 0.04 * xy[:, 0] + 0.5 * np.sin(xy[:, 1] / 12)
+
     xyz = scan.xyz + np.outer(hills(scan.xyz), [0, 0, 1]).astype(np.float32)
     plain, hilly = detector(scan).detections, detector(replace(scan, xyz=xyz)).detections
     plain = plain[plain.scores > 0.8]
@@ -334,8 +350,10 @@ def test_fallback_of_a_part_is_reported(detector):
 
 def test_no_fallback_if_cpu_fallback_is_off(detector, monkeypatch):
     """The parameter of the node applies to both networks."""
+
     def predict(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+
     monkeypatch.setattr(classifier, "predict", predict)
     other = copy.copy(detector)
     other.classifier = copy.copy(detector.classifier)
@@ -360,8 +378,7 @@ def test_cloud_without_intensity_goes_to_own_networks():
     scan = frame()
     without = replace(scan, intensity=None)
     assert same(detector(without), blind(without))
-    assert same(detector(replace(scan, intensity=np.full_like(scan.intensity, 0.3))),
-                blind(without))
+    assert same(detector(replace(scan, intensity=np.full_like(scan.intensity, 0.3))), blind(without))
     off = detector.with_params(with_values(detector.params, {"fused.use_intensity": False}))
     assert same(off(scan), blind(without))
     around = detector.with_range("around")

@@ -22,25 +22,25 @@ from lidar_perception.detectors.pointnet.clusters import (
 )
 from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS, make_pointnet_config
 from lidar_perception.detectors.pointnet.losses import cluster_loss
-from lidar_perception.detectors.pointnet.network import (
-    fuse_norms,
-    make_pointnet,
-    nearest,
-    squared_distances,
-)
-from lidar_perception.detectors.pointnet.predict import (
-    compute_probabilities,
-    predict,
-    select_detections,
-)
+from lidar_perception.detectors.pointnet.network import fuse_norms, make_pointnet, nearest, squared_distances
+from lidar_perception.detectors.pointnet.predict import compute_probabilities, predict, select_detections
 from lidar_perception.detectors.pointnet.torch_network import TorchPointNet, run_network
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-SMALL = dict(points=24, centroids=8, coarse=4, neighbours=(3, 5, 6), coarse_neighbours=4,
-             point_channels=(6, 8), group_channels=(6, 5), local_channels=9, global_channels=10,
-             head_channels=(12, 8))
+SMALL = dict(
+    points=24,
+    centroids=8,
+    coarse=4,
+    neighbours=(3, 5, 6),
+    coarse_neighbours=4,
+    point_channels=(6, 8),
+    group_channels=(6, 5),
+    local_channels=9,
+    global_channels=10,
+    head_channels=(12, 8),
+)
 
 
 @pytest.fixture
@@ -61,11 +61,13 @@ def network(name="improved", **changes):
 def called(net, clusters, **changes):
     inputs = make_network_input(clusters, net.config.points)
     with torch.inference_mode():
-        return net(*(torch.from_numpy(changes.get(name, getattr(inputs, name)))
-                     for name in ("points", "valid", "context")))
+        return net(
+            *(torch.from_numpy(changes.get(name, getattr(inputs, name))) for name in ("points", "valid", "context"))
+        )
 
 
 # inputs
+
 
 def test_make_clusters_groups_points_by_id(rng):
     frame = PointCloud(rng.normal(size=(50, 3)).astype(np.float32), rng.random(50, np.float32))
@@ -75,11 +77,11 @@ def test_make_clusters_groups_points_by_id(rng):
     clusters = make_clusters(frame, ids, 2)
     assert clusters.ids.tolist() == [n for n in np.unique(ids) if n > 0 and (ids == n).sum() > 1]
     for i, number in enumerate(clusters.ids):
-        own = clusters.points[clusters.first[i]:clusters.first[i + 1]]
+        own = clusters.points[clusters.first[i] : clusters.first[i + 1]]
         assert np.array_equal(own[:, :3], frame.xyz[ids == number])
         assert np.array_equal(own[:, 3], frame.intensity[ids == number])
     some = clusters.take(np.array([2, 0]))
-    assert np.array_equal(some.points[some.first[1]:], clusters.points[:clusters.first[1]])
+    assert np.array_equal(some.points[some.first[1] :], clusters.points[: clusters.first[1]])
     none = make_clusters(frame, np.zeros(50, int))
     assert len(none) == 0 and len(make_network_input(none, 8).points) == 0
     plain = make_clusters(PointCloud(frame.xyz), ids, 2)
@@ -92,7 +94,7 @@ def test_sampled_points_are_unique_and_independent_of_others(rng):
     inputs = make_network_input(clusters, 24)
     assert inputs.valid.sum(axis=1).tolist() == [1, 7, 24, 24, 24]
     for i in range(len(clusters)):
-        own = clusters.points[clusters.first[i]:clusters.first[i + 1], 3]
+        own = clusters.points[clusters.first[i] : clusters.first[i + 1], 3]
         drawn = inputs.points[i, inputs.valid[i], 3]
         assert len(np.unique(drawn)) == len(drawn) and np.isin(drawn, own).all()
         assert np.isin(inputs.points[i, :, 3], drawn).all()
@@ -114,7 +116,7 @@ def test_farthest_points_come_first(rng, size):
     while len(order) < min(10, len(drawn)):
         apart = np.linalg.norm(drawn[:, None, :3] - drawn[order, :3], axis=2).min(axis=1)
         order.append(int(apart.argmax()))
-    np.testing.assert_array_equal(xyz[:len(order)], drawn[order])
+    np.testing.assert_array_equal(xyz[: len(order)], drawn[order])
     assert {*map(tuple, xyz)} == {*map(tuple, drawn)}
 
 
@@ -134,13 +136,11 @@ def test_ground_height_follows_slopes(rng):
     assert (find_ground_heights(flat[:0], indices) == -SENSOR_HEIGHT).all()
     # heights are over it: a hill changes nothing
     clusters = replace(blobs(rng, [20, 30]), ground=np.array([-1.7, -1.5]))
-    lifted = replace(clusters, points=clusters.points + np.float32([0, 0, 3, 0]),
-                     ground=clusters.ground + 3)
+    lifted = replace(clusters, points=clusters.points + np.float32([0, 0, 3, 0]), ground=clusters.ground + 3)
     here, there = make_network_input(clusters, 24), make_network_input(lifted, 24)
     assert np.allclose(here.context, there.context, atol=1e-5)
     assert np.allclose(here.points, there.points, atol=1e-5)
-    assert np.allclose(make_network_input(clusters.take(np.array([1])), 24).context[0],
-                       here.context[1])
+    assert np.allclose(make_network_input(clusters.take(np.array([1])), 24).context[0], here.context[1])
 
 
 def test_network_input_does_not_depend_on_azimuth(rng):
@@ -149,8 +149,7 @@ def test_network_input_does_not_depend_on_azimuth(rng):
     cos, sin = np.cos(turn), np.sin(turn)
     turned[:, 0] = cos * clusters.points[:, 0] - sin * clusters.points[:, 1]
     turned[:, 1] = sin * clusters.points[:, 0] + cos * clusters.points[:, 1]
-    here, there = (make_network_input(c, 24) for c in
-                   (clusters, Clusters(turned, clusters.first, clusters.ids)))
+    here, there = (make_network_input(c, 24) for c in (clusters, Clusters(turned, clusters.first, clusters.ids)))
     assert np.allclose(here.points, there.points, atol=1e-5)
     assert np.allclose(here.context, there.context, atol=1e-5)
     assert np.allclose(wrap_angle(there.azimuths - here.azimuths - turn), 0, atol=1e-6)
@@ -163,6 +162,7 @@ def test_network_input_does_not_depend_on_azimuth(rng):
 
 
 # the network
+
 
 def test_nearest_equals_brute_force(rng):
     xyz = torch.from_numpy(rng.normal(size=(3, 20, 3)))
@@ -194,11 +194,13 @@ def test_groups_equal_plain_loops(rng, name):
                 scales, density = [], []
                 for (radius, k), part in zip(net.config.groups, net.local.nets):
                     near = [i for i in order[:k] if apart[i] <= radius]
-                    rows = torch.stack([torch.cat([(points[b, i, :3] - middle) / radius,
-                                                   points[b, i, 3:]]) for i in near])
+                    rows = torch.stack(
+                        [torch.cat([(points[b, i, :3] - middle) / radius, points[b, i, 3:]]) for i in near]
+                    )
                     scales.append(part(rows).amax(dim=0))
-                    density.append(len(near) / (k * radius) if name == "improved" else
-                                   (apart[real] <= radius).sum() / radius**3)
+                    density.append(
+                        len(near) / (k * radius) if name == "improved" else (apart[real] <= radius).sum() / radius**3
+                    )
                 scales = [scale * d * 3 / sum(density) for scale, d in zip(scales, density)]
                 wanted = net.local.join(torch.cat([*scales, features[b, c]])[None])[0]
                 assert torch.allclose(local[b, c], wanted, atol=1e-4)
@@ -212,7 +214,7 @@ def test_padding_points_change_nothing(rng, name):
     other = inputs.points.copy()
     for i in range(len(clusters)):
         real = np.flatnonzero(inputs.valid[i])
-        other[i, len(real):] = inputs.points[i, rng.choice(real, net.config.points - len(real))]
+        other[i, len(real) :] = inputs.points[i, rng.choice(real, net.config.points - len(real))]
     for mine, theirs in zip(called(net, clusters), called(net, clusters, points=other)):
         assert torch.allclose(mine, theirs, atol=1e-5)
     for mine, theirs in zip(run_network(net, inputs, chunk=2), called(net, clusters)):  # left out
@@ -233,10 +235,8 @@ def test_every_ablation_switch_has_an_effect():
     made = {name: make_pointnet_config(name) for name in ABLATIONS}
     known = {(c.clustering, c.groups, c.mrg, c.skip) for c in made.values()}
     assert len(known) == len(ABLATIONS)
-    sizes = {name: sum(p.numel() for p in make_pointnet(config).parameters())
-             for name, config in made.items()}
-    assert sizes["base"] == sizes["dynamic-threshold"] < sizes["skip"] < sizes["msg-skip"] < (
-        sizes["improved"])
+    sizes = {name: sum(p.numel() for p in make_pointnet(config).parameters()) for name, config in made.items()}
+    assert sizes["base"] == sizes["dynamic-threshold"] < sizes["skip"] < sizes["msg-skip"] < (sizes["improved"])
     assert make_pointnet_config("pointnet").groups == ()
     assert len(make_pointnet_config("pointnet2").groups) == 1
     assert made["base"].clustering.euclidean.threshold == "fixed"
@@ -253,21 +253,28 @@ def test_config_round_trip_and_invalid_values():
         make_pointnet_config(classes=("Car",))
     with pytest.raises(InputError, match="later version"):
         parse_config(config_module.PointNetConfig, {"wings": 2}, "")
-    for wrong in (dict(radii=(0.4, 0.2, 0.1)), dict(centroids=500), dict(neighbours=(1, 2)),
-                  dict(sampling="nearest"), dict(density="")):
+    for wrong in (
+        dict(radii=(0.4, 0.2, 0.1)),
+        dict(centroids=500),
+        dict(neighbours=(1, 2)),
+        dict(sampling="nearest"),
+        dict(density=""),
+    ):
         with pytest.raises(InputError):
             make_pointnet_config(**wrong)
 
 
 # boxes and scores
 
+
 def outputs_with(targets: BoxTargets, bins: int) -> Outputs:
     count = len(targets.yaw_bins)
     chosen = torch.zeros(count, bins)
     chosen[torch.arange(count), torch.from_numpy(targets.yaw_bins)] = 1
     rest = torch.from_numpy(targets.yaw_residuals)[:, None].expand(count, bins)
-    return Outputs(torch.zeros(count, 4), torch.from_numpy(targets.centres),
-                   torch.from_numpy(targets.sizes), chosen, rest)
+    return Outputs(
+        torch.zeros(count, 4), torch.from_numpy(targets.centres), torch.from_numpy(targets.sizes), chosen, rest
+    )
 
 
 def test_decoding_undoes_encoding(rng):
@@ -276,8 +283,7 @@ def test_decoding_undoes_encoding(rng):
     inputs = make_network_input(clusters, 8)
     kinds = rng.integers(0, 3, count)
     sizes = np.array(config.sizes)[kinds] * np.exp(rng.uniform(-1.5, 1.5, (count, 3)))
-    boxes = np.column_stack([inputs.centres + rng.normal(size=(count, 3)), sizes,
-                             rng.uniform(-np.pi, np.pi, count)])
+    boxes = np.column_stack([inputs.centres + rng.normal(size=(count, 3)), sizes, rng.uniform(-np.pi, np.pi, count)])
     targets = encode(boxes, kinds, inputs.centres, inputs.azimuths, config)
     assert np.abs(targets.yaw_residuals).max() <= 1 + 1e-6
     outputs = Outputs(*(x.numpy() for x in outputs_with(targets, config.yaw_bins)))
@@ -316,8 +322,9 @@ def test_calibration_makes_scores_match_accuracy(rng):
     logits = truth * 4 + torch.tensor([2.0, 0, 0, 0])  # too sure, and partial to one class
     before = calibration_error(torch.softmax(logits, 1).numpy(), labels.numpy())
     calibrate(net, logits, labels)
-    after = calibration_error(compute_probabilities(*(x.numpy() for x in (
-        logits, net.temperature, net.offsets))), labels.numpy())
+    after = calibration_error(
+        compute_probabilities(*(x.numpy() for x in (logits, net.temperature, net.offsets))), labels.numpy()
+    )
     assert after < 0.03 < 0.1 < before
     assert net.temperature.item() == pytest.approx(4, rel=0.1)
     unchanged = net.temperature.clone()
@@ -332,8 +339,7 @@ def test_best_of_overlapping_boxes_is_kept(rng):
     predictions = predict(TorchPointNet(network()), blobs(rng, [20] * 4))
     boxes = np.tile(np.array([5, 5, 0, 4, 2, 1.5, 0.3], np.float32), (4, 1))
     boxes[3, 0] += 20
-    probabilities = np.array([[0.6, 0, 0, 0.4], [0.9, 0, 0, 0.1], [0.1, 0, 0, 0.9],
-                              [0.5, 0, 0, 0.5]], np.float32)
+    probabilities = np.array([[0.6, 0, 0, 0.4], [0.9, 0, 0, 0.1], [0.1, 0, 0, 0.9], [0.5, 0, 0, 0.5]], np.float32)
     made = predictions.__class__(probabilities, np.zeros(4, int), boxes)
     kept = select_detections(made, config, (0.3, 0.3, 0.3))
     assert kept.scores.tolist() == pytest.approx([0.9, 0.5])

@@ -28,8 +28,7 @@ def test_clusters_of_all_sizes_and_counts_work():
     spots = rng.uniform(-80, 80, (5000, 1, 3)) * [1, 1, 0.01]
     xyz = (spots + rng.normal(0, 0.2, (5000, 6, 3))).reshape(-1, 3).astype(np.float32)
     batches.clear()
-    found = detector(PointCloud(xyz, np.zeros(len(xyz), np.float32)),
-                     cluster_ids=np.repeat(np.arange(5000), 6) + 1)
+    found = detector(PointCloud(xyz, np.zeros(len(xyz), np.float32)), cluster_ids=np.repeat(np.arange(5000), 6) + 1)
     assert sum(batches) == 4000 and max(batches) <= CHUNK
     assert len(found.detections) == detector.params.pointnet.nms.max_boxes
     assert "farthest 1000 of 5000 clusters are ignored" in found.problem
@@ -46,7 +45,9 @@ def test_excess_clusters_are_dropped_by_distance_and_counted():
     def detected(params, chosen=None):
         wanted = ids if chosen is None else np.where(chosen, ids, 0)
         return random_detector(with_values(params, {"pointnet.use_intensity": False}))(
-            frame, ground=ground, cluster_ids=wanted)
+            frame, ground=ground, cluster_ids=wanted
+        )
+
     few = with_values(eager(), {"pointnet.max_clusters": 40})
     capped, everything = detected(few), detected(eager())
     assert "farthest 260 of 300 clusters are ignored" in capped.problem

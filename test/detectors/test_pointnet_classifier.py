@@ -38,8 +38,7 @@ def test_clusters_are_points_in_each_box(frame, proposals):
     made = crop_boxes(proposals.boxes, frame, 0.2)
     assert len(made) == len(proposals) and made.sizes[3] < 5 < made.sizes[:3].min()
     for i, box in enumerate(proposals.boxes):
-        part, inside = made.points[made.first[i]:made.first[i + 1]], points_in_box(
-            frame.xyz, box, 0.2)
+        part, inside = made.points[made.first[i] : made.first[i + 1]], points_in_box(frame.xyz, box, 0.2)
         np.testing.assert_array_equal(part[:, :3], frame.xyz[inside])
         np.testing.assert_array_equal(part[:, 3], frame.intensity[inside])
     dark = crop_boxes(proposals.boxes, replace(frame, intensity=None), 0.2)
@@ -53,8 +52,7 @@ def test_classifier_judges_each_proposal_by_itself(frame, proposals):
     probabilities, boxes = classifier.classify(proposals, frame, ground, every)
     predictions = predict(classifier.network, crop_boxes(proposals.boxes[:3], frame, BOX_MARGIN_M))
     columns = [classifier.classes.index(CLASSES[i]) for i in proposals.class_ids[:3]]
-    np.testing.assert_allclose(probabilities[:3], predictions.probabilities[np.arange(3), columns],
-                               atol=1e-6)
+    np.testing.assert_allclose(probabilities[:3], predictions.probabilities[np.arange(3), columns], atol=1e-6)
     again = classifier.classify(proposals[::-1], frame, ground, every)
     np.testing.assert_allclose(again[0], probabilities[::-1], atol=1e-5)
     np.testing.assert_allclose(again[1], boxes[::-1], atol=1e-4)

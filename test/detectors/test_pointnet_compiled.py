@@ -19,8 +19,10 @@ from lidar_perception.detectors.pointnet.predict import predict
 from lidar_perception.detectors.pointnet.torch_network import run_network
 from lidar_perception.runs.threads import set_thread_count
 
-pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.skipif(
-    not LANES, reason="Numba compiles for a processor without AVX2")]
+pytestmark = [
+    pytest.mark.usefixtures("one_thread"),
+    pytest.mark.skipif(not LANES, reason="Numba compiles for a processor without AVX2"),
+]
 
 SIZES = [1, 2, 3, 5, 11, 12, 13, 31, 32, 33, 100, 300, 7]
 TOLERANCE = 1e-4  # of numbers whose sizes are about 1 to 20
@@ -48,10 +50,24 @@ def test_every_network_equals_torch(name, spread):
     assert_equal(small(name), blobs(rng, SIZES, spread))
 
 
-@pytest.mark.parametrize("changes", [
-    dict(), dict(points=200, centroids=40), dict(radii=(0.3,), neighbours=(5,)),
-    dict(point_channels=(20,), group_channels=(7, 9, 33), local_channels=50, global_channels=70,
-         head_channels=(5,), classes=("Car",), sizes=((3.9, 1.6, 1.5),), yaw_bins=5)])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(),
+        dict(points=200, centroids=40),
+        dict(radii=(0.3,), neighbours=(5,)),
+        dict(
+            point_channels=(20,),
+            group_channels=(7, 9, 33),
+            local_channels=50,
+            global_channels=70,
+            head_channels=(5,),
+            classes=("Car",),
+            sizes=((3.9, 1.6, 1.5),),
+            yaw_bins=5,
+        ),
+    ],
+)
 def test_other_widths_equal_torch(changes):
     rng = np.random.default_rng(1)
     assert_equal(make_pointnet_config(**changes), blobs(rng, SIZES))
@@ -74,8 +90,9 @@ def test_clusters_do_not_depend_on_those_around_them(monkeypatch):
     assert all(len(x) == 0 for x in network(nothing))
 
 
-@pytest.mark.parametrize("name", ["points.0.0.weight", "local.nets.1.0.0.weight",
-                                  "coarse.net.0.0.weight", "fine.0.0.bias"])
+@pytest.mark.parametrize(
+    "name", ["points.0.0.weight", "local.nets.1.0.0.weight", "coarse.net.0.0.weight", "fine.0.0.bias"]
+)
 def test_nan_weights_give_nan_logits(name):
     network = fuse_norms(lively(small()))
     network.get_parameter(name).view(-1)[0] = torch.nan
@@ -86,8 +103,7 @@ def test_nan_weights_give_nan_logits(name):
 @pytest.mark.parametrize("weights", ["fused", "pointnet"])
 def test_engine_torch_compiles_nothing(weights):
     for engine in "auto", "torch":
-        detector = open_detector(weights, "cpu", settings={
-            f"{weights}.warm_up": False, f"{weights}.engine": engine})
+        detector = open_detector(weights, "cpu", settings={f"{weights}.warm_up": False, f"{weights}.engine": engine})
         assert isinstance(detector.classifier.network, CompiledPointNet) == (engine == "auto")
 
 

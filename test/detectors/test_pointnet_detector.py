@@ -17,12 +17,7 @@ from pointnet_samples import CPU, eager, lively, make_classifier, random_detecto
 from samples import object_folder
 
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.detectors.checkpoint import (
-    Header,
-    read_header,
-    read_network_name,
-    save_checkpoint,
-)
+from lidar_perception.detectors.checkpoint import Header, read_header, read_network_name, save_checkpoint
 from lidar_perception.detectors.checkpoint import Header as PointPillarsHeader
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.normalized_view import to_sensor_frame
@@ -59,17 +54,21 @@ def moved(found: Detections, turn: float = 0.0, shift=(0, 0, 0)) -> Detections:
     return replace(found, boxes=boxes)
 
 
-def alike(a: Detections | DetectionResult, b: Detections | DetectionResult,
-          atol: float = 1e-4) -> bool:
+def alike(a: Detections | DetectionResult, b: Detections | DetectionResult, atol: float = 1e-4) -> bool:
     """Return True if both are equal; detections with almost equal scores may be swapped."""
     a, b = (x.detections if isinstance(x, DetectionResult) else x for x in (a, b))
     if len(a) != len(b):
         return False
     left = set(range(len(b)))
     for box, kind, score in zip(a.boxes, a.class_ids, a.scores):
-        near = [i for i in left if np.allclose(b.boxes[i, :6], box[:6], atol=atol)
-                and np.cos(b.boxes[i, 6] - box[6]) > 1 - atol
-                and b.class_ids[i] == kind and abs(b.scores[i] - score) < atol]
+        near = [
+            i
+            for i in left
+            if np.allclose(b.boxes[i, :6], box[:6], atol=atol)
+            and np.cos(b.boxes[i, 6] - box[6]) > 1 - atol
+            and b.class_ids[i] == kind
+            and abs(b.scores[i] - score) < atol
+        ]
         if not near:
             return False
         left.remove(near[0])
@@ -78,13 +77,18 @@ def alike(a: Detections | DetectionResult, b: Detections | DetectionResult,
 
 # clusters
 
+
 def test_given_columns_equal_computed_columns(ids):
     detector, scan = random_detector(), frame()
     computed = detector(scan).detections
     assert len(computed) > 3 and len(set(computed.class_ids)) > 1
     flat = segment_ground(scan, GROUND)
-    for columns in (dict(cluster_ids=ids), dict(ground=flat), dict(ground=flat.astype("u1")),
-                    dict(cluster_ids=ids.astype(np.uint32), ground=flat)):
+    for columns in (
+        dict(cluster_ids=ids),
+        dict(ground=flat),
+        dict(ground=flat.astype("u1")),
+        dict(cluster_ids=ids.astype(np.uint32), ground=flat),
+    ):
         assert same(detector(scan, **columns), computed)
 
 
@@ -103,10 +107,10 @@ def test_the_numbers_of_clusters_do_not_matter(ids):
 def test_clusters_do_not_know_of_each_other(ids):
     detector, scan = random_detector(), frame()
     everything = detector(scan, cluster_ids=ids).detections
-    alone = [detector(scan, cluster_ids=np.where(ids == i, ids, 0)).detections
-             for i in range(1, ids.max() + 1)]
-    joined = Detections(*(np.concatenate([getattr(one, part) for one in alone])
-                          for part in ("boxes", "class_ids", "scores")))
+    alone = [detector(scan, cluster_ids=np.where(ids == i, ids, 0)).detections for i in range(1, ids.max() + 1)]
+    joined = Detections(
+        *(np.concatenate([getattr(one, part) for one in alone]) for part in ("boxes", "class_ids", "scores"))
+    )
     assert alike(joined, everything)
 
 
@@ -115,12 +119,14 @@ def test_frame_without_clusters_has_a_problem(ids):
     nothing = np.zeros(len(scan), np.int32)
     far = PointCloud(np.float32([[9, 0, -1], [20, 3, 0]]), np.zeros(2, np.float32))
     for cloud, columns, words in (
-            (PointCloud(np.zeros((0, 3), np.float32)), {}, "empty"),
-            (PointCloud.of(np.full((5, 3), np.nan, np.float32)), {}, "no finite point"),
-            (scan, {"cluster_ids": nothing}, "no clusters"),
-            (scan, {"cluster_ids": nothing - 1}, "no clusters"), (far, {}, "no clusters"),
-            (scan, {"ground": np.ones(len(scan), bool)}, "no clusters"),
-            (scan, {"cluster_ids": np.arange(len(scan))}, "fewer than 3 points")):
+        (PointCloud(np.zeros((0, 3), np.float32)), {}, "empty"),
+        (PointCloud.of(np.full((5, 3), np.nan, np.float32)), {}, "no finite point"),
+        (scan, {"cluster_ids": nothing}, "no clusters"),
+        (scan, {"cluster_ids": nothing - 1}, "no clusters"),
+        (far, {}, "no clusters"),
+        (scan, {"ground": np.ones(len(scan), bool)}, "no clusters"),
+        (scan, {"cluster_ids": np.arange(len(scan))}, "fewer than 3 points"),
+    ):
         found = detector(cloud, **columns)
         assert len(found.detections) == 0 and words in found.problem, words
         assert found.best == {} and list(found.timings) == list(STEPS)
@@ -129,6 +135,7 @@ def test_frame_without_clusters_has_a_problem(ids):
 
 
 # where the sensor is
+
 
 def test_rotated_scene_has_rotated_boxes(ids):
     detector, scan = random_detector(), frame()
@@ -158,16 +165,16 @@ def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch, ids)
     detector, scan = random_detector(), frame()
     found = detector(scan, cluster_ids=ids).detections
     back = level_points(np.eye(3, dtype=np.float32), pose).T
-    detector.params = with_values(eager(), {"ground.sensor_pose.roll": roll,
-                                            "ground.sensor_pose.pitch": pitch,
-                                            "pointnet.nms.iou": 1.0})
+    detector.params = with_values(
+        eager(), {"ground.sensor_pose.roll": roll, "ground.sensor_pose.pitch": pitch, "pointnet.nms.iou": 1.0}
+    )
     seen = detector(replace(scan, xyz=scan.xyz @ back), cluster_ids=ids).detections
     detector.params = with_values(eager(), {"pointnet.nms.iou": 1.0})
-    assert alike(seen, to_sensor_frame(
-        detector(scan, cluster_ids=ids).detections, pose), 2e-3) and len(found) > 3
+    assert alike(seen, to_sensor_frame(detector(scan, cluster_ids=ids).detections, pose), 2e-3) and len(found) > 3
 
 
 # scores, boxes, intensity
+
 
 def test_detections_pass_thresholds_sorted_without_overlap(ids):
     detector, scan = random_detector(), frame()
@@ -187,8 +194,7 @@ def test_detections_pass_thresholds_sorted_without_overlap(ids):
     halves[thing[::2]] = ids.max() + 1
     detector.params = with_values(eager(), {"pointnet.nms.iou": 1.0})
     both = detector(scan, cluster_ids=halves).detections
-    detector.params = with_values(eager(), {"pointnet.nms.iou": 0.05,
-                                            "pointnet.nms.across_classes": True})
+    detector.params = with_values(eager(), {"pointnet.nms.iou": 0.05, "pointnet.nms.across_classes": True})
     assert len(both) > len(detector(scan, cluster_ids=halves).detections)
 
 
@@ -214,8 +220,7 @@ def test_nan_outputs_are_left_out_and_reported(layer, ids):
     assert f"1 of {ids.max()} clusters" in found.problem and "NaN" in found.problem
     network = detector.classifier.network.network
     getattr(network, layer).bias.fill_(np.nan)
-    broken = PointNetDetector(make_classifier(network, detector.classifier.header),
-                              detector.params)
+    broken = PointNetDetector(make_classifier(network, detector.classifier.header), detector.params)
     found = broken(scan, cluster_ids=ids)
     assert len(found.detections) == 0 and "NaN" in found.problem
 
@@ -244,9 +249,11 @@ def test_columns_of_another_length_are_refused():
 
 # devices
 
+
 def test_cpu_fallback_after_out_of_memory_is_reported(ids, monkeypatch):
     """Simulate a GPU without memory."""
     from lidar_perception.detectors.pointnet import classifier as module
+
     scan, expected, real = frame(), random_detector()(frame(), cluster_ids=ids), module.predict
     broken = random_detector()
 
@@ -254,6 +261,7 @@ def test_cpu_fallback_after_out_of_memory_is_reported(ids, monkeypatch):
         if broken.device != CPU:
             raise torch.cuda.OutOfMemoryError("CUDA out of memory")
         return real(network, clusters, **labels)
+
     monkeypatch.setattr(module, "predict", predict)
     broken.classifier.placement.device = "meta"
     for _ in range(2):
@@ -267,14 +275,14 @@ def test_cpu_fallback_after_out_of_memory_is_reported(ids, monkeypatch):
 
 # weights
 
+
 @pytest.fixture
 def saved(tmp_path):
     """Return checkpoints of both networks."""
     config, other = small(), tiny_pointpillars("v4")
     header = Header(config, {"data": "simulated"}, {"accuracy": 0.9}, "abc123")
     save_checkpoint(tmp_path / "n.safetensors", lively(config), header)
-    save_checkpoint(tmp_path / "p.safetensors", lively_pointpillars(other),
-                    PointPillarsHeader(other))
+    save_checkpoint(tmp_path / "p.safetensors", lively_pointpillars(other), PointPillarsHeader(other))
     return tmp_path / "n.safetensors", tmp_path / "p.safetensors", header
 
 
@@ -282,12 +290,11 @@ def with_header(path, out, **changes):
     """Copy a checkpoint with changed values in its header; None removes them."""
     content = path.read_bytes()
     length = struct.unpack("<Q", content[:8])[0]
-    names = json.loads(content[8:8 + length])
+    names = json.loads(content[8 : 8 + length])
     header = {**json.loads(names["__metadata__"]["lidar_perception"]), **changes}
-    names["__metadata__"]["lidar_perception"] = json.dumps(
-        {k: v for k, v in header.items() if v is not None})
+    names["__metadata__"]["lidar_perception"] = json.dumps({k: v for k, v in header.items() if v is not None})
     text = json.dumps(names).encode()
-    out.write_bytes(struct.pack("<Q", len(text)) + text + content[8 + length:])
+    out.write_bytes(struct.pack("<Q", len(text)) + text + content[8 + length :])
     return out
 
 
@@ -321,9 +328,11 @@ def test_weights_of_other_network_or_classes_are_refused(saved, tmp_path):
     with pytest.raises(InputError, match=r"classes is .*Cyclist.*expected was"):
         load_pointnet(path, two)
     config = json.loads(header.to_json())["config"]
-    for change, words in ((dict(classes=two.classes, sizes=two.sizes), "do not fit its header"),
-                          (dict(classes=("Car", "Dog", "Cyclist")), "no class 'Dog'"),
-                          (dict(colour=1), "'colour'")):
+    for change, words in (
+        (dict(classes=two.classes, sizes=two.sizes), "do not fit its header"),
+        (dict(classes=("Car", "Dog", "Cyclist")), "no class 'Dog'"),
+        (dict(colour=1), "'colour'"),
+    ):
         changed = with_header(path, tmp_path / "c.safetensors", config={**config, **change})
         with pytest.raises(InputError, match=words) as error:
             load_pointnet(changed)
@@ -333,7 +342,8 @@ def test_weights_of_other_network_or_classes_are_refused(saved, tmp_path):
 def test_network_with_one_class_keeps_its_class_id(ids):
     config = small(classes=("Pedestrian",), sizes=small().sizes[1:2])
     found = PointNetDetector(make_classifier(lively(config), Header(config)), eager())(
-        frame(), cluster_ids=ids).detections
+        frame(), cluster_ids=ids
+    ).detections
     assert len(found) > 3 and {*found.class_ids} == {CLASSES.index("Pedestrian")}
 
 
@@ -382,6 +392,7 @@ def test_missing_shipped_weights_are_requested(saved, tmp_path, monkeypatch):
 
 def test_real_scans_of_any_network_go_through(data):
     from lidar_perception.data.open import open_recording
+
     scan = open_recording(data / "kitti_object").frames[0].load()
     for name in "improved", "pointnet", "pointnet2":
         config = small(name)

@@ -20,8 +20,7 @@ from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import CLASSES
 
 # Others run these lines.
-pytestmark = [pytest.mark.no_cover,
-              pytest.mark.usefixtures("one_thread", "streets")]
+pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread", "streets")]
 FILES = [*sorted(WEIGHTS.glob("*.safetensors")), POINTNET, find_judge_weights()]
 MOST = {"pointpillars": 30e6, "pointnet": 6e6}  # bytes of all files
 
@@ -35,8 +34,15 @@ def test_they_are_small_enough_and_there():
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_shipped_headers_have_training_and_metrics(file):
     card = file.with_suffix(".md").read_text()
-    for words in ("Training data: sim", "Classes:", "Range:", "Sensor:", "AP in percent",
-                  "## Known failures", "## Licence"):
+    for words in (
+        "Training data: sim",
+        "Classes:",
+        "Range:",
+        "Sensor:",
+        "AP in percent",
+        "## Known failures",
+        "## Licence",
+    ):
         assert words in card
     header = read_header(file)
     assert header.training["data"] == ["sim"] and header.metrics["score"] > 0
@@ -55,8 +61,7 @@ def test_each_network_finds_most_clear_cars(file, scans):
     for scan in scans[2:] if "full" in file.stem else scans[1:]:  # these are slow
         cars = scan.truth.class_ids == CLASSES.index("Car")
         plain = np.array([e["num_points"] > 100 and e["visible"] > 0.5 for e in scan.truth.extras])
-        ahead = (scan.truth.boxes[:, 0] > 5) & (scan.truth.boxes[:, 0] < 35) & (
-            np.abs(scan.truth.boxes[:, 1]) < 20)
+        ahead = (scan.truth.boxes[:, 0] > 5) & (scan.truth.boxes[:, 0] < 35) & (np.abs(scan.truth.boxes[:, 1]) < 20)
         boxes = scan.truth.boxes[cars & plain & ahead]
         detections = detector(scan.frame).detections
         mine = detections.boxes[detections.class_ids == CLASSES.index("Car")]
@@ -82,8 +87,7 @@ def test_only_cars_are_moved_to_their_points(name, scans):
 
 def test_ego_vehicle_is_not_detected(data):
     """Whole scans of KITTI contain some points of the roof."""
-    frames = [frame for frame in open_recording(data / "kitti_object")
-              if (frame.load().xyz[:, 0] < -5).any()][:3]
+    frames = [frame for frame in open_recording(data / "kitti_object") if (frame.load().xyz[:, 0] < -5).any()][:3]
     for detector in open_detector("fused", "cpu", range="around"), open_detector("pointnet", "cpu"):
         for frame in frames:
             found = detector(frame.load()).detections

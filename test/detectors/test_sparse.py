@@ -30,8 +30,10 @@ from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import InputError
 
-pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.skipif(
-    not LANES, reason="Numba compiles for a processor without AVX2")]
+pytestmark = [
+    pytest.mark.usefixtures("one_thread"),
+    pytest.mark.skipif(not LANES, reason="Numba compiles for a processor without AVX2"),
+]
 
 TOLERANCE = 1e-4  # of features and logits, whose sizes are about 1 to 30
 WIDE = dict(low=(-12.8, -14.08, -3.0), high=(12.8, 14.08, 1.0))  # 176 x 160 pillars
@@ -60,9 +62,8 @@ def inputs(config, points, drawn, seed=0, share=1.0):
         cloud = np.column_stack([cloud, rng.integers(0, 60, points)])
     maps = (rng.random((1, 3, *config.grid)) < drawn).astype(np.uint8)
     for axis in 2, 3:
-        maps.swapaxes(2, axis)[:, :, int(share * maps.shape[axis]):] = 0
-    return (make_pillars(cloud.astype(np.float32), config),
-            maps if config.pseudo_map else None)
+        maps.swapaxes(2, axis)[:, :, int(share * maps.shape[axis]) :] = 0
+    return (make_pillars(cloud.astype(np.float32), config), maps if config.pseudo_map else None)
 
 
 def by_torch(network, pillars, maps):
@@ -79,7 +80,7 @@ def assert_equal(config, points, drawn, reach=None, seed=0, share=1.0):
         expected = by_torch(network, pillars, maps)
     cells, features, logits = sparse_network(network).evaluate(pillars, maps, reach)
     assert len(cells) == len(expected[0]) or reach is not None
-    values = features.at(cells)[:, :expected[0].shape[1]]
+    values = features.at(cells)[:, : expected[0].shape[1]]
     for found, wanted in (values, expected[0]), (logits, expected[1]):
         np.testing.assert_allclose(found, wanted[cells], rtol=0, atol=TOLERANCE)
     return expected[0]
@@ -91,17 +92,35 @@ def test_small_network_equals_torch(version, points, drawn):
     assert_equal(tiny(version), points, drawn, seed=points)
 
 
-@pytest.mark.parametrize(("version", "size", "changes"), [
-    ("v1", "compact", WIDE), ("v2", "compact", WIDE), ("v4", "compact", WIDE),
-    ("v4", "compact", dict(low=(0.0, -14.08, -3.0), high=(25.6, 14.08, 1.0), cell=0.08)),
-    ("v4", "full", dict(low=(0.0, -5.12, -3.0), high=(10.24, 5.12, 1.0))),
-    ("v1", "full", dict(low=(-5.12, -5.12, -3.0), high=(5.12, 5.12, 1.0))),
-    ("v4", "compact", dict(WIDE, block_strides=(1, 2, 4))),
-    ("v4", "compact", dict(low=(0.0, -7.68, -3.0), high=(15.36, 7.68, 1.0),
-                           block_strides=(2, 3, 2), classes=("Car",))),
-    ("v4", "compact", dict(WIDE, block_strides=(2, 2), block_channels=(24, 40),
-                           block_layers=(0, 2), map_channels=(6,), pillar_channels=10)),
-])
+@pytest.mark.parametrize(
+    ("version", "size", "changes"),
+    [
+        ("v1", "compact", WIDE),
+        ("v2", "compact", WIDE),
+        ("v4", "compact", WIDE),
+        ("v4", "compact", dict(low=(0.0, -14.08, -3.0), high=(25.6, 14.08, 1.0), cell=0.08)),
+        ("v4", "full", dict(low=(0.0, -5.12, -3.0), high=(10.24, 5.12, 1.0))),
+        ("v1", "full", dict(low=(-5.12, -5.12, -3.0), high=(5.12, 5.12, 1.0))),
+        ("v4", "compact", dict(WIDE, block_strides=(1, 2, 4))),
+        (
+            "v4",
+            "compact",
+            dict(low=(0.0, -7.68, -3.0), high=(15.36, 7.68, 1.0), block_strides=(2, 3, 2), classes=("Car",)),
+        ),
+        (
+            "v4",
+            "compact",
+            dict(
+                WIDE,
+                block_strides=(2, 2),
+                block_channels=(24, 40),
+                block_layers=(0, 2),
+                map_channels=(6,),
+                pillar_channels=10,
+            ),
+        ),
+    ],
+)
 def test_shipped_sizes_equal_torch_also_at_the_border(version, size, changes):
     config = make_config(version, size, **changes)
     few = assert_equal(config, 12, 0.001, share=0.1)
@@ -120,12 +139,12 @@ def test_head_is_evaluated_near_points_only():
     occupied.ravel()[pillars.cells] = True
     rows, columns = np.nonzero(shrink(occupied, 2))
     height, width = config.head_grid
-    away = np.maximum(np.abs(np.arange(height)[:, None, None] - rows),
-                      np.abs(np.arange(width)[:, None] - columns)).min(axis=2)
+    away = np.maximum(np.abs(np.arange(height)[:, None, None] - rows), np.abs(np.arange(width)[:, None] - columns)).min(
+        axis=2
+    )
     cells = np.flatnonzero(away <= 6)
     per_cell = config.anchors_per_cell
-    np.testing.assert_array_equal(
-        prediction.anchors, (cells[:, None] * per_cell + np.arange(per_cell)).ravel())
+    np.testing.assert_array_equal(prediction.anchors, (cells[:, None] * per_cell + np.arange(per_cell)).ravel())
     assert prediction.logits.shape == (len(cells) * per_cell, 3)
 
 
@@ -165,8 +184,7 @@ def test_an_error_in_one_part_is_raised(monkeypatch):
         run_in_parts(fail, 100, 4)
 
 
-@pytest.mark.parametrize("layer", ["pillar_net.linear.weight", "blocks.1.0.0.weight",
-                                   "neck.laterals.2.weight"])
+@pytest.mark.parametrize("layer", ["pillar_net.linear.weight", "blocks.1.0.0.weight", "neck.laterals.2.weight"])
 def test_nan_weights_are_reported(layer):
     config = tiny("v4")
     network = lively(config)
@@ -178,11 +196,18 @@ def test_nan_weights_are_reported(layer):
     assert len(found.detections) == 0 and found.problem
 
 
-@pytest.mark.parametrize("config, settings, words", [
-    (tiny("v0"), {}, "ground"), (tiny("v3"), {}, "ground"),
-    (tiny("v1", fusion="concat"), {}, "neck"), (tiny("v1", neck="deconv"), {}, "neck"),
-    (tiny("v1", max_points=4, zero_row=True), {}, "rows of zeros"),
-    (tiny("v4"), {"pointpillars.amp": "bf16"}, "16 bits"), (tiny("v4"), {}, "AVX2")])
+@pytest.mark.parametrize(
+    "config, settings, words",
+    [
+        (tiny("v0"), {}, "ground"),
+        (tiny("v3"), {}, "ground"),
+        (tiny("v1", fusion="concat"), {}, "neck"),
+        (tiny("v1", neck="deconv"), {}, "neck"),
+        (tiny("v1", max_points=4, zero_row=True), {}, "rows of zeros"),
+        (tiny("v4"), {"pointpillars.amp": "bf16"}, "16 bits"),
+        (tiny("v4"), {}, "AVX2"),
+    ],
+)
 def test_networks_that_torch_must_run(config, settings, words, tmp_path, monkeypatch):
     path = tmp_path / "a.safetensors"
     save_checkpoint(path, lively(config), Header(config))
@@ -202,15 +227,19 @@ def test_engine_is_a_parameter(weights):
         detector = open_detector(weights, "cpu", settings={**quick, f"{weights}.engine": engine})
         assert isinstance(detector.proposer.network, sparse.SparseNetwork) == expected
     with pytest.raises(InputError, match="engine"):
-        open_detector("pointpillars", "cpu", settings={
-            "pointpillars.warm_up": False, "pointpillars.engine": "sparse",
-            "pointpillars.version": "v0"})
+        open_detector(
+            "pointpillars",
+            "cpu",
+            settings={"pointpillars.warm_up": False, "pointpillars.engine": "sparse", "pointpillars.version": "v0"},
+        )
 
 
 @pytest.fixture(scope="module")
 def both_engines():
-    return [open_detector("fused", "cpu", settings={"fused.engine": engine, "fused.warm_up": False})
-            for engine in ("torch", "sparse")]
+    return [
+        open_detector("fused", "cpu", settings={"fused.engine": engine, "fused.warm_up": False})
+        for engine in ("torch", "sparse")
+    ]
 
 
 def assert_same_detections(detectors, frames):
@@ -253,8 +282,7 @@ def test_a_cloud_without_a_pillar_detects_nothing():
     detector = random_detector("v4")
     proposer, config = detector.proposer, detector.proposer.config
     proposer.network = sparse_network(lively(config))
-    broken = NetworkInput(np.full((10, 4), np.nan, np.float32),
-                          np.zeros((3, *config.grid), np.uint8))
+    broken = NetworkInput(np.full((10, 4), np.nan, np.float32), np.zeros((3, *config.grid), np.uint8))
     _, predictions = proposer._predict({False: broken})
     found = proposer._decode(predictions, [0.5] * 3, NmsParams())
     assert len(found.detections) == 0 and found.best == {} and found.problem is None

@@ -16,12 +16,7 @@ from click.testing import CliRunner
 from detection_samples import eager, frame, lively, make_detector, random_detector, same, tiny
 
 from lidar_perception.cli.main import cli
-from lidar_perception.detectors.checkpoint import (
-    Header,
-    copy_matching_weights,
-    read_header,
-    save_checkpoint,
-)
+from lidar_perception.detectors.checkpoint import Header, copy_matching_weights, read_header, save_checkpoint
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.detector import _load_network
 from lidar_perception.detectors.pointpillars import weights_file as weights_module
@@ -37,16 +32,17 @@ from lidar_perception.types import InputError
 pytestmark = pytest.mark.usefixtures("one_thread")
 needs_onnx = pytest.mark.skipif(
     not all(importlib.util.find_spec(name) for name in ("onnx", "onnxruntime", "onnxscript")),
-    reason="needs the extra [onnx]")
+    reason="needs the extra [onnx]",
+)
 
 
 # checkpoints
 
+
 @pytest.fixture
 def saved(tmp_path):
     config = tiny("v4")
-    header = Header(config, {"data": "simulated", "steps": 10}, {"map": 0.5}, "abc123",
-                    {"Pedestrian": (1.5, -0.25)})
+    header = Header(config, {"data": "simulated", "steps": 10}, {"map": 0.5}, "abc123", {"Pedestrian": (1.5, -0.25)})
     network = lively(config)
     save_checkpoint(tmp_path / "w.safetensors", network, header)
     return tmp_path / "w.safetensors", header, network
@@ -62,8 +58,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
     save_checkpoint(tmp_path / "half", network, header, half=True)
     assert (tmp_path / "half").stat().st_size < path.stat().st_size
     for name, value in load_network(tmp_path / "half")[1].state_dict().items():
-        torch.testing.assert_close(value, network.state_dict()[name], atol=1e-7,
-                                   rtol=0 if value.ndim < 2 else 2**-10)
+        torch.testing.assert_close(value, network.state_dict()[name], atol=1e-7, rtol=0 if value.ndim < 2 else 2**-10)
     found = load_detector(path, "cpu", eager(engine="torch"))(frame())
     expected = make_detector(TorchNetwork(network), header, eager())(frame())
     assert len(found.detections) and same(found, expected)
@@ -92,7 +87,7 @@ def test_matching_weights_of_another_network_are_copied(saved):
     taken, count = copy_matching_weights(other, path, NetworkConfig)
     assert taken == count
     first, old = (s["blocks.0.0.0.weight"] for s in (other.state_dict(), state))
-    assert first.shape[1] < old.shape[1] and torch.equal(first, old[:, :first.shape[1]])
+    assert first.shape[1] < old.shape[1] and torch.equal(first, old[:, : first.shape[1]])
     # a new input, such as the number of the cluster, comes last and begins at 0
     numbered = make_network(tiny("v2"))
     assert len(set(copy_matching_weights(numbered, path, NetworkConfig))) == 1
@@ -103,8 +98,9 @@ def test_matching_weights_of_another_network_are_copied(saved):
     before = {name: value.clone() for name, value in third.state_dict().items()}
     taken, count = copy_matching_weights(third, path, NetworkConfig)
     assert 0 < taken < count
-    assert all(torch.equal(value, before[name]) for name, value in third.state_dict().items()
-               if name.startswith("neck"))
+    assert all(
+        torch.equal(value, before[name]) for name, value in third.state_dict().items() if name.startswith("neck")
+    )
     with pytest.raises(InputError, match="no layer"):
         copy_matching_weights(torch.nn.Linear(2, 3), path, NetworkConfig)
 
@@ -113,20 +109,26 @@ def test_invalid_checkpoint_files_are_refused(saved, tmp_path):
     path, _, _ = saved
     content = path.read_bytes()
     length = struct.unpack("<Q", content[:8])[0]
-    names = json.loads(content[8:8 + length])
+    names = json.loads(content[8 : 8 + length])
     other = json.loads(names["__metadata__"]["lidar_perception"])
-    cases = {"missing": (None, "no checkpoint"), "cut": (content[:-9], "is truncated"),
-             "text": (b"hello", "is truncated"), "empty": (b"", "is truncated")}
+    cases = {
+        "missing": (None, "no checkpoint"),
+        "cut": (content[:-9], "is truncated"),
+        "text": (b"hello", "is truncated"),
+        "empty": (b"", "is truncated"),
+    }
     for name, change, words in (
-            ("foreign", None, "import-weights"), ("later", dict(format=9), "format 9"),
-            ("unknown", dict(config={**other["config"], "colour": 1}), "'colour'"),
-            ("unfit", dict(config={**other["config"], "fpn_channels": 9}), "do not fit"),
-            ("odd", dict(config={**other["config"], "cell": "wide"}), "describes no network")):
+        ("foreign", None, "import-weights"),
+        ("later", dict(format=9), "format 9"),
+        ("unknown", dict(config={**other["config"], "colour": 1}), "'colour'"),
+        ("unfit", dict(config={**other["config"], "fpn_channels": 9}), "do not fit"),
+        ("odd", dict(config={**other["config"], "cell": "wide"}), "describes no network"),
+    ):
         kept = {k: v for k, v in names.items() if k != "__metadata__"}
         if change:
             kept["__metadata__"] = {"lidar_perception": json.dumps({**other, **change})}
         text = json.dumps(kept).encode()
-        cases[name] = (struct.pack("<Q", len(text)) + text + content[8 + length:], words)
+        cases[name] = (struct.pack("<Q", len(text)) + text + content[8 + length :], words)
     for name, (raw, words) in cases.items():
         if raw is not None:
             (tmp_path / name).write_bytes(raw)
@@ -141,6 +143,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(saved, monkeypatch):
 
     def full(*_):
         raise OSError(28, "No space left on device")
+
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(InputError, match="No space left"):
         save_checkpoint(path, network, header, half=True)
@@ -153,11 +156,11 @@ def test_missing_shipped_weights_are_requested(tmp_path, monkeypatch):
         load_detector("", "cpu")
     wanted = with_values(eager(engine="torch"), {"pointpillars.version": "v1"})
     config = tiny("v1")
-    save_checkpoint(tmp_path / "pointpillars_v1_compact.safetensors", lively(config),
-                    Header(config))
+    save_checkpoint(tmp_path / "pointpillars_v1_compact.safetensors", lively(config), Header(config))
     assert same(load_detector("", "cpu", wanted)(frame()), random_detector("v1")(frame()))
-    named = with_values(eager(engine="torch"), {"pointpillars.weights": str(
-        tmp_path / "pointpillars_v1_compact.safetensors")})
+    named = with_values(
+        eager(engine="torch"), {"pointpillars.weights": str(tmp_path / "pointpillars_v1_compact.safetensors")}
+    )
     assert same(load_detector("", "cpu", named)(frame()), random_detector("v1")(frame()))
     with pytest.raises(InputError, match="no checkpoint /nowhere"):
         load_detector("", "cpu", with_values(eager(), {"pointpillars.weights": "/nowhere"}))
@@ -165,11 +168,13 @@ def test_missing_shipped_weights_are_requested(tmp_path, monkeypatch):
 
 # export
 
+
 @needs_onnx
 @pytest.mark.no_cover
 def test_an_exported_network_finds_the_same(tmp_path):
     """v0 is exported here, v4 by the command; the others have parts of both."""
     from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork, export_onnx
+
     config = tiny("v0", anchors=tiny().anchors[:1], max_points=3, zero_row=True, middle_z=True)
     network, header = lively(config), Header(config, {"steps": 3})
     export_onnx(network, header, tmp_path / "n.onnx")
@@ -186,8 +191,9 @@ def test_export_reads_checkpoints_and_refuses_bad_files(saved, tmp_path, monkeyp
     out = tmp_path / "o/w.onnx"
     done = CliRunner().invoke(cli, ["export", "onnx", str(path), "--out", str(out)])
     assert done.exit_code == 0 and "v4 compact" in " ".join(done.output.split())
-    assert same(load_detector(out, "cpu", eager())(frame()),
-                load_detector(path, "cpu", eager(engine="torch"))(frame()), 1e-4)
+    assert same(
+        load_detector(out, "cpu", eager())(frame()), load_detector(path, "cpu", eager(engine="torch"))(frame()), 1e-4
+    )
     with pytest.raises(InputError, match="not on 'cuda'"):
         load_detector(out, "cuda")
     with pytest.raises(InputError, match="set amp: off"):
@@ -204,16 +210,20 @@ def test_export_reads_checkpoints_and_refuses_bad_files(saved, tmp_path, monkeyp
 @pytest.mark.parametrize("name", ["improved", "farthest-ball-density", "pointnet"])
 def test_exported_pointnet_finds_the_same(tmp_path, name):
     config = pointnet_samples.small(name)
-    network, clusters = pointnet_samples.lively(config), pointnet_samples.blobs(
-        np.random.default_rng(0), [1, 5, 30, 100, 7])
+    network, clusters = (
+        pointnet_samples.lively(config),
+        pointnet_samples.blobs(np.random.default_rng(0), [1, 5, 30, 100, 7]),
+    )
     network.temperature.fill_(1.5)
     network.offsets.copy_(torch.arange(4) / 10)
     weights, out = tmp_path / "w.safetensors", tmp_path / "p.onnx"
     save_checkpoint(weights, network, Header(config, {"steps": 3}))
     done = CliRunner().invoke(cli, ["export", "onnx", str(weights), "--out", str(out)])
     assert done.exit_code == 0 and f"PointNet {name}" in " ".join(done.output.split())
-    detector, wanted = (open_detector(file, "cpu", settings={
-        "pointnet.warm_up": False, "pointnet.engine": "torch"}) for file in (out, weights))
+    detector, wanted = (
+        open_detector(file, "cpu", settings={"pointnet.warm_up": False, "pointnet.engine": "torch"})
+        for file in (out, weights)
+    )
     assert detector.params == wanted.params
     assert detector.classifier.header == wanted.classifier.header
     for count in (5, 1):
@@ -227,12 +237,27 @@ def test_exported_pointnet_finds_the_same(tmp_path, name):
 
 # weights of other projects
 
+
 def theirs(state, project):
     """Convert our state dict to the names and point inputs of another project."""
-    names = {"OpenPCDet": ("vfe", "backbone_2d.blocks", "backbone_2d.deblocks", "dense_head",
-                           ("conv_cls", "conv_box", "conv_dir_cls"), 1),
-             "mmdetection3d": ("voxel_encoder", "backbone.blocks", "neck.deblocks", "bbox_head",
-                               ("conv_cls", "conv_reg", "conv_dir_cls"), 0)}
+    names = {
+        "OpenPCDet": (
+            "vfe",
+            "backbone_2d.blocks",
+            "backbone_2d.deblocks",
+            "dense_head",
+            ("conv_cls", "conv_box", "conv_dir_cls"),
+            1,
+        ),
+        "mmdetection3d": (
+            "voxel_encoder",
+            "backbone.blocks",
+            "neck.deblocks",
+            "bbox_head",
+            ("conv_cls", "conv_reg", "conv_dir_cls"),
+            0,
+        ),
+    }
     points, blocks, ups, head, convs, first = names[project]
     out = {}
     for name, value in state.items():
@@ -256,10 +281,13 @@ def big():
     return lively(make_config("v0", "full", middle_z=True)).state_dict()
 
 
-@pytest.mark.parametrize("project, wrapped", [
-    ("OpenPCDet", lambda s: {"epoch": 80, "model_state": {**s, "global_step": torch.tensor([5])}}),
-    ("mmdetection3d", lambda s: {"meta": {"epoch": 160}, "state_dict": {
-        f"module.{k}": v for k, v in s.items()}})])
+@pytest.mark.parametrize(
+    "project, wrapped",
+    [
+        ("OpenPCDet", lambda s: {"epoch": 80, "model_state": {**s, "global_step": torch.tensor([5])}}),
+        ("mmdetection3d", lambda s: {"meta": {"epoch": 160}, "state_dict": {f"module.{k}": v for k, v in s.items()}}),
+    ],
+)
 def test_weights_of_other_projects_are_imported(project, wrapped, big, tmp_path):
     path = tmp_path / "theirs.pth"
     torch.save(wrapped(theirs(big, project)), path)
@@ -271,19 +299,30 @@ def test_weights_of_other_projects_are_imported(project, wrapped, big, tmp_path)
     xyz, rest = torch.randn(50, 3), torch.randn(50, 4)
     middle = xyz - torch.tensor([3.0, 2.0, -1.0])  # any pillar; z above the middle of the range
     first = middle if project == "mmdetection3d" else xyz  # it overwrites x y z
-    torch.testing.assert_close(torch.cat([first, rest, middle], dim=1) @ big[linear].T,
-                               torch.cat([xyz, rest, middle], dim=1) @ state[linear].T)
+    torch.testing.assert_close(
+        torch.cat([first, rest, middle], dim=1) @ big[linear].T, torch.cat([xyz, rest, middle], dim=1) @ state[linear].T
+    )
     car = config.anchors[config.classes.index("Car")]
     assert car.z == pytest.approx(-1.78 + 1.56 / 2) and config.zero_row
-    assert config.classes == (("Car", "Pedestrian", "Cyclist") if project == "OpenPCDet"
-                              else ("Pedestrian", "Cyclist", "Car"))
+    assert config.classes == (
+        ("Car", "Pedestrian", "Cyclist") if project == "OpenPCDet" else ("Pedestrian", "Cyclist", "Car")
+    )
 
 
 def test_weights_are_imported_from_the_command_line(big, tmp_path):
     torch.save(theirs(big, "OpenPCDet"), tmp_path / "a.pth")
-    done = CliRunner().invoke(cli, [
-        "import-weights", str(tmp_path / "a.pth"), "--out", str(tmp_path / "a.safetensors"),
-        "--classes", "Cyclist,Pedestrian,Car", "--half"])
+    done = CliRunner().invoke(
+        cli,
+        [
+            "import-weights",
+            str(tmp_path / "a.pth"),
+            "--out",
+            str(tmp_path / "a.safetensors"),
+            "--classes",
+            "Cyclist,Pedestrian,Car",
+            "--half",
+        ],
+    )
     assert done.exit_code == 0, done.output
     header = read_header(tmp_path / "a.safetensors")
     assert header.config.classes == ("Cyclist", "Pedestrian", "Car")
@@ -300,14 +339,18 @@ class Code:
 def test_files_with_other_content_are_refused(big, tmp_path, capsys):
     good = theirs(big, "OpenPCDet")
     points = "vfe.pfn_layers.0.linear.weight"
-    cases = [({**good, "evil": Code()}, (), "weights only"), ({}, (), "no state_dict"),
-             ([1], (), "no state_dict"), ({"a": torch.zeros(2)}, (), points),
-             ({**good, points: good[points][:, :9]}, (), "9 inputs"),
-             ({**good, "roi_head.weight": torch.zeros(3)}, (), "roi_head.weight"),
-             (good, ("Car", "Pedestrian"), "3 classes"), (good, ("Car", "Dog", "Cat"), "Dog"),
-             ({k: v for k, v in good.items() if "blocks.2.7" not in k}, (), "blocks.2.7"),
-             ({**good, "backbone_2d.blocks.0.1.weight": torch.zeros(64, 32, 3, 3)}, (),
-              "blocks.0.0.0.weight")]
+    cases = [
+        ({**good, "evil": Code()}, (), "weights only"),
+        ({}, (), "no state_dict"),
+        ([1], (), "no state_dict"),
+        ({"a": torch.zeros(2)}, (), points),
+        ({**good, points: good[points][:, :9]}, (), "9 inputs"),
+        ({**good, "roi_head.weight": torch.zeros(3)}, (), "roi_head.weight"),
+        (good, ("Car", "Pedestrian"), "3 classes"),
+        (good, ("Car", "Dog", "Cat"), "Dog"),
+        ({k: v for k, v in good.items() if "blocks.2.7" not in k}, (), "blocks.2.7"),
+        ({**good, "backbone_2d.blocks.0.1.weight": torch.zeros(64, 32, 3, 3)}, (), "blocks.0.0.0.weight"),
+    ]
     for content, classes, words in cases:
         torch.save(content, tmp_path / "x.pth")
         with pytest.raises(InputError, match=words) as error:
@@ -317,8 +360,7 @@ def test_files_with_other_content_are_refused(big, tmp_path, capsys):
     with zipfile.ZipFile(tmp_path / "damaged.pth", "w") as file:  # takes what nobody has put there
         file.writestr("x/data.pkl", b"\x80\x02R.")
         file.writestr("x/version", "3")
-    for name, words in (("x.pth", "weights only"), ("damaged.pth", "weights only"),
-                        ("none.pth", "no file")):
+    for name, words in (("x.pth", "weights only"), ("damaged.pth", "weights only"), ("none.pth", "no file")):
         with pytest.raises(InputError, match=words):
             import_weights(tmp_path / name)
     assert capsys.readouterr().out == ""

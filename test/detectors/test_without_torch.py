@@ -37,13 +37,17 @@ def test_detecting_does_not_load_torch():
 
 
 @needs_kernels
-@pytest.mark.parametrize("change", [
-    lambda tensors: tensors.pop("blocks.1.0.1.running_var"),
-    lambda tensors: tensors.pop("head.codes.bias"),
-    lambda tensors: tensors.pop("pillar_net.norm.num_batches_tracked"),
-    lambda tensors: tensors.update(more=np.zeros(1, np.float32)),
-    lambda tensors: tensors.update({"neck.laterals.0.bias": np.zeros(9, np.float32)}),
-    lambda tensors: tensors.update({"head.scores.bias": np.zeros(18, np.int64)})])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda tensors: tensors.pop("blocks.1.0.1.running_var"),
+        lambda tensors: tensors.pop("head.codes.bias"),
+        lambda tensors: tensors.pop("pillar_net.norm.num_batches_tracked"),
+        lambda tensors: tensors.update(more=np.zeros(1, np.float32)),
+        lambda tensors: tensors.update({"neck.laterals.0.bias": np.zeros(9, np.float32)}),
+        lambda tensors: tensors.update({"head.scores.bias": np.zeros(18, np.int64)}),
+    ],
+)
 def test_tensors_of_another_network_are_refused(change):
     config = tiny("v4")
     tensors = to_arrays(lively(config))
@@ -58,12 +62,11 @@ def test_folded_norm_equals_layer_and_norm():
     layer, norm = torch.nn.Conv2d(5, 7, 3, bias=False), torch.nn.BatchNorm2d(7, eps=0.01).eval()
     for values in norm.weight, norm.bias, norm.running_mean, norm.running_var:
         values.data.uniform_(0.5, 2)
-    weight, bias = LayerWeights(to_arrays(torch.nn.Sequential(layer, norm)), 0.01).take(
-        "0", (7, 5, 3, 3), "1")
+    weight, bias = LayerWeights(to_arrays(torch.nn.Sequential(layer, norm)), 0.01).take("0", (7, 5, 3, 3), "1")
     image = torch.from_numpy(rng.normal(size=(1, 5, 6, 6)).astype(np.float32))
     torch.testing.assert_close(
-        torch.nn.functional.conv2d(image, torch.from_numpy(weight), torch.from_numpy(bias)),
-        norm(layer(image)))
+        torch.nn.functional.conv2d(image, torch.from_numpy(weight), torch.from_numpy(bias)), norm(layer(image))
+    )
 
 
 @needs_kernels
@@ -71,10 +74,15 @@ def test_bf16_weights_are_read_by_torch(tmp_path):
     config = tiny("v4")
     path = tmp_path / "w.safetensors"
     from safetensors.torch import save_file
-    tensors = {name: value.bfloat16() if value.ndim > 1 else value
-               for name, value in lively(config).state_dict().items()}
-    save_file({name: value.contiguous() for name, value in tensors.items()}, path,
-              {"lidar_perception": Header(config).to_json()})
+
+    tensors = {
+        name: value.bfloat16() if value.ndim > 1 else value for name, value in lively(config).state_dict().items()
+    }
+    save_file(
+        {name: value.contiguous() for name, value in tensors.items()},
+        path,
+        {"lidar_perception": Header(config).to_json()},
+    )
     detector = open_detector(path, "cpu", settings={"pointpillars.warm_up": False})
     assert isinstance(detector.proposer.network, SparseNetwork)
 

@@ -22,8 +22,7 @@ def objects(owner, region=None):
     owner = np.asarray(owner, np.int32)
     region = owner if region is None else np.asarray(region, np.int32)
     count = int(owner.max(initial=0))
-    return Objects(owner, region, region > 0, np.ones(len(owner), bool), tuple("abcdef"[:count]),
-                   np.full(count, 10.0))
+    return Objects(owner, region, region > 0, np.ones(len(owner), bool), tuple("abcdef"[:count]), np.full(count, 10.0))
 
 
 def scores(ids, owner, ground=None, region=None):

@@ -79,10 +79,18 @@ def test_report_is_complete_with_and_without_records(coarse, models, frames):
     assert [*records[0]["changed"]["10 %"]] == ["improved, seed 0"]
     assert len(records[0]["drive"]) == 3 and records[1]["drive"] is None
     for some in ([], [{"frame": "x", "skipped": "why"}], records):
-        tables = {table.name: table for section in experiment.make_sections(some)
-                  for table in section.tables}
-        assert {"table_2", "table_3", "table_4", "table_5", "table_6", "table_7", "table_8",
-                "figure_10", "readings"} <= set(tables)
+        tables = {table.name: table for section in experiment.make_sections(some) for table in section.tables}
+        assert {
+            "table_2",
+            "table_3",
+            "table_4",
+            "table_5",
+            "table_6",
+            "table_7",
+            "table_8",
+            "figure_10",
+            "readings",
+        } <= set(tables)
         for table in tables.values():
             assert all(len(row) == len(table.header) for row in table.rows), table.name
     names = [row[0] for row in tables["table_5"].rows]
@@ -102,11 +110,34 @@ def test_every_network_of_the_tables_can_be_trained():
 
 def test_tiny_budget_runs_end_to_end(tmp_path, coarse, monkeypatch):
     monkeypatch.setattr(networks, "NETWORKS", ("improved",))
-    result = CliRunner().invoke(cli, [
-        "reproduce", "clusters", "sim", "--out", str(tmp_path / "out"), "--limit", "1", "--jobs",
-        "1", "--seeds", "1", *(word for value in (
-            f"sensor={SENSOR}", "data.scans=2", "data.val_scans=1", "steps=2", "batch=1",
-            "data.people=1") for word in ("--set", value))])
+    result = CliRunner().invoke(
+        cli,
+        [
+            "reproduce",
+            "clusters",
+            "sim",
+            "--out",
+            str(tmp_path / "out"),
+            "--limit",
+            "1",
+            "--jobs",
+            "1",
+            "--seeds",
+            "1",
+            *(
+                word
+                for value in (
+                    f"sensor={SENSOR}",
+                    "data.scans=2",
+                    "data.val_scans=1",
+                    "steps=2",
+                    "batch=1",
+                    "data.people=1",
+                )
+                for word in ("--set", value)
+            ),
+        ],
+    )
     assert result.exit_code == 0, result.output
     report = json.loads((tmp_path / "out/report.json").read_text())
     assert report["measured"] == 1 and "Table 8" in (tmp_path / "out/report.md").read_text()
@@ -120,7 +151,7 @@ def test_changed_clouds_are_reproducible_and_as_asked(frames):
     noisy = change_cloud(cloud, Change(noise=0.05), "a")
     shift = np.linalg.norm(noisy.xyz, axis=1) - np.linalg.norm(cloud.xyz, axis=1)
     assert shift.std() == pytest.approx(0.05, rel=0.1)
-    across = np.cross(noisy.xyz, cloud.xyz) / (np.linalg.norm(cloud.xyz, axis=1)**2)[:, None]
+    across = np.cross(noisy.xyz, cloud.xyz) / (np.linalg.norm(cloud.xyz, axis=1) ** 2)[:, None]
     assert np.abs(across).max() < 1e-4 and change_cloud(cloud, Change(), "a") is cloud
 
 
@@ -131,16 +162,17 @@ def test_simulated_labels_have_velocities(coarse):
     assert (speeds[np.isfinite(speeds)] > 2).any() and (speeds < 0.01).any()
     moved = {i: centre for i, centre in zip(labels[2].instances, labels[2].boxes.centres)}
     seconds = 1e-9 * (frames[2].stamp_ns - frames[0].stamp_ns)
-    for i, centre, velocity in zip(labels[0].instances, labels[0].boxes.centres,
-                                   labels[1].boxes.velocities):
+    for i, centre, velocity in zip(labels[0].instances, labels[0].boxes.centres, labels[1].boxes.velocities):
         if i in moved and i == labels[1].instances[list(labels[0].instances).index(i)]:
             np.testing.assert_allclose((moved[i] - centre)[:2], velocity * seconds, atol=0.3)
 
 
 def test_only_the_first_frame_of_a_scene_begins_a_drive(coarse, frames):
     assert len(list_drive(frames, 0)) == 3 and list_drive(frames, 1) == ()
-    key_frames = [replace(frame, native=simulate_key_frames(5)[0].native, sequence=name)
-                  for frame, name in zip([*frames, *frames], "aabb")]
+    key_frames = [
+        replace(frame, native=simulate_key_frames(5)[0].native, sequence=name)
+        for frame, name in zip([*frames, *frames], "aabb")
+    ]
     assert [len(list_drive(key_frames, i)) for i in range(4)] == [2, 0, 2, 0]
 
 
@@ -158,8 +190,9 @@ def test_detections_get_the_velocity_of_the_track_on_them():
 
 
 def test_scores_of_perfect_boxes_and_of_columns():
-    truth = GlobalBoxes.of([[5, 0, 0], [9, 3, 0]], np.ones((2, 3)), np.eye(4)[[0, 0]], 0,
-                           velocities=[[1, 0], [np.nan, np.nan]])
+    truth = GlobalBoxes.of(
+        [[5, 0, 0], [9, 3, 0]], np.ones((2, 3)), np.eye(4)[[0, 0]], 0, velocities=[[1, 0], [np.nan, np.nan]]
+    )
     found = replace(truth, scores=np.array([0.9, 0.8]))
     back = from_columns(json.loads(json.dumps(to_columns(found), allow_nan=False)))
     assert compute_scores([truth], [back])[1] > 0  # two of three classes are missing

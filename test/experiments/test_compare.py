@@ -31,8 +31,7 @@ from lidar_perception.types import Detections, InputError
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 CANDIDATES = ["STM-CPA paper", "STM-CPA best", "STM-CPA best, auto"]
-ROW = {"weights", "classes", "ap", "mean_ap", "pedestrian_centres", "ms", "ms_of_frames", "frames",
-       "failed"}
+ROW = {"weights", "classes", "ap", "mean_ap", "pedestrian_centres", "ms", "ms_of_frames", "frames", "failed"}
 
 
 @pytest.fixture
@@ -56,8 +55,7 @@ def weights(tmp_path_factory):
 
 def run(tmp_path, *arguments) -> tuple[dict, str]:
     path = tmp_path / "made/scores.json"
-    result = CliRunner().invoke(cli, ["compare", "--json", str(path), *map(str, arguments)],
-                                catch_exceptions=False)
+    result = CliRunner().invoke(cli, ["compare", "--json", str(path), *map(str, arguments)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return json.loads(path.read_text()), result.stdout
 
@@ -80,17 +78,15 @@ def copy_labels(frame, score=0.9) -> Detections:
     return Detections.of(truth.boxes, truth.class_ids, score)
 
 
-def test_all_detectors_run_and_missing_ones_are_listed(bare, weights, tmp_path,
-                                                       monkeypatch):
+def test_all_detectors_run_and_missing_ones_are_listed(bare, weights, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     root, png = crowd_folder(tmp_path / "kitti", 3), tmp_path / "pictures/compare.png"
     given = [word for name in "acb" for word in ("--weights", weights / name)]
     content, text = run(tmp_path, "--data", root, *given, "--png", png, "--device", "cpu")
-    assert [*content["rows"]] == [
-        *CANDIDATES, "PointPillars v0 compact", "PointNet", "PointPillars v0 compact #2"]
+    assert [*content["rows"]] == [*CANDIDATES, "PointPillars v0 compact", "PointNet", "PointPillars v0 compact #2"]
     assert {each["name"] for each in content["missing"]} == {"fused"} | {
-        f"PointPillars v{i} {size}" for i in range(5) for size in ("full", "compact")
-        if (i, size) != (0, "compact")}
+        f"PointPillars v{i} {size}" for i in range(5) for size in ("full", "compact") if (i, size) != (0, "compact")
+    }
     assert (content["frames"], content["pedestrians"]) == (3, {"frames": 2, "ground_truth": 8})
     assert content["objects"]["Pedestrian"]["hard"] == 8
     for name, row in content["rows"].items():
@@ -106,14 +102,12 @@ def test_all_detectors_run_and_missing_ones_are_listed(bare, weights, tmp_path,
     assert content["rows"]["PointPillars v0 compact #2"]["weights"] == str(weights / "b")
     assert png.read_bytes().startswith(b"\x89PNG")
     assert "missing" in text and "v4 full" in text and "AVOD" in text
-    lines = [line for line in text.splitlines()
-             if str(tmp_path) not in line and not line.startswith("missing: ")]
+    lines = [line for line in text.splitlines() if str(tmp_path) not in line and not line.startswith("missing: ")]
     assert max(map(len, lines)) <= 100 and "…" not in text
 
 
 def test_candidates_are_compared_in_any_layout(bare, tmp_path):
-    content, _ = run(tmp_path, "--data", tracking_folder(tmp_path / "kitti"), "--limit", 2,
-                     "--png", tmp_path / "a.png")
+    content, _ = run(tmp_path, "--data", tracking_folder(tmp_path / "kitti"), "--limit", 2, "--png", tmp_path / "a.png")
     assert [*content["rows"]] == CANDIDATES and content["frames"] == 2
     reasons = {each["name"]: each["reason"] for each in content["missing"]}
     assert len(reasons) == 12 and "--weights" in reasons["PointNet"]
@@ -121,8 +115,7 @@ def test_candidates_are_compared_in_any_layout(bare, tmp_path):
     frame, _ = open_recording(crowd_folder(tmp_path / "crowd", 2))  # as of a bag without a camera
     found, _ = open_contenders([], "cpu", 1.73)
     scan, blind = frame.load(), replace(frame, calibration=lambda: None)
-    whole, cropped = ([len(each.make_detector(one)(scan).detections) for each in found]
-                      for one in (blind, frame))
+    whole, cropped = ([len(each.make_detector(one)(scan).detections) for each in found] for one in (blind, frame))
     assert whole >= cropped > [0, 0, 0]
 
 
@@ -138,22 +131,21 @@ def test_perfect_detector_scores_100_and_failing_one_continues(tmp_path):
         return Detections.of(np.vstack([frame.truth().boxes, np.full((1, 7), np.nan)]))
 
     whole, failing, other, nan = compute_report(
-        root, make_fake(copy_labels), make_fake(fail), lambda frame: None,
-        make_fake(return_nan))["rows"].values()
+        root, make_fake(copy_labels), make_fake(fail), lambda frame: None, make_fake(return_nan)
+    )["rows"].values()
     assert whole["ap"]["Pedestrian"]["3d"]["moderate"] == 100 == whole["mean_ap"]["3d"]
     assert whole["pedestrian_centres"]["operating"]["f1"] == 1 and whole["failed"] == []
     assert (failing["frames"], failing["failed"]) == (2, ["000001: too dark"])
     assert failing["pedestrian_centres"]["operating"]["fn"] == 1
     assert (other["frames"], other["failed"], other["ms"]) == (0, [], None)
-    assert other["pedestrian_centres"]["best"] == {**other["pedestrian_centres"]["operating"],
-                                                   "score": None}
+    assert other["pedestrian_centres"]["best"] == {**other["pedestrian_centres"]["operating"], "score": None}
     assert len(nan["failed"]) == 3 and nan["ap"]["Pedestrian"]["3d"]["moderate"] == 100
 
 
 def test_pedestrians_count_from_default_threshold(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=1)
 
-    row, = compute_report(root, make_fake(lambda frame: copy_labels(frame, 0.2)))["rows"].values()
+    (row,) = compute_report(root, make_fake(lambda frame: copy_labels(frame, 0.2)))["rows"].values()
     row = row["pedestrian_centres"]
     assert (row["operating"]["tp"], row["best"]["tp"]) == (0, 1)
     assert row["best"]["score"] == pytest.approx(0.2)
@@ -167,9 +159,11 @@ def test_detectors_take_turns(tmp_path):
         for place in range(count):
             assert sorted(order[place] for order in orders) == sorted(2 * items)
     calls = []
-    compute_report(object_folder(tmp_path, walker_label(), count=3),
-                   *(lambda frame, i=i: calls.append((frame.name, i)) for i in range(3)))
-    first, *rest = (calls[i:i + 3] for i in range(0, len(calls), 3))
+    compute_report(
+        object_folder(tmp_path, walker_label(), count=3),
+        *(lambda frame, i=i: calls.append((frame.name, i)) for i in range(3)),
+    )
+    first, *rest = (calls[i : i + 3] for i in range(0, len(calls), 3))
     assert first == rest[0] and len(rest) == 3  # the first frame runs twice
     assert [frame[0][1] for frame in rest] == [0, 1, 2]
 
@@ -178,13 +172,13 @@ def test_unreadable_frames_are_skipped(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=2)
     write(root / "training/velodyne/000000.bin", b"123")
     content = compute_report(root, make_fake(lambda frame: Detections.none()))
-    line, = content["skipped"]
+    (line,) = content["skipped"]
     assert content["frames"] == content["rows"]["0"]["frames"] == 1 and "000000.bin" in line
 
 
 def test_mean_ignores_classes_without_labels(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=1)
-    row, = compute_report(root, make_fake(lambda frame: Detections.none()))["rows"].values()
+    (row,) = compute_report(root, make_fake(lambda frame: Detections.none()))["rows"].values()
     assert row["mean_ap"] == dict.fromkeys(row["mean_ap"], 0.0)
     assert [row["ap"][name]["3d"]["moderate"] for name in SCORED] == [None, 0.0, None]
 

@@ -17,14 +17,7 @@ from experiments.eg_pointpillars.measure import NO_CLASS, measure_diagonals
 from experiments.eg_pointpillars.models import choose_models
 from experiments.eg_pointpillars.pictures import count_errors
 from experiments.framework.experiment import Cell
-from experiments.framework.precision import (
-    CELLS,
-    compare_records,
-    compute_cells,
-    draw_cells,
-    from_record,
-    to_record,
-)
+from experiments.framework.precision import CELLS, compare_records, compute_cells, draw_cells, from_record, to_record
 from experiments.framework.statistics import compute_sampled_p, estimate
 from experiments.framework.trained_models import TrainedModel
 from lidar_perception.camera import Calibration
@@ -36,24 +29,27 @@ from lidar_perception.types import CLASSES, Detections, GroundTruth, PointCloud
 
 pytestmark = pytest.mark.no_cover
 CAR = CLASSES.index("Car")
-BOXES = np.array([[10, 2, -0.9, 3.9, 1.6, 1.6, 0.1], [15, -4, -0.9, 4.2, 1.7, 1.5, 0.0]],
-                 np.float32)
+BOXES = np.array([[10, 2, -0.9, 3.9, 1.6, 1.6, 0.1], [15, -4, -0.9, 4.2, 1.7, 1.5, 0.0]], np.float32)
 
 
-def make_record(boxes: np.ndarray, scores: np.ndarray | None = None,
-                calibration: Calibration | None = FORWARD_CAMERA) -> dict:
+def make_record(
+    boxes: np.ndarray, scores: np.ndarray | None = None, calibration: Calibration | None = FORWARD_CAMERA
+) -> dict:
     """Return the record of cars: labels, or detections with scores."""
     ids = np.full(len(boxes), CAR, np.int32)
-    objects = GroundTruth.of(boxes, ids) if scores is None else to_scored_labels(
-        Detections(boxes, ids, scores.astype(np.float32)))
-    return json.loads(json.dumps(to_record(to_camera_objects(objects, calibration)),
-                                 allow_nan=False))
+    objects = (
+        GroundTruth.of(boxes, ids)
+        if scores is None
+        else to_scored_labels(Detections(boxes, ids, scores.astype(np.float32)))
+    )
+    return json.loads(json.dumps(to_record(to_camera_objects(objects, calibration)), allow_nan=False))
 
 
 @pytest.mark.parametrize("calibration", [FORWARD_CAMERA, None])
 def test_objects_survive_their_record(calibration):
-    objects = to_camera_objects(to_scored_labels(Detections(
-        BOXES, np.full(2, CAR, np.int32), np.array([0.9, 0.2], np.float32))), calibration)
+    objects = to_camera_objects(
+        to_scored_labels(Detections(BOXES, np.full(2, CAR, np.int32), np.array([0.9, 0.2], np.float32))), calibration
+    )
     found = from_record(json.loads(json.dumps(to_record(objects))))
     for name in ("class_ids", "boxes", "image_boxes", "occluded", "scores", "truncated"):
         np.testing.assert_allclose(getattr(found, name), getattr(objects, name), atol=0.01)
@@ -69,8 +65,7 @@ def test_cells_and_paired_samples():
     car = [i for i, (name, _) in enumerate(CELLS) if name == "Car"]
     np.testing.assert_allclose(cells[:, car[1:]], 100)
     assert np.isnan(np.delete(cells[:, :-1], car, axis=1)).all()  # no such objects
-    draws = draw_cells([f"{i}" for i in range(12)], {
-        "a": frames, "b": compare_records(true, half)}, replicates=20)
+    draws = draw_cells([f"{i}" for i in range(12)], {"a": frames, "b": compare_records(true, half)}, replicates=20)
     gain = (draws["a"] - draws["b"])[:, 0, -1]
     assert gain[0] > 30 and compute_sampled_p(gain) == pytest.approx(2 / 21)
     assert compute_sampled_p(np.zeros(21)) == 1.0
@@ -82,18 +77,23 @@ def test_cells_and_paired_samples():
 
 
 def make_models() -> dict[str, TrainedModel]:
-    return {model.name: TrainedModel(model, Path("w"), 10, 60.0, 5, 8, 1000)
-            for seed in range(2) for model in choose_models(PointPillarsTraining(), seed)}
+    return {
+        model.name: TrainedModel(model, Path("w"), 10, 60.0, 5, 8, 1000)
+        for seed in range(2)
+        for model in choose_models(PointPillarsTraining(), seed)
+    }
 
 
 def test_report_has_values_of_the_paper_and_each_share():
     models = make_models()
     boxes = {name: BOXES if name.startswith("V4") else BOXES[:1] for name in models}
-    record = {"true": make_record(BOXES), "boxes": [[CAR, 4.2]], "clusters": [[CAR, 3.9], [-1, 1]],
-              "ms": {name: {"total": 10.0 + ("V4" in name), "experts": 1.0, "network": 8.0}
-                     for name in models},
-              "found": {name: make_record(b, np.linspace(0.9, 0.8, len(b)))
-                        for name, b in boxes.items()}}
+    record = {
+        "true": make_record(BOXES),
+        "boxes": [[CAR, 4.2]],
+        "clusters": [[CAR, 3.9], [-1, 1]],
+        "ms": {name: {"total": 10.0 + ("V4" in name), "experts": 1.0, "network": 8.0} for name in models},
+        "found": {name: make_record(b, np.linspace(0.9, 0.8, len(b))) for name, b in boxes.items()},
+    }
     records = [{"frame": f"{i}", **record} for i in range(3)] + [{"frame": "x", "skipped": "bad"}]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tables, "draw_cells", partial(draw_cells, replicates=4))
@@ -126,8 +126,7 @@ def test_clusters_get_the_class_of_their_label():
     assert found["boxes"] == [[CAR, pytest.approx(np.hypot(3.9, 1.6), abs=0.01)]]
     by_class = {c: d for c, d in found["clusters"]}
     assert 3.5 < by_class[CAR] < 4.3 and by_class[NO_CLASS] < 0.6
-    none = measure_diagonals(PointCloud(xyz), GroundTruth.of(np.zeros((0, 7)), np.zeros(0, int)),
-                             1.73)
+    none = measure_diagonals(PointCloud(xyz), GroundTruth.of(np.zeros((0, 7)), np.zeros(0, int)), 1.73)
     assert none["boxes"] == [] and {c for c, _ in none["clusters"]} == {NO_CLASS}
 
 
@@ -136,24 +135,53 @@ def test_classes_by_diagonal_are_counted():
     assert counts.sum() == 3 and counts[0, 0] == counts[0, 1] == counts[3, 3] == 1
     section = make_diagonal_section([{"boxes": [[CAR, 4.0]], "clusters": [[CAR, 2.0]]}])
     row = section.tables[1].rows[0]
-    assert row[:2] == ("Car", "1") and [c.value for c in row if isinstance(c, Cell)][3:] == [
-        0.0, 100.0, 0.0, 0.0]
+    assert row[:2] == ("Car", "1") and [c.value for c in row if isinstance(c, Cell)][3:] == [0.0, 100.0, 0.0, 0.0]
 
 
 @pytest.mark.usefixtures("one_thread", "streets")
 def test_tiny_run_from_training_to_pictures(tmp_path, monkeypatch):
-    monkeypatch.setitem(config_module.SIZES, "compact", dict(
-        cell=0.64, low=(0.0, -20.48, -3.0), high=(40.96, 20.48, 1.0), pillar_channels=4,
-        map_channels=(4,), block_channels=(4, 4, 4), block_layers=(0, 0, 0), deconv_channels=4,
-        fpn_channels=4))
+    monkeypatch.setitem(
+        config_module.SIZES,
+        "compact",
+        dict(
+            cell=0.64,
+            low=(0.0, -20.48, -3.0),
+            high=(40.96, 20.48, 1.0),
+            pillar_channels=4,
+            map_channels=(4,),
+            block_channels=(4, 4, 4),
+            block_layers=(0, 0, 0),
+            deconv_channels=4,
+            fpn_channels=4,
+        ),
+    )
     monkeypatch.setattr(tables, "draw_cells", partial(draw_cells, replicates=2))
-    sets = {"sensor": "generic:16,-20,5,2,10", "data.scans": 4, "data.val_scans": 1, "steps": 1,
-            "batch": 1, "augment.crowded": 0.0}
+    sets = {
+        "sensor": "generic:16,-20,5,2,10",
+        "data.scans": 4,
+        "data.val_scans": 1,
+        "steps": 1,
+        "batch": 1,
+        "augment.crowded": 0.0,
+    }
     out = tmp_path / "out"
-    result = CliRunner().invoke(cli, [
-        "reproduce", "eg-pointpillars", "--data", "sim", "--out", str(out), "--limit", "2",
-        "--jobs", "1", *(word for pair in sets.items() for word in ("--set", "{}={}".format(*pair))
-                         )], catch_exceptions=False)
+    result = CliRunner().invoke(
+        cli,
+        [
+            "reproduce",
+            "eg-pointpillars",
+            "--data",
+            "sim",
+            "--out",
+            str(out),
+            "--limit",
+            "2",
+            "--jobs",
+            "1",
+            *(word for pair in sets.items() for word in ("--set", "{}={}".format(*pair))),
+        ],
+        catch_exceptions=False,
+    )
     assert result.exit_code == 0, result.output
     report = json.loads((out / "report.json").read_text())
     assert report["measured"] == 2

@@ -36,8 +36,7 @@ def test_skipped_frames_are_grouped_by_reason():
 
 def test_report_escapes_text(few, tmp_path):
     records = run_experiment(SMALL, open_recording(few), tmp_path / "out")
-    page = write_report(tmp_path / "out", SMALL, records, points_table(records),
-                        {"folder": "<b>"}).read_text()
+    page = write_report(tmp_path / "out", SMALL, records, points_table(records), {"folder": "<b>"}).read_text()
     for text in ("Small & <quick>", "<Points>", "Points | of <all>", "a <note>", "<b>"):
         assert html.escape(text) in page and text not in page
     markdown = (tmp_path / "out/report.md").read_text()
@@ -54,9 +53,19 @@ def test_cells_show_their_decimals():
 
 @pytest.mark.parametrize("kind", ["svg", "png"])
 def test_figures_are_reproducible_with_and_without_points(kind):
-    panels = tuple(Panel(str(k), "x", "recall [%]", (
-        Line("a", [0, 1], [None, 50.0], [None, 40.0], [None, 60.0]), Line("empty", [], []),
-        Line("a, paper", [0.5, 0.5], [0, 100], dashed=True))) for k in range(4))
+    panels = tuple(
+        Panel(
+            str(k),
+            "x",
+            "recall [%]",
+            (
+                Line("a", [0, 1], [None, 50.0], [None, 40.0], [None, 60.0]),
+                Line("empty", [], []),
+                Line("a, paper", [0.5, 0.5], [0, 100], dashed=True),
+            ),
+        )
+        for k in range(4)
+    )
     figure = Figure("f", "F", panels)
     light = draw_figure(figure, kind)
     assert light == draw_figure(figure, kind) != draw_figure(figure, kind, dark=True)
@@ -75,13 +84,19 @@ def test_experiment_runs_by_its_name(few, tmp_path, monkeypatch):
     assert [float(r["points"]) for r in rows] == np.delete(expected, 3).tolist()
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (["other"], "'other'"), (["stm-cpa-configuration"], "did you mean 'stm-cpa-configurations'"),
-    (["--jobs", "0"], "0 is"), (["--limit", "0"], "0 is"),
-    (["--jobs", "2", "--dask", "a:1"], "give one of them"), (["none"], "'none'")])
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["other"], "'other'"),
+        (["stm-cpa-configuration"], "did you mean 'stm-cpa-configurations'"),
+        (["--jobs", "0"], "0 is"),
+        (["--limit", "0"], "0 is"),
+        (["--jobs", "2", "--dask", "a:1"], "give one of them"),
+        (["none"], "'none'"),
+    ],
+)
 def test_bad_arguments_are_named_and_nothing_is_written(tmp_path, arguments, words):
-    result = CliRunner().invoke(cli, ["reproduce", "--data", str(tmp_path), "--out",
-                                      str(tmp_path / "out"), *arguments])
+    result = CliRunner().invoke(cli, ["reproduce", "--data", str(tmp_path), "--out", str(tmp_path / "out"), *arguments])
     assert result.exit_code == 2 and words in result.output
     assert not (tmp_path / "out").exists()
 
@@ -89,8 +104,7 @@ def test_bad_arguments_are_named_and_nothing_is_written(tmp_path, arguments, wor
 def test_data_is_argument_or_option_but_not_both(tmp_path, monkeypatch, capsys):
     errors = []
     for words in (["none"], ["--data", "none"], ["none", "--data", "none"], []):
-        assert exit_of(monkeypatch, "reproduce", "stm-cpa", *words, "--out", tmp_path / "out",
-                       run=main) == 2
+        assert exit_of(monkeypatch, "reproduce", "stm-cpa", *words, "--out", tmp_path / "out", run=main) == 2
         errors.append(capsys.readouterr().err.splitlines()[-1])
     assert errors[0] == errors[1] and "none does not exist" in errors[0]
     assert "DATA is given twice" in errors[2] and "DATA is missing" in errors[3]
@@ -114,6 +128,7 @@ def test_every_verb_has_help_with_an_example(name):
 def test_installed_command_line_lacks_experiments():
     from lidar_perception.cli.main import COMMANDS as INSTALLED
     from lidar_perception.cli.main import cli as installed
+
     assert not {*COMMANDS} & {*INSTALLED}
     assert CliRunner().invoke(installed, ["reproduce"]).exit_code == 2
 

@@ -17,16 +17,7 @@ from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
-from experiment_samples import (
-    COUNT,
-    SMALL,
-    command,
-    count_points,
-    points_table,
-    read_lines,
-    small,
-    untimed,
-)
+from experiment_samples import COUNT, SMALL, command, count_points, points_table, read_lines, small, untimed
 from samples import object_folder, wait_for_the_end, write
 
 from experiments.framework import report_files
@@ -61,8 +52,11 @@ def kill_process(frames, number):
 
 def read_untimed_files(folder):
     """Return name -> content of the files without times."""
-    return {path.name: path.read_bytes() for path in sorted(folder.rglob("*"))
-            if path.suffix in (".csv", ".png") and path.stem not in TIMED}
+    return {
+        path.name: path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.suffix in (".csv", ".png") and path.stem not in TIMED
+    }
 
 
 # However it is spread and stopped
@@ -71,14 +65,16 @@ def read_untimed_files(folder):
 def test_dask_cluster_gives_the_same_records(crowds, whole, tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs the extra [distributed]")
     from dask import config
+
     forked = config.set({"distributed.worker.multiprocessing-method": "forkserver"})
-    with forked, distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
-                                          dashboard_address=None) as cluster:
+    with (
+        forked,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+    ):
         address = cluster.scheduler_address
         run_experiment(STM_CPA, open_recording(crowds), tmp_path / "out", dask=address)
         with pytest.raises(ZeroDivisionError):
-            run_experiment(small(raise_bug), open_recording(crowds), tmp_path / "broken",
-                           dask=address)
+            run_experiment(small(raise_bug), open_recording(crowds), tmp_path / "broken", dask=address)
     assert untimed(tmp_path / "out") == untimed(whole)
 
 
@@ -98,9 +94,13 @@ def test_missing_distributed_names_the_extra(few, tmp_path, monkeypatch):
 def test_killed_run_of_two_processes_resumes(crowds, whole, tmp_path):
     out = tmp_path / "out"
     process = subprocess.Popen(
-        [sys.executable, "-m", "experiments", "reproduce", "--data", str(crowds),
-         "--out", str(out), "--jobs", "2"], cwd=ROOT, start_new_session=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE)
+        [sys.executable, "-m", "experiments", "reproduce", "--data", str(crowds), "--out", str(out), "--jobs", "2"],
+        cwd=ROOT,
+        start_new_session=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stderr=subprocess.PIPE,
+    )
     while len(read_lines(out)) < 4:
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.005)
@@ -150,8 +150,7 @@ def test_skipped_frame_is_tried_again(few, tmp_path):
     first = run_experiment(SMALL, open_recording(few), tmp_path / "out")
     assert "000001.bin" in first[1]["skipped"] and "000001.bin" in first[2]["skipped"]
     scan.write_bytes(whole)
-    resumed, fresh = (run_experiment(SMALL, open_recording(few), tmp_path / name)
-                      for name in ("out", "again"))
+    resumed, fresh = (run_experiment(SMALL, open_recording(few), tmp_path / name) for name in ("out", "again"))
     assert resumed == fresh
 
 
@@ -206,8 +205,7 @@ def test_journal_without_plan_is_not_resumed(few, tmp_path, first):
 
 
 def test_folder_is_locked_by_a_run(few, tmp_path):
-    with (journal.open_journal(tmp_path / "out", {}) as _,
-          pytest.raises(InputError, match="another process")):
+    with journal.open_journal(tmp_path / "out", {}) as _, pytest.raises(InputError, match="another process"):
         run_experiment(SMALL, open_recording(few), tmp_path / "out", force=True)
 
 
@@ -248,11 +246,11 @@ def test_killed_worker_ends_run_with_reason(few, tmp_path):
 
 
 BROKEN = {
-    "velodyne/000000.bin": lambda b: b[:1003],        # cut
-    "velodyne/000001.bin": lambda b: b"",             # empty
-    "label_2/000002.txt": lambda b: b[:-30],          # cut in a line
+    "velodyne/000000.bin": lambda b: b[:1003],  # cut
+    "velodyne/000001.bin": lambda b: b"",  # empty
+    "label_2/000002.txt": lambda b: b[:-30],  # cut in a line
     "label_2/000003.txt": lambda b: b.replace(b"1.", b"nan ", 1),
-    "label_2/000004.txt": None,                       # not there
+    "label_2/000004.txt": None,  # not there
     "calib/000005.txt": None,
     "calib/000006.txt": lambda b: b[:200],
     "calib/000007.txt": lambda b: re.sub(rb"(Tr_velo_to_cam:).*", rb"\1" + b" 0" * 12, b),
@@ -297,8 +295,10 @@ def test_split_selects_frames(few, tmp_path):
 
 
 def test_folder_without_scans_or_pedestrians_is_refused(tmp_path):
-    for argument, words in ((tmp_path / "none", "does not exist"),
-                            (tmp_path, "is not a recording in a supported format")):
+    for argument, words in (
+        (tmp_path / "none", "does not exist"),
+        (tmp_path, "is not a recording in a supported format"),
+    ):
         with pytest.raises(InputError, match=words):
             command("--data", argument, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -316,8 +316,17 @@ def test_every_format_has_every_table_and_figure(whole):
     page = html.unescape((whole / "report.html").read_text())
     markdown = (whole / "report.md").read_text()
     tables = [t for section in report["sections"] for t in section["tables"]]
-    assert {t["name"] for t in tables} >= {"table_1", "table_3_6", "table_4", "table_5", "table_8",
-                                           "table_9", "search", "search_best", "figure_8"}
+    assert {t["name"] for t in tables} >= {
+        "table_1",
+        "table_3_6",
+        "table_4",
+        "table_5",
+        "table_8",
+        "table_9",
+        "search",
+        "search_best",
+        "figure_8",
+    }
     assert {p.stem for p in (whole / "tables").iterdir()} == {t["name"] for t in tables}
     for table in tables:
         assert table["title"] in page and f"**{table['title']}**" in markdown
@@ -329,19 +338,24 @@ def test_every_format_has_every_table_and_figure(whole):
                 if isinstance(cell, str):
                     assert there[name] == cell
                     continue
-                for key, value in ((name, cell.value), (f"{name} low", cell.low),
-                                   (f"{name} high", cell.high), (f"{name} paper", cell.paper)):
+                for key, value in (
+                    (name, cell.value),
+                    (f"{name} low", cell.low),
+                    (f"{name} high", cell.high),
+                    (f"{name} paper", cell.paper),
+                ):
                     assert there[key] == ("" if value is None else str(value))
                 value, interval, published = format_cell(cell)
                 assert value in page and interval in page and interval in markdown
-                assert not published or (f"paper {published}" in page
-                                         and f"(paper {published})" in markdown)
+                assert not published or (f"paper {published}" in page and f"(paper {published})" in markdown)
     for figure in (f for section in report["sections"] for f in section["figures"]):
         picture = whole / f"figures/{figure['name']}.png"
         assert picture.read_bytes().startswith(b"\x89PNG")
         assert figure["title"] in page and f"(figures/{figure['name']}.png)" in markdown
-    assert {p for p in whole.rglob("*") if p.is_file()} == {whole / journal.JOURNAL_NAME,
-                                                            *report_files.list_report_files(whole)}
+    assert {p for p in whole.rglob("*") if p.is_file()} == {
+        whole / journal.JOURNAL_NAME,
+        *report_files.list_report_files(whole),
+    }
 
 
 def test_page_is_self_contained_and_describes_the_run(whole, crowds):
@@ -357,8 +371,7 @@ def test_page_is_self_contained_and_describes_the_run(whole, crowds):
 def test_summary_shows_scores_next_to_the_papers(whole):
     text = (whole.parent / "said").read_text()
     report = json.loads((whole / "report.json").read_text())
-    row = next(t for s in report["sections"] for t in s["tables"]
-               if t["name"] == "table_3_6")["rows"][2]
+    row = next(t for s in report["sections"] for t in s["tables"] if t["name"] == "table_3_6")["rows"][2]
     assert f"{row[1]['value']:.1f} (46.7)" in text and f"{row[3]['value']:.1f} (52.1)" in text
     assert f"report: {whole}/report.html" in text.replace("\n", "")
     assert "skipped 1: no Pedestrian" in text

@@ -42,10 +42,17 @@ from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, Point
 SCANS = 6
 FEET = -1.7
 SIZES = {"Car": (3.9, 1.6, 1.5), "Pedestrian": (0.8, 0.6, 1.75), "Cyclist": (1.8, 0.6, 1.7)}
-PLACES = {"Car": ((15.0, 6.0), (25.0, 9.0), (38.0, 2.0)),
-          "Pedestrian": ((13.0, -3.0), (24.0, -6.0)), "Cyclist": ((17.0, -7.0), (27.0, 1.0))}
-COUNTS = ("scan points", "points", "elevation", *(
-    f"{name} {what}" for name in CLASSES for what in ("points", "points of all", "density")))
+PLACES = {
+    "Car": ((15.0, 6.0), (25.0, 9.0), (38.0, 2.0)),
+    "Pedestrian": ((13.0, -3.0), (24.0, -6.0)),
+    "Cyclist": ((17.0, -7.0), (27.0, 1.0)),
+}
+COUNTS = (
+    "scan points",
+    "points",
+    "elevation",
+    *(f"{name} {what}" for name in CLASSES for what in ("points", "points of all", "density")),
+)
 EXTENTS = [f"{name} {what}" for name in CLASSES for what in ("height", "length", "width")]
 FACES = [name for name in CURVES if name.startswith("Car from")]  # no car there shows one face only
 LIGHT = [name for name in CURVES if "intensity" in name]
@@ -56,8 +63,7 @@ def make_scan(seed: int, points: int = 500) -> Frame:
     rng = np.random.default_rng(seed)
     reach, turn = rng.uniform(3, 70, 12000), rng.uniform(-np.pi, np.pi, 12000)
     reach[:3000] = rng.uniform(3, 9, 3000)  # so dense that cells of the ground have enough
-    parts = [np.column_stack([reach * np.cos(turn), reach * np.sin(turn),
-                              rng.normal(FEET, 0.01, 12000)])]
+    parts = [np.column_stack([reach * np.cos(turn), reach * np.sin(turn), rng.normal(FEET, 0.01, 12000)])]
     boxes, ids = [], []
     for name, places in PLACES.items():
         for x, y in places:
@@ -69,8 +75,7 @@ def make_scan(seed: int, points: int = 500) -> Frame:
     xyz = np.concatenate(parts).astype(np.float32)
     intensity = rng.beta(2, 4, len(xyz)).round(2).astype(np.float32)
     extras = [{"occluded": 0, "truncated": 0.0} for _ in boxes]
-    return Frame.of(str(seed), PointCloud(xyz, intensity), GroundTruth.of(boxes, ids, extras),
-                    CALIBRATION)
+    return Frame.of(str(seed), PointCloud(xyz, intensity), GroundTruth.of(boxes, ids, extras), CALIBRATION)
 
 
 def with_scan(frame: Frame, scan: PointCloud) -> Frame:
@@ -85,8 +90,10 @@ def compute_rows(frame: Frame) -> dict:
 
 def change_scans(change, count: int = SCANS) -> list[Frame]:
     """The street's scans with every frame changed."""
-    return [with_scan(r, change(r.load(), np.random.default_rng(100 + i)))
-            for i, r in enumerate(map(make_scan, range(count)))]
+    return [
+        with_scan(r, change(r.load(), np.random.default_rng(100 + i)))
+        for i, r in enumerate(map(make_scan, range(count)))
+    ]
 
 
 @cache
@@ -95,16 +102,14 @@ def street():
 
 
 def list_judged_bins(content: dict, names=CURVES) -> list[dict]:
-    return [b for name in names for b in content["curves"][name]["bins"]
-            if b["within"] is not None]
+    return [b for name in names for b in content["curves"][name]["bins"] if b["within"] is not None]
 
 
 def test_recording_agrees_with_itself():
     content = compare_scans(street(), street())
     assert content["within"] == content["judged"] == len(list_judged_bins(content)) > 100
     assert all(b["ratio"] == 1.0 and compute_factor(b) == 1.0 for b in list_judged_bins(content))
-    assert all(content["curves"][name]["judged"] for name in CURVES
-               if "histogram" not in name and name not in FACES)
+    assert all(content["curves"][name]["judged"] for name in CURVES if "histogram" not in name and name not in FACES)
 
 
 def test_ground_is_found_below_a_low_sensor():
@@ -121,6 +126,7 @@ def test_ground_is_found_below_a_low_sensor():
 def test_half_the_points_change_counts_and_not_sizes():
     def half(frame, rng):
         return frame.take(np.flatnonzero(rng.random(len(frame)) < 0.5))
+
     content = compare_scans(street(), measure_scans(change_scans(half), PAPER))
     for name in COUNTS:
         bins = [b for b in list_judged_bins(content, [name]) if b["real"]["median"] >= 100]
@@ -131,8 +137,9 @@ def test_half_the_points_change_counts_and_not_sizes():
 
 
 def test_half_the_intensity_changes_intensities_only():
-    content = compare_scans(street(), measure_scans(
-        change_scans(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PAPER))
+    content = compare_scans(
+        street(), measure_scans(change_scans(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PAPER)
+    )
     for name, curve in content["curves"].items():
         if name not in LIGHT:
             assert all(b["ratio"] in (1.0, None) for b in curve["bins"]), name
@@ -141,8 +148,9 @@ def test_half_the_intensity_changes_intensities_only():
 
 
 def test_order_of_points_does_not_matter():
-    content = compare_scans(street(), measure_scans(
-        change_scans(lambda frame, rng: frame.take(rng.permutation(len(frame)))), PAPER))
+    content = compare_scans(
+        street(), measure_scans(change_scans(lambda frame, rng: frame.take(rng.permutation(len(frame)))), PAPER)
+    )
     for name, curve in content["curves"].items():
         for b in curve["bins"]:
             assert b["real"] == b["simulated"], name
@@ -152,8 +160,7 @@ def test_counts_add_up():
     one = make_scan(0)
     rows = {name: row[0] for name, row in compute_scan_rows(one.load()).items()}
     assert rows["points"].sum() == rows["scan points"][0] == len(one.load())
-    assert ((rows["ground share"] >= 0) & (rows["ground share"] <= 1)
-            | np.isnan(rows["ground share"])).all()
+    assert ((rows["ground share"] >= 0) & (rows["ground share"] <= 1) | np.isnan(rows["ground share"])).all()
     assert (rows["person clusters"] <= rows["clusters"]).all()
     for name in LIGHT:
         row = {**rows, **{k: v[0] for k, v in compute_rows(one).items()}}[name]
@@ -186,11 +193,13 @@ def test_empty_scans_are_not_judged():
 
 
 def test_scans_without_intensity_have_the_other_curves():
-    bare = [Frame.of(r.name, replace(r.load(), intensity=None), r.truth())
-            for r in map(make_scan, range(2))]
+    bare = [Frame.of(r.name, replace(r.load(), intensity=None), r.truth()) for r in map(make_scan, range(2))]
     measured = measure_scans(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
-    assert all((len(rows) == 0) == (name in LIGHT) for name, rows in measured.rows.items()
-               if not name.startswith(("stage", "final")) and name not in FACES)
+    assert all(
+        (len(rows) == 0) == (name in LIGHT)
+        for name, rows in measured.rows.items()
+        if not name.startswith(("stage", "final")) and name not in FACES
+    )
 
 
 def test_cropped_scan_counts_for_its_objects_only():
@@ -202,8 +211,7 @@ def test_cropped_scan_counts_for_its_objects_only():
     assert (measured.scans, measured.whole_scans) == (1, 0)
     assert all(not measured.rows[name] for name in ("points", "clusters", "ground intensity"))
     expected = compute_rows(whole)
-    assert all(np.array_equal(rows, expected[name], equal_nan=True)
-               for name, rows in compute_rows(cropped).items())
+    assert all(np.array_equal(rows, expected[name], equal_nan=True) for name, rows in compute_rows(cropped).items())
 
 
 def test_objects_at_image_border_do_not_count():
@@ -221,12 +229,13 @@ def test_occluded_objects_count_for_all_points_only(level):
     truth = one.truth()
     truth = replace(truth, extras=tuple({"occluded": level} for _ in truth.extras))
     found = set(compute_object_rows(one.load(), truth, one.camera()))
-    assert found == {name for name in compute_rows(one)
-                     if name.endswith("points of all") or "intensity" in name}
+    assert found == {name for name in compute_rows(one) if name.endswith("points of all") or "intensity" in name}
 
 
-@pytest.mark.parametrize("face, sensor", [("behind", (-15, 1, 0)), ("the front", (12, -2, 1)),
-                                          ("the side", (1, 14, 0)), ("the side", (-2, -9, 0))])
+@pytest.mark.parametrize(
+    "face, sensor",
+    [("behind", (-15, 1, 0)), ("the front", (12, -2, 1)), ("the side", (1, 14, 0)), ("the side", (-2, -9, 0))],
+)
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
 def test_depth_behind_car_face_is_measured(face, sensor, yaw):
     size, depth = np.array([4.0, 1.8, 1.5]), 0.07
@@ -240,8 +249,10 @@ def test_depth_behind_car_face_is_measured(face, sensor, yaw):
 
     def found(points, truth=box):
         scan = PointCloud((centre + points @ turn.T).astype(np.float32), None)
-        return {name: row for name, row in compute_object_rows(scan, truth, None).items()
-                if name.startswith("Car from")}
+        return {
+            name: row for name, row in compute_object_rows(scan, truth, None).items() if name.startswith("Car from")
+        }
+
     assert set(found(own)) == {f"Car from {face}"}
     assert found(own)[f"Car from {face}"][0] == pytest.approx([depth] * 3, abs=1e-4)
     assert found(own[:5]) == {} == found(own, replace(box, extras=({"occluded": 1},)))
@@ -254,8 +265,7 @@ def test_square_degrees_of_upright_and_rotated_boxes():
     turned = np.array([0, 20.0, 0, 0.5, 0.5, 1.7, np.pi / 2])
     assert compute_square_degrees(turned) == pytest.approx(compute_square_degrees(upright))
     side, behind = (np.array([20.0, 0, 0, 4, 2, 1.5, yaw]) for yaw in (np.pi / 2, 0))
-    assert compute_square_degrees(side) == pytest.approx(2 * compute_square_degrees(behind),
-                                                         rel=0.01)
+    assert compute_square_degrees(side) == pytest.approx(2 * compute_square_degrees(behind), rel=0.01)
 
 
 def test_ratio_is_none_for_missing_values():
@@ -274,9 +284,14 @@ def test_median_interval_covers_the_median():
 
 def test_median_within_real_interval_is_plausible():
     def thin(shares):
-        return measure_scans([with_scan(r, r.load().take(np.flatnonzero(
-            np.random.default_rng(100).random(len(r.load())) < share)))
-            for r, share in zip(map(make_scan, range(SCANS)), shares)], PAPER)
+        return measure_scans(
+            [
+                with_scan(r, r.load().take(np.flatnonzero(np.random.default_rng(100).random(len(r.load())) < share)))
+                for r, share in zip(map(make_scan, range(SCANS)), shares)
+            ],
+            PAPER,
+        )
+
     content = compare_scans(thin(np.linspace(0.3, 1, SCANS)), thin([0.9] * SCANS))
     points = list_judged_bins(content, ["scan points", "Car points"])
     assert not any(b["within"] for b in points) and all(b["plausible"] for b in points)
@@ -303,8 +318,7 @@ def tracking_folder(root):
     return root
 
 
-@pytest.mark.parametrize("make", [lambda root: object_folder(root, walker_label(), 1),
-                                  tracking_folder])
+@pytest.mark.parametrize("make", [lambda root: object_folder(root, walker_label(), 1), tracking_folder])
 def test_object_and_tracking_folders_are_read(tmp_path, make):
     measured = measure_scans(select_frames(open_recording(make(tmp_path))), PAPER)
     assert measured.objects == {"Car": 0, "Pedestrian": 1, "Cyclist": 0}
@@ -346,27 +360,31 @@ def test_command_writes_json_and_picture(tmp_path, monkeypatch):
     def few_drawn(path, content):
         """One panel of each kind: to draw all takes long."""
         kinds = {(CURVES[name].histogram, CURVES[name].log): name for name in CURVES}
-        draw_realism(path, {**content, "curves": {
-            name: content["curves"][name] for name in kinds.values()}})
+        draw_realism(path, {**content, "curves": {name: content["curves"][name] for name in kinds.values()}})
+
     monkeypatch.setattr(command, "draw_realism", few_drawn)
     root, made = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "made"
-    result = CliRunner().invoke(command.realism, [
-        str(root), "--frames", "1", "--json", str(made / "realism.json"), "--png",
-        str(made / "realism.png")], catch_exceptions=False)
+    result = CliRunner().invoke(
+        command.realism,
+        [str(root), "--frames", "1", "--json", str(made / "realism.json"), "--png", str(made / "realism.png")],
+        catch_exceptions=False,
+    )
     assert result.exit_code == 0, result.output
     content = json.loads((made / "realism.json").read_text())
     assert set(content["curves"]) == set(CURVES)
     picture = plt.imread(made / "realism.png")
-    panels = picture[2 * len(picture) // 5:3 * len(picture) // 4, :, :3]  # below the title
+    panels = picture[2 * len(picture) // 5 : 3 * len(picture) // 4, :, :3]  # below the title
     assert min(picture.shape[:2]) >= 300 and panels.std() > 0.05
     assert content["real"]["scans"] == content["simulated"]["scans"] == 1
 
 
 def test_command_simulates_the_given_sensor(tmp_path):
     root, found = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "realism.json"
-    result = CliRunner().invoke(command.realism, [
-        str(root), "--frames", "1", "--json", str(found), "--sensor", "generic:4,-12,0,2,10"],
-        catch_exceptions=False)
+    result = CliRunner().invoke(
+        command.realism,
+        [str(root), "--frames", "1", "--json", str(found), "--sensor", "generic:4,-12,0,2,10"],
+        catch_exceptions=False,
+    )
     assert result.exit_code == 0, result.output
     bins = json.loads(found.read_text())["curves"]["points"]["bins"]
     assert 100 < sum(b["simulated"]["median"] for b in bins) <= 4 * 180

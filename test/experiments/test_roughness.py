@@ -22,7 +22,7 @@ def test_plane_is_smooth_at_any_slope(slopes):
 
 def test_scatter_equals_noise_of_the_points():
     _, scatter = measure_cell_scatter(plane(1, 40_000, (0.05, 0.0), 0.03))
-    assert np.sqrt((scatter ** 2).mean()) == pytest.approx(0.03, rel=0.04)
+    assert np.sqrt((scatter**2).mean()) == pytest.approx(0.03, rel=0.04)
 
 
 def test_line_of_points_has_a_plane():

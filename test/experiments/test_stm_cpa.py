@@ -127,8 +127,7 @@ def test_stages_agree_with_evaluate_candidates(kitti, measured):
     for stage, score in report.scores.items():
         for key in ("tp", "fp", "fn"):
             assert add_up(measured, "stages", stage, key).tolist() == getattr(score, key).tolist()
-        np.testing.assert_allclose(add_up(measured, "stages", stage, "error"), score.error,
-                                   atol=1e-4)
+        np.testing.assert_allclose(add_up(measured, "stages", stage, "error"), score.error, atol=1e-4)
 
 
 def lower_sensor(frame, height):
@@ -138,10 +137,12 @@ def lower_sensor(frame, height):
     lower = np.eye(4)
     lower[2, 3] = -up[2]
     return Frame.of(
-        frame.name, replace(scan, xyz=scan.xyz + up),
+        frame.name,
+        replace(scan, xyz=scan.xyz + up),
         GroundTruth.of(truth.boxes + [*up[[0, 0, 2]], 0, 0, 0, 0], truth.class_ids, truth.extras),
         replace(calibration, lidar_to_camera=calibration.lidar_to_camera @ lower),
-        sensor_height=height)
+        sensor_height=height,
+    )
 
 
 def test_low_sensor_agrees_with_evaluate_candidates(kitti):
@@ -185,12 +186,13 @@ def test_search_at_paper_setting_equals_stage_1(refined, measured):
         tp, fp, *_ = count_by_range(boxes, truth, pairs)
         away = np.hypot(*np.concatenate([boxes, truth])[:, :2].T)
         for i, name in enumerate(RANGE_NAMES[:3]):
-            limits = RANGE_LIMITS[max(i - 1, 0):i + 1]
+            limits = RANGE_LIMITS[max(i - 1, 0) : i + 1]
             if (np.abs(away[:, None] - limits) < 1.0).any():
                 continue
             eps = NUMBERS.search_eps.index(DbscanParams().eps[i])
-            setting = (eps * len(NUMBERS.search_min_samples)
-                       + NUMBERS.search_min_samples.index(DbscanParams().min_samples))
+            setting = eps * len(NUMBERS.search_min_samples) + NUMBERS.search_min_samples.index(
+                DbscanParams().min_samples
+            )
             assert [counts[i] for counts in record["search"][setting]] == [tp[i], fp[i]], name
             compared += tp[i]
     assert compared >= 4
@@ -225,13 +227,20 @@ def test_overlaps_of_known_boxes():
     assert (hits, shares) == (2, [2, 0, 2, 0])
 
 
-@pytest.mark.parametrize("change, words", [
-    (lambda label: re.sub(r"(Pedestrian .*) \S+ \S+ \S+ (\S+)$", r"\1 4.00 -1.00 9.00 \2", label,
-                          flags=re.M), "has 0 points"),
-    (lambda label: label + "Car 0.00 0 0.00 0.00 0.00 0.00 0.00 9.00 90.00 90.00 0.00 3.00 20.00 "
-     "0.00\n", "stands in a labelled Car")])
-def test_bad_seed_gives_misses_and_reason(kitti, tmp_path, change,
-                                          words):
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (
+            lambda label: re.sub(r"(Pedestrian .*) \S+ \S+ \S+ (\S+)$", r"\1 4.00 -1.00 9.00 \2", label, flags=re.M),
+            "has 0 points",
+        ),
+        (
+            lambda label: label + "Car 0.00 0 0.00 0.00 0.00 0.00 0.00 9.00 90.00 90.00 0.00 3.00 20.00 0.00\n",
+            "stands in a labelled Car",
+        ),
+    ],
+)
+def test_bad_seed_gives_misses_and_reason(kitti, tmp_path, change, words):
     shutil.copytree(kitti, tmp_path / "kitti")
     label = tmp_path / "kitti/training/label_2/000002.txt"
     label.write_text(change(label.read_text()))
@@ -265,8 +274,7 @@ def test_tables_agree_with_records(measured):
         assert precision.value == pytest.approx(100 * tp / (tp + fp))
         assert f1.value == pytest.approx(200 * tp / (2 * tp + fp + fn))
         before = add_up(measured, "stages", "stage1", "tp").sum()
-        assert kept.value == pytest.approx(
-            100 * add_up(measured, "stages", stage, "kept").sum() / before)
+        assert kept.value == pytest.approx(100 * add_up(measured, "stages", stage, "kept").sum() / before)
         assert error.value == pytest.approx(add_up(measured, "stages", stage, "error").sum() / tp)
         assert [c.paper for c in (recall, precision, f1, kept, error)] == [*PAPER_TABLE_6[stage]]
         for cell in (recall, precision, f1):
@@ -275,8 +283,9 @@ def test_tables_agree_with_records(measured):
     final = dict(zip(tables["table_9"].header[1:], tables["table_9"].rows[2][1:]))
     steps = [cell.value for name, cell in final.items() if "total" not in name]
     assert final["total [ms]"].value == pytest.approx(sum(steps))
-    assert sum(steps) == pytest.approx(np.mean([sum(r["ms"].values()) - r["ms"]["stm_all"]
-                                                - r["ms"]["confidence"] for r in measured]))
+    assert sum(steps) == pytest.approx(
+        np.mean([sum(r["ms"].values()) - r["ms"]["stm_all"] - r["ms"]["confidence"] for r in measured])
+    )
     assert len(tables["table_5"].rows) == 9 and len(tables["table_4"].rows) == 15
 
 
@@ -284,8 +293,7 @@ def test_tables_without_records_are_empty():
     for section in STM_CPA.make_sections([{"frame": "a", "skipped": "b"}]):
         for table in section.tables:
             assert all(len(row) == len(table.header) for row in table.rows)
-            assert not any(cell.value for row in table.rows for cell in row
-                           if isinstance(cell, Cell))
+            assert not any(cell.value for row in table.rows for cell in row if isinstance(cell, Cell))
 
 
 def test_protocol_is_table_2_of_the_paper():
@@ -301,8 +309,11 @@ def test_published_values_are_consistent():
     assert paper.TABLE_5[0] == PAPER_TABLE_6["stage2"]
     for row in paper.TABLE_9.values():
         assert row[-1] == pytest.approx(sum(row[:-1]), abs=2e-3)
-    rows = [*PAPER_TABLE_6.values(), *paper.TABLE_5,
-            *(row for stages in paper.TABLE_4.values() for row in stages.values())]
+    rows = [
+        *PAPER_TABLE_6.values(),
+        *paper.TABLE_5,
+        *(row for stages in paper.TABLE_4.values() for row in stages.values()),
+    ]
     for recall, precision, f1, *_ in rows:
         if recall:
             assert f1 == pytest.approx(2 * recall * precision / (recall + precision), abs=0.15)
@@ -315,13 +326,18 @@ def test_published_values_are_consistent():
 @pytest.mark.skipif(not DIGEST.is_file(), reason="the papers are not beside the checkout")
 def test_published_values_agree_with_digest():
     text = DIGEST.read_text().partition("## B.")[0]
-    cells = {line.split("|")[1].strip().partition(":")[0]: line.split("|")[2]
-             for line in text.splitlines() if line.startswith("| ")}
+    cells = {
+        line.split("|")[1].strip().partition(":")[0]: line.split("|")[2]
+        for line in text.splitlines()
+        if line.startswith("| ")
+    }
 
     def rows(table):
         """Return the numbers of each part between semicolons, without names before colons."""
-        return [[float(x) for x in re.findall(r"\d*\.\d+|\b\d+\b", part.rpartition(":")[2])]
-                for part in cells[table].split(";")]
+        return [
+            [float(x) for x in re.findall(r"\d*\.\d+|\b\d+\b", part.rpartition(":")[2])]
+            for part in cells[table].split(";")
+        ]
 
     def drop_none(row):
         return [value for value in row if value is not None]
@@ -351,5 +367,8 @@ def test_real_frames_have_record_or_reason(data):
             continue
         record = measure_frame(frames, number)
         assert sum(record["pedestrians"]) == len(there)
-        assert record["clusters"][0] >= record["clusters"][1] == sum(
-            record["stages"]["stage1"]["tp"] + record["stages"]["stage1"]["fp"])
+        assert (
+            record["clusters"][0]
+            >= record["clusters"][1]
+            == sum(record["stages"]["stage1"]["tp"] + record["stages"]["stage1"]["fp"])
+        )

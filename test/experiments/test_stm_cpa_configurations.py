@@ -77,8 +77,7 @@ def test_given_pedestrian_is_neither_hit_nor_miss():
 @given(st.integers(0, 2**32 - 1))
 def test_best_f1_is_that_of_the_best_threshold(seed):
     rng = np.random.default_rng(seed)
-    ranked = [[[round(rng.random(), 1), int(rng.random() < 0.4)] for _ in range(rng.integers(6))]
-              for _ in range(4)]
+    ranked = [[[round(rng.random(), 1), int(rng.random() < 0.4)] for _ in range(rng.integers(6))] for _ in range(4)]
     pairs = [pair for frame in ranked for pair in frame]
     truth = sum(hit for _, hit in pairs) + int(rng.integers(1, 4))
     best = 0.0

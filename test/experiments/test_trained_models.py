@@ -20,20 +20,32 @@ from lidar_perception.training.params import PointPillarsTraining
 from lidar_perception.types import InputError
 
 pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread", "streets", "tiny_size")]
-TINY = {"sensor": "generic:16,-20,5,2,10", "data.scans": 4, "data.val_scans": 1, "steps": 2,
-        "batch": 1, "ahead": 10.0, "aside": 10.0, "augment.crowded": 0.0}
+TINY = {
+    "sensor": "generic:16,-20,5,2,10",
+    "data.scans": 4,
+    "data.val_scans": 1,
+    "steps": 2,
+    "batch": 1,
+    "ahead": 10.0,
+    "aside": 10.0,
+    "augment.crowded": 0.0,
+}
 
 
 def choose_models(params, seed):
-    return [Model(f"v0 seed {seed}", with_values(params, {"version": "v0", "seed": seed})),
-            Model(f"v0 half seed {seed}", with_values(params, {"version": "v0", "seed": seed}), 0.5,
-                  required=False)]
+    return [
+        Model(f"v0 seed {seed}", with_values(params, {"version": "v0", "seed": seed})),
+        Model(f"v0 half seed {seed}", with_values(params, {"version": "v0", "seed": seed}), 0.5, required=False),
+    ]
 
 
 def count_weights(frames, number, models):
     """Measure which weights a frame is measured with."""
-    return {"frame": frames[number].name, "points": len(frames[number].load()),
-            "weights": [str(model.weights) for model in models.values()]}
+    return {
+        "frame": frames[number].name,
+        "points": len(frames[number].load()),
+        "weights": [str(model.weights) for model in models.values()],
+    }
 
 
 def list_models(records, models):
@@ -41,14 +53,14 @@ def list_models(records, models):
     return [Section("Models", "", (Table("models", "Models", ("name", "steps", "scenes"), rows),))]
 
 
-TRAINED = Experiment("trained", "Trained", "How?", count_weights, list_models,
-                     training=PointPillarsTraining(), models=choose_models)
+TRAINED = Experiment(
+    "trained", "Trained", "How?", count_weights, list_models, training=PointPillarsTraining(), models=choose_models
+)
 
 
 def make_request(out: Path, **changes) -> ModelRequest:
     params = with_values(PointPillarsTraining(), {**TINY, **changes.pop("params", {})})
-    return ModelRequest(choose_models, params, ExperimentScenes("sim"), out,
-                        **{"test_frames": 2, **changes})
+    return ModelRequest(choose_models, params, ExperimentScenes("sim"), out, **{"test_frames": 2, **changes})
 
 
 def test_models_share_one_plan_and_are_trained_once(tmp_path, monkeypatch):
@@ -87,6 +99,7 @@ def test_budget_that_is_too_short_names_a_longer_one(tmp_path):
 
 def test_stopped_training_resumes(tmp_path, monkeypatch):
     from lidar_perception.training.run import Run
+
     request, step = make_request(tmp_path, params={"save_steps": 1}), Run.step
     plan = plan_training(request)
 
@@ -106,8 +119,7 @@ def test_stopped_training_resumes(tmp_path, monkeypatch):
 
 def run(*arguments):
     sets = [word for name, value in TINY.items() for word in ("--set", f"{name}={value}")]
-    return CliRunner().invoke(cli, ["reproduce", "trained", *map(str, arguments), "--jobs", "1",
-                                    *sets])
+    return CliRunner().invoke(cli, ["reproduce", "trained", *map(str, arguments), "--jobs", "1", *sets])
 
 
 @pytest.fixture
@@ -137,12 +149,10 @@ def test_frames_of_a_recording_are_used_once(tmp_path, listed):
     assert chosen.test == ("000001", "000003")
     result = run(folder, "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
-    assert (tmp_path / "out/models/train-50.txt").read_text().split() == [
-        *scenes.select_labelled(0.5)]
+    assert (tmp_path / "out/models/train-50.txt").read_text().split() == [*scenes.select_labelled(0.5)]
 
 
 @pytest.mark.parametrize("option", [("--budget", "1"), ("--seeds", "2"), ("--set", "steps=1")])
 def test_options_of_training_are_refused_without_training(tmp_path, option):
-    result = CliRunner().invoke(cli, ["reproduce", "stm-cpa", "sim", "--out", str(tmp_path / "o"),
-                                      *option])
+    result = CliRunner().invoke(cli, ["reproduce", "stm-cpa", "sim", "--out", str(tmp_path / "o"), *option])
     assert result.exit_code == 2 and "trains none" in result.output

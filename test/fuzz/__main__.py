@@ -30,17 +30,20 @@ def main(part: str, minutes: float, seed: int, first: int, cases: int) -> None:
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         attempt = module.Attempt(Path(folder))
         for number, case, outcome, used in run_cases(
-                module.make_case, attempt, seed, range(first, first + cases), PARTS[part],
-                begin + 60 * minutes):
+            module.make_case, attempt, seed, range(first, first + cases), PARTS[part], begin + 60 * minutes
+        ):
             verdicts[outcome.verdict] += 1
             largest = max(largest, used)
             if outcome.verdict == FAILED:
                 kinds[classify_reason(outcome.reason)] += 1
                 if kinds[classify_reason(outcome.reason)] == 1:
-                    print(f"{part} --seed {seed} --first {number} --cases 1: {case.name}: "
-                          f"{outcome.reason}", flush=True)
-    print(f"{part}: " + ", ".join(f"{verdicts[v]:,} {v}" for v in (SURVIVED, REFUSED, FAILED))
-          + f" in {monotonic() - begin:.0f} s; at most {largest:.0f} MB", flush=True)
+                    print(f"{part} --seed {seed} --first {number} --cases 1: {case.name}: {outcome.reason}", flush=True)
+    print(
+        f"{part}: "
+        + ", ".join(f"{verdicts[v]:,} {v}" for v in (SURVIVED, REFUSED, FAILED))
+        + f" in {monotonic() - begin:.0f} s; at most {largest:.0f} MB",
+        flush=True,
+    )
     for kind, times in kinds.most_common():
         print(f"  {times:,} x {kind}")
     sys.exit(verdicts[FAILED] > 0 or not verdicts)

@@ -40,9 +40,14 @@ def pick(rng: np.random.Generator, choices: Any) -> Any:
     return choices[int(rng.integers(len(choices)))]
 
 
-def run_cases(make_case: Callable[[int, int], Case], attempt: Callable[[Case], Outcome],
-              seed: int, numbers: Iterable[int], max_mb: float, deadline: float
-              ) -> Iterator[tuple[int, Case, Outcome, float]]:
+def run_cases(
+    make_case: Callable[[int, int], Case],
+    attempt: Callable[[Case], Outcome],
+    seed: int,
+    numbers: Iterable[int],
+    max_mb: float,
+    deadline: float,
+) -> Iterator[tuple[int, Case, Outcome, float]]:
     """Yield number, case, outcome and megabytes of each case, until the monotonic time `deadline`.
 
     An exception is a failure, and so is a case that takes more than max_mb of memory. A
@@ -58,8 +63,7 @@ def run_cases(make_case: Callable[[int, int], Case], attempt: Callable[[Case], O
             outcome = attempt(case)
         except Exception as error:
             last = traceback.extract_tb(error.__traceback__)[-1]
-            outcome = Outcome(FAILED, f"{type(error).__name__}: {error} "
-                              f"({Path(last.filename).name}:{last.lineno})")
+            outcome = Outcome(FAILED, f"{type(error).__name__}: {error} ({Path(last.filename).name}:{last.lineno})")
         finally:
             faulthandler.cancel_dump_traceback_later()
         used = max(0.0, read_memory_mb("VmHWM") - before)

@@ -18,32 +18,57 @@ from fuzz.mutation import mutate_bytes, mutate_text
 
 SECONDS, MEGABYTES = 60.0, 3000.0
 KITTI = ("--data", "kitti")
-DETECT = ("--out", "made", "--weights", "pointnet", "--limit", "2", "--png", "--format",
-          "kitti,json,csv,mcap,openlabel")
+DETECT = (
+    "--out",
+    "made",
+    "--weights",
+    "pointnet",
+    "--limit",
+    "2",
+    "--png",
+    "--format",
+    "kitti,json,csv,mcap,openlabel",
+)
 # Label format -> its folder or file; the labels are of the drive in bag/.
-LABELS = {"openlabel": "openlabel", "sustech": "sustech", "labelcloud": "labelcloud",
-          "nuscenes_tracking": "nuscenes_tracking/labels.json"}
+LABELS = {
+    "openlabel": "openlabel",
+    "sustech": "sustech",
+    "labelcloud": "labelcloud",
+    "nuscenes_tracking": "nuscenes_tracking/labels.json",
+}
 # Format -> its weight, and the commands that read it; {} is the damaged file.
 COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
-    "bag": (8, [("info", "bag/drive"), ("convert", "bag/drive", "--out", "made", "--force"),
-                ("setup", "--data", "bag/drive", "--out", "made"),
-                ("detect", "bag/drive", *DETECT)]),
-    "ros1": (3, [("info", "ros1/drive.bag"),
-                 ("convert", "ros1/drive.bag", "--out", "made", "--force")]),
-    "kitti": (4, [("convert", "kitti", "--out", "made", "--force"),
-                  ("evaluate", "candidates", *KITTI)]),
-    "tracking": (2, [("convert", "tracking", "--out", "made", "--force"),
-                     ("detect", "tracking", *DETECT, "--track", "--video", "made.gif")]),
+    "bag": (
+        8,
+        [
+            ("info", "bag/drive"),
+            ("convert", "bag/drive", "--out", "made", "--force"),
+            ("setup", "--data", "bag/drive", "--out", "made"),
+            ("detect", "bag/drive", *DETECT),
+        ],
+    ),
+    "ros1": (3, [("info", "ros1/drive.bag"), ("convert", "ros1/drive.bag", "--out", "made", "--force")]),
+    "kitti": (4, [("convert", "kitti", "--out", "made", "--force"), ("evaluate", "candidates", *KITTI)]),
+    "tracking": (
+        2,
+        [
+            ("convert", "tracking", "--out", "made", "--force"),
+            ("detect", "tracking", *DETECT, "--track", "--video", "made.gif"),
+        ],
+    ),
     "semantickitti": (3, [("evaluate", "segmentation", "--data", "semantickitti")]),
     "nuscenes": (3, [("convert", "nuscenes", "--out", "made", "--force")]),
-    **{name: (1, [("convert", name, "--out", "made", "--force")]) for name in (
-        "pcd", "ply", "npy", "openpcdet", "odometry", "raw")},
-    **{format: (1, [("convert", place, "--data", "bag/drive", "--to", "kitti_tracking",
-                     "--out", "made", "--force")]) for format, place in LABELS.items()},
+    **{
+        name: (1, [("convert", name, "--out", "made", "--force")])
+        for name in ("pcd", "ply", "npy", "openpcdet", "odometry", "raw")
+    },
+    **{
+        format: (1, [("convert", place, "--data", "bag/drive", "--to", "kitti_tracking", "--out", "made", "--force")])
+        for format, place in LABELS.items()
+    },
     "results": (2, [("evaluate", "detection", *KITTI, "--results", "results")]),
     "split": (1, [("convert", "kitti", "--out", "made", "--force", "--split", "{}")]),
-    "template": (3, [("evaluate", "candidates", *KITTI, "--set", "seed.source=file",
-                      "--set", "seed.file={}")]),
+    "template": (3, [("evaluate", "candidates", *KITTI, "--set", "seed.source=file", "--set", "seed.file={}")]),
     "yaml": (3, [("evaluate", "candidates", *KITTI, "--config", "{}")]),
     "sensor": (1, [("simulate", "--sensor", "{}", "--frames", "1", "--out", "made")]),
     "weights": (3, [("evaluate", "detection", *KITTI, "--limit", "1", "--weights", "{}")]),
@@ -52,9 +77,13 @@ COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
 }
 TEXT = (".txt", ".json", ".yaml", ".pcd", ".xml")
 INSTEAD: dict[str, Callable[[Path], object]] = {
-    "nothing": lambda path: None, "an empty file": Path.touch, "a folder": Path.mkdir,
-    "a pipe": os.mkfifo, "a link to itself": lambda path: path.symlink_to(path.name),
-    "zeros": lambda path: path.write_bytes(bytes(5000))}
+    "nothing": lambda path: None,
+    "an empty file": Path.touch,
+    "a folder": Path.mkdir,
+    "a pipe": os.mkfifo,
+    "a link to itself": lambda path: path.symlink_to(path.name),
+    "zeros": lambda path: path.write_bytes(bytes(5000)),
+}
 
 
 @functools.cache
@@ -63,8 +92,11 @@ def load_samples() -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as folder:
         # In another process, because threads that torch starts here would be missing in forks.
         subprocess.run([sys.executable, "-m", "fuzz.sample_files", folder], check=True)
-        return {path.relative_to(folder).as_posix(): path.read_bytes()
-                for path in sorted(Path(folder).rglob("*")) if path.is_file()}
+        return {
+            path.relative_to(folder).as_posix(): path.read_bytes()
+            for path in sorted(Path(folder).rglob("*"))
+            if path.is_file()
+        }
 
 
 def make_case(seed: int, number: int) -> Case:

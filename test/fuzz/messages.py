@@ -13,8 +13,7 @@ def make_case(seed: int, number: int) -> Case:
     rng = make_generator("messages", seed, number)
     node = draw_node(rng)
     _, inputs, variants = INPUTS[node]
-    topic = "input/points" if "input/points" in inputs and rng.random() < 0.7 else pick(
-        rng, list(inputs))
+    topic = "input/points" if "input/points" in inputs and rng.random() < 0.7 else pick(rng, list(inputs))
     data, change = mutate_valid_message(inputs[topic], rng)
     if rng.random() < 0.1:
         data, damage = mutate_bytes(data, rng)

@@ -17,8 +17,27 @@ from lidar_perception.wire.codec import bag_message, load_typestore
 
 INTEGERS = (0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
 FLOATS = (0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 1e-40, 1e38, -1e38, 1e308, 1e5, -1.0)
-WORDS = ("nan", "-inf", "1e400", "-1", "0", "1e-320", "9" * 400, "", "null", "é", "\x00", "0x10",
-         "1,5", "true", "[" * 5000, "{" * 5000, "-" * 30, "2147483648", "1e38")
+WORDS = (
+    "nan",
+    "-inf",
+    "1e400",
+    "-1",
+    "0",
+    "1e-320",
+    "9" * 400,
+    "",
+    "null",
+    "é",
+    "\x00",
+    "0x10",
+    "1,5",
+    "true",
+    "[" * 5000,
+    "{" * 5000,
+    "-" * 30,
+    "2147483648",
+    "1e38",
+)
 TEXTS = ("", "x" * 70_000, "é\u202e", "a b", "/", "../..", "\n", "x", "intensity")
 
 
@@ -37,9 +56,8 @@ def _change_bytes(data: bytes, rng: np.random.Generator) -> tuple[bytes, str]:
     low, high = pick(rng, ((0, size), (0, size), (0, min(size, 512)), (max(0, size - 4096), size)))
     at = int(rng.integers(low, high + 1))
     count = int(rng.integers(1, 1 + pick(rng, (1, 8, 64, 4096))))
-    before, part, after = data[:at], data[at:at + count], data[at + count:]
-    kind = pick(rng, ("flip", "flip", "delete", "insert", "repeat", "zero", "number", "number",
-                      "cut"))
+    before, part, after = data[:at], data[at : at + count], data[at + count :]
+    kind = pick(rng, ("flip", "flip", "delete", "insert", "repeat", "zero", "number", "number", "cut"))
     if kind == "flip":
         part = bytes([part[0] ^ 1 << int(rng.integers(8))]) + part[1:] if part else b""
     elif kind == "delete":
@@ -51,8 +69,8 @@ def _change_bytes(data: bytes, rng: np.random.Generator) -> tuple[bytes, str]:
     elif kind == "zero":
         part = bytes(len(part))
     elif kind == "number":
-        number = struct.pack("<Q", pick(rng, (*INTEGERS, size, size + 1)))[:pick(rng, (1, 2, 4, 8))]
-        part, after = number, (part + after)[len(number):]
+        number = struct.pack("<Q", pick(rng, (*INTEGERS, size, size + 1)))[: pick(rng, (1, 2, 4, 8))]
+        part, after = number, (part + after)[len(number) :]
     else:
         part = after = b""
     return before + part + after, f"{kind} at {at} of {size}, {count} bytes"
@@ -65,8 +83,7 @@ def mutate_text(text: str, rng: np.random.Generator) -> tuple[str, str]:
     for _ in range(int(rng.integers(1, 4))):
         spans = [m.span() for m in re.finditer(r"[\w.+-]+", text)] or [(0, 0)]
         begin, end = pick(rng, spans)
-        kind = pick(rng, ("word", "word", "word", "number", "drop", "swap", "line", "no line",
-                          "character", "cut"))
+        kind = pick(rng, ("word", "word", "word", "number", "drop", "swap", "line", "no line", "character", "cut"))
         if kind == "word":
             word = pick(rng, WORDS)
             text = text[:begin] + word + text[end:]
@@ -81,8 +98,7 @@ def mutate_text(text: str, rng: np.random.Generator) -> tuple[str, str]:
         elif kind in ("line", "no line"):
             lines = text.splitlines(keepends=True) or [""]
             i = int(rng.integers(len(lines)))
-            text = "".join(lines[:i] + lines[i:i + 1] * (2 if kind == "line" else 0)
-                           + lines[i + 1:])
+            text = "".join(lines[:i] + lines[i : i + 1] * (2 if kind == "line" else 0) + lines[i + 1 :])
         elif kind == "character":
             text = text[:begin] + pick(rng, "\x00\ufeff\r\t{}[]:,\"'#&*!|>%@`\u2028") + text[begin:]
         else:
@@ -122,13 +138,13 @@ def _draw_value(kind: str, rng: np.random.Generator) -> Any:
     return int(min(max(number, limits.min), limits.max))
 
 
-def _change_array(values: np.ndarray, rng: np.random.Generator, fixed: bool
-                  ) -> tuple[np.ndarray, str]:
+def _change_array(values: np.ndarray, rng: np.random.Generator, fixed: bool) -> tuple[np.ndarray, str]:
     values = np.array(values)
     if not fixed and rng.random() < 0.5:
         size = int(rng.integers(0, 2 * len(values) + 2))
-        return np.resize(values, size) if len(values) else np.zeros(size, values.dtype), \
-            f"{size} values of {len(values)}"
+        return np.resize(values, size) if len(values) else np.zeros(
+            size, values.dtype
+        ), f"{size} values of {len(values)}"
     if len(values):
         at = int(rng.integers(len(values)))
         values[at] = _draw_value(values.dtype.name, rng)

@@ -25,33 +25,60 @@ from msg_utils.markers import from_marker_array
 from msg_utils.messages import load_message_class
 from msg_utils.point_cloud2 import CloudError, to_array
 
-CAMERA = {"input/camera_info": "sensor_msgs/msg/CameraInfo",
-          "input/extrinsics": "geometry_msgs/msg/TransformStamped"}
+CAMERA = {"input/camera_info": "sensor_msgs/msg/CameraInfo", "input/extrinsics": "geometry_msgs/msg/TransformStamped"}
 SEED = {"input/ground_truth": MARKERS, "clicked_point": "geometry_msgs/msg/PointStamped"}
 POINTS = {"input/points": CLOUD}
 # Node -> its weight, its inputs with their types, the settings of which each case has one.
 # Detectors have small weights, as they take a tenth of a second for any cloud.
 INPUTS: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
-    "ground_segmentation": (20, POINTS | CAMERA, [
-        {"ground.method": "threshold", "view.enabled": False},
-        {"ground.method": "threshold", "view.enabled": True},
-        {"ground.method": "patchwork", "view.enabled": False},
-        {"ground.method": "cloth", "view.enabled": False}]),
-    "clustering": (20, POINTS, [
-        {"clustering.method": "dbscan", "clustering.dbscan.join_bands": False},
-        {"clustering.method": "dbscan", "clustering.dbscan.join_bands": True},
-        *({"clustering.method": "euclidean", "clustering.euclidean.threshold": t}
-          for t in ("local", "global", "fixed"))]),
-    "candidate_refinement": (24, POINTS | SEED, [
-        {"seed.source": source, "boxes.shape": shape, "confidence.enabled": confidence}
-        for source, shape, confidence in (
-            ("ground_truth", "axis_aligned", False), ("file", "min_area", False),
-            ("automatic", "l_shape", True), ("click", "axis_aligned", True))]),
-    "perception": (24, POINTS | CAMERA | SEED, [
-        {"seed.source": source, "view.enabled": view, "stm.window": window}
-        for source, view, window in (
-            ("ground_truth", True, "stretched"), ("file", False, "stretched"),
-            ("automatic", False, "metric"), ("click", False, "metric"))]),
+    "ground_segmentation": (
+        20,
+        POINTS | CAMERA,
+        [
+            {"ground.method": "threshold", "view.enabled": False},
+            {"ground.method": "threshold", "view.enabled": True},
+            {"ground.method": "patchwork", "view.enabled": False},
+            {"ground.method": "cloth", "view.enabled": False},
+        ],
+    ),
+    "clustering": (
+        20,
+        POINTS,
+        [
+            {"clustering.method": "dbscan", "clustering.dbscan.join_bands": False},
+            {"clustering.method": "dbscan", "clustering.dbscan.join_bands": True},
+            *(
+                {"clustering.method": "euclidean", "clustering.euclidean.threshold": t}
+                for t in ("local", "global", "fixed")
+            ),
+        ],
+    ),
+    "candidate_refinement": (
+        24,
+        POINTS | SEED,
+        [
+            {"seed.source": source, "boxes.shape": shape, "confidence.enabled": confidence}
+            for source, shape, confidence in (
+                ("ground_truth", "axis_aligned", False),
+                ("file", "min_area", False),
+                ("automatic", "l_shape", True),
+                ("click", "axis_aligned", True),
+            )
+        ],
+    ),
+    "perception": (
+        24,
+        POINTS | CAMERA | SEED,
+        [
+            {"seed.source": source, "view.enabled": view, "stm.window": window}
+            for source, view, window in (
+                ("ground_truth", True, "stretched"),
+                ("file", False, "stretched"),
+                ("automatic", False, "metric"),
+                ("click", False, "metric"),
+            )
+        ],
+    ),
     "tracker": (8, {"input/detections": MARKERS, "input/odometry": ODOMETRY_MESSAGE}, [{}]),
     "evaluator": (8, {"input/ground_truth": MARKERS, "input/final": MARKERS} | CAMERA, [{}]),
     "pointnet_detector": (0.5, POINTS, [{}]),
@@ -85,12 +112,14 @@ class FedNode:
 
     def __init__(self, name: str, context: Context, **values: Any):
         self.node = load_node_class(name)(
-            context=context, enable_rosout=False, start_parameter_services=False,
-            parameter_overrides=to_parameters(values))
+            context=context,
+            enable_rosout=False,
+            start_parameter_services=False,
+            parameter_overrides=to_parameters(values),
+        )
         self.node.start()
         self.inputs = INPUTS[name][1]
-        self.calls = {s.topic_name.removeprefix(f"/{name}").lstrip("/"): s.callback
-                      for s in self.node.subscriptions}
+        self.calls = {s.topic_name.removeprefix(f"/{name}").lstrip("/"): s.callback for s in self.node.subscriptions}
         for made in self.node.inputs:
             if isinstance(made, Reception):  # without its queue
                 self.calls[made.topic.removeprefix(f"/{name}").lstrip("/")] = made.deliver
@@ -130,8 +159,10 @@ class FedNode:
 
     def deliver_valid(self, *first: str) -> list[tuple[bytes, str]]:
         """Deliver a valid message to some inputs, then to all, the cloud last."""
-        return [self.deliver(t, make_valid_message(self.inputs[t])) for t in [
-            *first, *sorted(self.inputs, key=lambda t: t == "input/points")]]
+        return [
+            self.deliver(t, make_valid_message(self.inputs[t]))
+            for t in [*first, *sorted(self.inputs, key=lambda t: t == "input/points")]
+        ]
 
     def judge(self, states: list[tuple[bytes, str]]) -> Outcome:
         """Fail on a bug, on output that cannot be read, and if the last message, which is valid
@@ -149,8 +180,7 @@ class FedNode:
             try:
                 if kind is clouds:
                     to_array(decode(data, CLOUD))
-                elif kind is boxes and not np.isfinite(
-                        from_marker_array(decode(data, MARKERS)).boxes).all():
+                elif kind is boxes and not np.isfinite(from_marker_array(decode(data, MARKERS)).boxes).all():
                     return f"{topic} has boxes that are not finite"
             except (InputError, CloudError, ValueError) as error:
                 return f"{topic} cannot be read: {error}"

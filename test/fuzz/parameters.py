@@ -30,9 +30,7 @@ class Attempt(Nodes):
         fed, rng = self.nodes[name], make_generator("values", seed, number)
         names = [name for name in parameter_names(fed.node) if not name.startswith(NOT_OURS)]
         before = [fed.node.get_parameter(pick(rng, names)) for _ in range(pick(rng, (1, 1, 1, 2)))]
-        changes = [
-            Parameter(p.name, value=make_hostile_value(p.value, rng, find_limits(fed, p.name)))
-            for p in before]
+        changes = [Parameter(p.name, value=make_hostile_value(p.value, rng, find_limits(fed, p.name))) for p in before]
         shown = ", ".join(f"{p.name} = {str(p.value)[:40]!r}" for p in changes)
         result = fed.node.set_parameters_atomically(changes)
         if not result.successful:
@@ -49,8 +47,11 @@ class Attempt(Nodes):
 def find_limits(fed: FedNode, name: str) -> list[float]:
     """Return the lowest and highest value of a parameter; empty if it has no range."""
     described = fed.node.describe_parameter(name)
-    return [value for found in (*described.floating_point_range, *described.integer_range)
-            for value in (found.from_value, found.to_value)]
+    return [
+        value
+        for found in (*described.floating_point_range, *described.integer_range)
+        for value in (found.from_value, found.to_value)
+    ]
 
 
 def make_hostile_value(value: Any, rng: np.random.Generator, limits: list[float]) -> Any:
@@ -67,5 +68,8 @@ def make_hostile_value(value: Any, rng: np.random.Generator, limits: list[float]
     if kind is str:
         return pick(rng, TEXTS)
     items = [make_hostile_value(item, rng, limits) for item in value]
-    return [] if not items or rng.random() < 0.3 else [
-        item if isinstance(item, type(value[0])) else value[0] for item in items]
+    return (
+        []
+        if not items or rng.random() < 0.3
+        else [item if isinstance(item, type(value[0])) else value[0] for item in items]
+    )

@@ -26,8 +26,7 @@ from lidar_perception.wire.codec import bag_message, encode
 from msg_utils.point_cloud2 import add_columns, to_array
 
 COLUMNS = ("ground", "in_view", "cluster_id", "intensity")
-LARGEST = {kind: np.iinfo(kind).max for kind in ("u1", "i2", "u4", "i4")} | {
-    "f4": 3e38, "f8": 1e308}
+LARGEST = {kind: np.iinfo(kind).max for kind in ("u1", "i2", "u4", "i4")} | {"f4": 3e38, "f8": 1e308}
 WITH_CLOUDS = [name for name, (_, inputs, _) in INPUTS.items() if "input/points" in inputs]
 
 
@@ -40,9 +39,11 @@ def nodes(domain, tmp_path_factory):
     save_checkpoint(pillars, lively(config), Header(config))
     config = pointnet_samples.small()
     save_checkpoint(clusters, pointnet_samples.lively(config), Header(config))
-    values = {"pointpillars_detector": {"pointpillars.weights": pillars},
-              "pointnet_detector": {"pointnet.weights": clusters},
-              "fused_detector": {"fused.weights": pillars, "fused.classifier": clusters}}
+    values = {
+        "pointpillars_detector": {"pointpillars.weights": pillars},
+        "pointnet_detector": {"pointnet.weights": clusters},
+        "fused_detector": {"fused.weights": pillars, "fused.classifier": clusters},
+    }
     made = {name: FedNode(name, context, **values.get(name, {})) for name in INPUTS}
     yield made
     shut_down_context(context, *(each.node for each in made.values()))
@@ -51,16 +52,18 @@ def nodes(domain, tmp_path_factory):
 def test_every_input_of_a_node_is_fuzzed(nodes):
     assert set(INPUTS) == set(NODES) - {"bag_player", "bag_recorder"}
     for name, (_, inputs, _) in INPUTS.items():
-        assert set(inputs) == {topic for topic in nodes[name].calls if "parameter" not in topic
-                               and topic not in ("clock", "tf", "tf_static")}
+        assert set(inputs) == {
+            topic
+            for topic in nodes[name].calls
+            if "parameter" not in topic and topic not in ("clock", "tf", "tf_static")
+        }
 
 
 @pytest.mark.no_cover
 @pytest.mark.parametrize("part, cases", [(messages, 150), (parameters, 150)])
 def test_nodes_survive_or_refuse_each_case(part, cases, nodes, tmp_path):
     attempt = part.Attempt(tmp_path, nodes)
-    outcomes = [outcome for _, _, outcome, _ in run_cases(
-        part.make_case, attempt, 1, range(cases), 500.0, np.inf)]
+    outcomes = [outcome for _, _, outcome, _ in run_cases(part.make_case, attempt, 1, range(cases), 500.0, np.inf)]
     assert [outcome for outcome in outcomes if outcome.verdict == FAILED] == []
     assert len(outcomes) == cases
     assert min(sum(o.verdict == v for o in outcomes) for v in (SURVIVED, REFUSED)) >= cases // 10
@@ -68,8 +71,12 @@ def test_nodes_survive_or_refuse_each_case(part, cases, nodes, tmp_path):
 
 @pytest.mark.no_cover
 def test_commands_survive_or_refuse_damaged_files():
-    done = subprocess.run([sys.executable, "-m", "fuzz", "files", "--cases", "16"], text=True,
-                          capture_output=True, cwd=Path(__file__).parents[1])
+    done = subprocess.run(
+        [sys.executable, "-m", "fuzz", "files", "--cases", "16"],
+        text=True,
+        capture_output=True,
+        cwd=Path(__file__).parents[1],
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "0 failed" in done.stdout
 
@@ -88,8 +95,7 @@ def test_extreme_columns_cost_no_memory(nodes, name):
     for column in COLUMNS:
         for kind, largest in LARGEST.items():
             least, odd = -largest if kind[0] in "if" else 0, np.nan if kind[0] == "f" else 2
-            for values in (np.where(turn < 7, largest, 0),
-                           np.choose(turn, [1, largest, least, odd, largest, 0, 1])):
+            for values in (np.where(turn < 7, largest, 0), np.choose(turn, [1, largest, least, odd, largest, 0, 1])):
                 data = encode(add_columns(plain, bag_message, **{column: values.astype(kind)}))
                 before = read_memory_mb("VmRSS", reset=True)
                 outcome = node.attempt("input/points", data, params, False)
@@ -99,9 +105,14 @@ def test_extreme_columns_cost_no_memory(nodes, name):
     assert node.attempt("input/points", data, params, True).verdict != FAILED
 
 
-@pytest.mark.parametrize("column, reading", [
-    ("ground", {"clustering"}), ("in_view", set(WITH_CLOUDS)),
-    ("cluster_id", {"candidate_refinement", "pointnet_detector"})])
+@pytest.mark.parametrize(
+    "column, reading",
+    [
+        ("ground", {"clustering"}),
+        ("in_view", set(WITH_CLOUDS)),
+        ("cluster_id", {"candidate_refinement", "pointnet_detector"}),
+    ],
+)
 def test_column_with_count_above_1_is_refused(nodes, column, reading):
     plain = make_cloud("columns")
     plain.fields = [f for f in plain.fields if f.name in ("x", "y", "z", column)]
@@ -134,8 +145,10 @@ def test_command_outcome_needs_result_or_reason():
     assert judge_command(2, "", "3 frames\nError: cannot read it\n").verdict == REFUSED
     assert judge_command(1, "left out: a frame\n", "").verdict == REFUSED
     traceback = "Traceback (most recent call last):\n\nError: x"
-    bad = [judge_command(code, "", errors) for code, errors in (
-        *((code, "") for code in (None, -11, 1, 2, 70)), (0, traceback), (2, traceback))]
+    bad = [
+        judge_command(code, "", errors)
+        for code, errors in (*((code, "") for code in (None, -11, 1, 2, 70)), (0, traceback), (2, traceback))
+    ]
     assert {outcome.verdict for outcome in bad} == {FAILED}
 
 
@@ -145,6 +158,8 @@ def test_exceptions_and_memory_are_failures():
             raise ValueError("planted")
         np.ones((60 if case.name == "2" else 1) * 2**17)  # 60 or 1 MB
         return Outcome(SURVIVED)
-    first, second, third = (outcome for *_, outcome, _ in run_cases(
-        lambda seed, i: Case(str(i)), attempt, 1, range(3), 40.0, np.inf))
+
+    first, second, third = (
+        outcome for *_, outcome, _ in run_cases(lambda seed, i: Case(str(i)), attempt, 1, range(3), 40.0, np.inf)
+    )
     assert first.verdict == SURVIVED and "planted" in second.reason and "MB" in third.reason

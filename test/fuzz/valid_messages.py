@@ -19,16 +19,32 @@ from msg_utils.stamps import make_header
 CLOUD = "sensor_msgs/msg/PointCloud2"
 STAMP = 1_700_000_000_000_000_000
 PERSON = np.array([8.0, 0.5, -0.85, 0.6, 0.6, 1.7, 0.0])  # [x y z l w h yaw]
-KINDS = ("f", "fi", "velodyne", "double", "big-endian", "rows", "padded", "columns", "columns",
-         "columns", "empty", "one")
+KINDS = (
+    "f",
+    "fi",
+    "velodyne",
+    "double",
+    "big-endian",
+    "rows",
+    "padded",
+    "columns",
+    "columns",
+    "columns",
+    "empty",
+    "one",
+)
 PLAIN = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
 LAYOUTS: dict[str, Any] = {
     "fi": [*PLAIN, ("intensity", "<f4")],
     "velodyne": [*PLAIN, ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")],
     "double": [(name, "<f8") for name in ("x", "y", "z", "timestamp")],
     "big-endian": [(name, ">f4") for name in ("x", "y", "z", "intensity")],
-    "padded": dict(names=["z", "x", "y", "reflectivity"], formats=["<f4", "<f4", "<f4", "<u1"],
-                   offsets=[4, 16, 24, 33], itemsize=48),
+    "padded": dict(
+        names=["z", "x", "y", "reflectivity"],
+        formats=["<f4", "<f4", "<f4", "<u1"],
+        offsets=[4, 16, 24, 33],
+        itemsize=48,
+    ),
 }
 
 
@@ -52,17 +68,15 @@ def make_message_header() -> Any:
 
 def make_cloud(kind: str = "columns") -> Any:
     """Return a valid PointCloud2; kind: one of KINDS."""
-    xyz = make_points()[:{"empty": 0, "one": 1}.get(kind)]
+    xyz = make_points()[: {"empty": 0, "one": 1}.get(kind)]
     points = np.zeros(len(xyz), np.dtype(LAYOUTS.get(kind, PLAIN)))
     for i, name in enumerate("xyz"):
         points[name] = xyz[:, i]
-    message = from_array(points, make_message_header(), bag_message,
-                         height=4 if kind == "rows" else 1)
+    message = from_array(points, make_message_header(), bag_message, height=4 if kind == "rows" else 1)
     if kind == "columns":
         body = (xyz[:, 2] > -SENSOR_HEIGHT + 0.05).astype("u1")
         ids = np.where(body, 1 + np.arange(len(xyz)) // 90, 0).astype("u4")
-        message = add_columns(message, bag_message, ground=1 - body, in_view=np.ones_like(body),
-                              cluster_id=ids)
+        message = add_columns(message, bag_message, ground=1 - body, in_view=np.ones_like(body), cluster_id=ids)
     return message
 
 
@@ -75,14 +89,14 @@ def make_valid_message(kind: str) -> bytes:
         truth = GroundTruth.of([PERSON], [PEDESTRIAN], [{"track_id": 3}])
         return encode(make_truth_markers(truth, make_message_header(), bag_message))
     if kind == "sensor_msgs/msg/CameraInfo":
-        return encode(make_camera_info(FORWARD_CAMERA, make_header(STAMP, "camera_optical",
-                                                                   bag_message), bag_message))
+        return encode(make_camera_info(FORWARD_CAMERA, make_header(STAMP, "camera_optical", bag_message), bag_message))
     if kind == "geometry_msgs/msg/TransformStamped":
         return encode(make_extrinsics(FORWARD_CAMERA, make_message_header(), bag_message))
     if kind == "geometry_msgs/msg/PointStamped":
         x, y, z = map(float, PERSON[:3])
-        return encode(bag_message(kind, header=make_message_header(), point=bag_message(
-            "geometry_msgs/msg/Point", x=x, y=y, z=z)))
+        return encode(
+            bag_message(kind, header=make_message_header(), point=bag_message("geometry_msgs/msg/Point", x=x, y=y, z=z))
+        )
     if kind == "nav_msgs/msg/Odometry":
         message = bag_message(kind, header=make_message_header(), child_frame_id="lidar")
         message.pose.pose.orientation.w = 1.0
@@ -108,21 +122,19 @@ def mutate_valid_message(kind: str, rng: np.random.Generator) -> tuple[bytes, st
 
 def _change_values(message: Any, rng: np.random.Generator) -> str:
     """Set the values of one field, of some points or of all."""
-    fields = [f for f in message.fields if 1 <= f.datatype <= 8
-              and f.offset + 8 <= message.point_step]
+    fields = [f for f in message.fields if 1 <= f.datatype <= 8 and f.offset + 8 <= message.point_step]
     count = len(message.data) // message.point_step if message.point_step else 0
     if not fields or not count:
         return mutate_message(message, rng)
     field = pick(rng, fields)
     order = ">" if message.is_bigendian else "<"
-    dtype = np.dtype(order + " i1u1i2u2i4u4f4f8"[2 * field.datatype - 1:2 * field.datatype + 1])
+    dtype = np.dtype(order + " i1u1i2u2i4u4f4f8"[2 * field.datatype - 1 : 2 * field.datatype + 1])
     data = np.array(message.data)
     column = np.ndarray(count, dtype, data, field.offset, (message.point_step,))
     value = pick(rng, FLOATS if dtype.kind == "f" else INTEGERS)
     chosen = rng.random(count) < pick(rng, (0.01, 0.3, 1.0))
     with np.errstate(over="ignore"):
-        column[chosen] = (np.array(value).astype(dtype) if dtype.kind == "f"
-                          else value & np.iinfo(dtype).max)
+        column[chosen] = np.array(value).astype(dtype) if dtype.kind == "f" else value & np.iinfo(dtype).max
     message.data = data
     return f"{field.name} = {value} in {int(chosen.sum())} points"
 
@@ -140,7 +152,7 @@ def _add_column(message: Any, rng: np.random.Generator) -> str:
     if how == "extreme":
         values[:] = pick(rng, FLOATS if kind[0] == "f" else INTEGERS)
     elif how == "random":
-        values = rng.integers(-5, 2**pick(rng, (3, 16, 32)), count).astype(float)
+        values = rng.integers(-5, 2 ** pick(rng, (3, 16, 32)), count).astype(float)
     elif how == "sparse":
         values = np.where(rng.random(count) < 0.01, float(pick(rng, INTEGERS)), 0.0)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -173,5 +185,14 @@ def _change_data(message: Any, rng: np.random.Generator) -> str:
     return f"{size} bytes of {len(data)}"
 
 
-CLOUD_CHANGES = (_change_values, _change_values, _change_values, _add_column, _add_column,
-                 _change_field, _change_layout, _change_data, mutate_message)
+CLOUD_CHANGES = (
+    _change_values,
+    _change_values,
+    _change_values,
+    _add_column,
+    _add_column,
+    _change_field,
+    _change_layout,
+    _change_data,
+    mutate_message,
+)

@@ -11,20 +11,10 @@ from samples import DATA, needs_data
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.ground.cloth import lay_cloth, segment_by_cloth
-from lidar_perception.ground.cloth_slopes import (
-    REACH_CELLS,
-    STEP_M,
-    UNOBSERVED,
-    find_climbing_cells,
-)
+from lidar_perception.ground.cloth_slopes import REACH_CELLS, STEP_M, UNOBSERVED, find_climbing_cells
 from lidar_perception.ground.cloth_solver import settle_sheet
 from lidar_perception.ground.params import ClothParams
-from lidar_perception.scoring.points.segmentation import (
-    PROTOCOLS,
-    count_ground,
-    select_true_ground,
-    to_ground_row,
-)
+from lidar_perception.scoring.points.segmentation import PROTOCOLS, count_ground, select_true_ground, to_ground_row
 
 pytestmark = pytest.mark.no_cover  # other tests cover these lines
 
@@ -91,8 +81,7 @@ def climbing_road(seed=0):
         return 0.45 * (1 - np.cos(np.clip((x - 18) / 22, 0, 1) * np.pi))
 
     road = np.column_stack([x, y, rise(x) - 1.73 + rng.normal(0, 0.01, len(x))])[seen]
-    on_road = [rng.uniform(-1, 1, (300, 3)) * [2, 0.85, 0.55] + [*car, rise(car[0]) - 0.9]
-               for car in cars]
+    on_road = [rng.uniform(-1, 1, (300, 3)) * [2, 0.85, 0.55] + [*car, rise(car[0]) - 0.9] for car in cars]
     xyz = np.concatenate([road, *on_road])
     return xyz.astype(np.float32), np.arange(len(xyz)) < len(road)
 
@@ -107,8 +96,8 @@ def test_a_climbing_road_is_ground_and_cars_on_it_are_not():
     below[:, 2] -= rng.uniform(0, 9, 12)
     deep = np.concatenate([xyz, below, below + np.float32([0.6, 0, 0.2])])
     found = segment_by_cloth(deep)
-    assert found[:len(xyz)][road].mean() > 0.97 and not found[len(xyz):].any()
-    assert segment_by_cloth(deep, ClothParams(slope=0.0))[:len(xyz)][road].mean() > 0.9
+    assert found[: len(xyz)][road].mean() > 0.97 and not found[len(xyz) :].any()
+    assert segment_by_cloth(deep, ClothParams(slope=0.0))[: len(xyz)][road].mean() > 0.9
 
 
 @given(st.integers(0, 2**31), st.floats(0.01, 0.2))
@@ -123,15 +112,20 @@ def test_climbing_cells_equal_a_plain_implementation(seed, slope):
         new = set()
         for r, c in map(tuple, seen):
             near = sorted(((r - i) ** 2 + (c - j) ** 2, lowest[i, j]) for i, j in touched)
-            if (r, c) not in touched and near and near[0][0] <= REACH_CELLS**2 and (
-                    lowest[r, c] - near[0][1] <= STEP_M + slope * np.sqrt(near[0][0])):
+            if (
+                (r, c) not in touched
+                and near
+                and near[0][0] <= REACH_CELLS**2
+                and (lowest[r, c] - near[0][1] <= STEP_M + slope * np.sqrt(near[0][0]))
+            ):
                 new.add((r, c))
         if not new:
             break
         touched |= new
     found = find_climbing_cells(lowest, height, float(np.float32(0.1)), slope)
     assert {tuple(cell) for cell in np.argwhere(found)} == {
-        (r, c) for r, c in touched if lowest[r, c] > np.float32(0.1)}
+        (r, c) for r, c in touched if lowest[r, c] > np.float32(0.1)
+    }
 
 
 @given(st.integers(0, 2**31))
@@ -155,7 +149,7 @@ def test_a_hill_too_curved_for_a_plane_is_ground():
     hill = np.column_stack([xy, 2.5 * np.cos(xy[:, 0] / 12) * np.cos(xy[:, 1] / 15)])
     post = rng.uniform(-0.2, 0.2, (200, 3)) * [1, 1, 5] + [10, 10, 3]
     found = segment_by_cloth(np.concatenate([hill, post]).astype(np.float32))
-    assert found[:len(hill)].mean() > 0.99 and found[len(hill):].mean() < 0.2
+    assert found[: len(hill)].mean() > 0.99 and found[len(hill) :].mean() < 0.2
 
 
 @given(st.integers(0, 2**31))
@@ -169,14 +163,12 @@ def test_permuting_points_permutes_the_ground(seed):
 def test_rotating_about_z_rotates_the_ground(degrees, same):
     xyz, _ = street(3, slope=(0.05, 0.02))
     angle = np.radians(degrees)
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0],
-                     [0, 0, 1]])
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     turned = (xyz @ turn.T).astype(np.float32)
     assert (segment_by_cloth(turned) == segment_by_cloth(xyz)).mean() > same
 
 
-@pytest.mark.parametrize("far", [[1e5, 0, 0], [0, -9e4, 50], [0, 101, -1.7], [95, 80, 30],
-                                 [-99, 3, -8]])
+@pytest.mark.parametrize("far", [[1e5, 0, 0], [0, -9e4, 50], [0, 101, -1.7], [95, 80, 30], [-99, 3, -8]])
 def test_a_far_outlier_does_not_change_the_ground(far):
     xyz, _ = street(4)
     found = segment_by_cloth(np.concatenate([xyz, np.float32([far])]))[:-1]
@@ -185,8 +177,7 @@ def test_a_far_outlier_does_not_change_the_ground(far):
 
 def test_reflections_below_the_ground_do_not_move_it():
     xyz, _ = street(5)
-    below = np.column_stack([np.random.default_rng(0).uniform(-30, 30, (40, 2)),
-                             np.full(40, -4.0)]).astype(np.float32)
+    below = np.column_stack([np.random.default_rng(0).uniform(-30, 30, (40, 2)), np.full(40, -4.0)]).astype(np.float32)
     found = segment_by_cloth(np.concatenate([xyz, below]))
     assert not found[-40:].any()
     assert (found[:-40] != segment_by_cloth(xyz)).mean() < 0.002
@@ -198,15 +189,21 @@ def test_points_beyond_max_range_are_ignored():
     inside = (np.abs(xyz[:, :2]) <= 15).all(axis=1)
     found = segment_by_cloth(xyz, params)
     assert not found[~inside].any() and f1(found, road & inside) > 0.99
-    cells = 2 ** 5
+    cells = 2**5
     assert lay_cloth(xyz, params).height.size <= (2 * 15 / 0.5 + 2 * cells) ** 2
 
 
-@pytest.mark.parametrize("xyz, expected", [
-    (np.zeros((0, 3)), []), ([[5, 5, -1]], [True]), ([[500, 0, 0]], [False]),
-    (np.full((9, 3), 3.3), [True] * 9),
-    ([[1, 1, -2], [1, 1, -1.9], [1, 1, 4]], [True, True, False]),
-], ids=["empty", "one point", "far", "all equal", "column"])
+@pytest.mark.parametrize(
+    "xyz, expected",
+    [
+        (np.zeros((0, 3)), []),
+        ([[5, 5, -1]], [True]),
+        ([[500, 0, 0]], [False]),
+        (np.full((9, 3), 3.3), [True] * 9),
+        ([[1, 1, -2], [1, 1, -1.9], [1, 1, 4]], [True, True, False]),
+    ],
+    ids=["empty", "one point", "far", "all equal", "column"],
+)
 def test_small_clouds_are_segmented(xyz, expected):
     found = segment_by_cloth(np.asarray(xyz, np.float32).reshape(-1, 3))
     assert found.dtype == bool and found.tolist() == expected

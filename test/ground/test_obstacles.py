@@ -33,8 +33,9 @@ def test_height_is_above_the_nearest_cell_with_ground(seed, count, reach):
     rng = np.random.default_rng(seed)
     xyz, ground = make_cloud(rng, 50), make_cloud(rng, count)
     far = np.float32([reach, -reach, 0])
-    for found, heights in zip(height_above_ground(xyz + far, ground + far),
-                              plain_heights(xyz + far, ground + far), strict=True):
+    for found, heights in zip(
+        height_above_ground(xyz + far, ground + far), plain_heights(xyz + far, ground + far), strict=True
+    ):
         assert np.abs(heights - found).min() <= 1e-9
 
 
@@ -61,7 +62,8 @@ def test_obstacles_are_non_ground_points_within_the_band():
         np.testing.assert_array_equal(found, expected)
         order = rng.permutation(len(xyz))
         np.testing.assert_array_equal(
-            find_obstacles(xyz[order], ground[order], ObstacleParams(low, high)), found[order])
+            find_obstacles(xyz[order], ground[order], ObstacleParams(low, high)), found[order]
+        )
 
 
 def test_a_tilted_sensor_finds_the_same_obstacles():

@@ -8,12 +8,7 @@ from ground_samples import f1, street
 from samples import DATA, needs_data
 
 from lidar_perception.data.open import open_recording
-from lidar_perception.ground.params import (
-    GROUND_METHODS,
-    GroundParams,
-    PatchworkParams,
-    SensorPoseParams,
-)
+from lidar_perception.ground.params import GROUND_METHODS, GroundParams, PatchworkParams, SensorPoseParams
 from lidar_perception.ground.patchwork import segment_by_patchwork
 from lidar_perception.ground.segment import METHODS, level_points, segment_ground
 from lidar_perception.types import PointCloud
@@ -22,8 +17,7 @@ each_method = pytest.mark.parametrize("method", GROUND_METHODS)
 
 
 def segment(xyz, method, intensity=None, **params):
-    return segment_ground(PointCloud(np.asarray(xyz, np.float32), intensity),
-                          GroundParams(method=method, **params))
+    return segment_ground(PointCloud(np.asarray(xyz, np.float32), intensity), GroundParams(method=method, **params))
 
 
 def test_every_method_of_the_parameters_exists():
@@ -37,11 +31,18 @@ def test_a_flat_road_is_ground_and_objects_are_not(method):
     assert f1(segment(xyz, method)[beyond], road[beyond]) > 0.97
 
 
-BAD = {"empty": np.zeros((0, 3)), "one point": [[5, 0, -1.7]], "origin": np.zeros((50, 3)),
-       "all NaN": np.full((50, 3), np.nan), "all infinite": np.full((50, 3), -np.inf),
-       "all equal": np.full((50, 3), 4.0), "line": np.linspace(1, 9, 50)[:, None] * [1, 1, 0],
-       "100 km": [[1e5, 0, 0], [0, 1e5, 1e5], [5, 5, -1.7]], "huge": np.full((5, 3), 3e38),
-       "one below": np.concatenate([np.full((99, 3), 4.0), [[5, 5, -1e4]]])}
+BAD = {
+    "empty": np.zeros((0, 3)),
+    "one point": [[5, 0, -1.7]],
+    "origin": np.zeros((50, 3)),
+    "all NaN": np.full((50, 3), np.nan),
+    "all infinite": np.full((50, 3), -np.inf),
+    "all equal": np.full((50, 3), 4.0),
+    "line": np.linspace(1, 9, 50)[:, None] * [1, 1, 0],
+    "100 km": [[1e5, 0, 0], [0, 1e5, 1e5], [5, 5, -1.7]],
+    "huge": np.full((5, 3), 3e38),
+    "one below": np.concatenate([np.full((99, 3), 4.0), [[5, 5, -1e4]]]),
+}
 
 
 @each_method
@@ -84,8 +85,7 @@ def test_every_method_uses_the_height_of_the_sensor(method, height):
 
 
 @each_method
-@pytest.mark.parametrize("roll, pitch", [(0.05, 0.0), (0.0, 0.2), (-0.1, 0.3), (np.pi, 0.0),
-                                         (np.pi, -0.1)])
+@pytest.mark.parametrize("roll, pitch", [(0.05, 0.0), (0.0, 0.2), (-0.1, 0.3), (np.pi, 0.0), (np.pi, -0.1)])
 def test_a_tilted_sensor_finds_the_ground_of_a_level_one(method, roll, pitch):
     xyz, _ = street(4)
     pose = SensorPoseParams(roll=float(np.float32(roll)), pitch=pitch)
@@ -125,7 +125,7 @@ def hilly_scene(seed):
     x, y = distance * np.cos(angle), distance * np.sin(angle)
     z = -1.73 + 0.6 * np.sin(x / 15) + 0.02 * y + rng.normal(0, 0.02, len(x))
     plate = np.floor(x / 6) + 7 * np.floor(y / 6)
-    z += np.where(plate % 5 == 0, 2.2, 0.0)              # roofs of cars, hedges
+    z += np.where(plate % 5 == 0, 2.2, 0.0)  # roofs of cars, hedges
     wall = plate % 7 == 3
     z[wall] = rng.uniform(-1.7, 2.0, wall.sum())
     x[wall] = 6 * np.floor(x[wall] / 6) + rng.normal(0, 0.02, wall.sum())
@@ -151,9 +151,11 @@ def test_patchwork_equals_the_library_on_a_real_scan():
     off = GroundParams(method="patchwork", patchwork=PatchworkParams(remove_reflections=False))
     with_rnr, without = (run_library(frame.xyz, frame.intensity, rnr=r) for r in (True, False))
     assert (with_rnr != without).any()
-    for found, expected in ((segment_ground(frame, params), with_rnr),
-                            (segment_ground(PointCloud(frame.xyz), params), without),
-                            (segment_ground(frame, off), without)):
+    for found, expected in (
+        (segment_ground(frame, params), with_rnr),
+        (segment_ground(PointCloud(frame.xyz), params), without),
+        (segment_ground(frame, off), without),
+    ):
         assert (found != expected).sum() <= 20  # of 124,668; points within rounding of a limit
 
 

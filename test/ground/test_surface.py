@@ -31,8 +31,9 @@ def test_surface_moves_with_the_points(seed, z, cells):
     shift = np.array([round(cells) * CELL_M, -round(cells) * CELL_M, z])
     places = rng.uniform(-50, 50, (20, 2))
     surface = fit_ground_surface(ground, 0.0)
-    np.testing.assert_allclose(fit_ground_surface(ground + shift, 0.0).at(places + shift[:2]),
-                               surface.at(places) + z, atol=1e-6)
+    np.testing.assert_allclose(
+        fit_ground_surface(ground + shift, 0.0).at(places + shift[:2]), surface.at(places) + z, atol=1e-6
+    )
     heights = surface.at(places)
     assert heights.min() >= ground[:, 2].min() and heights.max() <= ground[:, 2].max()
     far = surface.at(places + [10_000, 0])

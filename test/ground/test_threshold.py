@@ -64,7 +64,7 @@ def test_ground_is_every_point_within_inlier_distance(seed, a, b):
     params = ThresholdParams(max_height=0.73, inlier_distance=0.07)
     plane = find_plane(xyz, params, sensor_height=1.73)
     x, y, z = xyz.T.astype(np.float64)
-    expected = (abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= 0.07)
+    expected = abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= 0.07
     np.testing.assert_array_equal(segment_by_threshold(xyz, params), expected)
     assert expected.sum() > 500
 
@@ -78,8 +78,9 @@ def test_the_plane_is_a_fixed_point_of_fitting(seed, a, b, offset):
     refitted = fit_plane(xyz[segment_by_threshold(xyz, params)])
     np.testing.assert_allclose(refitted[:2], plane[:2], rtol=0, atol=1e-9)
     origin = np.array([[offset, 0.0, 0.0]])
-    np.testing.assert_allclose(height_above_plane(origin, refitted),
-                               height_above_plane(origin, plane), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        height_above_plane(origin, refitted), height_above_plane(origin, plane), rtol=0, atol=1e-9
+    )
 
 
 @given(st.integers(0, 2**31), slopes, slopes)
@@ -87,26 +88,30 @@ def test_permuting_points_permutes_the_ground(seed, a, b):
     xyz = sloped_scene(seed, [a, b, -1.7])
     order = np.random.default_rng(seed).permutation(len(xyz))
     params = ThresholdParams(max_height=100.0)
-    np.testing.assert_array_equal(segment_by_threshold(xyz[order], params),
-                                  segment_by_threshold(xyz, params)[order])
+    np.testing.assert_array_equal(segment_by_threshold(xyz[order], params), segment_by_threshold(xyz, params)[order])
 
 
 @given(st.integers(0, 2**31), slopes, slopes)
 def test_fit_plane_equals_numpy_least_squares(seed, a, b):
     xyz = sloped_scene(seed, [a, b, -1.7], count=50).astype(np.float64)
     design = np.column_stack([xyz[:, :2], np.ones(len(xyz))])
-    np.testing.assert_allclose(fit_plane(xyz), np.linalg.lstsq(design, xyz[:, 2], rcond=None)[0],
-                               rtol=0, atol=1e-9)
+    np.testing.assert_allclose(fit_plane(xyz), np.linalg.lstsq(design, xyz[:, 2], rcond=None)[0], rtol=0, atol=1e-9)
 
 
 @needs_data
 @pytest.mark.parametrize("scan", [0, 5, 13, 20])
 def test_plane_of_a_real_cloud_equals_sklearn_ransac(scan):
-    xyz, = real_scans(scan)
+    (xyz,) = real_scans(scan)
     params = ThresholdParams()
     low = xyz[xyz[:, 2] < -1.3]
-    model = RANSACRegressor(LinearRegression(), residual_threshold=params.inlier_distance,
-                            max_trials=2000, stop_probability=1.0, random_state=1, min_samples=3)
+    model = RANSACRegressor(
+        LinearRegression(),
+        residual_threshold=params.inlier_distance,
+        max_trials=2000,
+        stop_probability=1.0,
+        random_state=1,
+        min_samples=3,
+    )
     sample = np.random.default_rng(0).permutation(len(low))[:5000]  # 2000 trials on all are slow
     model.fit(low[sample, :2].astype(float), low[sample, 2].astype(float))
     plane = np.array([*model.estimator_.coef_, model.estimator_.intercept_])
@@ -128,35 +133,49 @@ def test_plane_of_a_real_cloud_ignores_order_and_seed():
         plane = find_plane(xyz, params)
         np.testing.assert_allclose(fit_plane(xyz[ground]), plane, rtol=0, atol=1e-9)
         order = np.random.default_rng(0).permutation(len(xyz))
-        for other in (segment_by_threshold(xyz, ThresholdParams(seed=5)),
-                      segment_by_threshold(xyz[order], params)[np.argsort(order)]):
+        for other in (
+            segment_by_threshold(xyz, ThresholdParams(seed=5)),
+            segment_by_threshold(xyz[order], params)[np.argsort(order)],
+        ):
             assert (other != ground).mean() < 0.01
             assert max_distance(fit_plane(xyz[other]), plane) < 0.05
 
 
 def wall(count=400):
     rng = np.random.default_rng(0)
-    return np.column_stack([np.full(count, 5.0), rng.uniform(-8, 8, count),
-                            rng.uniform(-4, -1.4, count)])
+    return np.column_stack([np.full(count, 5.0), rng.uniform(-8, 8, count), rng.uniform(-4, -1.4, count)])
 
 
-upside_down = sloped_scene(0, np.array([0.01, 0, -1.73]),
-                           max_outlier=2.5) * np.float32([1, -1, -1])
+upside_down = sloped_scene(0, np.array([0.01, 0, -1.73]), max_outlier=2.5) * np.float32([1, -1, -1])
 
 
-@pytest.mark.parametrize("xyz", [
-    np.zeros((0, 3)),
-    np.full((1, 3), -2.0),
-    np.array([[1, 0, -2.0], [0, 1, -2]]),
-    np.full((100, 3), -2.0),
-    np.linspace(1, 9, 65)[:, None] * [1, 0, 0] - [0, 0, 2],
-    np.linspace(1, 9, 65)[:, None] * [1, 2, 0] - [0, 0, 2],
-    np.linspace(1, 9, 65)[:, None] * [0, 0, -1] - [4, 4, 2],
-    wall(),
-    sloped_scene(0, [0, 0, 0.5]),
-    upside_down,
-], ids=["empty", "one point", "two points", "all equal", "line", "slanted line", "pole", "wall",
-        "all above max_height", "upside-down sensor"])
+@pytest.mark.parametrize(
+    "xyz",
+    [
+        np.zeros((0, 3)),
+        np.full((1, 3), -2.0),
+        np.array([[1, 0, -2.0], [0, 1, -2]]),
+        np.full((100, 3), -2.0),
+        np.linspace(1, 9, 65)[:, None] * [1, 0, 0] - [0, 0, 2],
+        np.linspace(1, 9, 65)[:, None] * [1, 2, 0] - [0, 0, 2],
+        np.linspace(1, 9, 65)[:, None] * [0, 0, -1] - [4, 4, 2],
+        wall(),
+        sloped_scene(0, [0, 0, 0.5]),
+        upside_down,
+    ],
+    ids=[
+        "empty",
+        "one point",
+        "two points",
+        "all equal",
+        "line",
+        "slanted line",
+        "pole",
+        "wall",
+        "all above max_height",
+        "upside-down sensor",
+    ],
+)
 def test_clouds_without_ground_give_an_empty_mask(xyz):
     ground = segment_by_threshold(xyz.astype(np.float32))
     assert ground.shape == (len(xyz),) and ground.dtype == bool and not ground.any()
@@ -164,8 +183,7 @@ def test_clouds_without_ground_give_an_empty_mask(xyz):
 
 def test_three_points_are_enough_for_a_plane():
     xyz = np.float32([[0, 0, -2], [4, 0, -2.5], [0, 4, -1.75]])
-    np.testing.assert_allclose(fit_plane_by_ransac(xyz, ThresholdParams()), [-0.125, 0.0625, -2],
-                               atol=1e-9)
+    np.testing.assert_allclose(fit_plane_by_ransac(xyz, ThresholdParams()), [-0.125, 0.0625, -2], atol=1e-9)
     assert segment_by_threshold(xyz).all()
 
 
@@ -194,8 +212,10 @@ def test_ground_continues_where_the_road_rises_above_max_height():
 def test_max_height_counts_from_the_ground_under_the_sensor():
     """A second, larger plane 0.5 m higher counts only if max_height reaches it."""
     rng = np.random.default_rng(0)
-    floor, table = (np.column_stack([rng.uniform(-9, 9, (n, 2)), np.full(n, z)]).astype(np.float32)
-                    for n, z in ((300, -0.7), (900, -0.2)))
+    floor, table = (
+        np.column_stack([rng.uniform(-9, 9, (n, 2)), np.full(n, z)]).astype(np.float32)
+        for n, z in ((300, -0.7), (900, -0.2))
+    )
     xyz = np.concatenate([floor, table])
     for height, max_height, expected in ((0.7, 0.43, -0.7), (0.7, 0.6, -0.2), (0.2, 0.1, -0.2)):
         plane = find_plane(xyz, ThresholdParams(max_height=max_height), sensor_height=height)
@@ -213,5 +233,6 @@ def test_the_result_is_repeatable_and_the_input_not_modified():
 @given(st.integers(0, 2**31), slopes, slopes)
 def test_height_threshold_removes_all_low_points(seed, a, b):
     xyz = sloped_scene(seed, [a, b, -1.7])
-    np.testing.assert_array_equal(segment_by_threshold(xyz, ThresholdParams(separate="height")),
-                                  xyz[:, 2] < np.float32(-1.3))
+    np.testing.assert_array_equal(
+        segment_by_threshold(xyz, ThresholdParams(separate="height")), xyz[:, 2] < np.float32(-1.3)
+    )

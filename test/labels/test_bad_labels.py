@@ -19,29 +19,65 @@ from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
 from lidar_perception.labels.exchange import FORMATS, export_labels, import_labels, recognise_format
 from lidar_perception.types import InputError
 
-CLOUD = {"folder": "", "filename": "", "path": "", "objects": [
-    {"name": "Car", "centroid": {"x": 1, "y": 2, "z": 3},
-     "dimensions": {"length": 4, "width": 2, "height": 1}, "rotations": {"x": 0, "y": 0, "z": 5}}]}
-PSR = [{"psr": {part: {"x": 1, "y": 1, "z": 1} for part in ("position", "scale", "rotation")},
-        "obj_type": "Car", "obj_id": "1"}]
-CUBOID = {"openlabel": {"frames": {"5": {"objects": {"1": {"object_data": {"cuboid": [
-    {"name": "b", "val": [1, 2, 3, 0, 0, 0, 1, 4, 2, 1]}]}}}}}, "objects": {"1": {"type": "Car"}}}}
-RESULT = {"results": {"0000/000005": [{
-    "sample_token": "0000/000005", "translation": [1, 2, 3], "size": [1, 2, 1],
-    "rotation": [1, 0, 0, 0], "velocity": [0, 0], "detection_name": "car", "detection_score": 1.0,
-    "attribute_name": ""}]}}
-VALID = {"labelcloud": ("000005.json", CLOUD), "sustech": ("000005.json", PSR),
-         "openlabel": ("0000.json", CUBOID), "nuscenes-detection": ("r.json", RESULT),
-         "kitti": ("000005.txt", "Car 0 0 0 0 0 9 9 1.5 1.6 3.9 0 1.7 15 0\n"),
-         "kitti-tracking": ("0000.txt", "5 1 Car 0 0 0 0 0 9 9 1.5 1.6 3.9 0 1.7 15 0\n")}
+CLOUD = {
+    "folder": "",
+    "filename": "",
+    "path": "",
+    "objects": [
+        {
+            "name": "Car",
+            "centroid": {"x": 1, "y": 2, "z": 3},
+            "dimensions": {"length": 4, "width": 2, "height": 1},
+            "rotations": {"x": 0, "y": 0, "z": 5},
+        }
+    ],
+}
+PSR = [
+    {
+        "psr": {part: {"x": 1, "y": 1, "z": 1} for part in ("position", "scale", "rotation")},
+        "obj_type": "Car",
+        "obj_id": "1",
+    }
+]
+CUBOID = {
+    "openlabel": {
+        "frames": {
+            "5": {"objects": {"1": {"object_data": {"cuboid": [{"name": "b", "val": [1, 2, 3, 0, 0, 0, 1, 4, 2, 1]}]}}}}
+        },
+        "objects": {"1": {"type": "Car"}},
+    }
+}
+RESULT = {
+    "results": {
+        "0000/000005": [
+            {
+                "sample_token": "0000/000005",
+                "translation": [1, 2, 3],
+                "size": [1, 2, 1],
+                "rotation": [1, 0, 0, 0],
+                "velocity": [0, 0],
+                "detection_name": "car",
+                "detection_score": 1.0,
+                "attribute_name": "",
+            }
+        ]
+    }
+}
+VALID = {
+    "labelcloud": ("000005.json", CLOUD),
+    "sustech": ("000005.json", PSR),
+    "openlabel": ("0000.json", CUBOID),
+    "nuscenes-detection": ("r.json", RESULT),
+    "kitti": ("000005.txt", "Car 0 0 0 0 0 9 9 1.5 1.6 3.9 0 1.7 15 0\n"),
+    "kitti-tracking": ("0000.txt", "5 1 Car 0 0 0 0 0 9 9 1.5 1.6 3.9 0 1.7 15 0\n"),
+}
 INVALID = [  # format, text that is replaced, replacement, words of the error
     ("labelcloud", '"x": 1', '"x": NaN', "box 1 of 1: its numbers must be finite"),
     ("labelcloud", '"x": 1', '"x": 1e308', "within 100000 m"),
     ("labelcloud", '"name"', '"track_id": 10000000000000000000, "name"', "not an integer"),
     ("labelcloud", '"length": 4', '"length": 0', "its sides above 0"),
     ("labelcloud", '"centroid"', '"centre"', "has no 'centroid'"),
-    ("labelcloud", '"name": "Car",', '"name": "Car"',
-     ":1 is not valid JSON: Expecting ',' delimiter"),
+    ("labelcloud", '"name": "Car",', '"name": "Car"', ":1 is not valid JSON: Expecting ',' delimiter"),
     ("labelcloud", '"objects"', '"boxes"', "has no 'objects'"),
     ("sustech", '"x": 1', '"x": 1e999', "must be finite"),
     ("sustech", '"psr"', '"p"', "has no 'psr'"),
@@ -56,8 +92,7 @@ INVALID = [  # format, text that is replaced, replacement, words of the error
     ("nuscenes-detection", "0000/000005", "other", "has none of the drive's samples"),
     ("kitti", "3.9", "nan", "000005.txt:1 is not a KITTI label"),
     ("kitti", "Car 0", "Car 1e308", "000005.txt:1 is not a KITTI label"),
-    ("kitti-tracking", "5 1 Car", "51 1 Car",
-     "0000.txt:1 belongs to frame 51, but the drive has 5"),
+    ("kitti-tracking", "5 1 Car", "51 1 Car", "0000.txt:1 belongs to frame 51, but the drive has 5"),
 ]
 
 
@@ -89,9 +124,22 @@ def test_kitti_folder_is_recognised_by_its_folders(tmp_path):
         recognise_format(tmp_path / "set/training/calib")
 
 
-@pytest.mark.parametrize("content", [
-    5, None, [], [5], {"objs": 5}, {"objs": {}}, {"objects": 5}, {"objects": [5]}, {"results": 5},
-    {"results": {"a": 5}}, {"results": {"a": [5]}}])
+@pytest.mark.parametrize(
+    "content",
+    [
+        5,
+        None,
+        [],
+        [5],
+        {"objs": 5},
+        {"objs": {}},
+        {"objects": 5},
+        {"objects": [5]},
+        {"results": 5},
+        {"results": {"a": 5}},
+        {"results": {"a": [5]}},
+    ],
+)
 def test_other_json_files_are_not_recognised(content, tmp_path):
     (tmp_path / "0.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="no labels are recognised"):
@@ -107,8 +155,7 @@ def test_invalid_labels_are_reported_with_their_file(format, old, new, words, tm
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("format", ["labelcloud", "sustech", "kitti", "kitti-tracking",
-                                    "openlabel"])
+@pytest.mark.parametrize("format", ["labelcloud", "sustech", "kitti", "kitti-tracking", "openlabel"])
 def test_unknown_or_missing_label_files_are_reported(format, tmp_path):
     path = write_labels(tmp_path / "in", format)
     suffix = VALID[format][0][-5:].lstrip("0123456789")
@@ -145,9 +192,14 @@ def test_invalid_numbers_are_rejected():
 def test_fields_of_other_tools_are_kept_or_rejected(key, format, tmp_path):
     frames = drive("one")
     for value in None, "x", {}, [0] * 4, [10**400] * 4, [1, 0, 0, 0]:
-        labels = DriveLabels([FrameLabels.of(frame.name, frame.stamp_ns, [[5, 1, 0, 4, 2, 1, 0.1]],
-                                             ["Car"], [3], [0.5], [{key: value}])
-                              for frame in frames])
+        labels = DriveLabels(
+            [
+                FrameLabels.of(
+                    frame.name, frame.stamp_ns, [[5, 1, 0, 4, 2, 1, 0.1]], ["Car"], [3], [0.5], [{key: value}]
+                )
+                for frame in frames
+            ]
+        )
         try:
             export_labels(labels, format, tmp_path / "out", frames, force=True)
             assert import_labels(tmp_path / "out", format, frames).box_count == len(frames)
@@ -162,7 +214,7 @@ def test_huge_integers_survive_every_format(tmp_path):
     labels = import_labels(path, "labelcloud", frames)
     for format in set(FORMATS) - {"kitti", "kitti-tracking"}:  # they have no extra fields
         export_labels(labels, format, tmp_path / format, frames)
-        back, = import_labels(tmp_path / format, format, frames).frames[0].extra
+        (back,) = import_labels(tmp_path / format, format, frames).frames[0].extra
         assert back["n"] == 10**400
 
 
@@ -233,30 +285,37 @@ def test_missing_calibration_or_pose_is_reported(tmp_path):
     assert not (tmp_path / "k").exists() and not (tmp_path / "n").exists()
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["{bag}", "--to", "kitti", "--out", "{bag}"], "exists already"),
-    (["{bag}", "--to", "nuscenes-tracking", "--out", "{out}"], "has no pose"),
-    (["{bag}", "--to", "kitti", "--detections", "/none", "--out", "{out}"],
-     "has no topic /none; it has /camera/camera_info"),
-    (["{bag}", "--to", "openlabel", "--detections", "/points", "--out", "{out}"],
-     "/points is sensor_msgs/msg/PointCloud2, but labels are"),
-    (["{bag}", "--points", "/lidar", "--to", "nuscenes", "--out", "{out}"], "has no topic /lidar"),
-    (["{bag}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
-     "/ground_truth/detections has labels at"),
-    (["{bag}", "--data", "{kitti}", "--detections", "/none", "--to", "openlabel", "--out", "{out}"],
-     "has no topic /none"),
-    (["{empty}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
-     "no labels are recognised in"),
-    (["{kitti}/none", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
-     "does not exist"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["{bag}", "--to", "kitti", "--out", "{bag}"], "exists already"),
+        (["{bag}", "--to", "nuscenes-tracking", "--out", "{out}"], "has no pose"),
+        (
+            ["{bag}", "--to", "kitti", "--detections", "/none", "--out", "{out}"],
+            "has no topic /none; it has /camera/camera_info",
+        ),
+        (
+            ["{bag}", "--to", "openlabel", "--detections", "/points", "--out", "{out}"],
+            "/points is sensor_msgs/msg/PointCloud2, but labels are",
+        ),
+        (["{bag}", "--points", "/lidar", "--to", "nuscenes", "--out", "{out}"], "has no topic /lidar"),
+        (
+            ["{bag}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
+            "/ground_truth/detections has labels at",
+        ),
+        (
+            ["{bag}", "--data", "{kitti}", "--detections", "/none", "--to", "openlabel", "--out", "{out}"],
+            "has no topic /none",
+        ),
+        (["{empty}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"], "no labels are recognised in"),
+        (["{kitti}/none", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"], "does not exist"),
+    ],
+)
 def test_convert_reports_errors_in_one_line(arguments, words, tmp_path, monkeypatch, capsys):
     root = object_folder(tmp_path / "kitti")
-    write_bag(tmp_path / "bag", [replace(frame, pose=lambda: None, truth=walker_truth)
-                                 for frame in drive("one")])
+    write_bag(tmp_path / "bag", [replace(frame, pose=lambda: None, truth=walker_truth) for frame in drive("one")])
     (tmp_path / "empty").mkdir()
-    places = {"bag": tmp_path / "bag", "out": tmp_path / "out", "kitti": root,
-              "empty": tmp_path / "empty"}
+    places = {"bag": tmp_path / "bag", "out": tmp_path / "out", "kitti": root, "empty": tmp_path / "empty"}
     assert exit_of(monkeypatch, "convert", *(a.format(**places) for a in arguments)) == 2
     assert words in error_line(capsys)
     assert not (tmp_path / "out").exists()

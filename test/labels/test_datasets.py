@@ -38,8 +38,7 @@ from msg_utils.stamps import make_header
 MARKERS = "visualization_msgs/msg/MarkerArray"
 SMALL = make_generic_sensor(32, -25.0, 5.0, 0.4, 10.0)
 LAYOUTS = ("kitti", "kitti-tracking", "semantickitti")
-REAL = {"kitti_object": "kitti", "kitti_tracking": "kitti-tracking",
-        "semantickitti": "semantickitti"}
+REAL = {"kitti_object": "kitti", "kitti_tracking": "kitti-tracking", "semantickitti": "semantickitti"}
 
 
 def same_frames(recording, others, boxes=1e-5, points=0.0):
@@ -112,17 +111,21 @@ def test_simulated_drive_survives_conversion_to_nuscenes(simulated, tmp_path):
         assert other.sensor_height == frame.sensor_height
         truth, labels = frame.truth(), read_frame_labels(other)
         np.testing.assert_allclose(labels.boxes, truth.boxes, atol=1e-6)
-        for name, found, extra, track in zip(truth.labels, labels.class_names, truth.extras,
-                                             labels.track_ids.tolist()):
+        for name, found, extra, track in zip(truth.labels, labels.class_names, truth.extras, labels.track_ids.tolist()):
             assert found == {"Van": "Car", "Person_sitting": "Pedestrian"}.get(name, name)
             assert tracks.setdefault(extra["track_id"], track) == track
     assert len(set(tracks.values())) == len(tracks)
 
 
 def frames_at(seconds, **more):
-    return [Frame.of(str(i), PointCloud.of(np.full((3, 3), 5.0 + i), None,
-                                           1_700_000_000_000_000_000 + round(s * 1e9), "top"),
-                     **more) for i, s in enumerate(seconds)]
+    return [
+        Frame.of(
+            str(i),
+            PointCloud.of(np.full((3, 3), 5.0 + i), None, 1_700_000_000_000_000_000 + round(s * 1e9), "top"),
+            **more,
+        )
+        for i, s in enumerate(seconds)
+    ]
 
 
 @pytest.mark.parametrize("kind", ["tables", "results"])
@@ -155,12 +158,18 @@ def test_missing_camera_is_assumed_and_numbers_follow_time(tmp_path):
     summary = write_dataset("kitti-tracking", frames, tmp_path / "k", labels)
     assert (summary.frames, summary.drives) == (7, 2)
     assert {remark.split(":")[0]: n for remark, n in summary.remarks.items()} == {
-        "assumed": 7, "left out": 7, "without a track id": 6}
+        "assumed": 7,
+        "left out": 7,
+        "without a track id": 6,
+    }
     back = open_recording(tmp_path / "k")
     assert [frame.name for frame in back] == [
-        *(f"0000/{i:06}" for i in (0, 1, 3, 4)), *(f"0001/{i:06}" for i in range(3))]
-    found = DriveLabels([replace(read_frame_labels(frame), name=a.name, stamp_ns=a.stamp_ns)
-                         for a, frame in zip(frames, back)])
+        *(f"0000/{i:06}" for i in (0, 1, 3, 4)),
+        *(f"0001/{i:06}" for i in range(3)),
+    ]
+    found = DriveLabels(
+        [replace(read_frame_labels(frame), name=a.name, stamp_ns=a.stamp_ns) for a, frame in zip(frames, back)]
+    )
     same(labels, found, 2e-6)
 
 
@@ -177,18 +186,14 @@ def test_sensor_height_is_kept(tmp_path, layout, height):
 
 def test_point_labels_are_written_where_the_layout_has_them(tmp_path, monkeypatch, capsys):
     points = PointTruth(np.array([40, 252, 0], np.uint16), np.array([0, 7, 65535], np.uint16))
-    write_bag(tmp_path / "labelled", frames_at([0, 0.1], point_truth=lambda: points,
-                                               calibration=CALIBRATION))
+    write_bag(tmp_path / "labelled", frames_at([0, 0.1], point_truth=lambda: points, calibration=CALIBRATION))
     write_bag(tmp_path / "bare", frames_at([0, 0.1]))
-    assert exit_of(monkeypatch, "convert", tmp_path / "labelled", "--to", "semantickitti", "--out",
-                   tmp_path / "s") == 0
+    assert exit_of(monkeypatch, "convert", tmp_path / "labelled", "--to", "semantickitti", "--out", tmp_path / "s") == 0
     for frame in open_recording(tmp_path / "s"):
         assert frame.point_truth().instances.tolist() == [0, 7, 65535]
-    assert exit_of(monkeypatch, "convert", tmp_path / "labelled", "--to", "kitti", "--out",
-                   tmp_path / "k") == 0
+    assert exit_of(monkeypatch, "convert", tmp_path / "labelled", "--to", "kitti", "--out", tmp_path / "k") == 0
     assert "left out: point labels" in capsys.readouterr().out
-    assert exit_of(monkeypatch, "convert", tmp_path / "bare", "--to", "semantickitti", "--out",
-                   tmp_path / "none") == 2
+    assert exit_of(monkeypatch, "convert", tmp_path / "bare", "--to", "semantickitti", "--out", tmp_path / "none") == 2
     assert "has no point labels" in error_line(capsys)
     assert not (tmp_path / "none").exists() and not list(tmp_path.glob(".*"))
 
@@ -204,9 +209,18 @@ def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
             found = Detections.of(rng.uniform(1, 9, (i, 7)) / [1, 1, 1, 1, 1, 1, 3], 0, 0.5)
             header = make_header(frame.stamp_ns, "velodyne", bag_message)
             bag.write("/found", frame.stamp_ns, make_detection_markers(found, header, bag_message))
-            bag.write("/tracks", frame.stamp_ns, to_detection_array(
-                found.boxes, ["tree"] * i, found.scores.tolist(), header=header, make=bag_message,
-                ids=[100 + k for k in range(i)]))
+            bag.write(
+                "/tracks",
+                frame.stamp_ns,
+                to_detection_array(
+                    found.boxes,
+                    ["tree"] * i,
+                    found.scores.tolist(),
+                    header=header,
+                    make=bag_message,
+                    ids=[100 + k for k in range(i)],
+                ),
+            )
             expected.append(found.boxes.astype(float))
     found = bag_format.read(tmp_path / "bag", frames, "/found")
     tracks = bag_format.read(tmp_path / "bag", frames, "/tracks")
@@ -225,10 +239,10 @@ def test_boxes_are_transformed_to_the_frame_of_the_clouds(parts, tmp_path):
     boxes = np.array([[10.0, 2, 0.5, 4, 2, 1.5, 0.3]])
     rows = []
     for stamp in stamps():
-        marked = to_marker_array(boxes, ["Car"], ids=[1], make=bag_message,
-                                 header=make_header(stamp, "odom", bag_message))
-        rows += [(topic, MARKERS, stamp, marked) for topic in ("/n/output/detections",
-                                                               "/n/output/tracks")]
+        marked = to_marker_array(
+            boxes, ["Car"], ids=[1], make=bag_message, header=make_header(stamp, "odom", bag_message)
+        )
+        rows += [(topic, MARKERS, stamp, marked) for topic in ("/n/output/detections", "/n/output/tracks")]
     recording = recorded(tmp_path / "bag", *map(list, parts), rows)
     frames, poses = recording.frames[:], recording.frames.poses
     if not parts:
@@ -252,8 +266,7 @@ def test_scans_with_equal_stamps_are_kept(tmp_path):
     skipped = []
     assert write_bag(tmp_path / "plain", twice) == 3
     truth = GroundTruth.of(np.ones((1, 7)), [CAR])
-    assert write_bag(tmp_path / "bag", [replace(f, truth=lambda: truth) for f in twice],
-                     skipped=skipped) == 2
+    assert write_bag(tmp_path / "bag", [replace(f, truth=lambda: truth) for f in twice], skipped=skipped) == 2
     assert "another labelled scan has the same stamp" in skipped[0]
     unset = [replace(f, stamp_ns=0) for f in frames_at([0, 1])]
     with BagWriter(tmp_path / "unset") as bag:  # some drivers set no stamp
@@ -270,24 +283,29 @@ def test_detections_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch,
     bag_format.write(labels, export, recording)
     for topic in ("/ground_truth/detections", "/ground_truth/detections_3d"):
         out = tmp_path / topic.replace("/", "_")
-        assert exit_of(monkeypatch, "convert", export, "--to", "kitti-tracking", "--detections",
-                       topic, "--out", out) == 0
+        assert (
+            exit_of(monkeypatch, "convert", export, "--to", "kitti-tracking", "--detections", topic, "--out", out) == 0
+        )
         back = open_recording(out)
-        found = DriveLabels([replace(read_frame_labels(f), name=a.name, stamp_ns=a.stamp_ns)
-                             for a, f in zip(recording, back)])
+        found = DriveLabels(
+            [replace(read_frame_labels(f), name=a.name, stamp_ns=a.stamp_ns) for a, f in zip(recording, back)]
+        )
         expected = labels
         if topic.endswith("3d"):  # each box has a score
             expected = DriveLabels([replace(f, scores=np.ones(len(f))) for f in labels.frames])
         same(expected, found, 2e-6)
-    assert exit_of(monkeypatch, "convert", export, "--detections", "/odom", "--out",
-                   tmp_path / "no", "--to", "nuscenes") == 2
+    assert (
+        exit_of(monkeypatch, "convert", export, "--detections", "/odom", "--out", tmp_path / "no", "--to", "nuscenes")
+        == 2
+    )
     capsys.readouterr()
 
 
 def test_poses_are_relative_to_the_first_scan(tmp_path):
-    frames = [replace(f, point_truth=lambda: PointTruth(np.zeros(50, np.uint16),
-                                                        np.zeros(50, np.uint16)))
-              for f in drive("one", frames=3)]
+    frames = [
+        replace(f, point_truth=lambda: PointTruth(np.zeros(50, np.uint16), np.zeros(50, np.uint16)))
+        for f in drive("one", frames=3)
+    ]
     write_bag(tmp_path / "bag", frames)
     write_dataset("semantickitti", open_recording(tmp_path / "bag"), tmp_path / "s")
     first = np.linalg.inv(pose(5))

@@ -15,8 +15,7 @@ from lidar_perception.labels.exchange import FORMATS, export_labels, import_labe
 from lidar_perception.labels.formats.kitti_lines import compute_occlusion_levels
 
 VERTICES = "labelcloud-vertices"  # sides are computed from rounded corners
-REAL = {"kitti-tracking": "kitti_tracking/training/label_02",
-        "kitti": "kitti_object/training/label_2"}
+REAL = {"kitti-tracking": "kitti_tracking/training/label_02", "kitti": "kitti_object/training/label_2"}
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -49,8 +48,7 @@ def test_second_export_changes_nothing(format, name, tmp_path):
 def test_kitti_label_files_survive_every_format(format, tmp_path):
     """Other formats get the first frames. Some have no track ids, or no DontCare regions."""
     folder = DATA / REAL[format]
-    frames = [replace(frame, pose=np.eye(4).copy)
-              for frame in open_recording(folder.parent.parent)]
+    frames = [replace(frame, pose=np.eye(4).copy) for frame in open_recording(folder.parent.parent)]
     labels = import_labels(folder, format, frames)
     export_labels(labels, format, tmp_path / "own", frames)
     assert read_lines(tmp_path / "own") == read_lines(folder)
@@ -73,9 +71,11 @@ def read_lines(folder):
 
 def test_only_moved_boxes_get_new_columns(tmp_path):
     """Two cars, one behind the other; the columns of the moved one are computed."""
-    text = ("Car 0.13 3 -1.57 600.00 150.00 700.00 250.00 1.50 1.60 3.90 0.50 1.70 15.00 -1.57\n"
-            "Car 0.27 1 -1.57 600.00 150.00 700.00 250.00 1.50 1.60 3.90 0.50 1.70 30.00 -1.57\n"
-            "DontCare -1 -1 -10 10.00 20.00 30.00 40.00 -1 -1 -1 -1000 -1000 -1000 -10\n")
+    text = (
+        "Car 0.13 3 -1.57 600.00 150.00 700.00 250.00 1.50 1.60 3.90 0.50 1.70 15.00 -1.57\n"
+        "Car 0.27 1 -1.57 600.00 150.00 700.00 250.00 1.50 1.60 3.90 0.50 1.70 30.00 -1.57\n"
+        "DontCare -1 -1 -10 10.00 20.00 30.00 40.00 -1 -1 -1 -1000 -1000 -1000 -10\n"
+    )
     frames = drive("one", frames=1)
     folder = tmp_path / "label_2"
     folder.mkdir()
@@ -90,8 +90,7 @@ def test_only_moved_boxes_get_new_columns(tmp_path):
     name, truncated, occluded, alpha, left, top, right, bottom, *rest = new[1].split()
     assert (name, float(truncated), occluded) == ("Car", 0.0, "1")  # occlusion is kept
     assert rest[:3] == ["1.50", "1.60", "3.90"] and float(rest[5]) == pytest.approx(31, abs=0.02)
-    assert float(alpha) == pytest.approx(float(rest[6]) - np.arctan2(float(rest[3]),
-                                                                     float(rest[5])), abs=1e-5)
+    assert float(alpha) == pytest.approx(float(rest[6]) - np.arctan2(float(rest[3]), float(rest[5])), abs=1e-5)
     assert 600 < float(left) < float(right) < 700 and 150 < float(top) < float(bottom) < 250
 
 

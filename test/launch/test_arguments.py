@@ -17,15 +17,21 @@ from lidar_perception.testing.launching import include_launch_file
 NOTHING_STARTS = {"detectors": "dream"}
 
 
-@pytest.mark.parametrize("name, given, words", [
-    ("fused", {"pionts": "/cloud"}, "no launch argument 'pionts'; did you mean 'points'?"),
-    ("two_lidars", {"fused.scores.car": "0.7"}, "a parameter of fused_detector"),
-    ("fused", {"launch-prefix": ""}, "'dream' is none of")])
+@pytest.mark.parametrize(
+    "name, given, words",
+    [
+        ("fused", {"pionts": "/cloud"}, "no launch argument 'pionts'; did you mean 'points'?"),
+        ("two_lidars", {"fused.scores.car": "0.7"}, "a parameter of fused_detector"),
+        ("fused", {"launch-prefix": ""}, "'dream' is none of"),
+    ],
+)
 def test_argument_that_a_launch_file_does_not_have_is_refused(name, given, words, capfd):
     """Launch configurations of the file that includes ours are not its arguments."""
     service = LaunchService(noninteractive=True)
-    service.include_launch_description(LaunchDescription([
-        SetLaunchConfiguration("map", "office"), include_launch_file(name, **NOTHING_STARTS,
-                                                                     **given)]))
+    service.include_launch_description(
+        LaunchDescription(
+            [SetLaunchConfiguration("map", "office"), include_launch_file(name, **NOTHING_STARTS, **given)]
+        )
+    )
     assert service.run() == 1
     assert words in "".join(capfd.readouterr())

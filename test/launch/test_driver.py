@@ -38,14 +38,18 @@ class TestDriver(unittest.TestCase):
     def test_every_cloud_is_accounted_for(self):
         environment = {k: v for k, v in os.environ.items() if k not in PROFILE_VARIABLES}
         numbers = map(str, (COUNT, 10, POINTS, 1))
-        driver = subprocess.Popen([sys.executable, DRIVER, "/driver_points", "reliable", *numbers],
-                                  env=environment, stdin=subprocess.PIPE, text=True)
+        driver = subprocess.Popen(
+            [sys.executable, DRIVER, "/driver_points", "reliable", *numbers],
+            env=environment,
+            stdin=subprocess.PIPE,
+            text=True,
+        )
         with Peer() as peer:
+
             def value(key):
                 return int(peer.get_value("perception", key) or 0)
 
-            found = peer.listen("/perception/output/detections",
-                                "visualization_msgs/msg/MarkerArray")
+            found = peer.listen("/perception/output/detections", "visualization_msgs/msg/MarkerArray")
             peer.wait(lambda: found and value("frames") + value("dropped") == COUNT, "every cloud")
             assert value("lost") == 0
             assert peer.get_value("perception", "reliability") == "reliable"

@@ -26,11 +26,11 @@ HAS_LAUNCH = importlib.util.find_spec("launch_ros") is not None
 @pytest.fixture
 def launch(processes, peer, monkeypatch):
     """Return a function that starts a launch file, and returns one that waits for its end."""
+
     def start(name, **arguments):
         if HAS_LAUNCH:
             words = [f"{key}:={value}" for key, value in arguments.items()]
-            processes.run("launch", ["ros2", "launch", "lidar_perception", f"{name}.launch.py",
-                                     *words])
+            processes.run("launch", ["ros2", "launch", "lidar_perception", f"{name}.launch.py", *words])
             return lambda: peer.wait(lambda: processes.has_ended("launch"), "the end")
         install(monkeypatch)
         launch = Launch(name, {key: str(value) for key, value in arguments.items()})
@@ -51,28 +51,47 @@ def street():
     return points
 
 
-@pytest.mark.parametrize(("name", "arguments", "detectors"), [
-    ("perception", {}, ["candidates"]), ("pointpillars", {}, ["pointpillars"]),
-    ("pointnet", {"processes": "true"}, ["pointnet"]), ("fused", {"single": "true"}, ["fused"]),
-    ("detectors", {"detectors": "pointpillars,candidates", "processes": "false",
-                   "tracking": "true"}, ["pointpillars", "candidates"])])
+@pytest.mark.parametrize(
+    ("name", "arguments", "detectors"),
+    [
+        ("perception", {}, ["candidates"]),
+        ("pointpillars", {}, ["pointpillars"]),
+        ("pointnet", {"processes": "true"}, ["pointnet"]),
+        ("fused", {"single": "true"}, ["fused"]),
+        (
+            "detectors",
+            {"detectors": "pointpillars,candidates", "processes": "false", "tracking": "true"},
+            ["pointpillars", "candidates"],
+        ),
+    ],
+)
 def test_detectors_answer_a_cloud(name, arguments, detectors, launch, peer):
     launch(name, points="/lidar/points", **arguments)
     single = arguments.get("single") == "true"
-    results = [peer.listen(f"/{find_result_node(detector, single)}/output/detections", MARKERS)
-               for detector in detectors]
-    peer.send(peer.advertise("/lidar/points", CLOUD), make_cloud_message(street(), 10**9, "lidar"),
-              lambda: all(results), "detections of all detectors")
+    results = [
+        peer.listen(f"/{find_result_node(detector, single)}/output/detections", MARKERS) for detector in detectors
+    ]
+    peer.send(
+        peer.advertise("/lidar/points", CLOUD),
+        make_cloud_message(street(), 10**9, "lidar"),
+        lambda: all(results),
+        "detections of all detectors",
+    )
     assert {m.header.frame_id for found in results for a in found for m in a.markers} == {"lidar"}
 
 
 def test_two_lidars_have_results_of_their_own(launch, peer):
     launch("two_lidars", left="/lidar_left", detectors="candidates")
-    results = {side: peer.listen(f"/{side}/candidate_refinement/output/detections", MARKERS)
-               for side in ("left", "right")}
+    results = {
+        side: peer.listen(f"/{side}/candidate_refinement/output/detections", MARKERS) for side in ("left", "right")
+    }
     for side, topic in ("left", "/lidar_left"), ("right", "/right/points"):
-        peer.send(peer.advertise(topic, CLOUD), make_cloud_message(street(), 10**9, side),
-                  lambda s=side: results[s], f"the result of {side}")
+        peer.send(
+            peer.advertise(topic, CLOUD),
+            make_cloud_message(street(), 10**9, side),
+            lambda s=side: results[s],
+            f"the result of {side}",
+        )
     for side, found in results.items():
         assert {m.header.frame_id for array in found for m in array.markers} == {side}
 

@@ -31,17 +31,19 @@ metres = st.floats(-200, 200)
 yaws = st.floats(-math.pi, math.pi, exclude_min=True) | st.sampled_from([math.pi, 0.0])
 boxes = st.tuples(metres, metres, metres, *[st.floats(0.01, 30)] * 3, yaws)
 words = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=8)
-json_values = st.recursive(st.none() | st.booleans() | st.integers(-10**6, 10**6) | words
-                           | st.floats(allow_nan=False), lambda inner: st.lists(inner, max_size=3))
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**6), 10**6) | words | st.floats(allow_nan=False),
+    lambda inner: st.lists(inner, max_size=3),
+)
 contents = st.dictionaries(words.filter(lambda key: key != "score"), json_values, max_size=3)
-objects = st.lists(st.tuples(boxes, st.sampled_from(CLASSES) | words, st.floats(0, 1), contents),
-                   max_size=5)
+objects = st.lists(st.tuples(boxes, st.sampled_from(CLASSES) | words, st.floats(0, 1), contents), max_size=5)
 notes = st.lists(st.tuples(words, contents), max_size=2)
 
 
 def array(make, rows, **more):
-    return to_marker_array(np.array([box for box, *_ in rows]), [r[1] for r in rows],
-                           header=header(make), make=make, **more)
+    return to_marker_array(
+        np.array([box for box, *_ in rows]), [r[1] for r in rows], header=header(make), make=make, **more
+    )
 
 
 def keys(rows):
@@ -58,9 +60,16 @@ def same_boxes(a, b) -> bool:
 @each_make
 @given(rows=objects, remarks=notes)
 def test_from_marker_array_inverts_to_marker_array(make, rows, remarks):
-    got = from_marker_array(array(make, rows, scores=[r[2] for r in rows],
-                                  extras=[r[3] for r in rows], notes=remarks,
-                                  ids=range(7, 7 + len(rows))))
+    got = from_marker_array(
+        array(
+            make,
+            rows,
+            scores=[r[2] for r in rows],
+            extras=[r[3] for r in rows],
+            notes=remarks,
+            ids=range(7, 7 + len(rows)),
+        )
+    )
     assert same_boxes(got.boxes, [r[0] for r in rows])
     assert got.labels == [r[1] for r in rows]
     assert got.scores.tolist() == [r[2] for r in rows]
@@ -72,15 +81,13 @@ def test_from_marker_array_inverts_to_marker_array(make, rows, remarks):
 
 @given(rows=objects, remarks=notes)
 def test_markers_survive_the_wire(rows, remarks):
-    sent = array(codec.bag_message, rows, scores=[r[2] for r in rows], extras=[r[3] for r in rows],
-                 notes=remarks)
+    sent = array(codec.bag_message, rows, scores=[r[2] for r in rows], extras=[r[3] for r in rows], notes=remarks)
     raw = codec.encode(sent)
     read = codec.decode(raw, "visualization_msgs/msg/MarkerArray")
     assert codec.encode(read) == raw
     before, after = from_marker_array(sent), from_marker_array(read)
     assert np.array_equal(before.boxes, after.boxes)
-    assert (before.labels, before.extras, before.notes) == (after.labels, after.extras,
-                                                            after.notes)
+    assert (before.labels, before.extras, before.notes) == (after.labels, after.extras, after.notes)
 
 
 @each_make
@@ -124,28 +131,38 @@ def test_a_message_without_markers_is_empty(make):
 
 
 @each_make
-@pytest.mark.parametrize("text, score, extra", [
-    ("", 1.0, {}),
-    ("car 7", 1.0, {"text": "car 7"}),
-    ("{broken", 1.0, {"text": "{broken"}),
-    ("12", 1.0, {"text": "12"}),
-    ("[1, 2]", 1.0, {"text": "[1, 2]"}),
-    ('{"score": 0.25, "id": 3}', 0.25, {"score": 0.25, "id": 3}),
-    ('{"score": 1}', 1.0, {"score": 1}),
-    ('{"score": "high"}', 1.0, {"score": "high"}),
-    ('{"score": null}', 1.0, {"score": None}),
-    ('{"score": 1%s}' % ("0" * 400), 1.0, {"score": 10**400}),
-    *((endless, 1.0, {"text": endless}) for endless in ('{"a":' * 9000, "1" * 5000)),
-], ids=range(12))
+@pytest.mark.parametrize(
+    "text, score, extra",
+    [
+        ("", 1.0, {}),
+        ("car 7", 1.0, {"text": "car 7"}),
+        ("{broken", 1.0, {"text": "{broken"}),
+        ("12", 1.0, {"text": "12"}),
+        ("[1, 2]", 1.0, {"text": "[1, 2]"}),
+        ('{"score": 0.25, "id": 3}', 0.25, {"score": 0.25, "id": 3}),
+        ('{"score": 1}', 1.0, {"score": 1}),
+        ('{"score": "high"}', 1.0, {"score": "high"}),
+        ('{"score": null}', 1.0, {"score": None}),
+        ('{"score": 1%s}' % ("0" * 400), 1.0, {"score": 10**400}),
+        *((endless, 1.0, {"text": endless}) for endless in ('{"a":' * 9000, "1" * 5000)),
+    ],
+    ids=range(12),
+)
 def test_cubes_of_other_nodes_are_read(make, text, score, extra):
-    cube = make("visualization_msgs/msg/Marker", header=header(make, 5, "map"), ns="car", id=4,
-                type=CUBE, action=ADD, text=text,
-                pose=make_box_pose(np.array([1.0, 2, 3, 4, 5, 6, -2.0]), make),
-                scale=make("geometry_msgs/msg/Vector3", x=4.0, y=5.0, z=6.0))
+    cube = make(
+        "visualization_msgs/msg/Marker",
+        header=header(make, 5, "map"),
+        ns="car",
+        id=4,
+        type=CUBE,
+        action=ADD,
+        text=text,
+        pose=make_box_pose(np.array([1.0, 2, 3, 4, 5, 6, -2.0]), make),
+        scale=make("geometry_msgs/msg/Vector3", x=4.0, y=5.0, z=6.0),
+    )
     sphere = make("visualization_msgs/msg/Marker", header=header(make), type=2, action=ADD)
     clear = make("visualization_msgs/msg/Marker", action=3)  # DELETEALL, often without a header
-    got = from_marker_array(make("visualization_msgs/msg/MarkerArray",
-                                 markers=[clear, cube, sphere]))
+    got = from_marker_array(make("visualization_msgs/msg/MarkerArray", markers=[clear, cube, sphere]))
     assert same_boxes(got.boxes, [[1, 2, 3, 4, 5, 6, -2.0]])
     assert (got.labels, got.ids.tolist(), got.frame_id, got.stamp_ns) == (["car"], [4], "map", 5)
     assert got.scores.tolist() == [score] and got.extras == [extra]
@@ -169,12 +186,10 @@ def test_lifetime_and_color_reach_every_cube(make):
 
 
 @each_make
-@pytest.mark.parametrize("tracks, ids", [
-    ([4, 9], [4, 9]), ([4, None], [0, 1]), ([4, 4], [0, 1]), ([], [])])
+@pytest.mark.parametrize("tracks, ids", [([4, 9], [4, 9]), ([4, None], [0, 1]), ([4, 4], [0, 1]), ([], [])])
 def test_labels_keep_their_track_where_it_tells_them_apart(make, tracks, ids):
     extras = [{} if t is None else {"track_id": t} for t in tracks]
-    truth = GroundTruth.of(np.ones((len(tracks), 7)), [0] * len(tracks), extras,
-                           [("DontCare", {"track_id": -1})])
+    truth = GroundTruth.of(np.ones((len(tracks), 7)), [0] * len(tracks), extras, [("DontCare", {"track_id": -1})])
     got = from_marker_array(make_truth_markers(truth, header(make), make))
     assert got.ids.tolist() == ids
     assert to_truth(got).extras == truth.extras and to_truth(got).notes == truth.notes
@@ -182,9 +197,13 @@ def test_labels_keep_their_track_where_it_tells_them_apart(make, tracks, ids):
 
 @given(rows=objects)
 def test_from_detection_array_inverts_to_detection_array(rows):
-    msg = to_detection_array(np.array([r[0] for r in rows]), [r[1] for r in rows],
-                             [r[2] for r in rows], header=header(codec.bag_message),
-                             make=codec.bag_message)
+    msg = to_detection_array(
+        np.array([r[0] for r in rows]),
+        [r[1] for r in rows],
+        [r[2] for r in rows],
+        header=header(codec.bag_message),
+        make=codec.bag_message,
+    )
     for read in (msg, codec.decode(codec.encode(msg), "vision_msgs/msg/Detection3DArray")):
         got = from_detection_array(read)
         assert [d.id for d in read.detections] == [str(i) for i in range(len(rows))]
@@ -197,8 +216,9 @@ def test_from_detection_array_inverts_to_detection_array(rows):
 
 
 def test_a_detection_is_of_its_most_likely_class():
-    msg = to_detection_array(np.ones((2, 7)), ["Car", "Van"], [0.3, 0.5],
-                             header=header(codec.bag_message), make=codec.bag_message)
+    msg = to_detection_array(
+        np.ones((2, 7)), ["Car", "Van"], [0.3, 0.5], header=header(codec.bag_message), make=codec.bag_message
+    )
     msg.detections[0].results.extend(msg.detections[1].results)
     msg.detections[1].results.clear()
     got = from_detection_array(msg)

@@ -28,8 +28,7 @@ XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 @st.composite
 def layouts(draw) -> np.dtype:
     """Draw dtypes of clouds, with all datatypes, gaps, counts, byte and field orders."""
-    names = draw(st.lists(st.sampled_from(["x", "y", "z", "intensity", "ring", "t"]), min_size=1,
-                          unique=True))
+    names = draw(st.lists(st.sampled_from(["x", "y", "z", "intensity", "ring", "t"]), min_size=1, unique=True))
     order = draw(st.sampled_from("<>"))
     gaps = st.integers(0, 5)
     formats, offsets, end = [], [], 0
@@ -40,8 +39,14 @@ def layouts(draw) -> np.dtype:
         formats.append(base if count == 1 else (base, (count,)))
         end = offsets[-1] + base.itemsize * count
     listed = draw(st.permutations(range(len(names))))
-    return np.dtype(dict(names=names, formats=[formats[i] for i in listed],
-                         offsets=[offsets[i] for i in listed], itemsize=end + draw(gaps)))
+    return np.dtype(
+        dict(
+            names=names,
+            formats=[formats[i] for i in listed],
+            offsets=[offsets[i] for i in listed],
+            itemsize=end + draw(gaps),
+        )
+    )
 
 
 @st.composite
@@ -54,14 +59,21 @@ def points(draw, count=st.integers(0, 12)) -> np.ndarray:
 
 
 def field(make, name, offset, datatype=7, count=1):
-    return make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=datatype,
-                count=count)
+    return make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=datatype, count=count)
 
 
 def message(make, fields, data, *, height=1, width=1, point_step, row_step=None, big=False):
-    return make("sensor_msgs/msg/PointCloud2", header=header(make), height=height, width=width,
-                fields=fields, point_step=point_step, data=data, is_bigendian=big,
-                row_step=width * point_step if row_step is None else row_step)
+    return make(
+        "sensor_msgs/msg/PointCloud2",
+        header=header(make),
+        height=height,
+        width=width,
+        fields=fields,
+        point_step=point_step,
+        data=data,
+        is_bigendian=big,
+        row_step=width * point_step if row_step is None else row_step,
+    )
 
 
 def two_fields(make, *, names="ab", datatypes=(7, 7), count=1, **shape):
@@ -79,9 +91,16 @@ def padded(make, cloud: np.ndarray, height: int, pad: int, unnamed=()):
     rows = np.frombuffer(cloud.tobytes(), np.uint8).reshape(height, -1)
     data = np.pad(rows, [(0, 0), (0, pad)], constant_values=0xAA)
     fields = [*make_point_fields(cloud.dtype, make), *(field(make, "", at, 2) for at in unnamed)]
-    return message(make, fields, data.reshape(-1), height=height, width=len(cloud) // height,
-                   point_step=cloud.dtype.itemsize, row_step=data.shape[1],
-                   big=is_big(cloud.dtype))
+    return message(
+        make,
+        fields,
+        data.reshape(-1),
+        height=height,
+        width=len(cloud) // height,
+        point_step=cloud.dtype.itemsize,
+        row_step=data.shape[1],
+        big=is_big(cloud.dtype),
+    )
 
 
 def stacked(cloud: np.ndarray, times: int) -> np.ndarray:
@@ -91,8 +110,11 @@ def stacked(cloud: np.ndarray, times: int) -> np.ndarray:
 
 def same(a: np.ndarray, b: np.ndarray) -> bool:
     """Return True if all fields are equal bit by bit, ignoring padding."""
-    return len(a) == len(b) and a.dtype.names == b.dtype.names and all(
-        a[n].dtype == b[n].dtype and a[n].tobytes() == b[n].tobytes() for n in a.dtype.names)
+    return (
+        len(a) == len(b)
+        and a.dtype.names == b.dtype.names
+        and all(a[n].dtype == b[n].dtype and a[n].tobytes() == b[n].tobytes() for n in a.dtype.names)
+    )
 
 
 @each_make
@@ -164,8 +186,9 @@ def test_add_columns_keeps_every_old_byte_and_field(make, cloud, height, pad):
     cloud = stacked(cloud, height)
     step = cloud.dtype.itemsize
     old = padded(make, cloud, height, pad, unnamed=[0])
-    new = add_columns(old, make, label=np.arange(len(cloud), dtype=np.uint16),
-                      score=np.linspace(0, 1, len(cloud), dtype=np.float32))
+    new = add_columns(
+        old, make, label=np.arange(len(cloud), dtype=np.uint16), score=np.linspace(0, 1, len(cloud), dtype=np.float32)
+    )
     got = to_array(new)
     assert got.dtype.names == (*cloud.dtype.names, "label", "score")
     assert same(got[list(cloud.dtype.names)], cloud)
@@ -173,7 +196,7 @@ def test_add_columns_keeps_every_old_byte_and_field(make, cloud, height, pad):
     assert got["score"].tolist() == np.linspace(0, 1, len(cloud), dtype=np.float32).tolist()
     raw = np.frombuffer(new.data, np.uint8).reshape(len(cloud), new.point_step)
     assert raw[:, :step].tobytes() == cloud.tobytes()
-    assert list(new.fields[:len(old.fields)]) == list(old.fields)
+    assert list(new.fields[: len(old.fields)]) == list(old.fields)
     assert (new.height, new.width) == (old.height, old.width)
     assert (new.is_bigendian, new.is_dense) == (old.is_bigendian, old.is_dense)
     assert new.header == old.header
@@ -198,8 +221,7 @@ def test_a_column_of_another_shape_or_type_is_replaced(make, old, order):
     dtype = np.dtype([("x", "<f4"), old, ("y", "<f8")]).newbyteorder(order)
     cloud = np.zeros(3, dtype)
     cloud["x"], cloud["y"] = [1, 2, 3], [4, 5, 6]
-    got = to_array(add_columns(from_array(cloud, header(make), make), make,
-                               i=np.array([7, 8, 9], np.int32)))
+    got = to_array(add_columns(from_array(cloud, header(make), make), make, i=np.array([7, 8, 9], np.int32)))
     assert got.dtype["i"] == np.dtype(f"{order}i4") and got["i"].tolist() == [7, 8, 9]
     assert sorted(got.dtype.names) == ["i", "x", "y"]
     assert same(got[["x", "y"]], cloud[["x", "y"]])
@@ -233,12 +255,15 @@ def test_xyz_beyond_float32_is_infinite_and_not_a_warning():
     assert np.isinf(read_xyz(np.array([(1e300, 0, 0)], [(n, "<f8") for n in "xyz"]))[0, 0])
 
 
-@pytest.mark.parametrize("dtype, words", [
-    ([("y", "f4"), ("z", "f4")], "no field 'x'; it has y, z"),
-    ([("x", "f4", (2,)), ("y", "f4"), ("z", "f4")], "field 'x' has count > 1"),
-    ([("x", "i4"), ("y", "f4"), ("z", "f4")], "field 'x' is of type int32"),
-    ([("x", "f4"), ("y", "f4"), ("z", "u1")], "field 'z' is of type uint8"),
-])
+@pytest.mark.parametrize(
+    "dtype, words",
+    [
+        ([("y", "f4"), ("z", "f4")], "no field 'x'; it has y, z"),
+        ([("x", "f4", (2,)), ("y", "f4"), ("z", "f4")], "field 'x' has count > 1"),
+        ([("x", "i4"), ("y", "f4"), ("z", "f4")], "field 'x' is of type int32"),
+        ([("x", "f4"), ("y", "f4"), ("z", "u1")], "field 'z' is of type uint8"),
+    ],
+)
 def test_a_cloud_without_metres_names_the_field(dtype, words):
     with pytest.raises(CloudError, match=words):
         read_xyz(np.zeros(2, dtype))
@@ -251,26 +276,36 @@ def test_a_cloud_without_metres_names_the_field(dtype, words):
 def test_row_step_0_or_of_the_whole_cloud_is_that_of_a_row(make, height, width, step, more):
     cloud = np.arange(height * width * 2, dtype="f4").view([("a", "f4"), ("b", "f4")])
     data = np.pad(cloud.view(np.uint8), (0, more))
-    msg = message(make, make_point_fields(cloud.dtype, make), data, height=height, width=width,
-                  point_step=8, row_step=step(height, width))
+    msg = message(
+        make,
+        make_point_fields(cloud.dtype, make),
+        data,
+        height=height,
+        width=width,
+        point_step=8,
+        row_step=step(height, width),
+    )
     assert same(to_array(msg), cloud)
     wider = to_array(add_columns(msg, make, c=cloud["a"]))
     assert all(np.array_equal(wider[name], cloud[old]) for name, old in zip("abc", "aba"))
 
 
 @each_make
-@pytest.mark.parametrize("change, words", [
-    (dict(width=4), "data has 24 bytes where height 1 x width 4 x point_step 8 needs 32"),
-    (dict(height=2, width=2), "data has 24 bytes where height 2 .* needs 32"),
-    (dict(height=2, width=1, row_step=20), "data has 24 bytes .* needs 28"),
-    (dict(height=3, width=1, row_step=7), "row_step = 7 is less than width x point_step = 8"),
-    (dict(point_step=0), "point_step is 0 for 3 points"),
-    (dict(point_step=6), "field 'b' at offset 4 reaches past point_step = 6"),
-    (dict(names="aa"), "field 'a' exists twice"),
-    (dict(datatypes=(7, 9)), "field 'b' has datatype 9"),
-    (dict(datatypes=(0, 7)), "field 'a' has datatype 0"),
-    (dict(count=2), "field 'b' at offset 4 reaches past point_step = 8"),
-])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (dict(width=4), "data has 24 bytes where height 1 x width 4 x point_step 8 needs 32"),
+        (dict(height=2, width=2), "data has 24 bytes where height 2 .* needs 32"),
+        (dict(height=2, width=1, row_step=20), "data has 24 bytes .* needs 28"),
+        (dict(height=3, width=1, row_step=7), "row_step = 7 is less than width x point_step = 8"),
+        (dict(point_step=0), "point_step is 0 for 3 points"),
+        (dict(point_step=6), "field 'b' at offset 4 reaches past point_step = 6"),
+        (dict(names="aa"), "field 'a' exists twice"),
+        (dict(datatypes=(7, 9)), "field 'b' has datatype 9"),
+        (dict(datatypes=(0, 7)), "field 'a' has datatype 0"),
+        (dict(count=2), "field 'b' at offset 4 reaches past point_step = 8"),
+    ],
+)
 def test_a_broken_cloud_names_what_is_broken(make, change, words):
     with pytest.raises(CloudError, match=words) as error:
         to_array(two_fields(make, **change))
@@ -278,8 +313,9 @@ def test_a_broken_cloud_names_what_is_broken(make, change, words):
 
 
 @each_make
-@pytest.mark.parametrize("dtype", [[("x", "<f4"), ("y", ">f4")], [("x", "f2")], [("x", "i8")],
-                                   [("x", "?")], [("x", "S4")]])
+@pytest.mark.parametrize(
+    "dtype", [[("x", "<f4"), ("y", ">f4")], [("x", "f2")], [("x", "i8")], [("x", "?")], [("x", "S4")]]
+)
 def test_what_point_cloud2_cannot_say_is_refused(make, dtype):
     with pytest.raises(ValueError):
         from_array(np.zeros(2, dtype), header(make), make)
@@ -295,8 +331,7 @@ def test_rows_of_different_length_are_refused(make):
 @pytest.mark.parametrize("height, width", [(1, 0), (0, 1), (0, 2**32 - 1), (1, 1)])
 def test_huge_point_step_is_reported_with_and_without_points(make, height, width):
     fields = [field(make, name, 4 * i) for i, name in enumerate("xyz")]
-    msg = message(make, fields, np.zeros(12, np.uint8), height=height, width=width,
-                  point_step=2**32 - 1, row_step=0)
+    msg = message(make, fields, np.zeros(12, np.uint8), height=height, width=width, point_step=2**32 - 1, row_step=0)
     for read in (to_array, lambda m: add_columns(m, make, ground=np.zeros(0, "u1"))):
         with pytest.raises(CloudError, match="point_step = 4294967295"):
             read(msg)
@@ -305,7 +340,6 @@ def test_huge_point_step_is_reported_with_and_without_points(make, height, width
 @each_make
 def test_a_cloud_of_no_rows_gets_columns_whatever_its_width(make):
     fields = [field(make, name, 4 * i) for i, name in enumerate("xyz")]
-    msg = message(make, fields, np.zeros(0, np.uint8), height=0, width=2**32 - 1, point_step=12,
-                  row_step=0)
+    msg = message(make, fields, np.zeros(0, np.uint8), height=0, width=2**32 - 1, point_step=12, row_step=0)
     more = add_columns(msg, make, ground=np.zeros(0, "u1"))
     assert (more.row_step, more.width, len(to_array(more))) == (0, 2**32 - 1, 0)

@@ -17,8 +17,10 @@ from lidar_perception.types import InputError
 
 SIZE = 24, 16
 RED, GREEN = np.array([255, 0, 0], np.uint8), np.array([0, 255, 0], np.uint8)
-VIEWS = {"behind": Perspective((-10.0, 0.0, 5.0), (10.0, 0.0, 0.0), 70.0, 80, 60),
-         "above": BirdsEye((5.0, 0.0), 3.0, 80, 60)}
+VIEWS = {
+    "behind": Perspective((-10.0, 0.0, 5.0), (10.0, 0.0, 0.0), 70.0, 80, 60),
+    "above": BirdsEye((5.0, 0.0), 3.0, 80, 60),
+}
 
 
 def seeds():
@@ -85,8 +87,7 @@ def test_canvas_skips_invalid_and_outside_shapes():
 
 
 def test_polygon_covers_its_inside():
-    for corners in np.array([[2, 3], [12, 3], [12, 9], [2, 9]]), np.array([[2, 9], [12, 9], [12, 3],
-                                                                           [2, 3]]):
+    for corners in np.array([[2, 3], [12, 3], [12, 9], [2, 9]]), np.array([[2, 9], [12, 9], [12, 3], [2, 3]]):
         canvas = Canvas(*SIZE)
         canvas.fill_polygon(corners, GREEN, 0.5)
         assert (canvas.pixels[3:9, 2:12, 1] == 128).all()
@@ -158,9 +159,9 @@ def read_film(path):
             now += image.info["duration"] / 1000
         return seen, times
     import av
+
     with av.open(str(path)) as container:
-        frames = [(frame.to_ndarray(format="rgb24").astype(float), frame.time)
-                  for frame in container.decode(video=0)]
+        frames = [(frame.to_ndarray(format="rgb24").astype(float), frame.time) for frame in container.decode(video=0)]
     return [list(column) for column in zip(*frames)]
 
 

@@ -7,20 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidar_perception.rendering.colors import (
-    LABEL,
-    color_by_cluster,
-    color_by_height,
-    get_class_color,
-)
+from lidar_perception.rendering.colors import LABEL, color_by_cluster, color_by_height, get_class_color
 from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
 from lidar_perception.types import CLASSES, PointCloud
 
 CAR, PEDESTRIAN = CLASSES.index("Car"), CLASSES.index("Pedestrian")
 BOX = np.array([[12.0, 1.0, -1.0, 4.0, 1.8, 1.5, 0.3]])
 SIZE = 480, 270
-STAGES = {name: Stage(30.0, name == "ahead", -1.73, width=SIZE[0], height=SIZE[1])
-          for name in ("ahead", "around")}
+STAGES = {name: Stage(30.0, name == "ahead", -1.73, width=SIZE[0], height=SIZE[1]) for name in ("ahead", "around")}
 each_stage = pytest.mark.parametrize("stage", STAGES.values(), ids=STAGES)
 
 
@@ -57,8 +51,10 @@ def test_labels_trails_and_arrows_are_drawn(stage):
     assert all(np.subtract(labelled, plain) > 10)
     still = Boxes(BOX, np.array([CAR]))
     trail = BOX[0, :3] - np.linspace(6, 0, 20)[:, None] * [0.0, 1.0, 0.0]
-    for moving in (Boxes(BOX, np.array([CAR]), trails=[trail]),
-                   Boxes(BOX, np.array([CAR]), velocities=np.array([[0.0, 4.0]]))):
+    for moving in (
+        Boxes(BOX, np.array([CAR]), trails=[trail]),
+        Boxes(BOX, np.array([CAR]), velocities=np.array([[0.0, 4.0]])),
+    ):
         assert np.any(draw_frame(stage, EMPTY, moving) != draw_frame(stage, EMPTY, still))
 
 
@@ -81,8 +77,13 @@ def test_point_colour_is_height_or_intensity(stage):
     for color, expected in (("height", color_by_height(np.array([2.73]))[0]), ("intensity", None)):
         made = Stage(stage.reach, stage.ahead, stage.ground, color, *SIZE)
         expected = made.colors(scan)[0] if expected is None else expected
-        assert all(np.subtract(count_pixels(draw_frame(made, scan, Boxes()), expected, 0),
-                               count_pixels(draw_frame(made, EMPTY, Boxes()), expected, 0)) > 0)
+        assert all(
+            np.subtract(
+                count_pixels(draw_frame(made, scan, Boxes()), expected, 0),
+                count_pixels(draw_frame(made, EMPTY, Boxes()), expected, 0),
+            )
+            > 0
+        )
 
 
 def test_given_point_colours_are_not_modified():
@@ -98,8 +99,7 @@ def test_given_point_colours_are_not_modified():
 @pytest.mark.parametrize("far, reach", [(0.5, 6.0), (20.0, 20.0), (500.0, 55.0)])
 def test_stage_covers_range_of_first_cloud(far, reach):
     angles = np.linspace(0, 2 * np.pi, 200)
-    scan = PointCloud(np.stack([far * np.cos(angles), far * np.sin(angles), 0 * angles],
-                               axis=1).astype(np.float32))
+    scan = PointCloud(np.stack([far * np.cos(angles), far * np.sin(angles), 0 * angles], axis=1).astype(np.float32))
     stage = Stage.of(scan, 1.0, True, size=SIZE)
     assert stage.reach == pytest.approx(reach, rel=1e-3) and stage.ground == -1.0
     assert 3 <= len(stage.rings) <= 12

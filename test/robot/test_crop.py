@@ -46,10 +46,19 @@ def is_kept(point, params):
     return True
 
 
-@pytest.mark.parametrize("params", [
-    CropParams(), CropParams(body=BODY), CropParams(min_range=5.0), CropParams(max_range=5.0),
-    CropParams(sectors=(350.0, 370.0)), CropParams(sectors=(-190.0, -170.0, 30.0, 31.0)),
-    CropParams(sectors=(0.0, 360.0)), CROP])
+@pytest.mark.parametrize(
+    "params",
+    [
+        CropParams(),
+        CropParams(body=BODY),
+        CropParams(min_range=5.0),
+        CropParams(max_range=5.0),
+        CropParams(sectors=(350.0, 370.0)),
+        CropParams(sectors=(-190.0, -170.0, 30.0, 31.0)),
+        CropParams(sectors=(0.0, 360.0)),
+        CROP,
+    ],
+)
 def test_crop_equals_a_plain_implementation(params):
     xyz = make_points()
     expected = [is_kept(p, params) for p in xyz]
@@ -63,8 +72,7 @@ def test_a_rotated_sector_keeps_the_rotated_points(seed, angle):
     xyz = make_points(200, seed).astype(np.float64)
     rotated = Rotation.from_euler("z", angle, degrees=True).apply(xyz)
     edges = np.array([20.0, 75.0])
-    near = np.abs((np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))[:, None] - edges + 180) % 360
-                  - 180).min(axis=1) < 1e-6
+    near = np.abs((np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))[:, None] - edges + 180) % 360 - 180).min(axis=1) < 1e-6
     before = select_points(xyz, CropParams(sectors=tuple(edges)))
     after = select_points(rotated, CropParams(sectors=tuple(edges + angle)))
     np.testing.assert_array_equal(before[~near], after[~near])
@@ -75,9 +83,10 @@ def test_the_body_is_a_box_in_the_base_frame():
     base[:3, :3] = Rotation.from_euler("zyx", [2.0, 0.4, -0.3]).as_matrix()
     base[:3, 3] = 0.5, -0.2, 1.1
     xyz = make_points().astype(np.float64)
-    np.testing.assert_array_equal(select_points(xyz, CropParams(body=BODY), base),
-                                  select_points(xyz @ base[:3, :3].T + base[:3, 3],
-                                                CropParams(body=BODY)))
+    np.testing.assert_array_equal(
+        select_points(xyz, CropParams(body=BODY), base),
+        select_points(xyz @ base[:3, :3].T + base[:3, 3], CropParams(body=BODY)),
+    )
 
 
 @pytest.mark.parametrize("roll, pitch, ahead", [(0, 0, 180), (180, 0, 0), (15, -20, 90)])
@@ -87,7 +96,8 @@ def test_sectors_do_not_depend_on_the_mounting(roll, pitch, ahead):
     params = CropParams(sectors=(150.0, 210.0, 60.0, 90.0), min_range=2.0)
     np.testing.assert_array_equal(
         select_points(transform_points(straight, invert_pose(level)), params, level=level),
-        select_points(straight, params))
+        select_points(straight, params),
+    )
 
 
 def test_a_disabled_crop_returns_the_same_frame():
@@ -117,17 +127,19 @@ def test_a_cropped_message_has_the_points_of_a_cropped_frame():
     frame, usable = to_point_cloud(from_array(cloud, header(bag_message), bag_message))
     kept, _ = crop_frame(frame, CROP)
     finite = np.isfinite(cloud["x"])
-    np.testing.assert_array_equal(usable.take(kept), np.flatnonzero(
-        finite & select_points(make_points(300), CROP)))
+    np.testing.assert_array_equal(usable.take(kept), np.flatnonzero(finite & select_points(make_points(300), CROP)))
 
 
-@pytest.mark.parametrize("values, words", [
-    ({"body": (0.0, 1.0)}, "six numbers"),
-    ({"body": (1.0, 0.0, 0.0, 1.0, 1.0, 1.0)}, "min below its max"),
-    ({"body": (0.0, 0.0, 0.0, 1.0, 1.0, float("inf"))}, "finite"),
-    ({"sectors": (1.0,)}, "pairs"),
-    ({"min_range": 5.0, "max_range": 4.0}, "below min_range"),
-])
+@pytest.mark.parametrize(
+    "values, words",
+    [
+        ({"body": (0.0, 1.0)}, "six numbers"),
+        ({"body": (1.0, 0.0, 0.0, 1.0, 1.0, 1.0)}, "min below its max"),
+        ({"body": (0.0, 0.0, 0.0, 1.0, 1.0, float("inf"))}, "finite"),
+        ({"sectors": (1.0,)}, "pairs"),
+        ({"min_range": 5.0, "max_range": 4.0}, "below min_range"),
+    ],
+)
 def test_an_invalid_crop_is_refused_with_the_remedy(values, words):
     with pytest.raises(ValueError, match=words):
         CropParams(**values)

@@ -16,16 +16,14 @@ numbers = st.floats(-1, 1, allow_subnormal=False)
 def make_sweep(count=2000, seed=0):
     """Return points (N, 3), and the time of each in seconds after the stamp."""
     rng = np.random.default_rng(seed)
-    return (rng.uniform(-60, 60, (count, 3)).astype(np.float32),
-            rng.uniform(-0.05, 0.05, count))
+    return (rng.uniform(-60, 60, (count, 3)).astype(np.float32), rng.uniform(-0.05, 0.05, count))
 
 
 @given(st.tuples(numbers, numbers, numbers), st.tuples(numbers, numbers, numbers))
 def test_deskew_inverts_skew(velocity, rotation):
     xyz, seconds = make_sweep(200)
     poses = make_constant_motion(np.array(velocity) * 30, np.array(rotation) * 2)
-    np.testing.assert_allclose(deskew(skew(xyz, seconds, poses), seconds, poses), xyz,
-                               atol=1e-4)
+    np.testing.assert_allclose(deskew(skew(xyz, seconds, poses), seconds, poses), xyz, atol=1e-4)
 
 
 def test_deskew_equals_a_loop_over_the_points():
@@ -52,8 +50,7 @@ def test_points_of_a_static_sensor_do_not_move():
     pose[0, :3, 3] = 4e5, -3e4, 100.0
     found = deskew(xyz, seconds, lambda at: np.repeat(pose, len(at), axis=0))
     np.testing.assert_allclose(found, xyz, atol=1e-5)
-    np.testing.assert_array_equal(deskew(xyz, seconds,
-                                         make_constant_motion(np.zeros(3), np.zeros(3))), xyz)
+    np.testing.assert_array_equal(deskew(xyz, seconds, make_constant_motion(np.zeros(3), np.zeros(3))), xyz)
     poses = make_constant_motion([20.0, 0, 0], [0, 0, 1.0])
     np.testing.assert_array_equal(deskew(xyz, np.zeros(len(xyz)), poses), xyz)
     assert deskew(xyz[:0], seconds[:0], poses).shape == (0, 3)
@@ -67,6 +64,7 @@ def test_poses_are_looked_up_once_and_for_few_times(count):
     def poses(at):
         calls.append(len(at))
         return np.tile(np.eye(4), (len(at), 1, 1))
+
     deskew(xyz, seconds, poses)
     assert calls == [MAX_POSES + 1]
 

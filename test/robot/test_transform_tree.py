@@ -79,8 +79,7 @@ def test_inverse_lookups_and_detours_agree(seed):
 def test_poses_are_interpolated_linearly_and_by_slerp(seed, share):
     (t0, t1), (q0, q1) = make_transforms(seed, 2)
     times = np.array([START, START + SECOND_NS])
-    pose = interpolate_poses(times, [t0, t1], [q0, q1],
-                             np.array([START + round(share * SECOND_NS)]))[0]
+    pose = interpolate_poses(times, [t0, t1], [q0, q1], np.array([START + round(share * SECOND_NS)]))[0]
     np.testing.assert_allclose(pose[:3, 3], t0 + share * (t1 - t0), atol=1e-5)
     first = Rotation.from_quat(q0)
     whole = (first.inv() * Rotation.from_quat(q1)).magnitude()
@@ -92,11 +91,13 @@ def test_poses_are_interpolated_linearly_and_by_slerp(seed, share):
 
 def test_poses_are_not_extrapolated_by_default():
     tree, _, (times, _, _) = make_tree()
-    for stamp, words, late in [(times[-1] + 1, "'odom' -> 'base' is 0.000 s older", True),
-                               (times[-1] + 5 * SECOND_NS, "5.000 s older than needed", False),
-                               (times[-1] + 37 * SECOND_NS, "stopped.*different clocks", False),
-                               (START - SECOND_NS, "1.000 s newer than needed$", False),
-                               (1234 * SECOND_NS, "different clocks", False)]:
+    for stamp, words, late in [
+        (times[-1] + 1, "'odom' -> 'base' is 0.000 s older", True),
+        (times[-1] + 5 * SECOND_NS, "5.000 s older than needed", False),
+        (times[-1] + 37 * SECOND_NS, "stopped.*different clocks", False),
+        (START - SECOND_NS, "1.000 s newer than needed$", False),
+        (1234 * SECOND_NS, "different clocks", False),
+    ]:
         with pytest.raises(MissingTransform, match=words) as error:
             tree.lookup("map", "lidar", int(stamp))
         assert error.value.late == late
@@ -114,8 +115,7 @@ def test_max_gap_extrapolates_the_last_two_poses(seed, seconds):
     np.testing.assert_allclose(found[:3, :3], now[:3, :3] @ turn.as_matrix(), atol=1e-6)
     velocity = (now - before)[:3, 3] / 0.02
     np.testing.assert_allclose(found[:3, 3], now[:3, 3] + velocity * seconds, atol=1e-6)
-    np.testing.assert_array_equal(tree.lookup("odom", "base", last, 0.5),
-                                  tree.lookup("odom", "base", last))
+    np.testing.assert_array_equal(tree.lookup("odom", "base", last, 0.5), tree.lookup("odom", "base", last))
 
 
 def test_gaps_longer_than_max_gap_are_not_bridged():
@@ -140,8 +140,7 @@ def test_gaps_longer_than_max_gap_are_not_bridged():
 def test_unconnected_frames_are_named():
     tree, _, _ = make_tree()
     tree.set("world", "tower", 0, [0, 0, 0], [0, 0, 0, 1], static=True)
-    with pytest.raises(MissingTransform, match="'lidar' with 'radar': 'lidar' is below 'map', "
-                       "'radar' is not in TF"):
+    with pytest.raises(MissingTransform, match="'lidar' with 'radar': 'lidar' is below 'map', 'radar' is not in TF"):
         tree.lookup("radar", "lidar", START)
     with pytest.raises(MissingTransform, match="'tower' is below 'world', 'map' is the root"):
         tree.lookup("map", "tower", START)
@@ -188,8 +187,7 @@ def test_inserting_old_stamps_takes_logarithmic_time():
     tree = TransformTree(keeps_all=True)
     for first in (0, 5):
         for i in range(500):
-            tree.set("a", "b", CountingStamp(10 * i + first), [2 * i + first / 5, 0, 0],
-                     [0, 0, 0, 1])
+            tree.set("a", "b", CountingStamp(10 * i + first), [2 * i + first / 5, 0, 0], [0, 0, 0, 1])
     assert CountingStamp.comparisons < 1000 * 20
     assert [tree.lookup("a", "b", 5 * i)[0, 3] for i in range(1000)] == [*range(1000)]
 
@@ -211,18 +209,20 @@ def test_memory_is_bounded(monkeypatch):
         tree.set("g", "h", 0, [0, 0, 0], [0, 0, 0, 1])
 
 
-@pytest.mark.parametrize("change, words", [
-    (dict(quaternion=[0, 0, 0, 0]), "no unit quaternion"),
-    (dict(quaternion=[0, 0, 0, 1.5]), "no unit quaternion"),
-    (dict(quaternion=[0, 0, float("nan"), 1]), "no unit quaternion"),
-    (dict(translation=[0, float("inf"), 0]), "not finite"),
-    (dict(child="a"), "two frames with names"),
-    (dict(child=""), "two frames with names"),
-])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (dict(quaternion=[0, 0, 0, 0]), "no unit quaternion"),
+        (dict(quaternion=[0, 0, 0, 1.5]), "no unit quaternion"),
+        (dict(quaternion=[0, 0, float("nan"), 1]), "no unit quaternion"),
+        (dict(translation=[0, float("inf"), 0]), "not finite"),
+        (dict(child="a"), "two frames with names"),
+        (dict(child=""), "two frames with names"),
+    ],
+)
 def test_an_invalid_transform_is_refused_and_not_stored(change, words):
     tree = TransformTree()
-    good = dict(parent="a", child="b", stamp_ns=0, translation=[1, 2, 3],
-                quaternion=[0, 0, 0, 1.001], static=True)
+    good = dict(parent="a", child="b", stamp_ns=0, translation=[1, 2, 3], quaternion=[0, 0, 0, 1.001], static=True)
     tree.set(**good)
     before = tree.lookup("a", "b", 0)
     with pytest.raises(InputError, match=words):

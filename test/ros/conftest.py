@@ -10,6 +10,7 @@ def domain(domain) -> int:
     """Nodes are forked from a process without coverage: nodes in the process of a test cover
     nearly all lines."""
     from lidar_perception.testing import forking  # noqa: F401  sets what that process loads
+
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)
         forkserver.ensure_running()
@@ -21,6 +22,7 @@ def good_cloud(drive_bag):
     """First cloud of the simulated drive."""
     from lidar_perception.data.bag import Bag
     from lidar_perception.wire.topics import POINTS
+
     with Bag(drive_bag) as bag:
         return next(m for _, _, m in bag.messages({POINTS}))
 
@@ -32,9 +34,16 @@ def found(tested, shared_processes, shared_peer, weights):
 
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
+
     for node, remap in tested.graph.items():
-        shared_processes.start(node, remap, {**read_config(tested.stages, PipelineParams()), **(
-            {**tested.values(weights), **QUIET} if node == tested.node else {})})
+        shared_processes.start(
+            node,
+            remap,
+            {
+                **read_config(tested.stages, PipelineParams()),
+                **({**tested.values(weights), **QUIET} if node == tested.node else {}),
+            },
+        )
     return shared_peer.listen(f"/{tested.node}/output/detections", MARKERS)
 
 
@@ -42,6 +51,7 @@ def found(tested, shared_processes, shared_peer, weights):
 def talker(tested, shared_peer, found):
     """Publisher of clouds for the detector."""
     from ros_samples import CLOUD
+
     return shared_peer.advertise(tested.between, CLOUD)
 
 
@@ -51,19 +61,18 @@ def start(domain):
     from rclpy.parameter import Parameter
 
     from lidar_perception.nodes.external_node import create_context, shut_down_context
+
     context, nodes = create_context(domain), []
 
     def make(kind, **values):
-        overrides = [Parameter(k, value=list(v) if isinstance(v, tuple) else v)
-                     for k, v in values.items() if v != ()]
+        overrides = [Parameter(k, value=list(v) if isinstance(v, tuple) else v) for k, v in values.items() if v != ()]
         node = kind(context=context, parameter_overrides=overrides)
         nodes.append(node)
         node.start()
         assert node.active
         node.sent = {}
         for output in node._outputs:
-            output.publisher.publish = node.sent.setdefault(
-                output.topic_name.rpartition("/")[2], []).append
+            output.publisher.publish = node.sent.setdefault(output.topic_name.rpartition("/")[2], []).append
         return node
 
     yield make

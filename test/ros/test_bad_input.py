@@ -41,18 +41,18 @@ def send(shared_processes, peer):
 @pytest.fixture(scope="module")
 def results(peer):
     """Return {node: the clouds that it has published}."""
-    return {node: peer.listen(f"/{node}/output/points", CLOUD)
-            for node in ("ground_segmentation", "perception")}
+    return {node: peer.listen(f"/{node}/output/points", CLOUD) for node in ("ground_segmentation", "perception")}
 
 
 @pytest.fixture(scope="module")
 def process(send, results):
     """Return a function that sends a cloud to a node and returns the cloud that it publishes."""
+
     def processed(node, msg):
         stamp, received = to_ns(msg.header.stamp), results[node]
-        send(node, msg, lambda: received and to_ns(received[-1].header.stamp) == stamp,
-             "the cloud's result")
+        send(node, msg, lambda: received and to_ns(received[-1].header.stamp) == stamp, "the cloud's result")
         return received[-1]
+
     return processed
 
 
@@ -67,12 +67,16 @@ def test_bad_clouds_become_diagnostics_and_node_continues(node, send, process, p
     assert names[:4] == ["x", "y", "z", "intensity"] and "ground" in names
 
 
-@pytest.mark.parametrize("values", [
-    {"ground.method": "patchwork"}, {"ground.method": "cloth"},
-    {"ground.method": "cloth", "clustering.method": "euclidean", "boxes.shape": "l_shape"},
-], ids=["patchwork", "cloth", "paper C"])
-def test_every_method_survives_invalid_clouds(
-        values, send, process, results, shared_processes, peer, good_cloud):
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"ground.method": "patchwork"},
+        {"ground.method": "cloth"},
+        {"ground.method": "cloth", "clustering.method": "euclidean", "boxes.shape": "l_shape"},
+    ],
+    ids=["patchwork", "cloth", "paper C"],
+)
+def test_every_method_survives_invalid_clouds(values, send, process, results, shared_processes, peer, good_cloud):
     """Some libraries crash on NaN, outliers or empty clouds."""
     node = "perception" if "clustering.method" in values else "ground_segmentation"
     rng = np.random.default_rng(0)
@@ -99,15 +103,14 @@ def test_every_method_survives_invalid_clouds(
 
 def test_wrong_height_and_intensity_scale_are_reported(send, peer, good_cloud):
     """The sensor is mounted at 1.73 m; intensity is 0..1."""
+
     def is_reported(words):
         send(node, good_cloud, lambda: words in peer.get_message(node), words)
 
     node = "ground_segmentation"
-    with peer.parameters(f"/{node}", {"ground.method": "patchwork",
-                                      "ground.sensor_pose.height": 1.2}):
+    with peer.parameters(f"/{node}", {"ground.method": "patchwork", "ground.sensor_pose.height": 1.2}):
         is_reported("ground.sensor_pose.height is 1.2; set it to 1.7")
-        with peer.parameters(f"/{node}", {"ground.sensor_pose.height": 1.73,
-                                          "input.intensity_max": 0.001}):
+        with peer.parameters(f"/{node}", {"ground.sensor_pose.height": 1.73, "input.intensity_max": 0.001}):
             is_reported("input.intensity_max")
     is_reported("segmenting")
     assert peer.get_message(node) == "segmenting"
@@ -122,24 +125,27 @@ def test_layout_does_not_change_the_result(process, good_cloud):
     organised = cloud(np.concatenate([xyz, holes, np.zeros_like(holes)]), 103, is_dense=False)
     organised.height, organised.width = 8, 10_000
     organised.row_step = organised.width * organised.point_step
-    clouds = [process("ground_segmentation", msg) for msg in (cloud(xyz, 101), big_endian(xyz, 102),
-                                                            organised)]
+    clouds = [process("ground_segmentation", msg) for msg in (cloud(xyz, 101), big_endian(xyz, 102), organised)]
     plain, big, grid = (to_array(msg)["ground"] for msg in clouds)
     assert plain.sum() > 1000
     np.testing.assert_array_equal(plain, big)
-    np.testing.assert_array_equal(plain, grid[:len(plain)])
-    assert not grid[len(plain):].any() and clouds[-1].height == 8
+    np.testing.assert_array_equal(plain, grid[: len(plain)])
+    assert not grid[len(plain) :].any() and clouds[-1].height == 8
 
 
 def test_clustering_and_refinement_name_the_missing_column(send, peer, good_cloud):
     for node, name in ("clustering", "ground"), ("candidate_refinement", "cluster_id"):
-        send(node, good_cloud, lambda n=node, w=name: f"no column '{w}'" in peer.get_message(n),
-             f"a diagnostic of {node}")
+        send(
+            node,
+            good_cloud,
+            lambda n=node, w=name: f"no column '{w}'" in peer.get_message(n),
+            f"a diagnostic of {node}",
+        )
 
 
-def test_diagnostics_report_missing_camera_and_seed(
-        send, peer, good_cloud, drive_bag):
+def test_diagnostics_report_missing_camera_and_seed(send, peer, good_cloud, drive_bag):
     """view.enabled without CameraInfo; then without a seed; then with a clicked pedestrian."""
+
     def is_reported(words):
         send("perception", good_cloud, lambda: words in peer.get_message("perception"), words)
 
@@ -156,8 +162,9 @@ def test_diagnostics_report_missing_camera_and_seed(
         click = peer.advertise("/clicked_point", "geometry_msgs/msg/PointStamped")
         point = bag_message("geometry_msgs/msg/Point", x=nearest[0], y=nearest[1], z=nearest[2])
         for frame_id, words in (("map", "frame 'map'"), ("velodyne", "detecting")):
-            clicked = bag_message("geometry_msgs/msg/PointStamped", point=point,
-                                  header=make_header(0, frame_id, bag_message))
+            clicked = bag_message(
+                "geometry_msgs/msg/PointStamped", point=point, header=make_header(0, frame_id, bag_message)
+            )
             peer.send(click, clicked, click.get_subscription_count, "a subscriber of the click")
             is_reported(words)
         peer.wait(lambda: len(from_marker_array(found[-1])), "candidates, which may come late")

@@ -28,19 +28,20 @@ def offline(frame):
     people = select_pedestrians(frame.truth())
     if not len(people):
         return Detections.none()
-    return find_candidates(frame.load(), make_seed_source(people, None, PAPER), frame.camera(),
-                           PAPER)[1].final
+    return find_candidates(frame.load(), make_seed_source(people, None, PAPER), frame.camera(), PAPER)[1].final
 
 
-@pytest.mark.parametrize("graph, qos", [(STAGES, LATCHED), (SINGLE, SENSOR_DATA)],
-                         ids=["three nodes, latched", "one node, a driver's"])
-def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, qos, processes, peer,
-                                                                drive_bag):
+@pytest.mark.parametrize(
+    "graph, qos", [(STAGES, LATCHED), (SINGLE, SENSOR_DATA)], ids=["three nodes, latched", "one node, a driver's"]
+)
+def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, qos, processes, peer, drive_bag):
     frame, expected = next((f, e) for f in open_recording(drive_bag) if len(e := offline(f)))
     with Bag(drive_bag) as bag:
-        sent = {topic: msg for topic, _, msg in bag.messages({POINTS, TRUTH})
-                if to_ns((msg.header if topic == POINTS else msg.markers[0].header).stamp)
-                == frame.stamp_ns}
+        sent = {
+            topic: msg
+            for topic, _, msg in bag.messages({POINTS, TRUTH})
+            if to_ns((msg.header if topic == POINTS else msg.markers[0].header).stamp) == frame.stamp_ns
+        }
         camera = {topic: msg for topic, _, msg in bag.messages({CAMERA_INFO, EXTRINSICS})}
         types = dict(bag.topics)
     first, last = (list(graph)[i] for i in (0, -1))
@@ -49,20 +50,22 @@ def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, qos, proc
     found = peer.listen(f"/{last}/output/detections", MARKERS)
     truth, cloud = peer.advertise(TRUTH, MARKERS), peer.advertise(POINTS, CLOUD)
     peer.wait_for_graph(graph)
-    peer.send(cloud, sent[POINTS], lambda: "waits for the camera's calibration"
-              in peer.get_message(first), "the reason why it waits")
+    peer.send(
+        cloud,
+        sent[POINTS],
+        lambda: "waits for the camera's calibration" in peer.get_message(first),
+        "the reason why it waits",
+    )
     assert not found
     assert len(camera) == 2
-    for topic, over in ((CAMERA_INFO, "no CameraInfo on"),
-                        (EXTRINSICS, "waits for the camera")):
+    for topic, over in ((CAMERA_INFO, "no CameraInfo on"), (EXTRINSICS, "waits for the camera")):
         assert not found
         talker = peer.advertise(topic, types[topic], qos)
         if qos is LATCHED:
             talker.publish(encode(camera[topic]))
         else:
             assert over in peer.get_message(first)
-            peer.send(talker, camera[topic], lambda w=over: w not in peer.get_message(first),
-                      f"an end of '{over}'")
+            peer.send(talker, camera[topic], lambda w=over: w not in peer.get_message(first), f"an end of '{over}'")
     peer.send(truth, sent[TRUTH], lambda: found, "the detections")
     received = to_detections(from_marker_array(found[-1]))
     np.testing.assert_array_equal(received.boxes, expected.boxes)

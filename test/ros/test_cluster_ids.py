@@ -32,19 +32,22 @@ def test_boxes_and_candidates_have_the_ids_of_the_cloud(processes, peer, drive_b
     assert len(segmented.indices) == len(scan)
     own = segmented.cluster_ids.astype(np.int64)
     foreign = np.where(own > 0, 2**32 - 5 - 7 * own, 0)
-    msg = make_cloud_message(scan.xyz, ground=segmented.ground.astype("u1"),
-                             cluster_id=foreign.astype("u4"))
-    _, expected = find_candidates(scan, seed, None, params, ground=segmented.ground,
-                                  cluster_ids=foreign)
-    assert len(expected.final) and expected.clusters.max() > 2**31 and set(
-        expected.clusters) <= set(foreign)
+    msg = make_cloud_message(scan.xyz, ground=segmented.ground.astype("u1"), cluster_id=foreign.astype("u4"))
+    _, expected = find_candidates(scan, seed, None, params, ground=segmented.ground, cluster_ids=foreign)
+    assert len(expected.final) and expected.clusters.max() > 2**31 and set(expected.clusters) <= set(foreign)
 
     for node in ("candidate_refinement", "clustering"):
-        processes.start(node, {"~/input/points": "/in", "~/output/detections": "/found",
-                               "~/output/boxes": "/boxes", "~/output/points": "/out"},
-                        {"seed.source": "file"})
-    found, boxes, out = (peer.listen("/found", MARKERS), peer.listen("/boxes", MARKERS),
-                         peer.listen("/out", CLOUD))
+        processes.start(
+            node,
+            {
+                "~/input/points": "/in",
+                "~/output/detections": "/found",
+                "~/output/boxes": "/boxes",
+                "~/output/points": "/out",
+            },
+            {"seed.source": "file"},
+        )
+    found, boxes, out = (peer.listen("/found", MARKERS), peer.listen("/boxes", MARKERS), peer.listen("/out", CLOUD))
     peer.send(peer.advertise("/in", CLOUD), msg, lambda: found and boxes and out, "results of both")
 
     candidates = from_marker_array(found[-1])

@@ -29,8 +29,7 @@ from lidar_perception.types import InputError
 FRAMES = 4  # tracks are confirmed
 
 
-def test_demo_scores_the_offline_result_in_one_process_and_in_many(drive_bag, make_bag,
-                                                                   tmp_path):
+def test_demo_scores_the_offline_result_in_one_process_and_in_many(drive_bag, make_bag, tmp_path):
     """Tracks are equal to the byte."""
     bag = make_bag(open_recording(drive_bag).frames[:FRAMES])
     frames = {frame.stamp_ns: frame for frame in open_recording(bag)}
@@ -43,7 +42,7 @@ def test_demo_scores_the_offline_result_in_one_process_and_in_many(drive_bag, ma
         outcome = CliRunner().invoke(demo, ["--data", str(bag), *arguments, "--out", str(out)])
         assert outcome.exit_code == 0, outcome.output
         scores = json.loads((out / "scores.json").read_text())
-        found, = read_results(out / "result", list_result_topics(False, "fused")[FINAL])
+        (found,) = read_results(out / "result", list_result_topics(False, "fused")[FINAL])
         assert {f.stamp_ns for f in found} == frames.keys() and scores["results"] == len(frames)
         for answer in found:
             assert_equal(answer.found, expected[answer.stamp_ns])
@@ -58,8 +57,7 @@ def test_demo_scores_the_offline_result_in_one_process_and_in_many(drive_bag, ma
 
 
 @pytest.mark.parametrize(("real_time", "waiting"), [(False, graph_replay.AHEAD), (True, None)])
-def test_in_real_time_as_many_clouds_wait_as_on_a_robot(
-        drive_bag, tmp_path, monkeypatch, real_time, waiting):
+def test_in_real_time_as_many_clouds_wait_as_on_a_robot(drive_bag, tmp_path, monkeypatch, real_time, waiting):
     class Enough(Exception):
         pass
 
@@ -72,12 +70,23 @@ def test_in_real_time_as_many_clouds_wait_as_on_a_robot(
         graph_replay.replay(drive_bag, 1, tmp_path, PAPER, real_time=real_time)
 
 
-@pytest.mark.parametrize(("arguments", "node", "expected"), [
-    (["--set", "fused.scores.car=0.7", "--range", "around", "--device", "cpu"], "fused_detector",
-     {"fused.scores.car": 0.7, "fused.range": "around", "fused.device": "cpu"}),
-    (["--set", "ground.method=cloth"], "ground_segmentation", {"ground.method": "cloth"}),
-    (["--detector", "candidates", "--config", "best", "--set", "stm.shifts=1"],
-     "candidate_refinement", {"stm.shifts": 1, "stm.window": "metric"})], ids=range(3))
+@pytest.mark.parametrize(
+    ("arguments", "node", "expected"),
+    [
+        (
+            ["--set", "fused.scores.car=0.7", "--range", "around", "--device", "cpu"],
+            "fused_detector",
+            {"fused.scores.car": 0.7, "fused.range": "around", "fused.device": "cpu"},
+        ),
+        (["--set", "ground.method=cloth"], "ground_segmentation", {"ground.method": "cloth"}),
+        (
+            ["--detector", "candidates", "--config", "best", "--set", "stm.shifts=1"],
+            "candidate_refinement",
+            {"stm.shifts": 1, "stm.window": "metric"},
+        ),
+    ],
+    ids=range(3),
+)
 def test_parameters_reach_the_nodes(drive_bag, tmp_path, monkeypatch, arguments, node, expected):
     given = {}
 
@@ -103,12 +112,15 @@ def test_what_demo_did_not_make_stays(drive_bag, make_bag, tmp_path):
     assert message_bytes(mine) == message_bytes(bag)
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["--config", "best"], "the configuration best is for candidates"),
-    (["--set", "stm.threshold=0.5"], "there is no parameter 'stm.threshold' of fused"),
-    (["--ground-method", "cloth"], "--set ground.method=VALUE"),
-    (["--detector", "candidates", "--set", "fused.proposals=0.1"], "of candidates")])
-def test_demo_refuses_parameters_of_another_detector(tmp_path, monkeypatch, capsys, arguments,
-                                                     words):
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--config", "best"], "the configuration best is for candidates"),
+        (["--set", "stm.threshold=0.5"], "there is no parameter 'stm.threshold' of fused"),
+        (["--ground-method", "cloth"], "--set ground.method=VALUE"),
+        (["--detector", "candidates", "--set", "fused.proposals=0.1"], "of candidates"),
+    ],
+)
+def test_demo_refuses_parameters_of_another_detector(tmp_path, monkeypatch, capsys, arguments, words):
     assert exit_of(monkeypatch, "demo", *arguments, "--out", tmp_path / "out") == 2
     assert words in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -21,8 +21,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def drive(at_ns):
     """Return the pose of the base in odom: 15 m/s on a left turn."""
-    return make_constant_motion([15.0, 0.0, 0.0],
-                                [0.0, 0.0, 0.5])(np.array([(at_ns - START) * 1e-9]))[0]
+    return make_constant_motion([15.0, 0.0, 0.0], [0.0, 0.0, 0.5])(np.array([(at_ns - START) * 1e-9]))[0]
 
 
 @pytest.mark.parametrize("source", ["odometry", "tf"])
@@ -31,18 +30,24 @@ def test_cloud_of_moving_sensor_is_compensated(start, source):
     cloud is used uncompensated, with a warning."""
     rng = np.random.default_rng(0)
     sensor = mount_pose(1.2, 0.1, 1.8, 0.5, 0.0, 0.0)
-    still = np.vstack([rng.uniform(-30, 30, (3000, 3)) * [1, 1, 0.001] - [0, 0, 1.8],
-                       rng.uniform(-0.5, 0.5, (50, 3)) + [-1.0, 0, -0.6]]).astype(np.float32)
+    still = np.vstack(
+        [
+            rng.uniform(-30, 30, (3000, 3)) * [1, 1, 0.001] - [0, 0, 1.8],
+            rng.uniform(-0.5, 0.5, (50, 3)) + [-1.0, 0, -0.6],
+        ]
+    ).astype(np.float32)
     body = np.arange(3000, 3050)
     seconds = rng.uniform(0.0, 0.1, len(still))
 
     def poses(at):
         return np.array([drive(START + round(s * 1e9)) @ sensor for s in at])
+
     raw = skew(still, seconds, poses)
     raw[body] = still[body]
-    node = start(GroundSegmentation, **{
-        "input.deskew": source, "base_frame": "base",
-        "crop.body": [-1.5, -1.5, 0.2, 2.0, 1.5, 2.5]})
+    node = start(
+        GroundSegmentation,
+        **{"input.deskew": source, "base_frame": "base", "crop.body": [-1.5, -1.5, 0.2, 2.0, 1.5, 2.5]},
+    )
     node.transforms.on_tf(transforms(("base", "lidar", sensor, 0)), static=True)
     msg = message(raw, t=np.rint(seconds * 1e9).astype("<u4"))
 
@@ -73,8 +78,8 @@ def test_cloud_of_moving_sensor_is_compensated(start, source):
     again.transforms = node.transforms
     give(again, after)
     np.testing.assert_array_equal(  # moved once
-        to_array(decode(again.sent["points"][-1], "sensor_msgs/msg/PointCloud2"))["x"],
-        moved[:, 0])
+        to_array(decode(again.sent["points"][-1], "sensor_msgs/msg/PointCloud2"))["x"], moved[:, 0]
+    )
     give(node, message(raw, START + PERIOD))
     assert "no time column" in problems(node) and len(node.sent["points"]) == 3
     assert make_time(START, bag_message).sec == after.header.stamp.sec and len(frame_)
@@ -99,8 +104,7 @@ def test_first_cloud_waits_for_odometry_of_its_whole_turn(start):
 
 
 @pytest.mark.parametrize("first, begin, sectors", [(0.3, 0.0, ()), (1.0, -1.0, (120.0, 240.0))])
-def test_later_clouds_wait_for_the_end_of_their_turn(start, first, begin,
-                                                     sectors):
+def test_later_clouds_wait_for_the_end_of_their_turn(start, first, begin, sectors):
     """The first turn is partial, or the stamp is at the end of a turn, with cropped points there.
     Odometry comes every 0.02 s."""
     node = start(GroundSegmentation, **{"input.deskew": "odometry", "crop.sectors": sectors})
@@ -111,9 +115,10 @@ def test_later_clouds_wait_for_the_end_of_their_turn(start, first, begin,
         stamp = next(heard)
         node.transforms.on_odometry(odometry(np.eye(4), stamp, "lidar"))
         return stamp
+
     known = hear()
     for i in range(1, 8):
-        share = np.linspace(0, 1, 400)[:round(400 * (first if i == 1 else 1.0))]
+        share = np.linspace(0, 1, 400)[: round(400 * (first if i == 1 else 1.0))]
         angle, seconds = np.pi - 2 * np.pi * share, 0.0999 * (begin + share)
         xyz = np.column_stack([20 * np.cos(angle), 20 * np.sin(angle), np.full(len(angle), -1.7)])
         stamp = START + i * PERIOD + PERIOD // 10

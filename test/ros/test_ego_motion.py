@@ -52,14 +52,12 @@ def drive(node, tell, poses, frame_id="lidar"):
     for i, (found, at) in enumerate(zip(crowd(frames=len(poses)), poses)):
         stamp = START + i * TENTH
         tell(i, stamp)
-        seen = Detections.of(transform_boxes(found.boxes, invert_pose(at)), found.class_ids,
-                             found.scores)
+        seen = Detections.of(transform_boxes(found.boxes, invert_pose(at)), found.class_ids, found.scores)
         node.on_markers(make_detection_markers(seen, header(stamp, frame_id), bag_message))
         tracks, shown = library(seen, stamp, at), tracked(node)
         assert shown.ids.tolist() == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
         np.testing.assert_allclose(shown.boxes, tracks.detections.boxes, atol=1e-4)
-        np.testing.assert_allclose([extra["velocity"] for extra in shown.extras],
-                                   tracks.velocities, atol=2e-3)
+        np.testing.assert_allclose([extra["velocity"] for extra in shown.extras], tracks.velocities, atol=2e-3)
 
 
 @pytest.mark.parametrize("source", ["odometry", "tf", "auto"])
@@ -73,6 +71,7 @@ def test_odometry_is_transformed_to_the_sensor(start, source):
             node.transforms.on_odometry(odometry(base_at(i), stamp))
         else:
             node.transforms.on_tf(transforms(("odom", "base", base_at(i), stamp)), static=False)
+
     drive(node, tell, [base_at(i) @ SENSOR for i in range(20)])
     assert node.counts["ego"] == ("odometry" if source == "odometry" else "tf")
     assert node.state[1] == "tracking"
@@ -80,14 +79,19 @@ def test_odometry_is_transformed_to_the_sensor(start, source):
 
 def test_detections_in_the_frame_of_the_odometry_do_not_move(start):
     node = start(TrackerNode)
-    drive(node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp)),
-          np.tile(np.eye(4), (20, 1, 1)), "odom")
+    drive(
+        node,
+        lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp)),
+        np.tile(np.eye(4), (20, 1, 1)),
+        "odom",
+    )
 
 
 def test_missing_odometry_to_sensor_transform_is_reported(start):
     node = start(TrackerNode)
-    drive(node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp)),
-          [base_at(i) for i in range(10)])
+    drive(
+        node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp)), [base_at(i) for i in range(10)]
+    )
     assert "odometry is of 'base', the detections are in 'lidar'" in node.state[1]
     node.transforms.on_tf(transforms(("base", "lidar", SENSOR, 0)), static=True)
     stamp = START + 10 * TENTH
@@ -104,8 +108,7 @@ def test_missing_transform_is_named(start):
 
 
 @pytest.mark.parametrize("better", ["odometry", "tf"])
-def test_auto_falls_back_to_scans_and_returns_to_poses(
-        start, better):
+def test_auto_falls_back_to_scans_and_returns_to_poses(start, better):
     if not has_odometry():
         pytest.skip("needs kiss-icp, the extra [odometry]")
     node = start(TrackerNode)
@@ -116,8 +119,7 @@ def test_auto_falls_back_to_scans_and_returns_to_poses(
         for i in range(first, first + count):
             if len(node._receptions()) > node_inputs:
                 give_to_points(message(xyz, START + i * TENTH))
-            found.deliver(encode(make_detection_markers(next(crowd()), header(START + i * TENTH),
-                                                        bag_message)), False)
+            found.deliver(encode(make_detection_markers(next(crowd()), header(START + i * TENTH), bag_message)), False)
 
     def give_to_points(cloud):
         points = next(r for r in node._receptions() if r.topic.endswith("/points"))
@@ -164,8 +166,7 @@ def test_empty_cloud_is_answered_and_scan_poses_continue(start):
     node = start(Perception, **{"tracking.enabled": True, "ego.source": "kiss_icp"})
     xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     for i in range(6):
-        node._receptions()[0].deliver(encode(message(xyz[:0] if i == 3 else xyz,
-                                                     START + i * TENTH)), False)
+        node._receptions()[0].deliver(encode(message(xyz[:0] if i == 3 else xyz, START + i * TENTH)), False)
         assert node.counts["frames"] == len(node.sent["tracks"]) == i + 1
     assert node.counts["ego"] == "kiss_icp" and node.outputs.final.tracks.ego.icp_restarts == 1
 
@@ -222,8 +223,7 @@ def test_source_that_is_always_late_is_named(start, source, lag):
     assert node.counts["ego"] == source
 
 
-def test_first_of_two_odometry_publishers_is_used(
-        start, monkeypatch):
+def test_first_of_two_odometry_publishers_is_used(start, monkeypatch):
     node, now = start(TrackerNode), [100.0]
     monkeypatch.setattr(transforms_module, "monotonic", lambda: now[0])
 
@@ -241,8 +241,11 @@ def test_first_of_two_odometry_publishers_is_used(
 
 def test_odometry_without_child_frame_is_ignored(start):
     node = start(TrackerNode)
-    drive(node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp, "")),
-          [base_at(i) for i in range(10)])
+    drive(
+        node,
+        lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp, "")),
+        [base_at(i) for i in range(10)],
+    )
     assert "child_frame_id is empty" in node.state[1]
     with pytest.raises(MissingTransform, match="child_frame_id"):
         node.transforms.sensor_poses("odometry", "lidar", np.array([START]))
@@ -260,8 +263,9 @@ def test_scan_poses_are_converted_to_detection_frame(start):
     assert ego.find_pose(header(START, "base")) is None
     assert "TF does not connect them" in ego.find_problem("base", START)
     node.transforms.on_tf(transforms(("base", "lidar", rear, 0)), static=True)
-    np.testing.assert_allclose(ego.find_pose(header(START, "base")),
-                               ego.find_pose(header(START)) @ invert_pose(rear), atol=1e-6)
+    np.testing.assert_allclose(
+        ego.find_pose(header(START, "base")), ego.find_pose(header(START)) @ invert_pose(rear), atol=1e-6
+    )
     assert ego.find_problem("base", START) is None
     for late in (0, 1):  # repeated, or late from the queue of another driver: the map stays
         ego._on_cloud(message(xyz, START + (2 - late) * TENTH))
@@ -274,13 +278,11 @@ def test_foreign_class_names_are_mapped_or_reported(start):
     found = next(crowd())
     there = make_detection_markers(found, header(START), bag_message)
     for marker in there.markers:
-        marker.ns = {"Pedestrian": "person", "Car": "car", "Cyclist": "BICYCLE"}.get(marker.ns,
-                                                                                     marker.ns)
+        marker.ns = {"Pedestrian": "person", "Car": "car", "Cyclist": "BICYCLE"}.get(marker.ns, marker.ns)
     node = start(TrackerNode)
     node.on_markers(there)
     assert node.state[1] == "tracking"
-    assert to_class_ids(["person", "CAR", "bicycle", "tree"]) == [
-        PEDESTRIAN, CAR, CYCLIST, CLASSES.index("Misc")]
+    assert to_class_ids(["person", "CAR", "bicycle", "tree"]) == [PEDESTRIAN, CAR, CYCLIST, CLASSES.index("Misc")]
     there.markers[-1].ns = "sofa"
     node.on_markers(there)
     assert "sofa" in node.state[1] and "Pedestrian" in node.state[1]

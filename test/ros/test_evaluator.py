@@ -21,8 +21,9 @@ from msg_utils.stamps import make_header
 
 
 def array(number, frame_id="lidar"):
-    return make_detection_markers(next(crowd()), make_header(START + number * TENTH, frame_id,
-                                                             bag_message), bag_message)
+    return make_detection_markers(
+        next(crowd()), make_header(START + number * TENTH, frame_id, bag_message), bag_message
+    )
 
 
 def list_problems(node):
@@ -49,8 +50,7 @@ def test_detections_wait_for_their_labels_up_to_a_limit(start):
             node._add(name, array(i))
     assert node.counts["frames"] == MAX_INCOMPLETE_FRAMES and node.counts["incomplete"] == 30
     assert not node.waiting and node.counts["repeated"] == 30
-    assert "nothing on /evaluator/input/ground_truth with their" in node.state[1] or (
-        node.state[1] == "scoring")
+    assert "nothing on /evaluator/input/ground_truth with their" in node.state[1] or (node.state[1] == "scoring")
 
 
 def test_file_error_is_reported_and_writing_retried(start, tmp_path):
@@ -83,13 +83,21 @@ def test_boxes_in_other_frames_are_scored_with_a_warning(start):
 
 def objects(stamp, cars=(), cyclists=(), pedestrians=()):
     """Return markers of objects at the given distances ahead, 2 m apart to the left."""
-    rows = [[x, 2.0 * i, -0.9, *size, 0.0, CLASSES.index(name)] for name, size, found in (
-        ("Car", (4, 2, 1.5), cars), ("Cyclist", (1.8, 0.6, 1.7), cyclists),
-        ("Pedestrian", (0.8, 0.6, 1.7), pedestrians)) for i, x in enumerate(found)]
+    rows = [
+        [x, 2.0 * i, -0.9, *size, 0.0, CLASSES.index(name)]
+        for name, size, found in (
+            ("Car", (4, 2, 1.5), cars),
+            ("Cyclist", (1.8, 0.6, 1.7), cyclists),
+            ("Pedestrian", (0.8, 0.6, 1.7), pedestrians),
+        )
+        for i, x in enumerate(found)
+    ]
     boxes = np.array(rows, float).reshape(-1, 8)
     return make_detection_markers(
         Detections.of(boxes[:, :7], boxes[:, 7].astype(int), np.full(len(boxes), 0.9)),
-        make_header(stamp, "lidar", bag_message), bag_message)
+        make_header(stamp, "lidar", bag_message),
+        bag_message,
+    )
 
 
 @pytest.mark.parametrize("with_camera", [False, True])
@@ -97,16 +105,20 @@ def test_all_classes_are_scored_and_precision_at_the_end(with_camera, start, tmp
     file = tmp_path / "scores.json"
     node = start(Evaluator, file=str(file))
     if with_camera:
-        camera = Calibration(np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
-                             np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]),
-                             1200, 370)
+        camera = Calibration(
+            np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
+            np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]),
+            1200,
+            370,
+        )
         header = make_header(0, CAMERA_FRAME, bag_message)
         node.camera_info = make_camera_info(camera, header, bag_message)
         node.extrinsics = make_extrinsics(camera, make_header(0, "lidar", bag_message), bag_message)
     frames = [  # labels and detections
         (dict(cars=[20, -20], pedestrians=[10]), dict(cars=[20, -30], pedestrians=[10, 30])),
         (dict(cars=[15], cyclists=[12]), dict(cars=[15], pedestrians=[9])),
-        (dict(pedestrians=[8]), dict(pedestrians=[8], cyclists=[14]))]
+        (dict(pedestrians=[8]), dict(pedestrians=[8], cyclists=[14])),
+    ]
     for i, (truth, found) in enumerate(frames):
         node._add("ground_truth", objects(START + i, **truth))
         node._add("final", objects(START + i, **found))
@@ -126,11 +138,15 @@ def test_all_classes_are_scored_and_precision_at_the_end(with_camera, start, tmp
     assert node.counts["F1 of final, Car"] == ("1.000" if with_camera else "0.667")
 
 
-@pytest.mark.parametrize("values, words", [
-    ({"classes": ["Cart"]}, "no class 'Cart'; did you mean 'Car'"),
-    ({"stages": ["ground_truth"]}, "must be distinct names"),
-    ({"stages": ["a", "a"]}, "must be distinct names"),
-    ({"timing": ["foo"]}, "not of the form")])
+@pytest.mark.parametrize(
+    "values, words",
+    [
+        ({"classes": ["Cart"]}, "no class 'Cart'; did you mean 'Car'"),
+        ({"stages": ["ground_truth"]}, "must be distinct names"),
+        ({"stages": ["a", "a"]}, "must be distinct names"),
+        ({"timing": ["foo"]}, "not of the form"),
+    ],
+)
 def test_unusable_parameters_are_refused(start, values, words):
     with pytest.raises(InputError, match=words):
         start(Evaluator, **values)

@@ -17,12 +17,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.nodes.graph import cloud_topic, list_result_topics
 from lidar_perception.nodes.replay.graph_replay import replay
 from lidar_perception.param_fields import with_values
-from lidar_perception.scoring.centres.report import (
-    CandidateReport,
-    make_seed_source,
-    measure_frame,
-    select_pedestrians,
-)
+from lidar_perception.scoring.centres.report import CandidateReport, make_seed_source, measure_frame, select_pedestrians
 from lidar_perception.testing.processes import NodesUnderTest
 from lidar_perception.wire.messages import read_column, to_detections, to_point_cloud
 from lidar_perception.wire.topics import POINTS
@@ -33,8 +28,11 @@ PAPER_C = {"ground.method": "cloth", "clustering.method": "euclidean", "boxes.sh
 RUNS = {  # (single, processes, parameters in addition to PAPER)
     "three nodes of paper C": (False, True, PAPER_C),
     "the same in one process": (False, False, PAPER_C),
-    "one node, patchwork": (True, True, {"ground.method": "patchwork", "boxes.shape": "min_area",
-                                         "clustering.dbscan.join_bands": True}),
+    "one node, patchwork": (
+        True,
+        True,
+        {"ground.method": "patchwork", "boxes.shape": "min_area", "clustering.dbscan.join_bands": True},
+    ),
 }
 
 
@@ -52,8 +50,7 @@ def run(setting, drive_bag, tmp_path_factory):
     with Bag(drive_bag) as bag, pytest.MonkeyPatch.context() as patch:
         clouds = bag.counts[POINTS]
         patch.setattr("lidar_perception.nodes.replay.graph_replay.Processes", NodesUnderTest)
-        return single, replay(drive_bag, clouds, out, params, single=single,
-                              processes=processes), out
+        return single, replay(drive_bag, clouds, out, params, single=single, processes=processes), out
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +62,8 @@ def offline(setting, drive_bag):
         if len(people):
             report.update(measure_frame(frame, params))
             results[frame.stamp_ns] = find_candidates(
-                frame.load(), make_seed_source(people, None, params), frame.camera(), params)
+                frame.load(), make_seed_source(people, None, params), frame.camera(), params
+            )
     return results, report
 
 
@@ -105,8 +103,7 @@ def test_published_cloud_has_all_fields_and_offline_columns(run, offline, drive_
         segmented, _ = offline[0][frame.stamp_ns]
         np.testing.assert_array_equal(indices, segmented.indices)
         np.testing.assert_array_equal(read_column(msg, "ground", indices) > 0, segmented.ground)
-        np.testing.assert_array_equal(read_column(msg, "cluster_id", indices),
-                                      segmented.cluster_ids)
+        np.testing.assert_array_equal(read_column(msg, "cluster_id", indices), segmented.cluster_ids)
         assert msg.header.frame_id == "velodyne"
 
 

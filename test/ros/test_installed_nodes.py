@@ -19,14 +19,17 @@ from lidar_perception.nodes.main import STOP_SIGNALS
 from lidar_perception.wire.codec import bag_message
 
 PREFIX = Path(sys.prefix)
-STARTED_BY = {"ros2 run": lambda node: [PREFIX / "lib/lidar_perception" / node],
-              "lidar-perception run": lambda node: [PREFIX / "bin/lidar-perception", "run", node]}
+STARTED_BY = {
+    "ros2 run": lambda node: [PREFIX / "lib/lidar_perception" / node],
+    "lidar-perception run": lambda node: [PREFIX / "bin/lidar-perception", "run", node],
+}
 LIMIT = 120.0  # seconds until a process is where a test wants it, on a busy machine
 NOTE = "std_msgs/msg/String"
 
 pytestmark = pytest.mark.skipif(
     not (Path("/proc/self/maps").is_file() and STARTED_BY["ros2 run"]("tracker")[0].is_file()),
-    reason="needs /proc, and the package installed by pip")
+    reason="needs /proc, and the package installed by pip",
+)
 
 
 def blocks_signals(thread: Path) -> bool:
@@ -38,8 +41,11 @@ def blocks_signals(thread: Path) -> bool:
 def shared_segments(process: Path) -> set[Path]:
     """Return the segments of Fast DDS that a process has made: it holds their locks open."""
     opened = {file.readlink() for file in (process / "fd").iterdir() if file.is_symlink()}
-    return {path.with_name(path.name.removesuffix("_el")) for path in opened
-            if re.fullmatch(r"fastrtps_[0-9a-f]{16}_el", path.name)}
+    return {
+        path.with_name(path.name.removesuffix("_el"))
+        for path in opened
+        if re.fullmatch(r"fastrtps_[0-9a-f]{16}_el", path.name)
+    }
 
 
 def wait_for_stage(process: subprocess.Popen, stage: str, log: Path) -> None:
@@ -48,8 +54,8 @@ def wait_for_stage(process: subprocess.Popen, stage: str, log: Path) -> None:
     own = Path("/proc/self/cmdline").read_bytes()
     # Between fork and exec the child has this process's libraries, and blocks all signals.
     while (proc / "cmdline").read_bytes() == own or not (
-            blocks_signals(proc) if stage == "blocked" else
-            stage in (proc / "maps").read_text() or stage in log.read_text()):
+        blocks_signals(proc) if stage == "blocked" else stage in (proc / "maps").read_text() or stage in log.read_text()
+    ):
         assert process.poll() is None and monotonic() < end, log.read_text()
         sleep(0.01)
 
@@ -59,12 +65,16 @@ def start(processes, how: str, node: str, *arguments: str) -> tuple[subprocess.P
     return processes.running[node], processes.logs / f"{node}.log"
 
 
-@pytest.mark.parametrize("how, node, stage, number", [
-    ("ros2 run", "clustering", "blocked", signal.SIGINT),
-    ("ros2 run", "perception", "numpy", signal.SIGTERM),
-    ("ros2 run", "fused_detector", "configuring", signal.SIGINT),
-    ("lidar-perception run", "tracker", "blocked", signal.SIGTERM),
-    ("lidar-perception run", "evaluator", "ready", signal.SIGINT)])
+@pytest.mark.parametrize(
+    "how, node, stage, number",
+    [
+        ("ros2 run", "clustering", "blocked", signal.SIGINT),
+        ("ros2 run", "perception", "numpy", signal.SIGTERM),
+        ("ros2 run", "fused_detector", "configuring", signal.SIGINT),
+        ("lidar-perception run", "tracker", "blocked", signal.SIGTERM),
+        ("lidar-perception run", "evaluator", "ready", signal.SIGINT),
+    ],
+)
 def test_node_stops_cleanly_at_any_stage(how, node, stage, number, processes):
     process, log = start(processes, how, node)
     wait_for_stage(process, stage, log)
@@ -81,10 +91,12 @@ def test_node_stops_cleanly_at_any_stage(how, node, stage, number, processes):
 @pytest.mark.parametrize("number", sorted(STOP_SIGNALS))
 def test_recorder_completes_its_bag(number, processes, peer, tmp_path):
     bag, note = tmp_path / "bag", bag_message(NOTE)
-    process, _ = start(processes, "ros2 run", "bag_recorder", "--ros-args", "-p", f"bag:={bag}",
-                       "-p", "topics:=[/note]")
-    peer.send(peer.advertise("/note", NOTE), note,
-              lambda: int(peer.get_value("bag_recorder", "frames") or 0) > 1, "two notes")
+    process, _ = start(
+        processes, "ros2 run", "bag_recorder", "--ros-args", "-p", f"bag:={bag}", "-p", "topics:=[/note]"
+    )
+    peer.send(
+        peer.advertise("/note", NOTE), note, lambda: int(peer.get_value("bag_recorder", "frames") or 0) > 1, "two notes"
+    )
     process.send_signal(number)
     assert process.wait(timeout=60) == 0
     with Bag(bag) as recorded:
@@ -94,8 +106,9 @@ def test_recorder_completes_its_bag(number, processes, peer, tmp_path):
 
 def test_node_entry_blocks_signals_before_loading_libraries():
     """A thread that one starts would not block them: of NumPy's OpenBLAS, for one."""
-    code = ("import sys; before = {*sys.modules}; import lidar_perception.nodes.main, "
-            "lidar_perception.cli.entry; print(*{n.partition('.')[0] for n in {*sys.modules} - "
-            "before} - sys.stdlib_module_names)")
-    assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == [
-        "lidar_perception"]
+    code = (
+        "import sys; before = {*sys.modules}; import lidar_perception.nodes.main, "
+        "lidar_perception.cli.entry; print(*{n.partition('.')[0] for n in {*sys.modules} - "
+        "before} - sys.stdlib_module_names)"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == ["lidar_perception"]

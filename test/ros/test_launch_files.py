@@ -33,12 +33,19 @@ def launched(monkeypatch):
             launch = Launch(name, {"processes": "true"} | given)
             nodes.messages = launch.messages
             return {n.name if n.executable == "tracker" else n.executable: n for n in launch.nodes}
+
         return nodes
+
     return load
 
 
-FILES = {"perception": "candidates", "pointpillars": "pointpillars", "pointnet": "pointnet",
-         "fused": "fused", "detectors": "fused"}
+FILES = {
+    "perception": "candidates",
+    "pointpillars": "pointpillars",
+    "pointnet": "pointnet",
+    "fused": "fused",
+    "detectors": "fused",
+}
 SEVERAL = "candidates,pointpillars,pointnet"
 
 
@@ -51,8 +58,7 @@ def test_launch_file_starts_its_graph_or_single_detectors(name, launched):
     assert list(started) == list(build_graph(detectors))
     assert list(nodes(single="true")) == list(build_graph(detectors, single=True))
     assert ("~/input/points", "/cloud") in started["ground_segmentation"].remappings
-    assert ("~/input/points", "ground_segmentation/output/points") in (
-        started["clustering"].remappings)
+    assert ("~/input/points", "ground_segmentation/output/points") in (started["clustering"].remappings)
     for node in started.values():
         assert Path(node.parameters[0]).is_file() and node.namespace is None
         assert node.parameters[1] == {"use_sim_time": True, "input.reliability": "reliable"}
@@ -77,43 +83,59 @@ def test_launch_file_starts_its_graph_or_single_detectors(name, launched):
         nodes(ahead="left")
 
 
-@pytest.mark.parametrize(("processes", "cores", "together"), [
-    ("true", 2, False), ("false", 16, True), ("auto", 4, True), ("auto", 5, False)])
-def test_graph_is_one_process_on_request_or_on_few_cores(processes, cores, together, launched,
-                                                         monkeypatch):
+@pytest.mark.parametrize(
+    ("processes", "cores", "together"), [("true", 2, False), ("false", 16, True), ("auto", 4, True), ("auto", 5, False)]
+)
+def test_graph_is_one_process_on_request_or_on_few_cores(processes, cores, together, launched, monkeypatch):
     monkeypatch.setattr(graph_module, "count_cores", lambda: cores)
     nodes = launched("detectors")
-    given = dict(processes=processes, tracking="true", namespace="left", range="around",
-                 points="/cloud", log_level="debug", respawn="true")
+    given = dict(
+        processes=processes,
+        tracking="true",
+        namespace="left",
+        range="around",
+        points="/cloud",
+        log_level="debug",
+        respawn="true",
+    )
     started = nodes(**given)
     graph = build_graph(["fused"], tracking=True)
     assert len(started) == (1 if together else len(graph))
     assert len(nodes(**given | {"tracking": "false"}, single="true")) == 1
     if not together:
         return
-    node, = started.values()
-    assert (node.namespace, node.respawn, node.ros_arguments) == (
-        "left", True, ["--log-level", "debug"])
+    (node,) = started.values()
+    assert (node.namespace, node.respawn, node.ros_arguments) == ("left", True, ["--log-level", "debug"])
     parts, shared = split_arguments([node.executable, *node.arguments, "--ros-args", "-r", "a:=b"])
     assert [part[0] for part in parts] == [*graph] and shared == ["--ros-args", "-r", "a:=b"]
     for part, name in zip(parts, graph):
         alone = nodes(**given | {"processes": "true"})[name]
         options = list(zip(part[2::2], part[3::2]))
         assert [tuple(rule.split(":=")) for option, rule in options if option == "-r"] == [
-            ("__node", name), *alone.remappings]
+            ("__node", name),
+            *alone.remappings,
+        ]
         files = [file for option, file in options if option == "--params-file"]
         for file, parameters in zip(files, alone.parameters, strict=True):
-            assert read_sections(file) == (read_sections(parameters) if isinstance(parameters, str)
-                                           else {"/**": parameters})
+            assert read_sections(file) == (
+                read_sections(parameters) if isinstance(parameters, str) else {"/**": parameters}
+            )
 
 
-@pytest.mark.parametrize(("detectors", "given", "expected"), [
-    ("fused", {}, "ahead"), ("pointpillars,fused", {}, "ahead"), ("pointnet,fused", {}, None),
-    ("fused", {"range": "around"}, "around"), ("candidates", {}, None),
-    ("fused", {"weights": "mine.safetensors"}, None),
-    ("pointpillars,fused", {"config": "fused.range: around"}, None),
-    ("fused", {"config": "fused.range: around"}, "around"),
-    ("fused", {"config": "range: all"}, None)])
+@pytest.mark.parametrize(
+    ("detectors", "given", "expected"),
+    [
+        ("fused", {}, "ahead"),
+        ("pointpillars,fused", {}, "ahead"),
+        ("pointnet,fused", {}, None),
+        ("fused", {"range": "around"}, "around"),
+        ("candidates", {}, None),
+        ("fused", {"weights": "mine.safetensors"}, None),
+        ("pointpillars,fused", {"config": "fused.range: around"}, None),
+        ("fused", {"config": "fused.range: around"}, "around"),
+        ("fused", {"config": "range: all"}, None),
+    ],
+)
 def test_experts_have_the_range_of_the_detectors(detectors, given, expected, launched, tmp_path):
     nodes = launched("detectors")
     if "config" in given:
@@ -129,21 +151,26 @@ def test_experts_choose_the_file_of_ground_and_clusters(launched, tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text("")
     for detectors, experts, stem, words in (
-            ("pointnet,pointpillars", "", "pointnet", ["ground.method patchwork"]),
-            ("pointpillars,pointnet", "", "pointpillars", ["clustering.euclidean.gamma 0.0"]),
-            ("pointpillars,pointnet", "pointnet", "pointnet", ["ground.method patchwork"]),
-            ("pointpillars,pointnet", str(mine), "pointpillars", []),
-            ("candidates,pointnet,pointpillars", "", "perception",
-             ["ground.method cloth", "clustering.dbscan.eps [0.5, 0.7, 1.0]"]),
-            ("pointnet", "", "pointnet", [])):
+        ("pointnet,pointpillars", "", "pointnet", ["ground.method patchwork"]),
+        ("pointpillars,pointnet", "", "pointpillars", ["clustering.euclidean.gamma 0.0"]),
+        ("pointpillars,pointnet", "pointnet", "pointnet", ["ground.method patchwork"]),
+        ("pointpillars,pointnet", str(mine), "pointpillars", []),
+        (
+            "candidates,pointnet,pointpillars",
+            "",
+            "perception",
+            ["ground.method cloth", "clustering.dbscan.eps [0.5, 0.7, 1.0]"],
+        ),
+        ("pointnet", "", "pointnet", []),
+    ):
         started = nodes(detectors=detectors, experts=experts)
-        files = {name: Path(node.parameters[0]).name.split(".")[0]
-                 for name, node in started.items()}
+        files = {name: Path(node.parameters[0]).name.split(".")[0] for name, node in started.items()}
         assert files["ground_segmentation"] == files["clustering"] == stem
-        assert all(files[f"{name}_detector"] == name for name in detectors.split(",")
-                   if name != "candidates")
-        assert all((str(mine) in started[name].parameters) == (experts == str(mine))
-                   for name in ("ground_segmentation", "clustering"))
+        assert all(files[f"{name}_detector"] == name for name in detectors.split(",") if name != "candidates")
+        assert all(
+            (str(mine) in started[name].parameters) == (experts == str(mine))
+            for name in ("ground_segmentation", "clustering")
+        )
         assert len(nodes.messages) == len(words)
         assert all(word in line for word, line in zip(words, nodes.messages, strict=True))
     mine.write_text("/**: {ros__parameters: {ground: {method: patchwork}}}")
@@ -161,24 +188,33 @@ def test_arguments_override_user_file_and_defaults(launched, tmp_path):
         assert list(read_sections(file)) == ["/**"]
     nodes = launched("fused")
     mine = tmp_path / "mine.yaml"
-    mine.write_text("/**/fused_detector: {ros__parameters: {fused: {range: ahead}}}\n"
-                    "left: {clustering: {ros__parameters: {clustering.density: 1.0}}}\n")
+    mine.write_text(
+        "/**/fused_detector: {ros__parameters: {fused: {range: ahead}}}\n"
+        "left: {clustering: {ros__parameters: {clustering.density: 1.0}}}\n"
+    )
     started = nodes(config=f"{ROOT}/config/best.param.yaml,{mine}", range="around")
     *files, given, above = started["fused_detector"].parameters
-    assert [Path(file).name for file in files] == [
-        "fused.param.yaml", "best.param.yaml", "mine.yaml"]
-    assert read_sections(above) == {"/**/fused_detector": given} == {
-        "/**/fused_detector": {"fused.range": "around"}}
+    assert [Path(file).name for file in files] == ["fused.param.yaml", "best.param.yaml", "mine.yaml"]
+    assert read_sections(above) == {"/**/fused_detector": given} == {"/**/fused_detector": {"fused.range": "around"}}
     assert started["clustering"].parameters[1:] == files[1:]
     assert nodes.messages == []
 
 
-@pytest.mark.parametrize("section, words", [
-    ("fused_detectr", "is called 'fused_detectr'.*; did you mean 'fused_detector'"),
-    ("/left/ground_segmentaton", "'ground_segmentaton'.* 'ground_segmentation'"),
-    ("controller_server", "is called 'controller_server', so its parameters change nothing$"),
-    ("/**", ""), ("/*", ""), ("/left/**", ""), ("/**/clustering", ""), ("left/fused_detector", ""),
-    ("front_fused_detector", ""), ("perception", "")])  # ours, in another graph
+@pytest.mark.parametrize(
+    "section, words",
+    [
+        ("fused_detectr", "is called 'fused_detectr'.*; did you mean 'fused_detector'"),
+        ("/left/ground_segmentaton", "'ground_segmentaton'.* 'ground_segmentation'"),
+        ("controller_server", "is called 'controller_server', so its parameters change nothing$"),
+        ("/**", ""),
+        ("/*", ""),
+        ("/left/**", ""),
+        ("/**/clustering", ""),
+        ("left/fused_detector", ""),
+        ("front_fused_detector", ""),
+        ("perception", ""),
+    ],
+)  # ours, in another graph
 def test_section_of_unknown_node_is_a_warning(section, words, launched, tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text(f"{section}:\n  ros__parameters: {{input.queue: 2}}\n")
@@ -187,20 +223,23 @@ def test_section_of_unknown_node_is_a_warning(section, words, launched, tmp_path
     assert [bool(re.search(words, line)) for line in nodes.messages] == [True] * bool(words)
 
 
-@pytest.mark.parametrize("name, given, words", [
-    ("fused", "pionts", "no launch argument 'pionts'; did you mean 'points'?"),
-    ("fused", "fused.scores.car", "a parameter of fused_detector; set it in a parameter file"),
-    ("detectors", "zzz", "no launch argument 'zzz'; valid names: ahead, autostart"),
-    ("replay", "real_tme", "did you mean 'real_time'"),
-    ("replay", "namespace", "no launch argument 'namespace'"),
-    ("two_lidars", "lft", "did you mean 'left'")])
+@pytest.mark.parametrize(
+    "name, given, words",
+    [
+        ("fused", "pionts", "no launch argument 'pionts'; did you mean 'points'?"),
+        ("fused", "fused.scores.car", "a parameter of fused_detector; set it in a parameter file"),
+        ("detectors", "zzz", "no launch argument 'zzz'; valid names: ahead, autostart"),
+        ("replay", "real_tme", "did you mean 'real_time'"),
+        ("replay", "namespace", "no launch argument 'namespace'"),
+        ("two_lidars", "lft", "did you mean 'left'"),
+    ],
+)
 def test_unknown_launch_argument_is_refused(name, given, words, launched, drive_bag):
     with pytest.raises(InputError, match=re.escape(words)):
         launched(name)(**{given: "1"}, **({"bag": str(drive_bag)} if name == "replay" else {}))
 
 
-@pytest.mark.parametrize("name, given", [
-    ("fused", "points"), ("fused", "launch-prefix"), ("two_lidars", "range")])
+@pytest.mark.parametrize("name, given", [("fused", "points"), ("fused", "launch-prefix"), ("two_lidars", "range")])
 def test_known_launch_argument_is_accepted(name, given, launched):
     assert launched(name)(**{given: "auto"})
 
@@ -213,26 +252,31 @@ def test_second_sensor_has_its_own_names(launched):
     started = nodes(name_prefix="left_", detectors="pointnet")
     assert [n.name for n in started.values()] == ["left_" + n for n in started]
     assert started["clustering"].remappings == [
-        ("~/input/points", "left_ground_segmentation/output/points"), ("~/input/odometry", "odom")]
+        ("~/input/points", "left_ground_segmentation/output/points"),
+        ("~/input/odometry", "odom"),
+    ]
     assert ("~/input/points", "points") in started["ground_segmentation"].remappings
 
 
 def test_tracking_adds_a_tracker_to_each_detector(launched):
     nodes = launched("detectors")
-    started = nodes(tracking="true", odometry="/odometry", points="/cloud", namespace="left",
-                    name_prefix="a_", detectors=SEVERAL)
+    started = nodes(
+        tracking="true", odometry="/odometry", points="/cloud", namespace="left", name_prefix="a_", detectors=SEVERAL
+    )
     trackers = {name: node for name, node in started.items() if node.executable == "tracker"}
     assert list(trackers) == [f"a_{name}_tracker" for name in SEVERAL.split(",")]
     behind = trackers["a_pointnet_tracker"]
     found = "a_pointnet_detector/output/detections"
-    assert dict(behind.remappings) == {"~/input/points": "/cloud", "~/input/odometry": "/odometry",
-                                       "~/input/detections": found}
+    assert dict(behind.remappings) == {
+        "~/input/points": "/cloud",
+        "~/input/odometry": "/odometry",
+        "~/input/detections": found,
+    }
     assert behind.namespace == "left"
     [file] = behind.parameters
     assert Path(file).name == "tracker.param.yaml" and Path(file).is_file()
     alone = nodes(tracking="true", detectors="pointpillars")
-    assert ("~/input/detections", "pointpillars_detector/output/detections") in (
-        alone["tracker"].remappings)
+    assert ("~/input/detections", "pointpillars_detector/output/detections") in (alone["tracker"].remappings)
     assert "tracker" not in nodes(detectors="pointpillars")
 
 
@@ -247,10 +291,8 @@ def test_tracking_in_one_process_is_a_parameter_of_the_detector(launched):
 def test_rviz_follows_the_names_of_the_graph(launched):
     nodes = launched("detectors")
     assert "rviz2" not in nodes()
-    plain = nodes(rviz="true", detectors=SEVERAL, points="/cloud", rviz_frame="base_link",
-                  namespace="left")["rviz2"]
-    assert dict(plain.remappings) == {
-        "points": "/cloud", "tracker/output/tracks": "candidates_tracker/output/tracks"}
+    plain = nodes(rviz="true", detectors=SEVERAL, points="/cloud", rviz_frame="base_link", namespace="left")["rviz2"]
+    assert dict(plain.remappings) == {"points": "/cloud", "tracker/output/tracks": "candidates_tracker/output/tracks"}
     assert plain.namespace == "left"
     assert plain.arguments == ["-d", str(ROOT / "config/lidar_perception.rviz"), "-f", "base_link"]
     prefixed = dict(nodes(rviz="true", detectors=SEVERAL, name_prefix="left_")["rviz2"].remappings)
@@ -271,8 +313,12 @@ def test_weights_device_and_range_of_a_detector_are_arguments(name, launched):
         expected[f"{name}.range"] = "around"
     for file, weights in (name, "w.safetensors"), ("detectors", f"{name}=w.safetensors"):
         nodes = launched(file)
-        started = nodes(weights=weights, device="cpu", range="around", detectors=name
-                        if file == name else "pointnet,pointpillars,fused")
+        started = nodes(
+            weights=weights,
+            device="cpu",
+            range="around",
+            detectors=name if file == name else "pointnet,pointpillars,fused",
+        )
         assert started[f"{name}_detector"].parameters[1] == expected
 
 
@@ -281,18 +327,17 @@ def test_weights_device_and_range_of_a_detector_are_arguments(name, launched):
 def test_replay_connects_player_nodes_and_evaluator(detectors, single, launched, drive_bag):
     """Also where the file that includes it has arguments of these names."""
     nodes = launched("replay")
-    started = nodes(bag=str(drive_bag), detectors=detectors, single=single, scores="scores.json",
-                    processes="true")
+    started = nodes(bag=str(drive_bag), detectors=detectors, single=single, scores="scores.json", processes="true")
     names = detectors.split(",")
     assert {*started} == {*build_graph(names, single == "true"), "bag_player", "evaluator"}
-    found = {name: f"{find_result_node(name, single == 'true')}/output/detections"
-             for name in names}
+    found = {name: f"{find_result_node(name, single == 'true')}/output/detections" for name in names}
     player, evaluator = started["bag_player"].parameters[-1], started["evaluator"].parameters[-1]
     assert player["follow"] == [*found.values()]
     assert {f"{topic}:=2" for topic in found.values()} < {*player["wait_for"]}  # evaluator, player
     by_paper = names == ["candidates"]
-    assert evaluator["stages"] == (["stage1", "stage2", "final"] if by_paper else
-                                   ["final"] if len(names) == 1 else names)
+    assert evaluator["stages"] == (
+        ["stage1", "stage2", "final"] if by_paper else ["final"] if len(names) == 1 else names
+    )
     assert evaluator.get("classes") == (["Pedestrian"] if by_paper else None)
     remapped = dict(started["evaluator"].remappings)
     assert set(found.values()) < {*remapped.values()}
@@ -303,14 +348,17 @@ def test_replay_connects_player_nodes_and_evaluator(detectors, single, launched,
         assert ("replay_candidates.param.yaml" in files) == ("candidates" in names)
 
 
-@pytest.mark.parametrize("given, words", [
-    ({"detectors": "candidates,dream"}, "'dream' is none of candidates, pointpillars, pointnet"),
-    ({"detectors": ""}, "detectors is empty"),
-    ({"detectors": SEVERAL, "weights": "w.safetensors"}, "NAME=FILE"),
-    ({"detectors": SEVERAL, "weights": "v5=w"}, "'v5' is not one of"),
-    ({"config": "all.yaml"}, "config: no such parameter file: all.yaml"),
-    ({"experts": "pointnets"}, "pointnets is neither a parameter file nor a detector"),
-])
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ({"detectors": "candidates,dream"}, "'dream' is none of candidates, pointpillars, pointnet"),
+        ({"detectors": ""}, "detectors is empty"),
+        ({"detectors": SEVERAL, "weights": "w.safetensors"}, "NAME=FILE"),
+        ({"detectors": SEVERAL, "weights": "v5=w"}, "'v5' is not one of"),
+        ({"config": "all.yaml"}, "config: no such parameter file: all.yaml"),
+        ({"experts": "pointnets"}, "pointnets is neither a parameter file nor a detector"),
+    ],
+)
 def test_unusable_launch_argument_is_refused(given, words, launched):
     with pytest.raises(InputError, match=words):
         launched("detectors")(**given)

@@ -26,14 +26,19 @@ from msg_utils.messages import make_ros_message
 
 NODE, offline = DETECTOR.node, DETECTOR.offline
 pytestmark = pytest.mark.usefixtures("one_thread")
-LEADS_TO = {"configure": State.PRIMARY_STATE_INACTIVE, "activate": State.PRIMARY_STATE_ACTIVE,
-            "deactivate": State.PRIMARY_STATE_INACTIVE, "cleanup": State.PRIMARY_STATE_UNCONFIGURED,
-            "unconfigured_shutdown": State.PRIMARY_STATE_FINALIZED}
+LEADS_TO = {
+    "configure": State.PRIMARY_STATE_INACTIVE,
+    "activate": State.PRIMARY_STATE_ACTIVE,
+    "deactivate": State.PRIMARY_STATE_INACTIVE,
+    "cleanup": State.PRIMARY_STATE_UNCONFIGURED,
+    "unconfigured_shutdown": State.PRIMARY_STATE_FINALIZED,
+}
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
     from detection_samples import lively, tiny
+
     path = tmp_path_factory.mktemp("weights") / "v4.safetensors"
     save_checkpoint(path, lively(tiny("v4")), Header(tiny("v4")))
     return path
@@ -57,11 +62,11 @@ def nodes(shared_processes, weights, later):
     driven = {**values, "autostart": False}
     shared_processes.start(NODE, {}, driven, "ready")
     shared_processes.start(NODE, {}, {**driven, "pointpillars.weights": str(later)}, "waits")
-    shared_processes.start(NODE, {}, {**values, "pointpillars.weights": str(later)},
-                           "tries")
+    shared_processes.start(NODE, {}, {**values, "pointpillars.weights": str(later)}, "tries")
     for name in ("perception", "candidate_refinement"):
-        shared_processes.start(name, {}, {"autostart": False, "seed.source": "file",
-                                          "seed.file": "/nowhere.json"}, "waits")
+        shared_processes.start(
+            name, {}, {"autostart": False, "seed.source": "file", "seed.file": "/nowhere.json"}, "waits"
+        )
     return shared_processes
 
 
@@ -90,8 +95,11 @@ def here(peer):
 
     def make(kind, values, remap):
         rules = [word for a, b in remap.items() for word in ("-r", f"{a}:={b}")]
-        node = kind(context=peer.context, cli_args=["--ros-args", *rules], parameter_overrides=[
-            Parameter(k, value=list(v) if isinstance(v, tuple) else v) for k, v in values.items()])
+        node = kind(
+            context=peer.context,
+            cli_args=["--ros-args", *rules],
+            parameter_overrides=[Parameter(k, value=list(v) if isinstance(v, tuple) else v) for k, v in values.items()],
+        )
         made.append(node)
         node.start()
         peer.executor.add_node(node)
@@ -106,8 +114,10 @@ def here(peer):
 
 def entities(node):
     """Count the publishers, subscriptions and so on of a node."""
-    return {kind: len(list(getattr(node, kind))) for kind in (
-        "publishers", "subscriptions", "timers", "guards", "services", "clients", "waitables")}
+    return {
+        kind: len(list(getattr(node, kind)))
+        for kind in ("publishers", "subscriptions", "timers", "guards", "services", "clients", "waitables")
+    }
 
 
 def test_manager_drives_a_detector_through_all_states(nodes, peer, weights):
@@ -124,13 +134,14 @@ def test_manager_drives_a_detector_through_all_states(nodes, peer, weights):
     for round_ in (10, 20):
         talker.publish(encode(message(round_)))  # to nobody
         drive(peer, node, "activate")
-        peer.send(talker, message(round_ + 1), lambda n=round_: received(found, n + 1),
-                  "detections")
+        peer.send(talker, message(round_ + 1), lambda n=round_: received(found, n + 1), "detections")
         assert_equal(received(found, round_ + 1), offline(weights, message(1)))
         drive(peer, node, "deactivate")
         peer.wait(lambda: not talker.get_subscription_count(), "the end of the subscription")
-        peer.wait(lambda: peer.get_value(node, "lifecycle") == "inactive"
-                  and peer.get_message(node) == "not active", "the state in the diagnostics")
+        peer.wait(
+            lambda: peer.get_value(node, "lifecycle") == "inactive" and peer.get_message(node) == "not active",
+            "the state in the diagnostics",
+        )
         assert received(found, round_) is None
     drive(peer, node, "cleanup", "configure", "activate")
     peer.send(talker, message(31), lambda: received(found, 31), "detections")
@@ -145,8 +156,7 @@ def test_manager_drives_a_detector_through_all_states(nodes, peer, weights):
 def test_node_without_subscribers_reports_it(here, peer, monkeypatch):
     """A node that was restarted without its manager is reported, a deactivated one is not."""
     monkeypatch.setattr("lidar_perception.nodes.managed.MANAGER_TIMEOUT_S", 0.0)
-    for kind, topic, sent in ((GroundSegmentation, "points", CLOUD),
-                              (TrackerNode, "detections", MARKERS)):
+    for kind, topic, sent in ((GroundSegmentation, "points", CLOUD), (TrackerNode, "detections", MARKERS)):
         node = here(kind, {"autostart": False}, {f"~/input/{topic}": f"/{topic}"})
         name = node.get_name()
         peer.wait(lambda n=name: peer.get_message(n) == "not configured", "its diagnostics")
@@ -167,8 +177,9 @@ def test_cleanup_frees_the_network(here, peer, weights):
     empty, names = entities(node), set(vars(node))
     for stamp in (1, 2):
         drive(peer, NODE, "configure")
-        held = [weakref.ref(thing) for thing in (
-            node.detector, node.detector.proposer.network, node.outputs, node.sensor)]
+        held = [
+            weakref.ref(thing) for thing in (node.detector, node.detector.proposer.network, node.outputs, node.sensor)
+        ]
         drive(peer, NODE, "activate")
         peer.send(talker, message(stamp), lambda n=stamp: received(found, n), "detections")
         assert all(thing() is not None for thing in held)
@@ -186,12 +197,10 @@ def test_simulated_clock_continues_after_cleanup(here, peer):
     for second, sim_time in enumerate((False, True, True), start=1):
         peer.set_parameter(f"/{name}", "use_sim_time", sim_time)
         drive(peer, name, "deactivate", "cleanup", "configure", "activate")
-        told = make_ros_message(clock, clock=make_ros_message("builtin_interfaces/msg/Time",
-                                                              sec=second))
+        told = make_ros_message(clock, clock=make_ros_message("builtin_interfaces/msg/Time", sec=second))
         assert node.count_subscribers("/clock") == sim_time
         if sim_time:
-            peer.send(talker, told, lambda s=second: node.get_clock().now().nanoseconds
-                      == s * 10**9, "the time")
+            peer.send(talker, told, lambda s=second: node.get_clock().now().nanoseconds == s * 10**9, "the time")
 
 
 def test_node_waits_for_missing_network_file(nodes, peer, later, weights):
@@ -223,13 +232,13 @@ def test_missing_template_is_reported_at_configure(nodes, peer):
         assert not change(peer, name, "configure")
         peer.wait_for_diagnostics(name, "/nowhere.json", level=2)
         peer.set_parameter(f"/{name}", "seed.source", "click")
-        drive(peer, name, "configure", "activate", "deactivate", "cleanup",
-              "unconfigured_shutdown")
+        drive(peer, name, "configure", "activate", "deactivate", "cleanup", "unconfigured_shutdown")
 
 
 def test_failed_activation_is_reported_and_retried(here, peer, monkeypatch):
     def refuse(reception):
         raise RuntimeError("no such policy")
+
     with monkeypatch.context() as broken:
         broken.setattr(Reception, "open", refuse)
         node = here(GroundSegmentation, {}, {"~/input/points": "/in"})
@@ -247,7 +256,7 @@ def test_waiting_clouds_are_dropped_without_counting_pause(here, peer, good_clou
     talker = peer.advertise("/in", CLOUD)
     peer.send(talker, good_cloud, lambda: node.counts["frames"], "a frame")
     name = "ground_segmentation"
-    reception, = node._receptions()
+    (reception,) = node._receptions()
     sent = reception.arrivals.sent
     drive(peer, name, "deactivate")
     for _ in range(5):

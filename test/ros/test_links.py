@@ -52,8 +52,9 @@ def graph(domain):
         for _ in range(times):
             executor.spin_once(timeout_sec=0.01)
 
-    yield SimpleNamespace(ground=ground, clustering=clustering, spin=spin, context=context,
-                          reception=clustering._receptions()[0])
+    yield SimpleNamespace(
+        ground=ground, clustering=clustering, spin=spin, context=context, reception=clustering._receptions()[0]
+    )
     executor.shutdown()
     shut_down_context(context, ground, clustering)
 
@@ -66,10 +67,9 @@ def test_linked_nodes_pass_messages_without_dds(graph, monkeypatch):
     monkeypatch.setattr(graph.reception, "deliver", lambda msg, _: received.append(msg))
     graph.ground.on_points(cloud := make_cloud())
     graph.spin()
-    message, = received
+    (message,) = received
     assert message.header is cloud.header and not sent
-    graph.ground.create_subscription(load_message_class(CLOUD), GROUND_POINTS, lambda _: None,
-                                     RELIABLE)
+    graph.ground.create_subscription(load_message_class(CLOUD), GROUND_POINTS, lambda _: None, RELIABLE)
     graph.spin()
     graph.ground.on_points(cloud)
     assert sent == [encode(message)]
@@ -89,8 +89,7 @@ def test_newest_linked_message_wins_and_others_count_as_dropped(graph, monkeypat
 
 
 def test_second_publisher_ends_the_link(graph, monkeypatch):
-    other = graph.clustering.create_publisher(
-        load_message_class(CLOUD), GROUND_POINTS, RELIABLE)
+    other = graph.clustering.create_publisher(load_message_class(CLOUD), GROUND_POINTS, RELIABLE)
     graph.reception.adapt()
     assert graph.reception.subscription is not None and not graph.ground.points.receivers
     assert any("2 publishers" in text for _, _, text in graph.reception.problems())
@@ -115,14 +114,14 @@ def test_link_ends_with_the_nodes_that_made_it(graph):
 
 def test_tracker_reads_the_same_objects_from_rows_and_from_cdr():
     rng = np.random.default_rng(0)
-    found = Detections.of(rng.normal(0, 5, (20, 7)) ** 2, rng.integers(0, 3, 20),
-                          rng.random(20))
+    found = Detections.of(rng.normal(0, 5, (20, 7)) ** 2, rng.integers(0, 3, 20), rng.random(20))
     header = make_header(10**18 + 5, "velodyne", bag_message)
     for detections in (found, Detections.none()):
         rows = MarkerRows(make_detection_rows(detections, {("Car", 99)}), header)
         sent: list[bytes] = []
-        Output(SimpleNamespace(qos_profile=QoSProfile(depth=1), topic_name="/a",
-                               publish=sent.append), None).publish(rows)
+        Output(SimpleNamespace(qos_profile=QoSProfile(depth=1), topic_name="/a", publish=sent.append), None).publish(
+            rows
+        )
         direct, decoded = from_marker_array(rows), from_marker_array(decode(sent[0], MARKERS))
         for name in ("boxes", "scores", "ids"):
             np.testing.assert_array_equal(getattr(direct, name), getattr(decoded, name))
@@ -134,8 +133,10 @@ def test_latched_messages_are_always_published():
     sent: list[bytes] = []
     for qos, expected in ((LATCHED, [b"1"]), (RELIABLE, [])):
         sent.clear()
-        Output(SimpleNamespace(qos_profile=qos, topic_name="/a", publish=sent.append,
-                               get_subscription_count=lambda: 0), Links()).publish(b"1")
+        Output(
+            SimpleNamespace(qos_profile=qos, topic_name="/a", publish=sent.append, get_subscription_count=lambda: 0),
+            Links(),
+        ).publish(b"1")
         assert sent == expected
 
 
@@ -145,24 +146,21 @@ NODES = ("ground_segmentation", "clustering", "tracker")
 def start_together(processes, **params):
     with processes.together("graph"):
         for node in NODES:
-            processes.start(node, build_graph(["pointnet"], tracking=True)[node],
-                            params.get(node, {}))
+            processes.start(node, build_graph(["pointnet"], tracking=True)[node], params.get(node, {}))
 
 
 def test_nodes_of_one_process_have_their_own_parameters_and_end_at_a_signal(processes, peer):
-    start_together(processes, clustering={"input.queu": 5},
-                   tracker={"autostart": False})
+    start_together(processes, clustering={"input.queu": 5}, tracker={"autostart": False})
     peer.wait(lambda: set(NODES) <= set(peer.diagnostics), "all nodes")
     assert peer.get_message("tracker") == "not configured"
-    peer.wait(lambda: peer.get_value("ground_segmentation", f"subscribers of {GROUND_POINTS}"
-                                     ) == "1", "the link")
+    peer.wait(lambda: peer.get_value("ground_segmentation", f"subscribers of {GROUND_POINTS}") == "1", "the link")
     assert peer.set_parameters("/clustering", {"clustering.dbscan.min_samples": 7}) == []
     processes.running["graph"].send_signal(SIGINT)
     peer.spin_until(lambda: processes.has_ended("graph"), 15.0)
     assert processes.running["graph"].returncode == 0
     log = processes.read_log("graph")
     assert "Traceback" not in log
-    warned, = [line for line in log.splitlines() if "'input.queu'" in line]
+    (warned,) = [line for line in log.splitlines() if "'input.queu'" in line]
     assert "[clustering]" in warned and "is 'input.queue' meant" in warned
 
 

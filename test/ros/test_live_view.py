@@ -33,8 +33,7 @@ class LiveView:
 
     def __init__(self, processes):
         self.processes = processes
-        processes.run("view", [sys.executable, "-m", "lidar_perception.cli.main", "view", "--live",
-                               "--no-open"])
+        processes.run("view", [sys.executable, "-m", "lidar_perception.cli.main", "view", "--live", "--no-open"])
 
     @property
     def url(self):
@@ -60,13 +59,16 @@ def view(shared_processes, shared_peer):
 @pytest.fixture(scope="module")
 def received(shared_processes, shared_peer, view, drive_bag):
     """Return the messages of the detector while a bag is played in a loop."""
-    shared_peer.wait(lambda: any("nobody publishes clouds" in line for line in
-                                 view.json("api/drive")["status"]["lines"]), "a clear line")
+    shared_peer.wait(
+        lambda: any("nobody publishes clouds" in line for line in view.json("api/drive")["status"]["lines"]),
+        "a clear line",
+    )
     assert view.json("api/drive")["frames"] == []
     arrays = shared_peer.listen(FOUND, MARKERS)
     for node, remap in SINGLE.items():
-        shared_processes.start(node, remap, {"seed.source": "ground_truth", "view.enabled": False,
-                                             "tracking.enabled": True})
+        shared_processes.start(
+            node, remap, {"seed.source": "ground_truth", "view.enabled": False, "tracking.enabled": True}
+        )
     shared_processes.play(drive_bag, loop=True, rate=0.5)
     return arrays
 
@@ -78,14 +80,17 @@ def test_frames_have_the_published_columns_and_boxes(view, received, shared_peer
         nonlocal drive
         drive = view.json("api/drive")
         kinds = {t["kind"] for t in drive["status"]["topics"] if t["came"]}
-        return kinds == {"detections", "tracks", "labels"} and len(drive["frames"]) >= 3 and (
-            drive["status"]["clouds"]["topic"] == "/perception/output/points")
+        return (
+            kinds == {"detections", "tracks", "labels"}
+            and len(drive["frames"]) >= 3
+            and (drive["status"]["clouds"]["topic"] == "/perception/output/points")
+        )
+
     shared_peer.wait(complete, "clouds with columns, detections, tracks and labels")
 
     def published(stamp_ns):
         """Return the messages of a stamp; the looped bag repeats it with other tracks."""
-        return [to_detections(m) for m in map(from_marker_array, received[-40:])
-                if m.stamp_ns == stamp_ns]
+        return [to_detections(m) for m in map(from_marker_array, received[-40:]) if m.stamp_ns == stamp_ns]
 
     def compared():
         for frame in view.json("api/drive")["frames"][-20:]:  # older ones are dropped soon
@@ -96,10 +101,14 @@ def test_frames_have_the_published_columns_and_boxes(view, received, shared_peer
                 count = int(np.frombuffer(body, np.uint32, 1, 4)[0])
                 ground = np.frombuffer(body, np.uint8, count, 8 + 13 * count)
                 if ground.any():  # not a cloud shown before the first with columns
-                    found[:] = [np.array([[*row[:7], row[8]] for row in rows]), frame["stamp_ns"],
-                                ground, np.frombuffer(body, np.uint32, count,
-                                                      len(body) - 4 * count)]
+                    found[:] = [
+                        np.array([[*row[:7], row[8]] for row in rows]),
+                        frame["stamp_ns"],
+                        ground,
+                        np.frombuffer(body, np.uint32, count, len(body) - 4 * count),
+                    ]
         return found
+
     found: list = []
     shared_peer.wait(compared, "a frame with columns, detections and labels")
     shown, stamp_ns, ground, clusters = found
@@ -107,6 +116,7 @@ def test_frames_have_the_published_columns_and_boxes(view, received, shared_peer
     def as_published():  # the page may receive it before this listener
         expected = [np.column_stack([d.boxes, d.scores]) for d in published(stamp_ns)]
         return any(shown.shape == e.shape and np.allclose(shown, e, atol=1e-6) for e in expected)
+
     shared_peer.wait(as_published, f"detections as shown, {shown}")
     assert 0.2 < ground.mean() < 1 and clusters.max() >= 1 and not clusters[ground == 1].any()
     tracks = view.json("api/state")["tracks"]
@@ -120,12 +130,10 @@ def test_newest_frame_appears_and_replay_can_pause(view, received, shared_peer):
         page.goto(view.url)
         page.wait_for_selector("html[data-ready=true]", state="attached")
         first = page.evaluate("page.store.frame")
-        page.wait_for_function("n => page.store.frame > n + 3 && page.store.results.frame > n + 3",
-                               arg=first)
+        page.wait_for_function("n => page.store.frame > n + 3 && page.store.results.frame > n + 3", arg=first)
         assert page.evaluate("page.store.cloud.count") > 1000
         page.keyboard.press(" ")  # pause
-        page.wait_for_function("() => !page.store.playing"
-                               " && page.store.wanted === page.store.frame")
+        page.wait_for_function("() => !page.store.playing && page.store.wanted === page.store.frame")
         held = page.evaluate("page.store.frame")
         page.wait_for_function("() => page.store.status.clouds.passed > 2")  # still counted
         page.keyboard.press(",")
@@ -137,24 +145,33 @@ def test_newest_frame_appears_and_replay_can_pause(view, received, shared_peer):
 
 def test_boxes_in_another_frame_are_shown_where_tf_says(view, received, shared_peer):
     """The boxes of the detector, as a node with a target_frame publishes them."""
-    talker, place = shared_peer.advertise("/robot/output/detections", MARKERS), mount_pose(
-        0.5, 0.2, 1.7, 0.0, 0.0, 0.3)
+    talker, place = shared_peer.advertise("/robot/output/detections", MARKERS), mount_pose(0.5, 0.2, 1.7, 0.0, 0.0, 0.3)
     sent = 0
 
     def send():
         nonlocal sent
         if len(received) > sent:
             sent, found = len(received), from_marker_array(received[-1])
-            talker.publish(encode(to_marker_array(
-                transform_boxes(found.boxes, place), found.labels, found.scores, make=bag_message,
-                header=make_header(found.stamp_ns, "base", bag_message))))
+            talker.publish(
+                encode(
+                    to_marker_array(
+                        transform_boxes(found.boxes, place),
+                        found.labels,
+                        found.scores,
+                        make=bag_message,
+                        header=make_header(found.stamp_ns, "base", bag_message),
+                    )
+                )
+            )
 
     def lines():
         send()
         return view.json("api/drive")["status"]["lines"]
-    shared_peer.wait(lambda: any(
-        "/robot/output/detections are not shown: TF does not connect 'base'" in line
-        for line in lines()), "a line that names the frames")
+
+    shared_peer.wait(
+        lambda: any("/robot/output/detections are not shown: TF does not connect 'base'" in line for line in lines()),
+        "a line that names the frames",
+    )
     if not has_tf():
         shared_peer.wait(lambda: NO_TF in lines(), "a line that says what is not installed")
         pytest.skip("the wheels of the pip environment lack tf2_msgs")
@@ -165,11 +182,11 @@ def test_boxes_in_another_frame_are_shown_where_tf_says(view, received, shared_p
         send()
         for frame in view.json("api/drive")["frames"][-20:]:
             found = view.json(f"api/labels/{frame['frame']}")["detections"]
-            ours, theirs = (np.array([row[:7] for row in found.get(name, [])])
-                            for name in ("robot", "perception"))
+            ours, theirs = (np.array([row[:7] for row in found.get(name, [])]) for name in ("robot", "perception"))
             if len(ours) and ours.shape == theirs.shape and np.allclose(ours, theirs, atol=1e-6):
                 return True
         return False
+
     shared_peer.wait(same, "boxes of both, in one place")
 
 

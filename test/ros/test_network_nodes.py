@@ -10,16 +10,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from detection_samples import lively, tiny
-from detector_node import (
-    FUSED_NODE,
-    POINTNET_NODE,
-    POINTPILLARS_NODE,
-    REMAP,
-    assert_equal,
-    message,
-    received,
-    small_v4,
-)
+from detector_node import FUSED_NODE, POINTNET_NODE, POINTPILLARS_NODE, REMAP, assert_equal, message, received, small_v4
 from rcl_interfaces.srv import DescribeParameters
 from ros_samples import BAD, CLOUD
 
@@ -47,8 +38,9 @@ from msg_utils.point_cloud2 import to_array
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-@pytest.fixture(scope="module", params=[POINTPILLARS_NODE, POINTNET_NODE, FUSED_NODE],
-                ids=lambda tested: tested.network)
+@pytest.fixture(
+    scope="module", params=[POINTPILLARS_NODE, POINTNET_NODE, FUSED_NODE], ids=lambda tested: tested.network
+)
 def tested(request):
     return request.param
 
@@ -77,25 +69,22 @@ def segmented(tested):
     return segment_cloud(to_point_cloud(message(1), 0.0)[0], None, params)
 
 
-def test_detections_equal_those_of_offline_detector(tested, found, talker, peer, weights,
-                                                    segmented):
+def test_detections_equal_those_of_offline_detector(tested, found, talker, peer, weights, segmented):
     """A cloud through the whole graph, and one without columns sent to the detector directly."""
     points = peer.listen(tested.between, CLOUD)
-    times = {step: peer.listen(f"/{tested.node}/debug/{step}_ms", "std_msgs/msg/Float64")
-             for step in tested.steps}
+    times = {step: peer.listen(f"/{tested.node}/debug/{step}_ms", "std_msgs/msg/Float64") for step in tested.steps}
     peer.wait_for_diagnostics(tested.node, "waiting for input")
     scan = to_point_cloud(message(1), 0.0)[0]
     if len(tested.graph) > 1:
-        peer.send(peer.advertise(POINTS, CLOUD), message(1), lambda: points and received(found, 1),
-                  "detections")
+        peer.send(peer.advertise(POINTS, CLOUD), message(1), lambda: points and received(found, 1), "detections")
         assert segmented.ground.any() and segmented.cluster_ids.max() >= 2
         indices = np.arange(len(scan))
-        np.testing.assert_array_equal(read_column(points[-1], "cluster_id", indices),
-                                      segmented.cluster_ids)
-        np.testing.assert_array_equal(read_column(points[-1], "ground", indices) > 0,
-                                      segmented.ground)
-        assert_equal(received(found, 1), tested.offline(
-            weights, message(1), ground=segmented.ground, cluster_ids=segmented.cluster_ids))
+        np.testing.assert_array_equal(read_column(points[-1], "cluster_id", indices), segmented.cluster_ids)
+        np.testing.assert_array_equal(read_column(points[-1], "ground", indices) > 0, segmented.ground)
+        assert_equal(
+            received(found, 1),
+            tested.offline(weights, message(1), ground=segmented.ground, cluster_ids=segmented.cluster_ids),
+        )
         assert received(found, 1).frame_id == "lidar"
 
     plain = tested.offline(weights, message(2))
@@ -103,8 +92,9 @@ def test_detections_equal_those_of_offline_detector(tested, found, talker, peer,
     objects = received(found, 2)
     assert_equal(objects, plain)
     for i, extra in enumerate(objects.extras if plain.sources else []):
-        assert extra["sources"] == {name: pytest.approx(scores[i], abs=1e-3) for name, scores
-                                    in plain.sources.items() if np.isfinite(scores[i])}
+        assert extra["sources"] == {
+            name: pytest.approx(scores[i], abs=1e-3) for name, scores in plain.sources.items() if np.isfinite(scores[i])
+        }
         assert extra["sources"]["network"] > 0
     peer.wait(lambda: all(times.values()), "the times of the steps")
     assert all(values[-1].data >= 0 for values in times.values())
@@ -117,23 +107,23 @@ def test_columns_of_the_cloud_replace_own_segmentation(tested, found, talker, pe
     scan = to_point_cloud(message(1), 0.0)[0]
     no_ground = np.zeros(len(scan), np.uint8)
     ids = cluster_obstacles(scan.xyz, no_ground > 0, tested.params.clustering)
-    peer.send(talker, message(3, ground=no_ground, cluster_id=ids.astype(np.uint32)),
-              lambda: received(found, 3), "detections of a cloud with columns")
+    peer.send(
+        talker,
+        message(3, ground=no_ground, cluster_id=ids.astype(np.uint32)),
+        lambda: received(found, 3),
+        "detections of a cloud with columns",
+    )
     expected = tested.offline(weights, message(3), ground=no_ground > 0, cluster_ids=ids)
     assert_equal(received(found, 3), expected)
     plain = tested.offline(weights, message(2))
-    assert not (np.array_equal(expected.boxes, plain.boxes)
-                and np.array_equal(expected.scores, plain.scores))
+    assert not (np.array_equal(expected.boxes, plain.boxes) and np.array_equal(expected.scores, plain.scores))
 
 
-def test_bad_clouds_are_reported_and_the_node_continues(tested, talker, found, shared_processes,
-                                                        peer, weights):
-    bad = {**{name: bad for name, bad in BAD.items() if name != "one point"},
-           **tested.bad_clouds()}
+def test_bad_clouds_are_reported_and_the_node_continues(tested, talker, found, shared_processes, peer, weights):
+    bad = {**{name: bad for name, bad in BAD.items() if name != "one point"}, **tested.bad_clouds()}
     for name, (msg, words) in bad.items():
         peer.diagnostics.clear()
-        peer.send(talker, msg, lambda w=words: w in peer.get_message(tested.node),
-                  f"'{words}': {name}")
+        peer.send(talker, msg, lambda w=words: w in peer.get_message(tested.node), f"'{words}': {name}")
     peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
     assert_equal(received(found, 7), tested.offline(weights, message(7)))
     log = shared_processes.read_log(tested.node)
@@ -142,14 +132,19 @@ def test_bad_clouds_are_reported_and_the_node_continues(tested, talker, found, s
 
 def test_thresholds_change_at_run_time_others_are_fixed(tested, talker, found, peer):
     network = tested.network
-    for name, value, words in [(f"{network}.weights", "other.safetensors", "read-only"),
-                               (f"{network}.device", "cuda", "read-only"),
-                               (f"{network}.scores.car", 1.5, ""),
-                               ("ground.method", "dream", "patchwork")]:
-        reason, = peer.set_parameters(f"/{tested.node}", {name: value})
+    for name, value, words in [
+        (f"{network}.weights", "other.safetensors", "read-only"),
+        (f"{network}.device", "cuda", "read-only"),
+        (f"{network}.scores.car", 1.5, ""),
+        ("ground.method", "dream", "patchwork"),
+    ]:
+        (reason,) = peer.set_parameters(f"/{tested.node}", {name: value})
         assert reason and words in reason
-    described, = peer.call(f"/{tested.node}/describe_parameters", DescribeParameters,
-                           DescribeParameters.Request(names=[f"{network}.scores.car"])).descriptors
+    (described,) = peer.call(
+        f"/{tested.node}/describe_parameters",
+        DescribeParameters,
+        DescribeParameters.Request(names=[f"{network}.scores.car"]),
+    ).descriptors
     assert described.floating_point_range[0].to_value == 1.0 and "Car" in described.description
 
     names = [k for k in tested.values(Path("w")) if k.startswith(f"{network}.scores.")]
@@ -158,12 +153,15 @@ def test_thresholds_change_at_run_time_others_are_fixed(tested, talker, found, p
         assert len(received(found, 12)) == 0
         peer.wait(lambda: "threshold" in peer.get_message(tested.node), "the reason")
         if tested is not FUSED_NODE:
-            peer.wait(lambda: "Car 0." in (peer.get_value(tested.node, "best scores") or ""),
-                      "the scores")
+            peer.wait(lambda: "Car 0." in (peer.get_value(tested.node, "best scores") or ""), "the scores")
     if tested is POINTPILLARS_NODE:
         with peer.parameters(f"/{tested.node}", {"ground.sensor_pose.height": 1.2}):
-            peer.send(talker, message(13), lambda: "ground.sensor_pose.height is 1.2"
-                      in peer.get_message(tested.node), "the wrong height")
+            peer.send(
+                talker,
+                message(13),
+                lambda: "ground.sensor_pose.height is 1.2" in peer.get_message(tested.node),
+                "the wrong height",
+            )
 
 
 def other_version(folder):
@@ -182,8 +180,16 @@ def nan_weights(folder):
 def unshipped_version():
     """Version and size of a PointPillars whose weights are not shipped, or None."""
     from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
-    return next(((v, size) for v in ("v4", "v3", "v2", "v1", "v0") for size in ("compact", "full")
-                 if not (WEIGHTS / f"pointpillars_{v}_{size}.safetensors").is_file()), None)
+
+    return next(
+        (
+            (v, size)
+            for v in ("v4", "v3", "v2", "v1", "v0")
+            for size in ("compact", "full")
+            if not (WEIGHTS / f"pointpillars_{v}_{size}.safetensors").is_file()
+        ),
+        None,
+    )
 
 
 UNSHIPPED = unshipped_version()
@@ -200,18 +206,11 @@ UNUSABLE = {  # by detector: parameters made in a folder, level, words; more in 
             2,
             "'cuda:99' is not available",
         ),
-        (
-            lambda folder: {**other_version(folder), "pointpillars.device": "cuda:99"},
-            1,
-            "the CPU is used",
-        ),
+        (lambda folder: {**other_version(folder), "pointpillars.device": "cuda:99"}, 1, "the CPU is used"),
         (nan_weights, 1, "scores are NaN"),
         *[
             (
-                lambda folder, v=version, s=size: {
-                    "pointpillars.version": v,
-                    "pointpillars.size": s,
-                },
+                lambda folder, v=version, s=size: {"pointpillars.version": v, "pointpillars.size": s},
                 2,
                 f"no weights for {version} {size}",
             )
@@ -221,11 +220,7 @@ UNUSABLE = {  # by detector: parameters made in a folder, level, words; more in 
     POINTNET_NODE.node: [
         (lambda folder: {"pointnet.weights": "/nowhere.safetensors"}, 2, MISSING),
         (lambda folder: {"pointnet.weights": str(folder / (300 * "a"))}, 2, "File name too long"),
-        (
-            lambda folder: {"pointnet.weights": str(small_v4(folder))},
-            2,
-            "holds a PointPillars, which is for",
-        ),
+        (lambda folder: {"pointnet.weights": str(small_v4(folder))}, 2, "holds a PointPillars, which is for"),
     ],
     FUSED_NODE.node: [(lambda folder: {"fused.weights": "/nowhere.safetensors"}, 2, MISSING)],
 }
@@ -264,18 +259,24 @@ class Posts:
 """)
     from rclpy.serialization import deserialize_message
     from visualization_msgs.msg import MarkerArray
+
     monkeypatch.syspath_prepend(tmp_path)
-    node = start(FusedNode, **{"fused.weights": "own_fused:Posts",
-                               "ground.sensor_pose.height": 0.5, "fused.warm_up": False})
+    node = start(
+        FusedNode, **{"fused.weights": "own_fused:Posts", "ground.sensor_pose.height": 0.5, "fused.warm_up": False}
+    )
     node.on_points(message(1))
     found = from_marker_array(deserialize_message(node.sent["detections"][-1], MarkerArray))
     assert found.labels == ["Pedestrian"] and found.boxes[0, 5] == pytest.approx(0.5)
     assert node.counts["network"] == "own_fused:Posts, Pedestrian"
 
 
-@pytest.mark.parametrize("node, words", [
-    (POINTPILLARS_NODE.node, "pointpillars.scores.pedestrian (default 0.4)"),
-    (POINTNET_NODE.node, "pointnet.min_points (default 3)")])
+@pytest.mark.parametrize(
+    "node, words",
+    [
+        (POINTPILLARS_NODE.node, "pointpillars.scores.pedestrian (default 0.4)"),
+        (POINTNET_NODE.node, "pointnet.min_points (default 3)"),
+    ],
+)
 def test_help_lists_parameters(node, words, capsys):
     assert run(node, [node, "--help"]) == 0
     assert words in capsys.readouterr().out
@@ -295,6 +296,7 @@ def test_experts_segment_the_points_that_the_detector_reads(start, range):
     whole, everything = to_point_cloud(cloud, 0.0)
     view = NormalizedView.of(whole, node.params.ground.sensor_pose, **RANGES[range])
     np.testing.assert_array_equal(indices, everything[view.indices])
-    np.testing.assert_array_equal(read_column(got, "ground", indices) > 0,
-                                  segment_view_ground(view.frame, node.params.ground))
+    np.testing.assert_array_equal(
+        read_column(got, "ground", indices) > 0, segment_view_ground(view.frame, node.params.ground)
+    )
     assert rest.width == (~segment_ground(whole, node.params.ground)).sum()

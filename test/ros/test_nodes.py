@@ -34,8 +34,10 @@ SIGNALS = signal.SIGINT, signal.SIGTERM
 
 def test_every_node_ends_with_code_0(processes, peer, tmp_path, drive_bag):
     """SIGINT and SIGTERM in turn; test_stopping.py sends them in each phase."""
-    arguments = {"bag_player": {"bag": str(drive_bag), "loop": True, "wait_timeout": 0.0},
-                 "bag_recorder": {"bag": str(tmp_path / "bag"), "topics": ["/nothing"]}}
+    arguments = {
+        "bag_player": {"bag": str(drive_bag), "loop": True, "wait_timeout": 0.0},
+        "bag_recorder": {"bag": str(tmp_path / "bag"), "topics": ["/nothing"]},
+    }
     for node in NODES:
         processes.start(node, {}, {**arguments.get(node, {}), "input.queu": 5})
     peer.wait(lambda: set(NODES) <= set(peer.diagnostics), "all nodes")
@@ -63,26 +65,28 @@ def talker(shared_peer):
 def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
     """Names, defaults, descriptions and ranges; a value out of range is refused with a reason."""
     peer = shared_peer
-    names = set(peer.call("/perception/list_parameters", ListParameters,
-                          ListParameters.Request()).result.names)
+    names = set(peer.call("/perception/list_parameters", ListParameters, ListParameters.Request()).result.names)
     fields, defaults = collect_fields(PipelineParams()), flatten(PipelineParams())
     assert set(fields) <= names
     request = GetParameters.Request(names=list(fields))
     values = peer.call("/perception/get_parameters", GetParameters, request).values
     for name, value in zip(fields, map(parameter_value_to_python, values), strict=True):
         assert value == (list(d) if isinstance(d := defaults[name], tuple) else d), name
-    described = peer.call("/perception/describe_parameters", DescribeParameters,
-                          DescribeParameters.Request(names=list(fields))).descriptors
+    described = peer.call(
+        "/perception/describe_parameters", DescribeParameters, DescribeParameters.Request(names=list(fields))
+    ).descriptors
     for d in described:
         assert fields[d.name].metadata["doc"] in d.description
         if fields[d.name].metadata["unit"]:
             assert f"[{fields[d.name].metadata['unit']}]" in d.description
 
     with peer.parameters("/perception", {"stm.threshold": 0.6}):
-        for name, value, words in [("stm.threshold", 1.5, ""),
-                                   ("clustering.dbscan.eps", [0.1], "range_limits"),
-                                   ("seed.source", "dream", "ground_truth, click, file")]:
-            refused, = peer.set_parameters("/perception", {name: value})
+        for name, value, words in [
+            ("stm.threshold", 1.5, ""),
+            ("clustering.dbscan.eps", [0.1], "range_limits"),
+            ("seed.source", "dream", "ground_truth, click, file"),
+        ]:
+            (refused,) = peer.set_parameters("/perception", {name: value})
             assert refused and words in refused
 
 
@@ -118,14 +122,20 @@ def test_problem_with_changing_numbers_is_logged_once(start, monkeypatch):
     assert [level for level, _ in lines] == [WARN, OK, ERROR]
 
 
-ARGUMENTS = {"-p foo": "-p foo", "--params-file /nope.yaml": "/nope.yaml",
-             "-r __node:=1bad": "1bad", "--nonsense": "--nonsense", "-p stm.threshold:=7.0":
-             "stm.threshold", "-p bag:=7": "bag", f"-p bag:={300 * 'a'}": "File name too long"}
+ARGUMENTS = {
+    "-p foo": "-p foo",
+    "--params-file /nope.yaml": "/nope.yaml",
+    "-r __node:=1bad": "1bad",
+    "--nonsense": "--nonsense",
+    "-p stm.threshold:=7.0": "stm.threshold",
+    "-p bag:=7": "bag",
+    f"-p bag:={300 * 'a'}": "File name too long",
+}
 
 
 def test_invalid_ros_arguments_exit_with_code_2(domain):
     """The line has the logger name of the node."""
-    program = '''
+    program = """
 import sys
 from time import sleep
 from types import SimpleNamespace
@@ -137,40 +147,42 @@ for given in sys.argv[1:]:
     arguments = ["x", "--ros-args", "-r", "__node:=front", "-r", "__ns:=/left", *given.split()]
     print(main._spin(kind, arguments, 0.0, stop), flush=True)
     print("---", file=sys.stderr, flush=True)
-'''
-    done = subprocess.run([sys.executable, "-c", program, *ARGUMENTS], text=True,
-                          capture_output=True, timeout=100, check=True)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program, *ARGUMENTS], text=True, capture_output=True, timeout=100, check=True
+    )
     assert done.stdout.split() == ["2"] * len(ARGUMENTS)
     for words, said in zip(ARGUMENTS.values(), done.stderr.split("---\n"), strict=False):
-        fatal, = [line for line in said.splitlines() if "[FATAL]" in line]
+        (fatal,) = [line for line in said.splitlines() if "[FATAL]" in line]
         assert words in fatal and "[left.front]: " in fatal and "Traceback" not in said
 
 
 def test_parameter_that_a_node_does_not_have_is_named(start):
     """The message of rclpy would be: undeclared parameter(s): []."""
     node = start(GroundSegmentation)
-    for name, words in (("input.queu", "no parameter 'input.queu'; did you mean 'input.queue'?"),
-                        ("zzz", "/ground_segmentation has no parameter 'zzz'$")):
+    for name, words in (
+        ("input.queu", "no parameter 'input.queu'; did you mean 'input.queue'?"),
+        ("zzz", "/ground_segmentation has no parameter 'zzz'$"),
+    ):
         with pytest.raises(ParameterNotDeclaredException, match=words):
             node.set_parameters_atomically([Parameter(name, value=1)])
 
 
 def test_bad_parameter_files_are_refused_in_one_line(processes):
-    for i, (name, value, words) in enumerate([("stm.threshold", 7.0, "stm.threshold"),
-                                              ("clustering.dbscan.eps", [0.1], "range_limits")]):
+    for i, (name, value, words) in enumerate(
+        [("stm.threshold", 7.0, "stm.threshold"), ("clustering.dbscan.eps", [0.1], "range_limits")]
+    ):
         processes.start("perception", {}, {name: value}, namespace=f"bad{i}")
         assert processes.running[f"bad{i}.perception"].wait(timeout=60) == 2
         log = processes.read_log(f"bad{i}.perception")
         assert words in log and "Traceback" not in log
 
 
-def test_missing_template_is_reported_with_first_cloud(perception, shared_peer,
-                                                       talker, good_cloud):
+def test_missing_template_is_reported_with_first_cloud(perception, shared_peer, talker, good_cloud):
     """It is a diagnostic, because the file may appear later."""
     peer = shared_peer
     with peer.parameters("/perception", {"seed.file": "/nowhere.json"}):
-        peer.send(talker, good_cloud, lambda: "/nowhere.json" in peer.get_message("perception"),
-                  "the diagnostic")
+        peer.send(talker, good_cloud, lambda: "/nowhere.json" in peer.get_message("perception"), "the diagnostic")
 
 
 def test_unused_inputs_change_nothing(perception, shared_peer, talker, good_cloud):
@@ -178,9 +190,11 @@ def test_unused_inputs_change_nothing(perception, shared_peer, talker, good_clou
     peer, found = shared_peer, shared_peer.listen("/perception/output/detections", MARKERS)
     peer.send(talker, good_cloud, lambda: found, "candidates")
     first = from_marker_array(found[-1])
-    for topic, kind in (("/clicked_point", "geometry_msgs/msg/PointStamped"),
-                        ("/perception/input/camera_info", "sensor_msgs/msg/CameraInfo"),
-                        ("/perception/input/extrinsics", "geometry_msgs/msg/TransformStamped")):
+    for topic, kind in (
+        ("/clicked_point", "geometry_msgs/msg/PointStamped"),
+        ("/perception/input/camera_info", "sensor_msgs/msg/CameraInfo"),
+        ("/perception/input/extrinsics", "geometry_msgs/msg/TransformStamped"),
+    ):
         other = peer.advertise(topic, kind, LATCHED)
         peer.send(other, bag_message(kind), other.get_subscription_count, "a subscriber")
     before = len(found)
@@ -189,8 +203,7 @@ def test_unused_inputs_change_nothing(perception, shared_peer, talker, good_clou
     assert "Error" not in perception.read_log("perception")
 
 
-def test_old_markers_are_deleted_and_time_jumps_noticed(
-        perception, shared_peer, talker, good_cloud):
+def test_old_markers_are_deleted_and_time_jumps_noticed(perception, shared_peer, talker, good_cloud):
     peer, received = shared_peer, shared_peer.listen("/perception/output/boxes", MARKERS)
     peer.send(talker, good_cloud, lambda: received, "boxes")
     full = from_marker_array(received[-1])
@@ -212,8 +225,7 @@ def test_restarted_bag_pairs_clouds_of_the_new_round():
             for i in range(30):
                 stamp = i * 10**9
                 for kind in (first, "partner" if first == "cloud" else "cloud"):
-                    (paired.add_cloud if kind == "cloud" else paired.add_partner)(
-                        stamp, (round_, i))
+                    (paired.add_cloud if kind == "cloud" else paired.add_partner)(stamp, (round_, i))
         assert delivered == [((r, i), (r, i)) for r in range(3) for i in range(30)]
         paired.add_cloud(30 * 10**9, "waits")
         paired.add_cloud(0, "of the next round")
@@ -233,8 +245,9 @@ def test_clouds_wait_for_the_partner_with_their_stamp():
     for _ in range(50):
         delivered.clear()
         paired = StampMatcher(deliver, capacity=5)
-        arrivals = ([(i + rng.uniform(0, 2), "cloud", i) for i in range(20)]
-                    + [(i + rng.uniform(0, 2), "partner", i) for i in range(20)])
+        arrivals = [(i + rng.uniform(0, 2), "cloud", i) for i in range(20)] + [
+            (i + rng.uniform(0, 2), "partner", i) for i in range(20)
+        ]
         for _, kind, i in sorted(arrivals):
             (paired.add_cloud if kind == "cloud" else paired.add_partner)(i, i)
         assert sorted(c for c, _ in delivered) == list(range(20))
@@ -247,13 +260,15 @@ def test_clouds_wait_for_the_partner_with_their_stamp():
 
 def test_misspelt_parameter_file_section_is_reported(processes, tmp_path):
     file = tmp_path / "mine.yaml"
-    file.write_text("trackr: {ros__parameters: {autostart: false}}\n"
-                    "controller_server: {ros__parameters: {autostart: false}}\n"
-                    "pointnet_detectr: {ros__parameters: {autostart: false}}\n")
+    file.write_text(
+        "trackr: {ros__parameters: {autostart: false}}\n"
+        "controller_server: {ros__parameters: {autostart: false}}\n"
+        "pointnet_detectr: {ros__parameters: {autostart: false}}\n"
+    )
     processes.run_node("tracker", ["tracker", "--ros-args", "--params-file", str(file)])
     process = processes.running["tracker"]
     while "ready" not in (log := processes.read_log("tracker")):
         assert process.poll() is None
         sleep(0.05)
-    warned, = [line for line in log.splitlines() if "[WARN]" in line and "mine.yaml" in line]
+    (warned,) = [line for line in log.splitlines() if "[WARN]" in line and "mine.yaml" in line]
     assert "no node here is called 'trackr'" in warned and "did you mean 'tracker'" in warned

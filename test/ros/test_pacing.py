@@ -23,15 +23,14 @@ def stamp(number):
 
 
 def pace_of(topics, ahead, timeout=10.0):
-    return pacing.Pace(SimpleNamespace(create_subscription=lambda *_, **__: None), topics, ahead,
-                       timeout)
+    return pacing.Pace(SimpleNamespace(create_subscription=lambda *_, **__: None), topics, ahead, timeout)
 
 
 def test_player_limits_clouds_in_flight():
     """With answers that come late, twice, or not at all."""
     rng = np.random.default_rng(0)
     for _ in range(100):
-        topics, ahead = ["/a", "/b"][:rng.integers(1, 3)], int(rng.integers(1, 4))
+        topics, ahead = ["/a", "/b"][: rng.integers(1, 3)], int(rng.integers(1, 4))
         pace, answers = pace_of(topics, ahead), 0
 
         def serve(pace=pace, topics=topics):
@@ -83,9 +82,10 @@ def test_the_clouds_of_a_bag_are_found_or_those_it_has_are_named():
     types = {"/velodyne": cloud, "/note": "std_msgs/msg/String"}
     assert choose_cloud_topic("bag", types) == "/velodyne"
     for types, wanted, words in [
-            ({"/a": cloud, "/b": cloud}, "", "points:=TOPIC; it has /a, /b"),
-            ({"/a": cloud}, "/points", "bag has no cloud on /points; it has /a"),
-            ({"/note": "std_msgs/msg/String"}, "", "bag has no clouds")]:
+        ({"/a": cloud, "/b": cloud}, "", "points:=TOPIC; it has /a, /b"),
+        ({"/a": cloud}, "/points", "bag has no cloud on /points; it has /a"),
+        ({"/note": "std_msgs/msg/String"}, "", "bag has no clouds"),
+    ]:
         with pytest.raises(InputError, match=words):
             choose_cloud_topic("bag", types, wanted)
 
@@ -93,12 +93,15 @@ def test_the_clouds_of_a_bag_are_found_or_those_it_has_are_named():
 @pytest.mark.parametrize("own", [{}, {"OMP_WAIT_POLICY": "active"}], ids=["ours", "the user's"])
 def test_threads_wait_asleep_unless_the_user_says_otherwise(own):
     """The command sets it before torch is loaded, which reads it then."""
-    program = ("import atexit, os, sys; sys.argv[1:] = ['--version']; "
-               "atexit.register(lambda: print([os.environ.get(k) for k in "
-               f"{list(PASSIVE_WAITING)}], "
-               "'torch' in sys.modules)); from lidar_perception.cli.main import main; main()")
+    program = (
+        "import atexit, os, sys; sys.argv[1:] = ['--version']; "
+        "atexit.register(lambda: print([os.environ.get(k) for k in "
+        f"{list(PASSIVE_WAITING)}], "
+        "'torch' in sys.modules)); from lidar_perception.cli.main import main; main()"
+    )
     environment = {k: v for k, v in os.environ.items() if k not in PASSIVE_WAITING} | own
-    said = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True,
-                          text=True).stdout.splitlines()[-1]
+    said = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True
+    ).stdout.splitlines()[-1]
     expected = own or PASSIVE_WAITING
     assert said == f"{[expected.get(k) for k in PASSIVE_WAITING]} False"

@@ -26,8 +26,7 @@ from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
 from msg_utils.point_cloud2 import to_array
 from msg_utils.stamps import to_ns
 
-CLOUD, TEXT, INFO = ("sensor_msgs/msg/PointCloud2", "std_msgs/msg/String",
-                     "sensor_msgs/msg/CameraInfo")
+CLOUD, TEXT, INFO = ("sensor_msgs/msg/PointCloud2", "std_msgs/msg/String", "sensor_msgs/msg/CameraInfo")
 START, STEP = 10**18, 10**8
 
 
@@ -57,8 +56,10 @@ def test_bytes_of_the_bag_arrive_unchanged(processes, peer, drive_bag, tmp_path,
     played = drive_bag if ros == 2 else as_ros1(drive_bag, tmp_path / "drive.bag")
     with Bag(drive_bag) as bag:
         expected = {t: [d for topic, _, d in bag.raw_messages({t})] for t in (POINTS, TRUTH)}
-    received = {POINTS: peer.listen_raw(POINTS, CLOUD),
-                TRUTH: peer.listen_raw(TRUTH, "visualization_msgs/msg/MarkerArray")}
+    received = {
+        POINTS: peer.listen_raw(POINTS, CLOUD),
+        TRUTH: peer.listen_raw(TRUTH, "visualization_msgs/msg/MarkerArray"),
+    }
     info = peer.listen(CAMERA_INFO, INFO, LATCHED)
     processes.start("bag_player", {}, {"bag": str(played), "wait_for": [POINTS, TRUTH]})
     peer.wait(lambda: processes.has_ended("bag_player"), "the end of the bag")
@@ -66,17 +67,16 @@ def test_bytes_of_the_bag_arrive_unchanged(processes, peer, drive_bag, tmp_path,
     processes.check("bag_player")
     for topic, messages in expected.items():
         # The padding at the end of CDR may differ, the message may not.
-        assert all(a[:len(b)] == b[:len(a)] and abs(len(a) - len(b)) < 4
-                   for a, b in zip(received[topic], messages))
+        assert all(a[: len(b)] == b[: len(a)] and abs(len(a) - len(b)) < 4 for a, b in zip(received[topic], messages))
     assert len(info) == 1 and info[0].width == 1242
 
 
 def test_offset_duration_topics_and_remapping(processes, peer, text_bag):
     heard, note = peer.listen("/renamed", TEXT), peer.listen("/note", TEXT, LATCHED)
-    start(processes, text_bag, start_offset=0.5, duration=1.0, remap=["/text:=renamed"],
-          wait_for=["/renamed"], rate=10.0)
-    peer.wait(lambda: processes.has_ended("bag_player") and len(heard) >= 10 and note,
-              "ten messages")
+    start(
+        processes, text_bag, start_offset=0.5, duration=1.0, remap=["/text:=renamed"], wait_for=["/renamed"], rate=10.0
+    )
+    peer.wait(lambda: processes.has_ended("bag_player") and len(heard) >= 10 and note, "ten messages")
     assert texts(heard) == [str(i) for i in range(5, 15)]
     assert texts(note) == ["latched"]  # although the offset skips it
     processes.check("bag_player")
@@ -93,10 +93,10 @@ def test_a_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
     peer.wait(lambda: note, "the latched message")
 
 
-def test_static_transforms_accumulate_others_keep_last(
-        monkeypatch, start, tmp_path):
+def test_static_transforms_accumulate_others_keep_last(monkeypatch, start, tmp_path):
     """Each of their publishers sends its own, once."""
     from lidar_perception.nodes.replay import bag_player
+
     monkeypatch.setattr(bag_player, "TF_MESSAGE", TEXT)  # which the wheels of ROS lack
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/tf_static", TEXT, LATCHED_QOS)
@@ -117,37 +117,42 @@ def test_static_transforms_accumulate_others_keep_last(
 def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path):
     """A cloud that cannot be converted is skipped; all other messages are played."""
     from lidar_perception.nodes.replay.bag_player import BagPlayer
+
     points = livox_points()
     plain = np.zeros(3, [(axis, "<f4") for axis in "xyz"])
     with BagWriter(tmp_path / "bag") as bag:
         for topic, kind, messages in (
-                ("/livox", LIVOX[1], [livox_message(points)] * 2),
-                ("/zlib", COMPRESSED, [compressed_message(plain, "zlib")]),
-                ("/draco", COMPRESSED, [compressed_message(plain, "draco")] * 2),
-                ("/text", TEXT, [bag_message(TEXT, data="text")])):
+            ("/livox", LIVOX[1], [livox_message(points)] * 2),
+            ("/zlib", COMPRESSED, [compressed_message(plain, "zlib")]),
+            ("/draco", COMPRESSED, [compressed_message(plain, "draco")] * 2),
+            ("/text", TEXT, [bag_message(TEXT, data="text")]),
+        ):
             bag.add_topic(topic, kind)
             for message in messages:
                 bag.write(topic, START, message)
     player = start(BagPlayer, bag=str(tmp_path / "bag"))
     assert {p.topic_name: p.msg_type.__name__ for p in player.publishers_by_topic.values()} == {
-        "/livox": "PointCloud2", "/zlib": "PointCloud2", "/draco": "PointCloud2", "/text": "String"}
+        "/livox": "PointCloud2",
+        "/zlib": "PointCloud2",
+        "/draco": "PointCloud2",
+        "/text": "String",
+    }
     player.serve = lambda timeout_sec: None
     player._play_once()
-    sent = {topic: [decode(d, TEXT if topic == "text" else CLOUD) for d in data]
-            for topic, data in player.sent.items()}
-    assert [np.array_equal(to_array(cloud)["x"], points["x"]) for cloud in sent["livox"]] == [True,
-                                                                                              True]
+    sent = {topic: [decode(d, TEXT if topic == "text" else CLOUD) for d in data] for topic, data in player.sent.items()}
+    assert [np.array_equal(to_array(cloud)["x"], points["x"]) for cloud in sent["livox"]] == [True, True]
     assert [len(to_array(cloud)) for cloud in sent["zlib"]] == [3]
     assert (sent["draco"], texts(sent["text"]), player.counts["left_out"]) == ([], ["text"], 2)
 
 
 def test_bag_with_wrong_metadata_is_played_with_a_warning(start, text_bag, tmp_path, capfd):
     from lidar_perception.nodes.replay.bag_player import BagPlayer
+
     shutil.copytree(text_bag, tmp_path / "bag")
     metadata = yaml.safe_load((text_bag / "metadata.yaml").read_text())
     metadata["rosbag2_bagfile_information"].update(
-        starting_time={"nanoseconds_since_epoch": START + 10 * STEP}, duration={"nanoseconds": 5},
-        storage_identifier="")
+        starting_time={"nanoseconds_since_epoch": START + 10 * STEP}, duration={"nanoseconds": 5}, storage_identifier=""
+    )
     (tmp_path / "bag/metadata.yaml").write_text(yaml.safe_dump(metadata))
     player = start(BagPlayer, bag=str(tmp_path / "bag"), rate=100.0)
     player.serve = lambda timeout_sec: None
@@ -161,13 +166,16 @@ def test_topic_of_several_publishers_offers_best_qos():
     from lidar_perception.nodes.replay.bag_player import _qos
 
     def profile(reliability, durability):
-        return SimpleNamespace(depth=1, reliability=SimpleNamespace(name=reliability),
-                               durability=SimpleNamespace(name=durability))
+        return SimpleNamespace(
+            depth=1, reliability=SimpleNamespace(name=reliability), durability=SimpleNamespace(name=durability)
+        )
+
     poor, good = profile("BEST_EFFORT", "VOLATILE"), profile("RELIABLE", "TRANSIENT_LOCAL")
     for profiles, best in (([poor], False), ([good], True), ([poor, good], True)):
         made = _qos(profiles, 1, lossless=False)
         assert (made.reliability.name, made.durability.name) == (
-            ("RELIABLE", "TRANSIENT_LOCAL") if best else ("BEST_EFFORT", "VOLATILE"))
+            ("RELIABLE", "TRANSIENT_LOCAL") if best else ("BEST_EFFORT", "VOLATILE")
+        )
 
 
 def test_pause_step_resume_and_rate(processes, peer, text_bag):
@@ -188,6 +196,7 @@ def test_pause_step_resume_and_rate(processes, peer, text_bag):
 def test_bag_time_runs_at_the_rate_and_stands_still_while_paused(monkeypatch):
     from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams
+
     player = bag_player.BagPlayer.__new__(bag_player.BagPlayer)
     player.now_ns, player.anchor, player.paused, player.clock = START, 50.0, False, None
     player.params = PlayerParams(rate=2.5)
@@ -206,6 +215,7 @@ def test_bag_time_runs_at_the_rate_and_stands_still_while_paused(monkeypatch):
 def test_clock_keeps_its_rate_between_rare_messages(monkeypatch):
     from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams
+
     player, now, sent = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], []
     player.now_ns, player.anchor, player.paused, player.steps = START, now[0], False, 0
     player.params, player.next_clock = PlayerParams(clock_hz=100.0), 0.0
@@ -214,6 +224,7 @@ def test_clock_keeps_its_rate_between_rare_messages(monkeypatch):
 
     def serve(timeout_sec):
         now[0] += timeout_sec + 1e-4
+
     player.serve = serve
     assert player._wait_until(START + 10**9, "/text")
     assert 99 <= len(sent) <= 102
@@ -254,8 +265,14 @@ def test_player_waits_until_a_node_has_matched_its_subscriber(processes, peer, t
     heard = peer.listen("/text", TEXT)
 
     def tell(count, until, what):
-        peer.send(said, DiagnosticArray(status=[DiagnosticStatus(name=me, values=[
-            KeyValue(key=f"subscribers of {between}", value=count)])]), until, what)
+        peer.send(
+            said,
+            DiagnosticArray(
+                status=[DiagnosticStatus(name=me, values=[KeyValue(key=f"subscribers of {between}", value=count)])]
+            ),
+            until,
+            what,
+        )
 
     start(processes, text_bag, wait_for=["/text", between], rate=1.0)
     peer.wait(lambda: peer.get_value("bag_player", "subscribers of /text") == "1", "the player")
@@ -302,11 +319,14 @@ def test_unplayable_bag_is_one_line_and_exit_code_2(refused, shared_processes, c
 
 
 def test_recorder_writes_the_played_messages(processes, peer, text_bag, tmp_path):
-    processes.start("bag_recorder", {}, {"bag": str(tmp_path / "copy"), "compression": "lz4",
-                                         "topics": ["/text", "/note"]})
+    processes.start(
+        "bag_recorder", {}, {"bag": str(tmp_path / "copy"), "compression": "lz4", "topics": ["/text", "/note"]}
+    )
     start(processes, text_bag, rate=2.0)  # the player keeps ten for late subscribers
-    peer.wait(lambda: processes.has_ended("bag_player")
-              and peer.get_value("bag_recorder", "frames") == "21", "21 recorded messages")
+    peer.wait(
+        lambda: processes.has_ended("bag_player") and peer.get_value("bag_recorder", "frames") == "21",
+        "21 recorded messages",
+    )
     assert processes.stop()["bag_recorder"] == 0
     with Bag(tmp_path / "copy") as bag:
         assert [m.data for _, _, m in bag.messages({"/text"})] == [str(i) for i in range(20)]
@@ -316,10 +336,10 @@ def test_recorder_writes_the_played_messages(processes, peer, text_bag, tmp_path
         assert {c.compression for c in make_reader(stream).get_summary().chunk_indexes} == {"lz4"}
 
 
-def test_looped_single_message_bag_does_not_flood(
-        monkeypatch, tmp_path):
+def test_looped_single_message_bag_does_not_flood(monkeypatch, tmp_path):
     from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams
+
     player, now, sent, served = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], [], []
     player.params, player.awaited, player.clock = PlayerParams(loop=True), {}, None
     player.paused, player.steps, player.stop = False, 0, Future()
@@ -341,6 +361,7 @@ def test_looped_single_message_bag_does_not_flood(
         now[0] += timeout_sec + 1e-5
         if now[0] > 60:
             player.stop.set_result(None)
+
     player._play_once = play
     player.spin(SimpleNamespace(spin_once=serve))
     assert np.diff(served).max() < 0.06

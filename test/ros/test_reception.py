@@ -25,11 +25,7 @@ from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.reception import BEST_EFFORT, RELIABLE, WINDOW, Arrivals, Reception
 from lidar_perception.nodes.runtime import LATCHED
 from lidar_perception.nodes.runtime import RELIABLE as RELIABLE_QOS
-from lidar_perception.nodes.shared_memory import (
-    PROFILE_VARIABLES,
-    SOCKET_BUFFER,
-    read_socket_buffer_size,
-)
+from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES, SOCKET_BUFFER, read_socket_buffer_size
 from lidar_perception.nodes.track_outputs import find_marker_lifetime_ns
 from lidar_perception.params import MarkerParams, ReceptionParams
 from lidar_perception.wire.codec import encode
@@ -45,9 +41,18 @@ def driver(peer, reliability, count, points=KITTI, first=1, hz=10):
     """Run a process without a Fast DDS profile, which sends clouds."""
     environment = {k: v for k, v in os.environ.items() if k not in PROFILE_VARIABLES}
     process = subprocess.Popen(
-        [sys.executable, Path(__file__).with_name("driver.py"), "/in", reliability,
-         *map(str, (count, hz, points, first))], env=environment, text=True,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        [
+            sys.executable,
+            Path(__file__).with_name("driver.py"),
+            "/in",
+            reliability,
+            *map(str, (count, hz, points, first)),
+        ],
+        env=environment,
+        text=True,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
     os.set_blocking(process.stdout.fileno(), False)
     try:
         peer.wait(lambda: process.stdout.readline() == "sent\n", "the driver")
@@ -60,6 +65,7 @@ def driver(peer, reliability, count, points=KITTI, first=1, hz=10):
 def test_clouds_of_a_driver_without_our_profile(processes, peer):
     """A RELIABLE driver loses nothing. A BEST_EFFORT one loses little where a socket buffer holds a
     cloud, and losses are reported with a remedy. Its end is an ERROR, then STALE."""
+
     def value(key):
         return int(peer.get_value(NODE, key) or 0)
 
@@ -71,14 +77,14 @@ def test_clouds_of_a_driver_without_our_profile(processes, peer):
 
     for name in PROFILE_VARIABLES:  # the node chooses its profile, as one started by a user
         processes.environment.pop(name, None)
-    processes.start(NODE, {"~/input/points": "/in"}, {"input.error_after": 1, "input.stale_after":
-                                                      3, "input.max_lost": 0})
+    processes.start(
+        NODE, {"~/input/points": "/in"}, {"input.error_after": 1, "input.stale_after": 3, "input.max_lost": 0}
+    )
     with driver(peer, "reliable", 30):
         peer.wait(lambda: done() == 30, "all clouds of a reliable driver")
     assert value("lost") == 0 and peer.get_value(NODE, "reliability") == "reliable"
     assert peer.diagnostics[NODE].hardware_id == "driver_lidar"
-    peer.wait(lambda: level() == ERROR and "no cloud on /in for more than 1 s"
-              in peer.get_message(NODE), "the silence")
+    peer.wait(lambda: level() == ERROR and "no cloud on /in for more than 1 s" in peer.get_message(NODE), "the silence")
     peer.wait(lambda: level() == STALE and "more than 3 s" in peer.get_message(NODE), "it is stale")
 
     before = value("frames")
@@ -106,8 +112,10 @@ def test_newest_cloud_wins_and_others_are_counted(processes, peer):
     """A burst arrives while a node processes a large cloud. A second publisher is reported."""
     processes.start(NODE, {"~/input/points": "/in"}, {"ground.method": "patchwork"})
     talker, rng = peer.advertise("/in", CLOUD), np.random.default_rng(0)
-    large, *small = (encode(cloud(rng.uniform(-50, 50, (n, 3)) * [1, 1, 0.05], stamp))
-                     for stamp, n in enumerate([1_000_000, *[2000] * 40], start=2))
+    large, *small = (
+        encode(cloud(rng.uniform(-50, 50, (n, 3)) * [1, 1, 0.05], stamp))
+        for stamp, n in enumerate([1_000_000, *[2000] * 40], start=2)
+    )
     peer.wait(talker.get_subscription_count, "the node")
     talker.publish(encode(cloud(np.ones((9, 3)), 1)))
     peer.wait(lambda: peer.get_value(NODE, "frames") == "1", "the first cloud")
@@ -140,8 +148,7 @@ def test_two_sensors_in_namespaces(two_sensors, shared_peer):
     """Two equal graphs share no topic, and the diagnostics name the sensor."""
     peer = shared_peer
     talkers = {side: peer.advertise(f"/{side}/points", CLOUD) for side in SIDES}
-    found = {side: peer.listen(f"/{side}/candidate_refinement/output/detections", MARKERS)
-             for side in SIDES}
+    found = {side: peer.listen(f"/{side}/candidate_refinement/output/detections", MARKERS) for side in SIDES}
     click = peer.advertise("/right/clicked_point", "geometry_msgs/msg/PointStamped")
     peer.wait(click.get_subscription_count, "the clicked points of one")
     street = np.random.default_rng(0).uniform(-20, 20, (5000, 3)) * [1, 1, 1e-3] - [0, 0, 1.73]
@@ -153,8 +160,10 @@ def test_two_sensors_in_namespaces(two_sensors, shared_peer):
     own = {f"{side}/{node}": (side, f"{side}/lidar") for side in SIDES for node in STAGES}
     peer.wait(lambda: own.keys() <= peer.diagnostics.keys(), "diagnostics of all")
     assert all(peer.diagnostics[name].hardware_id in ids for name, ids in own.items())
-    peer.wait(lambda: all(peer.diagnostics[f"{side}/clustering"].hardware_id == f"{side}/lidar"
-                          for side in SIDES), "the sensors' frames")
+    peer.wait(
+        lambda: all(peer.diagnostics[f"{side}/clustering"].hardware_id == f"{side}/lidar" for side in SIDES),
+        "the sensors' frames",
+    )
     names = {name for name, _ in peer.node.get_topic_names_and_types()}
     ours = {t for t in names if not t.startswith(("/left/", "/right/"))}
     assert ours <= {"/diagnostics", "/parameter_events", "/rosout", "/tf_static", "/clock"}
@@ -163,8 +172,7 @@ def test_two_sensors_in_namespaces(two_sensors, shared_peer):
 
 def test_two_nodes_of_one_name_are_reported(two_sensors, shared_peer, processes):
     processes.start("clustering", {}, {}, namespace="left")
-    shared_peer.wait_for_diagnostics("left/clustering", "another node is called /left/clustering",
-                                     WARN)
+    shared_peer.wait_for_diagnostics("left/clustering", "another node is called /left/clustering", WARN)
 
 
 def infos(numbers, period=10**8):
@@ -222,14 +230,24 @@ def test_slower_sensor_is_detected_by_its_stamps():
 OVERRIDE = f"qos_overrides./{NODE}/input/points.subscription.reliability"
 
 
-@pytest.mark.parametrize("values, remedy", [
-    ({}, ""), ({OVERRIDE: "best_effort"}, ""), ({OVERRIDE: "reliable"}, OVERRIDE),
-    ({"input.reliability": "reliable"}, "input.reliability to auto")])
+@pytest.mark.parametrize(
+    "values, remedy",
+    [
+        ({}, ""),
+        ({OVERRIDE: "best_effort"}, ""),
+        ({OVERRIDE: "reliable"}, OVERRIDE),
+        ({"input.reliability": "reliable"}, "input.reliability to auto"),
+    ],
+)
 def test_incompatible_publisher_is_reported_with_remedy(start, monkeypatch, values, remedy):
-    reception, = start(GroundSegmentation, **values)._receptions()
+    (reception,) = start(GroundSegmentation, **values)._receptions()
     for offered in ({RELIABLE}, {BEST_EFFORT}, {RELIABLE, BEST_EFFORT}):
-        there = [SimpleNamespace(node_namespace="/", node_name=kind.name.lower(),
-                                 qos_profile=SimpleNamespace(reliability=kind)) for kind in offered]
+        there = [
+            SimpleNamespace(
+                node_namespace="/", node_name=kind.name.lower(), qos_profile=SimpleNamespace(reliability=kind)
+            )
+            for kind in offered
+        ]
         monkeypatch.setattr(reception, "publishers", lambda there=there: there)
         reception.adapt()
         asked = reception.subscription.qos_profile.reliability
@@ -241,7 +259,7 @@ def test_incompatible_publisher_is_reported_with_remedy(start, monkeypatch, valu
 
 def test_middleware_queue_holds_input_queue_clouds(start):
     for queue, depth in (1, 5), (20, 20):
-        reception, = start(GroundSegmentation, **{"input.queue": queue})._receptions()
+        (reception,) = start(GroundSegmentation, **{"input.queue": queue})._receptions()
         assert reception.subscription.qos_profile.depth == reception.arrivals.depth == depth
 
 
@@ -251,43 +269,57 @@ def test_unlatched_topic_error_names_the_remedy(peer, start):
     peer.advertise("/static", TEXT, RELIABLE_QOS)
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    peer.wait(lambda: [executor.spin_once(0.0), "transient local" in node.state[1]][1],
-              "the remedy")
+    peer.wait(lambda: [executor.spin_once(0.0), "transient local" in node.state[1]][1], "the remedy")
 
 
 def test_source_of_losses_is_named_after_it_has_ended(start, monkeypatch):
-    reception, = start(GroundSegmentation, **{"input.max_lost": 0})._receptions()
-    driver = SimpleNamespace(node_namespace="/", node_name="driver", qos_profile=SimpleNamespace(
-        reliability=BEST_EFFORT))
+    (reception,) = start(GroundSegmentation, **{"input.max_lost": 0})._receptions()
+    driver = SimpleNamespace(
+        node_namespace="/", node_name="driver", qos_profile=SimpleNamespace(reliability=BEST_EFFORT)
+    )
     for there in ([driver], []):
         monkeypatch.setattr(reception, "publishers", lambda there=there: there)
         reception.adapt()
-        reception.arrivals.add([{"publication_sequence_number": number, "source_timestamp": number}
-                                for number in (1, 3)], 0)
-        said, = (text for kind, _, text in reception.problems() if kind == "lost")
+        reception.arrivals.add(
+            [{"publication_sequence_number": number, "source_timestamp": number} for number in (1, 3)], 0
+        )
+        (said,) = (text for kind, _, text in reception.problems() if kind == "lost")
         assert "let /driver publish reliable" in said
 
 
-@pytest.mark.parametrize("topic, what, publisher, silent, slow", [
-    ("/velodyne_points", "cloud", "driver", "is the sensor /driver running", "is the sensor /dri"),
-    ("/velodyne_points", "cloud", "", "is the sensor running, and connected?", "sensor overloaded"),
-    ("/points", "cloud", "rosbag2_player", "has the player /rosbag2_player reached", "more slowly"),
-    ("/clustering/output/points", "cloud", "clustering", "is the node /clustering running",
-     "is the node /clustering overloaded"),
-    ("/fused_detector/output/detections", "array", "fused_detector",
-     "is the detector /fused_detector running, and does it get clouds?", "is the detector /fused"),
-    ("/boxes", "array", "", "is the detector running", "is the detector overloaded")])
+@pytest.mark.parametrize(
+    "topic, what, publisher, silent, slow",
+    [
+        ("/velodyne_points", "cloud", "driver", "is the sensor /driver running", "is the sensor /dri"),
+        ("/velodyne_points", "cloud", "", "is the sensor running, and connected?", "sensor overloaded"),
+        ("/points", "cloud", "rosbag2_player", "has the player /rosbag2_player reached", "more slowly"),
+        (
+            "/clustering/output/points",
+            "cloud",
+            "clustering",
+            "is the node /clustering running",
+            "is the node /clustering overloaded",
+        ),
+        (
+            "/fused_detector/output/detections",
+            "array",
+            "fused_detector",
+            "is the detector /fused_detector running, and does it get clouds?",
+            "is the detector /fused",
+        ),
+        ("/boxes", "array", "", "is the detector running", "is the detector overloaded"),
+    ],
+)
 def test_problem_names_the_kind_of_publisher(monkeypatch, topic, what, publisher, silent, slow):
     late = Late(monkeypatch, lambda stamp: 0.0, rate=10.0)
     late.reception.topic, late.reception.what = topic, what
-    late.reception.last_publishers = [SimpleNamespace(node_namespace="/", node_name=publisher)
-                          ] * bool(publisher)
+    late.reception.last_publishers = [SimpleNamespace(node_namespace="/", node_name=publisher)] * bool(publisher)
     late.reception.last_time, late.now = 1.0, 4.0
-    said, = (text for _, _, text in late.reception.problems())
+    (said,) = (text for _, _, text in late.reception.problems())
     assert said.startswith(f"no {what} on {topic} for more than 2 s: ") and silent in said
     late.now = 1.0
     monkeypatch.setattr(late.reception.arrivals, "measure_rate", lambda: 3.0)
-    said, = (text for _, _, text in late.reception.problems())
+    (said,) = (text for _, _, text in late.reception.problems())
     assert slow in said and ("sensor" in said) == (topic == "/velodyne_points")
 
 
@@ -301,9 +333,10 @@ class Late:
         self.now, self.lag, self.answered = 0.0, lag, []
         monkeypatch.setattr(reception_module, "monotonic", lambda: self.now)
         node = SimpleNamespace(
-            resolve_topic_name=lambda name: name, _parameter_overrides={},
-            create_guard_condition=lambda work: SimpleNamespace(trigger=lambda: self.todo.append(
-                work)))
+            resolve_topic_name=lambda name: name,
+            _parameter_overrides={},
+            create_guard_condition=lambda work: SimpleNamespace(trigger=lambda: self.todo.append(work)),
+        )
         self.todo, asked = [], ReceptionParams(**params)
         self.reception = Reception(node, None, "points", self.deliver, lambda: asked)
         handle = MagicMock()
@@ -321,26 +354,39 @@ class Late:
         for tick in range(1, round(seconds * 100)):
             self.now = tick / 100
             if tick % 10 == 0:
-                self.reception._on_message(self.now, {"publication_sequence_number": tick // 10,
-                                                      "source_timestamp": tick * 10**7})
+                self.reception._on_message(
+                    self.now, {"publication_sequence_number": tick // 10, "source_timestamp": tick * 10**7}
+                )
             self.reception.retry()
             while self.todo:
                 self.todo.pop(0)()
 
 
-@pytest.mark.parametrize("given, learned, error, stale, lifetime", [
-    (0.0, None, 2, 10, 2), (10.0, None, 2, 10, 2), (0.4, None, 7.5, 15, 6.25),
-    (0.0, 0.4, 7.5, 15, 6.25), (10.0, 0.4, 2, 10, 2)])
-def test_slow_sensor_is_not_reported_silent(
-        monkeypatch, given, learned, error, stale, lifetime):
+@pytest.mark.parametrize(
+    "given, learned, error, stale, lifetime",
+    [
+        (0.0, None, 2, 10, 2),
+        (10.0, None, 2, 10, 2),
+        (0.4, None, 7.5, 15, 6.25),
+        (0.0, 0.4, 7.5, 15, 6.25),
+        (10.0, 0.4, 2, 10, 2),
+    ],
+)
+def test_slow_sensor_is_not_reported_silent(monkeypatch, given, learned, error, stale, lifetime):
     late = Late(monkeypatch, lambda stamp: 0.0, rate=given)
     late.reception.arrivals.learned, late.reception.last_time = learned, 1.0
-    for late.now, kinds in ((1 + error, []), (1.1 + error, ["silent"]), (1 + stale, ["silent"]),
-                            (1.1 + stale, ["stale"])):
+    for late.now, kinds in (
+        (1 + error, []),
+        (1.1 + error, ["silent"]),
+        (1 + stale, ["silent"]),
+        (1.1 + stale, ["stale"]),
+    ):
         assert [kind for kind, _, _ in late.reception.problems()] == kinds
     for wanted, stay in ((0, 0), (2, lifetime), (9, 9)):
-        node = SimpleNamespace(_receptions=lambda: [late.reception], node_params=SimpleNamespace(
-            output=MarkerParams(marker_lifetime=wanted)))
+        node = SimpleNamespace(
+            _receptions=lambda: [late.reception],
+            node_params=SimpleNamespace(output=MarkerParams(marker_lifetime=wanted)),
+        )
         assert find_marker_lifetime_ns(node) == stay * 10**9
 
 

@@ -30,11 +30,11 @@ def test_the_recorder_has_what_each_of_several_publishers_latched(processes, pee
 def test_late_publisher_with_weaker_qos_is_recorded(processes, peer, tmp_path):
     """Also by a name of the node's namespace."""
     first = peer.advertise("/robot/text", TEXT, RELIABLE)
-    processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["text"]},
-                    namespace="robot")
+    processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["text"]}, namespace="robot")
 
     def frames():
         return int(peer.get_value("robot/bag_recorder", "frames") or 0)
+
     peer.send(first, bag_message(TEXT, data="first"), frames, "the first")
     before, later = frames(), peer.advertise("/robot/text", TEXT, SENSOR_DATA)
     peer.send(later, bag_message(TEXT, data="later"), lambda: frames() > before, "the later one")
@@ -45,12 +45,14 @@ def test_late_publisher_with_weaker_qos_is_recorded(processes, peer, tmp_path):
 
 def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start, tmp_path):
     from lidar_perception.nodes.replay import bag_recorder
+
     known = bag_recorder.load_message_class
 
     def lacking(name):
         if name == INFO:
             raise ModuleNotFoundError
         return known(name)
+
     monkeypatch.setattr(bag_recorder, "load_message_class", lacking)
     peer.advertise("/info", INFO)
     peer.advertise("/text", TEXT)
@@ -64,14 +66,17 @@ def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start
 def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tmp_path):
     """Also while simulated time does not advance."""
     from lidar_perception.nodes.replay import bag_recorder
+
     monkeypatch.setattr(bag_recorder, "MAX_QUEUED", 100)
     held = threading.Event()
     monkeypatch.setattr(bag_recorder.BagWriter, "write", lambda *_: held.wait())
     kept = []
-    monkeypatch.setattr(bag_recorder.BagRecorder, "create_subscription",
-                        lambda self, kind, topic, received, *_, **__: kept.append(received))
-    node = start(bag_recorder.BagRecorder, **{"bag": str(tmp_path / "bag"), "topics": ["/a"],
-                                              "use_sim_time": True})
+    monkeypatch.setattr(
+        bag_recorder.BagRecorder,
+        "create_subscription",
+        lambda self, kind, topic, received, *_, **__: kept.append(received),
+    )
+    node = start(bag_recorder.BagRecorder, **{"bag": str(tmp_path / "bag"), "topics": ["/a"], "use_sim_time": True})
     node._subscribe("/a", None)
     try:
         for _ in range(10):

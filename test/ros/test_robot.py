@@ -37,8 +37,12 @@ def test_cropped_cloud_gives_the_offline_candidates(processes, peer, cloud):
 
     An empty parameter can be set at run time, also with integers.
     """
-    values = {"crop.body": [-2, -1, -2, 3, 1, 1], "crop.min_range": 3.0,
-              "crop.sectors": [60.0, 300.0], "crop.max_range": 40.0}
+    values = {
+        "crop.body": [-2, -1, -2, 3, 1, 1],
+        "crop.min_range": 3.0,
+        "crop.sectors": [60.0, 300.0],
+        "crop.max_range": 40.0,
+    }
     params = with_values(PipelineParams(), values)
     processes.start("perception", {"~/input/points": "/in"}, values)
     processes.start("ground_segmentation", {"~/input/points": "/in"}, values)
@@ -60,8 +64,12 @@ def test_cropped_cloud_gives_the_offline_candidates(processes, peer, cloud):
     peer.wait(lambda: peer.get_value("perception", "cropped") == cropped, "the count")
 
     peer.set_parameter("/ground_segmentation", "crop.sectors", [0, 360])
-    peer.send(talker, cloud, lambda: not read_column(clouds[-1], "in_view", everything).any(),
-              "a cloud of which nothing is left")
+    peer.send(
+        talker,
+        cloud,
+        lambda: not read_column(clouds[-1], "in_view", everything).any(),
+        "a cloud of which nothing is left",
+    )
     peer.wait(lambda: "crop.* leaves none" in peer.get_message("ground_segmentation"), "the reason")
 
 
@@ -72,8 +80,7 @@ def test_tilted_sensor_gets_its_mount_from_tf(processes, peer):
     base = mount_pose(0.5, 0.2, 1.7, 0.0, 0.3, -0.2)
     moved = mount_pose(30.0, -4.0, 0.0, 0.0, 0.0, 0.0)
     xyz, person = walker(base)
-    processes.start("perception", {"~/input/points": "/in"}, {
-        **WALKING, "base_frame": "base", "target_frame": "odom"})
+    processes.start("perception", {"~/input/points": "/in"}, {**WALKING, "base_frame": "base", "target_frame": "odom"})
     static = peer.advertise("/tf_static", TF_MESSAGE, STATIC_QOS)
     static.publish(encode(transforms(("base", "lidar", base, 0))))
     moving = peer.advertise("/tf", TF_MESSAGE)
@@ -81,16 +88,30 @@ def test_tilted_sensor_gets_its_mount_from_tf(processes, peer):
     found = peer.listen("/perception/output/detections", MARKERS)
     talker = peer.advertise("/in", CLOUD)
     at = (person + moved[:3, 3]).tolist()
-    peer.send(click, bag_message(
-        "geometry_msgs/msg/PointStamped", header=make_header(START, "odom", bag_message),
-        point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at)))),
-        click.get_subscription_count, "a subscriber of the click")
+    peer.send(
+        click,
+        bag_message(
+            "geometry_msgs/msg/PointStamped",
+            header=make_header(START, "odom", bag_message),
+            point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at))),
+        ),
+        click.get_subscription_count,
+        "a subscriber of the click",
+    )
     early, late = (transforms(("odom", "base", moved, START + i * PERIOD)) for i in (-1, 1))
     peer.send(moving, early, moving.get_subscription_count, "a subscriber of /tf")
-    peer.send(talker, message(xyz), lambda: "waits for the newest transform of 'odom' -> 'base'"
-              in peer.get_message("perception"), "a cloud, once /tf_static is there, to wait")
-    peer.send(moving, late, lambda: found and from_marker_array(found[-1]).frame_id == "odom",
-              "the person, in a cloud that has waited")
+    peer.send(
+        talker,
+        message(xyz),
+        lambda: "waits for the newest transform of 'odom' -> 'base'" in peer.get_message("perception"),
+        "a cloud, once /tf_static is there, to wait",
+    )
+    peer.send(
+        moving,
+        late,
+        lambda: found and from_marker_array(found[-1]).frame_id == "odom",
+        "the person, in a cloud that has waited",
+    )
     objects = from_marker_array(found[-1])
     assert (len(objects), objects.stamp_ns) == (1, START)
     np.testing.assert_allclose(objects.boxes[0, :2], at[:2], atol=0.3)

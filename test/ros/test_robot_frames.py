@@ -9,18 +9,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from detection_samples import eager, frame, lively, tiny
 from rclpy.parameter import Parameter
-from robot_messages import (
-    PERIOD,
-    START,
-    WALKING,
-    give,
-    message,
-    mount_pose,
-    odometry,
-    problems,
-    transforms,
-    walker,
-)
+from robot_messages import PERIOD, START, WALKING, give, message, mount_pose, odometry, problems, transforms, walker
 from samples import WALKER
 from samples import scene as walker_scene
 
@@ -46,8 +35,11 @@ def boxes_of(node, topic="detections"):
     return to_detections(objects), objects.frame_id, objects.stamp_ns
 
 
-TILTS = {"nods": (0.4, 0.1, 1.9, 0.0, 0.35, 0.0), "leans": (-0.2, 0.5, 1.2, 0.3, 0.0, -0.3),
-         "upside down": (0.0, 0.0, 2.2, -0.4, 0.1, np.pi - 0.05)}
+TILTS = {
+    "nods": (0.4, 0.1, 1.9, 0.0, 0.35, 0.0),
+    "leans": (-0.2, 0.5, 1.2, 0.3, 0.0, -0.3),
+    "upside down": (0.0, 0.0, 2.2, -0.4, 0.1, np.pi - 0.05),
+}
 
 
 @pytest.mark.parametrize("tilt", TILTS)
@@ -58,13 +50,16 @@ def test_candidates_of_tilted_and_level_sensor_are_equal(start, tilt):
     for base in (mount_pose(x, y, height, yaw, 0.0, 0.0), mount_pose(*TILTS[tilt])):
         node = start(Perception, base_frame="base", target_frame="base", **WALKING)
         camera = mount_pose(1.0, 0.0, 0.5, 1.0, 0.2, 0.1)
-        node.transforms.on_tf(transforms(("base", "lidar", base, 0), ("base", "eye", camera, 0)),
-                              static=True)
+        node.transforms.on_tf(transforms(("base", "lidar", base, 0), ("base", "eye", camera, 0)), static=True)
         xyz, person = walker(base)
         at = transform_points(person[None], invert_pose(camera))[0].tolist()
-        node.seed._on_click(bag_message(
-            "geometry_msgs/msg/PointStamped", header=make_header(START, "eye", bag_message),
-            point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at)))))
+        node.seed._on_click(
+            bag_message(
+                "geometry_msgs/msg/PointStamped",
+                header=make_header(START, "eye", bag_message),
+                point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at))),
+            )
+        )
         give(node, message(xyz))
         detections, frame_id, stamp = boxes_of(node)
         assert (frame_id, stamp, len(detections)) == ("base", START, 1)
@@ -81,9 +76,13 @@ def test_seed_bank_keeps_the_last_clicks_and_skips_a_bad_one(start):
 
     def click(*places):
         for place in places:
-            node.seed._on_click(bag_message(
-                "geometry_msgs/msg/PointStamped", header=make_header(START, "lidar", bag_message),
-                point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", place)))))
+            node.seed._on_click(
+                bag_message(
+                    "geometry_msgs/msg/PointStamped",
+                    header=make_header(START, "lidar", bag_message),
+                    point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", place))),
+                )
+            )
         give(node, cloud)
         return len(node.seed.clicked_seeds)
 
@@ -125,13 +124,13 @@ def test_detections_of_tilted_and_level_sensor_are_equal(start, weights):
         boxes = detections.boxes.astype(np.float64)
         if name == "lidar":
             boxes[:, :3] = transform_points(boxes[:, :3], place @ tilt)
-            by_hand = start(PointPillarsNode, **{
-                **weights, "ground.sensor_pose.roll": -0.2, "ground.sensor_pose.pitch": 0.3})
+            by_hand = start(
+                PointPillarsNode, **{**weights, "ground.sensor_pose.roll": -0.2, "ground.sensor_pose.pitch": 0.3}
+            )
             give(by_hand, message(seen, intensity=scan.intensity))
             hand, _, _ = boxes_of(by_hand)
             assert len(hand) == len(detections)
-            np.testing.assert_allclose(np.sort(hand.boxes, axis=0),
-                                       np.sort(detections.boxes, axis=0), atol=2e-2)
+            np.testing.assert_allclose(np.sort(hand.boxes, axis=0), np.sort(detections.boxes, axis=0), atol=2e-2)
         order, other = (np.lexsort(b[:, 1::-1].round(1).T) for b in (boxes, expected.boxes))
         np.testing.assert_allclose(boxes[order][:, :6], expected.boxes[other][:, :6], atol=2e-2)
         if name == "base":
@@ -150,8 +149,11 @@ def test_parameter_ahead_turns_the_view_of_the_detectors(start, weights, by):
     tilt = np.eye(4) if by == "nothing" else make_tilted_pose(-0.2, 0.3)
     level = invert_pose(mount_pose(0, 0, 0, np.radians(ahead), 0, 0)) @ tilt
     seen = transform_points(scan.xyz.astype(np.float64), invert_pose(level))
-    leans = {"hand": {"ground.sensor_pose.roll": -0.2, "ground.sensor_pose.pitch": 0.3},
-             "TF": {"base_frame": "base"}, "nothing": {}}[by]
+    leans = {
+        "hand": {"ground.sensor_pose.roll": -0.2, "ground.sensor_pose.pitch": 0.3},
+        "TF": {"base_frame": "base"},
+        "nothing": {},
+    }[by]
     node = start(PointPillarsNode, **{**weights, **leans, "input.ahead": ahead})
     if by == "TF":
         place = mount_pose(0.7, -0.3, 1.73, 1.0, 0.0, 0.0)  # its heading in the base has no effect
@@ -174,9 +176,13 @@ def test_click_and_candidates_in_rotated_cloud(start):
     node = start(Perception, **WALKING, **{"input.ahead": -100.0})
     xyz, person = transform_points(walker_scene()[:, :3].astype(np.float64), turn), WALKER[:3]
     at = transform_points(np.array(person, np.float64)[None], turn)[0]
-    node.seed._on_click(bag_message(
-        "geometry_msgs/msg/PointStamped", header=make_header(START, "lidar", bag_message),
-        point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at.tolist())))))
+    node.seed._on_click(
+        bag_message(
+            "geometry_msgs/msg/PointStamped",
+            header=make_header(START, "lidar", bag_message),
+            point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at.tolist()))),
+        )
+    )
     give(node, message(xyz))
     detections, frame_id, _ = boxes_of(node)
     assert frame_id == "lidar" and len(detections) == 1
@@ -192,13 +198,22 @@ def test_missing_frames_are_named_and_parameters_used(start):
         give(node, message(xyz))
     assert asks.sent["detections"] == plain.sent["detections"]
     said = problems(asks)
-    for words in ("base_frame 'base_footprint'", "'lidar' is not in TF", "sensor_pose is used",
-                  "target_frame 'odom'", "results are in 'lidar'"):
+    for words in (
+        "base_frame 'base_footprint'",
+        "'lidar' is not in TF",
+        "sensor_pose is used",
+        "target_frame 'odom'",
+        "results are in 'lidar'",
+    ):
         assert words in said
     assert "frame" not in problems(plain)
-    asks.transforms.on_tf(transforms(
-        ("odom", "base_footprint", np.eye(4), START),
-        ("base_footprint", "lidar", mount_pose(0, 0, -1.0, 0, 0, 0), START)), static=True)
+    asks.transforms.on_tf(
+        transforms(
+            ("odom", "base_footprint", np.eye(4), START),
+            ("base_footprint", "lidar", mount_pose(0, 0, -1.0, 0, 0, 0), START),
+        ),
+        static=True,
+    )
     give(asks, message(xyz, START + 1))
     assert "-1.00 m above 'base_footprint', which must be on the ground" in problems(asks)
     assert "odom" not in problems(asks)
@@ -206,19 +221,16 @@ def test_missing_frames_are_named_and_parameters_used(start):
 
 def test_body_crop_needs_a_known_frame(start):
     """Otherwise it could be a person. A body below the ground is reported."""
-    node = start(GroundSegmentation, base_frame="base", **{
-        "crop.body": [-0.5, -0.4, 0.2, 0.5, 0.4, 1.0]})
+    node = start(GroundSegmentation, base_frame="base", **{"crop.body": [-0.5, -0.4, 0.2, 0.5, 0.4, 1.0]})
     floor = np.random.default_rng(0).uniform(-20, 20, (2000, 3)) * [1, 1, 0]
     sensor = mount_pose(0.5, 0.0, 1.2, 0.0, 0.0, 0.0)  # the base's origin is behind it
-    seen = transform_points(np.vstack([floor, [[0.3, 0.0, 0.8]], [[0.9, 0.0, 0.8]]]),
-                            invert_pose(sensor))
+    seen = transform_points(np.vstack([floor, [[0.3, 0.0, 0.8]], [[0.9, 0.0, 0.8]]]), invert_pose(sensor))
     give(node, message(seen))
     assert not node.counts["cropped"] and "crop.body is not cropped" in problems(node)
     node.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
     give(node, message(seen, START + 1))
     assert node.counts["cropped"] == 1 and "crop.body" not in problems(node)
-    low = start(GroundSegmentation, base_frame="base", **{
-        "crop.body": [-0.5, -0.4, -1.0, 0.5, 0.4, -0.2]})
+    low = start(GroundSegmentation, base_frame="base", **{"crop.body": [-0.5, -0.4, -1.0, 0.5, 0.4, -0.2]})
     low.transforms = node.transforms.__class__(low)
     low.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
     give(low, message(seen))
@@ -265,8 +277,10 @@ def test_cloud_waits_for_late_or_missing_transform(start):
 def test_tracks_of_tilted_sensor_are_in_the_cloud_frame(start, weights):
     """Tracks are in the frame of the cloud while detections are in that of the base."""
     scan, tilt = frame(), make_tilted_pose(-0.2, 0.3, 1.73)
-    node = start(PointPillarsNode, **{**weights, "base_frame": "base", "target_frame": "base",
-                                      "tracking.enabled": True, "tracking.report": 0.0})
+    node = start(
+        PointPillarsNode,
+        **{**weights, "base_frame": "base", "target_frame": "base", "tracking.enabled": True, "tracking.report": 0.0},
+    )
     node.transforms.on_tf(transforms(("base", "lidar", tilt, 0)), static=True)
     seen = transform_points(scan.xyz.astype(np.float64), make_tilted_pose(-0.2, 0.3).T)
     for i in range(4):

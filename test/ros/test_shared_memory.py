@@ -20,12 +20,15 @@ from lidar_perception.nodes.graph import reserve_domain
 from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES
 
 
-@pytest.mark.parametrize("remap, buffer, profile", [
-    ("~/input/points:=/velodyne_points", 8 << 20, "fastdds_driver.xml"),
-    ("~/input/points:=/velodyne_points", 212_992, "fastdds.xml"),
-    ("~/input/points:=clustering/output/points", 8 << 20, "fastdds.xml")])
-def test_driver_clouds_use_udp_if_the_socket_buffer_is_large(remap, buffer, profile,
-                                                                 monkeypatch):
+@pytest.mark.parametrize(
+    "remap, buffer, profile",
+    [
+        ("~/input/points:=/velodyne_points", 8 << 20, "fastdds_driver.xml"),
+        ("~/input/points:=/velodyne_points", 212_992, "fastdds.xml"),
+        ("~/input/points:=clustering/output/points", 8 << 20, "fastdds.xml"),
+    ],
+)
+def test_driver_clouds_use_udp_if_the_socket_buffer_is_large(remap, buffer, profile, monkeypatch):
     monkeypatch.setattr(shared_memory, "read_socket_buffer_size", lambda: buffer)
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=1 << 20, f_frsize=4096))
     for name in PROFILE_VARIABLES:
@@ -48,8 +51,11 @@ def segments(pid: int | str) -> set[Path]:
 
 def shares_no_segment(process) -> bool:
     """Return True if a process shares no segment with another one."""
-    return all(segments(process.pid).isdisjoint(segments(other.name))
-               for other in Path("/proc").glob("[0-9]*") if other.name != str(process.pid))
+    return all(
+        segments(process.pid).isdisjoint(segments(other.name))
+        for other in Path("/proc").glob("[0-9]*")
+        if other.name != str(process.pid)
+    )
 
 
 def short():
@@ -57,8 +63,12 @@ def short():
     code = "import rclpy; rclpy.init(); node = rclpy.create_node('short'); print(); input()"
     while True:
         process = subprocess.Popen(
-            [sys.executable, "-c", code], text=True, stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, env={**os.environ, "ROS_DOMAIN_ID": str(reserve_domain())})
+            [sys.executable, "-c", code],
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "ROS_DOMAIN_ID": str(reserve_domain())},
+        )
         process.stdout.readline()
         if shares_no_segment(process):
             return process
@@ -77,13 +87,13 @@ def test_only_shared_memory_of_killed_process_is_removed(capsys):
                         os.utime(f"{segment}_el", age)
                 if age:
                     shared_memory.remove_dead_segments()
+
         remove_as_if_old()
         assert theirs and others and all(segment.exists() for segment in theirs | others)
         killed.kill()
         killed.wait()
         end = monotonic() + 10
-        while (left := [s for s in theirs if s.exists() or Path(f"{s}_el").exists()]
-               ) and monotonic() < end:
+        while (left := [s for s in theirs if s.exists() or Path(f"{s}_el").exists()]) and monotonic() < end:
             remove_as_if_old()  # another starting node may hold their locks
         assert not left
         assert all(segment.exists() for segment in others)

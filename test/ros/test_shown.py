@@ -30,23 +30,39 @@ CONFIG = Path(__file__).resolve().parents[2] / "config"
 NAV2 = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "nav2.md"
 CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
 # Nav2's obstacle_layer.cpp (jazzy) and spatio_temporal_voxel_layer.cpp
-NAV2_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT,
-                      durability=DurabilityPolicy.VOLATILE)
-SOURCE = {"topic": str, "data_type": str, "marking": bool, "clearing": bool,
-          "min_obstacle_height": float, "max_obstacle_height": float,
-          "expected_update_rate": float}
+NAV2_QOS = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
+SOURCE = {
+    "topic": str,
+    "data_type": str,
+    "marking": bool,
+    "clearing": bool,
+    "min_obstacle_height": float,
+    "max_obstacle_height": float,
+    "expected_update_rate": float,
+}
 PLANAR = SOURCE | {"obstacle_max_range": float, "raytrace_max_range": float}
 LAYERS = {  # parameters of a layer, and of its sources, of those that nav2.md uses
-    "nav2_costmap_2d::ObstacleLayer": ({"min_obstacle_height": float,
-                                        "max_obstacle_height": float}, PLANAR),
-    "nav2_costmap_2d::VoxelLayer": ({"min_obstacle_height": float, "max_obstacle_height": float,
-                                     "origin_z": float, "z_resolution": float, "z_voxels": int},
-                                    PLANAR),
+    "nav2_costmap_2d::ObstacleLayer": ({"min_obstacle_height": float, "max_obstacle_height": float}, PLANAR),
+    "nav2_costmap_2d::VoxelLayer": (
+        {
+            "min_obstacle_height": float,
+            "max_obstacle_height": float,
+            "origin_z": float,
+            "z_resolution": float,
+            "z_voxels": int,
+        },
+        PLANAR,
+    ),
     "spatio_temporal_voxel_layer/SpatioTemporalVoxelLayer": (
-        {"voxel_decay": float, "voxel_size": float}, SOURCE | {"obstacle_range": float}),
+        {"voxel_decay": float, "voxel_size": float},
+        SOURCE | {"obstacle_range": float},
+    ),
 }
-RVIZ = {"rviz_default_plugins/PointCloud2": CLOUD, "rviz_default_plugins/MarkerArray": MARKERS,
-        "rviz_default_plugins/PublishPoint": "geometry_msgs/msg/PointStamped"}
+RVIZ = {
+    "rviz_default_plugins/PointCloud2": CLOUD,
+    "rviz_default_plugins/MarkerArray": MARKERS,
+    "rviz_default_plugins/PublishPoint": "geometry_msgs/msg/PointStamped",
+}
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +71,16 @@ def graph(domain):
     them."""
     context = create_context(domain)
     nodes, types, offered = [], {}, {}
-    for name, remap in {**build_graph([*DETECTOR_NODES]), **SINGLE,
-                        **build_graph(["candidates"], tracking=True)}.items():
+    for name, remap in {
+        **build_graph([*DETECTOR_NODES]),
+        **SINGLE,
+        **build_graph(["candidates"], tracking=True),
+    }.items():
         rules = [word for rule in remap.items() for word in ("-r", ":=".join(rule))]
         node = load_node_class(name)(context=context, cli_args=["--ros-args", *rules])
         node.start()  # which creates the topics of managed nodes
         nodes.append(node)
-        types.update((t, kinds[0]) for t, kinds in node.get_subscriber_names_and_types_by_node(
-            name, "/"))
+        types.update((t, kinds[0]) for t, kinds in node.get_subscriber_names_and_types_by_node(name, "/"))
         for topic, kinds in node.get_publisher_names_and_types_by_node(name, "/"):
             types[topic] = kinds[0]
             offered[topic] = node.get_publishers_info_by_topic(topic)[0].qos_profile
@@ -82,8 +100,7 @@ def test_every_topic_of_the_rviz_file_is_in_the_graph(graph):
     for display in shown:
         topic, policy = f"/{display['Topic']['Value']}", display["Topic"]["Reliability Policy"]
         assert types[topic] == RVIZ[display["Class"]], topic
-        wanted = QoSProfile(depth=5, reliability=ReliabilityPolicy.get_from_short_key(
-            policy.lower().replace(" ", "_")))
+        wanted = QoSProfile(depth=5, reliability=ReliabilityPolicy.get_from_short_key(policy.lower().replace(" ", "_")))
         if topic in offered:
             assert compatible(offered[topic], wanted)[0] != QoSCompatibility.ERROR, topic
 
@@ -112,7 +129,8 @@ def test_rviz_and_foxglove_show_the_same_topics():
     topics = next(p["topics"] for n, p in layout.items() if n.startswith("3D!"))
     displays = [d for d in rviz_manager()["Displays"] if "Topic" in d]
     assert {f"/{d['Topic']['Value']}": d["Enabled"] for d in displays} == {
-        topic: how["visible"] for topic, how in topics.items()}
+        topic: how["visible"] for topic, how in topics.items()
+    }
 
 
 def costmap_layers():
@@ -157,7 +175,6 @@ def test_a_costmap_gets_the_obstacles_of_each_cloud(processes, peer, drive_bag):
     assert 0 < chosen.sum() < (~ground).sum()
     sent = to_array(cloud)[indices[chosen]]
     for message, *_ in heard.values():
-        assert [(f.name, f.datatype) for f in message.fields] == [
-            (name, 7) for name in ("x", "y", "z", "intensity")]
+        assert [(f.name, f.datatype) for f in message.fields] == [(name, 7) for name in ("x", "y", "z", "intensity")]
         assert message.header == cloud.header
         np.testing.assert_array_equal(to_array(message), sent)

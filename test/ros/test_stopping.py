@@ -22,8 +22,10 @@ print("ready", flush=True)
 """
 WORK_HANGS = "hang()"
 TEARDOWN_HANGS = "awake.wait(); stop.begin_closing(); stop.finish_closing(3); hang()"
-WRITES_LONG = ("from time import sleep\nawake.wait(); stop.begin_closing(); sleep(7)\n"
-               "print('written', flush=True); stop.finish_closing(0)")
+WRITES_LONG = (
+    "from time import sleep\nawake.wait(); stop.begin_closing(); sleep(7)\n"
+    "print('written', flush=True); stop.finish_closing(0)"
+)
 ENDS_BY_ITSELF = "stop.begin_closing(); stop.finish_closing(2); hang()"
 REFUSED = """
 from lidar_perception.nodes.main import _spin
@@ -40,10 +42,12 @@ sys.exit(_spin(Refused, ["node"], 0.0, stop))
 
 # By case: program, signal, exit code and output. The signals are equivalent
 # (STOP_SIGNALS), so each case has one.
-CASES = {"work": (WORK_HANGS, signal.SIGINT, 0, ""),
-         "teardown": (TEARDOWN_HANGS, signal.SIGTERM, 3, ""),
-         "writing": (WRITES_LONG, signal.SIGTERM, 0, "written\n"),
-         "by itself": (ENDS_BY_ITSELF, None, 2, "")}
+CASES = {
+    "work": (WORK_HANGS, signal.SIGINT, 0, ""),
+    "teardown": (TEARDOWN_HANGS, signal.SIGTERM, 3, ""),
+    "writing": (WRITES_LONG, signal.SIGTERM, 0, "written\n"),
+    "by itself": (ENDS_BY_ITSELF, None, 2, ""),
+}
 if importlib.util.find_spec("rclpy"):
     CASES["what a refused node has made"] = REFUSED, None, 2, ""
 
@@ -51,15 +55,15 @@ if importlib.util.find_spec("rclpy"):
 @pytest.fixture(scope="module")
 def ended():
     """Run all cases at the same time; return {case: (output, exit code)}."""
-    running = {name: subprocess.Popen([sys.executable, "-c", PROGRAM.format(rest=rest)],
-                                      text=True, stdout=subprocess.PIPE)
-               for name, (rest, *_) in CASES.items()}
+    running = {
+        name: subprocess.Popen([sys.executable, "-c", PROGRAM.format(rest=rest)], text=True, stdout=subprocess.PIPE)
+        for name, (rest, *_) in CASES.items()
+    }
     for name, process in running.items():
         assert process.stdout.readline() == "ready\n"
         if CASES[name][1]:
             process.send_signal(CASES[name][1])
-    return {name: (process.communicate(timeout=30)[0], process.returncode)
-            for name, process in running.items()}
+    return {name: (process.communicate(timeout=30)[0], process.returncode) for name, process in running.items()}
 
 
 @pytest.mark.parametrize("name", list(CASES))
@@ -90,6 +94,7 @@ def test_context_shuts_down_once_the_graph_has_settled(looks, monkeypatch):
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     from lidar_perception.nodes import external_node
     from lidar_perception.nodes.external_node import MAX_SETTLE_S, SETTLE_S, shut_down_context
+
     clock, ended = [0.0], []
     monkeypatch.setattr(external_node, "monotonic", lambda: clock[0])
     monkeypatch.setattr(external_node, "sleep", lambda s: clock.__setitem__(0, clock[0] + s))

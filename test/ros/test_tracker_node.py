@@ -25,20 +25,14 @@ from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
 from lidar_perception.wire.codec import bag_message, decode, encode
-from lidar_perception.wire.messages import (
-    make_detection_markers,
-    make_odometry,
-    to_detections,
-    to_truth,
-)
+from lidar_perception.wire.messages import make_detection_markers, make_odometry, to_detections, to_truth
 from lidar_perception.wire.topics import CAMERA_INFO, ODOMETRY, POINTS, TRUTH
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import ADD, from_marker_array
 from msg_utils.stamps import make_header, to_ns
 
 NODE, ODOMETRY_TYPE = "tracker", "nav_msgs/msg/Odometry"
-REMAP = {"~/input/detections": "/found", "~/output/tracks": "/tracks",
-         "~/input/odometry": "/moved"}
+REMAP = {"~/input/detections": "/found", "~/output/tracks": "/tracks", "~/input/odometry": "/moved"}
 ALL_OF_THEM = QoSProfile(depth=1000)
 DELETEALL = 3
 
@@ -50,15 +44,18 @@ def header(stamp, frame_id="lidar"):
 def poses_of(path):
     """Return the poses of a bag by stamp."""
     with Bag(path) as bag:
-        return {to_ns(m.header.stamp): read_pose(m.pose.pose)
-                for _, _, m in bag.messages({ODOMETRY})}
+        return {to_ns(m.header.stamp): read_pose(m.pose.pose) for _, _, m in bag.messages({ODOMETRY})}
 
 
 def read(message):
     """Return stamp, ids, Detections and velocities of an array of tracks."""
     objects = from_marker_array(message)
-    return (objects.stamp_ns, objects.ids.tolist(), to_detections(objects),
-            [extra["velocity"] for extra in objects.extras])
+    return (
+        objects.stamp_ns,
+        objects.ids.tolist(),
+        to_detections(objects),
+        [extra["velocity"] for extra in objects.extras],
+    )
 
 
 def assert_same(message, tracks):
@@ -76,29 +73,44 @@ def looped(domain, drive_bag, tmp_path_factory):
     """Play a drive three times; return {topic: {stamp: its messages in order}} of the graph."""
     params = with_values(BEST, {"seed.source": "automatic"})
     graph = build_graph(["candidates"], single=True, tracking=True)
-    outputs = {"found": "/perception/output/detections", "behind": "/tracker/output/tracks",
-               "inside": "/perception/output/tracks"}
+    outputs = {
+        "found": "/perception/output/detections",
+        "behind": "/tracker/output/tracks",
+        "inside": "/perception/output/tracks",
+    }
     with Bag(drive_bag) as bag:
         clouds = bag.counts[POINTS]
-    with NodesUnderTest(tmp_path_factory.mktemp("looped"), domain) as processes, \
-            Peer(domain) as peer:
+    with NodesUnderTest(tmp_path_factory.mktemp("looped"), domain) as processes, Peer(domain) as peer:
         heard = {name: peer.listen(topic, MARKERS, ALL_OF_THEM) for name, topic in outputs.items()}
         for node, remap in graph.items():
-            extra = ({**flatten(params), "tracking.enabled": True, "input.queue": 2}
-                     if node == "perception" else {})
+            extra = {**flatten(params), "tracking.enabled": True, "input.queue": 2} if node == "perception" else {}
             processes.start(node, {**remap, **ODOMETRY_INPUT}, {**extra, "ego.max_wait": 60.0})
         listeners = {"found": 2, "behind": 1, "inside": 1}  # by the diagnostics of each node
-        peer.wait(lambda: all(
-            int(peer.get_value(topic.split("/")[1], f"subscribers of {topic}") or 0)
-            >= listeners[name] for name, topic in outputs.items()), "the nodes to be connected")
-        processes.start("bag_player", {}, {
-            "bag": str(drive_bag), "loop": True,
-            "follow": [outputs[name].lstrip("/") for name in ("found", "behind")],
-            "wait_for": [POINTS, f"{ODOMETRY}:=2", f"{CAMERA_INFO}:=1", outputs["found"] + ":=3",
-                         outputs["behind"] + ":=2"],
-            "wait_timeout": 120.0})
-        peer.wait(lambda: min(map(len, heard.values())) > 2.5 * clouds, "the drive, three times",
-                  300.0)
+        peer.wait(
+            lambda: all(
+                int(peer.get_value(topic.split("/")[1], f"subscribers of {topic}") or 0) >= listeners[name]
+                for name, topic in outputs.items()
+            ),
+            "the nodes to be connected",
+        )
+        processes.start(
+            "bag_player",
+            {},
+            {
+                "bag": str(drive_bag),
+                "loop": True,
+                "follow": [outputs[name].lstrip("/") for name in ("found", "behind")],
+                "wait_for": [
+                    POINTS,
+                    f"{ODOMETRY}:=2",
+                    f"{CAMERA_INFO}:=1",
+                    outputs["found"] + ":=3",
+                    outputs["behind"] + ":=2",
+                ],
+                "wait_timeout": 120.0,
+            },
+        )
+        peer.wait(lambda: min(map(len, heard.values())) > 2.5 * clouds, "the drive, three times", 300.0)
         processes.check()
         diagnostics = {key: peer.get_value(NODE, key) for key in ("alive", "born", "ended")}
     return clouds, heard, diagnostics
@@ -124,10 +136,11 @@ def test_graph_tracks_equal_library_tracks_and_end_on_loop(looped, drive_bag):
     clouds, heard, diagnostics = looped
     poses = poses_of(drive_bag)
     stamps = [from_marker_array(m).stamp_ns for m in heard["found"]]
-    assert len(poses) == clouds and stamps[:2 * clouds] == 2 * sorted(poses)
+    assert len(poses) == clouds and stamps[: 2 * clouds] == 2 * sorted(poses)
     shown = assert_tracked(heard["found"], heard["behind"], poses, TrackingParams())
-    rounds = [{i for t in shown[start:start + clouds] if t is not None for i in t.ids.tolist()}
-              for start in (0, clouds)]
+    rounds = [
+        {i for t in shown[start : start + clouds] if t is not None for i in t.ids.tolist()} for start in (0, clouds)
+    ]
     assert rounds[0] and rounds[1] and not rounds[0] & rounds[1]
     assert int(diagnostics["ended"]) > 0 and int(diagnostics["born"]) > 0
 
@@ -135,8 +148,7 @@ def test_graph_tracks_equal_library_tracks_and_end_on_loop(looped, drive_bag):
 def test_ids_follow_the_people_of_the_drive(looped, drive_bag):
     clouds, heard, _ = looped
     with Bag(drive_bag) as bag:
-        truth = {o.stamp_ns: to_truth(o) for o in
-                 (from_marker_array(m) for _, _, m in bag.messages({TRUTH}))}
+        truth = {o.stamp_ns: to_truth(o) for o in (from_marker_array(m) for _, _, m in bag.messages({TRUTH}))}
     report = TrackingReport()
     for i, message in enumerate(heard["behind"][:clouds]):
         stamp, ids, found, _ = read(message)
@@ -148,8 +160,7 @@ def test_ids_follow_the_people_of_the_drive(looped, drive_bag):
 def test_tracker_inside_the_detector_equals_the_library(looped, drive_bag):
     """Each cloud waits for its pose, like the frames of a tracker node."""
     _, heard, _ = looped
-    shown = assert_tracked(heard["found"], heard["inside"], poses_of(drive_bag),
-                           TrackingParams())
+    shown = assert_tracked(heard["found"], heard["inside"], poses_of(drive_bag), TrackingParams())
     assert any(t is not None and len(t) for t in shown)
 
 
@@ -157,15 +168,16 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     processes.start(NODE, REMAP, {})
     talker, tracks = peer.advertise("/found", MARKERS), peer.listen("/tracks", MARKERS)
     moving, now = peer.advertise("/moved", ODOMETRY_TYPE), START
-    peer.wait(lambda: peer.get_message(NODE) and talker.get_subscription_count()
-              and moving.get_subscription_count(), "the tracker")
+    peer.wait(
+        lambda: peer.get_message(NODE) and talker.get_subscription_count() and moving.get_subscription_count(),
+        "the tracker",
+    )
 
     def send(message, words="tracking", answered=True):
         """Publish once; wait for the tracks, if any are expected, and for the reason."""
         shown = len(tracks)
         talker.publish(encode(message))
-        peer.wait(lambda: words in peer.get_message(NODE) and len(tracks) >= shown + answered,
-                  f"'{words}'")
+        peer.wait(lambda: words in peer.get_message(NODE) and len(tracks) >= shown + answered, f"'{words}'")
         return tracks[-1]
 
     def frame(found, frame_id="lidar"):
@@ -179,8 +191,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
             stamp = now + (i + 1) * TENTH
             message = make_odometry(at, header(stamp, "odom"), child, bag_message)
             moving.publish(encode(message))
-        peer.send(moving, message, lambda: peer.get_value(NODE, "last_pose_ns") == str(stamp),
-                  "the poses")
+        peer.send(moving, message, lambda: peer.get_value(NODE, "last_pose_ns") == str(stamp), "the poses")
 
     found = cars(car(10))
     for _ in range(3):
@@ -223,13 +234,20 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
 def test_detection_arrays_are_tracked_as_markers_are(start):
     """The node runs in this process, because vision_msgs may be missing."""
     node, tracker = start(TrackerNode), Tracker()
-    node.transforms.on_odometry(make_odometry(pose(50, 0, 1), header(START, "lidar"), "base",
-                                              bag_message))  # detections are in its fixed frame
+    node.transforms.on_odometry(
+        make_odometry(pose(50, 0, 1), header(START, "lidar"), "base", bag_message)
+    )  # detections are in its fixed frame
     for i, found in enumerate(crowd()):
         stamp = START + i * TENTH
-        node.on_detections(to_detection_array(
-            found.boxes, [CLASSES[kind] for kind in found.class_ids], found.scores.tolist(),
-            header=header(stamp), make=bag_message))
+        node.on_detections(
+            to_detection_array(
+                found.boxes,
+                [CLASSES[kind] for kind in found.class_ids],
+                found.scores.tolist(),
+                header=header(stamp),
+                make=bag_message,
+            )
+        )
         tracks = tracker(found, stamp, np.eye(4))
         shown = read(decode(node.sent["tracks"][-1], MARKERS))
         assert shown[1] == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]

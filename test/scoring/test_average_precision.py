@@ -7,11 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidar_perception.scoring.average_precision import (
-    average_curve,
-    choose_thresholds,
-    sample_curve,
-)
+from lidar_perception.scoring.average_precision import average_curve, choose_thresholds, sample_curve
 
 pytestmark = pytest.mark.no_cover  # others run these lines
 
@@ -28,8 +24,7 @@ def test_thresholds_are_scores_of_hits_at_evenly_spaced_recall(seed, objects):
     assert len(chosen) <= 41 and (np.diff(chosen) < 0).all() and np.isin(chosen, hits).all()
     recall = np.array([(hits >= t).sum() for t in chosen]) / objects
     # Each is within half a step of its recall point; the last hit covers the remaining points.
-    np.testing.assert_allclose(recall[:-1], np.arange(len(chosen) - 1) / 40,
-                               atol=1 / objects + 1e-9)
+    np.testing.assert_allclose(recall[:-1], np.arange(len(chosen) - 1) / 40, atol=1 / objects + 1e-9)
     assert chosen[-1] == hits.min()
 
 

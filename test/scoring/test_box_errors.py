@@ -19,15 +19,21 @@ from lidar_perception.types import Detections, GroundTruth
 def frame(true: np.ndarray, found: np.ndarray, scores=0.9):
     truth = GroundTruth.of(true, np.full(len(true), CAR))
     detections = Detections.of(found, CAR, scores)
-    return compare_objects(to_camera_objects(truth, None),
-                           to_camera_objects(to_scored_labels(detections), None))
+    return compare_objects(to_camera_objects(truth, None), to_camera_objects(to_scored_labels(detections), None))
 
 
 def cars(count: int, rng) -> np.ndarray:
     """Return cars on an outward spiral, so that none touches another."""
     way, away = np.linspace(-1, 1, count), np.linspace(8, 70, count)
-    return np.column_stack([away * np.cos(way), away * np.sin(way), np.full(count, -0.9),
-                            np.tile([4.0, 1.7, 1.5], (count, 1)), rng.uniform(-3, 3, count)])
+    return np.column_stack(
+        [
+            away * np.cos(way),
+            away * np.sin(way),
+            np.full(count, -0.9),
+            np.tile([4.0, 1.7, 1.5], (count, 1)),
+            rng.uniform(-3, 3, count),
+        ]
+    )
 
 
 def moved(boxes: np.ndarray, away=0.0, aside=0.0, **sizes) -> np.ndarray:
@@ -52,8 +58,9 @@ def test_scores_equal_to_share_of_right_boxes_are_reliable(seed):
     share = rng.uniform(0.05, 1, 400)
     found = true.copy()
     found[rng.random(400) >= share] += [1e4, 0, 0, 0, 0, 0, 0]
-    honest, modest = (measure_reliability(Comparison.of([frame(true, found, scores)]), "Car")
-                      for scores in (share, 0.05 + share / 10))
+    honest, modest = (
+        measure_reliability(Comparison.of([frame(true, found, scores)]), "Car") for scores in (share, 0.05 + share / 10)
+    )
     assert sum(row["boxes"] for row in honest["bins"]) == 400
     assert honest["error"] < 12 and modest["error"] > 30
     assert measure_reliability(Comparison.of([frame(true, found[:0])]), "Car")["error"] is None
@@ -69,8 +76,9 @@ def test_fitted_calibration_recovers_distorted_scores(seed):
     found = true.copy()
     found[rng.random(3000) >= share] += [1e6, 0, 0, 0, 0, 0, 0]
     bent = expit((logit(share) + 0.7) / 1.6)
-    slope, offset = fit_calibrations(Comparison.of([frame(true[i::30], found[i::30], bent[i::30])
-                                                    for i in range(30)]))["Car"]
+    slope, offset = fit_calibrations(Comparison.of([frame(true[i::30], found[i::30], bent[i::30]) for i in range(30)]))[
+        "Car"
+    ]
     assert slope == pytest.approx(1.6, abs=0.25) and offset == pytest.approx(-0.7, abs=0.25)
     assert fit_calibrations(Comparison.of([frame(true[:5], found[:5], bent[:5])])) == {}
 
@@ -90,10 +98,10 @@ def test_known_box_errors_are_measured():
 def test_correcting_an_error_raises_the_overlap():
     true = cars(12, np.random.default_rng(1))
     off = moved(true)
-    off[:4, 2] += 0.6    # 3D only
+    off[:4, 2] += 0.6  # 3D only
     off[4:8, :2] += 0.3  # BEV and 3D
     found, scores = np.concatenate([off, off[:1] + [0, 200, 0, 0, 0, 0, 0]]), np.full(13, 0.9)
-    scores[11] = 0.1     # too weak to count
+    scores[11] = 0.1  # too weak to count
     content = measure_box_errors([frame(true, found, scores)], "Car", 0.2)
     assert content["by_range"]["all"]["pairs"] <= 11
     strict = content["strict"]

@@ -18,12 +18,7 @@ from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.scores import CentreScores
 from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.kitti.camera_objects import to_camera_objects
-from lidar_perception.scoring.kitti.protocol import (
-    DIFFICULTIES,
-    SCORED,
-    Comparison,
-    compute_precision,
-)
+from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED, Comparison, compute_precision
 from lidar_perception.scoring.kitti.report import ROWS, DetectionReport, average_3d
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
 
@@ -34,8 +29,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def labels(text):
-    return to_ground_truth([parse_label(line) for line in text.splitlines()],
-                           CALIBRATION.lidar_to_camera)
+    return to_ground_truth([parse_label(line) for line in text.splitlines()], CALIBRATION.lidar_to_camera)
 
 
 def report(frames, calibration=CALIBRATION):
@@ -58,10 +52,10 @@ def numbers(content):
 
 
 # One line: a car 20 m ahead, 60 pixels high, seen in full; a result is the same with a score.
-def car(kind="Car", left=500, top=150, bottom=210, z=20.0, x=0.0, occluded=0, truncated=0.0,
-        alpha=0.0, score=None, y=1.6):
-    line = (f"{kind} {truncated} {occluded} {alpha} {left} {top} {left + 100} {bottom} "
-            f"1.5 1.6 3.9 {x} {y} {z} 0.3")
+def car(
+    kind="Car", left=500, top=150, bottom=210, z=20.0, x=0.0, occluded=0, truncated=0.0, alpha=0.0, score=None, y=1.6
+):
+    line = f"{kind} {truncated} {occluded} {alpha} {left} {top} {left + 100} {bottom} 1.5 1.6 3.9 {x} {y} {z} 0.3"
     return line if score is None else f"{line} {score}"
 
 
@@ -73,8 +67,7 @@ def concatenate(*lines):
     return "\n".join(lines)
 
 
-@pytest.mark.parametrize("seed, count, noise", [(0, 30, 0.12), (1, 60, 0.05), (2, 12, 0.1),
-                                                (3, 20, 0.3), (4, 2, 0.1)])
+@pytest.mark.parametrize("seed, count, noise", [(0, 30, 0.12), (1, 60, 0.05), (2, 12, 0.1), (3, 20, 0.3), (4, 2, 0.1)])
 def test_scores_equal_an_independent_implementation(seed, count, noise):
     rng = np.random.default_rng(seed)
     frames = [reference.random_frame(rng, noise=noise) for _ in range(count)]
@@ -99,9 +92,13 @@ def test_average_precision_of_four_objects_worked_out_by_hand():
     # Scores: 0.9 right, 0.8 wrong, 0.7 right, 0.6 wrong, 0.5 right; the fourth car is missed.
     # Recall 1/4, 2/4, 3/4 at precision 1, 2/3, 3/5.
     truth = concatenate(*(car(left=120 * i, x=6.0 * i) for i in range(4)))
-    found = concatenate(car(score=0.9, left=0), car(score=0.8, **WRONG),
-                        car(score=0.7, left=120, x=6.0, alpha=np.pi / 2),
-                        car(score=0.6, left=900, z=50.0, x=20.0), car(score=0.5, left=240, x=12.0))
+    found = concatenate(
+        car(score=0.9, left=0),
+        car(score=0.8, **WRONG),
+        car(score=0.7, left=120, x=6.0, alpha=np.pi / 2),
+        car(score=0.6, left=900, z=50.0, x=20.0),
+        car(score=0.5, left=240, x=12.0),
+    )
     row = ap([(truth, found)])["Car"]["3d"]["easy"]
     assert row["objects"] == 4
     # 40 points: 10 up to 1/4, 10 up to 2/4, 10 up to 3/4, 10 beyond.
@@ -119,8 +116,7 @@ def test_average_precision_of_four_objects_worked_out_by_hand():
 def test_average_precision_equals_hand_computed_value():
     # 50 cars found, then 50 false ones, then the other 50 cars: precision 1 up to recall 1/2, and
     # at recall 1 it is 100 / 150, which is the best there is beyond 1/2.
-    frames = [(car(), concatenate(car(score=0.9 - i * 1e-3), car(score=0.5 + i * 1e-4, **WRONG)))
-              for i in range(50)]
+    frames = [(car(), concatenate(car(score=0.9 - i * 1e-3), car(score=0.5 + i * 1e-4, **WRONG))) for i in range(50)]
     frames += [(car(), car(score=0.4 - i * 1e-3)) for i in range(50)]
     for key in ("", "official_"):
         row = ap(frames)["Car"]["bev"]["moderate"]
@@ -130,27 +126,30 @@ def test_average_precision_equals_hand_computed_value():
 
 # A car found at 0.9 and something found at 0.95: AP is 100 if that does not count, else 50, as
 # the only precision is 1 / 2. By metric, in the difficulty that is named.
-@pytest.mark.parametrize("case, other_truth, other_found, level, image, space", [
-    ("nothing there", None, car(**WRONG, score=0.95), "easy", 50, 50),
-    ("a van", car("Van", **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
-    ("a truck", car("Truck", **WRONG), car(**WRONG, score=0.95), "easy", 50, 50),
-    ("someone sitting", car("Person_sitting", **WRONG), car(**WRONG, score=0.95), "easy", 50, 50),
-    ("a region", REGION.format(880, 1010), car(**WRONG, score=0.95), "easy", 100, 50),
-    ("half a region", REGION.format(880, 950), car(**WRONG, score=0.95), "easy", 50, 50),
-    ("hidden, easy", car(occluded=1, **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
-    ("hidden, not told", car(occluded=3, **WRONG), car(**WRONG, score=0.95), "hard", 100, 100),
-    ("cut off", car(truncated=0.16, **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
-    ("cut off more", car(truncated=0.51, **WRONG), car(**WRONG, score=0.95), "hard", 100, 100),
-    ("39 pixels, easy", None, car(**WRONG, bottom=189, score=0.95), "easy", 100, 100),
-    ("39 pixels, moderate", None, car(**WRONG, bottom=189, score=0.95), "moderate", 50, 50),
-    ("24 pixels", None, car(**WRONG, bottom=174, score=0.95), "hard", 100, 100),
-    ("25 pixels", None, car(**WRONG, bottom=175, score=0.95), "hard", 50, 50),
-    ("another class", None, car("Pedestrian", **WRONG, score=0.95), "easy", 100, 100),
-    # A detection lower than 25 pixels is ignored, but it is matched with the car.
-    ("24 pixels, another class", None, car("Pedestrian", bottom=174, score=0.95), "hard", 100, 0),
-    # The better score is the only threshold, and above it nothing is wrong.
-    ("found twice", None, car(score=0.95), "easy", 100, 100),
-])
+@pytest.mark.parametrize(
+    "case, other_truth, other_found, level, image, space",
+    [
+        ("nothing there", None, car(**WRONG, score=0.95), "easy", 50, 50),
+        ("a van", car("Van", **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
+        ("a truck", car("Truck", **WRONG), car(**WRONG, score=0.95), "easy", 50, 50),
+        ("someone sitting", car("Person_sitting", **WRONG), car(**WRONG, score=0.95), "easy", 50, 50),
+        ("a region", REGION.format(880, 1010), car(**WRONG, score=0.95), "easy", 100, 50),
+        ("half a region", REGION.format(880, 950), car(**WRONG, score=0.95), "easy", 50, 50),
+        ("hidden, easy", car(occluded=1, **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
+        ("hidden, not told", car(occluded=3, **WRONG), car(**WRONG, score=0.95), "hard", 100, 100),
+        ("cut off", car(truncated=0.16, **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
+        ("cut off more", car(truncated=0.51, **WRONG), car(**WRONG, score=0.95), "hard", 100, 100),
+        ("39 pixels, easy", None, car(**WRONG, bottom=189, score=0.95), "easy", 100, 100),
+        ("39 pixels, moderate", None, car(**WRONG, bottom=189, score=0.95), "moderate", 50, 50),
+        ("24 pixels", None, car(**WRONG, bottom=174, score=0.95), "hard", 100, 100),
+        ("25 pixels", None, car(**WRONG, bottom=175, score=0.95), "hard", 50, 50),
+        ("another class", None, car("Pedestrian", **WRONG, score=0.95), "easy", 100, 100),
+        # A detection lower than 25 pixels is ignored, but it is matched with the car.
+        ("24 pixels, another class", None, car("Pedestrian", bottom=174, score=0.95), "hard", 100, 0),
+        # The better score is the only threshold, and above it nothing is wrong.
+        ("found twice", None, car(score=0.95), "easy", 100, 100),
+    ],
+)
 def test_what_counts_as_wrong(case, other_truth, other_found, level, image, space):
     truth = concatenate(car(), *([other_truth] if other_truth else []))
     rows = ap([(truth, concatenate(car(score=0.9), other_found))])["Car"]
@@ -159,14 +158,27 @@ def test_what_counts_as_wrong(case, other_truth, other_found, level, image, spac
     assert found == [image, space, space]
 
 
-@pytest.mark.parametrize("change, counted", [
-    ({}, (1, 1, 1)), (dict(occluded=1), (0, 1, 1)), (dict(occluded=2), (0, 0, 1)),
-    (dict(occluded=3), (0, 0, 0)), (dict(truncated=0.15), (1, 1, 1)),
-    (dict(truncated=0.16), (0, 1, 1)), (dict(truncated=0.3), (0, 1, 1)),
-    (dict(truncated=0.31), (0, 0, 1)), (dict(truncated=0.5), (0, 0, 1)),
-    (dict(truncated=0.51), (0, 0, 0)), (dict(bottom=190), (1, 1, 1)),
-    (dict(bottom=189.9), (0, 1, 1)), (dict(bottom=175), (0, 1, 1)), (dict(bottom=174.9), (0, 0, 0)),
-    (dict(kind="Van"), (0, 0, 0)), (dict(kind="Truck"), (0, 0, 0))])
+@pytest.mark.parametrize(
+    "change, counted",
+    [
+        ({}, (1, 1, 1)),
+        (dict(occluded=1), (0, 1, 1)),
+        (dict(occluded=2), (0, 0, 1)),
+        (dict(occluded=3), (0, 0, 0)),
+        (dict(truncated=0.15), (1, 1, 1)),
+        (dict(truncated=0.16), (0, 1, 1)),
+        (dict(truncated=0.3), (0, 1, 1)),
+        (dict(truncated=0.31), (0, 0, 1)),
+        (dict(truncated=0.5), (0, 0, 1)),
+        (dict(truncated=0.51), (0, 0, 0)),
+        (dict(bottom=190), (1, 1, 1)),
+        (dict(bottom=189.9), (0, 1, 1)),
+        (dict(bottom=175), (0, 1, 1)),
+        (dict(bottom=174.9), (0, 0, 0)),
+        (dict(kind="Van"), (0, 0, 0)),
+        (dict(kind="Truck"), (0, 0, 0)),
+    ],
+)
 def test_what_must_be_found(change, counted):
     rows = ap([(car(**change), "")])["Car"]["3d"]
     assert tuple(rows[level]["objects"] if rows[level] else 0 for level in DIFFICULTIES) == counted
@@ -177,9 +189,14 @@ def test_truncation_level_of_tracks_is_not_a_share():
     across = np.array([7.0, 6.3, -0.9, 3.9, 1.6, 1.5, 0.2])
     share = project_boxes(across[None], CALIBRATION)[1][0]
     assert 0.3 < share < 0.95
-    extras = [{"track_id": 1, "truncated": 0.0}, {"track_id": 2, "truncated": 1.0},
-              {"track_id": 3, "truncated": 0.0}, {"track_id": 4, "truncated": 2.0},
-              {"truncated": 0.21}, {}]
+    extras = [
+        {"track_id": 1, "truncated": 0.0},
+        {"track_id": 2, "truncated": 1.0},
+        {"track_id": 3, "truncated": 0.0},
+        {"track_id": 4, "truncated": 2.0},
+        {"truncated": 0.21},
+        {},
+    ]
     boxes = [inside, inside, across, inside, across, across]
     truth = GroundTruth.of(boxes, [0] * 6, extras)
     objects = to_camera_objects(truth, CALIBRATION)
@@ -196,8 +213,7 @@ def test_missing_label_fields_are_computed_from_the_box():
     x, z = np.arange(6) - 3.0, 15.0 + np.arange(6)
     np.testing.assert_allclose(said.alpha, 0.3 - np.arctan2(x, z), atol=1e-9)
     np.testing.assert_allclose(bare.alpha, said.alpha, atol=1e-3)  # the camera is tilted
-    np.testing.assert_allclose(bare.image_boxes,
-                               project_boxes(labels(text).boxes, CALIBRATION)[0], atol=1e-9)
+    np.testing.assert_allclose(bare.image_boxes, project_boxes(labels(text).boxes, CALIBRATION)[0], atol=1e-9)
 
 
 @few
@@ -205,14 +221,21 @@ def test_missing_label_fields_are_computed_from_the_box():
 def test_the_truth_scores_100_in_everything(seed):
     rng = np.random.default_rng(seed)
     # Objects far apart: where labels overlap one another one may be found by another's box.
-    truths = [labels(concatenate(*(reference.line(reference.with_pixels(
-        {**reference.some_object(rng), "x": 8.0 * k - 8, "z": 20.0})) for k in range(3))))
-        for _ in range(rng.integers(1, 40))]
+    truths = [
+        labels(
+            concatenate(
+                *(
+                    reference.line(reference.with_pixels({**reference.some_object(rng), "x": 8.0 * k - 8, "z": 20.0}))
+                    for k in range(3)
+                )
+            )
+        )
+        for _ in range(rng.integers(1, 40))
+    ]
     total = DetectionReport()
     for truth in truths:
         scores = rng.uniform(0, 1, len(truth))
-        found = GroundTruth.of(truth.boxes, truth.class_ids,
-                               [{**e, "score": s} for e, s in zip(truth.extras, scores)])
+        found = GroundTruth.of(truth.boxes, truth.class_ids, [{**e, "score": s} for e, s in zip(truth.extras, scores)])
         total.update(FrameDetections("frame", truth, found, CALIBRATION))
     content = total.compute()
     for name in SCORED:
@@ -230,8 +253,10 @@ def test_the_order_of_detections_changes_nothing(seed):
     frames, shuffled = [], []
     for _ in range(20):
         truth, found = reference.random_frame(rng)
-        lines = [f"{line.rsplit(' ', 1)[0]} {rng.integers(1, 4) / 4}"  # many equal scores
-                 for line in found.splitlines()]
+        lines = [
+            f"{line.rsplit(' ', 1)[0]} {rng.integers(1, 4) / 4}"  # many equal scores
+            for line in found.splitlines()
+        ]
         frames.append((truth, concatenate(*lines)))
         shuffled.append((truth, concatenate(*rng.permutation(lines))))
     assert report(frames).compute() == report(shuffled).compute()
@@ -241,9 +266,7 @@ def test_the_order_of_equal_scores_changes_nothing():
     # The first of two people is found by either detection, the second by one of them only.
     truth = concatenate(*(car("Pedestrian", left=300 * i, x=1.6 * i) for i in range(2)))
     found = [car("Pedestrian", x=x, score=0.5) for x in (0.8, -0.8)]
-    there, back = (
-        ap([(truth, concatenate(*order))])["Pedestrian"] for order in (found, found[::-1])
-    )
+    there, back = (ap([(truth, concatenate(*order))])["Pedestrian"] for order in (found, found[::-1]))
     assert there == back and there["bev_relaxed"]["easy"]["r40"] > 0
 
 
@@ -252,9 +275,16 @@ def test_the_order_of_equal_scores_changes_nothing():
 def test_a_wrong_detection_of_lower_score_never_raises_ap(seed):
     rng = np.random.default_rng(seed)
     frames = [reference.random_frame(rng) for _ in range(20)]
-    worse = [(truth, concatenate(*found.splitlines(), *(
-        car(name, left=2000 + 200 * i, x=300.0, score=-rng.uniform())
-        for i, name in enumerate(SCORED)))) for truth, found in frames]
+    worse = [
+        (
+            truth,
+            concatenate(
+                *found.splitlines(),
+                *(car(name, left=2000 + 200 * i, x=300.0, score=-rng.uniform()) for i, name in enumerate(SCORED)),
+            ),
+        )
+        for truth, found in frames
+    ]
     before, after = numbers(ap(frames)), numbers(ap(worse))
     assert len(before) == len(after)
     assert all(a <= b for a, b in zip(after, before))
@@ -305,12 +335,17 @@ def test_error_about_non_finite_number_names_the_frame(broken):
         DetectionReport().update(FrameDetections("000123", labels(car()), found, CALIBRATION))
 
 
-@pytest.mark.parametrize("shift, taller, words", [
-    (0.62, 0, "0.62 m too high; check the sensor height"),
-    (-0.62, 0, "0.62 m too low; check the sensor"),
-    (-0.75, 0, "0.75 m too low; that is half their height"),
-    (0, 0, ""), (0.1, 0, ""), (0, 4.0, "0.00 m too high or too low, and 4.00 m too tall"),
-])
+@pytest.mark.parametrize(
+    "shift, taller, words",
+    [
+        (0.62, 0, "0.62 m too high; check the sensor height"),
+        (-0.62, 0, "0.62 m too low; check the sensor"),
+        (-0.75, 0, "0.75 m too low; that is half their height"),
+        (0, 0, ""),
+        (0.1, 0, ""),
+        (0, 4.0, "0.00 m too high or too low, and 4.00 m too tall"),
+    ],
+)
 def test_wrong_heights_are_diagnosed(shift, taller, words):
     total = DetectionReport()
     truth = labels(concatenate(*(car(left=100 * i, x=5.0 * i - 10) for i in range(5))))
@@ -322,7 +357,7 @@ def test_wrong_heights_are_diagnosed(shift, taller, words):
     assert content["matched"]["Car"]["z_error_m"] == pytest.approx(shift, abs=0.01)
     assert content["ap"]["Car"]["bev"]["moderate"]["r40"] > 99
     if words:
-        line, = content["diagnosis"]
+        (line,) = content["diagnosis"]
         assert line.startswith("Car: AP is 100.0 in BEV but 0.0 in 3D") and words in line
     else:
         assert content["diagnosis"] == []
@@ -338,13 +373,13 @@ def test_the_best_score_is_the_best_of_all_scores(seed):
     rng = np.random.default_rng(seed)
     scores = CentreScores()
     for _ in range(6):
-        truth, found = (np.column_stack([rng.uniform(-2, 2, (n, 3)), np.ones((n, 4))])
-                        for n in rng.integers(1, 6, 2))
+        truth, found = (np.column_stack([rng.uniform(-2, 2, (n, 3)), np.ones((n, 4))]) for n in rng.integers(1, 6, 2))
         scores.update(truth, found, rng.integers(0, 3, len(found)) / 2)
     best = scores.make_rows(scores.find_best_score())["all"]["f1"]
     assert best == pytest.approx(brute_best(scores))
     assert scores.compute()["of_all"]["all"]["tp"] == sum(
-        len(match_centres(found, truth)[0]) for truth, found, _ in scores.frames)
+        len(match_centres(found, truth)[0]) for truth, found, _ in scores.frames
+    )
 
 
 def test_detections_of_equal_score_are_kept_together():
@@ -358,8 +393,7 @@ def test_detections_of_equal_score_are_kept_together():
 def test_pedestrians_by_centre_distance_worked_out_by_hand():
     total = DetectionReport()
     person = np.array([10.0, 0, -0.8, 0.8, 0.6, 1.7, 0])
-    truth = GroundTruth.of([person, person + [0, 4, 0, 0, 0, 0, 0]],
-                           [PEDESTRIAN] * 2)
+    truth = GroundTruth.of([person, person + [0, 4, 0, 0, 0, 0, 0]], [PEDESTRIAN] * 2)
     near, far, behind = (person + [dx, 0, 0, 0, 0, 0, 0] for dx in (0.9, 1.1, -30))
     found = Detections.of([near, far, behind], PEDESTRIAN, [0.8, 0.3, 0.9])
     total.update(FrameDetections("a", truth, found, CALIBRATION))

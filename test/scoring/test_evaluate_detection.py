@@ -31,8 +31,13 @@ def error_of(monkeypatch, capsys, *arguments):
 
 
 def cells(content):
-    return {(name, row, level): cell for name in SCORED for row in ROWS for level in DIFFICULTIES
-            if (cell := content["ap"][name][row][level])}
+    return {
+        (name, row, level): cell
+        for name in SCORED
+        for row in ROWS
+        for level in DIFFICULTIES
+        if (cell := content["ap"][name][row][level])
+    }
 
 
 def result_files(folder, text, count=2):
@@ -58,13 +63,13 @@ def detector(monkeypatch):
     """Replace the detector of a checkpoint by made.find, and record the calls in made.asked."""
     made = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
 
-    def open_detector(path, device="auto", *, min_score=None, sensor_height=None,
-                      range="auto", settings=None):
+    def open_detector(path, device="auto", *, min_score=None, sensor_height=None, range="auto", settings=None):
         made.asked.append((str(path), device, min_score, sensor_height))
 
         def detect(frame):
             made.scans.append(frame)
             return DetectionResult(made.find(frame))
+
         return detect
 
     monkeypatch.setattr("lidar_perception.detectors.open.open_detector", open_detector)
@@ -84,8 +89,7 @@ def test_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path, mon
     assert content["frames"] == 2 and content["source"] == str(found)
     assert len(cells(content)) == 2 * len(ROWS) * len(DIFFICULTIES)
     assert {(c["objects"], c["r11"], c["r40"]) for c in cells(content).values()} == {(2, 100, 100)}
-    assert content["map_3d"] == {"r11": 100, "r40": 100} and content["ap"]["Cyclist"]["3d"][
-        "easy"] is None
+    assert content["map_3d"] == {"r11": 100, "r40": 100} and content["ap"]["Cyclist"]["3d"]["easy"] is None
     assert content["pedestrian_centres"]["of_all"]["all"]["f1"] == 1
     for words in ("Table 5", "67.09", "here, R40", "Pedestrians within 1.0 m", "BEV"):
         assert words in text
@@ -107,8 +111,11 @@ def test_label_without_scan_is_skipped_by_name(kitti, detector, found, tmp_path)
     content, text = evaluate(tmp_path, "--data", kitti, "--weights", "any")
     assert content["frames"] == 1 and "000001.txt has no scan" in content["skipped"][0]
     assert "has no scan" in " ".join(text.split())
-    assert evaluate(tmp_path, "--data", kitti, "--weights", "any", "--limit", 1)[0][
-        "skipped"] == evaluate(tmp_path, "--data", kitti, "--results", found)[0]["skipped"] == []
+    assert (
+        evaluate(tmp_path, "--data", kitti, "--weights", "any", "--limit", 1)[0]["skipped"]
+        == evaluate(tmp_path, "--data", kitti, "--results", found)[0]["skipped"]
+        == []
+    )
 
 
 def test_scans_are_not_needed_for_result_files(kitti, found, tmp_path):
@@ -124,8 +131,7 @@ def test_scans_are_not_needed_for_result_files(kitti, found, tmp_path):
 
 def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
     detector.find = lambda frame: truth_of(kitti)
-    content, text = evaluate(tmp_path, "--data", kitti, "--weights", "v4.onnx",
-                             "--device", "cpu")
+    content, text = evaluate(tmp_path, "--data", kitti, "--weights", "v4.onnx", "--device", "cpu")
     assert detector.asked == [("v4.onnx", "cpu", MIN_SCORE, SENSOR_HEIGHT)]
     assert len(detector.scans) == 2
     assert len(detector.scans[0]) == len(open_recording(kitti).frames[0].load())
@@ -166,12 +172,11 @@ def test_a_smaller_share_is_part_of_a_larger_one(kitti):
 def test_written_results_score_like_the_detections(kitti, detector, tmp_path):
     noise = np.random.default_rng(0)
     detector.find = lambda frame: Detections.of(
-        truth_of(kitti).boxes + noise.normal(0, 0.02, 7), truth_of(kitti).class_ids,
-        [0.123456, 3])
+        truth_of(kitti).boxes + noise.normal(0, 0.02, 7), truth_of(kitti).class_ids, [0.123456, 3]
+    )
     out = tmp_path / "out/data"
     direct, text = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", out)
-    assert "result files" in text and sorted(p.name for p in out.iterdir()) == [
-        "000000.txt", "000001.txt"]
+    assert "result files" in text and sorted(p.name for p in out.iterdir()) == ["000000.txt", "000001.txt"]
     read, _ = evaluate(tmp_path, "--data", kitti, "--results", out)
     for key, cell in cells(direct).items():
         assert cells(read)[key] == pytest.approx(cell, abs=1e-3)
@@ -179,9 +184,15 @@ def test_written_results_score_like_the_detections(kitti, detector, tmp_path):
 
 def test_result_files_hold_what_was_found(tmp_path):
     rng = np.random.default_rng(3)
-    boxes = np.column_stack([rng.uniform(8, 40, 20), rng.uniform(-9, 9, 20),
-                             rng.uniform(-2, 0, 20), rng.uniform(0.5, 4, (20, 3)),
-                             rng.uniform(-3, 3, 20)])
+    boxes = np.column_stack(
+        [
+            rng.uniform(8, 40, 20),
+            rng.uniform(-9, 9, 20),
+            rng.uniform(-2, 0, 20),
+            rng.uniform(0.5, 4, (20, 3)),
+            rng.uniform(-3, 3, 20),
+        ]
+    )
     boxes[0, 0] = -30  # behind the camera: no 2D box
     made = Detections.of(boxes, rng.integers(0, 6, 20), rng.uniform(-2, 1, 20))
     path = tmp_path / "000000.txt"
@@ -201,39 +212,39 @@ def test_result_files_hold_what_was_found(tmp_path):
 def test_result_files_keep_the_order_of_weak_scores(tmp_path):
     """Average precision depends on many boxes just above the lowest score."""
     scores = np.float32(0.001 + 3e-6 * np.arange(100))
-    write_results(tmp_path / "a.txt", Detections.of(np.tile([20.0, 0, -1, 4, 2, 1.5, 0], (100, 1)),
-                                                    0, scores), CALIBRATION)
+    write_results(
+        tmp_path / "a.txt", Detections.of(np.tile([20.0, 0, -1, 4, 2, 1.5, 0], (100, 1)), 0, scores), CALIBRATION
+    )
     back = read_results(tmp_path / "a.txt", CALIBRATION.lidar_to_camera)
     assert (np.diff([e["score"] for e in back.extras]) > 0).all()
 
 
-def test_frames_without_labels_are_written_and_not_scored(kitti, detector, tmp_path, monkeypatch,
-                                                          capsys):
+def test_frames_without_labels_are_written_and_not_scored(kitti, detector, tmp_path, monkeypatch, capsys):
     (kitti / "training/label_2/000001.txt").unlink()
     out = tmp_path / "out"
     content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", out)
     assert content["frames"] == 1 and (out / "000001.txt").exists()
-    line = error_of(monkeypatch, capsys, "--data", kitti, "--weights", "w", "--write-results",
-                    kitti / "training/label_2")
+    line = error_of(
+        monkeypatch, capsys, "--data", kitti, "--weights", "w", "--write-results", kitti / "training/label_2"
+    )
     assert "label_2 has files already" in line
     (kitti / "training/label_2/000000.txt").unlink()
-    content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results",
-                          tmp_path / "others")
+    content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", tmp_path / "others")
     assert content["frames"] == 0
     line = error_of(monkeypatch, capsys, "--data", kitti, "--weights", "w")
     assert line == f"Error: {kitti}: no frame with labels"
 
 
-def test_truncated_scan_is_skipped_and_rejected_scan_missed(kitti, detector,
-                                                            tmp_path):
+def test_truncated_scan_is_skipped_and_rejected_scan_missed(kitti, detector, tmp_path):
     write(kitti / "training/velodyne/000001.bin", b"123")
     content, text = evaluate(tmp_path, "--data", kitti, "--weights", "w")
-    line, = content["skipped"]
+    (line,) = content["skipped"]
     assert "000001.bin" in line and "is truncated" in line and "skipped" in text
     assert content["frames"] == 1
 
     def refuse(frame):
         raise InputError("the cloud has no intensity")
+
     detector.find = refuse
     content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w")
     assert content["skipped"][0] == "000000: the cloud has no intensity"
@@ -241,8 +252,16 @@ def test_truncated_scan_is_skipped_and_rejected_scan_missed(kitti, detector,
 
 
 def test_results_that_cannot_be_written_end_the_run(kitti, detector, monkeypatch, capsys):
-    line = error_of(monkeypatch, capsys, "--data", kitti, "--weights", "w", "--write-results",
-                    kitti / "training/calib/000000.txt/out")
+    line = error_of(
+        monkeypatch,
+        capsys,
+        "--data",
+        kitti,
+        "--weights",
+        "w",
+        "--write-results",
+        kitti / "training/calib/000000.txt/out",
+    )
     assert line.startswith("Error: cannot write") and not detector.scans
 
 
@@ -259,8 +278,7 @@ BAD = {
     "score": (f"{PERSON} 0.9\n{WHOLE}", "000000.txt:2 is not a result"),
     "too large": (f"{PERSON} 1e308", "000000.txt:1 is not a KITTI label"),
     "nan": (f"{PERSON} nan", "000000.txt:1 is not a KITTI label"),
-    "class": (f"{PERSON} 0.9".replace("Pedestrian", "Walker"),
-              "000000.txt:1 has the unknown class 'Walker'"),
+    "class": (f"{PERSON} 0.9".replace("Pedestrian", "Walker"), "000000.txt:1 has the unknown class 'Walker'"),
     "bytes": (b"\xff\xfe\x00", "cannot read the labels"),
 }
 
@@ -290,13 +308,16 @@ def test_missing_files_and_labels_are_named(kitti, found, tmp_path, monkeypatch,
     assert "no frame with labels" in (line := error("--results", found)) and "000000.txt:1" in line
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (["--data", "a", "--results", "b", "--weights", "c"], "give either --results DIR or"),
-    (["--data", "a", "--results", "b", "--keep", "0.1"], "--keep thins the scans"),
-    (["--data", "a", "--weights", "b", "--keep", "1.1"], "1.1 is not in the range"),
-    (["--results", "b"], "DATA is missing"),
-    (["--data", "a", "--results", "b", "--write-results", "c"], "has its files already"),
-])
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--data", "a", "--results", "b", "--weights", "c"], "give either --results DIR or"),
+        (["--data", "a", "--results", "b", "--keep", "0.1"], "--keep thins the scans"),
+        (["--data", "a", "--weights", "b", "--keep", "1.1"], "1.1 is not in the range"),
+        (["--results", "b"], "DATA is missing"),
+        (["--data", "a", "--results", "b", "--write-results", "c"], "has its files already"),
+    ],
+)
 def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):
     assert exit_of(monkeypatch, "evaluate", "detection", *arguments) == 2
     assert words in capsys.readouterr().err
@@ -329,6 +350,7 @@ def test_real_boxes_project_onto_their_2d_labels(data, detector, tmp_path):
     def find(frame):
         truth = next(truths)
         return Detections.of(truth.boxes, truth.class_ids, np.linspace(1, 0.5, len(truth)))
+
     detector.find = find
     content, _ = evaluate(tmp_path, "--data", data / "kitti_object", "--weights", "w")
     for (name, row, _), cell in cells(content).items():
@@ -340,8 +362,9 @@ def test_real_tracks_are_scored_by_what_is_outside_the_image(data, tmp_path):
     frames = open_recording(root).frames
     for frame in frames:
         truth = frame.truth()
-        write_results(tmp_path / f"found/{frame.name}.txt",
-                      Detections.of(truth.boxes, truth.class_ids), frame.calibration())
+        write_results(
+            tmp_path / f"found/{frame.name}.txt", Detections.of(truth.boxes, truth.class_ids), frame.calibration()
+        )
     content, _ = evaluate(tmp_path, "--data", root, "--results", tmp_path / "found")
     assert content["frames"] == len(frames) == 30
     assert content["ap"]["Cyclist"]["3d"]["easy"]["r40"] == pytest.approx(100)

@@ -16,13 +16,7 @@ from click.testing import CliRunner
 from lidar_perception.cli.main import cli
 from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
 from lidar_perception.data.nuscenes.folder import open_nuscenes
-from lidar_perception.data.nuscenes.results import (
-    MAX_BOXES,
-    NAME_BY_CLASS,
-    read_results,
-    to_results,
-    write_results,
-)
+from lidar_perception.data.nuscenes.results import MAX_BOXES, NAME_BY_CLASS, read_results, to_results, write_results
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.open import open_detector
@@ -45,8 +39,7 @@ def detections(frame, seed=0):
     kept &= np.array([extras["points"] > 0 for extras in truth.extras])
     near = truth.boxes[kept] + rng.normal(0, 0.05, 7)
     ids = truth.class_ids[kept]
-    return Detections.of(np.vstack([near, near[:1]]), [*ids, CLASSES.index("Van")],
-                         rng.uniform(0.1, 1, len(near) + 1))
+    return Detections.of(np.vstack([near, near[:1]]), [*ids, CLASSES.index("Van")], rng.uniform(0.1, 1, len(near) + 1))
 
 
 @pytest.fixture
@@ -57,14 +50,16 @@ def detector(monkeypatch):
     def opened(path, device, *, min_score, sensor_height, range, settings):
         made.asked.append((path, device, min_score, sensor_height))
         return lambda scan: DetectionResult(made.find(scan))
+
     monkeypatch.setattr("lidar_perception.detectors.open.open_detector", opened)
     return made
 
 
 def evaluate(tmp_path, *arguments):
     path = tmp_path / "made/scores.json"
-    result = CliRunner().invoke(cli, ["evaluate", "nuscenes", "--json", str(path),
-                                      *map(str, arguments)], catch_exceptions=False)
+    result = CliRunner().invoke(
+        cli, ["evaluate", "nuscenes", "--json", str(path), *map(str, arguments)], catch_exceptions=False
+    )
     assert result.exit_code == 0, result.output
     return json.loads(path.read_text()), result.stdout
 
@@ -82,15 +77,19 @@ def test_a_checkpoint_is_run_and_its_results_score_the_same(root, detector, tmp_
     monkeypatch.setenv("COLUMNS", "80")
     frames, out = by_stamp(root), tmp_path / "out/results.json"
     detector.find = lambda scan: detections(frames[scan.stamp_ns])
-    direct, text = evaluate(tmp_path, "--data", root, "--weights", "w.safetensors", "--device",
-                            "cpu", "--write-results", out)
-    (path, *asked), = detector.asked
+    direct, text = evaluate(
+        tmp_path, "--data", root, "--weights", "w.safetensors", "--device", "cpu", "--write-results", out
+    )
+    ((path, *asked),) = detector.asked
     assert (str(path), *asked) == ("w.safetensors", "cpu", MIN_SCORE, folder.SENSOR[2])
     assert direct["frames"] == 8 and direct["ms"] >= 0 and direct["version"] == "v1.0-mini"
     car, person = (direct["classes"][n] for n in ("car", "pedestrian"))
     assert car["mean_ap"] > 99 and car["ate"] < 0.3 and person["mean_ap"] > 99
-    assert all(direct["classes"][n]["mean_ap"] == 0 and direct["classes"][n]["ate"] == 1
-               for n in NAMES if n not in DETECTED_NAMES)
+    assert all(
+        direct["classes"][n]["mean_ap"] == 0 and direct["classes"][n]["ate"] == 1
+        for n in NAMES
+        if n not in DETECTED_NAMES
+    )
     assert direct["ours"]["ave"] == direct["ours"]["aae"] == 1
     assert direct["all"]["map"] == pytest.approx(0.3 * direct["ours"]["map"])
     read, _ = evaluate(tmp_path, "--data", root, "--results", out)
@@ -145,6 +144,7 @@ def test_unreadable_and_rejected_scans_are_reported(root, detector, tmp_path):
         if scan.stamp_ns == frames[2].stamp_ns:
             raise InputError("too dark")
         return detections(by_stamp(root)[scan.stamp_ns])
+
     detector.find = find
     out = tmp_path / "r.json"
     content, text = evaluate(tmp_path, "--data", root, "--weights", "w", "--write-results", out)
@@ -155,29 +155,34 @@ def test_unreadable_and_rejected_scans_are_reported(root, detector, tmp_path):
     assert results[frames[2].native.token] == [] and frames[0].native.token not in results
 
 
-def test_a_version_without_labels_is_written_and_not_scored(tmp_path, detector, monkeypatch,
-                                                            capsys):
+def test_a_version_without_labels_is_written_and_not_scored(tmp_path, detector, monkeypatch, capsys):
     tables = {name: rows for name, rows in TABLES.items() if name != "sample_annotation"}
     root = tmp_path / "test"
     folder.save(root, TABLES)
     folder.save(root, tables, "v1.0-test", sweeps=False)
     detector.find = lambda scan: Detections.of(np.ones((1, 7)), 0, 0.5)
     out = tmp_path / "r.json"
-    content, _ = evaluate(tmp_path, "--data", root / "v1.0-test", "--weights", "w",
-                          "--write-results", out)
+    content, _ = evaluate(tmp_path, "--data", root / "v1.0-test", "--weights", "w", "--write-results", out)
     assert content["frames"] == 0 and content["all"] is None
     assert [len(rows) for rows in json.loads(out.read_text())["results"].values()] == [1] * 8
     assert content["version"] == "v1.0-test"
     assert "v1.0-test: no frame with labels" in error_of(
-        monkeypatch, capsys, "--data", root / "v1.0-test", "--results", out)
+        monkeypatch, capsys, "--data", root / "v1.0-test", "--results", out
+    )
     line = error_of(monkeypatch, capsys, "--data", root, "--results", out)
     assert "several versions" in line and str(root / "v1.0-test") in line
 
 
-@pytest.mark.parametrize("text, words", [
-    (None, "cannot read the results"), ("{", "is not a JSON file"),
-    ("[" * 100_000, "is not a JSON file"), ("[]", "has no 'results'"),
-    ('{"results": []}', "has no 'results'")])
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        (None, "cannot read the results"),
+        ("{", "is not a JSON file"),
+        ("[" * 100_000, "is not a JSON file"),
+        ("[]", "has no 'results'"),
+        ('{"results": []}', "has no 'results'"),
+    ],
+)
 def test_files_that_are_no_results_are_named(root, tmp_path, monkeypatch, capsys, text, words):
     path = tmp_path / "r.json"
     if text is not None:
@@ -185,12 +190,15 @@ def test_files_that_are_no_results_are_named(root, tmp_path, monkeypatch, capsys
     assert words in error_of(monkeypatch, capsys, "--data", root, "--results", path)
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (["--data", "a"], "give either --results JSON or --weights FILE"),
-    (["--data", "a", "--results", "b", "--weights", "c"], "give either"),
-    (["--results", "b"], "DATA is missing"),
-    (["--data", "a", "--results", "b", "--write-results", "c"], "such a file already"),
-])
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--data", "a"], "give either --results JSON or --weights FILE"),
+        (["--data", "a", "--results", "b", "--weights", "c"], "give either"),
+        (["--results", "b"], "DATA is missing"),
+        (["--data", "a", "--results", "b", "--write-results", "c"], "such a file already"),
+    ],
+)
 def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):
     assert exit_of(monkeypatch, "evaluate", "nuscenes", *arguments) == 2
     assert words in capsys.readouterr().err
@@ -199,6 +207,7 @@ def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):
 def test_scene_files_that_are_wrong_are_named(root, tmp_path, monkeypatch, capsys):
     def error(path):
         return error_of(monkeypatch, capsys, "--data", root, "--weights", "w", "--split", path)
+
     scenes = tmp_path / "scenes.txt"
     assert "cannot read the split" in error(scenes)
     scenes.write_text("\n")
@@ -207,10 +216,10 @@ def test_scene_files_that_are_wrong_are_named(root, tmp_path, monkeypatch, capsy
     assert "names scene-9999 (1 unknown)" in error(scenes)
 
 
-@pytest.mark.parametrize("made, config", [(detection_samples, detection_samples.tiny()),
-                                          (pointnet_samples, pointnet_samples.small())])
-def test_detector_gets_the_sensor_height(made, config, tmp_path,
-                                         one_thread):
+@pytest.mark.parametrize(
+    "made, config", [(detection_samples, detection_samples.tiny()), (pointnet_samples, pointnet_samples.small())]
+)
+def test_detector_gets_the_sensor_height(made, config, tmp_path, one_thread):
     save_checkpoint(tmp_path / "w", made.lively(config), Header(config))
     detector = open_detector(tmp_path / "w", "cpu", sensor_height=1.84)
     assert detector.networks[0].config == config

@@ -18,12 +18,7 @@ from experiments.stm_cpa.frames import load_labelled_frame
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams, SeedParams
 from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.scoring.centres.matching import (
-    RANGE_NAMES,
-    Score,
-    find_range_bins,
-    match_centres,
-)
+from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, find_range_bins, match_centres
 from lidar_perception.scoring.centres.report import (
     CandidateReport,
     CandidateResult,
@@ -35,14 +30,7 @@ from lidar_perception.scoring.centres.report import (
 from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.scoring.run import Skipped, fill, measure_frames
-from lidar_perception.types import (
-    CLASSES,
-    PEDESTRIAN,
-    Detections,
-    GroundTruth,
-    InputError,
-    PointCloud,
-)
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError, PointCloud
 
 seeds = st.integers(0, 2**32 - 1)
 small = st.integers(0, 5)
@@ -150,14 +138,21 @@ def test_hits_misses_and_false_positives_add_up(seed, frames):
 
 def test_a_case_by_hand():
     score = Score()
-    score.update(boxes([10.3, 0, 0], [20, 0, 0.5], [14.5, 14.5, 0], [61, 0, 0]),
-                 boxes([10, 0, 0], [20, 0, 0], [40, 0, 0]))
+    score.update(
+        boxes([10.3, 0, 0], [20, 0, 0.5], [14.5, 14.5, 0], [61, 0, 0]), boxes([10, 0, 0], [20, 0, 0], [40, 0, 0])
+    )
     score.update(np.zeros((0, 7), np.float32), boxes([5, 0, 0]))
     score.update(boxes([0, -50, 0]).astype(np.float32), np.zeros((0, 7)))
     table = score.make_rows()
     counts = {name: tuple(row[k] for k in ("tp", "fp", "fn")) for name, row in table.items()}
-    assert counts == {"0-15": (1, 0, 1), "15-30": (1, 1, 0), "30-45": (0, 0, 1),
-                      "45-60": (0, 1, 0), "60+": (0, 1, 0), "all": (2, 3, 2)}
+    assert counts == {
+        "0-15": (1, 0, 1),
+        "15-30": (1, 1, 0),
+        "30-45": (0, 0, 1),
+        "45-60": (0, 1, 0),
+        "60+": (0, 1, 0),
+        "all": (2, 3, 2),
+    }
     everything = table["all"]
     assert everything["precision"] == pytest.approx(2 / 5)
     assert everything["recall"] == pytest.approx(2 / 4)
@@ -174,10 +169,8 @@ def test_a_hit_belongs_to_the_range_of_the_true_object():
 
 
 def test_a_range_begins_at_its_lower_limit():
-    at = boxes([0, 0, 9], [14.999, 0, 0], [0, 15, 0], [18, -24, 0], [45, 0, 0], [60, 0, 0],
-               [1e4, 0, 0])
-    assert [RANGE_NAMES[i] for i in find_range_bins(at)] == [
-        "0-15", "0-15", "15-30", "30-45", "45-60", "60+", "60+"]
+    at = boxes([0, 0, 9], [14.999, 0, 0], [0, 15, 0], [18, -24, 0], [45, 0, 0], [60, 0, 0], [1e4, 0, 0])
+    assert [RANGE_NAMES[i] for i in find_range_bins(at)] == ["0-15", "0-15", "15-30", "30-45", "45-60", "60+", "60+"]
 
 
 def test_nothing_found_and_nothing_to_find_have_ratios_of_0():
@@ -223,16 +216,19 @@ HERE = (7.05, 0, -0.82)
 
 
 def test_report_is_json_and_counts_every_pedestrian():
-    content, found = run([
-        frame("both", truth_of(HERE, (25, 9, -0.8))), frame("car", truth_of(HERE, label="Car")),
-        frame("none", None), Frame("cut", 0, cut, lambda: truth_of(HERE)),
-        frame("again", truth_of(HERE))])
-    assert [type(r) for r in found] == [CandidateResult, NoneType, NoneType, Skipped,
-                                        CandidateResult]
+    content, found = run(
+        [
+            frame("both", truth_of(HERE, (25, 9, -0.8))),
+            frame("car", truth_of(HERE, label="Car")),
+            frame("none", None),
+            Frame("cut", 0, cut, lambda: truth_of(HERE)),
+            frame("again", truth_of(HERE)),
+        ]
+    )
+    assert [type(r) for r in found] == [CandidateResult, NoneType, NoneType, Skipped, CandidateResult]
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     assert content["frames"] == 2 and content["ground_truth"] == 3
-    assert content["ground_truth_by_range"] == {"0-15": 2, "15-30": 1, "30-45": 0, "45-60": 0,
-                                                "60+": 0}
+    assert content["ground_truth_by_range"] == {"0-15": 2, "15-30": 1, "30-45": 0, "45-60": 0, "60+": 0}
     assert content["skipped"] == ["frame 3 is cut"]
     for stage in ("stage1", "stage2", "final"):
         row = content[stage]["all"]
@@ -255,8 +251,9 @@ def test_an_empty_recording_has_an_empty_report():
 
 
 def test_only_pedestrians_count():
-    mixed = GroundTruth.of(boxes([1, 0, 0], [2, 0, 0], [3, 0, 0]),
-                           [PEDESTRIAN, CLASSES.index("Person_sitting"), CLASSES.index("Cyclist")])
+    mixed = GroundTruth.of(
+        boxes([1, 0, 0], [2, 0, 0], [3, 0, 0]), [PEDESTRIAN, CLASSES.index("Person_sitting"), CLASSES.index("Cyclist")]
+    )
     np.testing.assert_array_equal(select_pedestrians(mixed), boxes([1, 0, 0]))
     assert select_pedestrians(None).shape == (0, 7)
 
@@ -266,8 +263,12 @@ def test_labels_behind_the_camera_do_not_count():
     scan, people = PointCloud(cloud[:, :3], cloud[:, 3]), truth.of_class(PEDESTRIAN)
     ahead, behind, around = (
         Frame.of("a", scan, GroundTruth.of(own, [PEDESTRIAN] * len(own)), CALIBRATION)
-        for own in (people, people * [-1, -1, 1, 1, 1, 1, 1],
-                    np.concatenate([people, people * [-1, -1, 1, 1, 1, 1, 1]])))
+        for own in (
+            people,
+            people * [-1, -1, 1, 1, 1, 1, 1],
+            np.concatenate([people, people * [-1, -1, 1, 1, 1, 1, 1]]),
+        )
+    )
     expected, found = measure_frame(ahead, PAPER), measure_frame(around, PAPER)
     np.testing.assert_array_equal(found.truth, people)
     np.testing.assert_array_equal(found.boxes["final"], expected.boxes["final"])

@@ -7,18 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.scoring.centres.scores import CentreScores
-from lidar_perception.scoring.intervals import (
-    BLOCK_FRAMES,
-    MIN_DRIVES,
-    compute_interval,
-    group_frames,
-)
+from lidar_perception.scoring.intervals import BLOCK_FRAMES, MIN_DRIVES, compute_interval, group_frames
 
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=15), st.booleans())
 def test_blocks_partition_the_frames_of_each_drive(lengths, named):
-    names = [f"{drive:04}/{i:06}" if named else f"{drive}{i:06}"
-             for drive, count in enumerate(lengths) for i in range(count)]
+    names = [
+        f"{drive:04}/{i:06}" if named else f"{drive}{i:06}" for drive, count in enumerate(lengths) for i in range(count)
+    ]
     parts = group_frames(names)
     assert sorted(np.concatenate([np.zeros(0, int), *parts]).tolist()) == [*range(len(names))]
     for part in parts:

@@ -16,13 +16,7 @@ import pytest
 from lidar_perception.data.nuscenes.boxes import CATEGORIES, NAMES, GlobalBoxes
 from lidar_perception.data.nuscenes.folder import open_nuscenes
 from lidar_perception.data.nuscenes.results import META, read_results
-from lidar_perception.scoring.nuscenes.protocol import (
-    RANGES,
-    compute_errors,
-    score_class,
-    select_counted,
-    summarize,
-)
+from lidar_perception.scoring.nuscenes.protocol import RANGES, compute_errors, score_class, select_counted, summarize
 from lidar_perception.scoring.nuscenes.report import DETECTED_NAMES, NuscenesReport, select_boxes
 from lidar_perception.types import InputError
 
@@ -33,24 +27,31 @@ ERRORS = dict(zip(("ate", "ase", "aoe", "ave", "aae"), reference.ERRORS))
 def boxes(*centres, kind="car", scores=0.0, yaw=0.0, **columns):
     """Return boxes of 4 x 2 x 1.5 m at (x, y)."""
     count = len(centres)
-    return GlobalBoxes.of([[*c, 0.0] for c in centres], [[4, 2, 1.5]] * count,
-                          [[math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]] * count,
-                          NAMES.index(kind), scores=scores, **columns)
+    return GlobalBoxes.of(
+        [[*c, 0.0] for c in centres],
+        [[4, 2, 1.5]] * count,
+        [[math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]] * count,
+        NAMES.index(kind),
+        scores=scores,
+        **columns,
+    )
 
 
 def scored(truth, found, kind="car", true_frames=None, found_frames=None):
     def numbers(given, of):
         return np.zeros(len(of), int) if given is None else np.array(given)
-    return score_class(kind, truth, numbers(true_frames, truth), found,
-                       numbers(found_frames, found))
+
+    return score_class(kind, truth, numbers(true_frames, truth), found, numbers(found_frames, found))
 
 
 ROW = [(10.0 * i, 0.0) for i in range(20)]
 
 
 def test_everything_found_scores_one():
-    s = scored(boxes(*ROW, velocities=1.0, attributes=6),
-               boxes(*ROW, scores=np.linspace(1, 0.1, 20), velocities=1.0, attributes=6))
+    s = scored(
+        boxes(*ROW, velocities=1.0, attributes=6),
+        boxes(*ROW, scores=np.linspace(1, 0.1, 20), velocities=1.0, attributes=6),
+    )
     assert s.objects == s.detections == 20 and s.mean_ap == pytest.approx(1)
     assert s.errors == dict.fromkeys(ERRORS, 0.0)
     assert summarize({"car": s})["nds"] == pytest.approx(1)
@@ -109,8 +110,7 @@ def test_objects_of_other_frames_are_not_found():
 
 
 def test_no_detections_or_labels_give_ap_0_and_errors_1():
-    for truth, found in ((boxes((0, 0)), boxes()), (boxes(), boxes((0, 0), scores=1.0)),
-                         (boxes(), boxes())):
+    for truth, found in ((boxes((0, 0)), boxes()), (boxes(), boxes((0, 0), scores=1.0)), (boxes(), boxes())):
         s = scored(truth, found)
         assert s.mean_ap == 0 and set(s.errors.values()) == {1.0}
     cone = scored(boxes(), boxes(), "traffic_cone")
@@ -122,8 +122,7 @@ def test_errors_of_a_pair():
     found = boxes((0.3, 0.4), yaw=math.pi - 0.1, velocities=[0.0, 4.0], attributes=6)
     larger = GlobalBoxes.of(found.centres, 2 * found.sizes, found.rotations, found.class_ids)
     e = compute_errors(truth, found, False)
-    assert {k: v[0] for k, v in e.items()} == pytest.approx(
-        dict(ate=0.5, ase=0, aoe=math.pi - 0.1, ave=5, aae=1))
+    assert {k: v[0] for k, v in e.items()} == pytest.approx(dict(ate=0.5, ase=0, aoe=math.pi - 0.1, ave=5, aae=1))
     assert compute_errors(truth, found, True)["aoe"] == pytest.approx(0.1)
     assert compute_errors(truth, larger, False)["ase"] == pytest.approx(7 / 8)
     for true, other in ((boxes((0, 0)), found), (truth, boxes((0, 0)))):
@@ -143,9 +142,7 @@ def test_a_class_counts_within_its_range_of_the_vehicle(kind):
     there = np.array([100.0, 50.0])
     away = RANGES[kind]
     kept = select_counted(
-        boxes(*(there + [away * s, 0] for s in (0.999, 1, -0.999, 1.2)), kind=kind),
-        np.array([100, 50, 7]),
-        boxes(),
+        boxes(*(there + [away * s, 0] for s in (0.999, 1, -0.999, 1.2)), kind=kind), np.array([100, 50, 7]), boxes()
     )
     assert kept.tolist() == [True, False, True, False]
     assert (RANGES["car"], RANGES["pedestrian"], RANGES["barrier"]) == (50, 40, 30)
@@ -156,8 +153,11 @@ def test_labels_without_points_and_cycles_in_racks_do_not_count():
     for kind, inside in ("bicycle", False), ("motorcycle", False), ("pedestrian", True):
         kept = select_counted(boxes((0.9, 1.9), (1.9, 0.9), kind=kind), np.zeros(3), rack)
         assert kept.tolist() == [inside, True]
-    assert select_counted(boxes((0, 0), (1, 0), (2, 0), points=[0, 3, -1]), np.zeros(3),
-                          boxes()).tolist() == [False, True, True]
+    assert select_counted(boxes((0, 0), (1, 0), (2, 0), points=[0, 3, -1]), np.zeros(3), boxes()).tolist() == [
+        False,
+        True,
+        True,
+    ]
     none = GlobalBoxes.of(np.zeros((1, 3)), np.ones((1, 3)), [[1, 0, 0, 0]], -1)
     assert not select_counted(none, np.zeros(3), boxes()).any()
 
@@ -184,12 +184,12 @@ def close_to_reference(content, by_class, over):
         row = content[key]
         assert row["map"] == pytest.approx(100 * mean_ap, abs=1e-9)
         assert row["nds"] == pytest.approx(100 * nds, abs=1e-3)
-        assert [row[e] for e in ERRORS] == pytest.approx([errors[k] for k in ERRORS.values()],
-                                                         abs=1e-5)
+        assert [row[e] for e in ERRORS] == pytest.approx([errors[k] for k in ERRORS.values()], abs=1e-5)
 
 
-@pytest.mark.parametrize("seed, frames, objects, noise", [
-    (0, 2, 20, 0.1), (1, 3, 60, 0.4), (2, 5, 150, 0.4), (3, 4, 90, 1.0)])
+@pytest.mark.parametrize(
+    "seed, frames, objects, noise", [(0, 2, 20, 0.1), (1, 3, 60, 0.4), (2, 5, 150, 0.4), (3, 4, 90, 1.0)]
+)
 @pytest.mark.no_cover
 def test_the_same_as_a_second_reading(tmp_path, seed, frames, objects, noise):
     tables = folder.make_tables(seed, frames, objects)
@@ -197,8 +197,7 @@ def test_the_same_as_a_second_reading(tmp_path, seed, frames, objects, noise):
     by_class, over = reference.evaluate(tables, results, CATEGORIES)
     content = reported(folder.save(tmp_path, tables, sweeps=False), results)
     assert content["frames"] == 2 * frames and 0 < content["all"]["map"] < 100
-    close_to_reference(content, by_class,
-                       {"all": over, "ours": reference.over(by_class, DETECTED_NAMES)})
+    close_to_reference(content, by_class, {"all": over, "ours": reference.over(by_class, DETECTED_NAMES)})
 
 
 @pytest.mark.parametrize("seed, ties", [(4, False), (5, False), (4, True)])
@@ -206,6 +205,7 @@ def test_the_same_as_nuscenes_devkit(tmp_path, seed, ties):
     module = pytest.importorskip("nuscenes.eval.detection.evaluate", reason="needs nuscenes-devkit")
     from nuscenes import NuScenes
     from nuscenes.eval.common.config import config_factory
+
     tables = folder.make_tables(seed, 8, 100)
     results = folder.make_results(tables, CATEGORIES, seed)
     for box in itertools.chain(*results.values()) if ties else ():
@@ -213,19 +213,29 @@ def test_the_same_as_nuscenes_devkit(tmp_path, seed, ties):
     content = reported(folder.save(tmp_path, tables, sweeps=False), results)
     devkit = module.DetectionEval(
         NuScenes(folder.VERSION, str(tmp_path), verbose=False),
-        config_factory("detection_cvpr_2019"), str(tmp_path / "results.json"), "mini_val",
-        str(tmp_path / "out"), verbose=False)
+        config_factory("detection_cvpr_2019"),
+        str(tmp_path / "results.json"),
+        "mini_val",
+        str(tmp_path / "out"),
+        verbose=False,
+    )
     figures = devkit.evaluate()[0].serialize()
     names = dict(zip(ERRORS, ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")))
-    assert content["all"] == pytest.approx({
-        "map": 100 * figures["mean_ap"], "nds": 100 * figures["nd_score"],
-        **{key: figures["tp_errors"][name] for key, name in names.items()}}, abs=1e-9)
+    assert content["all"] == pytest.approx(
+        {
+            "map": 100 * figures["mean_ap"],
+            "nds": 100 * figures["nd_score"],
+            **{key: figures["tp_errors"][name] for key, name in names.items()},
+        },
+        abs=1e-9,
+    )
     for kind, row in content["classes"].items():
         assert row["ap"] == pytest.approx(
-            {f"{d:g}": 100 * ap for d, ap in figures["label_aps"][kind].items()}, abs=1e-9)
+            {f"{d:g}": 100 * ap for d, ap in figures["label_aps"][kind].items()}, abs=1e-9
+        )
         assert [math.nan if row[key] is None else row[key] for key in names] == pytest.approx(
-            [figures["label_tp_errors"][kind][name] for name in names.values()], abs=1e-9,
-            nan_ok=True)
+            [figures["label_tp_errors"][kind][name] for name in names.values()], abs=1e-9, nan_ok=True
+        )
 
 
 def test_turning_and_moving_the_world_changes_nothing(tmp_path):
@@ -233,8 +243,7 @@ def test_turning_and_moving_the_world_changes_nothing(tmp_path):
     before = reported(folder.save(tmp_path / "a", TABLES, sweeps=False), results)
     tables, turn = copy.deepcopy(TABLES), folder.Rotation.from_euler("z", 1.1)
     moved = copy.deepcopy(results)
-    for row in [*tables["ego_pose"], *tables["sample_annotation"], *itertools.chain(
-            *moved.values())]:
+    for row in [*tables["ego_pose"], *tables["sample_annotation"], *itertools.chain(*moved.values())]:
         row["rotation"] = folder.to_wxyz(turn * folder.to_rotation(row))
         row["translation"] = (turn.apply(row["translation"]) + [30, -200, 0]).tolist()
         if "velocity" in row:
@@ -245,8 +254,7 @@ def test_turning_and_moving_the_world_changes_nothing(tmp_path):
 
 
 def test_ap_depends_on_the_order_of_scores_only(tmp_path):
-    root, results = folder.save(tmp_path, TABLES, sweeps=False), folder.make_results(
-        TABLES, CATEGORIES)
+    root, results = folder.save(tmp_path, TABLES, sweeps=False), folder.make_results(TABLES, CATEGORIES)
     before = reported(root, results)
     for rows in results.values():
         rows.reverse()
@@ -254,30 +262,37 @@ def test_ap_depends_on_the_order_of_scores_only(tmp_path):
             row["detection_score"] **= 3
     after = reported(root, results)
     assert {n: r["ap"] for n, r in after["classes"].items()} == {
-        n: pytest.approx(r["ap"]) for n, r in before["classes"].items()}
+        n: pytest.approx(r["ap"]) for n, r in before["classes"].items()
+    }
 
 
 def spoil(**values):
     def change(results):
         next(rows for rows in results.values() if rows)[0].update(values)
+
     return change
 
 
-@pytest.mark.parametrize("change, words", [
-    (lambda r: r.pop("s0k1"), "no boxes for scene-0103/01, sample s0k1 (missing: 1 of 8 frames)"),
-    (lambda r: r.update(s0k0=r["s0k0"] * 100), "at most 500 boxes"),
-    (lambda r: r.update(s0k0={}), "needs a list"),
-    (lambda r: r["s0k0"][0].pop("size"), "a box has no 'size'"),
-    (spoil(detection_name="van"), "the class 'van' is not one of"),
-    (spoil(attribute_name="red"), "is malformed"),
-    (spoil(size=[1, 2, 0]), "sizes above 0"), (spoil(rotation=[0, 0, 0, 0]), "a quaternion"),
-    (spoil(translation=[1, 2, math.nan]), "must be finite"), (spoil(size=[1]), "is malformed"),
-    (spoil(velocity=[math.inf, 0]), "velocity finite or NaN"),
-                                           (spoil(velocity=[0]), "is malformed"),
-    (spoil(detection_score="high"), "is malformed"),
-    (spoil(translation=[10**400, 0, 0]), "is malformed"),
-    (spoil(rotation=[1e308, 0, 0, 0]), "a quaternion"),
-])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda r: r.pop("s0k1"), "no boxes for scene-0103/01, sample s0k1 (missing: 1 of 8 frames)"),
+        (lambda r: r.update(s0k0=r["s0k0"] * 100), "at most 500 boxes"),
+        (lambda r: r.update(s0k0={}), "needs a list"),
+        (lambda r: r["s0k0"][0].pop("size"), "a box has no 'size'"),
+        (spoil(detection_name="van"), "the class 'van' is not one of"),
+        (spoil(attribute_name="red"), "is malformed"),
+        (spoil(size=[1, 2, 0]), "sizes above 0"),
+        (spoil(rotation=[0, 0, 0, 0]), "a quaternion"),
+        (spoil(translation=[1, 2, math.nan]), "must be finite"),
+        (spoil(size=[1]), "is malformed"),
+        (spoil(velocity=[math.inf, 0]), "velocity finite or NaN"),
+        (spoil(velocity=[0]), "is malformed"),
+        (spoil(detection_score="high"), "is malformed"),
+        (spoil(translation=[10**400, 0, 0]), "is malformed"),
+        (spoil(rotation=[1e308, 0, 0, 0]), "a quaternion"),
+    ],
+)
 def test_results_that_are_wrong_are_named(tmp_path, change, words):
     results = folder.make_results(TABLES, CATEGORIES)
     change(results)

@@ -35,12 +35,19 @@ def recorded(request, tmp_path):
             stamp = START + i * TENTH
             header = make_header(stamp, "velodyne", bag_message)
             tracks = tracker(found, stamp)
-            extras = [{"track_id": k, "occluded": 0, "truncated": 0.0} if request.param else {}
-                      for k in range(len(found))]
+            extras = [
+                {"track_id": k, "occluded": 0, "truncated": 0.0} if request.param else {} for k in range(len(found))
+            ]
             truth = GroundTruth.of(found.boxes, found.class_ids, extras)
-            message = make_track_markers(tracks.ids, tracks.detections, tracks.velocities,
-                                         tracks.moving, trails(tracks, tracker.pose, stamp, 1.0),
-                                         header, bag_message)
+            message = make_track_markers(
+                tracks.ids,
+                tracks.detections,
+                tracks.velocities,
+                tracks.moving,
+                trails(tracks, tracker.pose, stamp, 1.0),
+                header,
+                bag_message,
+            )
             bag.write(TRUTH, stamp, make_truth_markers(truth, header, bag_message))
             bag.write(TRACKS, stamp, message)
     return tmp_path / "bag", request.param, message
@@ -53,8 +60,10 @@ def test_recorded_tracks_are_scored_if_labels_have_ids(recorded):
     if with_ids:
         scores = score_recorded_tracks(frames, None)["Pedestrian"]
         assert (scores["true_tracks"], scores["switches"]) == (3, 0) and scores["HOTA"] > 0.8
-        later = [replace(f, stamp_ns=f.stamp_ns + 600 * TENTH,
-                         found=replace(f.found, ids=np.asarray(f.found.ids) + 100)) for f in frames]
+        later = [
+            replace(f, stamp_ns=f.stamp_ns + 600 * TENTH, found=replace(f.found, ids=np.asarray(f.found.ids) + 100))
+            for f in frames
+        ]
         both = score_recorded_tracks([*frames, *later], None)["Pedestrian"]  # two drives
         assert (both["true_tracks"], both["switches"], both["HOTA"]) == (6, 0, scores["HOTA"])
     else:

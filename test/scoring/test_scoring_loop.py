@@ -44,6 +44,7 @@ def ending(name, recording):
         if frame.name == name:
             raise RunError(f"cannot go on after {frame.name}")
         return frame.name, 0
+
     return measure
 
 
@@ -70,9 +71,7 @@ def test_results_are_equal_and_ordered_with_many_processes(root):
 
 def test_processes_measure_the_frames_of_a_split(root, tmp_path):
     split = write(tmp_path / "split.txt", "000004 000000 000002")
-    found = [
-        [*measure_frames(open_recording(root, split=split), counting, jobs=jobs)] for jobs in (1, 2)
-    ]
+    found = [[*measure_frames(open_recording(root, split=split), counting, jobs=jobs)] for jobs in (1, 2)]
     assert found[0] == found[1]
     assert [name for _, (name, _) in found[0]] == ["000004", "000000", "000002"]
 
@@ -81,7 +80,7 @@ def test_processes_measure_the_frames_of_a_split(root, tmp_path):
 def test_unreadable_frame_is_skipped_by_name(root, jobs):
     recording, report = open_recording(root), Names()
     fill(report, recording, counting, jobs=jobs)
-    line, = report.skipped
+    (line,) = report.skipped
     assert report.names == ["000000", "000002", "000004"]
     assert "000001.bin" in line and "\n" not in line
 
@@ -92,14 +91,18 @@ def test_run_error_ends_the_run_and_keeps_earlier_results(root, jobs):
     with pytest.raises(InputError, match=r"^cannot go on after 000002$"):
         fill(report, open_recording(root), functools.partial(ending, "000002"), jobs=jobs)
     assert report.skipped == [] and "000002" not in report.names
-    assert report.names == ["000000", "000001"][:len(report.names)]
+    assert report.names == ["000000", "000001"][: len(report.names)]
 
 
 def test_failed_run_is_reported_in_one_line(root, tmp_path, monkeypatch, capsys):
     (tmp_path / "found").mkdir()
     for jobs in 1, 2:
-        assert exit_of(monkeypatch, "evaluate", "detection", "--data", root, "--results",
-                       tmp_path / "found", "--jobs", jobs) == 2
+        assert (
+            exit_of(
+                monkeypatch, "evaluate", "detection", "--data", root, "--results", tmp_path / "found", "--jobs", jobs
+            )
+            == 2
+        )
         assert "result file" in error_line(capsys)
     with pytest.raises(RunError):
         [*measure_frames(open_recording(root), partial(measure_result_files, tmp_path / "found"))]
@@ -108,20 +111,28 @@ def test_failed_run_is_reported_in_one_line(root, tmp_path, monkeypatch, capsys)
 def test_programming_error_is_raised_with_frame_name(root):
     def mistaken(recording):
         return lambda frame: 1 // (frame.name != "000002")
+
     with pytest.raises(ZeroDivisionError) as error:
         [*measure_frames(open_recording(root), mistaken)]
     assert error.value.__notes__ == ["while frame 000002 was measured"]
 
 
-@pytest.mark.parametrize("limit, expected", [
-    (None, ["000000", "000002", "000004"]), (1, ["000000"]), (3, ["000000", "000002"]),
-    (99, ["000000", "000002", "000004"])])
+@pytest.mark.parametrize(
+    "limit, expected",
+    [
+        (None, ["000000", "000002", "000004"]),
+        (1, ["000000"]),
+        (3, ["000000", "000002"]),
+        (99, ["000000", "000002", "000004"]),
+    ],
+)
 def test_limit_reads_no_other_frames(root, limit, expected):
     touched = []
 
     def noting(recording):
         measure = counting(recording)
         return lambda frame: touched.append(frame.name) or measure(frame)
+
     report = Names()
     fill(report, open_recording(root), noting, limit=limit)
     assert report.names == expected
@@ -134,6 +145,7 @@ def test_start_and_each_measurement_run_once_and_lazily(root):
     def start(recording):
         called.append("start")
         return lambda frame: called.append(frame.name)
+
     found = measure_frames(open_recording(root), start)
     assert called == []
     next(found)
@@ -155,8 +167,9 @@ def test_results_are_sorted_and_yielded_early(numbers, random):
         for number in sent:
             taken.append(number)
             yield number, -number
+
     for k, pair in enumerate(sort_results(pairs(), numbers)):
         assert pair == (numbers[k], -numbers[k])
-        needed = 1 + max(sent.index(number) for number in numbers[:k + 1])
+        needed = 1 + max(sent.index(number) for number in numbers[: k + 1])
         assert taken == sent[:needed]  # no more than it needed
     assert taken == sent

@@ -48,9 +48,14 @@ def objects(owner, region=None, near=None, counted=None, ranges=None):
     owner = np.asarray(owner, np.int32)
     region = owner if region is None else np.asarray(region, np.int32)
     count = int(owner.max(initial=0))
-    return Objects(owner, region, region > 0 if near is None else np.asarray(near, bool),
-                   np.ones(len(owner), bool) if counted is None else np.asarray(counted, bool),
-                   tuple("abcdefghij"[:count]), np.full(count, 10.0) if ranges is None else ranges)
+    return Objects(
+        owner,
+        region,
+        region > 0 if near is None else np.asarray(near, bool),
+        np.ones(len(owner), bool) if counted is None else np.asarray(counted, bool),
+        tuple("abcdefghij"[:count]),
+        np.full(count, 10.0) if ranges is None else ranges,
+    )
 
 
 def report_of(cluster_ids, truth) -> dict:
@@ -65,8 +70,7 @@ def some(seed):
     rng = np.random.default_rng(seed)
     owner = rng.integers(0, rng.integers(1, 6), 300).astype(np.int32)
     owner = np.unique(owner, return_inverse=True)[1].reshape(-1)
-    region = np.where(owner == 0, rng.integers(0, owner.max() + 1, 300) * (rng.random(300) < 0.1),
-                      owner)
+    region = np.where(owner == 0, rng.integers(0, owner.max() + 1, 300) * (rng.random(300) < 0.1), owner)
     found = np.where(rng.random(300) < 0.7, owner, rng.integers(0, 9, 300)).astype(np.int32)
     return found, objects(owner, region, counted=rng.random(300) < 0.9)
 
@@ -148,8 +152,7 @@ def test_order_of_points_and_numbers_of_clusters_do_not_matter(seed):
     order = rng.permutation(len(found))
     large = rng.permutation(np.unique(rng.integers(1, 2**31, 40)))[:10]  # tables would take GBs
     renamed = np.concatenate([[0], large])[found]
-    shuffled = replace(truth, **{name: getattr(truth, name)[order]
-                                 for name in ("owner", "region", "near", "counted")})
+    shuffled = replace(truth, **{name: getattr(truth, name)[order] for name in ("owner", "region", "near", "counted")})
     assert report_of(renamed[order], shuffled) == report_of(found, truth)
 
 
@@ -167,8 +170,9 @@ def test_scores_equal_a_plain_loop_over_sets(seed):
         best = {c for c, v in ious.items() if v == max(ious.values())}
         assert score.iou[k] == max(ious.values(), default=0)
         assert score.pieces[k] == len(pieces[k])
-        assert score.shared[k] == any(c in pieces[k] and any(
-            c in p for j, p in enumerate(pieces) if j != k) for c in best)
+        assert score.shared[k] == any(
+            c in pieces[k] and any(c in p for j, p in enumerate(pieces) if j != k) for c in best
+        )
     near = set(np.flatnonzero(truth.near))
     assert score.judged == sum(2 * len(s & near) > len(s) for s in sets.values())
     assert score.judged >= np.sum(score.iou > 0.5)  # so that no ratio is above 1
@@ -188,9 +192,15 @@ def column(x, y, z, count):
 
 
 def test_low_points_are_neutral_and_small_objects_ignored():
-    xyz = np.concatenate([column(10, 0, (-1.65, -1.55), 5), column(10, 0, (-1.45, 0), 12),
-                          column(20, 0, (-1.4, 0), 9), column(10, 1.1, (-1, 0), 3),
-                          column(30, 0, (-1, 0), 4)]).astype(np.float32)
+    xyz = np.concatenate(
+        [
+            column(10, 0, (-1.65, -1.55), 5),
+            column(10, 0, (-1.45, 0), 12),
+            column(20, 0, (-1.4, 0), 9),
+            column(10, 1.1, (-1, 0), 3),
+            column(30, 0, (-1, 0), 4),
+        ]
+    ).astype(np.float32)
     truth = GroundTruth.of([[20, 0, -0.7, 2, 2, 2, 0], [10, 0, -0.7, 2, 2, 2, 0.0]], [CAR, VAN])
     found = find_objects_in_boxes(xyz, truth)
     assert found.owner.tolist() == [0] * 5 + [1] * 12 + [0] * 16
@@ -211,18 +221,25 @@ def test_a_point_in_two_boxes_belongs_to_the_smaller():
 
 def test_dont_care_and_no_boxes_are_no_objects():
     xyz = column(10, 0, (-1, 0), 20).astype(np.float32)
-    for truth in (GroundTruth.of([[10, 0, 0, 2, 2, 4, 0]], [CLASSES.index("DontCare")]),
-                  GroundTruth.of([], [])):
+    for truth in (GroundTruth.of([[10, 0, 0, 2, 2, 4, 0]], [CLASSES.index("DontCare")]), GroundTruth.of([], [])):
         found = find_objects_in_boxes(xyz, truth)
         assert found.classes == () and not found.owner.any() and not found.near.any()
 
 
 def test_instances_include_moving_points():
-    kinds = [(10, 5, 12), (252, 6, 10), (30, 5, 11), (10, 0, 20), (11, 1, 9), (50, 5, 30),
-             (0, 5, 4), (1, 0, 4), (40, 0, 10)]
+    kinds = [
+        (10, 5, 12),
+        (252, 6, 10),
+        (30, 5, 11),
+        (10, 0, 20),
+        (11, 1, 9),
+        (50, 5, 30),
+        (0, 5, 4),
+        (1, 0, 4),
+        (40, 0, 10),
+    ]
     counts = [count for _, _, count in kinds]
-    semantic, instance = (np.repeat([kind[i] for kind in kinds], counts).astype(np.uint16)
-                          for i in (0, 1))
+    semantic, instance = (np.repeat([kind[i] for kind in kinds], counts).astype(np.uint16) for i in (0, 1))
     xyz = np.zeros((len(semantic), 3), np.float32)
     xyz[:12] = [30, 40, 1]
     found = find_instances(xyz, semantic, instance)
@@ -238,8 +255,11 @@ def test_each_protocol_by_hand():
     semantic = np.array([40, 44, 48, 49, 60, 72, 70, 70, 70, 0, 1, 10, 50], np.uint16)
     z = np.full(len(semantic), -1.7)
     z[7:9] = [-1.3, -1.2]  # at the limit is not low
-    expected = ([1] * 6 + [None] * 5 + [0, 0], [1] * 7 + [0, 0, None, None, 0, 0],
-                [1] * 6 + [0, 0, 0, None, None, 0, 0])
+    expected = (
+        [1] * 6 + [None] * 5 + [0, 0],
+        [1] * 7 + [0, 0, None, None, 0, 0],
+        [1] * 6 + [0, 0, 0, None, None, 0, 0],
+    )
     for name, row in zip(PROTOCOLS, expected, strict=True):
         ground, counted = select_true_ground(semantic, z, name)
         assert [int(g) if c else None for g, c in zip(ground, counted)] == row, name
@@ -267,8 +287,7 @@ def test_counts_and_ratios_of_ground_by_hand():
         report.update(count_by_protocol(found[:7], np.where(ground[:7], 40, 50), np.zeros(7)), 3.0)
     row = report.compute()["protocols"]["without vegetation"]
     assert [row[k] for k in ("tp", "fp", "fn", "tn")] == [4, 2, 2, 6]
-    assert [row[k] for k in ("precision", "recall", "f1", "accuracy")] == pytest.approx(
-        [2 / 3, 2 / 3, 2 / 3, 5 / 7])
+    assert [row[k] for k in ("precision", "recall", "f1", "accuracy")] == pytest.approx([2 / 3, 2 / 3, 2 / 3, 5 / 7])
     assert report.compute()["scans"] == 2 and report.compute()["ms"] == 3.0
 
 
@@ -279,8 +298,7 @@ def semantic_folder(root, scans=("00/000000", "00/000001", "05/000000")):
     car = rng.uniform(-1, 1, (200, 3)) * [0.15, 0.15, 0.3] - [0, 0, 0.9]
     xyz = np.concatenate([road, car + [8, 3, 0], car + [9, -4, 0], [[0, 0, 0], [np.nan, 1, 1]]])
     cloud = np.column_stack([xyz, np.full(len(xyz), 0.4)]).astype(np.float32)
-    labels = np.repeat(np.array([40, 10 | 7 << 16, 252 | 300 << 16, 0], np.uint32),
-                       [4000, 200, 200, 2])
+    labels = np.repeat(np.array([40, 10 | 7 << 16, 252 | 300 << 16, 0], np.uint32), [4000, 200, 200, 2])
     for name in scans:
         sequence, scan = name.split("/")
         write(root / f"sequences/{sequence}/velodyne/{scan}.bin", cloud.tobytes())
@@ -302,13 +320,18 @@ def test_a_folder_is_read_in_order_without_unusable_returns(tmp_path):
     assert instance[[0, 4000, 4200]].tolist() == [0, 7, 300]
 
 
-@pytest.mark.parametrize("root, file, content, text", [
-    ("nowhere", None, None, "does not exist"), (".", None, None, "is not a recording"),
-    ("unlabelled", "velodyne/000000.bin", b"", "scans but no labels"),
-    ("kitti", "velodyne/000001.bin", b"", "cannot read .*label"),
-    ("kitti", "labels/000000.label", bytes(40), "has 10 labels for the 4402 points"),
-    ("kitti", "labels/000000.label", bytes(41), "not a multiple of 4"),
-    ("kitti", "velodyne/000000.bin", bytes(41), "not a multiple of 16")])
+@pytest.mark.parametrize(
+    "root, file, content, text",
+    [
+        ("nowhere", None, None, "does not exist"),
+        (".", None, None, "is not a recording"),
+        ("unlabelled", "velodyne/000000.bin", b"", "scans but no labels"),
+        ("kitti", "velodyne/000001.bin", b"", "cannot read .*label"),
+        ("kitti", "labels/000000.label", bytes(40), "has 10 labels for the 4402 points"),
+        ("kitti", "labels/000000.label", bytes(41), "not a multiple of 4"),
+        ("kitti", "velodyne/000000.bin", bytes(41), "not a multiple of 16"),
+    ],
+)
 def test_a_broken_folder_gives_one_line_with_a_remedy(tmp_path, root, file, content, text):
     semantic_folder(tmp_path / "kitti", ["00/000000"])
     if file:
@@ -328,8 +351,7 @@ def test_real_scan_has_a_label_for_every_point():
     assert len(frame) == len(semantic) == len(instance) > 100_000
     assert np.isin(semantic, GROUND).mean() > 0.4
     cars = np.bincount(instance[semantic == 10])
-    assert find_instances(frame.xyz, semantic, instance).classes.count("car") == np.sum(
-        cars[1:] >= 10)
+    assert find_instances(frame.xyz, semantic, instance).classes.count("car") == np.sum(cars[1:] >= 10)
 
 
 def run(*arguments):
@@ -350,16 +372,14 @@ def test_command_scores_every_method_and_skips_broken_scan(tmp_path):
     assert set(content["clusters"]) == {"SemanticKITTI", "KITTI object data"}
     for reports in content["clusters"].values():
         assert list(reports) == list(CLUSTERING_METHODS)
-    cars, walkers = (content["clusters"][s]["dbscan"] for s in ("SemanticKITTI",
-                                                                "KITTI object data"))
+    cars, walkers = (content["clusters"][s]["dbscan"] for s in ("SemanticKITTI", "KITTI object data"))
     assert (cars["objects"], cars["hits"], cars["precision"]) == (4, 4, 1)
     assert (walkers["objects"], walkers["frames"]) == (2, 2)
 
 
 def test_methods_and_frames_can_be_chosen(tmp_path):
     root, path, png = semantic_folder(tmp_path), tmp_path / "a.json", tmp_path / "made/a.png"
-    assert run("--data", root, "--methods", "threshold", "--limit", 1, "--json", path,
-               "--png", png).exit_code == 0
+    assert run("--data", root, "--methods", "threshold", "--limit", 1, "--json", path, "--png", png).exit_code == 0
     content = json.loads(path.read_text())
     assert list(content["ground"]) == ["threshold"] and content["clusters"] == {}
     ground = content["ground"]["threshold"]
@@ -370,10 +390,12 @@ def test_methods_and_frames_can_be_chosen(tmp_path):
 def test_invalid_calls_name_the_reason(tmp_path):
     root = semantic_folder(tmp_path / "semantic", ["00/000000"])
     kitti = object_folder(tmp_path / "kitti")
-    for arguments, text in (([], "DATA is missing"),
-                            (["--data", root, "--methods", "magic"], "is no method"),
-                            (["--data", kitti, "--png", "a.png"], "--png draws"),
-                            (["--data", kitti, "--methods", "threshold"], "labelled points only")):
+    for arguments, text in (
+        ([], "DATA is missing"),
+        (["--data", root, "--methods", "magic"], "is no method"),
+        (["--data", kitti, "--png", "a.png"], "--png draws"),
+        (["--data", kitti, "--methods", "threshold"], "labelled points only"),
+    ):
         result = run(*arguments)
         assert result.exit_code == 2 and text in result.output
     write(root / "sequences/00/labels/000000.label", b"")
@@ -384,6 +406,7 @@ def test_invalid_calls_name_the_reason(tmp_path):
 @pytest.mark.parametrize("command", [segmentation, candidates])
 def test_bag_of_a_lower_sensor_scores_equally(command, tmp_path):
     """The height is measured and used, unless options give another one."""
+
     def scores(name, lower, *flags):
         path, bag = tmp_path / f"{name}.json", tmp_path / name
         write_bag(bag, [lowered_crowd(i, lower) for i in range(3)])
@@ -391,9 +414,11 @@ def test_bag_of_a_lower_sensor_scores_equally(command, tmp_path):
         result = CliRunner().invoke(command, call, catch_exceptions=False)
         assert result.exit_code == 0, result.output
         content = json.loads(path.read_text())
-        return [content[stage]["all"]["tp"] for stage in STAGES] if command is candidates else [
-            (row["hits"], row["clusters"])
-            for rows in content["clusters"].values() for row in rows.values()]
+        return (
+            [content[stage]["all"]["tp"] for stage in STAGES]
+            if command is candidates
+            else [(row["hits"], row["clusters"]) for rows in content["clusters"].values() for row in rows.values()]
+        )
 
     usual = scores("usual", 0.0)
     assert np.min(usual) > 0 and scores("lower", 1.0) == usual

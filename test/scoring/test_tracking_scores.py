@@ -18,12 +18,7 @@ from lidar_perception.scoring.run import fill
 from lidar_perception.scoring.tracking.clear import ClearCounts, count_clear
 from lidar_perception.scoring.tracking.hota import HotaCounts, count_hota
 from lidar_perception.scoring.tracking.over_recall import score_over_recall
-from lidar_perception.scoring.tracking.pairs import (
-    Pairs,
-    drop_ignored,
-    make_pairs,
-    to_tracked_labels,
-)
+from lidar_perception.scoring.tracking.pairs import Pairs, drop_ignored, make_pairs, to_tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, measure_tracking, observe
 from lidar_perception.scoring.tracking.tables import print_tracking_report
 from lidar_perception.simulation.camera import FORWARD_CAMERA
@@ -43,21 +38,35 @@ def random_sequences(seed: int) -> list[list[Pairs]]:
             true = np.sort(rng.choice(5, rng.integers(0, 5), replace=False))
             tracks = np.sort(rng.choice(6, rng.integers(0, 5), replace=False)) + 10
             same = (tracks[None, :] - 10) == true[:, None]
-            alike = rng.uniform(0, 1, same.shape) * np.where(
-                same & (rng.uniform(size=same.shape) < 0.8), 1.0, 0.6)
-            frames.append(Pairs(true, rng.uniform(size=len(true)) < 0.2, tracks,
-                                tracks / 16 + rng.uniform(0, 0.05, len(tracks)),
-                                rng.uniform(size=len(tracks)) < 0.2, alike,
-                                np.clip(alike - 0.1, 0, 1)))
+            alike = rng.uniform(0, 1, same.shape) * np.where(same & (rng.uniform(size=same.shape) < 0.8), 1.0, 0.6)
+            frames.append(
+                Pairs(
+                    true,
+                    rng.uniform(size=len(true)) < 0.2,
+                    tracks,
+                    tracks / 16 + rng.uniform(0, 0.05, len(tracks)),
+                    rng.uniform(size=len(tracks)) < 0.2,
+                    alike,
+                    np.clip(alike - 0.1, 0, 1),
+                )
+            )
         sequences.append(frames)
     return sequences
 
 
 def plainly(sequences):
-    return [[(list(zip(f.true_ids.tolist(), f.ignored.tolist())),
-              list(zip(f.track_ids.tolist(), f.scores.tolist(), f.excused.tolist())),
-              lambda i, j, f=f: float(f.similarity[i, j]),
-              lambda i, j, f=f: float(f.overlap[i, j])) for f in frames] for frames in sequences]
+    return [
+        [
+            (
+                list(zip(f.true_ids.tolist(), f.ignored.tolist())),
+                list(zip(f.track_ids.tolist(), f.scores.tolist(), f.excused.tolist())),
+                lambda i, j, f=f: float(f.similarity[i, j]),
+                lambda i, j, f=f: float(f.overlap[i, j]),
+            )
+            for f in frames
+        ]
+        for frames in sequences
+    ]
 
 
 def counted(sequences):
@@ -72,19 +81,19 @@ def counted(sequences):
 def test_fast_scores_equal_a_slow_reading(seed):
     sequences = random_sequences(seed)
     hota, clear = counted(sequences)
-    assert [hota[k] for k in ("HOTA", "DetA", "AssA")] == pytest.approx(
-        slow.hota(plainly(sequences)), abs=1e-12)
-    assert (clear.tp, clear.fn, clear.fp, clear.switches, clear.fragments) == slow.clear(
-        plainly(sequences))
+    assert [hota[k] for k in ("HOTA", "DetA", "AssA")] == pytest.approx(slow.hota(plainly(sequences)), abs=1e-12)
+    assert (clear.tp, clear.fn, clear.fp, clear.switches, clear.fragments) == slow.clear(plainly(sequences))
     curve = score_over_recall(sequences)
     assert [curve[k] for k in ("sAMOTA", "AMOTA", "AMOTP")] == pytest.approx(
-        slow.over_recall(plainly(sequences)), abs=1e-12)
+        slow.over_recall(plainly(sequences)), abs=1e-12
+    )
 
 
 def test_names_of_ids_do_not_matter():
     sequences = random_sequences(7)
-    renamed = [[replace(f, track_ids=1000 - f.track_ids, true_ids=f.true_ids * 7 + 3)
-                for f in frames] for frames in sequences]
+    renamed = [
+        [replace(f, track_ids=1000 - f.track_ids, true_ids=f.true_ids * 7 + 3) for f in frames] for frames in sequences
+    ]
     assert counted(renamed)[0] == pytest.approx(counted(sequences)[0])
     assert counted(renamed)[1].switches == counted(sequences)[1].switches
 
@@ -94,8 +103,7 @@ def drive(ids=(1, 2), frames=10, switch_at=None, kind=CAR):
     result = []
     for i in range(frames):
         boxes = np.array([[10.0 + i, y, -1.0, 4.0, 1.8, 1.5, 0.0] for y in (-3.0, 3.0)])
-        truth = GroundTruth.of(boxes, [kind] * 2, [{"track_id": k, "occluded": 0,
-                                                    "truncated": 0.0} for k in (7, 8)])
+        truth = GroundTruth.of(boxes, [kind] * 2, [{"track_id": k, "occluded": 0, "truncated": 0.0} for k in (7, 8)])
         names = ids[::-1] if switch_at is not None and i >= switch_at else ids
         result.append((truth, to_tracked_labels(np.array(names), Detections.of(boxes, CAR, 0.9))))
     return result
@@ -129,19 +137,23 @@ def test_the_order_in_which_frames_come_does_not_matter():
 
 def test_unnamed_drives_of_a_bag_score_like_named_ones():
     """Track ids are counted separately in each drive."""
+
     def content(named):
         frames, found = [], {}
         for k in range(2):
             for i, (truth, _) in enumerate(drive()):
                 scan = PointCloud(np.ones((1, 3), np.float32), None, k * 10**10 + i * 10**8)
-                truth = GroundTruth.of(truth.boxes[::1 - 2 * k], truth.class_ids, truth.extras)
+                truth = GroundTruth.of(truth.boxes[:: 1 - 2 * k], truth.class_ids, truth.extras)
                 found[scan.stamp_ns] = DetectionResult(Detections.of(truth.boxes, CAR, 0.9))
-                frames.append(Frame.of(f"{k}/{i}", scan, truth, sequence=str(k) * named,
-                                       index=i if named else len(frames)))
+                frames.append(
+                    Frame.of(f"{k}/{i}", scan, truth, sequence=str(k) * named, index=i if named else len(frames))
+                )
         recording, report = Recording("a", "", frames), TrackingReport()
-        fill(report, recording,
-             partial(measure_tracking, lambda: lambda scan: found[scan.stamp_ns],
-                     TrackingParams(), "none"))
+        fill(
+            report,
+            recording,
+            partial(measure_tracking, lambda: lambda scan: found[scan.stamp_ns], TrackingParams(), "none"),
+        )
         return report.compute()
 
     assert content(False) == content(True)
@@ -150,14 +162,24 @@ def test_unnamed_drives_of_a_bag_score_like_named_ones():
 
 def test_frames_without_pose_are_counted_and_reported(capsys):
     poses = [np.eye(4), None, None]
-    frames = [Frame.of(f"a/{i}", PointCloud(np.ones((1, 3), np.float32), None, 10**8 * (i + 1)),
-                       truth, sequence="a", index=i, pose=lambda i=i: poses[i])
-              for i, (truth, _) in enumerate(drive(frames=3))]
+    frames = [
+        Frame.of(
+            f"a/{i}",
+            PointCloud(np.ones((1, 3), np.float32), None, 10**8 * (i + 1)),
+            truth,
+            sequence="a",
+            index=i,
+            pose=lambda i=i: poses[i],
+        )
+        for i, (truth, _) in enumerate(drive(frames=3))
+    ]
     for ego, unknown in ("recording", 2), ("none", 0):
         report = TrackingReport()
-        fill(report, Recording("a", "", frames), partial(
-            measure_tracking, lambda: lambda scan: DetectionResult(Detections.none()),
-            TrackingParams(), ego))
+        fill(
+            report,
+            Recording("a", "", frames),
+            partial(measure_tracking, lambda: lambda scan: DetectionResult(Detections.none()), TrackingParams(), ego),
+        )
         print_tracking_report({"ego": ego, **report.compute()}, Console(width=200))
         assert report.compute()["without_pose"] == unknown
         said = capsys.readouterr().out
@@ -167,22 +189,41 @@ def test_frames_without_pose_are_counted_and_reported(capsys):
 def test_neighbour_classes_and_truncated_labels_are_ignored():
     vans = drive(kind=VAN)
     assert scored(vans) is None
-    cut = [(GroundTruth.of(t.boxes, t.class_ids, [{**e, "truncated": 2.0} for e in t.extras]), k)
-           for t, k in drive()]
+    cut = [(GroundTruth.of(t.boxes, t.class_ids, [{**e, "truncated": 2.0} for e in t.extras]), k) for t, k in drive()]
     assert scored(cut) is None
-    behind = [(GroundTruth.of(t.boxes - [60.0, 0, 0, 0, 0, 0, 0], t.class_ids, t.extras),
-               to_tracked_labels(np.arange(1), Detections.of(t.boxes[:1] - 30.0, CAR, 0.9)))
-              for t, _ in drive()]
+    behind = [
+        (
+            GroundTruth.of(t.boxes - [60.0, 0, 0, 0, 0, 0, 0], t.class_ids, t.extras),
+            to_tracked_labels(np.arange(1), Detections.of(t.boxes[:1] - 30.0, CAR, 0.9)),
+        )
+        for t, _ in drive()
+    ]
     assert scored(behind, calibration=FORWARD_CAMERA) is None
     assert scored(behind)["misses"] == 2 * scored(behind)["false"] == 20
 
 
 def test_a_track_in_a_dont_care_region_is_excused():
-    (_, tracks), = drive(frames=1)
-    wide = GroundTruth.of([], [], [], [("DontCare", {
-        "bbox": [0.0, 0.0, 1241.0, 374.0], "track_id": -1, "truncated": -1.0, "occluded": -1,
-        "alpha": -10.0, "dimensions": [-1.0] * 3, "location": [-1000.0] * 3,
-        "rotation_y": -10.0})])
+    ((_, tracks),) = drive(frames=1)
+    wide = GroundTruth.of(
+        [],
+        [],
+        [],
+        [
+            (
+                "DontCare",
+                {
+                    "bbox": [0.0, 0.0, 1241.0, 374.0],
+                    "track_id": -1,
+                    "truncated": -1.0,
+                    "occluded": -1,
+                    "alpha": -10.0,
+                    "dimensions": [-1.0] * 3,
+                    "location": [-1000.0] * 3,
+                    "rotation_y": -10.0,
+                },
+            )
+        ],
+    )
     nothing = GroundTruth.of([], [])
     assert scored([(wide, tracks)], calibration=FORWARD_CAMERA) is None
     assert scored([(nothing, tracks)], calibration=FORWARD_CAMERA)["false"] == 2
@@ -204,10 +245,10 @@ def test_what_cannot_be_scored_says_why():
         observe("a", 0, truth, twice)
     with pytest.raises(InputError, match="no track id"):
         make_pairs(GroundTruth.of(truth.boxes, truth.class_ids), tracks, None)
-    frame = Frame("a/0", 0, lambda: 1 / 0, lambda: GroundTruth.of(
-        truth.boxes, truth.class_ids, [{"track_id": -1}] * len(truth)))  # as KITTI writes none
-    measure = measure_tracking(lambda: None, TrackingParams(), "none",
-                               Recording("a", "", [frame], frozenset()))
+    frame = Frame(
+        "a/0", 0, lambda: 1 / 0, lambda: GroundTruth.of(truth.boxes, truth.class_ids, [{"track_id": -1}] * len(truth))
+    )  # as KITTI writes none
+    measure = measure_tracking(lambda: None, TrackingParams(), "none", Recording("a", "", [frame], frozenset()))
     with pytest.raises(InputError, match="no track id"):  # before the scan is loaded
         measure(frame)
     with pytest.raises(InputError, match="needs a calibration"):
@@ -215,8 +256,10 @@ def test_what_cannot_be_scored_says_why():
 
 
 def test_result_files_come_back_as_they_were(tmp_path):
-    frames = [(i, np.array([4, 9]), Detections.of(tracks.boxes, [CAR, 4], [0.25, 0.75]))
-              for i, (_, tracks) in enumerate(drive(frames=3))]
+    frames = [
+        (i, np.array([4, 9]), Detections.of(tracks.boxes, [CAR, 4], [0.25, 0.75]))
+        for i, (_, tracks) in enumerate(drive(frames=3))
+    ]
     path = tmp_path / "0000.txt"
     write_tracking_results(path, frames, FORWARD_CAMERA)
     found = read_tracking_labels(path, FORWARD_CAMERA.lidar_to_camera)

@@ -50,11 +50,13 @@ def test_tilted_sensor_is_measured_correctly(name):
     for kind in ("intensity", "ring", "time"):
         column = driver[kind]
         assert (column[0] if column else f"no {kind}") in next(
-            row.value for row in list_values(m) if row.name == "columns")
+            row.value for row in list_values(m) if row.name == "columns"
+        )
     if driver["intensity"]:
         assert m.intensity.full == driver["intensity"][2] and m.intensity.sure
-        assert m.intensity.zeros == pytest.approx(float(np.mean(np.concatenate(
-            [s.intensity for s in m.source.scans]) == 0)))
+        assert m.intensity.zeros == pytest.approx(
+            float(np.mean(np.concatenate([s.intensity for s in m.source.scans]) == 0))
+        )
     if driver["time"]:
         assert m.timing.rate == pytest.approx(sensor.rate, rel=0.01)
 
@@ -64,8 +66,7 @@ def test_sensor_file_is_the_measured_sensor(tmp_path):
         path = tmp_path / f"{name}.yaml"
         path.write_text(format_sensor(measure(name)))
         sensor, known = load_sensor(path), find_sensor(name)
-        assert sensor.columns == known.columns and sensor.divergence == pytest.approx(
-            known.divergence, abs=1e-6)
+        assert sensor.columns == known.columns and sensor.divergence == pytest.approx(known.divergence, abs=1e-6)
         assert np.allclose(sensor.elevations, known.elevations, atol=np.radians(0.05))
         assert sensor.height == pytest.approx(MOUNTS[name][3], abs=0.02)
         assert sensor.min_range == known.min_range  # not the nearest ground of this drive
@@ -75,27 +76,26 @@ def test_slice_of_wall_is_not_ground_of_upside_down_sensor():
     rng = np.random.default_rng(0)
     ground = rng.uniform([-25, -25, 1.71], [25, 25, 1.75], (20000, 3))
     wall = rng.uniform([4, -3, -0.28], [9, 3, -0.24], (150, 3))
-    seen = [SimpleNamespace(xyz=np.concatenate(parts).astype(np.float32))
-            for parts in ([ground, wall],) * 3]
+    seen = [SimpleNamespace(xyz=np.concatenate(parts).astype(np.float32)) for parts in ([ground, wall],) * 3]
     assert find_ground_plane(seen[0].xyz, True) is not None
     mount = measure_mount(seen)
     assert mount.upside_down and mount.height == pytest.approx(1.73, abs=0.01)
     indoors = [SimpleNamespace(xyz=(s.xyz * [1, 1, -1]).astype(np.float32)) for s in seen]
     ceiling = rng.uniform([-25, -25, 2.2], [25, 25, 2.24], (20000, 3))
-    indoors = [SimpleNamespace(xyz=np.concatenate([s.xyz, ceiling]).astype(np.float32))
-               for s in indoors]
+    indoors = [SimpleNamespace(xyz=np.concatenate([s.xyz, ceiling]).astype(np.float32)) for s in indoors]
     assert not measure_mount(indoors).upside_down
 
 
 def test_partly_seen_model_gets_all_its_beams(tmp_path):
-    seen = tuple(s._make(column[s.ring > 1] if isinstance(column, np.ndarray) else column
-                         for column in s) for s in scans("vlp-16"))
+    seen = tuple(
+        s._make(column[s.ring > 1] if isinstance(column, np.ndarray) else column for column in s)
+        for s in scans("vlp-16")
+    )
     m = measure_sensor(seen, [0, 1, 10, 11], "part", 12, None)
     (tmp_path / "sensor.yaml").write_text(format_sensor(m))
     assert len(m.pattern.beams.elevations) == 14
     assert "14 of the 16 beams" in " ".join(find_warnings(m))
-    assert load_sensor(tmp_path / "sensor.yaml").elevations == pytest.approx(
-        find_sensor("vlp-16").elevations)
+    assert load_sensor(tmp_path / "sensor.yaml").elevations == pytest.approx(find_sensor("vlp-16").elevations)
 
 
 @pytest.mark.parametrize("name", SENSOR_NAMES)
@@ -119,8 +119,7 @@ def test_height_hint_counts_without_ground():
 
 def test_beams_by_ring_and_by_elevation_agree():
     with_rings = scans("vlp-16")
-    by_ring, by_elevation = (find_beams(s) for s in (
-        with_rings, [scan._replace(ring=None) for scan in with_rings]))
+    by_ring, by_elevation = (find_beams(s) for s in (with_rings, [scan._replace(ring=None) for scan in with_rings]))
     assert (by_ring.method, by_elevation.method) == ("ring", "elevation")
     assert np.abs(by_ring.elevations - by_elevation.elevations).max() < 1e-3
     assert np.mean(by_ring.labels[0] == by_elevation.labels[0]) > 0.999
@@ -134,10 +133,17 @@ def test_lines_of_non_repeating_pattern_are_not_beams():
     changed = []
     for scan in scans("vlp-16"):
         away, aside = rng.uniform(2, 12, len(scan.xyz)), np.radians(scan.azimuth)
-        xyz = np.column_stack([away * np.cos(aside), away * np.sin(aside),
-                               2 - 0.02 * away + rng.normal(0, 0.01, len(away))])
-        changed.append(scan._replace(xyz=xyz, ground_range=away, ring=np.arange(len(away)) % 4,
-                                     elevation=np.degrees(np.arctan2(xyz[:, 2], away))))
+        xyz = np.column_stack(
+            [away * np.cos(aside), away * np.sin(aside), 2 - 0.02 * away + rng.normal(0, 0.01, len(away))]
+        )
+        changed.append(
+            scan._replace(
+                xyz=xyz,
+                ground_range=away,
+                ring=np.arange(len(away)) % 4,
+                elevation=np.degrees(np.arctan2(xyz[:, 2], away)),
+            )
+        )
     assert find_beams(changed) is None
 
 
@@ -165,10 +171,16 @@ def test_constant_intensities_are_read_as_0():
     assert measure_intensity(scans) is None and "silent: 1" in format_sensor(same)
 
 
-@pytest.mark.parametrize("folder, model, height, rings", [
-    ("kitti_tracking", "hdl-64e", 1.73, 64), ("nuscenes/unlabelled", "hdl-32e", 1.84, 32),
-    ("sensors/vlp16.pcd", "vlp-16", None, 16), ("sensors/xt32.pcd", "pandarxt-32", None, 32),
-    ("sensors/pandar64.pcd", "pandar64", None, 64)])
+@pytest.mark.parametrize(
+    "folder, model, height, rings",
+    [
+        ("kitti_tracking", "hdl-64e", 1.73, 64),
+        ("nuscenes/unlabelled", "hdl-32e", 1.84, 32),
+        ("sensors/vlp16.pcd", "vlp-16", None, 16),
+        ("sensors/xt32.pcd", "pandarxt-32", None, 32),
+        ("sensors/pandar64.pcd", "pandar64", None, 64),
+    ],
+)
 def test_real_sensors_are_recognised(data, folder, model, height, rings):
     clouds = open_clouds(data / folder)
     numbers = choose_clouds(clouds.count, 4)

@@ -14,10 +14,7 @@ from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.robot.poses import invert_pose
 from lidar_perception.sensor_setup.measurement.measure import measure_sensor
 from lidar_perception.sensor_setup.measurement.motion import compute_shifts, estimate_heading
-from lidar_perception.sensor_setup.measurement.recorded_poses import (
-    RecordedPoses,
-    read_recorded_poses,
-)
+from lidar_perception.sensor_setup.measurement.recorded_poses import RecordedPoses, read_recorded_poses
 from lidar_perception.sensor_setup.measurement.scans import read_scan
 from lidar_perception.sensor_setup.report.files import format_params
 from lidar_perception.sensor_setup.report.params import choose_params
@@ -51,15 +48,13 @@ def make_mount(yaw, roll=0.0, pitch=0.0):
 
 def measure_drive(recorded, backwards=False):
     scans, _ = drive()
-    return measure_sensor(scans[::-1] if backwards else scans, range(COUNT), "drive", COUNT, None,
-                          recorded)
+    return measure_sensor(scans[::-1] if backwards else scans, range(COUNT), "drive", COUNT, None, recorded)
 
 
 def record(poses, actual, mount=None, height=None):
     """Return recorded poses of a robot whose sensor is at `actual`, while TF says `mount`."""
     footprint = None if height is None else make_tilted_pose(0, 0, height)
-    return RecordedPoses("base_link", mount, footprint,
-                         {i: pose @ invert_pose(actual) for i, pose in enumerate(poses)})
+    return RecordedPoses("base_link", mount, footprint, {i: pose @ invert_pose(actual) for i, pose in enumerate(poses)})
 
 
 @pytest.mark.parametrize("yaw", [0, pytest.param(-150, marks=pytest.mark.no_cover)])
@@ -94,8 +89,7 @@ def test_driving_to_and_fro_needs_odometry():
 
 def test_odometry_of_sensor_shows_its_heading():
     _, poses = drive()
-    m = measure_drive(RecordedPoses(poses={
-        i: pose @ make_mount(30) for i, pose in enumerate(poses)}))
+    m = measure_drive(RecordedPoses(poses={i: pose @ make_mount(30) for i, pose in enumerate(poses)}))
     heading = m.mounting.heading
     assert heading.degrees == pytest.approx(-30, abs=1) and not heading.from_base
 
@@ -132,10 +126,12 @@ def test_contradictions_of_tf_and_clouds_are_reported():
     recorded = right.mounting.recorded._replace(problem="3 of 4 clouds have no pose")
     unposed = replace(right, mounting=right.mounting._replace(recorded=recorded))
     assert any("from clouds alone: 3 of 4 clouds" in line for line in find_warnings(unposed))
-    for tf_mount, height, words in ((make_mount(0, roll + 3, pitch), None, "with roll"),
-                                    (make_mount(0, roll, pitch - 3), None, "and pitch"),
-                                    (make_mount(45, roll, pitch), None, "correct the yaw"),
-                                    (true, mount.height + 0.4, "above the ground")):
+    for tf_mount, height, words in (
+        (make_mount(0, roll + 3, pitch), None, "with roll"),
+        (make_mount(0, roll, pitch - 3), None, "and pitch"),
+        (make_mount(45, roll, pitch), None, "correct the yaw"),
+        (true, mount.height + 0.4, "above the ground"),
+    ):
         wrong = measure_drive(record(poses, true, tf_mount, height))
         assert sum("URDF" in line and words in line for line in find_warnings(wrong)) == 1
         row = next(value for value in list_values(wrong) if value.name == "mount by TF")
@@ -164,8 +160,7 @@ def test_mount_and_poses_are_read_from_bag(tmp_path):
     assert "child_frame_id" in nameless.problem
     recorded(tmp_path / "bare", moving(ODOMETRY, ""))
     clouds = open_clouds(tmp_path / "bare")
-    assert read_recorded_poses(clouds.poses, range(3), clouds.stamps_ns) == RecordedPoses(
-        problem=nameless.problem)
+    assert read_recorded_poses(clouds.poses, range(3), clouds.stamps_ns) == RecordedPoses(problem=nameless.problem)
     # With another clock there are no poses at the times of the clouds.
     recorded(tmp_path / "clock", moving(ODOMETRY), mount())
     clouds = open_clouds(tmp_path / "clock")

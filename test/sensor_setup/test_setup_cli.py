@@ -39,16 +39,14 @@ def robot(bag, tmp_path_factory):
     out = tmp_path_factory.mktemp("setup") / "robot"
     result = run("--data", bag, "--out", out, "--height-hint", 1.2)
     assert result.exit_code == 0
-    assert "vlp-16" in result.output and "warning: the sensor is 0.60 m above" in " ".join(
-        result.output.split())
+    assert "vlp-16" in result.output and "warning: the sensor is 0.60 m above" in " ".join(result.output.split())
     return out
 
 
 def test_every_file_is_written_and_readable(robot):
     assert sorted(p.name for p in robot.iterdir()) == sorted(FILES)
     assert load_sensor(robot / "sensor.yaml").rings == 16
-    params = with_values(PipelineParams(), read_config(robot / "robot.param.yaml",
-                                                       PipelineParams()))
+    params = with_values(PipelineParams(), read_config(robot / "robot.param.yaml", PipelineParams()))
     assert params.ground.sensor_pose.height == pytest.approx(0.6, abs=0.02)
     assert params.ground.sensor_pose.pitch == pytest.approx(0.1396, abs=0.0035)
     assert params.input.intensity_max == 255
@@ -65,21 +63,32 @@ def test_files_are_replaced_only_with_force(robot, bag):
     with pytest.raises(InputError, match="--force"):
         run("--data", bag, "--out", robot)
     assert {p.name: p.read_bytes() for p in robot.iterdir()} == before
-    assert run("--data", bag, "--out", robot, "--topic", "/lidar/points", "--scans", 2,
-               "--force").exit_code == 0
+    assert run("--data", bag, "--out", robot, "--topic", "/lidar/points", "--scans", 2, "--force").exit_code == 0
 
 
 def test_simulate_accepts_measured_sensor(robot, tmp_path):
-    result = CliRunner().invoke(cli, [
-        "simulate", "--sensor", str(robot / "sensor.yaml"), "--frames", "1", "--format",
-        "semantickitti", "--out", str(tmp_path / "street"), "--jobs", "1"])
+    result = CliRunner().invoke(
+        cli,
+        [
+            "simulate",
+            "--sensor",
+            str(robot / "sensor.yaml"),
+            "--frames",
+            "1",
+            "--format",
+            "semantickitti",
+            "--out",
+            str(tmp_path / "street"),
+            "--jobs",
+            "1",
+        ],
+    )
     assert result.exit_code == 0, result.output
 
 
 def test_bad_input_leaves_no_file(tmp_path, bag):
     (tmp_path / "one.pcd").write_text("no cloud")
-    for data, named in ((tmp_path / "none", "does not exist"),
-                        (tmp_path / "one.pcd", "not a readable PCD file")):
+    for data, named in ((tmp_path / "none", "does not exist"), (tmp_path / "one.pcd", "not a readable PCD file")):
         with pytest.raises(InputError, match=named):
             run("--data", data, "--out", tmp_path / "robot")
     with pytest.raises(InputError, match="no topic"):

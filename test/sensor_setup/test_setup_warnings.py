@@ -47,16 +47,18 @@ def change_cloud(msg, change, frame_id="lidar"):
 
 def turn_by(matrix):
     """Return a change that turns all points."""
+
     def change(points):
         xyz = np.column_stack([points[a] for a in "xyz"]) @ np.transpose(matrix)
         for axis, values in zip("xyz", xyz.T):
             points[axis] = values
         return points
+
     return change
 
 
 def measure(scans, numbers=(0, 1, 10, 11, 20, 21), stamps=None):
-    return measure_sensor(scans, numbers[:len(scans)], "drive", 22, stamps)
+    return measure_sensor(scans, numbers[: len(scans)], "drive", 22, stamps)
 
 
 def change_scans(change):
@@ -86,8 +88,11 @@ def test_robots_body_is_found_and_cropped():
         up = np.radians(np.linspace(-15, 15, 16))[new["ring"]]
         bearing = np.repeat(np.radians(np.linspace(165.2, 194.8, 60)), 16)
         reach = 0.7 + rng.normal(0, 0.005, 960)
-        new["x"], new["y"], new["z"] = (reach * np.cos(up) * np.cos(bearing),
-                                        reach * np.cos(up) * np.sin(bearing), reach * np.sin(up))
+        new["x"], new["y"], new["z"] = (
+            reach * np.cos(up) * np.cos(bearing),
+            reach * np.cos(up) * np.sin(bearing),
+            reach * np.sin(up),
+        )
         return np.concatenate([points[np.hypot(points["x"], points["y"]) > 1.0], new])
 
     m = measure(change_scans(with_body))
@@ -104,8 +109,9 @@ def test_robots_body_is_found_and_cropped():
     by_tf = m.mounting.recorded._replace(footprint=make_tilted_pose(0.1, -0.2, 0.9))
     by_ground = make_tilted_pose(mount.roll, mount.pitch, mount.height)
     for recorded, base in ((m.mounting.recorded, by_ground), (by_tf, by_tf.footprint)):
-        (line,) = re.findall(r"# body: (.*)", format_params(
-            replace(m, mounting=m.mounting._replace(recorded=recorded))))
+        (line,) = re.findall(
+            r"# body: (.*)", format_params(replace(m, mounting=m.mounting._replace(recorded=recorded)))
+        )
         assert select_points(own, CropParams(body=tuple(json.loads(line))), base).mean() < 0.02
 
 
@@ -121,8 +127,9 @@ def simulate_scans(half=np.inf, body=0.0, height=0.6, seed=0, turn=np.eye(3)):
     _, y, z = np.moveaxis(way @ turn.T, -1, 0)
     for _ in range(8):
         things = np.repeat(rng.uniform(5, 50, 72), 10)[:, None]
-        reach = np.minimum.reduce([half / np.maximum(np.abs(y), 1e-3), height / np.maximum(
-            -z, 1e-3), np.where(z > 0.2, np.inf, things)])
+        reach = np.minimum.reduce(
+            [half / np.maximum(np.abs(y), 1e-3), height / np.maximum(-z, 1e-3), np.where(z > 0.2, np.inf, things)]
+        )
         reach[(np.abs(aside - np.pi) < 0.4) & (up < 0) & (body > 0)] = body
         hit = np.isfinite(reach)
         yield make_scan(way[hit] * reach[hit, None] + rng.normal(0, 0.005, (hit.sum(), 3)))
@@ -136,8 +143,19 @@ def make_trees():
 
 def make_scan(xyz):
     r, flat = np.linalg.norm(xyz, axis=1), np.hypot(*xyz[:, :2].T)
-    return Scan(xyz, np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) % 360, np.degrees(
-        np.arctan2(xyz[:, 2], flat)), r, flat, None, None, None, 0, "lidar", ("x", "y", "z"))
+    return Scan(
+        xyz,
+        np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) % 360,
+        np.degrees(np.arctan2(xyz[:, 2], flat)),
+        r,
+        flat,
+        None,
+        None,
+        None,
+        0,
+        "lidar",
+        ("x", "y", "z"),
+    )
 
 
 @pytest.mark.parametrize("half", [0.8, 1.1, 2.0])
@@ -165,16 +183,19 @@ def test_robot_stands_still_while_people_pass():
     assert len(parked.view.coverage.box) and not parked.view.coverage.blocked
     # A slow robot hardly moves between successive clouds, either.
     numbers = [40 * (i // 2) + i % 2 for i in range(8)]
-    slow = [make_scan(np.concatenate([scan.xyz[scan.xyz[:, 2] < -0.5],
-                                      make_trees() - [0.04 * n, 0, 0]]))
-            for n, scan in zip(numbers, simulate_scans())]
+    slow = [
+        make_scan(np.concatenate([scan.xyz[scan.xyz[:, 2] < -0.5], make_trees() - [0.04 * n, 0, 0]]))
+        for n, scan in zip(numbers, simulate_scans())
+    ]
     m = measure_sensor(slow, numbers, "slow", 160, None)
     assert m.mounting.heading.distance < 0.1 and m.view.coverage.still is False
 
 
 def test_poses_show_motion_on_uniform_ground():
-    ground = [make_scan(scan.xyz[(scan.xyz[:, 2] < -0.5) | (np.hypot(*scan.xyz[:, :2].T) < 2)])
-              for scan in simulate_scans(body=1.5)]
+    ground = [
+        make_scan(scan.xyz[(scan.xyz[:, 2] < -0.5) | (np.hypot(*scan.xyz[:, :2].T) < 2)])
+        for scan in simulate_scans(body=1.5)
+    ]
     for distance, drives in ((0.0, False), (4.0, True)):
         poses = {i: make_tilted_pose(0, 0, 0) for i in range(8)}
         poses[7][0, 3] = distance
@@ -200,8 +221,7 @@ def test_tilted_sensor_has_no_blind_sky_and_nearest_ground(roll, pitch):
     assert np.degrees(mount.pitch) == pytest.approx(pitch, abs=0.5) and not mount.is_level
     assert m.view.coverage.view == (0, 360) and not make_sensor(m).blocked
     assert warns(m, "level sensor")
-    nearest = min(np.hypot(*(s.xyz[p.on] @ lean.T)[:, :2].T).min()
-                  for s, p in zip(m.source.scans, mount.planes))
+    nearest = min(np.hypot(*(s.xyz[p.on] @ lean.T)[:, :2].T).min() for s, p in zip(m.source.scans, mount.planes))
     assert choose_params(m)["ground.patchwork.min_range"][0] <= nearest
 
 
@@ -233,8 +253,10 @@ def test_upside_down_sensor_is_described_as_mounted(beams):
         to = np.arctan2(points["y"], points["x"])
         return points[(up < np.radians(4)) & (to > np.radians(-30))]
 
-    own, other = (measure(change_scans(lambda p, axes=axes: turn_by(np.diag(axes))(select_part(p))))
-                  for axes in ([1, 1, 1], [1, -1, -1]))
+    own, other = (
+        measure(change_scans(lambda p, axes=axes: turn_by(np.diag(axes))(select_part(p))))
+        for axes in ([1, 1, 1], [1, -1, -1])
+    )
     level, turned = make_sensor(own), make_sensor(other)
     np.testing.assert_allclose(turned.elevations, level.elevations, atol=np.radians(0.1))
     np.testing.assert_allclose(turned.blocked, level.blocked, atol=1.01)
@@ -251,9 +273,11 @@ def with_elevations(m, elevations):
     return replace(m, pattern=m.pattern._replace(beams=beams))
 
 
-DRIVES = {"at a robot's speed": (501, "campus", 0.92, 14, (0, 180, -25)),
-          "at a car's": (502, "street", 11.15, 8, (0, 90)),
-          "not at all": (504, "campus", 0.0, 6, (90,))}
+DRIVES = {
+    "at a robot's speed": (501, "campus", 0.92, 14, (0, 180, -25)),
+    "at a car's": (502, "street", 11.15, 8, (0, 90)),
+    "not at all": (504, "campus", 0.0, 6, (90,)),
+}
 
 
 @pytest.mark.parametrize("name", DRIVES)
@@ -276,8 +300,11 @@ def test_heading_is_measured_at_any_speed(name):
         assert abs((m.mounting.heading.degrees - degrees + 180) % 360 - 180) < 5
         assert warns(m, "drives towards", "input.ahead") == (degrees != 0)
         assert ("input.ahead" in choose_params(m)) == (degrees in (90, -25))
-        assert warns(m, "backwards") == (degrees == 180) and row.confidence == (
-            "low" if degrees else "fair") and not warns(m, "yaw unknown")
+        assert (
+            warns(m, "backwards") == (degrees == 180)
+            and row.confidence == ("low" if degrees else "fair")
+            and not warns(m, "yaw unknown")
+        )
 
 
 def test_cloud_in_turned_frame_has_no_beams_and_gets_grid():
@@ -291,8 +318,7 @@ def test_cloud_in_turned_frame_has_no_beams_and_gets_grid():
     grid = make_sensor(m)
     low, high = np.percentile(np.concatenate([s.elevation for s in m.source.scans]), [1, 99])
     assert grid.wander > 0 and grid.rings * grid.columns < 60_000
-    assert np.degrees(grid.elevations[0]) >= high - 1 and np.degrees(
-        grid.elevations[-1] - grid.wander) <= low + 1
+    assert np.degrees(grid.elevations[0]) >= high - 1 and np.degrees(grid.elevations[-1] - grid.wander) <= low + 1
 
 
 def test_mount_is_unknown_without_ground():
@@ -310,8 +336,11 @@ def test_unusable_clouds_are_refused():
         points["x"], points["y"] = points["x"] + 300, points["y"] - 300
         return points
 
-    for change, named in ((in_millimetres, "millimetres"), (in_map_frame, "frame such as map"),
-                          (lambda p: p[:50], "50 usable points")):
+    for change, named in (
+        (in_millimetres, "millimetres"),
+        (in_map_frame, "frame such as map"),
+        (lambda p: p[:50], "50 usable points"),
+    ):
         with pytest.raises(InputError, match=named) as error:
             read_scan(change_cloud(messages()[0], change))
         assert "\n" not in str(error.value)
@@ -340,10 +369,17 @@ def test_mixed_frames_gaps_and_jumping_stamps_are_reported():
     assert drives.missing == 0
 
 
-@pytest.mark.parametrize("values, full, sure", [
-    (np.linspace(0, 0.99, 500), 1.0, True), (np.arange(256.0), 255.0, True),
-    (np.arange(120.0), 255.0, False), (np.arange(30.0), 255.0, False),
-    (np.linspace(0, 99.5, 999), 100.0, True), (np.arange(60000.0), 65535.0, True)])
+@pytest.mark.parametrize(
+    "values, full, sure",
+    [
+        (np.linspace(0, 0.99, 500), 1.0, True),
+        (np.arange(256.0), 255.0, True),
+        (np.arange(120.0), 255.0, False),
+        (np.arange(30.0), 255.0, False),
+        (np.linspace(0, 99.5, 999), 100.0, True),
+        (np.arange(60000.0), 65535.0, True),
+    ],
+)
 def test_intensity_scale(values, full, sure):
     scan = replace_intensity(change_scans(None)[0], values)
     found = measure_intensity([scan])

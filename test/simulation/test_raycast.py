@@ -67,14 +67,14 @@ def test_hits_equal_slow_reference(seed, motion):
         assert np.allclose(hits.range, nearest, rtol=1e-9)
         assert np.array_equal(hits.solid, solid)
         assert np.array_equal(hits.owner, np.where(solid < 0, 0, made.owner[solid]))
-        assert {k: n for k, n in enumerate(hits.reached) if n} == {
-            k: n for k, n in reached.items() if n}
+        assert {k: n for k, n in enumerate(hits.reached) if n} == {k: n for k, n in reached.items() if n}
 
 
 def leafy(seed):
     made, rng = crowd(seed), np.random.default_rng(seed)
-    return replace(made, density=np.where(rng.random(60) < 0.4, 1.0, np.inf),
-                   transmission=np.where(rng.random(60) < 0.3, 0.5, 0.0))
+    return replace(
+        made, density=np.where(rng.random(60) < 0.4, 1.0, np.inf), transmission=np.where(rng.random(60) < 0.3, 0.5, 0.0)
+    )
 
 
 def test_hits_depend_on_seed_only():
@@ -93,10 +93,13 @@ def test_nearest_of_single_casts_equals_joint_cast(motion):
     count, rng = 160, np.random.default_rng(0)
     made = crowd(5, count)
     far = np.linalg.norm(made.centre[:, :2], axis=1)[:, None]
-    made = replace(made, centre=made.centre * (5 + 0.3 * far) / far - [0, 0, 1],
-                   half=0.6 * made.half,
-                   density=np.where(rng.random(count) < 0.3, 1.0, np.inf),
-                   owner=np.where(rng.random(count) < 0.7, 0, made.owner).astype(np.int32))
+    made = replace(
+        made,
+        centre=made.centre * (5 + 0.3 * far) / far - [0, 0, 1],
+        half=0.6 * made.half,
+        density=np.where(rng.random(count) < 0.3, 1.0, np.inf),
+        owner=np.where(rng.random(count) < 0.7, 0, made.owner).astype(np.int32),
+    )
     ground = FULL._replace(rough=0.8, litter=0.6, camber=0.03, curb_left=3.0, curb_right=-2.0)
     hits = cast_rays(made, ground, OVER_ROAD, SENSOR, motion)
     nearest = cast_rays(made.take(np.arange(0)), ground, OVER_ROAD, SENSOR, motion)._asdict()
@@ -117,8 +120,9 @@ def test_wall_is_flat_only_after_compensation():
     wall = solids(BOX, (10, 0, 0), (1, 40, 8))
     exact = replace(SENSOR, range_noise=0.0, dropout=0.0)
     hits = cast_rays(wall, Ground(), NO_GROUND, exact, DRIVE)
-    flat, raw = (make_returns(hits, exact, DRIVE, np.random.default_rng(0), compensated)
-                 for compensated in (True, False))
+    flat, raw = (
+        make_returns(hits, exact, DRIVE, np.random.default_rng(0), compensated) for compensated in (True, False)
+    )
     assert len(flat.xyz) > 1000 and np.abs(flat.xyz[:, 0] - 9).max() < 1e-5
     assert np.ptp(raw.xyz[:, 0]) > 0.1
     still = cast_rays(wall, Ground(), NO_GROUND, exact)
@@ -153,8 +157,10 @@ def test_leaf_clumps_are_constant_during_drive():
 @pytest.mark.parametrize("kind", [BOX, ELLIPSOID, CYLINDER])
 def test_foliage_stops_rays_after_mean_free_path(kind, even_leaves):
     fine = make_generic_sensor(32, -8.0, 8.0, 0.2, 10.0, divergence=0.0)
-    thin, thick = (cast_rays(solids(kind, (12, 0, 0), (3, 3, 3), density=density), Ground(),
-                             NO_GROUND, fine, seed=5) for density in (np.inf, 0.7))
+    thin, thick = (
+        cast_rays(solids(kind, (12, 0, 0), (3, 3, 3), density=density), Ground(), NO_GROUND, fine, seed=5)
+        for density in (np.inf, 0.7)
+    )
     shell = np.isfinite(thin.range)
     path = thick.range[shell] - thin.range[shell]
     assert shell.sum() > 1000 and (path > 0).all()
@@ -167,15 +173,16 @@ def test_foliage_stops_rays_after_mean_free_path(kind, even_leaves):
 
 
 def test_rays_from_inside_are_stopped_only_by_foliage(even_leaves):
-    inside = [cast_rays(solids(ELLIPSOID, (0.5, 0, 0), (4, 4, 4), density=density), Ground(),
-                        NO_GROUND, SENSOR).range for density in (np.inf, 1.0)]
+    inside = [
+        cast_rays(solids(ELLIPSOID, (0.5, 0, 0), (4, 4, 4), density=density), Ground(), NO_GROUND, SENSOR).range
+        for density in (np.inf, 1.0)
+    ]
     assert not np.isfinite(inside[0]).any()
     assert abs((inside[1] < 1).mean() - (1 - np.exp(-1))) < 0.03 and inside[1].min() > 0
 
 
 def test_glass_passes_its_share_of_rays():
-    panes = solids([BOX, BOX], [(8, 0, 0), (12, 0, 0)], (0.01, 3, 2), [1, 2],
-                   transmission=0.7)
+    panes = solids([BOX, BOX], [(8, 0, 0), (12, 0, 0)], (0.01, 3, 2), [1, 2], transmission=0.7)
     panes = replace(panes, transmission=np.array([0.7, 0.0]))
     fine = make_generic_sensor(32, -5.0, 5.0, 0.1, 10.0, divergence=0.0)
     hits = cast_rays(panes, Ground(), NO_GROUND, fine)
@@ -208,8 +215,7 @@ def test_edge_beams_return_from_between_or_one_side():
     assert 0.9 < unchanged[exact.owner > 0].mean() < 1
     x = (fine.directions() * np.where(np.isfinite(beams.range), beams.range, 0)[..., None])[..., 0]
     assert (np.abs(x[beams.owner == 1] - 4.8) < 0.01).all()  # an owner's points are on it
-    apart = cast_rays(replace(made, centre=made.centre + [[0, 0, 0], [3, 0, 0]]), Ground(),
-                      NO_GROUND, fine)
+    apart = cast_rays(replace(made, centre=made.centre + [[0, 0, 0], [3, 0, 0]]), Ground(), NO_GROUND, fine)
     assert (apart.owner[np.isfinite(apart.range)] > 0).all()  # too far apart to mix
     assert np.array_equal(beams.reached, exact.reached)
 

@@ -41,9 +41,13 @@ def transform_points(xyz, pose):
     return xyz @ pose[:3, :3].T + pose[:3, 3]
 
 
-@pytest.mark.parametrize("scenes, seed, moment, points, metres, labels", [
-    (Scenes(), 1, 0, 2575, 40385.126304, 129.929893373),
-    (Scenes("zone", 3.0), 5, 60, 2529, 45604.297402, 803.007722902)])
+@pytest.mark.parametrize(
+    "scenes, seed, moment, points, metres, labels",
+    [
+        (Scenes(), 1, 0, 2575, 40385.126304, 129.929893373),
+        (Scenes("zone", 3.0), 5, 60, 2529, 45604.297402, 803.007722902),
+    ],
+)
 def test_seed_gives_known_scene(scenes, seed, moment, points, metres, labels):
     """Update the values when things are changed on purpose."""
     scan = simulate_scan(seed, moment, TINY, scenes)
@@ -59,10 +63,8 @@ def test_trajectory_derivatives_are_exact():
         way = draw_trajectory(np.random.default_rng(seed), (0.5, 1.5), 0.2, 0.7)
         for t in (0.0, 3.3, 19.0):
             before, now, after = (way.at(t + d) for d in (-h, 0.0, h))
-            assert np.allclose(np.subtract(after[:2], before[:2]) / (2 * h), now.velocity,
-                               atol=1e-6)
-            assert (after.heading - before.heading) / (2 * h) == pytest.approx(now.yaw_rate,
-                                                                               abs=1e-6)
+            assert np.allclose(np.subtract(after[:2], before[:2]) / (2 * h), now.velocity, atol=1e-6)
+            assert (after.heading - before.heading) / (2 * h) == pytest.approx(now.yaw_rate, abs=1e-6)
             assert abs(now.heading) < 0.71 and np.hypot(*now.velocity) < 1.5 / np.cos(0.7)
             assert np.allclose(np.tan(now.heading) * now.velocity[0], now.velocity[1])
     assert way.sampled(20.0, 0.1).shape == (201, 3)
@@ -94,8 +96,7 @@ def test_points_and_boxes_agree_with_world(scene, kind):
     made = replace(made, ground=made.ground._replace(rough=0.0, litter=0.0))
     for t in (0.0, 7.3):
         moment, pose = made.at(t, 0.6), made.sensor_pose(t, 0.6)
-        hits = cast_rays(moment.solids, made.ground, moment.position, EXACT, moment.motion, 1,
-                         moment.heading)
+        hits = cast_rays(moment.solids, made.ground, moment.position, EXACT, moment.motion, 1, moment.heading)
         got = make_returns(hits, EXACT, moment.motion, np.random.default_rng(0))
         world = transform_points(got.xyz.astype(float), pose)
         ground = np.isin(got.semantic, GROUND) & (got.owner == 0)
@@ -136,10 +137,8 @@ def test_mixed_scenes_alternate():
 @pytest.mark.parametrize("kind", SCENE_TYPES["indoor"].kinds)
 def test_setup_finds_the_height_indoors(kind):
     sensor = replace(find_sensor("vlp-16", 0.6), azimuth_step=float(np.radians(0.8)))
-    frames = [simulate_scan(7, i, sensor, Scenes(kind, 1.0, "indoor")).frame
-              for i in (0, 1, 90, 91)]
-    clouds = [from_array(to_point_array(frame), header(bag_message, frame.stamp_ns), bag_message)
-              for frame in frames]
+    frames = [simulate_scan(7, i, sensor, Scenes(kind, 1.0, "indoor")).frame for i in (0, 1, 90, 91)]
+    clouds = [from_array(to_point_array(frame), header(bag_message, frame.stamp_ns), bag_message) for frame in frames]
     mount = measure_mount([read_scan(cloud) for cloud in clouds])
     assert mount.height == pytest.approx(0.6, abs=0.02)
     assert np.degrees([mount.roll, mount.pitch]) == pytest.approx([0.0, 0.0], abs=0.2)
@@ -148,10 +147,28 @@ def test_setup_finds_the_height_indoors(kind):
 @pytest.mark.parametrize("layout", ["mcap", "kitti-tracking", "semantickitti"])
 def test_command_writes_every_layout_for_robots(layout, tmp_path):
     out = tmp_path / "drive"
-    result = CliRunner().invoke(simulate, [
-        "--scene", "campus", "--kind", "path", "--sensor", "generic:16,-15,15,2,10",
-        "--mount-height", "0.6", "--format", layout, "--frames", "2", "--jobs", "1", "--out",
-        str(out)], catch_exceptions=False)
+    result = CliRunner().invoke(
+        simulate,
+        [
+            "--scene",
+            "campus",
+            "--kind",
+            "path",
+            "--sensor",
+            "generic:16,-15,15,2,10",
+            "--mount-height",
+            "0.6",
+            "--format",
+            layout,
+            "--frames",
+            "2",
+            "--jobs",
+            "1",
+            "--out",
+            str(out),
+        ],
+        catch_exceptions=False,
+    )
     assert result.exit_code == 0
     first, second = open_recording(out)
     assert len(first.load()) > 500
@@ -160,16 +177,39 @@ def test_command_writes_every_layout_for_robots(layout, tmp_path):
         assert 0.0 <= np.linalg.norm(apart[:3, 3]) < 0.3
     if layout == "semantickitti":
         classes = set(np.unique(first.point_truth().classes))
-        assert classes & set(GROUND) and classes <= {1, 10, 11, 13, 15, 16, 18, 20, 30, 31, 50,
-                                                     51, 70, 71, 80, 81, 99, *GROUND, *MOVING}
+        assert classes & set(GROUND) and classes <= {
+            1,
+            10,
+            11,
+            13,
+            15,
+            16,
+            18,
+            20,
+            30,
+            31,
+            50,
+            51,
+            70,
+            71,
+            80,
+            81,
+            99,
+            *GROUND,
+            *MOVING,
+        }
 
 
-@pytest.mark.parametrize("scenes, message", [
-    (Scenes(scene="moon"), "unknown scene 'moon': must be one of street, campus, indoor"),
-    (Scenes("zone", 1.0, "campus"), "kind = 'zone' must be one of forecourt, square, path"),
-    (Scenes("city", 1.0, "street,campus"), "kind = 'city' must be one of forecourt, square, path"),
-    (Scenes(people=np.nan), "people = nan must be 0 .. 100"),
-    (Scenes(people=1e25), "people = 1e.25 must be 0 .. 100")])
+@pytest.mark.parametrize(
+    "scenes, message",
+    [
+        (Scenes(scene="moon"), "unknown scene 'moon': must be one of street, campus, indoor"),
+        (Scenes("zone", 1.0, "campus"), "kind = 'zone' must be one of forecourt, square, path"),
+        (Scenes("city", 1.0, "street,campus"), "kind = 'city' must be one of forecourt, square, path"),
+        (Scenes(people=np.nan), "people = nan must be 0 .. 100"),
+        (Scenes(people=1e25), "people = 1e.25 must be 0 .. 100"),
+    ],
+)
 def test_unknown_scenes_are_named(scenes, message):
     with pytest.raises(InputError, match=message):
         next(simulate_frames(0, 1, TINY, 1, scenes))

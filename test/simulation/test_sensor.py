@@ -29,15 +29,21 @@ SMALL = make_generic_sensor(8, -10.0, 4.0, 0.5, 10.0)
 def hits(sensor, distance, brightness=0.3, cosine=1.0):
     """Return hits of every ray at a distance and brightness; arrays or numbers."""
     shape = sensor.columns, sensor.rings
-    return Hits(np.broadcast_to(np.asarray(distance, float), shape),
-                np.broadcast_to(np.asarray(brightness, float), shape),
-                np.broadcast_to(cosine, shape), np.ones(shape, np.int32),
-                np.full(shape, 10, np.uint16), np.zeros(shape, np.int32), np.array([0, 1]))
+    return Hits(
+        np.broadcast_to(np.asarray(distance, float), shape),
+        np.broadcast_to(np.asarray(brightness, float), shape),
+        np.broadcast_to(cosine, shape),
+        np.ones(shape, np.int32),
+        np.full(shape, 10, np.uint16),
+        np.zeros(shape, np.int32),
+        np.array([0, 1]),
+    )
 
 
 def measured(sensor, distance, brightness=0.3, motion=NO_MOTION, seed=0, cosine=1.0, **flags):
-    return make_returns(hits(sensor, distance, brightness, cosine), sensor, motion,
-                        np.random.default_rng(seed), **flags)
+    return make_returns(
+        hits(sensor, distance, brightness, cosine), sensor, motion, np.random.default_rng(seed), **flags
+    )
 
 
 @pytest.mark.parametrize("name", SENSOR_NAMES)
@@ -48,8 +54,7 @@ def test_presets_are_sensible(name):
     assert np.allclose(np.linalg.norm(direction, axis=2), 1)
     assert np.allclose(direction[0, :, 1], 0) and (direction[0, :, 0] > 0).all()
     assert (np.diff(direction[..., 2], axis=1) < 0).all()
-    assert name.endswith(str(sensor.rings)) or name in ("hdl-64e", "hdl-32e", "vlp-32c", "pandar64",
-                                                        "livox-mid360")
+    assert name.endswith(str(sensor.rings)) or name in ("hdl-64e", "hdl-32e", "vlp-32c", "pandar64", "livox-mid360")
     times = sensor.times()
     assert times.min() == 0 and times.max() < 1 / sensor.rate
     assert len(np.unique(times)) == sensor.columns
@@ -60,18 +65,33 @@ def test_hdl64e_agrees_with_kitti():
     assert abs(np.degrees(HDL64E.azimuth_step) - 0.168) < 1e-3
 
 
-@pytest.mark.parametrize("change, named", [
-    ({"elevations": ()}, "elevations"), ({"elevations": (0.1, 0.2)}, "elevations"),
-    ({"elevations": tuple(np.linspace(1, -1, 70_000)), "azimuth_step": 1.5}, "65536 beams"),
-    ({"elevations": (2.0,)}, "elevations"), ({"elevations": (np.nan,)}, "elevations"),
-    ({"lifts": (0.1,)}, "lifts"), ({"biases": (0.1,)}, "biases"), ({"offsets": (0.1,)}, "offsets"),
-    ({"azimuth_step": 0.0}, "azimuth_step"), ({"azimuth_step": np.nan}, "azimuth_step"),
-    ({"height": 0.0}, "height"), ({"max_range": 0.5}, "max_range"),
-    ({"min_range": -1}, "max_range"),
-    ({"rate": 0.0}, "rate"), ({"reach": 0.0}, "reach"), ({"dropout": 1.5}, "dropout"),
-    ({"range_noise": -0.1}, "range_noise"), ({"divergence": np.inf}, "divergence"),
-    ({"wander": -0.1}, "wander"), ({"wander": 1.5}, "wander"),
-    ({"pulse": -1.0}, "pulse"), ({"fade": (np.nan, 0)}, "fade")])
+@pytest.mark.parametrize(
+    "change, named",
+    [
+        ({"elevations": ()}, "elevations"),
+        ({"elevations": (0.1, 0.2)}, "elevations"),
+        ({"elevations": tuple(np.linspace(1, -1, 70_000)), "azimuth_step": 1.5}, "65536 beams"),
+        ({"elevations": (2.0,)}, "elevations"),
+        ({"elevations": (np.nan,)}, "elevations"),
+        ({"lifts": (0.1,)}, "lifts"),
+        ({"biases": (0.1,)}, "biases"),
+        ({"offsets": (0.1,)}, "offsets"),
+        ({"azimuth_step": 0.0}, "azimuth_step"),
+        ({"azimuth_step": np.nan}, "azimuth_step"),
+        ({"height": 0.0}, "height"),
+        ({"max_range": 0.5}, "max_range"),
+        ({"min_range": -1}, "max_range"),
+        ({"rate": 0.0}, "rate"),
+        ({"reach": 0.0}, "reach"),
+        ({"dropout": 1.5}, "dropout"),
+        ({"range_noise": -0.1}, "range_noise"),
+        ({"divergence": np.inf}, "divergence"),
+        ({"wander": -0.1}, "wander"),
+        ({"wander": 1.5}, "wander"),
+        ({"pulse": -1.0}, "pulse"),
+        ({"fade": (np.nan, 0)}, "fade"),
+    ],
+)
 def test_impossible_sensors_are_refused(change, named):
     with pytest.raises(InputError, match=named) as error:
         replace(SMALL, **change)
@@ -93,31 +113,49 @@ def test_names_are_found_in_any_spelling():
 
 def test_file_in_degrees_gives_sensor_in_radians(tmp_path):
     path = tmp_path / "mine.yaml"
-    path.write_text("name: mine\nelevations: [4, 0, -10.5]\nazimuth_step: 0.5\nrate: 10\n"
-                    "divergence: 0.2\nfade: [10, 0.1]\nblocked:\n- [1, 350, 10]\nwander: 2\n")
-    assert load_sensor(path) == find_sensor(str(path)) == Sensor(
-        tuple(np.radians([4.0, 0.0, -10.5])), np.radians(0.5), rate=10.0,
-        divergence=np.radians(0.2), fade=(10.0, 0.1), blocked=((1, 350.0, 10.0),),
-        wander=np.radians(2.0))
+    path.write_text(
+        "name: mine\nelevations: [4, 0, -10.5]\nazimuth_step: 0.5\nrate: 10\n"
+        "divergence: 0.2\nfade: [10, 0.1]\nblocked:\n- [1, 350, 10]\nwander: 2\n"
+    )
+    assert (
+        load_sensor(path)
+        == find_sensor(str(path))
+        == Sensor(
+            tuple(np.radians([4.0, 0.0, -10.5])),
+            np.radians(0.5),
+            rate=10.0,
+            divergence=np.radians(0.2),
+            fade=(10.0, 0.1),
+            blocked=((1, 350.0, 10.0),),
+            wander=np.radians(2.0),
+        )
+    )
 
 
-@pytest.mark.parametrize("text, named", [
-    ("[1, 2", "not YAML"), ("rate: 2024-13-45", "not YAML"), ("rate: " + "1" * 5000, "not YAML"),
-    ("- 1", "describes no sensor"), ("azimuth_step: 1", "elevations"),
-    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nbeams: 3", "no 'beams'; known are"),
-    ("elevations: 3\nazimuth_step: 1\nrate: 10", "elevations = 3 must be a list of numbers"),
-    ("elevations: [1]\nazimuth_step: yes\nrate: 10", "azimuth_step = True must be a number"),
-    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nfade: [1]", "fade"),
-    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [1, 2, 3]", "blocked"),
-    ("elevations: [a]\nazimuth_step: 1\nrate: 10", "elevations"),
-    ("elevations: [1, 2]\nazimuth_step: 1\nrate: 10", "descend"),
-    ("elevations: [1]\nazimuth_step: 0\nrate: 10", "azimuth_step"),
-    ("elevations: [1]\nazimuth_step: 1\nrate: .inf", "rate"),
-    ("elevations: [1]\nazimuth_step: 1\nrate: 1" + "0" * 400, "rate"),
-    ("elevations: " + "[" * 5000 + "]" * 5000 + "\nazimuth_step: 1\nrate: 10", "elevations"),
-    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nfade: []", "fade"),
-    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [[.inf, 0, 10]]", "blocked"),
-    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [[0.5, 0, 10]]", "blocked")])
+@pytest.mark.parametrize(
+    "text, named",
+    [
+        ("[1, 2", "not YAML"),
+        ("rate: 2024-13-45", "not YAML"),
+        ("rate: " + "1" * 5000, "not YAML"),
+        ("- 1", "describes no sensor"),
+        ("azimuth_step: 1", "elevations"),
+        ("elevations: [1]\nazimuth_step: 1\nrate: 10\nbeams: 3", "no 'beams'; known are"),
+        ("elevations: 3\nazimuth_step: 1\nrate: 10", "elevations = 3 must be a list of numbers"),
+        ("elevations: [1]\nazimuth_step: yes\nrate: 10", "azimuth_step = True must be a number"),
+        ("elevations: [1]\nazimuth_step: 1\nrate: 10\nfade: [1]", "fade"),
+        ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [1, 2, 3]", "blocked"),
+        ("elevations: [a]\nazimuth_step: 1\nrate: 10", "elevations"),
+        ("elevations: [1, 2]\nazimuth_step: 1\nrate: 10", "descend"),
+        ("elevations: [1]\nazimuth_step: 0\nrate: 10", "azimuth_step"),
+        ("elevations: [1]\nazimuth_step: 1\nrate: .inf", "rate"),
+        ("elevations: [1]\nazimuth_step: 1\nrate: 1" + "0" * 400, "rate"),
+        ("elevations: " + "[" * 5000 + "]" * 5000 + "\nazimuth_step: 1\nrate: 10", "elevations"),
+        ("elevations: [1]\nazimuth_step: 1\nrate: 10\nfade: []", "fade"),
+        ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [[.inf, 0, 10]]", "blocked"),
+        ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [[0.5, 0, 10]]", "blocked"),
+    ],
+)
 def test_bad_sensor_file_is_named_with_reason(tmp_path, text, named):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
@@ -155,8 +193,13 @@ def test_returns_have_documented_properties():
     n = len(found.xyz)
     assert n > 1000
     assert [(f.shape, f.dtype) for f in found] == [
-        ((n, 3), np.float32), ((n,), np.float32), ((n,), np.int32), ((n,), np.uint16),
-        ((n,), np.uint16), ((n,), np.float32)]
+        ((n, 3), np.float32),
+        ((n,), np.float32),
+        ((n,), np.int32),
+        ((n,), np.uint16),
+        ((n,), np.uint16),
+        ((n,), np.float32),
+    ]
     reach = np.linalg.norm(found.xyz - [0, 0, 0.16], axis=1)
     assert reach.min() > sensor.min_range - 0.06 and reach.max() < sensor.max_range + 0.06
     assert found.intensity.min() >= 0 and found.intensity.max() <= 1
@@ -191,8 +234,11 @@ def test_offsets_shift_ranges_per_beam():
 
 def test_far_and_dark_returns_are_lost():
     open_sensor = replace(SMALL, dropout=0.0)
-    share = {(r, b): len(measured(open_sensor, r, b).xyz) / SMALL.columns / SMALL.rings
-             for r in (5, 25, 50, 100) for b in (0.03, 0.1, 0.4, 0.9)}
+    share = {
+        (r, b): len(measured(open_sensor, r, b).xyz) / SMALL.columns / SMALL.rings
+        for r in (5, 25, 50, 100)
+        for b in (0.03, 0.1, 0.4, 0.9)
+    }
     for b in (0.03, 0.1, 0.4, 0.9):
         assert share[5, b] >= share[25, b] >= share[50, b] >= share[100, b]
     for r in (5, 25, 50, 100):
@@ -253,20 +299,33 @@ def test_vehicle_blocks_its_sectors():
     assert isinstance(sensor, Sensor) and len(found.xyz) == sensor.open_rays().sum()
 
 
-@pytest.mark.parametrize("start, end, degrees", [
-    (0, 360, 360), (-180, 180, 360), (-10, 370, 360), (350, 10, 20), (-10, 10, 20), (10, 10, 0)])
+@pytest.mark.parametrize(
+    "start, end, degrees", [(0, 360, 360), (-180, 180, 360), (-10, 370, 360), (350, 10, 20), (-10, 10, 20), (10, 10, 0)]
+)
 def test_blocked_sector_may_be_whole_turn(start, end, degrees):
     shut = ~replace(SMALL, blocked=((4, start, end),)).open_rays()
     assert (shut[:, 4:].sum(axis=0) == 2 * degrees).all() and not shut[:, :4].any()
 
 
-@pytest.mark.parametrize("name", ["generic:", "generic:32", "generic:64,-24,2,1e-9,10",
-                                  "generic:64,-24,2,1e-320,10", "generic:1e12,-24,2,0.2,10",
-                                  "generic:inf,-24,2,0.2,10", "generic:1000000,-24,2,1,10",
-                                  "generic:70000,-24,2,90,10", "generic:32.5,-24,2,1,10",
-                                  "generic:a,b,c,d,e",
-                                  "generic:32,-25,15,0.2,10,3", "generic:32,15,-25,0.2,10",
-                                  "generic:0,-25,15,0.2,10", "generic:nan,-25,15,0.2,10"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "generic:",
+        "generic:32",
+        "generic:64,-24,2,1e-9,10",
+        "generic:64,-24,2,1e-320,10",
+        "generic:1e12,-24,2,0.2,10",
+        "generic:inf,-24,2,0.2,10",
+        "generic:1000000,-24,2,1,10",
+        "generic:70000,-24,2,90,10",
+        "generic:32.5,-24,2,1,10",
+        "generic:a,b,c,d,e",
+        "generic:32,-25,15,0.2,10,3",
+        "generic:32,15,-25,0.2,10",
+        "generic:0,-25,15,0.2,10",
+        "generic:nan,-25,15,0.2,10",
+    ],
+)
 def test_bad_generic_sensor_is_refused_in_one_line(name):
     with pytest.raises(InputError) as error:
         find_sensor(name)

@@ -44,14 +44,14 @@ def invoke(options):
 
 def test_data_set_records_its_settings(made):
     record = json.loads((made / "semantickitti/dataset.json").read_text())
-    assert record.items() >= {"format": "semantickitti", "sensor": "tiny", "seed": 3, "frames": 5,
-                              "streets_of": 2}.items()
+    assert (
+        record.items() >= {"format": "semantickitti", "sensor": "tiny", "seed": 3, "frames": 5, "streets_of": 2}.items()
+    )
     assert "simulate" in record["command"] and record["version"]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_failed_data_set_is_marked_and_resumed(made, tmp_path, monkeypatch,
-                                               layout):
+def test_failed_data_set_is_marked_and_resumed(made, tmp_path, monkeypatch, layout):
     out, calls = tmp_path / "set", itertools.count()
 
     def fails(*args):
@@ -82,12 +82,16 @@ def start():
 
     def begin(out, frames, *more):
         process = subprocess.Popen(
-            [sys.executable, "-c", SCRIPT, "simulate",
-             *arguments(out, "kitti-tracking", frames, 2, *more)],
-            cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, start_new_session=True,
-            text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            [sys.executable, "-c", SCRIPT, "simulate", *arguments(out, "kitti-tracking", frames, 2, *more)],
+            cwd=ROOT,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            start_new_session=True,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             # Background processes of a shell ignore SIGINT.
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
         groups.append(process.pid)
         while len(list(out.glob(".parts/*.json"))) < 3:
             assert process.poll() is None, process.stderr.read()
@@ -196,8 +200,22 @@ def test_recorded_command_reproduces_data_set(tmp_path):
     sensor = tmp_path / "my sensor.yaml"
     sensor.write_text("elevations: [2, -8]\nazimuth_step: 5\nrate: 10\nheight: 12.3456789\n")
     made, again = tmp_path / "made", tmp_path / "again"
-    invoke(["--out", str(made), "--format", "kitti", "--sensor", str(sensor), "--frames", "1",
-            "--jobs", "1", "--people", "1.23456789"])
+    invoke(
+        [
+            "--out",
+            str(made),
+            "--format",
+            "kitti",
+            "--sensor",
+            str(sensor),
+            "--frames",
+            "1",
+            "--jobs",
+            "1",
+            "--people",
+            "1.23456789",
+        ]
+    )
     command = json.loads((made / "dataset.json").read_text())["command"]
     program, name, *options = shlex.split(command)
     assert (program, name) == ("lidar-perception", "simulate")
@@ -208,8 +226,7 @@ def test_recorded_command_reproduces_data_set(tmp_path):
 def test_other_sensor_of_same_name_is_not_resumed(tmp_path):
     sensor, out = tmp_path / "mine.yaml", tmp_path / "set"
     sensor.write_text("elevations: [2, -8]\nazimuth_step: 5\nrate: 10\n")
-    options = ["--out", str(out), "--format", "kitti", "--sensor", str(sensor), "--frames", "1",
-               "--jobs", "1"]
+    options = ["--out", str(out), "--format", "kitti", "--sensor", str(sensor), "--frames", "1", "--jobs", "1"]
     invoke(options)
     assert "nothing to do" in invoke([*options, "--resume"]).output
     sensor.write_text("elevations: [2, -9]\nazimuth_step: 5\nrate: 10\n")
@@ -231,12 +248,20 @@ def test_resume_names_every_difference(tmp_path, monkeypatch):
     assert run(out, "kitti", 2, 1, "--force").exit_code == 0
 
 
-@pytest.mark.parametrize("options, message", [
-    (["--sensor", "hdl65"], "unknown sensor 'hdl65': must be one of hdl-32e"),
-    (["--format", "pcap"], "pcap"), (["--frames", "0"], "0 is not in the range"),
-    (["--seed", "-1"], "-1 is not in the range"), (["--people", "nan"], "people = nan"),
-    (["--people", "101"], "101.0 is not in the range"), (["--streets-of", "201"], "1 .. 200"),
-    (["--resume", "--force"], "one of them"), (["--format", "mcap", "--resume"], "with 'convert'")])
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (["--sensor", "hdl65"], "unknown sensor 'hdl65': must be one of hdl-32e"),
+        (["--format", "pcap"], "pcap"),
+        (["--frames", "0"], "0 is not in the range"),
+        (["--seed", "-1"], "-1 is not in the range"),
+        (["--people", "nan"], "people = nan"),
+        (["--people", "101"], "101.0 is not in the range"),
+        (["--streets-of", "201"], "1 .. 200"),
+        (["--resume", "--force"], "one of them"),
+        (["--format", "mcap", "--resume"], "with 'convert'"),
+    ],
+)
 def test_bad_arguments_are_named(tmp_path, options, message):
     arguments = ["--out", str(tmp_path / "set"), "--format", "kitti", *options]
     result = CliRunner().invoke(simulate, arguments)

@@ -1,6 +1,5 @@
 """Simulated data sets: documented properties of scans, and reading from every layout."""
 
-
 import numpy as np
 import pytest
 from simulate_samples import TINY, run
@@ -16,8 +15,10 @@ from lidar_perception.simulation.scene import CROWDED_ZONES
 from lidar_perception.simulation.sensor import SENSORS
 from lidar_perception.types import SENSOR_HEIGHT
 
-pytestmark = [pytest.mark.no_cover,  # others run these lines
-              pytest.mark.usefixtures("streets", "tiny_sensor")]
+pytestmark = [
+    pytest.mark.no_cover,  # others run these lines
+    pytest.mark.usefixtures("streets", "tiny_sensor"),
+]
 
 
 def test_single_scan_equals_scan_of_drive():
@@ -80,15 +81,13 @@ def test_hidden_objects_become_dont_care():
 
 def test_tracking_layout_reads_back(made):
     frames = open_recording(made / "kitti-tracking").frames
-    assert [f.name for f in frames] == ["0000/000000", "0000/000001", "0001/000000", "0001/000001",
-                                        "0002/000000"]
+    assert [f.name for f in frames] == ["0000/000000", "0000/000001", "0001/000000", "0001/000001", "0002/000000"]
     for number, recorded in enumerate(open_recording(made / "kitti-tracking")):
         scan = simulate_scan(3 + number // 2, number % 2, TINY)
         expected = make_kitti_labels(scan.truth)
         truth = recorded.truth()
         assert_same_objects(truth, expected, 6e-7, truncation=0.26)
-        assert ([e["track_id"] for e in truth.extras]
-                == [e["track_id"] for e in expected.extras])
+        assert [e["track_id"] for e in truth.extras] == [e["track_id"] for e in expected.extras]
 
 
 def assert_same_objects(found, expected, accuracy, truncation=None):
@@ -110,8 +109,7 @@ def assert_same_objects(found, expected, accuracy, truncation=None):
 def test_semantickitti_layout_reads_back(made):
     root = made / "semantickitti"
     frames = open_recording(root).frames
-    assert [f.name for f in frames] == ["00/000000", "00/000001", "01/000000", "01/000001",
-                                        "02/000000"]
+    assert [f.name for f in frames] == ["00/000000", "00/000001", "01/000000", "01/000001", "02/000000"]
     for number, frame in enumerate(frames):
         scan = simulate_scan(3 + number // 2, number % 2, TINY)
         order = np.argsort(scan.ring, kind="stable")
@@ -122,10 +120,8 @@ def test_semantickitti_layout_reads_back(made):
         assert np.allclose(frame.pose(), scan.pose, atol=1e-9)  # inverts pose_line
     for sequence in range(2):
         folder = root / f"sequences/{sequence:02}"
-        calibration = dict(line.split(": ") for line in
-                           (folder / "calib.txt").read_text().splitlines())
-        to_camera = np.vstack([np.fromstring(calibration["Tr"], sep=" ").reshape(3, 4),
-                               [0, 0, 0, 1]])
+        calibration = dict(line.split(": ") for line in (folder / "calib.txt").read_text().splitlines())
+        to_camera = np.vstack([np.fromstring(calibration["Tr"], sep=" ").reshape(3, 4), [0, 0, 0, 1]])
         poses = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
         assert np.loadtxt(folder / "times.txt").tolist() == [0.0, 0.1]
         for moment, pose in enumerate(poses):  # as SemanticKITTI's own tools do
@@ -133,9 +129,10 @@ def test_semantickitti_layout_reads_back(made):
             assert np.allclose(pose, simulate_scan(3 + sequence, moment, TINY).pose, atol=1e-9)
 
 
-@pytest.mark.parametrize("layout, inner", [
-    ("kitti", "training/velodyne"), ("kitti-tracking", "training/velodyne/0000"),
-    ("semantickitti", "sequences/00")])
+@pytest.mark.parametrize(
+    "layout, inner",
+    [("kitti", "training/velodyne"), ("kitti-tracking", "training/velodyne/0000"), ("semantickitti", "sequences/00")],
+)
 def test_sensor_height_is_kept_in_every_layout(tmp_path, layout, inner):
     low = tmp_path / "low"
     assert run(low, layout, 2, 1, "--mount-height", 0.6).exit_code == 0
@@ -143,8 +140,13 @@ def test_sensor_height_is_kept_in_every_layout(tmp_path, layout, inner):
         recording = open_recording(path)
         assert recording.has_sensor_height and {frame.sensor_height for frame in recording} == {0.6}
     assert open_recording(low, sensor_height=1.0).frames[0].sensor_height == 1.0
-    for other in ("{", "[" * 10**4, '{"height": 480}',  # of another program
-                  '{"height": "1", "sensor_digest": ""}', '{"height": NaN, "sensor_digest": ""}'):
+    for other in (
+        "{",
+        "[" * 10**4,
+        '{"height": 480}',  # of another program
+        '{"height": "1", "sensor_digest": ""}',
+        '{"height": NaN, "sensor_digest": ""}',
+    ):
         (low / "dataset.json").write_text(other)
         assert open_recording(low).frames[0].sensor_height == SENSOR_HEIGHT
 
@@ -162,9 +164,15 @@ def test_bag_continues_with_next_street(tmp_path):
 
 def test_2d_boxes_contain_projected_corners():
     rng = np.random.default_rng(0)
-    boxes = np.column_stack([rng.uniform(-10, 60, 300), rng.uniform(-20, 20, 300),
-                             rng.uniform(-2, 1, 300), rng.uniform(0.3, 6, (300, 3)),
-                             rng.uniform(-4, 4, 300)])
+    boxes = np.column_stack(
+        [
+            rng.uniform(-10, 60, 300),
+            rng.uniform(-20, 20, 300),
+            rng.uniform(-2, 1, 300),
+            rng.uniform(0.3, 6, (300, 3)),
+            rng.uniform(-4, 4, 300),
+        ]
+    )
     found, outside = write_kitti.project_boxes(boxes, FORWARD_CAMERA)
     seen = np.isfinite(found[:, 0])
     assert 30 < seen.sum() < 250 and ((outside >= 0) & (outside <= 1)).all()
@@ -175,11 +183,10 @@ def test_2d_boxes_contain_projected_corners():
     pixels = corners[..., :2] / corners[..., 2:]
     inside = whole & ((pixels >= 0) & (pixels <= [1241, 374])).all(axis=(1, 2)) & seen
     assert inside.sum() > 10 and np.abs(outside[inside]).max() < 1e-9
-    assert np.allclose(found[inside], np.concatenate([pixels[inside].min(axis=1),
-                                                      pixels[inside].max(axis=1)], axis=1))
+    assert np.allclose(found[inside], np.concatenate([pixels[inside].min(axis=1), pixels[inside].max(axis=1)], axis=1))
     # Many points of a box that reaches behind the camera: none in the image is outside its 2D box.
     for box, limits in zip(boxes[~whole & seen], found[~whole & seen]):
-        inner = (rng.uniform(-0.5, 0.5, (4000, 3)) * box[3:6])
+        inner = rng.uniform(-0.5, 0.5, (4000, 3)) * box[3:6]
         cos, sin = np.cos(box[6]), np.sin(box[6])
         points = inner @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) + box[:3]
         p = points @ projection[:, :3].T + projection[:, 3]

@@ -35,8 +35,17 @@ def scan(seed, t, sensor=COARSE):
 
 def test_same_seed_same_bytes():
     def content(seed):
-        return [(s.frame.xyz.tobytes(), s.frame.intensity.tobytes(), s.frame.stamp_ns,
-                 s.truth.boxes.tobytes(), s.truth.extras) for s in simulate_drive(seed, 2, COARSE)]
+        return [
+            (
+                s.frame.xyz.tobytes(),
+                s.frame.intensity.tobytes(),
+                s.frame.stamp_ns,
+                s.truth.boxes.tobytes(),
+                s.truth.extras,
+            )
+            for s in simulate_drive(seed, 2, COARSE)
+        ]
+
     first = content(0)
     assert first == content(0)
     assert all(a[0] != b[0] for a, b in zip(first, content(1)))
@@ -53,8 +62,7 @@ def test_frames_have_documented_properties():
         assert reach.min() >= COARSE.min_range - 0.2 and reach.max() <= COARSE.max_range + 0.2
         assert frame.intensity.min() >= 0.0 and frame.intensity.max() <= 1.0
         assert np.hypot(*found.boxes[:, :2].T).max() <= 80.0
-        assert all(e["num_points"] > 0 and e["occluded"] in (0, 1, 2) and e["truncated"] == 0.0
-                   for e in found.extras)
+        assert all(e["num_points"] > 0 and e["occluded"] in (0, 1, 2) and e["truncated"] == 0.0 for e in found.extras)
         assert all(0.0 <= e["visible"] <= 1.0 for e in found.extras)
         tracks = [e["track_id"] for e in found.extras]
         assert len(set(tracks)) == len(tracks) and min(tracks) > 0
@@ -65,8 +73,7 @@ def test_frames_have_documented_properties():
 def test_points_of_object_are_in_its_box(seed, t):
     _, moment, hits, xyz, owner = scan(seed, t)
     semantic = make_returns(hits, COARSE, NO_MOTION, np.random.default_rng(0)).semantic
-    for box, track, speed, kind in zip(moment.boxes, moment.track_ids, moment.speeds,
-                                       moment.class_ids):
+    for box, track, speed, kind in zip(moment.boxes, moment.track_ids, moment.speeds, moment.class_ids):
         own = (owner == track) & (semantic != 99)  # 99: what a person carries
         # What only the rim of a beam meets is reported in the middle of the beam. A box is that at
         # the stamp, half a turn from some points. Mirrors and umbrellas stick out.
@@ -77,8 +84,7 @@ def test_points_of_object_are_in_its_box(seed, t):
         assert speed > 2 or outside.sum() <= 0.4 * own.sum()
     assert set(np.unique(owner)) <= {0, *moment.track_ids}
     found = label_scan(moment, hits, owner)
-    assert [e["num_points"] for e in found.extras] == [
-        (owner == e["track_id"]).sum() for e in found.extras]
+    assert [e["num_points"] for e in found.extras] == [(owner == e["track_id"]).sum() for e in found.extras]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -114,16 +120,19 @@ def test_scans_resemble_those_of_real_sensor():
         assert 95_000 < len(frame) < 135_000
         assert 0.15 < frame.intensity.mean() < 0.4
         labels |= set(found.labels)
-        density += [e["num_points"] * (box[0] ** 2 + box[1] ** 2)
-                    for box, label, e in zip(found.boxes, found.labels, found.extras)
-                    if label == "Pedestrian" and e["occluded"] == 0]
+        density += [
+            e["num_points"] * (box[0] ** 2 + box[1] ** 2)
+            for box, label, e in zip(found.boxes, found.labels, found.extras)
+            if label == "Pedestrian" and e["occluded"] == 0
+        ]
     assert 12_000 < np.median(density) < 45_000
     assert {"Car", "Pedestrian", "Cyclist"} <= labels <= set(CLASSES)
 
 
-@pytest.mark.parametrize("arguments, named", [
-    ({"frames": 0}, "frames = 0"), ({"frames": 10_000}, "frames = 10000"),
-    ({"seed": -1}, "seed = -1")])
+@pytest.mark.parametrize(
+    "arguments, named",
+    [({"frames": 0}, "frames = 0"), ({"frames": 10_000}, "frames = 10000"), ({"seed": -1}, "seed = -1")],
+)
 def test_bad_input_is_named_at_the_call(arguments, named):
     with pytest.raises(ValueError, match=named) as error:
         simulate_drive(**arguments)

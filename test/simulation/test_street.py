@@ -22,8 +22,7 @@ EVERY = [(kind, seed) for kind in STREET_KINDS for seed in SEEDS]
 SIGN = 81  # of SemanticKITTI
 TIMES = (0.0, 4.0, 8.0, 12.0, 16.0)
 HEIGHT = 1.73
-SITTING, CAR, PEDESTRIAN, CYCLIST = (
-    CLASSES.index(name) for name in ("Person_sitting", "Car", "Pedestrian", "Cyclist"))
+SITTING, CAR, PEDESTRIAN, CYCLIST = (CLASSES.index(name) for name in ("Person_sitting", "Car", "Pedestrian", "Cyclist"))
 make_cached_scene = cache(lambda kind, seed, people=1.0: make_scene(seed, kind, people))
 
 
@@ -59,8 +58,9 @@ def test_everything_is_on_ground(kind, seed):
     for actor in [a for a in scene.actors if not a.thing.label][::15]:
         m = replace(scene, actors=(actor,)).at(actor.x / max(scene.trajectory.speed, 0.1), HEIGHT)
         if len(m.solids):
-            foot = (m.solids.centre[:, 2] - np.abs(m.solids.axes[:, 2] * m.solids.half).sum(axis=1)
-                    ).min() + m.position[2]
+            foot = (m.solids.centre[:, 2] - np.abs(m.solids.axes[:, 2] * m.solids.half).sum(axis=1)).min() + m.position[
+                2
+            ]
             box = make_flat_boxes(actor.footprint[None], 0.0)
             under = surface_height(scene.ground, *box_corners(box)[0, :4, :2].T)
             assert under.min() - 1.5 < foot < under.min() + 0.12
@@ -93,8 +93,7 @@ def test_no_vehicle_is_close_to_ego_vehicle(kind, seed):
     scene = make_cached_scene(kind, seed)
     for t in (0.0, 10.0, 20.0):
         m = scene.at(t, HEIGHT)
-        lane = ((np.abs(m.boxes[:, 1]) < 1.0) & (np.abs(m.boxes[:, 6]) < 0.1)
-                & (m.class_ids < PEDESTRIAN))
+        lane = (np.abs(m.boxes[:, 1]) < 1.0) & (np.abs(m.boxes[:, 6]) < 0.1) & (m.class_ids < PEDESTRIAN)
         gap = np.abs(m.boxes[lane, 0]) - m.boxes[lane, 3] / 2 - 2.3
         assert (gap > 0.6 * scene.trajectory.speed).all()
 
@@ -114,8 +113,14 @@ def test_islands_are_at_crossings_and_off_lanes():
     found = 0
     for kind, seed in EVERY:
         scene = make_cached_scene(kind, seed)
-        middle = [a for a in scene.actors if not a.thing.label and a.speed == 0.0
-                  and 1.3 < a.y < 2.8 and (a.thing.parts(0.0)["semantic"] == SIGN).any()]
+        middle = [
+            a
+            for a in scene.actors
+            if not a.thing.label
+            and a.speed == 0.0
+            and 1.3 < a.y < 2.8
+            and (a.thing.parts(0.0)["semantic"] == SIGN).any()
+        ]
         edges = np.ravel(scene.ground.crossings)
         for actor in middle:
             found += 1
@@ -135,21 +140,23 @@ def test_streets_have_objects_that_kitti_labels():
         for seed in seeds:
             for t in TIMES:
                 m = make_cached_scene(kind, seed).at(t, HEIGHT)
-                seen = ((np.abs(np.arctan2(m.boxes[:, 1], m.boxes[:, 0])) < np.radians(40))
-                        & (np.hypot(*m.boxes[:, :2].T) < 30))
+                seen = (np.abs(np.arctan2(m.boxes[:, 1], m.boxes[:, 0])) < np.radians(40)) & (
+                    np.hypot(*m.boxes[:, :2].T) < 30
+                )
                 found[i] += np.bincount(m.class_ids[seen], minlength=len(CLASSES))
     mean = share @ found / (len(TIMES) * len(seeds))
     assert share.sum() == pytest.approx(1.0)
     assert 1.0 < mean[CAR] < 4.5
     assert 0.2 < mean[PEDESTRIAN] < 1.5
     assert 0.05 < mean[CYCLIST] < 0.6
-    assert (found.sum(axis=0)[:len(CLASSES) - 1] > 0).sum() >= 6
+    assert (found.sum(axis=0)[: len(CLASSES) - 1] > 0).sum() >= 6
 
 
 def test_people_option_scales_number_of_people():
     def people(factor):
         labels = [a.thing.label for a in make_cached_scene("residential", 0, factor).actors]
         return sum(label in ("Pedestrian", "Person_sitting", "Cyclist") for label in labels)
+
     assert people(0.0) == 0 < people(1.0) < people(4.0) / 2
 
 
@@ -162,9 +169,15 @@ def test_moment_without_objects_has_empty_arrays():
     assert m.class_ids.dtype == m.track_ids.dtype == np.int32
 
 
-@pytest.mark.parametrize("arguments, named", [
-    ({"seed": -1}, "seed = -1"), ({"people": -0.5}, "people = -0.5"),
-    ({"people": np.nan}, "people = nan"), ({"kind": "moon"}, "kind = 'moon' must be one of city")])
+@pytest.mark.parametrize(
+    "arguments, named",
+    [
+        ({"seed": -1}, "seed = -1"),
+        ({"people": -0.5}, "people = -0.5"),
+        ({"people": np.nan}, "people = nan"),
+        ({"kind": "moon"}, "kind = 'moon' must be one of city"),
+    ],
+)
 def test_impossible_arguments_are_named(arguments, named):
     with pytest.raises(InputError, match=named) as error:
         make_scene(**arguments)

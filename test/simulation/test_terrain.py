@@ -10,13 +10,7 @@ from raycast_samples import FULL, OVER_ROAD, SENSOR, crowd
 from experiments.realism.roughness import compute_roughness
 from lidar_perception.simulation.raycast import cast_rays
 from lidar_perception.simulation.sensor import HDL64E, make_rays
-from lidar_perception.simulation.terrain import (
-    Ground,
-    cast_ground,
-    surface_height,
-    to_compiled,
-    tuft_height,
-)
+from lidar_perception.simulation.terrain import Ground, cast_ground, surface_height, to_compiled, tuft_height
 
 pytestmark = pytest.mark.no_cover  # others run these lines
 
@@ -41,9 +35,9 @@ def cast_on_ground(ground, position=(3.0, 0.4), sensor=None):
     return at[met], hits.semantic[met], met, hits
 
 
-@pytest.mark.parametrize("ground", [
-    FULL, FULL._replace(crossings=()), FULL._replace(wave=0.0, camber=0.05),
-    Ground(0.02, -0.03, 0.1)])
+@pytest.mark.parametrize(
+    "ground", [FULL, FULL._replace(crossings=()), FULL._replace(wave=0.0, camber=0.05), Ground(0.02, -0.03, 0.1)]
+)
 def test_hit_is_on_surface_of_ground(ground):
     at, semantic, met, _ = cast_on_ground(ground)
     x, y, z = at.T
@@ -110,8 +104,7 @@ def test_grass_is_rough_and_hides_ground_behind():
 def march_to_tufts(ground, start, way):
     """Return the first range, in steps of 5 mm, at which a ray is below the tufts."""
     t = 0.0
-    while t < 30.0 and start[2] + t * way[2] >= tuft_height(ground, start[0] + t * way[0],
-                                                            start[1] + t * way[1], 0.0):
+    while t < 30.0 and start[2] + t * way[2] >= tuft_height(ground, start[0] + t * way[0], start[1] + t * way[1], 0.0):
         t += 0.005
     return t
 
@@ -122,8 +115,12 @@ def test_tuft_hits_equal_slow_march():
     yaw, down = rng.uniform(0.3, 2.8, 400), rng.uniform(0.06, 0.3, 400)
     ways = np.stack([np.cos(yaw) * np.cos(down), np.sin(yaw) * np.cos(down), -np.sin(down)], 1)
     ground, start = to_compiled(meadow), (0.0, 0.0, 1.7)
-    off = np.abs([cast_ground(ground, start, tuple(way), 60.0).range
-                  - march_to_tufts(ground, start, tuple(way)) for way in ways.tolist()])
+    off = np.abs(
+        [
+            cast_ground(ground, start, tuple(way), 60.0).range - march_to_tufts(ground, start, tuple(way))
+            for way in ways.tolist()
+        ]
+    )
     # Steps are longer than tufts are thick: some are missed, and few met too early.
     assert np.quantile(off, 0.5) < 0.1 and np.quantile(off, 0.9) < 0.5
 

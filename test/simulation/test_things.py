@@ -33,20 +33,36 @@ LABELLED = {
     "backpack": (partial(people.make_pedestrian, speed=1.2, carried="backpack"), 16),
     "sitting": (people.make_sitting_person, 18),
     "on bench": (partial(people.make_sitting_person, chair=False), 16),
-    "cyclist": (cyclists.make_cyclist, 20), "motorcyclist": (cyclists.make_motorcyclist, 24),
+    "cyclist": (cyclists.make_cyclist, 20),
+    "motorcyclist": (cyclists.make_motorcyclist, 24),
     "car": (vehicles.make_car, 34),
-    "parked": (partial(vehicles.make_car, driver=False), 34), "van": (vehicles.make_van, 34),
-    "truck": (heavy_vehicles.make_truck, 32), "bus": (heavy_vehicles.make_bus, 32),
-    "tram": (heavy_vehicles.make_tram, 32)}
+    "parked": (partial(vehicles.make_car, driver=False), 34),
+    "van": (vehicles.make_van, 34),
+    "truck": (heavy_vehicles.make_truck, 32),
+    "bus": (heavy_vehicles.make_bus, 32),
+    "tram": (heavy_vehicles.make_tram, 32),
+}
 SCENERY = {
-    **{f.__name__: (f, 8) for f in (
-        furniture.make_pole, furniture.make_lamp, *furniture.PERSON_SIZED, cyclists.make_bicycle,
-        cyclists.make_motorcycle, vegetation.make_tree, vegetation.make_conifer,
-        vegetation.make_bush)},
-    **{f.__name__: (partial(f, length=7.0), 8) for f in (
-        furniture.make_fence, furniture.make_wall, vegetation.make_hedge)},
+    **{
+        f.__name__: (f, 8)
+        for f in (
+            furniture.make_pole,
+            furniture.make_lamp,
+            *furniture.PERSON_SIZED,
+            cyclists.make_bicycle,
+            cyclists.make_motorcycle,
+            vegetation.make_tree,
+            vegetation.make_conifer,
+            vegetation.make_bush,
+        )
+    },
+    **{
+        f.__name__: (partial(f, length=7.0), 8)
+        for f in (furniture.make_fence, furniture.make_wall, vegetation.make_hedge)
+    },
     "building": (partial(buildings.make_building, length=15.0, depth=10.0, storeys=4), 40),
-    "cottage": (partial(buildings.make_building, length=6.0, depth=8.0, storeys=1), 40)}
+    "cottage": (partial(buildings.make_building, length=6.0, depth=8.0, storeys=1), 40),
+}
 SEMANTICS = {10, 11, 15, 16, 18, 20, 30, 31, 32, 50, 51, 70, 71, 80, 81, 99}
 
 
@@ -119,8 +135,11 @@ def test_foot_on_ground_does_not_slide():
         thing = people.make_pedestrian(np.random.default_rng(seed), 1.3)
         ways = np.linspace(0, find_stride(thing), 401)
         feet = np.array([thing.parts(x)[-2:] for x in ways])
-        tip = feet["centre"][..., 0] + feet["half"][..., 0] * np.cos(feet["pitch"]) + (
-            ways[:, None] - feet["half"][..., 2] * np.sin(feet["pitch"]))
+        tip = (
+            feet["centre"][..., 0]
+            + feet["half"][..., 0] * np.cos(feet["pitch"])
+            + (ways[:, None] - feet["half"][..., 2] * np.sin(feet["pitch"]))
+        )
         sole = np.array([compute_extents(f)[0][:, 2] for f in feet])
         stands = (sole[1:] < 1e-9) & (sole[:-1] < 1e-9)
         assert (stands.any(axis=1)).all()
@@ -149,8 +168,7 @@ def test_limbs_are_connected_and_keep_length():
 
 
 def test_faster_walkers_take_longer_steps():
-    lengths = [people.make_pedestrian(np.random.default_rng(1), speed).size[0]
-               for speed in (0.5, 0.8, 1.1, 1.4)]
+    lengths = [people.make_pedestrian(np.random.default_rng(1), speed).size[0] for speed in (0.5, 0.8, 1.1, 1.4)]
     assert (np.diff(lengths) > 0).all()
 
 
@@ -198,8 +216,7 @@ def scan_thing(thing, distance, yaw, seed):
     """Return the xyz that the HDL-64E sees of a thing at a distance ahead; z above its bottom."""
     made = thing.parts(0.4 * seed)
     base = np.tile([distance, 0.0, -1.73], (len(made), 1))
-    solids = place_parts(made, base, np.full(len(made), yaw), np.ones(len(made)),
-                         np.zeros((len(made), 3)))
+    solids = place_parts(made, base, np.full(len(made), yaw), np.ones(len(made)), np.zeros((len(made), 3)))
     hits = cast_rays(solids, Ground(), np.array([0.0, 0.0, 1e4]), HDL64E, NO_MOTION, seed)
     xyz = make_returns(hits, HDL64E, NO_MOTION, np.random.default_rng(seed)).xyz
     return xyz + np.array([0.0, 0.0, 1.73])
@@ -215,8 +232,7 @@ def test_low_share_of_cyclist_agrees_with_kitti():
     assert 0.40 < np.mean(shares) < 0.52
 
 
-@pytest.mark.parametrize("distance, low, high", [(20.0, 0.22, 0.32), (33.0, 0.20, 0.32),
-                                                 (48.0, 0.08, 0.25)])
+@pytest.mark.parametrize("distance, low, high", [(20.0, 0.22, 0.32), (33.0, 0.20, 0.32), (48.0, 0.08, 0.25)])
 def test_share_above_belt_of_car_falls_with_range(distance, low, high):
     """On KITTI 38, 31 and 16 % of the points are above 0.65 of the height, of 22, 17 and 15 cars
     seen from behind at 12 to 25, 25 to 40 and 40 to 70 m, whose lower parts are often hidden."""
@@ -233,20 +249,24 @@ def test_share_above_belt_of_car_falls_with_range(distance, low, high):
 def scan_cars_from_front():
     """Return 24 cars and their points from 20 m away."""
     cars = [vehicles.make_car(np.random.default_rng(seed)) for seed in range(24)]
-    return [(car, scan_thing(car, 20.0, np.pi + 0.05 * (seed % 5 - 2), seed))
-            for seed, car in enumerate(cars)]
+    return [(car, scan_thing(car, 20.0, np.pi + 0.05 * (seed % 5 - 2), seed)) for seed, car in enumerate(cars)]
 
 
-@pytest.mark.parametrize("zone, low, high", [((0.15, 0.35), 0.04, 0.10), ((0.35, 0.55), 0.12, 0.24),
-                                             ((0.55, 0.65), 0.45, 0.75)])
+@pytest.mark.parametrize(
+    "zone, low, high", [((0.15, 0.35), 0.04, 0.10), ((0.35, 0.55), 0.12, 0.24), ((0.55, 0.65), 0.45, 0.75)]
+)
 def test_only_bumper_reaches_front_of_box(zone, low, high):
     """A quarter of the points of a zone of heights are within 0.07, 0.17 and 0.60 m of the end of
     the box: medians of 42 to 59 cars of KITTI seen from the front."""
     depths = []
     for thing, points in scan_cars_from_front():
         x, y, z = points.T
-        met = (np.abs(y) < 0.45 * thing.size[1]) & (z > zone[0] * thing.size[2]) & (
-            z < zone[1] * thing.size[2]) & (x < 21.0)
+        met = (
+            (np.abs(y) < 0.45 * thing.size[1])
+            & (z > zone[0] * thing.size[2])
+            & (z < zone[1] * thing.size[2])
+            & (x < 21.0)
+        )
         depths.append(np.percentile(x[met] - 20.0 + thing.size[0] / 2, 25))
     assert low < np.median(depths) < high
 
@@ -297,8 +317,7 @@ def test_scenery_is_on_or_in_ground(name):
 
 
 def test_rods_and_discs_have_given_ends():
-    made = parts([rod((0, 0, 0), (3, 4, 12), 1e-6), disc((1, 2, 3), 0.5, 0.1),
-                  block((1, -1, 2), (0, 1, 0))], 10)
+    made = parts([rod((0, 0, 0), (3, 4, 12), 1e-6), disc((1, 2, 3), 0.5, 0.1), block((1, -1, 2), (0, 1, 0))], 10)
     low, high = compute_extents(made)
     assert np.allclose(low, [(0, 0, 0), (0.5, 1.9, 2.5), (0, -1, 0)], atol=1e-5)
     assert np.allclose(high, [(3, 4, 12), (1.5, 2.1, 3.5), (1, 1, 2)], atol=1e-5)

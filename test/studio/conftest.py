@@ -27,8 +27,7 @@ def browser():
 def labels(drive_bag, tmp_path_factory):
     """A running label server, on a port that stays the same after a restart."""
     out, port = tmp_path_factory.mktemp("labels"), free_port()
-    arguments = ("label", "--data", str(drive_bag), "--out", str(out), "--no-open", "--no-propose",
-                 "--port", str(port))
+    arguments = ("label", "--data", str(drive_bag), "--out", str(out), "--no-open", "--no-propose", "--port", str(port))
     with serving(*arguments) as server:
         yield Label(server.process, server.url, out, arguments)
 

@@ -16,16 +16,7 @@ from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import InputError
 from lidar_studio.actions import HANDLERS, apply, convert_tracks
 from lidar_studio.interpolation import Motion
-from lidar_studio.state import (
-    KEY,
-    PROPOSED,
-    Box,
-    State,
-    Track,
-    find_next_uncertain,
-    track_from_json,
-    track_to_json,
-)
+from lidar_studio.state import KEY, PROPOSED, Box, State, Track, find_next_uncertain, track_from_json, track_to_json
 
 FRAMES = 8
 STAMPS = np.array([0, 100, 200, 350, 400, 500, 650, 700]) * 10**6  # not evenly
@@ -49,24 +40,30 @@ metres = st.floats(-50, 50)
 sides = st.floats(0.1, 5)
 boxes = st.tuples(metres, metres, metres, sides, sides, sides, st.floats(-3.1, 3.1)).map(list)
 ACTIONS = st.one_of(
-    st.fixed_dictionaries({"do": st.just("add"), "frame": frames, "box": boxes,
-                           "class": st.sampled_from(["Car", "Pedestrian", "Marsmobil"])}),
-    st.fixed_dictionaries({"do": st.sampled_from(["box", "snap"]), "track": tracks,
-                           "frame": frames, "box": boxes}),
-    st.fixed_dictionaries({"do": st.just("size"), "track": tracks,
-                           "size": st.tuples(sides, sides, sides).map(list)}),
-    st.fixed_dictionaries({"do": st.sampled_from(["remove_box", "split", "interpolate"]),
-                           "track": tracks, "frame": frames}),
+    st.fixed_dictionaries(
+        {
+            "do": st.just("add"),
+            "frame": frames,
+            "box": boxes,
+            "class": st.sampled_from(["Car", "Pedestrian", "Marsmobil"]),
+        }
+    ),
+    st.fixed_dictionaries({"do": st.sampled_from(["box", "snap"]), "track": tracks, "frame": frames, "box": boxes}),
+    st.fixed_dictionaries({"do": st.just("size"), "track": tracks, "size": st.tuples(sides, sides, sides).map(list)}),
+    st.fixed_dictionaries(
+        {"do": st.sampled_from(["remove_box", "split", "interpolate"]), "track": tracks, "frame": frames}
+    ),
     st.fixed_dictionaries({"do": st.just("copy"), "track": tracks, "from": frames, "to": frames}),
     st.fixed_dictionaries({"do": st.just("merge"), "tracks": st.tuples(tracks, tracks).map(list)}),
-    st.fixed_dictionaries({"do": st.sampled_from(["accept", "reject", "reopen"]),
-                           "track": tracks}),
-    st.fixed_dictionaries({"do": st.just("trim"), "track": tracks, "frame": frames,
-                           "side": st.sampled_from(["before", "after"])}),
+    st.fixed_dictionaries({"do": st.sampled_from(["accept", "reject", "reopen"]), "track": tracks}),
+    st.fixed_dictionaries(
+        {"do": st.just("trim"), "track": tracks, "frame": frames, "side": st.sampled_from(["before", "after"])}
+    ),
     st.sampled_from([{"do": "reject_rest"}, {"do": "reject_rest", "class": "Van"}]),
     st.fixed_dictionaries({"do": st.just("class"), "track": tracks, "class": st.just("Van")}),
     st.fixed_dictionaries({"do": st.just("check"), "frame": frames, "checked": st.booleans()}),
-    st.sampled_from([{"do": "undo"}, {"do": "redo"}]))
+    st.sampled_from([{"do": "undo"}, {"do": "redo"}]),
+)
 
 
 def done(actions, motion, state=State()):
@@ -100,8 +97,7 @@ def test_replaying_the_lines_gives_the_same_state(actions, motion):
     assert again == state
     for track in state.tracks.values():
         assert track_from_json(json.loads(json.dumps(track_to_json(track)))) == track
-        assert all(np.isfinite(b.values).all() and min(b.values[3:6]) > 0
-                   for b in track.boxes.values())
+        assert all(np.isfinite(b.values).all() and min(b.values[3:6]) > 0 for b in track.boxes.values())
         assert not track.removed_frames & track.boxes.keys()
 
 
@@ -130,19 +126,28 @@ def test_invalid_action_changes_nothing(action, before):
     assert (labels(state), state.seq) == kept
 
 
-@pytest.mark.parametrize("wrong", [
-    {"do": "fly"}, {}, {"do": "add", "frame": 8, "box": [0, 0, 0, 1, 1, 1, 0], "class": "Car"},
-    {"do": "add", "frame": -1, "box": [0, 0, 0, 1, 1, 1, 0], "class": "Car"},
-    {"do": "add", "frame": True, "box": [0, 0, 0, 1, 1, 1, 0], "class": "Car"},
-    {"do": "add", "frame": 0, "box": [math.nan, 0, 0, 1, 1, 1, 0], "class": "Car"},
-    {"do": "add", "frame": 0, "box": [0, 0, 0, 1, 1, 0, 0], "class": "Car"},
-    {"do": "add", "frame": 0, "box": [0, 0, 0, 1, 1, 1], "class": "Car"},
-    {"do": "add", "frame": 0, "box": "box", "class": "Car"},
-    {"do": "add", "frame": 0, "box": [0, 0, 0, 1, 1, 1, 0], "class": ""},
-    {"do": "box", "track": 7, "frame": 0, "box": [0, 0, 0, 1, 1, 1, 0]},
-    {"do": "merge", "tracks": [1, 1]}, {"do": "merge", "tracks": [1]}, {"do": "undo"},
-    {"do": "check", "frame": 0, "checked": 1}, {"do": "seed", "frame": 0, "xyz": [0, 0, 0],
-                                                "class": "Car"}], ids=str)
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"do": "fly"},
+        {},
+        {"do": "add", "frame": 8, "box": [0, 0, 0, 1, 1, 1, 0], "class": "Car"},
+        {"do": "add", "frame": -1, "box": [0, 0, 0, 1, 1, 1, 0], "class": "Car"},
+        {"do": "add", "frame": True, "box": [0, 0, 0, 1, 1, 1, 0], "class": "Car"},
+        {"do": "add", "frame": 0, "box": [math.nan, 0, 0, 1, 1, 1, 0], "class": "Car"},
+        {"do": "add", "frame": 0, "box": [0, 0, 0, 1, 1, 0, 0], "class": "Car"},
+        {"do": "add", "frame": 0, "box": [0, 0, 0, 1, 1, 1], "class": "Car"},
+        {"do": "add", "frame": 0, "box": "box", "class": "Car"},
+        {"do": "add", "frame": 0, "box": [0, 0, 0, 1, 1, 1, 0], "class": ""},
+        {"do": "box", "track": 7, "frame": 0, "box": [0, 0, 0, 1, 1, 1, 0]},
+        {"do": "merge", "tracks": [1, 1]},
+        {"do": "merge", "tracks": [1]},
+        {"do": "undo"},
+        {"do": "check", "frame": 0, "checked": 1},
+        {"do": "seed", "frame": 0, "xyz": [0, 0, 0], "class": "Car"},
+    ],
+    ids=str,
+)
 def test_invalid_action_is_refused_in_one_line(wrong):
     with pytest.raises(InputError) as error:
         apply(State(), wrong, STANDING)
@@ -153,25 +158,32 @@ def walking(start, velocity, motion, kind=KEY):
     """Boxes by frame of an object with constant velocity in the fixed frame."""
     found = {}
     for f, t in enumerate(motion.times):
-        fixed = np.array([start[0] + velocity[0] * t, start[1] + velocity[1] * t, -0.9, *SIZE,
-                          math.atan2(velocity[1], velocity[0])])
-        box = fixed if motion.poses is None else transform_boxes(
-            fixed, invert_pose(motion.poses[f]))[0]
+        fixed = np.array(
+            [start[0] + velocity[0] * t, start[1] + velocity[1] * t, -0.9, *SIZE, math.atan2(velocity[1], velocity[0])]
+        )
+        box = fixed if motion.poses is None else transform_boxes(fixed, invert_pose(motion.poses[f]))[0]
         found[f] = Box.of(box, kind)
     return found
 
 
-@given(st.tuples(metres, metres), st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
-       st.sampled_from([STANDING, DRIVING]), st.sets(frames, min_size=2), st.randoms())
-def test_constant_motion_is_exact_between_key_boxes_in_any_order(
-        start, velocity, motion, keys, random):
+@given(
+    st.tuples(metres, metres),
+    st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
+    st.sampled_from([STANDING, DRIVING]),
+    st.sets(frames, min_size=2),
+    st.randoms(),
+)
+def test_constant_motion_is_exact_between_key_boxes_in_any_order(start, velocity, motion, keys, random):
     true = walking(start, velocity, motion)
     order = sorted(keys)
     random.shuffle(order)
-    state, _ = done([{"do": "add", "frame": order[0], "class": "Pedestrian",
-                      "box": list(true[order[0]].values)},
-                     *({"do": "box", "track": 1, "frame": f, "box": list(true[f].values)}
-                       for f in order[1:])], motion)
+    state, _ = done(
+        [
+            {"do": "add", "frame": order[0], "class": "Pedestrian", "box": list(true[order[0]].values)},
+            *({"do": "box", "track": 1, "frame": f, "box": list(true[f].values)} for f in order[1:]),
+        ],
+        motion,
+    )
     found = state.tracks[1].boxes
     assert found.keys() == set(range(min(keys), max(keys) + 1))
     for f, box in found.items():
@@ -181,8 +193,9 @@ def test_constant_motion_is_exact_between_key_boxes_in_any_order(
             assert box.values == true[f].values  # to the last bit
 
 
-@given(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), st.floats(-1.5, 1.5), frames,
-       st.sampled_from([STANDING, DRIVING]))
+@given(
+    st.tuples(st.floats(-1, 1), st.floats(-1, 1)), st.floats(-1.5, 1.5), frames, st.sampled_from([STANDING, DRIVING])
+)
 def test_correction_moves_a_whole_track_without_key_boxes(shift, turn, frame, motion):
     true = walking((5.0, 3.0), (1.0, 0.5), motion, PROPOSED)
     off = {}
@@ -190,8 +203,7 @@ def test_correction_moves_a_whole_track_without_key_boxes(shift, turn, frame, mo
         wrong = motion.to_fixed(box.values, f) + [*shift, 0.1, 0.2, -0.1, 0.3, turn]
         off[f] = Box.of(motion.to_sensor(wrong, f), PROPOSED)
     state = State({1: Track(1, "Pedestrian", boxes=off)}, next_id=2)
-    after, _ = apply(state, {"do": "box", "track": 1, "frame": frame,
-                             "box": list(true[frame].values)}, motion)
+    after, _ = apply(state, {"do": "box", "track": 1, "frame": frame, "box": list(true[frame].values)}, motion)
     for f, box in after.tracks[1].boxes.items():
         assert close(box.values, true[f].values, 1e-7)
 
@@ -215,18 +227,22 @@ def replace_kind(box):
 def test_frame_emptied_by_a_person_stays_empty():
     true = walking((5.0, 3.0), (1.0, 0.0), STANDING, PROPOSED)
     state = State({1: Track(1, "Pedestrian", boxes=true)}, next_id=2)
-    state, _ = done([{"do": "remove_box", "track": 1, "frame": 3},
-                     {"do": "box", "track": 1, "frame": 0, "box": list(true[0].values)},
-                     {"do": "box", "track": 1, "frame": 7, "box": list(true[7].values)}],
-                    STANDING, state)
+    state, _ = done(
+        [
+            {"do": "remove_box", "track": 1, "frame": 3},
+            {"do": "box", "track": 1, "frame": 0, "box": list(true[0].values)},
+            {"do": "box", "track": 1, "frame": 7, "box": list(true[7].values)},
+        ],
+        STANDING,
+        state,
+    )
     assert state.tracks[1].boxes.keys() == set(range(8)) - {3}
 
 
 @given(st.sets(frames, min_size=2), st.integers(1, FRAMES - 1))
 def test_split_and_merge_are_inverses(there, cut):
     true = walking((5.0, 3.0), (1.0, 0.5), DRIVING, PROPOSED)
-    track = Track(1, "Pedestrian", boxes={f: true[f] for f in there},
-                  removed_frames=frozenset({0}) - there)
+    track = Track(1, "Pedestrian", boxes={f: true[f] for f in there}, removed_frames=frozenset({0}) - there)
     state = State({1: track}, seeds=((min(there), 1), (max(there), 1)), next_id=2)
     try:
         parts, _ = apply(state, {"do": "split", "track": 1, "frame": cut}, DRIVING)
@@ -258,20 +274,24 @@ def test_trim_keeps_the_same_boxes_as_split():
 
 def test_copied_box_stands_still_in_the_fixed_frame():
     box = [12.0, -3.0, -0.9, *SIZE, 0.4]
-    state, _ = done([{"do": "add", "frame": 1, "box": box, "class": "Car"},
-                     {"do": "copy", "track": 1, "from": 1, "to": 6},
-                     {"do": "copy", "track": 1, "from": 6, "to": 1}], DRIVING)
+    state, _ = done(
+        [
+            {"do": "add", "frame": 1, "box": box, "class": "Car"},
+            {"do": "copy", "track": 1, "from": 1, "to": 6},
+            {"do": "copy", "track": 1, "from": 6, "to": 1},
+        ],
+        DRIVING,
+    )
     found = state.tracks[1].boxes
     assert close(found[1].values, box)
-    assert all(close(DRIVING.to_fixed(b.values, f), DRIVING.to_fixed(box, 1))
-               for f, b in found.items())
+    assert all(close(DRIVING.to_fixed(b.values, f), DRIVING.to_fixed(box, 1)) for f, b in found.items())
 
 
 def test_next_uncertain_wraps_around():
     def track(number, score, **more):
         return Track(number, "Car", score=score, boxes={0: Box((9.0,) * 7, PROPOSED)}, **more)
-    state = State({t.id: t for t in (track(1, 0.9), track(2, 0.45), track(3, 0.55),
-                                     track(4, 0.5, state="accepted"))})
+
+    state = State({t.id: t for t in (track(1, 0.9), track(2, 0.45), track(3, 0.55), track(4, 0.5, state="accepted"))})
     seen = [find_next_uncertain(state, after).id for after in (None, 2, 3, 1, 4)]
     assert seen == [2, 3, 1, 2, 2]
     assert find_next_uncertain(State()) is None
@@ -280,11 +300,12 @@ def test_next_uncertain_wraps_around():
 def test_rest_of_a_class_is_rejected_and_restored_as_one_action():
     def track(number, name, **more):
         return Track(number, name, boxes={0: Box((9.0,) * 7, PROPOSED)}, **more)
-    state = State({t.id: t for t in (track(1, "Car"), track(2, "Van"), track(3, "Car"),
-                                     track(4, "Car", state="accepted"))})
+
+    state = State(
+        {t.id: t for t in (track(1, "Car"), track(2, "Van"), track(3, "Car"), track(4, "Car", state="accepted"))}
+    )
     cars, _ = apply(state, {"do": "reject_rest", "class": "Car"}, STANDING)
-    assert [t.state for t in cars.tracks.values()] == ["rejected", "proposed", "rejected",
-                                                       "accepted"]
+    assert [t.state for t in cars.tracks.values()] == ["rejected", "proposed", "rejected", "accepted"]
     every, _ = apply(cars, {"do": "reject_rest"}, STANDING)
     assert every.tracks[2].state == "rejected" and every.tracks[4].state == "accepted"
     with pytest.raises(InputError, match="left to reject"):
@@ -295,11 +316,14 @@ def test_rest_of_a_class_is_rejected_and_restored_as_one_action():
 
 @given(st.lists(ACTIONS, max_size=6), ACTIONS)
 def test_joined_action_is_undone_with_the_previous_one(before, action):
-    state, _ = done([*before, {"do": "add", "frame": 1, "box": [5, 0, 0, *SIZE, 0],
-                               "class": "Van"}], DRIVING)
+    state, _ = done([*before, {"do": "add", "frame": 1, "box": [5, 0, 0, *SIZE, 0], "class": "Van"}], DRIVING)
     below = state.undo_stack[1]
-    rest = {"do": "propose", "joins": True, "removed": [state.next_id - 1], "tracks": [
-        Track(state.next_id, "Car", boxes={2: Box((9.0,) * 7, PROPOSED)})]}
+    rest = {
+        "do": "propose",
+        "joins": True,
+        "removed": [state.next_id - 1],
+        "tracks": [Track(state.next_id, "Car", boxes={2: Box((9.0,) * 7, PROPOSED)})],
+    }
     line = json.dumps(convert_tracks(rest, track_to_json))
     assert convert_tracks(json.loads(line), track_from_json) == rest
     both, _ = apply(state, rest, DRIVING)
@@ -312,6 +336,22 @@ def test_joined_action_is_undone_with_the_previous_one(before, action):
 
 def test_every_action_is_tested():
     tried = {"seed", "propose", "import"}  # tested in test_label_server.py
-    named = {"add", "box", "snap", "size", "remove_box", "split", "interpolate", "copy", "merge",
-             "accept", "reject", "reject_rest", "trim", "reopen", "class", "check"}
+    named = {
+        "add",
+        "box",
+        "snap",
+        "size",
+        "remove_box",
+        "split",
+        "interpolate",
+        "copy",
+        "merge",
+        "accept",
+        "reject",
+        "reject_rest",
+        "trim",
+        "reopen",
+        "class",
+        "check",
+    }
     assert tried | named == HANDLERS.keys()

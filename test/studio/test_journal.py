@@ -42,8 +42,8 @@ def test_torn_last_line_is_cut_off_at_any_byte(tmp_path):
         (tmp_path / JOURNAL_NAME).write_bytes(content[:size])
         with open_journal(tmp_path, HEAD) as journal:
             whole = content[:size].count(b"\n")
-            assert journal.lines == lines(2)[:max(whole - 1, 0)]
-            torn = size not in (0, first) and content[size - 1:size] != b"\n"
+            assert journal.lines == lines(2)[: max(whole - 1, 0)]
+            torn = size not in (0, first) and content[size - 1 : size] != b"\n"
             assert (journal.message is not None) == torn
             journal.append({"seq": len(journal.lines) + 1, "do": "undo"})
         with open_journal(tmp_path, HEAD) as journal:
@@ -64,8 +64,9 @@ with open_journal(Path(sys.argv[1]), make_journal_header("drive", ["a", "b c"], 
 def test_kill_while_writing_loses_no_confirmed_action(tmp_path):
     for stop in (1, 20, 37):
         folder = tmp_path / str(stop)
-        with subprocess.Popen([sys.executable, "-c", WRITER, str(folder)], text=True,
-                              stdout=subprocess.PIPE) as process:
+        with subprocess.Popen(
+            [sys.executable, "-c", WRITER, str(folder)], text=True, stdout=subprocess.PIPE
+        ) as process:
             last = 0
             for text in process.stdout:
                 last = int(text)
@@ -73,13 +74,11 @@ def test_kill_while_writing_loses_no_confirmed_action(tmp_path):
                     process.send_signal(signal.SIGKILL)
         with open_journal(folder, HEAD) as journal:
             assert len(journal.lines) >= last >= stop
-            assert [line["seq"] for line in journal.lines] == list(range(
-                1, len(journal.lines) + 1))
+            assert [line["seq"] for line in journal.lines] == list(range(1, len(journal.lines) + 1))
 
 
 def test_second_process_is_refused_until_the_first_is_killed(tmp_path):
-    with subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], text=True,
-                          stdout=subprocess.PIPE) as process:
+    with subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], text=True, stdout=subprocess.PIPE) as process:
         process.stdout.readline()
         with pytest.raises(InputError, match="another process"), open_journal(tmp_path, HEAD):
             pass
@@ -89,10 +88,15 @@ def test_second_process_is_refused_until_the_first_is_killed(tmp_path):
         assert journal.lines
 
 
-@pytest.mark.parametrize("other", [
-    make_journal_header("other", ["a", "b c"], [1, 2]), make_journal_header("drive", ["a"], [1]),
-    make_journal_header("drive", ["a", "b"], [1, 2]),
-    make_journal_header("drive", ["a", "b c"], [1, 3])])
+@pytest.mark.parametrize(
+    "other",
+    [
+        make_journal_header("other", ["a", "b c"], [1, 2]),
+        make_journal_header("drive", ["a"], [1]),
+        make_journal_header("drive", ["a", "b"], [1, 2]),
+        make_journal_header("drive", ["a", "b c"], [1, 3]),
+    ],
+)
 def test_journal_of_another_drive_is_refused_and_kept(tmp_path, other):
     content = filled(tmp_path, 2)
     with pytest.raises(InputError, match="another drive"), open_journal(tmp_path, other):
@@ -136,8 +140,7 @@ with open_journal(Path(sys.argv[1]), make_journal_header("drive", ["a", "b c"], 
 
 
 def test_full_disk_is_reported_and_writing_continues_later(tmp_path):
-    result = subprocess.run([sys.executable, "-c", FULL, str(tmp_path)], text=True, check=True,
-                            capture_output=True)
+    result = subprocess.run([sys.executable, "-c", FULL, str(tmp_path)], text=True, check=True, capture_output=True)
     done, _, message_text = result.stdout.partition(" ")
     assert "nothing was done" in message_text and int(done) > 3
     with open_journal(tmp_path, HEAD) as journal:

@@ -31,9 +31,13 @@ BOX = [8.0, 3.0, -0.9, 0.8, 0.6, 1.7, 0.3]
 
 def frames(x=5.0):
     cloud = np.tile(np.array([[x, 0, -1]], np.float32), (50, 1))
-    return [replace(Frame.of(f"{i:06}", PointCloud(cloud + np.float32(i), cloud[:, 0] * 0,
-                                                   (i + 1) * 10**8, "velodyne")), index=i)
-            for i in range(COUNT)]
+    return [
+        replace(
+            Frame.of(f"{i:06}", PointCloud(cloud + np.float32(i), cloud[:, 0] * 0, (i + 1) * 10**8, "velodyne")),
+            index=i,
+        )
+        for i in range(COUNT)
+    ]
 
 
 def drive(name="monday", x=5.0):
@@ -54,8 +58,7 @@ def test_journal_is_identified_by_clouds_not_by_folder_name(tmp_path):
 
 
 def test_old_journal_is_identified_by_the_drive_name(tmp_path):
-    old = make_journal_header("monday", [f.name for f in frames()],
-                              [f.stamp_ns for f in frames()], "")
+    old = make_journal_header("monday", [f.name for f in frames()], [f.stamp_ns for f in frames()], "")
     del old["clouds"]
     Journal(tmp_path, old).close()
     with open_session(drive(), tmp_path) as session:
@@ -67,6 +70,7 @@ def test_old_journal_is_identified_by_the_drive_name(tmp_path):
 def test_journal_that_grew_meanwhile_is_not_overwritten(tmp_path, monkeypatch):
     def no_locks(*_):
         raise OSError(9, "Bad file descriptor")
+
     monkeypatch.setattr(fcntl, "flock", no_locks)
     with open_session(drive(), tmp_path) as one, open_session(drive(), tmp_path) as two:
         assert "cannot be locked" in one.journal.message
@@ -139,8 +143,13 @@ def test_concurrent_exports_are_complete(tmp_path):
 
 
 def test_journal_is_refused_if_poses_appear_or_disappear(tmp_path):
-    bare, posed = drive(), Drive("monday", Recording(Path("monday"), "made up", [
-        replace(frame, pose=lambda: np.eye(4)) for frame in frames()]))
+    bare, posed = (
+        drive(),
+        Drive(
+            "monday",
+            Recording(Path("monday"), "made up", [replace(frame, pose=lambda: np.eye(4)) for frame in frames()]),
+        ),
+    )
     for k, (now, then) in enumerate(((bare, posed), (posed, bare))):
         with open_session(now, tmp_path / str(k)) as session:
             labelled(session)
@@ -161,8 +170,13 @@ def test_export_does_not_overwrite_the_journal(tmp_path, name):
 
 def test_nan_is_null_in_the_journal():
     none, box = float("nan"), np.array([BOX])
-    labels = DriveLabels([FrameLabels.of("000000", 10**8, box, ["Car"], [1], [0.5],
-                                         [{"velocity": [none, 1.0]}], [("area", {"x": none})])])
+    labels = DriveLabels(
+        [
+            FrameLabels.of(
+                "000000", 10**8, box, ["Car"], [1], [0.5], [{"velocity": [none, 1.0]}], [("area", {"x": none})]
+            )
+        ]
+    )
     tracks, kept = to_tracks(labels, 1)
     json.dumps([track_to_json(tracks[0]), kept], allow_nan=False)
     back = to_labels(replace(State(), tracks={1: tracks[0]}, kept=kept), frames()[:1])
@@ -175,6 +189,7 @@ def test_command_imports_once_and_needs_a_journal_to_export(tmp_path):
 
     def run(*words):
         return CliRunner().invoke(cli, ["label", "--data", str(tmp_path / "bag"), *map(str, words)])
+
     to = ("--export", f"OpenLabel:{tmp_path}/made/../labels.json")
     nowhere = run("--out", tmp_path / "empty", *to)
     assert isinstance(nowhere.exception, InputError) and "no journal" in str(nowhere.exception)
@@ -183,7 +198,6 @@ def test_command_imports_once_and_needs_a_journal_to_export(tmp_path):
         labelled(session)
     assert run("--out", tmp_path / "made", *to).exit_code == 0
     for _ in range(2):
-        again = run("--out", tmp_path / "two", "--import", f"openlabel:{tmp_path / 'labels.json'}",
-                    *to, "--force")
+        again = run("--out", tmp_path / "two", "--import", f"openlabel:{tmp_path / 'labels.json'}", *to, "--force")
         assert again.exit_code == 0 and ": 1 boxes" in again.output.replace("\n", "")
     assert "already" in again.output.replace("\n", " ")

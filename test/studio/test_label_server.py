@@ -47,12 +47,14 @@ def test_page_that_is_too_far_behind_is_disconnected():
 
         async def close():
             page.closed = True
+
         for event in range(MAX_QUEUED_EVENTS + 5):
             Server.broadcast(page, event)
         assert not page.pages
         page.send_json, page.close = send_json, close
         await asyncio.wait_for(_send_events(page, queue), 10)
         assert page.closed and sent == [*range(1, MAX_QUEUED_EVENTS)]
+
     asyncio.run(behind())
 
 
@@ -75,8 +77,7 @@ class Page:
 
     async def do(self, expected=200, page="one", **action):
         """Send an action and return the reply."""
-        async with self.http.post(f"{self.base}/api/do", data=json.dumps(action),
-                                  headers={"X-Page": page}) as answer:
+        async with self.http.post(f"{self.base}/api/do", data=json.dumps(action), headers={"X-Page": page}) as answer:
             found = await answer.json()
             assert answer.status == expected, found
             assert expected == 200 or "\n" not in found["error"]
@@ -94,9 +95,11 @@ async def opened(url):
 
 def run_on_page(url, questions):
     """Return the result of the coroutine questions(page)."""
+
     async def run():
         async with opened(url) as page:
             return await asyncio.wait_for(questions(page), 600)
+
     return asyncio.run(run())
 
 
@@ -119,6 +122,7 @@ def test_cloud_has_all_columns_in_a_fixed_random_order(server_url, written):
         one, again = [(await page.get("/api/cloud/1"))[1] for _ in range(2)]
         assert one == again  # the order is always the same
         return one
+
     body = run_on_page(server_url, questions)
     frame = list(open_recording(written))[1].load()
     n = int(np.frombuffer(body, np.uint32, 1, 4)[0])
@@ -139,8 +143,8 @@ def test_click_becomes_a_track_and_a_seed_similar_to_itself(server_url):
         before = await page.json("/api/state")
         await page.do(do="seed", frame=0, xyz=WALKER[:3].tolist(), **{"class": "Pedestrian"})
         state = await page.json("/api/state")
-        track, = [t for t in state["tracks"] if t["id"] not in {u["id"] for u in before["tracks"]}]
-        (frame, *box, kind), = track["boxes"]
+        (track,) = [t for t in state["tracks"] if t["id"] not in {u["id"] for u in before["tracks"]}]
+        ((frame, *box, kind),) = track["boxes"]
         assert (frame, kind, track["state"]) == (0, "key", "accepted")
         assert np.hypot(box[0] - WALKER[0], box[1] - WALKER[1]) < 0.3
         assert state["seeds"][-1] == [0, track["id"]]
@@ -150,18 +154,18 @@ def test_click_becomes_a_track_and_a_seed_similar_to_itself(server_url):
         assert (await page.get(f"/api/silhouettes?frame=1&track={track['id']}"))[0] == 404
         await page.do(do="snap", track=track["id"], frame=0, to="ground")
         await page.do(do="snap", track=track["id"], frame=0, to="cluster")
-        after, = [t for t in (await page.json("/api/state"))["tracks"] if t["id"] == track["id"]]
+        (after,) = [t for t in (await page.json("/api/state"))["tracks"] if t["id"] == track["id"]]
         assert np.hypot(*(np.array(after["boxes"][0][1:3]) - WALKER[:2])) < 0.1
         nothing = await page.do(400, do="seed", frame=0, xyz=[80, 80, 80], **{"class": "Car"})
         assert "cluster" in nothing["error"]
         assert await page.json("/api/next?after=0") == {"track": None, "frame": 0}
+
     run_on_page(server_url, questions)
 
 
 def test_second_page_sees_actions_of_the_first(server_url):
     async def questions(page):
-        async with opened(server_url) as other, other.http.ws_connect(
-                f"{other.base}/api/events") as events:
+        async with opened(server_url) as other, other.http.ws_connect(f"{other.base}/api/events") as events:
             seq = (await page.do(page="first", **ADD))["seq"]
             event = await events.receive_json()
             assert (event["seq"], event["by"], event["action"]["do"]) == (seq, "first", "add")
@@ -170,22 +174,34 @@ def test_second_page_sees_actions_of_the_first(server_url):
             await page.do(do="undo")
             event = await events.receive_json()
             assert event["removed"] and event["can_redo"]
+
     run_on_page(server_url, questions)
 
 
-@pytest.mark.parametrize("wrong", [
-    {"do": "fly"}, {}, {**ADD, "frame": 3}, {**ADD, "frame": "0"}, {**ADD, "box": BOX[:6]},
-    {**ADD, "box": [float("nan"), *BOX[1:]]}, {**ADD, "box": [1e9, *BOX[1:]]},
-    {"do": "snap", "track": 10**6, "frame": 0, "to": "ground"}, {"do": "poses", "poses": []},
-    {"do": "import", "path": "/nowhere", "format": "kitti"},
-    {"do": "import", "path": 5, "format": []},
-    {"do": "seed", "frame": 0, "xyz": [0, 0], "class": "Car"},
-], ids=str)
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"do": "fly"},
+        {},
+        {**ADD, "frame": 3},
+        {**ADD, "frame": "0"},
+        {**ADD, "box": BOX[:6]},
+        {**ADD, "box": [float("nan"), *BOX[1:]]},
+        {**ADD, "box": [1e9, *BOX[1:]]},
+        {"do": "snap", "track": 10**6, "frame": 0, "to": "ground"},
+        {"do": "poses", "poses": []},
+        {"do": "import", "path": "/nowhere", "format": "kitti"},
+        {"do": "import", "path": 5, "format": []},
+        {"do": "seed", "frame": 0, "xyz": [0, 0], "class": "Car"},
+    ],
+    ids=str,
+)
 def test_invalid_request_is_reported_and_changes_nothing(server_url, wrong):
     async def questions(page):
         before = await page.json("/api/state")
         await page.do(400, **wrong)
         assert await page.json("/api/state") == before
+
     run_on_page(server_url, questions)
 
 
@@ -196,9 +212,17 @@ def test_requests_from_elsewhere_are_refused(server_url):
     async def strangers():
         async with aiohttp.ClientSession() as http:
             page = Page(http, base)
-            for path in ("/", "/api/drive", "/api/cloud/0", "/static/app.js", "/?token=",
-                         "/api/state?token=" + token[:-1], "/?token=" + "x" * len(token),
-                         "/?token=%C3%A4", "/api/events"):
+            for path in (
+                "/",
+                "/api/drive",
+                "/api/cloud/0",
+                "/static/app.js",
+                "/?token=",
+                "/api/state?token=" + token[:-1],
+                "/?token=" + "x" * len(token),
+                "/?token=%C3%A4",
+                "/api/events",
+            ):
                 status, body = await page.get(path)
                 assert status == 403 and body.count(b"\n") == 1, path
             async with http.post(f"{base}/api/do", json=ADD) as answer:
@@ -208,10 +232,10 @@ def test_requests_from_elsewhere_are_refused(server_url):
                 assert status == 403, host
             origin = {"Origin": "http://evil.example"}
             assert (await page.get(f"/api/state?token={token}", headers=origin))[0] == 403
-            async with http.post(f"{base}/api/do?token={token}", json=ADD,
-                                 headers=origin) as answer:
+            async with http.post(f"{base}/api/do?token={token}", json=ADD, headers=origin) as answer:
                 assert answer.status == 403
             assert (await page.get(f"/api/state?token={token}"))[0] == 200
+
     asyncio.run(strangers())
     with socket.socket() as outside:  # only the loopback address listens
         outside.settimeout(5)
@@ -220,13 +244,21 @@ def test_requests_from_elsewhere_are_refused(server_url):
 
 def test_only_files_of_the_page_are_served(server_url):
     async def questions(page):
-        for path in ("/static/..%2fserver.py", "/static/%2e%2e%2fserver.py", "/static/../server.py",
-                     "/static//etc/passwd", "/static/..", "/static/", "/etc/passwd",
-                     "/static/%2fetc%2fpasswd", "/static/x%00", "/nothing"):
+        for path in (
+            "/static/..%2fserver.py",
+            "/static/%2e%2e%2fserver.py",
+            "/static/../server.py",
+            "/static//etc/passwd",
+            "/static/..",
+            "/static/",
+            "/etc/passwd",
+            "/static/%2fetc%2fpasswd",
+            "/static/x%00",
+            "/nothing",
+        ):
             status, body = await page.get(path)
             assert status in (400, 404) and b"import" not in body, path
-        for path in ("/api/cloud/3", "/api/cloud/-1", "/api/cloud/a", "/api/cloud/" + "9" * 50,
-                     "/api/labels/3"):
+        for path in ("/api/cloud/3", "/api/cloud/-1", "/api/cloud/a", "/api/cloud/" + "9" * 50, "/api/labels/3"):
             status, body = await page.get(path)
             assert status == 400 and "frame" in json.loads(body)["error"], path
         async with page.http.get(f"{page.base}/") as answer:
@@ -235,6 +267,7 @@ def test_only_files_of_the_page_are_served(server_url):
             assert answer.status == 400 and (await answer.json())["error"]
         async with page.http.post(f"{page.base}/api/do", data=b"[]") as answer:
             assert answer.status == 400
+
     run_on_page(server_url, questions)
 
 
@@ -251,6 +284,7 @@ def test_killed_server_loses_nothing_and_a_second_is_refused(written, tmp_path):
         await page.do(do="box", track=1, frame=2, box=BOX)
         await page.do(do="undo")
         return await page.json("/api/state")
+
     with serving(*label(written, tmp_path)) as server:
         before = run_on_page(server.url, edit)
         command = standalone_command(*label(written, tmp_path))
@@ -283,6 +317,7 @@ def test_full_disk_is_reported_and_labels_match_the_journal(written, tmp_path):
                     assert await page.json("/api/state") == before
                     return before
         raise AssertionError("the disk was never full")
+
     with serving(*label(written, tmp_path), before=limited) as server:
         before = run_on_page(server.url, fill)
     assert len(before["tracks"]) > 3
@@ -302,22 +337,22 @@ def test_exported_labels_are_imported_unchanged(written, tmp_path):
             first = await answer.json()
         async with page.http.post(f"{page.base}/api/export", json=export_request) as answer:
             assert answer.status == 400, await answer.text()  # it exists
-        async with page.http.post(f"{page.base}/api/export",
-                                  json={**export_request, "force": True}) as answer:
+        async with page.http.post(f"{page.base}/api/export", json={**export_request, "force": True}) as answer:
             assert await answer.json() == first
         for bad in ({"format": "x", "out": "y"}, {"format": "openlabel", "out": "../y"}, {}):
             async with page.http.post(f"{page.base}/api/export", json=bad) as answer:
                 assert answer.status == 400 and (await answer.json())["error"]
         return first, await page.json("/api/state")
+
     with serving(*label(written, tmp_path / "one")) as server:
         written_to, state = run_on_page(server.url, make)
     assert written_to["boxes"] == 4 and written_to["frames"] == 3
     again = ["--import", f"openlabel:{written_to['path']}"]
     with serving(*label(written, tmp_path / "two", *again)) as server:
         back = run_on_page(server.url, lambda page: page.json("/api/state"))
-        assert {(t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"]))))
-                for t in back["tracks"]} == {
-            (t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"])))) for t in state["tracks"]}
+        assert {(t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"])))) for t in back["tracks"]} == {
+            (t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"])))) for t in state["tracks"]
+        }
         run_on_page(server.url, lambda page: page.do(do="undo"))
         assert run_on_page(server.url, lambda page: page.json("/api/state"))["tracks"] == []
 
@@ -326,7 +361,7 @@ def test_labels_of_the_drive_are_shown_only_on_request(server_url, written, tmp_
     assert run_on_page(server_url, lambda page: page.json("/api/labels/0"))["labels"] == []
     with serving(*label(written, tmp_path, "--show-labels")) as server:
         shown = run_on_page(server.url, lambda page: page.json("/api/labels/0"))
-        (*box, name, _), = shown["labels"]
+        ((*box, name, _),) = shown["labels"]
         assert np.allclose(box, WALKER) and name == "Pedestrian"
         assert run_on_page(server.url, lambda page: page.json("/api/labels/1"))["labels"] == []
 
@@ -340,10 +375,12 @@ def test_drive_is_surveyed_once_in_the_background(written, tmp_path):
                 assert "error" not in event, event
                 state["progress"] = event["progress"]
         return await page.json("/api/state")
+
     before = None
     for _ in range(2):  # the second one finds the proposals in the journal
-        with subprocess.Popen(standalone_command(*label(written, tmp_path, "--propose")), text=True,
-                              stdout=subprocess.PIPE) as process:
+        with subprocess.Popen(
+            standalone_command(*label(written, tmp_path, "--propose")), text=True, stdout=subprocess.PIPE
+        ) as process:
             try:
                 state = run_on_page(process.stdout.readline().strip(), wait)
             finally:

@@ -28,8 +28,7 @@ FOUND, TRACKED = "/fused_detector/output/detections", "/tracker/output/tracks"
 
 
 def cloud(stamp, points=50):
-    found = np.zeros(points, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("ground", "u1"),
-                              ("cluster_id", "<u4")])
+    found = np.zeros(points, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("ground", "u1"), ("cluster_id", "<u4")])
     found["x"] = 1 + np.arange(points)
     found["ground"], found["cluster_id"] = 1, 0
     found["ground"][:10], found["cluster_id"][:10] = 0, 7_000_000
@@ -38,9 +37,16 @@ def cloud(stamp, points=50):
 
 def boxes(stamp, frame_id="velodyne", x=5.0, ids=(3,)):
     count = len(ids)
-    return MarkedObjects(np.tile([x, 0, 0, 1, 1, 1, 0], (count, 1)), ["Car"] * count,
-                         np.full(count, 0.5), np.array(ids),
-                         [{"sources": {"pillars": 0.25}}] * count, [], stamp, frame_id)
+    return MarkedObjects(
+        np.tile([x, 0, 0, 1, 1, 1, 0], (count, 1)),
+        ["Car"] * count,
+        np.full(count, 0.5),
+        np.array(ids),
+        [{"sources": {"pillars": 0.25}}] * count,
+        [],
+        stamp,
+        frame_id,
+    )
 
 
 @pytest.fixture
@@ -58,7 +64,7 @@ def list_shown_frames(live):
 
 def test_frame_waits_for_its_boxes_and_late_ones_are_counted(live, monkeypatch):
     live.add_cloud(cloud(10))
-    live.add_boxes(FOUND, boxes(10), None)       # the first: from now on clouds wait for this topic
+    live.add_boxes(FOUND, boxes(10), None)  # the first: from now on clouds wait for this topic
     live.add_cloud(cloud(20))
     assert list_shown_frames(live)[-1] == 0
     live.add_boxes(FOUND, boxes(20), None)
@@ -69,7 +75,7 @@ def test_frame_waits_for_its_boxes_and_late_ones_are_counted(live, monkeypatch):
     assert list_shown_frames(live)[-1] == 2 and live.layers(2, 0.0)["detections"] == {}
     live.add_boxes(FOUND, boxes(30), None)
     assert list_shown_frames(live)[-2:] == [2, 2]
-    row, = live.layers(2, 0.0)["detections"]["fused_detector"]
+    (row,) = live.layers(2, 0.0)["detections"]["fused_detector"]
     assert row[:9] == [5, 0, 0, 1, 1, 1, 0, "Car", 0.5] and row[9] == {"pillars": 0.25}
     assert [t["late"] for t in live.get_status()["topics"]] == [1]
 
@@ -80,12 +86,11 @@ def test_early_boxes_wait_and_unmatched_ones_are_counted(live):
     assert len(live.layers(0, 0.0)["detections"]["fused_detector"]) == 1
     for stamp in range(1000, 1000 + live_graph.MAX_EARLY_ARRAYS + 3):
         live.add_boxes(FOUND, boxes(stamp), None)
-    topic, = live.get_status()["topics"]
+    (topic,) = live.get_status()["topics"]
     assert (topic["alone"], topic["late"]) == (3, 0)
 
 
-@given(st.lists(st.integers(1, 2000), min_size=1, max_size=60), st.integers(1, 12),
-       st.integers(1, 40_000))
+@given(st.lists(st.integers(1, 2000), min_size=1, max_size=60), st.integers(1, 12), st.integers(1, 40_000))
 def test_memory_is_bounded_and_the_newest_frame_is_stored(sizes, most, max_bytes):
     live = LiveGraph("test", max_bytes, most)
     for stamp, size in enumerate(sizes):
@@ -135,7 +140,7 @@ def test_early_labels_are_matched_when_a_bag_loops(live):
 def test_missing_tf_is_reported_and_invalid_boxes_left_out(live):
     live.add_cloud(cloud(1))
     live.add_boxes(FOUND, boxes(1, "base_link"), None)
-    line, = live.get_status()["lines"]
+    (line,) = live.get_status()["lines"]
     assert FOUND in line and "TF does not connect 'base_link' with 'velodyne'" in line
     assert live.layers(0, 0.0)["detections"] == {}
     wrong = boxes(1, ids=(1, 2, 3, 4))
@@ -157,9 +162,15 @@ def test_boxes_in_another_frame_are_transformed_once_tf_arrives(live, monkeypatc
         live.add_cloud(cloud(stamp))
         pose = make_pose(np.array([4.0 * i / 2, 0, 0]), [0, 0, 0, 1]) @ make_pose(mounted, turned)
         found = Detections.of(transform_boxes(boxes(stamp).boxes, pose), [0], [0.5])
-        tracks = make_track_markers(np.array([3]), found, np.zeros((1, 2)), np.zeros(1),
-                                    [transform_points(trail, pose)],
-                                    make_header(stamp, "odom", bag_message), bag_message)
+        tracks = make_track_markers(
+            np.array([3]),
+            found,
+            np.zeros((1, 2)),
+            np.zeros(1),
+            [transform_points(trail, pose)],
+            make_header(stamp, "odom", bag_message),
+            bag_message,
+        )
         live.add_boxes(TRACKED, from_marker_array(tracks), tracks)
         if i:
             live.add_boxes(FOUND, boxes(stamp), None)
@@ -168,7 +179,7 @@ def test_boxes_in_another_frame_are_transformed_once_tf_arrives(live, monkeypatc
     live.tree.set("odom", "base", 11 * second, [4, 0, 0], [0, 0, 0, 1])
     live.update()
     assert list_shown_frames(live)[-1] == 1
-    track, = live.list_tracks()
+    (track,) = live.list_tracks()
     for row, frame in zip(track["boxes"], (0, 1), strict=True):
         np.testing.assert_allclose(row[1:8], boxes(0).boxes[0], atol=1e-6)
         np.testing.assert_allclose(track["trails"][frame], trail, atol=1e-3)
@@ -198,16 +209,28 @@ def test_two_trackers_have_distinct_ids_and_misses_are_known(live):
 
 
 def test_cloud_with_most_columns_and_its_boxes_are_selected():
-    one = {"/points": CLOUD, "/ground_segmentation/output/points": CLOUD,
-           "/clustering/output/points": CLOUD, FOUND: MARKERS, FOUND + "_3d": ARRAY,
-           TRACKED: MARKERS, "/ground_truth/detections": MARKERS,
-           "/clustering/output/boxes": MARKERS}
+    one = {
+        "/points": CLOUD,
+        "/ground_segmentation/output/points": CLOUD,
+        "/clustering/output/points": CLOUD,
+        FOUND: MARKERS,
+        FOUND + "_3d": ARRAY,
+        TRACKED: MARKERS,
+        "/ground_truth/detections": MARKERS,
+        "/clustering/output/boxes": MARKERS,
+    }
     assert select_cloud_topic(one) == "/clustering/output/points"
     assert select_box_topics(one, "/clustering/output/points") == {
-        FOUND: BOXES, TRACKED: TRACKS, "/ground_truth/detections": LABELS}
+        FOUND: BOXES,
+        TRACKED: TRACKS,
+        "/ground_truth/detections": LABELS,
+    }
     assert select_box_topics({FOUND + "_3d": ARRAY}, "/points") == {FOUND + "_3d": BOXES}
     assert select_box_topics(one, "/points", wanted=["clustering/output/boxes"]) == {
-        "/clustering/output/boxes": BOXES, TRACKED: TRACKS, "/ground_truth/detections": LABELS}
+        "/clustering/output/boxes": BOXES,
+        TRACKED: TRACKS,
+        "/ground_truth/detections": LABELS,
+    }
     two = {f"/{ns}{topic}": kind for ns in ("front", "rear") for topic, kind in one.items()}
     with pytest.raises(InputError, match="--namespace"):
         select_cloud_topic(two)
@@ -226,15 +249,23 @@ def test_boxes_of_another_robot_are_not_selected():
     one = dict.fromkeys([FOUND, TRACKED, TRUTH], MARKERS) | {"/clustering/output/points": CLOUD}
     both = one | {f"/b{topic}": kind for topic, kind in one.items()}
     for robot in ("", "/b"):
-        clouds, expected = robot + "/clustering/output/points", {
-            robot + FOUND, robot + TRACKED, robot + TRUTH}
+        clouds, expected = robot + "/clustering/output/points", {robot + FOUND, robot + TRACKED, robot + TRUTH}
         assert select_cloud_topic(both, robot or "/") == clouds
         assert set(select_box_topics(both, clouds, robot or "/")) == expected
-        for name in ("clustering/output/points", "a_clustering/output/points", "points",
-                     "velodyne_points", "ouster/points"):
+        for name in (
+            "clustering/output/points",
+            "a_clustering/output/points",
+            "points",
+            "velodyne_points",
+            "ouster/points",
+        ):
             assert set(select_box_topics(both, f"{robot}/{name}")) == expected
-    for clouds, theirs in (("/clustering/output/points", False), ("/a/points", False),
-                           ("/points", True), ("/livox/lidar", True)):
+    for clouds, theirs in (
+        ("/clustering/output/points", False),
+        ("/a/points", False),
+        ("/points", True),
+        ("/livox/lidar", True),
+    ):
         alone = {"/b" + FOUND: MARKERS}  # of another robot, or the only one
         assert bool(select_box_topics(alone, clouds)) == theirs
         assert not select_box_topics(alone | {"/c" + FOUND: MARKERS}, clouds)

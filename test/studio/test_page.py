@@ -31,8 +31,9 @@ def test_seed_works_without_a_mouse(page, labels, person):
     page.locator("#tracks").focus()
     for key in ("Escape", "s", "Enter"):  # picks the middle of the view
         page.keyboard.press(key)
-    page.wait_for_function("before => page.store.selected !== null "
-                           "&& !before.includes(page.store.selected)", arg=sorted(before))
+    page.wait_for_function(
+        "before => page.store.selected !== null && !before.includes(page.store.selected)", arg=sorted(before)
+    )
     box = labels.box(page.evaluate("page.store.selected"))
     assert math.dist(box[:2], person[:2]) < 0.6
 
@@ -42,11 +43,11 @@ def test_keys_accept_reject_and_reopen_and_update_the_progress(page, labels, per
     for key, state in (("r", "rejected"), ("a", "accepted"), ("u", "proposed")):
         page.keyboard.press(key)
         labels.wait(page, number, lambda t, s=state: t["state"] == s)
-        page.wait_for_function("s => document.getElementById('state').textContent === s",
-                               arg=state)
+        page.wait_for_function("s => document.getElementById('state').textContent === s", arg=state)
         progress = labels.state()["progress"]
-        page.wait_for_function("s => document.getElementById('progress-text').textContent"
-                               ".startsWith(s)", arg=f"{progress['left']} left")
+        page.wait_for_function(
+            "s => document.getElementById('progress-text').textContent.startsWith(s)", arg=f"{progress['left']} left"
+        )
 
 
 def test_all_controls_fit_into_half_a_screen(page, labels, person):
@@ -54,18 +55,27 @@ def test_all_controls_fit_into_half_a_screen(page, labels, person):
     whole = page.viewport_size
     page.set_viewport_size({"width": 800, "height": 900})
     parts = "header nav button, #frame-name, #filters button, #numbers input, #actions button"
-    outside = page.evaluate("""parts => [...document.querySelectorAll(parts)]
+    outside = page.evaluate(
+        """parts => [...document.querySelectorAll(parts)]
         .filter(each => each.getBoundingClientRect().right > innerWidth)
-        .map(each => each.id || each.textContent)""", parts)
+        .map(each => each.id || each.textContent)""",
+        parts,
+    )
     under = page.evaluate("""() => document.getElementById('timeline').getBoundingClientRect().right
         - document.getElementById('right').getBoundingClientRect().left""")
     page.set_viewport_size(whole)
     assert outside == [] and under < 1
 
 
-@pytest.mark.parametrize(("where", "name", "way"), [
-    ("[data-view=top]", "+x", (40, 0)), ("[data-view=side]", "+z", (0, -25)),
-    ("[data-view=front]", "-y", (20, 0)), ("#handles", "+z", (0, -40))])
+@pytest.mark.parametrize(
+    ("where", "name", "way"),
+    [
+        ("[data-view=top]", "+x", (40, 0)),
+        ("[data-view=side]", "+z", (0, -25)),
+        ("[data-view=front]", "-y", (20, 0)),
+        ("#handles", "+z", (0, -40)),
+    ],
+)
 def test_dragged_face_moves_alone(page, labels, person, where, name, way):
     number = labels.chosen(page, person)
     before = labels.box(number)
@@ -81,11 +91,17 @@ def test_dragged_face_moves_alone(page, labels, person, where, name, way):
 def test_handles_disappear_immediately_with_the_key(page, labels, person, key):
     labels.chosen(page, person)
     page.wait_for_function("() => document.getElementById('handles').style.display === ''")
-    assert page.evaluate("""async key => {
+    assert (
+        page.evaluate(
+            """async key => {
         document.body.dispatchEvent(new KeyboardEvent('keydown', {key, bubbles: true}));
         for (let k = 0; k < 10; k++) await null; // no picture comes between
         return document.getElementById('handles').style.display;
-    }""", key) == "none"
+    }""",
+            key,
+        )
+        == "none"
+    )
 
 
 def test_body_is_dragged_horizontally_and_turns_about_its_centre(page, labels, person):
@@ -176,8 +192,7 @@ def test_undo_and_redo_step_through_every_state(page, labels, person):
         labels.wait(page, number, lambda t, last=states[-1]: t != last[number])
         states.append(labels.tracks())
     page.keyboard.press(",")  # a copy goes on to its frame
-    for key, expected in [*(("Control+z", s) for s in states[-2::-1]),
-                          *(("Control+y", s) for s in states[1:])]:
+    for key, expected in [*(("Control+z", s) for s in states[-2::-1]), *(("Control+y", s) for s in states[1:])]:
         page.keyboard.press(key)
         labels.wait(page, number, lambda t, e=expected: t == e[number])
         assert labels.tracks() == expected
@@ -193,8 +208,9 @@ def test_class_of_a_seed_is_chosen_at_the_click(page, labels, person):
     before = set(labels.tracks())
     labels.look_at(page, person)
     page.keyboard.press("Enter")
-    page.wait_for_function("before => page.store.selected !== null "
-                           "&& !before.includes(page.store.selected)", arg=sorted(before))
+    page.wait_for_function(
+        "before => page.store.selected !== null && !before.includes(page.store.selected)", arg=sorted(before)
+    )
     tracks = labels.tracks()
     assert tracks[page.evaluate("page.store.selected")]["class"] == name
     assert tracks[number]["class"] != name and labels.lines()[-1]["class"] == name
@@ -225,12 +241,10 @@ def test_pages_see_each_others_edits(page, browser, labels, person):
         page.keyboard.press("3")
         name = page.evaluate("page.store.drive.classes[2].name")
         for each in (other, third):
-            each.wait_for_function("([n, c]) => page.store.tracks.get(n).class === c",
-                                   arg=[number, name])
+            each.wait_for_function("([n, c]) => page.store.tracks.get(n).class === c", arg=[number, name])
         other.wait_for_selector("#notes .toast")
         other.click("#undo")
-        page.wait_for_function("([n, c]) => page.store.tracks.get(n).class !== c",
-                               arg=[number, name])
+        page.wait_for_function("([n, c]) => page.store.tracks.get(n).class !== c", arg=[number, name])
 
 
 def test_unsaved_edit_is_reported_and_reverted(page, labels, person):
@@ -300,8 +314,9 @@ def test_killed_server_loses_nothing(page, browser, labels, person):
         assert labels.tracks() == before and before[number]["state"] != "rejected"
         with opened(browser, server.url) as again:
             assert again.evaluate("n => page.store.tracks.has(n)", number)
-        page.wait_for_function("() => document.getElementById('lost').textContent"
-                               ".includes('address')")  # its token is another one now
+        page.wait_for_function(
+            "() => document.getElementById('lost').textContent.includes('address')"
+        )  # its token is another one now
 
 
 def test_view_shows_labels_and_refuses_actions(browser, drive_bag):
@@ -311,34 +326,34 @@ def test_view_shows_labels_and_refuses_actions(browser, drive_bag):
         assert page.locator("#accept").is_hidden() and page.locator("#export").is_hidden()
         page.click("#play")
         page.wait_for_function("() => page.store.frame >= 2 && page.store.results.frame >= 2")
-        reply = json.loads(page.evaluate("""async () => (await fetch("/api/do", {method: "POST",
-            body: '{"do": "undo"}'})).text()"""))
+        reply = json.loads(
+            page.evaluate("""async () => (await fetch("/api/do", {method: "POST",
+            body: '{"do": "undo"}'})).text()""")
+        )
         assert "label" in reply["error"]
 
 
-def test_view_selects_labels_and_keys_step_through_missed_ones(browser, drive_bag,
-                                                               tmp_path):
+def test_view_selects_labels_and_keys_step_through_missed_ones(browser, drive_bag, tmp_path):
     results = tmp_path / "nothing"  # was found in any frame
     results.mkdir()
-    with serving("view", drive_bag, "--results", results, "--no-open") as shown, \
-            opened(browser, shown.url) as page:
+    with serving("view", drive_bag, "--results", results, "--no-open") as shown, opened(browser, shown.url) as page:
         missed = page.evaluate("page.store.results.matches.nothing.missed")
-        counts = page.evaluate("[...document.querySelectorAll('#counts b')].map(b => "
-                               "Number(b.textContent))")
+        counts = page.evaluate("[...document.querySelectorAll('#counts b')].map(b => Number(b.textContent))")
         assert counts[0] == sum(counts[1:4]) > counts[2] == len(missed) > 0
         assert counts[4] == sum(counts[5:]) == 0
         seen = []
         for k in [*missed, None]:
             page.keyboard.press("n")
-            page.wait_for_function("([n, seen]) => page.store.found?.wrong === 'missed' && "
-                                   "page.store.found.frame * 1000 + page.store.found.k !== seen",
-                                   arg=[k, seen[-1] if seen else -1])
+            page.wait_for_function(
+                "([n, seen]) => page.store.found?.wrong === 'missed' && "
+                "page.store.found.frame * 1000 + page.store.found.k !== seen",
+                arg=[k, seen[-1] if seen else -1],
+            )
             seen.append(page.evaluate("page.store.found.frame * 1000 + page.store.found.k"))
         assert seen[:-1] == missed and seen[-1] >= 1000  # then the next frame
         assert page.inner_text("#state") == "missed" and page.is_visible("#facts")
         page.keyboard.press("[")
-        page.wait_for_function("k => page.store.frame === 0 && page.store.found?.k === k",
-                               arg=missed[-1])
+        page.wait_for_function("k => page.store.frame === 0 && page.store.found?.k === k", arg=missed[-1])
         row = page.evaluate("page.store.found.row")
         page.keyboard.press("Escape")
         page.wait_for_function("() => page.store.found === null")

@@ -21,8 +21,9 @@ def find_cycle(imports: dict[str, set[str]]) -> list[str]:
 
 
 def test_page_modules_import_in_one_direction():
-    imports = {path.stem: set(re.findall(r'(?:from|import) "\./(\w+)\.js"', path.read_text()))
-               for path in SOURCES.glob("*.js")}
+    imports = {
+        path.stem: set(re.findall(r'(?:from|import) "\./(\w+)\.js"', path.read_text())) for path in SOURCES.glob("*.js")
+    }
     assert imports["api"] and imports.keys() >= set().union(*imports.values())
     assert find_cycle(imports) == []
 

@@ -11,21 +11,23 @@ from labeling_pages import boxes_of, opened
 pytestmark = pytest.mark.no_cover  # others run these lines
 
 
-def test_typed_number_changes_only_itself_and_escape_nothing(page, labels,
-                                                             person):
+def test_typed_number_changes_only_itself_and_escape_nothing(page, labels, person):
     number = labels.chosen(page, person)
     page.click("[data-filter=all]")
     before, lines = labels.box(number), len(labels.lines())
-    for key, text, there in (("Enter", "", before), ("Enter", "1e99", before),
-                             ("Escape", "4.5", before), ("Enter", "4.567", [before[0], 4.567])):
+    for key, text, there in (
+        ("Enter", "", before),
+        ("Enter", "1e99", before),
+        ("Escape", "4.5", before),
+        ("Enter", "4.567", [before[0], 4.567]),
+    ):
         page.click(f"#tracks [data-track='{number}']")
         page.click("#field-y", click_count=3)
         page.keyboard.press("Delete")
         page.keyboard.type(text)
         page.keyboard.press(key)
         labels.wait(page, number, lambda t, y=there[1]: boxes_of(t)[0][1] == y)
-        page.wait_for_function("y => document.getElementById('field-y').value === y",
-                               arg=f"{there[1]:.2f}")
+        page.wait_for_function("y => document.getElementById('field-y').value === y", arg=f"{there[1]:.2f}")
     page.click("#errors .toast button")  # the refusal was reported
     assert labels.box(number) == [before[0], 4.567, *before[2:]]
     assert len(labels.lines()) == lines + 1
@@ -37,8 +39,7 @@ def test_typed_number_changes_only_itself_and_escape_nothing(page, labels,
     labels.wait(page, number, lambda t: boxes_of(t)[0][:2] == [3.25, 2.125])
 
 
-def test_keys_while_a_frame_loads_apply_to_the_shown_one(browser, page, labels,
-                                                         person):
+def test_keys_while_a_frame_loads_apply_to_the_shown_one(browser, page, labels, person):
     number = labels.chosen(page, person)
     before, held = labels.box(number), []
     with opened(browser, f"{labels.url}&track={number}") as other:

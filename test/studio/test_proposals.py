@@ -33,8 +33,7 @@ SEED, FRAMES = 127, 6  # a street with people near and far
 @pytest.fixture(scope="module")
 def drive(streets):
     frames = list(simulate_frames(SEED, FRAMES, streets_of=20))
-    return Drive("simulated", Recording(Path("simulated"), "simulated", frames,
-                                        frozenset({BOXES, POSES})))
+    return Drive("simulated", Recording(Path("simulated"), "simulated", frames, frozenset({BOXES, POSES})))
 
 
 @pytest.fixture
@@ -49,8 +48,9 @@ def person(session):
     people = {}
     for f, frame in enumerate(session.drive.frames):
         truth = frame.truth()
-        for box, extra in zip(truth.boxes[truth.class_ids == PEDESTRIAN],
-                              np.array(truth.extras)[truth.class_ids == PEDESTRIAN]):
+        for box, extra in zip(
+            truth.boxes[truth.class_ids == PEDESTRIAN], np.array(truth.extras)[truth.class_ids == PEDESTRIAN]
+        ):
             people.setdefault(extra["track_id"], {})[f] = box
     boxes = min(people.values(), key=lambda b: np.hypot(*next(iter(b.values()))[:2]))
     frame = min(boxes)
@@ -73,18 +73,20 @@ def test_clicked_person_is_tracked_through_the_drive(session):
     assert len(boxes) >= FRAMES - 1 and boxes.keys() <= track.boxes.keys()
     near = [np.hypot(*(np.array(track.boxes[f].values)[:2] - b[:2])) for f, b in boxes.items()]
     assert max(near) < 0.5
-    assert all(t.class_name == "Pedestrian" and t.state == PROPOSED
-               for t in session.state.tracks.values() if t.id != track.id)
+    assert all(
+        t.class_name == "Pedestrian" and t.state == PROPOSED for t in session.state.tracks.values() if t.id != track.id
+    )
 
 
 def boxes_of(session):
     """Return all tracks without their ids, which depend on the order of discovery."""
-    return {(t.class_name, t.state, t.source, t.score, tuple(sorted(t.boxes.items())))
-            for t in session.state.tracks.values()}
+    return {
+        (t.class_name, t.state, t.source, t.score, tuple(sorted(t.boxes.items())))
+        for t in session.state.tracks.values()
+    }
 
 
-def test_seed_in_a_long_drive_is_tracked_nearby_first(
-        session, drive, tmp_path, monkeypatch):
+def test_seed_in_a_long_drive_is_tracked_nearby_first(session, drive, tmp_path, monkeypatch):
     session.propose()
     click(session)
     full = boxes_of(session)
@@ -107,10 +109,10 @@ def test_seed_in_a_long_drive_is_tracked_nearby_first(
 def test_seed_is_applied_once_and_its_tracks_are_encoded_once(session, monkeypatch):
     session.propose()
     applied, encoded = [], []
-    monkeypatch.setattr("lidar_studio.session.apply",
-                        lambda *args: applied.append(args) or apply(*args))
-    monkeypatch.setattr("lidar_studio.session.track_to_json",
-                        lambda track: encoded.append(track.id) or track_to_json(track))
+    monkeypatch.setattr("lidar_studio.session.apply", lambda *args: applied.append(args) or apply(*args))
+    monkeypatch.setattr(
+        "lidar_studio.session.track_to_json", lambda track: encoded.append(track.id) or track_to_json(track)
+    )
     monkeypatch.setattr("lidar_studio.state.track_from_json", None)
     click(session)
     assert len(applied) == 1
@@ -145,8 +147,7 @@ def test_cluster_of_the_seed_size_is_most_similar(length, width, height, share):
     assert compute_size_similarity(same, size) == pytest.approx(1.0)
     scaled = same * [1, 1, 1, share, 1, 1, 1]
     assert 0 <= compute_size_similarity(scaled, size)[0] <= 1
-    larger = [compute_size_similarity(same * [1, 1, 1, s, s, s, 1], size)[0]
-              for s in (1.0, 1.1, 1.3, 1.6)]
+    larger = [compute_size_similarity(same * [1, 1, 1, s, s, s, 1], size)[0] for s in (1.0, 1.1, 1.3, 1.6)]
     assert larger == sorted(larger, reverse=True) and larger[-1] < 0.1
 
 
@@ -160,6 +161,7 @@ def run_survey(drive, folder, until=FRAMES):
         def report(count, on_progress):
             progress.append(count)
             return on_progress(count) and not count == until < FRAMES
+
         session.proposer.run_survey = lambda f: run(lambda count: report(count, f))
         session.propose()
         if until == FRAMES:
@@ -190,8 +192,12 @@ def test_cancelled_survey_is_continued(drive, tmp_path, monkeypatch, posed):
 
 def test_survey_of_another_drive_is_replaced_and_reported(drive, tmp_path, monkeypatch):
     monkeypatch.setattr(survey_cache, "FRAMES_PER_FILE", 2)
-    other = Drive("simulated", Recording(Path("simulated"), "simulated", [
-        replace(frame, load=drive.frames[0].load) for frame in drive.frames]))  # other clouds only
+    other = Drive(
+        "simulated",
+        Recording(
+            Path("simulated"), "simulated", [replace(frame, load=drive.frames[0].load) for frame in drive.frames]
+        ),
+    )  # other clouds only
     run_survey(drive, tmp_path, until=5)
     (tmp_path / JOURNAL_NAME).unlink()  # the journal is of the clouds, too
     progress, messages, _ = run_survey(other, tmp_path, until=3)
@@ -200,8 +206,9 @@ def test_survey_of_another_drive_is_replaced_and_reported(drive, tmp_path, monke
     (tmp_path / JOURNAL_NAME).unlink()
     progress, messages, _ = run_survey(drive, tmp_path)
     assert progress == [1, 2, 3, 4, 5, 6] and "surveyed again" in messages
-    found, why = survey_cache.read(tmp_path / survey_cache.FOLDER,
-                                   survey_cache.make_key(drive, DetectorChoice("pointpillars")))
+    found, why = survey_cache.read(
+        tmp_path / survey_cache.FOLDER, survey_cache.make_key(drive, DetectorChoice("pointpillars"))
+    )
     assert found == [] and "weights '', not 'pointpillars'" in why
 
 
@@ -215,8 +222,7 @@ def test_survey_cache_is_bounded(drive, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("restarted", [False, True])
-def test_seed_corrected_before_tracking_is_tracked(
-        drive, tmp_path, monkeypatch, restarted):
+def test_seed_corrected_before_tracking_is_tracked(drive, tmp_path, monkeypatch, restarted):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
     with open_session(drive, tmp_path, detector=None) as session:
         session.propose()
@@ -238,16 +244,21 @@ def test_seed_corrected_before_tracking_is_tracked(
     assert [f for f, b in found.boxes.items() if b.kind == KEY] == [0, 1]
 
 
-def test_undoing_a_correction_after_tracking_leaves_it_tracked(
-        session, monkeypatch):
+def test_undoing_a_correction_after_tracking_leaves_it_tracked(session, monkeypatch):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
     session.propose()
     begun, start = [], session._start
     monkeypatch.setattr(session, "_start", lambda *asked: begun.append(asked))  # slowly
     _, track = click(session)
-    session.do({"do": "box", "track": track.id, "frame": 1, "box": [
-        track.boxes[1].values[0] + 0.1, *track.boxes[1].values[1:]]})
-    (_, work), = begun
+    session.do(
+        {
+            "do": "box",
+            "track": track.id,
+            "frame": 1,
+            "box": [track.boxes[1].values[0] + 0.1, *track.boxes[1].values[1:]],
+        }
+    )
+    ((_, work),) = begun
     work()
     extend_track = session.state.tracks[track.id]
     assert len(extend_track.boxes) >= FRAMES - 1 and not extend_track.nearby
@@ -260,15 +271,14 @@ def test_undoing_a_correction_after_tracking_leaves_it_tracked(
 
 
 @pytest.mark.parametrize("verb", ["accept", "reopen"])
-def test_click_rejected_while_tracking_is_tracked_once_restored(
-        session, monkeypatch, verb):
+def test_click_rejected_while_tracking_is_tracked_once_restored(session, monkeypatch, verb):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
     session.propose()
     begun, start = [], session._start
     monkeypatch.setattr(session, "_start", lambda *asked: begun.append(asked))  # slowly
     _, track = click(session)
     session.do({"do": "reject", "track": track.id})
-    (_, work), = begun
+    ((_, work),) = begun
     work()
     assert session.state.tracks[track.id].nearby
     monkeypatch.setattr(session, "_start", start)
@@ -302,10 +312,9 @@ def test_survey_survives_a_restart_and_is_redone_if_damaged(drive, tmp_path):
         assert np.array_equal(old.detections.boxes, new.detections.boxes)
         assert old.features.keys() == new.features.keys()
         assert all(np.array_equal(old.features[n], new.features[n]) for n in old.features)
-    kept, = folder.iterdir()
+    (kept,) = folder.iterdir()
     content = kept.read_bytes()
-    for damaged in (content[:len(content) // 2], content[:-30], b"",
-                    content[:3000] + bytes(100) + content[3100:]):
+    for damaged in (content[: len(content) // 2], content[:-30], b"", content[:3000] + bytes(100) + content[3100:]):
         kept.write_bytes(damaged)
         found, why = survey_cache.read(folder, key)
         assert found == [] and "damaged" in why
@@ -327,7 +336,7 @@ def test_person_clicked_before_the_survey_is_tracked_after_it(session):
     session.propose()
     extend_track = session.state.tracks[track.id]
     assert len(extend_track.boxes) >= FRAMES - 1 and extend_track.state == "accepted"
-    key, = [f for f, b in extend_track.boxes.items() if b.kind == KEY]
+    (key,) = [f for f, b in extend_track.boxes.items() if b.kind == KEY]
     assert extend_track.boxes[key] == track.boxes[key]
 
 
@@ -378,8 +387,7 @@ def test_boxes_snap_to_ground_and_cluster(drive):
     for box in truth.boxes[(truth.class_ids == 3) & near]:
         lifted = box + [0.1, -0.1, 0.3, 0, 0, 0, 0]
         down = snap_to_ground(scan, lifted)
-        assert abs(down[2] - box[2]) < 0.1 and (down[[0, 1, 3, 4, 5, 6]]
-                                                == lifted[[0, 1, 3, 4, 5, 6]]).all()
+        assert abs(down[2] - box[2]) < 0.1 and (down[[0, 1, 3, 4, 5, 6]] == lifted[[0, 1, 3, 4, 5, 6]]).all()
         around = snap_to_cluster(scan, lifted)
         assert np.hypot(*(around[:2] - box[:2])) < 0.4
         assert abs(np.angle(np.exp(1j * (around[6] - lifted[6])))) <= np.pi / 4 + 1e-9

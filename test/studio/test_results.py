@@ -56,8 +56,7 @@ def test_exact_detections_leave_nothing_missed_or_false():
     boxes = np.vstack([CARS, [[8.0, -3, -1, 0.6, 0.6, 1.7, 0]]])
     found = Detections.of(boxes, ids, [0.9, 0.4, 0.7])
     for order in ([0, 1, 2], [2, 0, 1]):
-        assert wrong(truth(boxes[order], np.array(ids)[order]), found, 0.0) == {
-            "missed": [], "false": []}
+        assert wrong(truth(boxes[order], np.array(ids)[order]), found, 0.0) == {"missed": [], "false": []}
 
 
 def test_detection_below_the_minimum_score_is_ignored():
@@ -81,16 +80,22 @@ def test_van_is_neither_missed_nor_a_false_car():
     assert (result["ignored_labels"], result["ignored"]) == ([1], [1])
 
 
-@given(st.lists(st.tuples(st.integers(0, 8), st.integers(0, 3)), max_size=6),
-       st.lists(st.tuples(st.integers(0, 8), st.integers(0, 3), st.integers(0, 4)), max_size=6),
-       st.sampled_from([frozenset(DETECTED), frozenset(["Pedestrian"]), frozenset(["Car", "Van"])]))
+@given(
+    st.lists(st.tuples(st.integers(0, 8), st.integers(0, 3)), max_size=6),
+    st.lists(st.tuples(st.integers(0, 8), st.integers(0, 3), st.integers(0, 4)), max_size=6),
+    st.sampled_from([frozenset(DETECTED), frozenset(["Pedestrian"]), frozenset(["Car", "Van"])]),
+)
 def test_every_label_and_detection_is_counted_once(labels, detections, classes):
     def boxes(rows):
         return np.array([[3.0 * place, 2, -1, 4, 1.6, 1.5, 0] for place, *_ in rows]).reshape(-1, 7)
+
     kinds = CAR, VAN, PEDESTRIAN, CLASSES.index("Tram")
-    wrong(truth(boxes(labels), [kinds[k] for _, k in labels]),
-          Detections.of(boxes(detections), [kinds[k] for _, k, _ in detections],
-                        [score / 4 for *_, score in detections]), 0.5, classes=classes)
+    wrong(
+        truth(boxes(labels), [kinds[k] for _, k in labels]),
+        Detections.of(boxes(detections), [kinds[k] for _, k, _ in detections], [score / 4 for *_, score in detections]),
+        0.5,
+        classes=classes,
+    )
 
 
 def test_source_does_not_miss_classes_it_cannot_detect(drive_bag):
@@ -109,14 +114,16 @@ def test_bag_without_ground_and_clusters_is_segmented(drive_bag):
         assert np.array_equal(getattr(ours, name), getattr(theirs, name))
 
 
-NUMBERS = st.lists(st.integers(-2**31, 2**31 - 1), min_size=1, max_size=6, unique=True)
+NUMBERS = st.lists(st.integers(-(2**31), 2**31 - 1), min_size=1, max_size=6, unique=True)
 
 
 @given(st.lists(NUMBERS, min_size=2, max_size=4), st.integers(1, 10**6))
 def test_tracks_of_different_trackers_have_distinct_ids(trackers, far):
     trackers[1] = [*{*trackers[1], *(n + far for n in trackers[0] if n + far < 2**31)}]
-    made = [[t["id"] for t in tracks_to_json({0: marked(numbers)}, "/a/output/tracks", k)]
-            for k, numbers in enumerate(trackers)]
+    made = [
+        [t["id"] for t in tracks_to_json({0: marked(numbers)}, "/a/output/tracks", k)]
+        for k, numbers in enumerate(trackers)
+    ]
     all_ids = [number for each in made for number in each]
     assert len(set(all_ids)) == len(all_ids) == sum(map(len, trackers))
     assert all(0 <= number < 2**53 for number in all_ids)  # what a page can count
@@ -125,14 +132,19 @@ def test_tracks_of_different_trackers_have_distinct_ids(trackers, far):
 
 def test_track_has_the_last_class_of_its_tracker():
     first, then = marked([7]), replace(marked([7]), labels=["Cyclist"])
-    track, = tracks_to_json({0: first, 1: then}, "/a/output/tracks", 0)
+    (track,) = tracks_to_json({0: first, 1: then}, "/a/output/tracks", 0)
     assert track["class"] == "Cyclist" and len(track["boxes"]) == 2
 
 
 def marked(numbers):
     count = len(numbers)
-    return MarkedObjects(np.tile([5.0, 0, 0, 1, 1, 1, 0], (count, 1)), ["Car"] * count,
-                         np.full(count, 0.5), np.array(numbers), [{}] * count)
+    return MarkedObjects(
+        np.tile([5.0, 0, 0, 1, 1, 1, 0], (count, 1)),
+        ["Car"] * count,
+        np.full(count, 0.5),
+        np.array(numbers),
+        [{}] * count,
+    )
 
 
 def test_tracks_of_all_trackers_in_a_bag_are_distinct(tmp_path):
@@ -140,19 +152,44 @@ def test_tracks_of_all_trackers_in_a_bag_are_distinct(tmp_path):
     with BagWriter(tmp_path / "bag") as made:
         for topic, ids in numbers.items():
             made.add_topic(topic, "visualization_msgs/msg/MarkerArray")
-            made.write(topic, 10, to_marker_array(
-                np.tile([5.0, 0, 0, 1, 1, 1, 0], (2, 1)), ["Car"] * 2, ids=ids,
-                header=make_header(10, "velodyne", bag_message), make=bag_message))
+            made.write(
+                topic,
+                10,
+                to_marker_array(
+                    np.tile([5.0, 0, 0, 1, 1, 1, 0], (2, 1)),
+                    ["Car"] * 2,
+                    ids=ids,
+                    header=make_header(10, "velodyne", bag_message),
+                    make=bag_message,
+                ),
+            )
     found = read_recorded_results(BagPoses(BagHandle(tmp_path / "bag"), ""), [10]).tracks
     assert len({t["id"] for t in found}) == len(found) == 4
     assert {t["source"] for t in found} == {"a", "b"}
 
 
 def test_sources_have_unique_short_names():
-    paths = [Path(name) for name in ("fused", "robot/fused.json", "a/v4/best.safetensors",
-                                     "b/v4/best.safetensors", "/out/data", "x/y.json", "x/y.onnx")]
-    assert make_short_names(paths, ["data"]) == ["fused", "robot/fused", "a/v4/best", "b/v4/best",
-                                                 "out/data", "x/y.json", "x/y.onnx"]
+    paths = [
+        Path(name)
+        for name in (
+            "fused",
+            "robot/fused.json",
+            "a/v4/best.safetensors",
+            "b/v4/best.safetensors",
+            "/out/data",
+            "x/y.json",
+            "x/y.onnx",
+        )
+    ]
+    assert make_short_names(paths, ["data"]) == [
+        "fused",
+        "robot/fused",
+        "a/v4/best",
+        "b/v4/best",
+        "out/data",
+        "x/y.json",
+        "x/y.onnx",
+    ]
 
 
 def test_missing_result_folder_is_named(tmp_path):
@@ -167,8 +204,7 @@ def test_missing_frame_is_reported(drive_bag):
 
 @pytest.mark.parametrize("verb", ["view", "label"])
 @pytest.mark.parametrize("content", [b"no cloud\n", b"", b"# .PCD v0.7\nDATA ascii\n"])
-def test_file_without_a_cloud_is_refused_before_serving(verb, content, tmp_path,
-                                                        monkeypatch, capsys):
+def test_file_without_a_cloud_is_refused_before_serving(verb, content, tmp_path, monkeypatch, capsys):
     file = tmp_path / "text.pcd"
     file.write_bytes(content)
     monkeypatch.chdir(tmp_path)

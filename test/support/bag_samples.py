@@ -17,16 +17,21 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.types import PointCloud
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, TF_STATIC
 
-OTHER_CALIBRATION = Calibration(CALIBRATION.intrinsics * [[2], [2], [1]],
-                                CALIBRATION.lidar_to_camera, 640, 480)
+OTHER_CALIBRATION = Calibration(CALIBRATION.intrinsics * [[2], [2], [1]], CALIBRATION.lidar_to_camera, 640, 480)
 LATCHED = {CAMERA_INFO, EXTRINSICS, TF_STATIC}
 
 
 def scans(count: int = 3) -> list[Frame]:
     """Return frames, all but the second with labels; the calibration changes after the second."""
-    return [Frame.of(str(i), cloud_frame(scene(i), STAMP + i * 10**8),
-                     None if i == 1 else walker_truth(),
-                     CALIBRATION if i < 2 else OTHER_CALIBRATION) for i in range(count)]
+    return [
+        Frame.of(
+            str(i),
+            cloud_frame(scene(i), STAMP + i * 10**8),
+            None if i == 1 else walker_truth(),
+            CALIBRATION if i < 2 else OTHER_CALIBRATION,
+        )
+        for i in range(count)
+    ]
 
 
 def cloud_frame(cloud: np.ndarray, stamp_ns: int) -> PointCloud:
@@ -46,6 +51,5 @@ def same_cloud(cloud: np.ndarray, xyz: np.ndarray) -> bool:
 def as_ros1(source: Path, path: Path, compress: str | None = None) -> Path:
     """Convert a bag to ROS 1 and return its path; `compress` is lz4, bz2 or None."""
     with redirect_stdout(io.StringIO()):
-        convert([source], path, "", 0, compress, "", None, get_typestore(Stores.ROS1_NOETIC),
-                (), (), (), ())
+        convert([source], path, "", 0, compress, "", None, get_typestore(Stores.ROS1_NOETIC), (), (), (), ())
     return path

@@ -9,10 +9,18 @@ from contextlib import contextmanager
 import pytest
 
 # The headless builds come first: they start faster.
-BROWSERS = ("chromium-headless-shell", "chrome-headless-shell", "chromium", "chromium-browser",
-            "google-chrome", "google-chrome-stable")
-FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
-         "--disable-background-networking --disable-component-update --disable-sync").split()
+BROWSERS = (
+    "chromium-headless-shell",
+    "chrome-headless-shell",
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+    "google-chrome-stable",
+)
+FLAGS = (
+    "--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
+    "--disable-background-networking --disable-component-update --disable-sync"
+).split()
 
 
 @contextmanager

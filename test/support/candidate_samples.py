@@ -31,8 +31,12 @@ def floor(seed=0):
 
 def scene():
     """Return a floor, three people and two other objects, one of them as high as a person."""
-    parts = [floor(), *(person(*at, seed=i) for i, at in enumerate(PEOPLE)),
-             block(10, 8, [2.0, 3.0, 1.3]), block(13, 3, [0.2, 0.6, 1.69])]
+    parts = [
+        floor(),
+        *(person(*at, seed=i) for i, at in enumerate(PEOPLE)),
+        block(10, 8, [2.0, 3.0, 1.3]),
+        block(13, 3, [0.2, 0.6, 1.69]),
+    ]
     return np.concatenate(parts).astype(np.float32)
 
 

@@ -47,8 +47,9 @@ def scores(content: dict) -> dict:
 def evaluate_detection(tmp_path, *arguments):
     """Return the JSON file and the output of `evaluate detection`."""
     path = tmp_path / "made/scores.json"
-    result = CliRunner().invoke(cli, ["evaluate", "detection", "--json", str(path),
-                                      *map(str, arguments)], catch_exceptions=False)
+    result = CliRunner().invoke(
+        cli, ["evaluate", "detection", "--json", str(path), *map(str, arguments)], catch_exceptions=False
+    )
     assert result.exit_code == 0, result.output
     return json.loads(path.read_text()), result.stdout
 
@@ -60,6 +61,5 @@ def error_line(capsys) -> str:
     """
     *before, line = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("Error: ")
-    assert all(re.search(r": .*, \d+ frames?\b|^compiling ", each)
-               for each in before if each), before
+    assert all(re.search(r": .*, \d+ frames?\b|^compiling ", each) for each in before if each), before
     return line

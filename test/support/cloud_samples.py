@@ -13,35 +13,57 @@ from lidar_perception.wire.clouds import COMPRESSED
 from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array
 
-COMPRESS = {"zlib": zlib.compress, "gzip": gzip.compress,
-            "zstd": zstandard.ZstdCompressor().compress, "draco": lambda data: b"DRACO" + data}
+COMPRESS = {
+    "zlib": zlib.compress,
+    "gzip": gzip.compress,
+    "zstd": zstandard.ZstdCompressor().compress,
+    "draco": lambda data: b"DRACO" + data,
+}
 
 
 def livox_points(count: int = 5) -> dict[str, np.ndarray]:
     """Columns of a CustomMsg of `count` points, 10 microseconds apart."""
     rng = np.random.default_rng(count)
-    return {"offset_time": np.arange(count, dtype=np.uint32) * 10_000,
-            **{axis: rng.uniform(-20, 20, count).astype(np.float32) for axis in "xyz"},
-            "reflectivity": np.linspace(0, 255, count).astype(np.uint8),
-            "tag": np.full(count, 16, np.uint8), "line": np.arange(count, dtype=np.uint8) % 6}
+    return {
+        "offset_time": np.arange(count, dtype=np.uint32) * 10_000,
+        **{axis: rng.uniform(-20, 20, count).astype(np.float32) for axis in "xyz"},
+        "reflectivity": np.linspace(0, 255, count).astype(np.uint8),
+        "tag": np.full(count, 16, np.uint8),
+        "line": np.arange(count, dtype=np.uint8) % 6,
+    }
 
 
-def livox_message(points: dict[str, np.ndarray], package: str = "livox_ros_driver2",
-                  stamp_ns: int = STAMP, frame_id: str = "livox_frame"):
+def livox_message(
+    points: dict[str, np.ndarray],
+    package: str = "livox_ros_driver2",
+    stamp_ns: int = STAMP,
+    frame_id: str = "livox_frame",
+):
     """CustomMsg of rosbags' class."""
-    rows = [bag_message(f"{package}/msg/CustomPoint", **dict(zip(points, map(lambda v: v.item(),
-                                                                             row))))
-            for row in zip(*points.values())]
-    return bag_message(f"{package}/msg/CustomMsg", header=header(bag_message, stamp_ns, frame_id),
-                       timebase=stamp_ns, point_num=len(rows), lidar_id=1, points=rows)
+    rows = [
+        bag_message(f"{package}/msg/CustomPoint", **dict(zip(points, map(lambda v: v.item(), row))))
+        for row in zip(*points.values())
+    ]
+    return bag_message(
+        f"{package}/msg/CustomMsg",
+        header=header(bag_message, stamp_ns, frame_id),
+        timebase=stamp_ns,
+        point_num=len(rows),
+        lidar_id=1,
+        points=rows,
+    )
 
 
 def compressed_message(points: np.ndarray, packing: str, stamp_ns: int = STAMP):
     """CompressedPointCloud2 of rosbags' class, of a structured array; gzip is a kind of zlib."""
     cloud = from_array(points, header(bag_message, stamp_ns), bag_message)
     packed = COMPRESS[packing](cloud.data.tobytes())
-    return bag_message(COMPRESSED, compressed_data=np.frombuffer(packed, np.uint8),
-                       format="zlib" if packing == "gzip" else packing,
-                       **{name: getattr(cloud, name) for name in (
-                           "header", "height", "width", "fields", "is_bigendian", "point_step",
-                           "row_step", "is_dense")})
+    return bag_message(
+        COMPRESSED,
+        compressed_data=np.frombuffer(packed, np.uint8),
+        format="zlib" if packing == "gzip" else packing,
+        **{
+            name: getattr(cloud, name)
+            for name in ("header", "height", "width", "fields", "is_bigendian", "point_step", "row_step", "is_dense")
+        },
+    )

@@ -86,9 +86,17 @@ def read_json(out):
 
 def objects(content):
     """Frame -> rows of numbers of its objects."""
-    return {frame["name"]: [[CLASSES.index(row["class"]), row["score"], *(row[name] for name in (
-        "x", "y", "z", "length", "width", "height", "yaw"))] for row in frame["objects"]]
-        for frame in content["frames"]}
+    return {
+        frame["name"]: [
+            [
+                CLASSES.index(row["class"]),
+                row["score"],
+                *(row[name] for name in ("x", "y", "z", "length", "width", "height", "yaw")),
+            ]
+            for row in frame["objects"]
+        ]
+        for frame in content["frames"]
+    }
 
 
 def make_run(recording, out, **header):

@@ -25,9 +25,17 @@ LABELS = torch.tensor([0, 1])
 
 def tiny(version: str = "v0", **changes) -> NetworkConfig:
     """Any version on 32 x 32 pillars with a few channels."""
-    small = dict(low=(0.0, -5.12, -3.0), high=(10.24, 5.12, 1.0), cell=0.32, pillar_channels=8,
-                 map_channels=(4, 8), block_channels=(8, 12, 16), block_layers=(1, 1, 1),
-                 deconv_channels=8, fpn_channels=8)
+    small = dict(
+        low=(0.0, -5.12, -3.0),
+        high=(10.24, 5.12, 1.0),
+        cell=0.32,
+        pillar_channels=8,
+        map_channels=(4, 8),
+        block_channels=(8, 12, 16),
+        block_layers=(1, 1, 1),
+        deconv_channels=8,
+        fpn_channels=8,
+    )
     return make_config(version, "compact", **{**small, **changes})
 
 
@@ -46,8 +54,11 @@ def two_objects(seed: int = 0) -> np.ndarray:
         flat[np.arange(300), side] = np.sign(flat[np.arange(300), side]) / 2
         flat *= [length, width, height]
         cos, sin = np.cos(yaw), np.sin(yaw)
-        parts.append(np.column_stack([x + cos * flat[:, 0] - sin * flat[:, 1],
-                                      y + sin * flat[:, 0] + cos * flat[:, 1], z + flat[:, 2]]))
+        parts.append(
+            np.column_stack(
+                [x + cos * flat[:, 0] - sin * flat[:, 1], y + sin * flat[:, 0] + cos * flat[:, 1], z + flat[:, 2]]
+            )
+        )
     xyz = np.concatenate(parts)
     return np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32)
 
@@ -76,30 +87,38 @@ def frame(seed: int = 0) -> PointCloud:
     return PointCloud(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
 
 
-def eager(params: DetectorParams = DetectorParams(), score: float = 0.25,
-          engine: str = "auto") -> DetectorParams:
+def eager(params: DetectorParams = DetectorParams(), score: float = 0.25, engine: str = "auto") -> DetectorParams:
     """Parameters with which random weights find something."""
     names = ("car", "pedestrian", "cyclist", "other")
-    return with_values(params, {**{f"pointpillars.scores.{n}": score for n in names},
-                                "pointpillars.nms.iou": 0.2, "pointpillars.engine": engine})
+    return with_values(
+        params,
+        {
+            **{f"pointpillars.scores.{n}": score for n in names},
+            "pointpillars.nms.iou": 0.2,
+            "pointpillars.engine": engine,
+        },
+    )
 
 
-def random_detector(version: str = "v0", params: DetectorParams | None = None,
-                    **changes) -> PointPillarsDetector:
+def random_detector(version: str = "v0", params: DetectorParams | None = None, **changes) -> PointPillarsDetector:
     """With random weights."""
-    return make_detector(TorchNetwork(lively(tiny(version, **changes))),
-                         Header(tiny(version, **changes)), params or eager())
+    return make_detector(
+        TorchNetwork(lively(tiny(version, **changes))), Header(tiny(version, **changes)), params or eager()
+    )
 
 
-def make_detector(network: Network, header: Header, params: DetectorParams = DetectorParams(),
-                  device: str = CPU) -> PointPillarsDetector:
+def make_detector(
+    network: Network, header: Header, params: DetectorParams = DetectorParams(), device: str = CPU
+) -> PointPillarsDetector:
     return PointPillarsDetector(PointPillarsProposer(network, header, device), params)
 
 
-def same(a: Detections | DetectionResult, b: Detections | DetectionResult,
-         atol: float = 0.0) -> bool:
+def same(a: Detections | DetectionResult, b: Detections | DetectionResult, atol: float = 0.0) -> bool:
     """Return True if both are equal, in the same order."""
     a, b = (x.detections if isinstance(x, DetectionResult) else x for x in (a, b))
-    return (len(a) == len(b) and np.array_equal(a.class_ids, b.class_ids)
-            and np.allclose(a.boxes, b.boxes, rtol=0, atol=atol)
-            and np.allclose(a.scores, b.scores, rtol=0, atol=atol))
+    return (
+        len(a) == len(b)
+        and np.array_equal(a.class_ids, b.class_ids)
+        and np.allclose(a.boxes, b.boxes, rtol=0, atol=atol)
+        and np.allclose(a.scores, b.scores, rtol=0, atol=atol)
+    )

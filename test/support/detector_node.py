@@ -74,16 +74,21 @@ class DetectorUnderTest:
 
         The node uses the CPU as `offline` does: a GPU rounds differently.
         """
-        params = with_values(self.params, {f"{self.network}.weights": str(weights),
-                                           f"{self.network}.device": "cpu",
-                                           f"{self.network}.threads": 1, **changes})
+        params = with_values(
+            self.params,
+            {
+                f"{self.network}.weights": str(weights),
+                f"{self.network}.device": "cpu",
+                f"{self.network}.threads": 1,
+                **changes,
+            },
+        )
         defaults = flatten(type(self.params)())
         return {k: v for k, v in flatten(params).items() if v != defaults[k]}
 
     def offline(self, weights: Path, msg: Any, **columns: Any) -> Any:
         """Return the detections of the detector without ROS."""
-        detector = self.load(weights, "cpu", with_values(self.params, {
-            f"{self.network}.threads": 1}))
+        detector = self.load(weights, "cpu", with_values(self.params, {f"{self.network}.threads": 1}))
         point_cloud = to_point_cloud(msg, self.params.input.intensity_max)[0]
         return detector(point_cloud, **columns).detections
 
@@ -125,8 +130,7 @@ def small_pointnet(folder: Path) -> Path:
 
 def small_fusion(folder: Path) -> Path:
     """Write a fused detector of small weights, with curves that differ from the shipped ones."""
-    models = {name: {**model, "bias": model["bias"] + 1}
-              for name, model in load_shipped_models().items()}
+    models = {name: {**model, "bias": model["bias"] + 1} for name, model in load_shipped_models().items()}
     write_fusion(folder / "fused.json", (small_v4(folder), None), models, {})
     return folder / "fused.json"
 
@@ -140,18 +144,16 @@ def _pointpillars_clouds():
         "behind": (cloud(np.abs(xyz) * [-1, 1, -1] - [1, 0, 0]), "network's range"),
         "no intensity": (cloud(xyz), "no intensity"),
         "a million": (cloud(rng.uniform(-50, 50, (1_000_000, 3)) * [1, 1, 0.05]), "no intensity"),
-        "some NaN": (cloud(np.where(np.arange(len(xyz))[:, None] % 3, xyz, np.nan)),
-                     "no intensity"),
+        "some NaN": (cloud(np.where(np.arange(len(xyz))[:, None] % 3, xyz, np.nan)), "no intensity"),
         "all is ground": (message(1, ground=count.astype("u1") + 1), "is ground"),
-        "no clusters": (message(1, ground=count.astype("u1"), cluster_id=count.astype("u4")),
-                        "detecting"),
-        "ids beyond int32": (message(1, cluster_id=(count + 2**32 - 1).astype("u4"),
-                                     ground=count.astype("u1")), "detecting"),
+        "no clusters": (message(1, ground=count.astype("u1"), cluster_id=count.astype("u4")), "detecting"),
+        "ids beyond int32": (
+            message(1, cluster_id=(count + 2**32 - 1).astype("u4"), ground=count.astype("u1")),
+            "detecting",
+        ),
         "large ids": (message(1, cluster_id=(count + 2**31 - 1).astype("u4")), "detecting"),
-        "float columns": (message(1, cluster_id=count * np.nan, ground=count * np.nan),
-                          "detecting"),
-        "two values per point": (message(1, ground=np.zeros((len(xyz), 2), "u1")),
-                                 "'ground' has count > 1"),
+        "float columns": (message(1, cluster_id=count * np.nan, ground=count * np.nan), "detecting"),
+        "two values per point": (message(1, ground=np.zeros((len(xyz), 2), "u1")), "'ground' has count > 1"),
     }
 
 
@@ -161,32 +163,58 @@ def _pointnet_clouds():
         "one point": (cloud([[5, 0, -1]]), "no clusters"),
         "all is ground": (message(1, ground=count.astype("u1") + 1), "no clusters"),
         "no clusters": (message(1, cluster_id=count.astype("u4")), "no clusters"),
-        "clusters of one point": (message(1, cluster_id=np.arange(len(count), dtype="u4")),
-                                  "fewer than 3 points"),
-        "ids beyond int32": (message(1, cluster_id=(count + 2**32 - 1).astype("u4")),
-                             "no clusters"),
-        "one large cluster": (message(1, cluster_id=(count + 2**31 - 1).astype("u4")),
-                              "detecting"),
+        "clusters of one point": (message(1, cluster_id=np.arange(len(count), dtype="u4")), "fewer than 3 points"),
+        "ids beyond int32": (message(1, cluster_id=(count + 2**32 - 1).astype("u4")), "no clusters"),
+        "one large cluster": (message(1, cluster_id=(count + 2**31 - 1).astype("u4")), "detecting"),
         "float column": (message(1, cluster_id=count * np.nan), "no clusters"),
         "no intensity": (cloud(frame().xyz), "no intensity"),
-        "two values per point": (message(1, cluster_id=np.zeros((len(count), 2), "u4")),
-                                 "'cluster_id' has count > 1"),
+        "two values per point": (message(1, cluster_id=np.zeros((len(count), 2), "u4")), "'cluster_id' has count > 1"),
     }
 
 
 def _fused_clouds():
-    return {"out of range": (cloud(frame().xyz + [500, 0, 0]), "network's range"),
-            "all is ground": (message(1, ground=np.ones(len(frame()), "u1")), "is ground")}
+    return {
+        "out of range": (cloud(frame().xyz + [500, 0, 0]), "network's range"),
+        "all is ground": (message(1, ground=np.ones(len(frame()), "u1")), "is ground"),
+    }
 
 
 POINTPILLARS_NODE = DetectorUnderTest(
-    "pointpillars_detector", POINTPILLARS, CONFIG / "pointpillars.param.yaml", eager(),
-    load_detector, small_v4, POINTPILLARS_STEPS, "v4 compact", _pointpillars_clouds)
+    "pointpillars_detector",
+    POINTPILLARS,
+    CONFIG / "pointpillars.param.yaml",
+    eager(),
+    load_detector,
+    small_v4,
+    POINTPILLARS_STEPS,
+    "v4 compact",
+    _pointpillars_clouds,
+)
 POINTNET_NODE = DetectorUnderTest(
-    "pointnet_detector", POINTNET, CONFIG / "pointnet.param.yaml", pointnet_samples.eager(),
-    load_pointnet_detector, small_pointnet, POINTNET_STEPS, "improved, Car", _pointnet_clouds)
+    "pointnet_detector",
+    POINTNET,
+    CONFIG / "pointnet.param.yaml",
+    pointnet_samples.eager(),
+    load_pointnet_detector,
+    small_pointnet,
+    POINTNET_STEPS,
+    "improved, Car",
+    _pointnet_clouds,
+)
 FUSED_NODE = DetectorUnderTest(
-    "fused_detector", build_graph(["fused"], single=True), CONFIG / "fused.param.yaml",
-    with_values(FusedDetectorParams(), {"fused.range": "around", **{
-        f"fused.scores.{name}": 0.0 for name in ("car", "pedestrian", "cyclist", "other")}}),
-    load_fused_detector, small_fusion, FUSED_STEPS, "", _fused_clouds)
+    "fused_detector",
+    build_graph(["fused"], single=True),
+    CONFIG / "fused.param.yaml",
+    with_values(
+        FusedDetectorParams(),
+        {
+            "fused.range": "around",
+            **{f"fused.scores.{name}": 0.0 for name in ("car", "pedestrian", "cyclist", "other")},
+        },
+    ),
+    load_fused_detector,
+    small_fusion,
+    FUSED_STEPS,
+    "",
+    _fused_clouds,
+)

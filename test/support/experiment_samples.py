@@ -23,12 +23,16 @@ def count_points(frames, number):
 
 
 def points_table(records):
-    rows = tuple((r["frame"], Cell(r["points"], paper=7, digits=0)) for r in records
-                 if "skipped" not in r)
+    rows = tuple((r["frame"], Cell(r["points"], paper=7, digits=0)) for r in records if "skipped" not in r)
     curve = Line("points | all", range(len(rows)), [row[1].value for row in rows])
-    return [Section("<Points>", "How many & where", (
-        Table("points", "Points | of <all>", ("frame", "points"), rows, "a <note>"),),
-        (Figure("curve", "A curve", (Panel("one", "x", "y", (curve,)),)),))]
+    return [
+        Section(
+            "<Points>",
+            "How many & where",
+            (Table("points", "Points | of <all>", ("frame", "points"), rows, "a <note>"),),
+            (Figure("curve", "A curve", (Panel("one", "x", "y", (curve,)),)),),
+        )
+    ]
 
 
 def small(measure=count_points, **settings):

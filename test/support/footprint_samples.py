@@ -10,8 +10,7 @@ from lidar_perception.simulation.actors import HEADING, LENGTH, SPEED, START, ST
 
 def compute_centres(footprints, t):
     """Return the centres (M, 2) of footprints (M, 8) at time t."""
-    way = footprints[:, SPEED] * np.clip(t - footprints[:, START], 0.0,
-                                         footprints[:, STOP] - footprints[:, START])
+    way = footprints[:, SPEED] * np.clip(t - footprints[:, START], 0.0, footprints[:, STOP] - footprints[:, START])
     heading = footprints[:, HEADING]
     return footprints[:, :2] + way[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
 
@@ -20,8 +19,7 @@ def make_flat_boxes(footprints, t):
     """Return boxes (M, 7) [x y 0 l w 1 heading] of footprints (M, 8) at time t, in the world."""
     middle = compute_centres(footprints, t)
     one, zero = np.ones(len(middle)), np.zeros(len(middle))
-    return np.column_stack([middle, zero, 2 * footprints[:, LENGTH:WIDTH + 1], one,
-                            footprints[:, HEADING]])
+    return np.column_stack([middle, zero, 2 * footprints[:, LENGTH : WIDTH + 1], one, footprints[:, HEADING]])
 
 
 def find_overlaps(boxes, many):

@@ -17,19 +17,26 @@ DRIVES = {"one": ("0000",), "several": ("0003", "0011")}
 NOTES = ("openlabel", "mcap", "mcap-labels")
 KITTI = ("kitti", "kitti-tracking")
 # Rounding error of each format, metres and radians.
-EXACT = {"kitti": 2e-6, "kitti-tracking": 2e-6, "openlabel": 1e-12,
-         "nuscenes-detection": 1e-9, "nuscenes-tracking": 1e-9, "labelcloud": 1e-8,
-         "labelcloud-rel": 1e-8, "labelcloud-vertices": 5e-8, "sustech": 1e-12, "mcap": 1e-12,
-         "mcap-labels": 1e-12}
+EXACT = {
+    "kitti": 2e-6,
+    "kitti-tracking": 2e-6,
+    "openlabel": 1e-12,
+    "nuscenes-detection": 1e-9,
+    "nuscenes-tracking": 1e-9,
+    "labelcloud": 1e-8,
+    "labelcloud-rel": 1e-8,
+    "labelcloud-vertices": 5e-8,
+    "sustech": 1e-12,
+    "mcap": 1e-12,
+    "mcap-labels": 1e-12,
+}
 
 
 def pose(i: int) -> np.ndarray:
     """Return the pose of the LiDAR in frame i, on a slope."""
     yaw, pitch = 0.1 * i, 0.02
-    about_z = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0],
-                        [0, 0, 1]])
-    about_y = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0],
-                        [-math.sin(pitch), 0, math.cos(pitch)]])
+    about_z = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
+    about_y = np.array([[math.cos(pitch), 0, math.sin(pitch)], [0, 1, 0], [-math.sin(pitch), 0, math.cos(pitch)]])
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = about_z @ about_y, [100 + 2.0 * i, -50, 3]
     return matrix
@@ -43,9 +50,16 @@ def drive(name: str, frames: int = 3, camera: bool = True) -> list[Frame]:
         for i in range(5, 5 + frames):
             stamp = 1_700_000_000_000_000_000 + (100 * s + i) * 100_000_000
             xyz = rng.uniform(-20, 20, (50, 3)).astype(np.float32)
-            made.append(Frame.of(f"{sequence}/{i:06}", PointCloud.of(xyz, None, stamp, "velodyne"),
-                                 calibration=CALIBRATION if camera else None,
-                                 pose=pose(i).copy, sequence=sequence, index=i))
+            made.append(
+                Frame.of(
+                    f"{sequence}/{i:06}",
+                    PointCloud.of(xyz, None, stamp, "velodyne"),
+                    calibration=CALIBRATION if camera else None,
+                    pose=pose(i).copy,
+                    sequence=sequence,
+                    index=i,
+                )
+            )
     return made
 
 
@@ -57,18 +71,25 @@ def make_labels(frames: list[Frame], format: str, seed: int = 0) -> DriveLabels:
     found = []
     for number, frame in enumerate(frames):
         count = 0 if number == 1 else 4
-        boxes = np.column_stack([rng.uniform(-40, 40, (count, 2)), rng.uniform(-2, 1, count),
-                                 rng.uniform(0.3, 5, (count, 3)),
-                                 rng.uniform(-math.pi, math.pi, count)])
+        boxes = np.column_stack(
+            [
+                rng.uniform(-40, 40, (count, 2)),
+                rng.uniform(-2, 1, count),
+                rng.uniform(0.3, 5, (count, 3)),
+                rng.uniform(-math.pi, math.pi, count),
+            ]
+        )
         ids = np.array([3, 17, 2**31 + 5, -1])[:count]
         scores = [0.25, float("nan"), 1.0, 0.123456][:count]
-        extra = [{"occluded": 2, "obj_attr": "dark, ünder a tree", "seen": {"by": [1, "two"]}}
-                 ] * count
+        extra = [{"occluded": 2, "obj_attr": "dark, ünder a tree", "seen": {"by": [1, "two"]}}] * count
         notes = [("DontCare", {"bbox": [1.0, 2.0, 3.0, 4.0]})] * (format in NOTES)
         if format == "kitti":
             ids = np.full(count, -1)
-        found.append(FrameLabels.of(frame.name, frame.stamp_ns, boxes,
-                                    rng.choice(names, count).tolist(), ids, scores, extra, notes))
+        found.append(
+            FrameLabels.of(
+                frame.name, frame.stamp_ns, boxes, rng.choice(names, count).tolist(), ids, scores, extra, notes
+            )
+        )
     return DriveLabels(found)
 
 

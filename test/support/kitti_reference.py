@@ -10,8 +10,10 @@ import math
 
 import numpy as np
 
-MIN_OVERLAP = {"strict": {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5},
-               "relaxed": {"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25}}
+MIN_OVERLAP = {
+    "strict": {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5},
+    "relaxed": {"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25},
+}
 LIMITS = {"easy": (40, 0, 0.15), "moderate": (25, 1, 0.30), "hard": (25, 2, 0.50)}
 NAMES = ("kind truncated occluded alpha left top right bottom h w l x y z ry score").split()
 
@@ -21,24 +23,28 @@ def read(text):
     rows = []
     for line in text.splitlines():
         words = line.split()
-        rows.append({name: word if name == "kind" else float(word)
-                     for name, word in zip(NAMES, words)})
+        rows.append({name: word if name == "kind" else float(word) for name, word in zip(NAMES, words)})
     return rows
 
 
 def footprint(o):
     """Corners in the x-z plane, around."""
     c, s = math.cos(o["ry"]), math.sin(o["ry"])
-    return [(o["x"] + c * a + s * b, o["z"] - s * a + c * b)
-            for a, b in ((o["l"] / 2, o["w"] / 2), (-o["l"] / 2, o["w"] / 2),
-                         (-o["l"] / 2, -o["w"] / 2), (o["l"] / 2, -o["w"] / 2))]
+    return [
+        (o["x"] + c * a + s * b, o["z"] - s * a + c * b)
+        for a, b in (
+            (o["l"] / 2, o["w"] / 2),
+            (-o["l"] / 2, o["w"] / 2),
+            (-o["l"] / 2, -o["w"] / 2),
+            (o["l"] / 2, -o["w"] / 2),
+        )
+    ]
 
 
 def inside(p, o):
     dx, dz = p[0] - o["x"], p[1] - o["z"]
     c, s = math.cos(o["ry"]), math.sin(o["ry"])
-    return (abs(c * dx - s * dz) <= o["l"] / 2 + 1e-12
-            and abs(s * dx + c * dz) <= o["w"] / 2 + 1e-12)
+    return abs(c * dx - s * dz) <= o["l"] / 2 + 1e-12 and abs(s * dx + c * dz) <= o["w"] / 2 + 1e-12
 
 
 def crossing(p, q, r, s):
@@ -67,8 +73,7 @@ def shared_ground(a, b):
         return 0.0
     mx, mz = (sum(p[k] for p in points) / len(points) for k in (0, 1))
     points.sort(key=lambda p: math.atan2(p[1] - mz, p[0] - mx))
-    return abs(sum(p[0] * q[1] - q[0] * p[1]
-                   for p, q in zip(points, points[1:] + points[:1]))) / 2
+    return abs(sum(p[0] * q[1] - q[0] * p[1] for p, q in zip(points, points[1:] + points[:1]))) / 2
 
 
 def shared_pixels(a, b):
@@ -96,8 +101,7 @@ def role_of_truth(o, kind, level):
     """'find', 'may find' or None."""
     height, occluded, truncated = LIMITS[level]
     if o["kind"] == kind:
-        easy_enough = (o["bottom"] - o["top"] >= height and o["occluded"] <= occluded
-                       and o["truncated"] <= truncated)
+        easy_enough = o["bottom"] - o["top"] >= height and o["occluded"] <= occluded and o["truncated"] <= truncated
         return "find" if easy_enough else "may find"
     if (kind, o["kind"]) in (("Car", "Van"), ("Pedestrian", "Person_sitting")):
         return "may find"
@@ -120,8 +124,12 @@ def prepare(frames, metric):
     prepared = []
     for labels, results in frames:
         truth, found = read(labels), by_falling_score(read(results))
-        table = {(j, i): overlap(d, o, metric) for j, d in enumerate(found)
-                 for i, o in enumerate(truth) if o["kind"] != "DontCare"}
+        table = {
+            (j, i): overlap(d, o, metric)
+            for j, d in enumerate(found)
+            for i, o in enumerate(truth)
+            if o["kind"] != "DontCare"
+        }
         prepared.append((truth, found, table))
     return prepared
 
@@ -136,8 +144,11 @@ def first_pass(prepared, kind, level, least):
             objects += role == "find"
             if role is None:
                 continue
-            fitting = [j for j, d in enumerate(found) if j not in used
-                       and role_of_detection(d, kind, level) and table[j, i] > least]
+            fitting = [
+                j
+                for j, d in enumerate(found)
+                if j not in used and role_of_detection(d, kind, level) and table[j, i] > least
+            ]
             if fitting:
                 j = max(fitting, key=lambda j: found[j]["score"])
                 used.add(j)
@@ -174,8 +185,8 @@ def second_pass(prepared, kind, level, least, metric, threshold):
             if role_of_detection(found[j], kind, level) != "judge" or j in used:
                 continue
             if metric == "image" and any(
-                    shared_pixels(found[j], o) / pixels(found[j]) > least
-                    for o in truth if o["kind"] == "DontCare"):
+                shared_pixels(found[j], o) / pixels(found[j]) > least for o in truth if o["kind"] == "DontCare"
+            ):
                 continue
             wrong += 1
     if right + wrong == 0:
@@ -218,23 +229,41 @@ def evaluate(prepared, kind, level, least, metric):
         points = []
         for k in range(41):
             enough = [row for row in reached if row[0] >= k / 40 - 1e-9]
-            points.append((max((row[1] for row in enough), default=0.0),
-                           max((row[2] for row in enough), default=0.0)))
-    return (objects, *averages([p for p, _ in points]), *averages([s for _, s in points]),
-            *averages([p for p, _ in official]))
+            points.append((max((row[1] for row in enough), default=0.0), max((row[2] for row in enough), default=0.0)))
+    return (
+        objects,
+        *averages([p for p, _ in points]),
+        *averages([s for _, s in points]),
+        *averages([p for p, _ in official]),
+    )
 
 
-SIZES = {"Car": (1.5, 1.6, 3.9), "Van": (2.2, 1.9, 5.0), "Pedestrian": (1.7, 0.6, 0.8),
-         "Person_sitting": (1.3, 0.6, 0.8), "Cyclist": (1.7, 0.6, 1.8), "Truck": (3.2, 2.6, 10.0)}
+SIZES = {
+    "Car": (1.5, 1.6, 3.9),
+    "Van": (2.2, 1.9, 5.0),
+    "Pedestrian": (1.7, 0.6, 0.8),
+    "Person_sitting": (1.3, 0.6, 0.8),
+    "Cyclist": (1.7, 0.6, 1.8),
+    "Truck": (3.2, 2.6, 10.0),
+}
 
 
 def some_object(rng):
     kind = rng.choice(list(SIZES), p=[0.35, 0.08, 0.22, 0.05, 0.25, 0.05])
     h, w, l = np.array(SIZES[kind]) * rng.uniform(0.9, 1.1, 3)  # noqa: E741
-    o = dict(kind=str(kind), truncated=float(rng.choice([0, 0, 0, 0.2, 0.4, 0.7])),
-             occluded=int(rng.choice([0, 0, 0, 1, 2, 3])), alpha=rng.uniform(-3.1, 3.1), h=h, w=w,
-             l=l, x=rng.uniform(-12, 12), y=rng.uniform(1.4, 1.9), z=rng.uniform(6, 45),
-             ry=rng.uniform(-3.1, 3.1))
+    o = dict(
+        kind=str(kind),
+        truncated=float(rng.choice([0, 0, 0, 0.2, 0.4, 0.7])),
+        occluded=int(rng.choice([0, 0, 0, 1, 2, 3])),
+        alpha=rng.uniform(-3.1, 3.1),
+        h=h,
+        w=w,
+        l=l,
+        x=rng.uniform(-12, 12),
+        y=rng.uniform(1.4, 1.9),
+        z=rng.uniform(6, 45),
+        ry=rng.uniform(-3.1, 3.1),
+    )
     return with_pixels(o)
 
 
@@ -245,9 +274,13 @@ def with_pixels(o):
 
 
 def moved(o, rng, by):
-    o = {**o, "alpha": o["alpha"] + rng.normal() * 3 * by, "ry": o["ry"] + rng.normal() * by,
-         **{k: o[k] + rng.normal() * by for k in "xyz"},
-         **{k: o[k] * (1 + rng.normal() * by / 2) for k in "hwl"}}
+    o = {
+        **o,
+        "alpha": o["alpha"] + rng.normal() * 3 * by,
+        "ry": o["ry"] + rng.normal() * by,
+        **{k: o[k] + rng.normal() * by for k in "xyz"},
+        **{k: o[k] * (1 + rng.normal() * by / 2) for k in "hwl"},
+    }
     if rng.random() < 0.15:
         o["kind"] = str(rng.choice(["Car", "Pedestrian", "Cyclist"]))
     return with_pixels(o)
@@ -262,12 +295,25 @@ def line(o, score=None):
 def random_frame(rng, most=8, noise=0.12):
     """(label text, result text): misses, duplicates, wrong classes, false boxes, DontCare."""
     truth = [some_object(rng) for _ in range(rng.integers(0, most + 1))]
-    found = [moved(o, rng, noise * rng.uniform(0.1, 1.5)) for o in truth
-             for _ in range(rng.choice([0, 1, 1, 1, 2]))]
+    found = [moved(o, rng, noise * rng.uniform(0.1, 1.5)) for o in truth for _ in range(rng.choice([0, 1, 1, 1, 2]))]
     found += [some_object(rng) for _ in range(rng.integers(0, 4))]
-    regions = [line({**some_object(rng), "kind": "DontCare", "truncated": -1, "occluded": -1,
-                     "h": -1, "w": -1, "l": -1, "x": -1000, "y": -1000, "z": -1000})
-               for _ in range(rng.integers(0, 3))]
+    regions = [
+        line(
+            {
+                **some_object(rng),
+                "kind": "DontCare",
+                "truncated": -1,
+                "occluded": -1,
+                "h": -1,
+                "w": -1,
+                "l": -1,
+                "x": -1000,
+                "y": -1000,
+                "z": -1000,
+            }
+        )
+        for _ in range(rng.integers(0, 3))
+    ]
     labels = [line(o) for o in truth] + regions
     results = [line(d, score) for d, score in zip(found, rng.uniform(0, 1, len(found)))]
     return "\n".join(labels), "\n".join(results)

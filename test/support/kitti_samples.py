@@ -50,8 +50,9 @@ def tracking_folder(root):
     for sequence, frames in (("0000", (0, 1, 2)), ("0007", (5, 6))):
         for i in frames:
             write(root / f"training/velodyne/{sequence}/{i:06}.bin", scene(i).tobytes())
-        write(root / f"training/calib/{sequence}.txt",
-              calibration_text("R_rect", "Tr_velo_cam"))  # without colons, as in KITTI's files
+        write(
+            root / f"training/calib/{sequence}.txt", calibration_text("R_rect", "Tr_velo_cam")
+        )  # without colons, as in KITTI's files
     write(root / "training/label_02/0000.txt", TRACKING_LABELS)
     return root
 
@@ -61,14 +62,22 @@ def raw_folder(root):
     drive = day / "2011_09_26_drive_0001_sync"
     for i in range(3):
         write(drive / f"velodyne_points/data/{i:010}.bin", scene(i).tobytes())
-    write(drive / "velodyne_points/timestamps.txt",
-          "2011-09-26 13:02:25.594360375\n2011-09-26 13:02:25.7\n2011-09-26 13:02:26.000000001\n")
+    write(
+        drive / "velodyne_points/timestamps.txt",
+        "2011-09-26 13:02:25.594360375\n2011-09-26 13:02:25.7\n2011-09-26 13:02:26.000000001\n",
+    )
     write(drive / "tracklet_labels.xml", TRACKLETS)
-    write(day / "calib_cam_to_cam.txt", "calib_time: 09-Jan-2012 13:57:47\n"
-          f"S_rect_02: 1.242e+03 3.75e+02\nR_rect_00: {numbers(RECTIFY)}\n"
-          f"P_rect_02: {numbers(INTRINSICS)}\n")
-    write(day / "calib_velo_to_cam.txt", "calib_time: 15-Mar-2012 11:37:16\n"
-          f"R: {numbers(VELODYNE[:, :3])}\nT: {numbers(VELODYNE[:, 3])}\ndelta_f: 0 0\n")
+    write(
+        day / "calib_cam_to_cam.txt",
+        "calib_time: 09-Jan-2012 13:57:47\n"
+        f"S_rect_02: 1.242e+03 3.75e+02\nR_rect_00: {numbers(RECTIFY)}\n"
+        f"P_rect_02: {numbers(INTRINSICS)}\n",
+    )
+    write(
+        day / "calib_velo_to_cam.txt",
+        "calib_time: 15-Mar-2012 11:37:16\n"
+        f"R: {numbers(VELODYNE[:, :3])}\nT: {numbers(VELODYNE[:, 3])}\ndelta_f: 0 0\n",
+    )
     return root
 
 
@@ -87,5 +96,10 @@ def through_markers(truth: GroundTruth) -> GroundTruth:
 
 def same(a: GroundTruth, b: GroundTruth) -> bool:
     yaw_difference = np.abs((a.boxes[:, 6] - b.boxes[:, 6] + np.pi) % (2 * np.pi) - np.pi)
-    return (np.array_equal(a.boxes[:, :6], b.boxes[:, :6]) and bool((yaw_difference < 1e-12).all())
-            and a.labels == b.labels and a.extras == b.extras and a.notes == b.notes)
+    return (
+        np.array_equal(a.boxes[:, :6], b.boxes[:, :6])
+        and bool((yaw_difference < 1e-12).all())
+        and a.labels == b.labels
+        and a.extras == b.extras
+        and a.notes == b.notes
+    )

@@ -24,7 +24,7 @@ from lidar_studio import results, server, session  # noqa: F401
 from lidar_studio.cli import label, view  # noqa: F401  loaded once, for all servers
 
 PATIENCE = 60.0  # seconds
-NEAR = 20.0      # metres
+NEAR = 20.0  # metres
 
 
 def find_nearest_person(frame) -> np.ndarray:
@@ -49,7 +49,8 @@ def serving(*arguments: object, before: Callable[[], None] = lambda: None) -> It
     before: called first in the fork."""
     (out, said), (errors, wrong) = os.pipe(), os.pipe()
     process = multiprocessing.get_context("fork").Process(
-        target=_command, args=([str(a) for a in arguments], said, wrong, before))
+        target=_command, args=([str(a) for a in arguments], said, wrong, before)
+    )
     process.start()
     os.close(said)
     os.close(wrong)
@@ -99,8 +100,7 @@ class Label:
         """Centre the view on a person, from the side of the sensor."""
         x, y, z = map(float, person[:3])
         away = 5.0 / math.hypot(x, y)
-        page.evaluate("([place, from]) => page.lookAt(place, from)",
-                      [[x, y, z], [x - x * away, y - y * away, z + 1.5]])
+        page.evaluate("([place, from]) => page.lookAt(place, from)", [[x, y, z], [x - x * away, y - y * away, z + 1.5]])
 
     def seed(self, page, person: np.ndarray) -> int:
         """Click a person as a seed; return the id of the new track."""
@@ -111,8 +111,9 @@ class Label:
         area = page.locator("#scene").bounding_box()
         at = page.evaluate("p => page.project(...p)", [*map(float, person[:3])])
         page.mouse.click(area["x"] + at[0], area["y"] + at[1])
-        page.wait_for_function("before => page.store.selected !== null "
-                               "&& !before.includes(page.store.selected)", arg=sorted(before))
+        page.wait_for_function(
+            "before => page.store.selected !== null && !before.includes(page.store.selected)", arg=sorted(before)
+        )
         page.keyboard.press("Escape")
         return page.evaluate("page.store.selected")
 
@@ -142,8 +143,12 @@ def opened(browser, url: str, before: Callable = lambda page: None) -> Iterator:
     page, wrong = context.new_page(), []
     page.set_default_timeout(60_000)
     page.on("pageerror", lambda error: wrong.append(error))
-    page.on("request", lambda r: wrong.append(r.url) if "127.0.0.1" not in r.url
-            and not r.url.startswith(("data:", "blob:")) else None)
+    page.on(
+        "request",
+        lambda r: (
+            wrong.append(r.url) if "127.0.0.1" not in r.url and not r.url.startswith(("data:", "blob:")) else None
+        ),
+    )
     before(page)
     page.goto(url)
     page.wait_for_selector("html[data-ready=true]", state="attached")
@@ -161,14 +166,16 @@ def faces(box: list[float]) -> dict[str, float]:
     x, y, z, *size, yaw = box
     cos, sin = math.cos(yaw), math.sin(yaw)
     along = cos * x + sin * y, -sin * x + cos * y, z
-    return {f"{sign}{axis}": (1 if sign == "+" else -1) * along[k] + size[k] / 2
-            for k, axis in enumerate("xyz") for sign in "+-"}
+    return {
+        f"{sign}{axis}": (1 if sign == "+" else -1) * along[k] + size[k] / 2
+        for k, axis in enumerate("xyz")
+        for sign in "+-"
+    }
 
 
 def drawn(page) -> None:
     """Wait until the current state of the page is drawn."""
-    page.evaluate("() => new Promise(done => requestAnimationFrame(() => "
-                  "requestAnimationFrame(done)))")
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 
 def middle(page, selector: str) -> tuple[float, float]:

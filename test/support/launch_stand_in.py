@@ -112,9 +112,22 @@ class EmitEvent:
 
 
 class Node(SimpleNamespace):
-    def __init__(self, *, executable, package, name=None, namespace=None, parameters=(),
-                 remappings=(), arguments=(), ros_arguments=(), output="log", respawn=False,
-                 respawn_delay=0.0, exec_name=None):
+    def __init__(
+        self,
+        *,
+        executable,
+        package,
+        name=None,
+        namespace=None,
+        parameters=(),
+        remappings=(),
+        arguments=(),
+        ros_arguments=(),
+        output="log",
+        respawn=False,
+        respawn_delay=0.0,
+        exec_name=None,
+    ):
         super().__init__(**{k: v for k, v in locals().items() if k not in ("self", "__class__")})
 
     def execute(self, context):
@@ -122,8 +135,11 @@ class Node(SimpleNamespace):
 
     def list_arguments(self, folder: Path) -> list[str]:
         """Return the command line, with parameters that are values in a file in `folder`."""
-        rules = [*([("__node", self.name)] if self.name else []),
-                 *([("__ns", f"/{self.namespace}")] if self.namespace else []), *self.remappings]
+        rules = [
+            *([("__node", self.name)] if self.name else []),
+            *([("__ns", f"/{self.namespace}")] if self.namespace else []),
+            *self.remappings,
+        ]
         words = [self.executable, *self.arguments, "--ros-args", *self.ros_arguments]
         words += [word for a, b in rules for word in ("-r", f"{a}:={b}")]
         for number, given in enumerate(self.parameters):
@@ -137,11 +153,22 @@ class Node(SimpleNamespace):
 
 MODULES: dict[str, tuple] = {
     "launch": (LaunchDescription,),
-    "launch.actions": (DeclareLaunchArgument, EmitEvent, IncludeLaunchDescription, LogInfo,
-                       OpaqueFunction, RegisterEventHandler, TimerAction),
-    "launch.event_handlers": (OnProcessExit,), "launch.events": (Shutdown,),
+    "launch.actions": (
+        DeclareLaunchArgument,
+        EmitEvent,
+        IncludeLaunchDescription,
+        LogInfo,
+        OpaqueFunction,
+        RegisterEventHandler,
+        TimerAction,
+    ),
+    "launch.event_handlers": (OnProcessExit,),
+    "launch.events": (Shutdown,),
     "launch.launch_description_sources": (PythonLaunchDescriptionSource,),
-    "launch.substitutions": (LaunchConfiguration,), "launch_ros": (), "launch_ros.actions": (Node,)}
+    "launch.substitutions": (LaunchConfiguration,),
+    "launch_ros": (),
+    "launch_ros.actions": (Node,),
+}
 
 
 def install(monkeypatch) -> None:
@@ -172,8 +199,11 @@ class Launch:
         self.handlers: list[OnProcessExit] = []
         self.timers: list[tuple[float, list]] = []
         self.shutdown_reason: str | None = None
-        self._execute(IncludeLaunchDescription(PythonLaunchDescriptionSource(
-            str(LAUNCH_FILES / f"{name}.launch.py")), arguments.items()))
+        self._execute(
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(str(LAUNCH_FILES / f"{name}.launch.py")), arguments.items()
+            )
+        )
 
     def perform_substitution(self, value: Any) -> str:
         if isinstance(value, LaunchConfiguration):

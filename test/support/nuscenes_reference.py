@@ -6,10 +6,19 @@ from __future__ import annotations
 
 import math
 
-RANGE = {"car": 50, "truck": 50, "bus": 50, "trailer": 50, "construction_vehicle": 50,
-         "pedestrian": 40, "motorcycle": 40, "bicycle": 40, "traffic_cone": 30, "barrier": 30}
-WITHOUT = {"traffic_cone": {"orientation", "velocity", "attribute"},
-           "barrier": {"velocity", "attribute"}}
+RANGE = {
+    "car": 50,
+    "truck": 50,
+    "bus": 50,
+    "trailer": 50,
+    "construction_vehicle": 50,
+    "pedestrian": 40,
+    "motorcycle": 40,
+    "bicycle": 40,
+    "traffic_cone": 30,
+    "barrier": 30,
+}
+WITHOUT = {"traffic_cone": {"orientation", "velocity", "attribute"}, "barrier": {"velocity", "attribute"}}
 ERRORS = ("translation", "scale", "orientation", "velocity", "attribute")
 
 
@@ -62,15 +71,21 @@ def labels_by_sample(tables, classes):
         if category == "static_object.bicycle_rack":
             racks.append(label)
         elif category in classes and label["num_lidar_pts"] + label["num_radar_pts"] > 0:
-            true.append({**label, "name": classes[category],
-                         "velocity": velocity(label, labels, times),
-                         "attribute": next(map(attributes.get, label["attribute_tokens"]), None)})
+            true.append(
+                {
+                    **label,
+                    "name": classes[category],
+                    "velocity": velocity(label, labels, times),
+                    "attribute": next(map(attributes.get, label["attribute_tokens"]), None),
+                }
+            )
     return samples
 
 
 def counts(box, name, racks, vehicle):
-    return (flat_distance(box["translation"], vehicle) < RANGE[name]
-            and not (name in ("bicycle", "motorcycle") and in_rack(box, racks)))
+    return flat_distance(box["translation"], vehicle) < RANGE[name] and not (
+        name in ("bicycle", "motorcycle") and in_rack(box, racks)
+    )
 
 
 def read_off(x, xs, ys):
@@ -98,22 +113,26 @@ def error(kind, true, found, name):
         if true["velocity"] is None or any(math.isnan(v) for v in found["velocity"]):
             return None
         return flat_distance(true["velocity"], found["velocity"])
-    return None if true["attribute"] is None else float(
-        true["attribute"] != found["attribute_name"])
+    return None if true["attribute"] is None else float(true["attribute"] != found["attribute_name"])
 
 
 def of_class(samples, results, name, most):
     """AP and the five errors at one distance."""
-    left = {s: [b for b in true if b["name"] == name and counts(b, name, racks, vehicle)]
-            for s, (true, racks, vehicle) in samples.items()}
+    left = {
+        s: [b for b in true if b["name"] == name and counts(b, name, racks, vehicle)]
+        for s, (true, racks, vehicle) in samples.items()
+    }
     objects = sum(map(len, left.values()))
-    found = [(s, b) for s, (_, racks, vehicle) in samples.items() for b in results[s]
-             if b["detection_name"] == name and counts(b, name, racks, vehicle)]
+    found = [
+        (s, b)
+        for s, (_, racks, vehicle) in samples.items()
+        for b in results[s]
+        if b["detection_name"] == name and counts(b, name, racks, vehicle)
+    ]
     found.sort(key=lambda item: -item[1]["detection_score"])
     recall, precision, scores, pairs = [], [], [], []
     for n, (sample, box) in enumerate(found, 1):
-        near = min(left[sample], default=None,
-                   key=lambda t: flat_distance(t["translation"], box["translation"]))
+        near = min(left[sample], default=None, key=lambda t: flat_distance(t["translation"], box["translation"]))
         if near and flat_distance(near["translation"], box["translation"]) < most:
             left[sample].remove(near)
             pairs.append((near, box))
@@ -145,8 +164,11 @@ def evaluate(tables, results, classes):
     samples, by_class = labels_by_sample(tables, classes), {}
     for name in RANGE:
         rows = {d: of_class(samples, results, name, d) for d in (0.5, 1.0, 2.0, 4.0)}
-        by_class[name] = (rows[2.0][0], {d: row[1] for d, row in rows.items()}, {
-            k: v for k, v in rows[2.0][2].items() if k not in WITHOUT.get(name, ())})
+        by_class[name] = (
+            rows[2.0][0],
+            {d: row[1] for d, row in rows.items()},
+            {k: v for k, v in rows[2.0][2].items() if k not in WITHOUT.get(name, ())},
+        )
     return by_class, over(by_class, by_class)
 
 

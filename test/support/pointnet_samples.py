@@ -16,9 +16,18 @@ from lidar_perception.detectors.pointnet.torch_network import TorchPointNet
 from lidar_perception.param_fields import with_values
 
 CPU = "cpu"
-SMALL = dict(points=32, centroids=12, coarse=4, neighbours=(4, 6, 8), coarse_neighbours=4,
-             point_channels=(8, 8), group_channels=(8, 8), local_channels=12, global_channels=16,
-             head_channels=(16,))
+SMALL = dict(
+    points=32,
+    centroids=12,
+    coarse=4,
+    neighbours=(4, 6, 8),
+    coarse_neighbours=4,
+    point_channels=(8, 8),
+    group_channels=(8, 8),
+    local_channels=12,
+    global_channels=16,
+    head_channels=(16,),
+)
 
 
 def small(name: str = "improved", **changes) -> PointNetConfig:
@@ -37,9 +46,11 @@ def lively(config: PointNetConfig, seed: int = 0) -> PointNet:
             torch.nn.init.normal_(module.bias, std=0.3)
             module.momentum = 1.0
     torch.nn.init.normal_(network.classes.weight, std=0.5)
-    clusters = (torch.randn(64, config.points, 5) * torch.tensor([2.0, 1, 1, 0.5, 1])
-                * torch.rand(64, 1, 5), torch.ones(64, config.points, dtype=torch.bool),
-                torch.rand(64, CONTEXT) * 2)
+    clusters = (
+        torch.randn(64, config.points, 5) * torch.tensor([2.0, 1, 1, 0.5, 1]) * torch.rand(64, 1, 5),
+        torch.ones(64, config.points, dtype=torch.bool),
+        torch.rand(64, CONTEXT) * 2,
+    )
     with torch.no_grad():
         network(*clusters)  # which the norms remember
         logits = network.eval()(*clusters).logits
@@ -47,11 +58,13 @@ def lively(config: PointNetConfig, seed: int = 0) -> PointNet:
     return network.requires_grad_(False)
 
 
-def eager(params: PointNetDetectorParams = PointNetDetectorParams(),
-          score: float = 0.0) -> PointNetDetectorParams:
+def eager(params: PointNetDetectorParams = PointNetDetectorParams(), score: float = 0.0) -> PointNetDetectorParams:
     """Parameters with which random weights find something; with a score of 0 every cluster."""
-    return with_values(params, {f"pointnet.scores.{name}": score for name in (
-        "car", "pedestrian", "cyclist", "other")} | {"pointnet.nms.iou": 0.9})
+    return with_values(
+        params,
+        {f"pointnet.scores.{name}": score for name in ("car", "pedestrian", "cyclist", "other")}
+        | {"pointnet.nms.iou": 0.9},
+    )
 
 
 def make_classifier(network: PointNet, header: Header, engine: str = "auto") -> PointNetClassifier:
@@ -59,8 +72,7 @@ def make_classifier(network: PointNet, header: Header, engine: str = "auto") -> 
     return PointNetClassifier(TorchPointNet(fuse_norms(network), engine), header)
 
 
-def random_detector(params: PointNetDetectorParams | None = None,
-                    **changes) -> PointNetDetector:
+def random_detector(params: PointNetDetectorParams | None = None, **changes) -> PointNetDetector:
     """With random weights."""
     config = small(**changes)
     return PointNetDetector(make_classifier(lively(config), Header(config)), params or eager())

@@ -29,8 +29,7 @@ def semantic_folder(root):
         for i in range(count):
             cloud = scene(i)
             write_scan(folder, i, cloud, np.arange(len(cloud)) % 260, np.arange(len(cloud)) % 7)
-        write(folder / "poses.txt", "".join(format_pose(drive(i), CALIBRATION)
-                                            for i in range(count)))
+        write(folder / "poses.txt", "".join(format_pose(drive(i), CALIBRATION) for i in range(count)))
         write(folder / "calib.txt", format_calibration(CALIBRATION))
     return root
 
@@ -58,8 +57,7 @@ def odometry_folder(root):
             write(folder / f"velodyne/{i:06}.bin", scene(i).tobytes())
         write(folder / "calib.txt", format_calibration(CALIBRATION))
         write(folder / "times.txt", "".join(f"{0.1036 * i:e}\n" for i in range(count)))
-        write(root / f"dataset/poses/{sequence}.txt",
-              "".join(format_pose(drive(i), CALIBRATION) for i in range(count)))
+        write(root / f"dataset/poses/{sequence}.txt", "".join(format_pose(drive(i), CALIBRATION) for i in range(count)))
     return root
 
 
@@ -69,8 +67,7 @@ def kitti360_folder(root):
     scans = root / f"data_3d_raw/{name}/velodyne_points"
     for i in (0, 1, 3):
         write(scans / f"data/{i:010}.bin", scene(i).tobytes())
-    write(scans / "timestamps.txt",
-          "".join(f"2013-05-28 08:46:02.{i}04700000\n" for i in range(4)))
+    write(scans / "timestamps.txt", "".join(f"2013-05-28 08:46:02.{i}04700000\n" for i in range(4)))
     return root
 
 
@@ -91,23 +88,25 @@ def cloud_folder(root):
 
 MADE = {  # name: (writer, inner paths that are the same recording, description, content)
     "object": (object_folder, ("", "training"), "KITTI object data, 2 frames", {BOXES, CAMERA}),
-    "tracking": (tracking_folder, ("", "training"), "KITTI tracking data, 5 frames",
-                 {BOXES, CAMERA}),
-    "reduced": (reduced_folder, ("", "training"), "KITTI tracking data, 5 frames",
-                {BOXES, CAMERA}),
-    "raw": (raw_folder, ("", "2011_09_26", "2011_09_26/2011_09_26_drive_0001_sync"),
-            "KITTI raw drives, 3 frames", {BOXES, CAMERA}),
-    "nuscenes": (nuscenes_root, ("", nuscenes_folder.VERSION), "nuScenes v1.0-mini, 6 frames",
-                 {BOXES, POSES}),
-    "semantickitti": (semantic_folder, ("", "sequences"), "SemanticKITTI, 3 frames",
-                      {POINT_LABELS, POSES}),
-    "odometry": (odometry_folder, ("", "dataset", "dataset/sequences"),
-                 "KITTI odometry, 3 frames", {CAMERA, POSES}),
-    "kitti360": (kitti360_folder, ("", "data_3d_raw", "data_3d_raw/2013_05_28_drive_0000_sync"),
-                 "KITTI-360, 3 frames", set()),
+    "tracking": (tracking_folder, ("", "training"), "KITTI tracking data, 5 frames", {BOXES, CAMERA}),
+    "reduced": (reduced_folder, ("", "training"), "KITTI tracking data, 5 frames", {BOXES, CAMERA}),
+    "raw": (
+        raw_folder,
+        ("", "2011_09_26", "2011_09_26/2011_09_26_drive_0001_sync"),
+        "KITTI raw drives, 3 frames",
+        {BOXES, CAMERA},
+    ),
+    "nuscenes": (nuscenes_root, ("", nuscenes_folder.VERSION), "nuScenes v1.0-mini, 6 frames", {BOXES, POSES}),
+    "semantickitti": (semantic_folder, ("", "sequences"), "SemanticKITTI, 3 frames", {POINT_LABELS, POSES}),
+    "odometry": (odometry_folder, ("", "dataset", "dataset/sequences"), "KITTI odometry, 3 frames", {CAMERA, POSES}),
+    "kitti360": (
+        kitti360_folder,
+        ("", "data_3d_raw", "data_3d_raw/2013_05_28_drive_0000_sync"),
+        "KITTI-360, 3 frames",
+        set(),
+    ),
     "openpcdet": (openpcdet_folder, ("",), "OpenPCDet custom data, 3 frames", {BOXES}),
-    "bag": (bag_folder, ("", "bag.mcap"), "rosbag2 bag, clouds on /points, 3 frames",
-            {BOXES, CAMERA}),
+    "bag": (bag_folder, ("", "bag.mcap"), "rosbag2 bag, clouds on /points, 3 frames", {BOXES, CAMERA}),
     "files": (cloud_folder, ("",), ".bin clouds, no times in file names, 3 frames", set()),
 }
 each_recording = pytest.mark.parametrize("kind", MADE)

@@ -37,12 +37,16 @@ def stamps():
 
 def transform(parent, child, stamp, pose):
     x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    return bag_message("geometry_msgs/msg/TransformStamped", child_frame_id=child,
-                       header=make_header(stamp, parent, bag_message),
-                       transform=bag_message(
-        "geometry_msgs/msg/Transform",
-        translation=bag_message("geometry_msgs/msg/Vector3", **dict(zip("xyz", pose[:3, 3]))),
-        rotation=bag_message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)))
+    return bag_message(
+        "geometry_msgs/msg/TransformStamped",
+        child_frame_id=child,
+        header=make_header(stamp, parent, bag_message),
+        transform=bag_message(
+            "geometry_msgs/msg/Transform",
+            translation=bag_message("geometry_msgs/msg/Vector3", **dict(zip("xyz", pose[:3, 3]))),
+            rotation=bag_message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        ),
+    )
 
 
 def tf(*transforms):
@@ -53,8 +57,12 @@ def moving(topic, child="base_link", seconds=CLOUDS / 10):
     """Yield odometry every 20 ms."""
     for i in range(-2, round(50 * seconds) + 1):
         stamp = START + i * SECOND_NS // 50
-        yield topic, ODOMETRY_MESSAGE, stamp, make_odometry(
-            base_at(stamp), make_header(stamp, "odom", bag_message), child, bag_message)
+        yield (
+            topic,
+            ODOMETRY_MESSAGE,
+            stamp,
+            make_odometry(base_at(stamp), make_header(stamp, "odom", bag_message), child, bag_message),
+        )
 
 
 def moving_tf(seconds=CLOUDS / 10):
@@ -62,13 +70,21 @@ def moving_tf(seconds=CLOUDS / 10):
     for i in range(-2, round(50 * seconds) + 1):
         stamp = START + i * SECOND_NS // 50
         jump = make_tilted_pose(0, 0, i % 2)
-        yield TF, TF_MESSAGE, stamp, tf(transform("map", "odom", stamp, jump),
-                                        transform("odom", "base_link", stamp, base_at(stamp)))
+        yield (
+            TF,
+            TF_MESSAGE,
+            stamp,
+            tf(transform("map", "odom", stamp, jump), transform("odom", "base_link", stamp, base_at(stamp))),
+        )
 
 
 def mount(parent="base_link", pose=ON_BASE):
-    yield TF_STATIC, TF_MESSAGE, START, tf(transform(parent, "plate", 0, np.eye(4)),
-                                           transform("plate", "/lidar", 0, pose))
+    yield (
+        TF_STATIC,
+        TF_MESSAGE,
+        START,
+        tf(transform(parent, "plate", 0, np.eye(4)), transform("plate", "/lidar", 0, pose)),
+    )
 
 
 def point(stamp):
@@ -79,8 +95,7 @@ def point(stamp):
 def recorded(path, *parts, cloud=point):
     """Write a bag of clouds in the frame lidar and the given messages; return the recording."""
     messages = [message for part in parts for message in part]
-    messages += [(POINTS, "sensor_msgs/msg/PointCloud2", stamp, cloud(stamp))
-                 for stamp in stamps()]
+    messages += [(POINTS, "sensor_msgs/msg/PointCloud2", stamp, cloud(stamp)) for stamp in stamps()]
     with BagWriter(path) as bag:
         for topic, kind in dict.fromkeys((topic, kind) for topic, kind, *_ in messages):
             bag.add_topic(topic, kind)

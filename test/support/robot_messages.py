@@ -24,8 +24,7 @@ def give(node, msg):
 
 
 def message(xyz, stamp=START, intensity=None, frame_id="lidar", **columns):
-    kinds = [*((n, "<f4") for n in ("x", "y", "z", "intensity")),
-             *((k, v.dtype.str) for k, v in columns.items())]
+    kinds = [*((n, "<f4") for n in ("x", "y", "z", "intensity")), *((k, v.dtype.str) for k, v in columns.items())]
     points = np.zeros(len(xyz), kinds)
     points["x"], points["y"], points["z"] = np.asarray(xyz, np.float32).T
     points["intensity"] = 0.3 if intensity is None else intensity
@@ -41,8 +40,7 @@ def transforms(*rows):
 
 def odometry(pose, stamp, child="base", frame="odom"):
     t, q = pose[:3, 3].tolist(), Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
-    found = bag_message("nav_msgs/msg/Odometry", child_frame_id=child,
-                        header=make_header(stamp, frame, bag_message))
+    found = bag_message("nav_msgs/msg/Odometry", child_frame_id=child, header=make_header(stamp, frame, bag_message))
     for name, value in zip("xyz", t):
         setattr(found.pose.pose.position, name, value)
     for name, value in zip("xyzw", q):

@@ -54,5 +54,4 @@ BAD = {  # defect -> message, words of the diagnostic
 }
 
 
-QUIET = {"input.queue": 5, "input.min_rate": 0.0, "input.error_after": 1e6,
-         "input.stale_after": 1e6}
+QUIET = {"input.queue": 5, "input.min_rate": 0.0, "input.error_after": 1e6, "input.stale_after": 1e6}

@@ -26,6 +26,7 @@ def for_all(cases):
     """One test that goes through all cases: thousands of a microsecond each would take longer to
     list than to run. The case that fails is named. A case is an argument, a tuple of them, or a
     pytest.param."""
+
     def of(test):
         def each():
             assert cases
@@ -35,30 +36,40 @@ def for_all(cases):
                 except BaseException as error:
                     error.add_note(f"of {getattr(case, 'id', case)}")
                     raise
+
         each.__name__, each.__doc__, each.__module__ = test.__name__, test.__doc__, test.__module__
         return each
+
     return of
 
 
 # Both kinds of message classes: rosbags' own, and ROS's.
-each_make = pytest.mark.parametrize("make", [
-    pytest.param(bag_message, id="rosbags"),
-    pytest.param(make_ros_message, id="ros", marks=pytest.mark.skipif(
-        importlib.util.find_spec("rclpy") is None, reason="needs ROS 2, or the extra [ros]")),
-])
+each_make = pytest.mark.parametrize(
+    "make",
+    [
+        pytest.param(bag_message, id="rosbags"),
+        pytest.param(
+            make_ros_message,
+            id="ros",
+            marks=pytest.mark.skipif(
+                importlib.util.find_spec("rclpy") is None, reason="needs ROS 2, or the extra [ros]"
+            ),
+        ),
+    ],
+)
 
 # Real scans next to the checkout.
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="no real data next to the checkout "
-                                "(../shared/data)")
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="no real data next to the checkout (../shared/data)")
 
 STAMP = 1_700_000_000_123_456_789
 
 # A forward-looking camera, almost level, a little before the LiDAR.
 AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # x forward, z up -> x right, y down
 RECTIFY = Rotation.from_euler("xyz", [0.004, -0.007, 0.003]).as_matrix()
-VELODYNE = np.column_stack([Rotation.from_euler("xyz", [0.002, 0.006, -0.009]).as_matrix() @ AXES,
-                            [0.01, -0.08, -0.27]])
+VELODYNE = np.column_stack(
+    [Rotation.from_euler("xyz", [0.002, 0.006, -0.009]).as_matrix() @ AXES, [0.01, -0.08, -0.27]]
+)
 INTRINSICS = np.array([[721.5377, 0, 609.6, 45.0], [0, 721.5377, 172.9, 0.2], [0, 0, 1, 0.003]])
 LIDAR_TO_CAMERA = np.eye(4)
 LIDAR_TO_CAMERA[:3] = RECTIFY @ VELODYNE
@@ -98,8 +109,7 @@ def numbers(matrix: np.ndarray) -> str:
 
 
 def calibration_text(rectify: str = "R0_rect:", velodyne: str = "Tr_velo_to_cam:") -> str:
-    return (f"P2: {numbers(INTRINSICS)}\n{rectify} {numbers(RECTIFY)}\n"
-            f"{velodyne} {numbers(VELODYNE)}\n")
+    return f"P2: {numbers(INTRINSICS)}\n{rectify} {numbers(RECTIFY)}\n{velodyne} {numbers(VELODYNE)}\n"
 
 
 def write(path: Path, content: str | bytes | np.ndarray) -> Path:
@@ -125,8 +135,9 @@ def upright(rng, x: float, y: float, height: float, width: float) -> np.ndarray:
     """(N, 3) the side of a thing that a sensor sees, with fewer points the farther it stands: a
     person if width is negative, narrow at the head and at the feet."""
     away = np.hypot(x, y)
-    z, across = (m.ravel() for m in np.meshgrid(np.arange(0.02, height, 0.0073 * away),
-                                                np.arange(-0.5, 0.5, 0.003 * away)))
+    z, across = (
+        m.ravel() for m in np.meshgrid(np.arange(0.02, height, 0.0073 * away), np.arange(-0.5, 0.5, 0.003 * away))
+    )
     wide = np.interp(z / height, [0, 0.5, 0.8, 0.85, 1], [0.2, 0.3, 0.5, 0.2, 0.15])
     kept = np.abs(across) < (wide / 2 if width < 0 else width / 2)
     side, depth = np.array([-y, x, 0]) / away, np.array([x, y, 0]) / away
@@ -151,13 +162,13 @@ def crowd(seed: int, people: int = 4) -> tuple[np.ndarray, GroundTruth]:
         boxes.append([x, y, height / 2 - 1.7, 0.6, 0.6, height, rng.uniform(-3, 3)])
         ids.append(PEDESTRIAN)
     for width in (0.15, 0.4, 0.4, 0.8, 0.8, 1.0):
-        parts.append(upright(rng, *somewhere(rng.choice([-1, 1]) * rng.uniform(0.3, 0.5)),
-                             rng.uniform(1.5, 2.0), width))
+        parts.append(
+            upright(rng, *somewhere(rng.choice([-1, 1]) * rng.uniform(0.3, 0.5)), rng.uniform(1.5, 2.0), width)
+        )
     boxes.append([15, 8, -0.95, 4.0, 1.6, 1.5, 0.1])
     ids.append(CLASSES.index("Car"))
     xyz = np.concatenate(parts)
-    return np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32), GroundTruth.of(
-        boxes, ids)
+    return np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32), GroundTruth.of(boxes, ids)
 
 
 def lowered_crowd(seed: int, by: float) -> Frame:
@@ -165,8 +176,7 @@ def lowered_crowd(seed: int, by: float) -> Frame:
     cloud, truth = crowd(seed)
     up = np.array([0, 0, by], np.float32)
     scan = PointCloud.of(cloud[:, :3] + up, cloud[:, 3].copy(), 10**9 + seed * 10**8, "velodyne")
-    return Frame.of(str(seed), scan, GroundTruth.of(truth.boxes + np.pad(up, (0, 4)),
-                                                    truth.class_ids))
+    return Frame.of(str(seed), scan, GroundTruth.of(truth.boxes + np.pad(up, (0, 4)), truth.class_ids))
 
 
 def crowd_folder(root: Path, count: int = 6) -> Path:

@@ -9,8 +9,21 @@ TINY = make_generic_sensor(16, -14.0, 3.0, 2.0, 10.0)
 
 
 def arguments(out, layout="kitti", frames=5, jobs=1, *more):
-    return ["--out", str(out), "--format", layout, "--sensor", "tiny", "--frames", str(frames),
-            "--seed", "3", "--jobs", str(jobs), *map(str, more)]
+    return [
+        "--out",
+        str(out),
+        "--format",
+        layout,
+        "--sensor",
+        "tiny",
+        "--frames",
+        str(frames),
+        "--seed",
+        "3",
+        "--jobs",
+        str(jobs),
+        *map(str, more),
+    ]
 
 
 def run(out, layout="kitti", frames=5, jobs=1, *more):
@@ -21,5 +34,4 @@ def run(out, layout="kitti", frames=5, jobs=1, *more):
 
 
 def content(folder):
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*"))
-            if p.is_file()}
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}

@@ -18,34 +18,37 @@ from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
 
 # Columns of a driver: name, type and scale.
-VELODYNE = dict(intensity=("intensity", "<f4", 255), ring=("ring", "<u2", -1),
-                time=("time", "<f4", 1))
+VELODYNE = dict(intensity=("intensity", "<f4", 255), ring=("ring", "<u2", -1), time=("time", "<f4", 1))
 OUSTER = dict(intensity=("intensity", "<f4", 255), ring=("ring", "<u1", 1), time=("t", "<u4", 1e9))
-HESAI = dict(intensity=("intensity", "u1", 255), ring=("channel", "<u2", 1),
-             time=("time_stamp", "<u4", 1e9))
+HESAI = dict(intensity=("intensity", "u1", 255), ring=("channel", "<u2", 1), time=("time_stamp", "<u4", 1e9))
 KITTI = dict(intensity=("intensity", "<f4", 1), ring=None, time=None)
 BARE = dict(intensity=None, ring=None, time=None)
 EVEN = dict(camber=0.0, wave=0.0, rough=0.0, litter=0.0)  # street without unevenness
 MOUNTS = {  # sensor: driver, roll and pitch in degrees, height in metres
-    "hdl-64e": (KITTI, 1.5, -2.0, 1.73), "hdl-32e": (VELODYNE, -3.0, 4.0, 1.9),
-    "vlp-16": (VELODYNE, 5.0, 8.0, 0.6), "vlp-32c": (VELODYNE, -6.0, -3.0, 1.1),
-    "os1-64": (OUSTER, 2.0, 12.0, 1.4), "os1-128": (OUSTER, -1.0, 3.0, 0.8),
-    "pandar64": (HESAI, 4.0, -1.0, 2.1), "pandarxt-32": (BARE, -2.5, 6.0, 0.9)}
+    "hdl-64e": (KITTI, 1.5, -2.0, 1.73),
+    "hdl-32e": (VELODYNE, -3.0, 4.0, 1.9),
+    "vlp-16": (VELODYNE, 5.0, 8.0, 0.6),
+    "vlp-32c": (VELODYNE, -6.0, -3.0, 1.1),
+    "os1-64": (OUSTER, 2.0, 12.0, 1.4),
+    "os1-128": (OUSTER, -1.0, 3.0, 0.8),
+    "pandar64": (HESAI, 4.0, -1.0, 2.1),
+    "pandarxt-32": (BARE, -2.5, 6.0, 0.9),
+}
 
 
 def tilt_matrix(roll: float, pitch: float) -> np.ndarray:
     """Return (3, 3) from the axes of a sensor with this roll and pitch in degrees to level ones."""
     r, p = np.radians([roll, pitch])
     return np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]]) @ np.array(
-        [[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]])
+        [[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]]
+    )
 
 
 def find_road_pose(ground: Ground, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return axes (3, 3) with z along the normal of the road around (x, y), and its point there."""
     x, y = np.meshgrid(np.linspace(-6, 6, 25), np.linspace(-3, 3, 13))
     z = surface_height(ground._replace(curb_height=0.0), at[0] + x, at[1] + y)
-    a, b, c = np.linalg.lstsq(np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]), z.ravel(),
-                              rcond=None)[0]
+    a, b, c = np.linalg.lstsq(np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]), z.ravel(), rcond=None)[0]
     up = np.array([-a, -b, 1.0]) / np.sqrt(a * a + b * b + 1)
     ahead = np.array([up[2], 0.0, -up[0]]) / np.hypot(up[0], up[2])
     return np.column_stack([ahead, np.cross(up, ahead), up]), np.array([*at, c])
@@ -58,16 +61,15 @@ def _cast_ground(ground, start, direction, since, velocity, lift, max_range):
     for i in range(direction.shape[0]):
         for k in range(direction.shape[1]):
             at = start + velocity * since[i] + lift[k]
-            hit = cast_ground(ground, (at[0], at[1], at[2]),
-                              (direction[i, k, 0], direction[i, k, 1], direction[i, k, 2]),
-                              max_range)
+            hit = cast_ground(
+                ground, (at[0], at[1], at[2]), (direction[i, k, 0], direction[i, k, 1], direction[i, k, 2]), max_range
+            )
             out[i, k, 0], out[i, k, 1] = hit.range, hit.brightness
             out[i, k, 2], out[i, k, 3] = hit.cosine, hit.semantic
     return out
 
 
-def simulate_tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int,
-                    even: bool = True):
+def simulate_tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int, even: bool = True):
     """Return the returns of one turn of a sensor with roll and pitch in degrees against the road.
 
     even: the street has slopes and curbs, but is smooth otherwise.
@@ -80,32 +82,50 @@ def simulate_tilted(sensor: Sensor, roll: float, pitch: float, street: int, numb
     axes, foot = find_road_pose(ground, moment.position[:2])
     position = foot + sensor.height * axes[:, 2]
     world = axes @ tilt_matrix(roll, pitch)
-    solids = replace(moment.solids, centre=(moment.solids.centre + moment.position - position)
-                     @ world, axes=world.T @ moment.solids.axes,
-                     velocity=moment.solids.velocity @ world)
+    solids = replace(
+        moment.solids,
+        centre=(moment.solids.centre + moment.position - position) @ world,
+        axes=world.T @ moment.solids.axes,
+        velocity=moment.solids.velocity @ world,
+    )
     motion = Motion(tuple(np.array(moment.motion.velocity) @ world))
     hits = cast_rays(solids, Ground(), np.array([0.0, 0.0, 1e6]), sensor, motion, street)
     made = make_rays(sensor, motion)
     lift = np.outer(sensor.lifts or np.zeros(sensor.rings), world[:, 2])
-    on_ground = _cast_ground(to_compiled(ground), position, made.direction @ world.T, made.since,
-                             np.array(moment.motion.velocity), lift, sensor.max_range)
+    on_ground = _cast_ground(
+        to_compiled(ground),
+        position,
+        made.direction @ world.T,
+        made.since,
+        np.array(moment.motion.velocity),
+        lift,
+        sensor.max_range,
+    )
     nearer = on_ground[..., 0] < hits.range
-    merged = [np.where(nearer, on_ground[..., i], part)
-              for i, part in enumerate((hits.range, hits.brightness, hits.cosine))]
+    merged = [
+        np.where(nearer, on_ground[..., i], part) for i, part in enumerate((hits.range, hits.brightness, hits.cosine))
+    ]
     owner = np.where(nearer, 0, hits.owner)
     semantic = np.where(nearer, on_ground[..., 3], hits.semantic).astype(np.uint16)
-    return make_returns(Hits(*merged, owner, semantic, hits.solid, hits.reached), sensor, motion,
-                        np.random.default_rng([street, number]), compensated=False)
+    return make_returns(
+        Hits(*merged, owner, semantic, hits.solid, hits.reached),
+        sensor,
+        motion,
+        np.random.default_rng([street, number]),
+        compensated=False,
+    )
 
 
 def make_cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str = "lidar"):
     """Return a PointCloud2 with a driver's columns: beam by beam for KITTI, else by firings."""
-    order = np.arange(len(returns.xyz)) if driver is KITTI else np.argsort(
-        returns.time, kind="stable")
+    order = np.arange(len(returns.xyz)) if driver is KITTI else np.argsort(returns.time, kind="stable")
     columns = {axis: returns.xyz[order, i] for i, axis in enumerate("xyz")}
     kinds = [(axis, "<f4") for axis in "xyz"]
-    for key, values in (("intensity", returns.intensity), ("ring", returns.ring),
-                        ("time", returns.time - returns.time.min())):
+    for key, values in (
+        ("intensity", returns.intensity),
+        ("ring", returns.ring),
+        ("time", returns.time - returns.time.min()),
+    ):
         if driver[key] is not None:
             name, kind, scale = driver[key]
             values = values[order].astype(np.float64) * abs(scale)
@@ -126,5 +146,4 @@ def simulate_clouds(name: str, count: int = 4, even: bool = True, street: int = 
     sensor = replace(find_sensor(name), height=height)
     for i in range(count):
         returns = simulate_tilted(sensor, roll, pitch, street + i // 2, 20 + i % 2, even)
-        yield make_cloud(returns, driver, round(1e9 * (10 * (i // 2) + (i % 2) / sensor.rate)),
-                         sensor.rings)
+        yield make_cloud(returns, driver, round(1e9 * (10 * (i // 2) + (i % 2) / sensor.rate)), sensor.rings)

@@ -25,16 +25,21 @@ def counted(frames):
     """Without what nobody needs to find: frames of labels [id], tracks [id], alike {(i, j): s}."""
     result = []
     for labels, tracks, alike, _ in frames:
-        pairs = best_assignment(len(labels), len(tracks),
-                                lambda i, j, alike=alike: alike(i, j) if alike(i, j) >= 0.5 else 0)
+        pairs = best_assignment(
+            len(labels), len(tracks), lambda i, j, alike=alike: alike(i, j) if alike(i, j) >= 0.5 else 0
+        )
         gone = {j for i, j in pairs if labels[i][1]}
         free = set(range(len(tracks))) - {j for _, j in pairs}
         gone |= {j for j in free if tracks[j][2]}
         rows = [i for i, (_, ignored) in enumerate(labels) if not ignored]
         columns = [j for j in range(len(tracks)) if j not in gone]
-        result.append(([labels[i][0] for i in rows], [tracks[j][0] for j in columns],
-                       {(a, b): alike(i, j) for a, i in enumerate(rows)
-                        for b, j in enumerate(columns)}))
+        result.append(
+            (
+                [labels[i][0] for i in rows],
+                [tracks[j][0] for j in columns],
+                {(a, b): alike(i, j) for a, i in enumerate(rows) for b, j in enumerate(columns)},
+            )
+        )
     return result
 
 
@@ -58,10 +63,11 @@ def hota(sequences):
         for number, alpha in enumerate(alphas):
             matches = {}
             for true, tracks, alike in frames:
-                def gain(a, b, true=true, tracks=tracks, alike=alike, together=together,
-                         length=length, found=found):
+
+                def gain(a, b, true=true, tracks=tracks, alike=alike, together=together, length=length, found=found):
                     c = together.get((true[a], tracks[b]), 0)
                     return alike[a, b] * c / (length[true[a]] + found[tracks[b]] - c)
+
                 for a, b in best_assignment(len(true), len(tracks), gain):
                     if alike[a, b] >= alpha - 1e-15:
                         key = true[a], tracks[b]
@@ -69,12 +75,10 @@ def hota(sequences):
                 labels[number] += len(true)
                 boxes[number] += len(tracks)
             tp[number] += sum(matches.values())
-            associated[number] += sum(n * n / (length[i] + found[j] - n)
-                                      for (i, j), n in matches.items())
+            associated[number] += sum(n * n / (length[i] + found[j] - n) for (i, j), n in matches.items())
     det = [t / max(1, a + b - t) for t, a, b in zip(tp, labels, boxes)]
     ass = [s / max(1, t) for s, t in zip(associated, tp)]
-    return (float(np.mean([(d * a) ** 0.5 for d, a in zip(det, ass)])), float(np.mean(det)),
-            float(np.mean(ass)))
+    return (float(np.mean([(d * a) ** 0.5 for d, a in zip(det, ass)])), float(np.mean(det)), float(np.mean(ass)))
 
 
 def clear(sequences):
@@ -90,6 +94,7 @@ def clear(sequences):
             def gain(a, b, true=true, tracks=tracks, alike=alike, before=before):
                 s = alike[a, b]
                 return 0 if s < 0.5 else s + 1000 * (before.get(true[a]) == tracks[b])
+
             pairs = best_assignment(len(true), len(tracks), gain)
             now = {true[a]: tracks[b] for a, b in pairs}
             for i, j in now.items():
@@ -120,9 +125,13 @@ def over_recall(sequences):
             stories = {}
             for f, (labels, tracks, _, overlap) in enumerate(frames):
                 kept = [j for j, (i, _, _) in enumerate(tracks) if score[i] >= threshold]
-                pairs = best_assignment(len(labels), len(kept), lambda a, b, overlap=overlap,
-                                        kept=kept: overlap(a, kept[b]) + 10
-                                        if overlap(a, kept[b]) >= 0.25 else 0)
+                pairs = best_assignment(
+                    len(labels),
+                    len(kept),
+                    lambda a, b, overlap=overlap, kept=kept: (
+                        overlap(a, kept[b]) + 10 if overlap(a, kept[b]) >= 0.25 else 0
+                    ),
+                )
                 pairs = {a: kept[b] for a, b in pairs}
                 once.update((number, f, j) for j in pairs.values())
                 for a, (i, ignored) in enumerate(labels):
@@ -133,8 +142,7 @@ def over_recall(sequences):
                     if hit:
                         total += overlap(a, pairs[a])
                         hits.append(score[tracks[pairs[a]][0]])
-                fp += sum(j not in pairs.values() and not (
-                    tracks[j][2] and (number, f, j) not in once) for j in kept)
+                fp += sum(j not in pairs.values() and not (tracks[j][2] and (number, f, j) not in once) for j in kept)
             for story in stories.values():
                 known = story[0][0]
                 for k in range(1, len(story)):

@@ -34,8 +34,7 @@ def crowd(seed=0, frames=20):
     """Yield noisy detections of objects on straight lines, in the fixed frame."""
     rng = np.random.default_rng(seed)
     kinds = np.array([CAR, CAR, CYCLIST, PEDESTRIAN, PEDESTRIAN, PEDESTRIAN])
-    start = np.array([car(10), car(20, 8, np.pi), car(15, -8), person(8, 4), person(12, -4),
-                      person(25, 5)])
+    start = np.array([car(10), car(20, 8, np.pi), car(15, -8), person(8, 4), person(12, -4), person(25, 5)])
     velocity = np.array([[8, 0], [-5, 0], [4, 0], [1, 0.5], [0, 0], [-1, 0]])
     for i in range(frames):
         boxes = start.copy()

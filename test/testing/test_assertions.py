@@ -17,11 +17,7 @@ from lidar_perception.testing.detections import assert_detections, to_objects
 from lidar_perception.testing.launching import include_launch_file, make_description
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import (
-    make_detection_markers,
-    make_truth_markers,
-    to_point_cloud,
-)
+from lidar_perception.wire.messages import make_detection_markers, make_truth_markers, to_point_cloud
 from msg_utils.detections import to_detection_array
 from msg_utils.point_cloud2 import to_array
 
@@ -29,10 +25,15 @@ NAMES = ("Car", "Pedestrian", "Cyclist")
 
 
 def some(rng, count):
-    boxes = np.column_stack([rng.uniform(-30, 30, (count, 2)), rng.uniform(-2, 0, count),
-                             rng.uniform(0.5, 4, (count, 3)), rng.uniform(-3, 3, count)])
-    return Detections.of(boxes, [CLASSES.index(n) for n in rng.choice(NAMES, count)],
-                         rng.uniform(0, 1, count))
+    boxes = np.column_stack(
+        [
+            rng.uniform(-30, 30, (count, 2)),
+            rng.uniform(-2, 0, count),
+            rng.uniform(0.5, 4, (count, 3)),
+            rng.uniform(-3, 3, count),
+        ]
+    )
+    return Detections.of(boxes, [CLASSES.index(n) for n in rng.choice(NAMES, count)], rng.uniform(0, 1, count))
 
 
 def pairs_of(objects):
@@ -44,11 +45,15 @@ def test_every_kind_of_detections_says_the_same(make):
     found = some(np.random.default_rng(0), 7)
     expected = to_objects(found)
     truth = GroundTruth.of(found.boxes, found.class_ids)
-    kinds = [make_detection_markers(found, header(make), make),
-             make_truth_markers(truth, header(make), make), truth, expected, pairs_of(expected)]
+    kinds = [
+        make_detection_markers(found, header(make), make),
+        make_truth_markers(truth, header(make), make),
+        truth,
+        expected,
+        pairs_of(expected),
+    ]
     if make is not bag_message and importlib.util.find_spec("vision_msgs"):
-        kinds.append(to_detection_array(found.boxes, expected.labels, found.scores,
-                                        header=header(make), make=make))
+        kinds.append(to_detection_array(found.boxes, expected.labels, found.scores, header=header(make), make=make))
     for kind in kinds:
         objects = to_objects(kind)
         assert objects.labels == expected.labels
@@ -65,13 +70,14 @@ def test_order_does_not_matter_and_what_was_taken_away_is_missing(limit):
         expected = some(rng, int(rng.integers(1, 20)))
         order = rng.permutation(len(expected))
         found = expected[order]
-        assert sorted(assert_detections(found, expected, **limit)) == [
-            (i, int(j)) for i, j in enumerate(order)]
+        assert sorted(assert_detections(found, expected, **limit)) == [(i, int(j)) for i, j in enumerate(order)]
         gone = int(rng.integers(len(found)))
         fewer = found[np.arange(len(found)) != gone]
         place = "at ({:.2f}, {:.2f}".format(*found.boxes[gone, :2])
-        for a, b, word, allowed in ((fewer, expected, "missing", "max_missing"),
-                                    (expected, fewer, "extra", "max_extra")):
+        for a, b, word, allowed in (
+            (fewer, expected, "missing", "max_missing"),
+            (expected, fewer, "extra", "max_extra"),
+        ):
             with pytest.raises(AssertionError) as error:
                 assert_detections(a, b, **limit)
             lines = [line for line in str(error.value).splitlines()[1:]]
@@ -82,8 +88,7 @@ def test_order_does_not_matter_and_what_was_taken_away_is_missing(limit):
 def test_as_many_pairs_as_possible_and_a_class_is_a_class():
     """The nearest of the first would leave the second without any."""
     found = [("Car", [0, 0, 0]), ("Car", [0.9, 0, 0])]
-    assert assert_detections(found, [("Car", [0.8, 0, 0]), ("Car", [1.7, 0, 0])]) == [
-        (0, 0), (1, 1)]
+    assert assert_detections(found, [("Car", [0.8, 0, 0]), ("Car", [1.7, 0, 0])]) == [(0, 0), (1, 1)]
     cyclist = [("Cyclist", [0, 0, 0]), ("Car", [0.9, 0, 0])]
     with pytest.raises(AssertionError, match=r"missing: Car .*nearest: Cyclist, 0\.00 m"):
         assert_detections(cyclist, found)
@@ -92,10 +97,14 @@ def test_as_many_pairs_as_possible_and_a_class_is_a_class():
     assert_detections(found, [], max_extra=None)
 
 
-@pytest.mark.parametrize("found, words", [
-    (3, "int is not a MarkerArray"), ([("Car", [1, 2])], "list is not a MarkerArray"),
-    (["Car"], "is not a MarkerArray"),
-])
+@pytest.mark.parametrize(
+    "found, words",
+    [
+        (3, "int is not a MarkerArray"),
+        ([("Car", [1, 2])], "list is not a MarkerArray"),
+        (["Car"], "is not a MarkerArray"),
+    ],
+)
 def test_what_is_no_detection_is_refused(found, words):
     with pytest.raises(InputError, match=words):
         assert_detections(found, [])
@@ -108,7 +117,8 @@ def test_a_bag_gives_back_its_arrays(make_bag, storage):
     truths = [walker_truth(), None, [("Pedestrian", walker_truth().boxes[0])]]
     path = make_bag([scene(i) for i in range(3)], truths, storage=storage, points="/front", hz=5.0)
     assert [p.suffix for p in path.iterdir() if p.name != "metadata.yaml"] == [
-        {"mcap": ".mcap", "sqlite3": ".db3"}[storage]]
+        {"mcap": ".mcap", "sqlite3": ".db3"}[storage]
+    ]
     with Bag(path) as bag:
         clouds = [to_point_cloud(m, 1.0)[0] for _, _, m in bag.messages({"/front"})]
     assert [np.array_equal(c.xyz, scene(i)[:, :3]) for i, c in enumerate(clouds)] == [True] * 3
@@ -119,14 +129,17 @@ def test_a_bag_gives_back_its_arrays(make_bag, storage):
     np.testing.assert_allclose(frames.frames[2].truth().boxes, walker_truth().boxes)
 
 
-@pytest.mark.parametrize("clouds, labels, options, words", [
-    ([np.zeros((5, 2))], None, {}, r"cloud 0 has shape \(5, 2\)"),
-    ([scene()], [], {}, "1 clouds and labels of 0"),
-    ([scene()], [[("Dragon", [0] * 7)]], {}, "'Dragon' is none of Car"),
-    ([scene()], [[("Car", [0] * 3)]], {}, "complete boxes"),
-    ([scene()], None, {"storage": "tape"}, "'tape' is none of mcap, sqlite3"),
-    (make_frames([scene()]), [None], {"hz": 5.0}, "they take no labels and no hz"),
-])
+@pytest.mark.parametrize(
+    "clouds, labels, options, words",
+    [
+        ([np.zeros((5, 2))], None, {}, r"cloud 0 has shape \(5, 2\)"),
+        ([scene()], [], {}, "1 clouds and labels of 0"),
+        ([scene()], [[("Dragon", [0] * 7)]], {}, "'Dragon' is none of Car"),
+        ([scene()], [[("Car", [0] * 3)]], {}, "complete boxes"),
+        ([scene()], None, {"storage": "tape"}, "'tape' is none of mcap, sqlite3"),
+        (make_frames([scene()]), [None], {"hz": 5.0}, "they take no labels and no hz"),
+    ],
+)
 def test_a_bag_that_cannot_be_made_is_refused_by_name(make_bag, clouds, labels, options, words):
     with pytest.raises(InputError, match=words):
         make_bag(clouds, labels, **options)

@@ -12,12 +12,15 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-FILES = re.findall(r"`(\w+\.py)`[^`]*?:?\n(?:[^`]*\n)?\n?```python\n(.*?)```",
-                   (ROOT / "docs/how-to/test-your-stack.md").read_text(), re.S)
+FILES = re.findall(
+    r"`(\w+\.py)`[^`]*?:?\n(?:[^`]*\n)?\n?```python\n(.*?)```",
+    (ROOT / "docs/how-to/test-your-stack.md").read_text(),
+    re.S,
+)
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-BROKEN = '''
+BROKEN = """
 import sys
 
 def test_who_dies(peer, processes):
@@ -26,7 +29,7 @@ def test_who_dies(peer, processes):
 
 def test_who_waits(peer):
     peer.wait_for_messages("/nowhere", "std_msgs/msg/Bool", count=2, timeout=0.1)
-'''
+"""
 
 
 @pytest.fixture(scope="module")
@@ -38,32 +41,39 @@ def folder(tmp_path_factory) -> Path:
 
 
 def run(folder: Path, *command: str) -> subprocess.CompletedProcess:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(
-        [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])}
-    return subprocess.run([sys.executable, "-m", *command], cwd=folder, env=environment,
-                          capture_output=True, text=True)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
+    }
+    return subprocess.run([sys.executable, "-m", *command], cwd=folder, env=environment, capture_output=True, text=True)
 
 
 def test_the_page_has_its_files():
-    assert [name for name, _ in FILES] == ["emergency_stop.py", "conftest.py",
-                                           "test_emergency_stop.py", "test_stop_launch.py"]
+    assert [name for name, _ in FILES] == [
+        "emergency_stop.py",
+        "conftest.py",
+        "test_emergency_stop.py",
+        "test_stop_launch.py",
+    ]
 
 
 def test_the_whole_test_passes_and_a_failure_says_what_was_seen(folder):
     (folder / "test_broken.py").write_text(BROKEN)
-    done = run(folder, "pytest", "-q", "-p", "no:cacheprovider", "test_emergency_stop.py",
-               "test_broken.py")
+    done = run(folder, "pytest", "-q", "-p", "no:cacheprovider", "test_emergency_stop.py", "test_broken.py")
     said = " ".join(done.stdout.split())
     assert "2 failed, 3 passed" in said, done.stdout
-    for words in ("while the test waited for a miracle, speaker ended with code 3",
-                  "log of speaker, which ended with code 3", "I am tired",
-                  "in vain for 2 messages on /nowhere; diagnostics: none; received: /nowhere "
-                  "nothing from 0 publishers"):
+    for words in (
+        "while the test waited for a miracle, speaker ended with code 3",
+        "log of speaker, which ended with code 3",
+        "I am tired",
+        "in vain for 2 messages on /nowhere; diagnostics: none; received: /nowhere nothing from 0 publishers",
+    ):
         assert words in said, done.stdout
 
 
-@pytest.mark.skipif(importlib.util.find_spec("launch_testing") is None,
-                    reason="needs launch_testing, which comes with ROS 2")
+@pytest.mark.skipif(
+    importlib.util.find_spec("launch_testing") is None, reason="needs launch_testing, which comes with ROS 2"
+)
 def test_the_launch_test_passes(folder):
     done = run(folder, "launch_testing.launch_test", "test_stop_launch.py")
     assert done.returncode == 0, done.stdout + done.stderr

@@ -26,14 +26,14 @@ from lidar_perception.tracking.ego import (
 from lidar_perception.tracking.params import EGO_SOURCES, RECORDED_EGO
 from lidar_perception.types import InputError
 
-SETS = [{*chosen} for chosen in chain.from_iterable(
-    combinations(SOURCES, count) for count in range(len(SOURCES) + 1))]
+SETS = [{*chosen} for chosen in chain.from_iterable(combinations(SOURCES, count) for count in range(len(SOURCES) + 1))]
 
 
 @pytest.mark.parametrize("available", SETS, ids=lambda names: "+".join(sorted(names)) or "nothing")
 def test_best_available_source_is_chosen(available):
     def rank(name):
         return (*SOURCES, NO_SOURCE).index(name)
+
     best = choose_source("auto", available)
     assert rank(best) == min(map(rank, available), default=rank(NO_SOURCE))
     for name in SOURCES:
@@ -47,8 +47,7 @@ def test_source_options_are_the_known_sources():
 
 
 @pytest.mark.parametrize("installed", [True, False])
-def test_recorded_poses_come_before_kiss_icp(monkeypatch,
-                                             installed):
+def test_recorded_poses_come_before_kiss_icp(monkeypatch, installed):
     monkeypatch.setattr(ego, "has_odometry", lambda: installed)
     assert choose_recorded_source(True) == "recording"
     assert choose_recorded_source(False) == ("kiss_icp" if installed else NO_SOURCE)
@@ -76,9 +75,7 @@ def test_kiss_icp_replaces_poses_missing_at_the_start(monkeypatch, installed, fi
 
     frames = [Frame(str(i), i, lambda: None, pose=partial(pose_of, i)) for i in range(200)]
     recording = Recording(Path("drive"), "", frames, frozenset({POSES}))
-    assert choose_ego_source(recording) == (
-        "kiss_icp" if installed and first >= MAX_POSE_CHECKS else "recording"
-    )
+    assert choose_ego_source(recording) == ("kiss_icp" if installed and first >= MAX_POSE_CHECKS else "recording")
     assert choose_ego_source(recording, "recording") == "recording"
     assert read == [*range(min(first + 1, MAX_POSE_CHECKS))] * installed
 

@@ -31,8 +31,7 @@ def test_two_predictions_equal_one_long_prediction(state, first, second):
     means, p = np.array([state]), spread()
     at_once = predict(means, p, first + second, NONE, NONE, NONE)
     again = predict(*predict(means, p, first, NONE, NONE, NONE), second, NONE, NONE, NONE)
-    np.testing.assert_allclose(again[0][:, [0, 1, 2, 3, 5]], at_once[0][:, [0, 1, 2, 3, 5]],
-                               atol=1e-6)
+    np.testing.assert_allclose(again[0][:, [0, 1, 2, 3, 5]], at_once[0][:, [0, 1, 2, 3, 5]], atol=1e-6)
     assert wrap_angle(again[0][0, 4] - at_once[0][0, 4]) == pytest.approx(0, abs=1e-6)
 
 
@@ -42,8 +41,7 @@ def test_covariance_prediction_matches_numeric_jacobian(state, seconds):
     _, grown = predict(means, p, seconds, NONE, NONE, NONE)
     step, slope = 1e-5, np.zeros((6, 6))
     for k in range(6):
-        ends = [predict(means + s * np.eye(6)[k], p, seconds, NONE, NONE, NONE)[0][0]
-                for s in (step, -step)]
+        ends = [predict(means + s * np.eye(6)[k], p, seconds, NONE, NONE, NONE)[0][0] for s in (step, -step)]
         slope[:, k] = ends[0] - ends[1]
         slope[4, k] = wrap_angle(slope[4, k])
     slope /= 2 * step
@@ -70,8 +68,10 @@ def test_update_shrinks_covariance_and_moves_to_measurement():
 @given(st.floats(-3.1, 3.1), st.floats(-1.4, 1.4))
 def test_opposite_headings_give_same_update(heading, off):
     means = np.array([[0, 0, 0, 0, heading, 0.0]])
-    ends = [update(means, spread(2), np.array([[0.1, 0.2, heading + off + k * np.pi]]),
-                   np.full((1, 3), 0.2))[0] for k in (0, 1)]
+    ends = [
+        update(means, spread(2), np.array([[0.1, 0.2, heading + off + k * np.pi]]), np.full((1, 3), 0.2))[0]
+        for k in (0, 1)
+    ]
     np.testing.assert_allclose(ends[0][0, :4], ends[1][0, :4], atol=1e-7)
     assert wrap_angle(ends[0][0, 4] - ends[1][0, 4]) == pytest.approx(0, abs=1e-7)
 
@@ -82,8 +82,7 @@ def test_lateral_speed_shrinks_and_reversed_heading_flips():
     across = [np.cos(m[4]) * m[3] - np.sin(m[4]) * m[2] for m in (means[0], kept[0])]
     assert abs(across[1]) < 0.2 * abs(across[0]) and (np.linalg.eigvalsh(p) > 0).all()
     backwards = np.array([[0.0, 0, -5, 0, 0.2, 0], [0, 0, -0.5, 0, 0.2, 0]])
-    flipped, agreement = flip_reversed_headings(backwards, np.array([9.0, 9.0]),
-                                                np.array([2.0, 2.0]))
+    flipped, agreement = flip_reversed_headings(backwards, np.array([9.0, 9.0]), np.array([2.0, 2.0]))
     assert flipped[:, 4] == pytest.approx([0.2 - np.pi, 0.2])
     assert agreement.tolist() == [-9, 9]
     again, _ = flip_reversed_headings(flipped, agreement, np.full(2, 2.0))

@@ -37,8 +37,14 @@ def test_plain_tracker_follows_car_and_compensates_poses():
 
 
 def test_both_trackers_are_scored_on_the_same_frames():
-    frames = [TrackedFrame(one(10 + i), GroundTruth.of(one(10 + i).boxes, [CAR], [{
-        "track_id": 5, "occluded": 0, "truncated": 0.0}]), 10**18 + i * 10**8) for i in range(12)]
+    frames = [
+        TrackedFrame(
+            one(10 + i),
+            GroundTruth.of(one(10 + i).boxes, [CAR], [{"track_id": 5, "occluded": 0, "truncated": 0.0}]),
+            10**18 + i * 10**8,
+        )
+        for i in range(12)
+    ]
     content = measure_tracking({"a": frames})
     assert list(content) == ["plain AB3DMOT", "ours"]
     for scores in content.values():
@@ -53,14 +59,22 @@ def test_only_recordings_with_track_ids_are_tracked(monkeypatch):
     from benchmark import tracking
     from lidar_perception.data.frame import Frame, Recording
     from lidar_perception.types import PointCloud
+
     scans = [PointCloud(one(10 + i).boxes[:, :3], None, 10**18 + i * 10**8) for i in range(6)]
-    monkeypatch.setattr(tracking, "open_detector", lambda *_, **__: lambda scan: SimpleNamespace(
-        detections=one(scan.xyz[0, 0])))
+    monkeypatch.setattr(
+        tracking, "open_detector", lambda *_, **__: lambda scan: SimpleNamespace(detections=one(scan.xyz[0, 0]))
+    )
 
     def recording(sequence, extra):
-        return Recording(Path("drive"), "made up", [Frame.of(
-            str(i), scan, GroundTruth.of(one(10 + i).boxes, [CAR], [extra]), sequence=sequence,
-            index=i) for i, scan in enumerate(scans)])
+        return Recording(
+            Path("drive"),
+            "made up",
+            [
+                Frame.of(str(i), scan, GroundTruth.of(one(10 + i).boxes, [CAR], [extra]), sequence=sequence, index=i)
+                for i, scan in enumerate(scans)
+            ],
+        )
+
     content = tracking.measure_recording(recording("0000", {"track_id": 5}))
     assert content["ours"]["classes"]["Car"]["tracks"] == 1
     assert tracking.measure_recording(recording("", {"track_id": 5})) == {}
@@ -69,6 +83,7 @@ def test_only_recordings_with_track_ids_are_tracked(monkeypatch):
 
 def test_intervals_of_drives_are_paired():
     from benchmark.drives import _interval, resample
+
     values = [1.0, 2.0, 4.0]
     means = resample(values, lambda chosen: sum(chosen) / 3)
     np.testing.assert_array_equal(means, resample(values, lambda chosen: sum(chosen) / 3))

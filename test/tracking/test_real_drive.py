@@ -17,6 +17,7 @@ def detector(data):
     from lidar_perception.data.open import open_recording
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.detectors.params import MIN_SCORE
+
     found, detect = {}, open_detector("pointpillars", min_score=MIN_SCORE)
     for frame in open_recording(data / "kitti_tracking").frames[:FRAMES]:
         scan = frame.load()
@@ -39,7 +40,6 @@ def test_no_id_switches_on_real_drive(data, detector, ego):
     report, drive = TrackingReport(), open_recording(data / "kitti_tracking")
     if ego == "auto" and POSES not in drive.has:
         assert choose_ego_source(drive) == ("kiss_icp" if has_odometry() else "none")
-    fill(report, drive, partial(measure_tracking, lambda: detector, TrackingParams(), ego),
-         limit=FRAMES)
+    fill(report, drive, partial(measure_tracking, lambda: detector, TrackingParams(), ego), limit=FRAMES)
     cars = report.compute()["classes"]["Car"]
     assert cars["switches"] == 0 and cars["HOTA"] > 0.7

@@ -22,8 +22,10 @@ from lidar_perception.types import PEDESTRIAN, Detections
 def track(frames, poses=None, tracker=None, stamps=None):
     """Return the Tracks of every frame, at 10 Hz unless stamps are given."""
     tracker = tracker or Tracker()
-    return [tracker(found, START + i * TENTH if stamps is None else stamps[i],
-                    None if poses is None else poses[i]) for i, found in enumerate(frames)]
+    return [
+        tracker(found, START + i * TENTH if stamps is None else stamps[i], None if poses is None else poses[i])
+        for i, found in enumerate(frames)
+    ]
 
 
 def test_ids_are_stable_and_velocities_correct():
@@ -42,8 +44,7 @@ def test_ids_are_stable_and_velocities_correct():
 @pytest.mark.parametrize("rate", [20, 10, 5, 2])
 def test_fast_car_is_one_track_at_any_rate(rate):
     frames = [cars(car(-60 + 28.0 * i / rate)) for i in range(20)]
-    *_, last = track(frames, [np.eye(4)] * 20, stamps=[
-        START + i * 10**9 // rate for i in range(20)])
+    *_, last = track(frames, [np.eye(4)] * 20, stamps=[START + i * 10**9 // rate for i in range(20)])
     assert last.ids.tolist() == [1]
     np.testing.assert_allclose(last.velocities, [[28, 0]], atol=0.5)
 
@@ -63,10 +64,10 @@ def test_tracker_is_deterministic_and_keeps_its_input():
 @pytest.mark.parametrize("roll", [0.0, np.pi])
 def test_moving_sensor_gives_same_tracks_as_static_one(roll):
     frames = list(crowd(1))
-    poses = [pose(0.9 * i, 0.1 * i, 0.04 * i) @ make_tilted_pose(roll, 0.0)
-             for i in range(len(frames))]
-    moved = [Detections.of(transform_boxes(f.boxes, np.linalg.inv(p)), f.class_ids, f.scores)
-             for f, p in zip(frames, poses)]
+    poses = [pose(0.9 * i, 0.1 * i, 0.04 * i) @ make_tilted_pose(roll, 0.0) for i in range(len(frames))]
+    moved = [
+        Detections.of(transform_boxes(f.boxes, np.linalg.inv(p)), f.class_ids, f.scores) for f, p in zip(frames, poses)
+    ]
     standing = track(frames, [np.eye(4)] * len(frames))
     for still, seen, p in zip(standing, track(moved, poses), poses):
         assert seen.ids.tolist() == still.ids.tolist()
@@ -77,8 +78,8 @@ def test_moving_sensor_gives_same_tracks_as_static_one(roll):
         side = np.linalg.det(p[:2, :2])
         np.testing.assert_allclose(side * seen.turn_rates, still.turn_rates, atol=1e-3)
         np.testing.assert_allclose(
-            p[:2, :2] @ seen.covariances[:, 2:4, 2:4] @ p[:2, :2].T,
-            still.covariances[:, 2:4, 2:4], atol=1e-3)
+            p[:2, :2] @ seen.covariances[:, 2:4, 2:4] @ p[:2, :2].T, still.covariances[:, 2:4, 2:4], atol=1e-3
+        )
         np.testing.assert_allclose(seen.moving, still.moving, atol=1e-3)
 
 
@@ -119,9 +120,13 @@ def test_occluded_track_lasts_equally_long_at_any_rate(rate):
     def started(hidden):
         frames = [cars(car(10))] * (4 * rate) + [Detections.none()] * int(hidden * rate)
         tracker = Tracker()
-        track([*frames, cars(car(10))], tracker=tracker,
-              stamps=[START + i * 10**9 // rate for i in range(len(frames) + 1)])
+        track(
+            [*frames, cars(car(10))],
+            tracker=tracker,
+            stamps=[START + i * 10**9 // rate for i in range(len(frames) + 1)],
+        )
         return tracker.started
+
     assert (started(1.4), started(2.0)) == (1, 2)
 
 
@@ -130,8 +135,11 @@ def test_weak_detections_continue_but_never_start_tracks():
     tracker = Tracker()
     track([cars(car(10), scores=weak)] * 10, tracker=tracker)
     assert (tracker.started, tracker.alive) == (0, 0)
-    tracks = track([cars(car(10))] * 10 + [cars(car(10), scores=weak)] * 3, tracker=tracker,
-                   stamps=[START + (20 + i) * TENTH for i in range(13)])
+    tracks = track(
+        [cars(car(10))] * 10 + [cars(car(10), scores=weak)] * 3,
+        tracker=tracker,
+        stamps=[START + (20 + i) * TENTH for i in range(13)],
+    )
     assert tracks[-1].ids.tolist() == [1] and tracks[-1].seen[0]
 
 
@@ -154,8 +162,7 @@ def test_constantly_doubtful_object_stays_doubtful():
 
 def test_reversed_heading_detections_do_not_turn_a_car():
     tracks = track([cars(car(10 + i, yaw=np.pi * (i % 2))) for i in range(20)])
-    assert [wrap_angle(t.detections.boxes[0, 6]) for t in tracks[6:]] == pytest.approx(
-        [0.0] * 14, abs=0.1)
+    assert [wrap_angle(t.detections.boxes[0, 6]) for t in tracks[6:]] == pytest.approx([0.0] * 14, abs=0.1)
 
 
 @pytest.mark.parametrize("at", [None, pose(0)])
@@ -163,8 +170,7 @@ def test_reversed_heading_detections_do_not_turn_a_car():
 def test_slow_object_heading_follows_majority_of_scores(at, speed):
     flipped = np.random.default_rng(0).random(60) < 0.25
     flipped[:3] = True
-    tracks = track([cars(car(10 + 0.1 * speed * i, yaw=np.pi * wrong))
-                    for i, wrong in enumerate(flipped)], [at] * 60)
+    tracks = track([cars(car(10 + 0.1 * speed * i, yaw=np.pi * wrong)) for i, wrong in enumerate(flipped)], [at] * 60)
     headings = wrap_angle(np.array([t.detections.boxes[0, 6] for t in tracks]))
     assert np.abs(np.abs(headings[:3]) - np.pi).max() < 0.01
     assert np.abs(headings[15:]).max() < 0.01 and {t.ids.tolist()[0] for t in tracks} == {1}
@@ -172,13 +178,13 @@ def test_slow_object_heading_follows_majority_of_scores(at, speed):
 
 def test_moving_object_heading_follows_motion():
     tracks = track([cars(car(10 + 0.6 * i, yaw=np.pi)) for i in range(40)], [pose(0)] * 40)
-    assert [wrap_angle(t.detections.boxes[0, 6]) for t in tracks[6:]] == pytest.approx(
-        [0.0] * 34, abs=0.1)
+    assert [wrap_angle(t.detections.boxes[0, 6]) for t in tracks[6:]] == pytest.approx([0.0] * 34, abs=0.1)
 
 
 def test_alternating_class_is_one_track_of_better_class():
-    frames = [cars(person(10 + 0.1 * i), kind=[CYCLIST, PEDESTRIAN][i % 2],
-                   scores=[0.6, 0.9][i % 2]) for i in range(30)]
+    frames = [
+        cars(person(10 + 0.1 * i), kind=[CYCLIST, PEDESTRIAN][i % 2], scores=[0.6, 0.9][i % 2]) for i in range(30)
+    ]
     tracks = track(frames)
     assert {t.ids.tolist()[0] for t in tracks[1:]} == {tracks[-1].ids[0]}
     assert {int(t.detections.class_ids[0]) for t in tracks[8:]} == {PEDESTRIAN}
@@ -245,11 +251,7 @@ def test_ego_motion_is_extrapolated_up_to_max_gap():
     np.testing.assert_allclose(on.pose, pose(1, 0.1, 0.05) @ step, atol=2e-2)
     long = advance_ego(advance_ego(ego, None, 5.0, 1.0), None, 5.0, 1.0)
     np.testing.assert_allclose(long.pose, advance_ego(ego, None, 1.0, 1.0).pose)
-    assert (
-        not is_valid_pose(2 * np.eye(4))
-        and not is_valid_pose(np.eye(3))
-        and not is_valid_pose(None)
-    )
+    assert not is_valid_pose(2 * np.eye(4)) and not is_valid_pose(np.eye(3)) and not is_valid_pose(None)
 
 
 def test_invalid_boxes_are_ignored():
@@ -269,8 +271,7 @@ def test_ten_thousand_detections_stay_within_limits():
     for i in range(5):
         boxes = np.tile(car(0), (10_000, 1))
         boxes[:, :2] = rng.uniform(-70, 70, (10_000, 2))
-        tracks = tracker(Detections.of(boxes, rng.integers(0, 9, 10_000),
-                                       rng.uniform(0, 1, 10_000)), START + i * TENTH)
+        tracks = tracker(Detections.of(boxes, rng.integers(0, 9, 10_000), rng.uniform(0, 1, 10_000)), START + i * TENTH)
         assert tracker.alive <= 80 and len(tracks) <= 80
         assert "too many" in tracker.problem
 
@@ -279,8 +280,7 @@ def test_assignment_maximizes_pairs_within_gates():
     tracks = np.array([car(0), car(2), car(100)])
     found = np.array([car(1.2), car(-0.4), car(50)])
     kinds = np.zeros(3, int)
-    pairs = find_pairs(tracks, np.full(3, 0.3), kinds, np.full(3, 1.5), found, kinds,
-                       AssociationParams())
+    pairs = find_pairs(tracks, np.full(3, 0.3), kinds, np.full(3, 1.5), found, kinds, AssociationParams())
     assert {2} & {*pairs.tracks.tolist(), *pairs.boxes.tolist()} == set()
     assert [p.tolist() for p in assign(pairs)] == [[0, 1], [1, 0]]
     none = find_pairs(np.zeros((0, 7)), *[np.zeros(0, int)] * 3, found, kinds, AssociationParams())
@@ -292,8 +292,14 @@ def test_sparse_assignment_equals_dense_one(count, overlap):
     """Reference: costs of all tracks with all detections, and one assignment of all."""
     rng, params = np.random.default_rng(count), AssociationParams(overlap=overlap)
     extent = 2.5 * np.sqrt(count)
-    tracks = np.column_stack([rng.uniform(0, extent, (count, 2)), np.zeros(count),
-                              rng.uniform(0.5, 4, (count, 3)), rng.uniform(-4, 4, count)])
+    tracks = np.column_stack(
+        [
+            rng.uniform(0, extent, (count, 2)),
+            np.zeros(count),
+            rng.uniform(0.5, 4, (count, 3)),
+            rng.uniform(-4, 4, count),
+        ]
+    )
     found = tracks[rng.permutation(count)] + rng.normal(0, 0.5, (count, 7)) * [1, 1, 0, 0, 0, 0, 1]
     found = np.concatenate([found, tracks[:1] + 0.1])
     kinds, box_kinds = rng.integers(0, 3, count), rng.integers(0, 3, count + 1)
@@ -316,9 +322,9 @@ def test_sparse_assignment_equals_dense_one(count, overlap):
 def test_parked_cars_keep_ids_from_turning_car_without_poses():
     """Parked cars move sideways in the sensor's frame, so heading must not constrain motion."""
     parked = np.array([car(25, 4), car(32, -6, 0.1), car(40, 5)])
-    frames = [Detections.of(transform_boxes(parked, np.linalg.inv(pose(0.6 * i, 0.0, 0.02 * i))),
-                            CAR,
-                            0.9) for i in range(25)]
+    frames = [
+        Detections.of(transform_boxes(parked, np.linalg.inv(pose(0.6 * i, 0.0, 0.02 * i))), CAR, 0.9) for i in range(25)
+    ]
     tracks = track(frames)
     assert {tuple(t.ids.tolist()) for t in tracks} == {(1, 2, 3)}
     for t, found in zip(tracks[5:], frames[5:]):
@@ -327,14 +333,15 @@ def test_parked_cars_keep_ids_from_turning_car_without_poses():
 
 def test_fast_object_is_unlikely_a_pedestrian():
     """Only with poses: relative to a moving sensor everything is fast."""
+
     def score(speed, at):
-        frames = [cars(person(20 + 0.1 * speed * i), kind=PEDESTRIAN, scores=0.7)
-                  for i in range(20)]
+        frames = [cars(person(20 + 0.1 * speed * i), kind=PEDESTRIAN, scores=0.7) for i in range(20)]
         tracker = Tracker(with_values(TrackingParams(), {"report": 0.0}))
         for i, found in enumerate(frames):
             tracks = tracker(found, START + i * TENTH, at)
         assert tracks.ids.tolist() == [1]
         return tracks.detections.scores[0]
+
     assert score(1.5, pose(0)) > score(0.0, pose(0)) > score(4.0, pose(0))
     assert score(4.0, pose(0)) < score(4.0, None)
 
@@ -343,8 +350,7 @@ def test_fast_object_is_unlikely_a_pedestrian():
 def test_constant_heading_error_does_not_shift_track(kind):
     """Heading errors of a detector are correlated over time."""
     speed = 5.0 if kind == CYCLIST else 1.5
-    frames = [cars([10 + 0.1 * speed * i, 3, -0.8, 1.7, 0.6, 1.7, 0.25], kind=kind)
-              for i in range(30)]
+    frames = [cars([10 + 0.1 * speed * i, 3, -0.8, 1.7, 0.6, 1.7, 0.25], kind=kind) for i in range(30)]
     last = track(frames, [np.eye(4)] * 30)[-1]
     assert abs(last.detections.boxes[0, 1] - 3) < 0.02 and abs(last.velocities[0, 1]) < 0.05
     assert abs(wrap_angle(last.detections.boxes[0, 6])) < 0.05  # the heading follows the motion

@@ -20,14 +20,13 @@ def test_trails_are_the_past_positions_of_tracks(seconds):
     tracker, trails, seen = Tracker(), Trails(), {}
     for i, found in enumerate(crowd(2, 40)):
         at, stamp = pose(0.9 * i, 0.1 * i, 0.03 * i), START + i * TENTH
-        local = Detections.of(transform_boxes(found.boxes, np.linalg.inv(at)), found.class_ids,
-                              found.scores)
+        local = Detections.of(transform_boxes(found.boxes, np.linalg.inv(at)), found.class_ids, found.scores)
         tracks = tracker(local, stamp, at)
         lines = trails(tracks, tracker.pose, stamp, seconds)
         for number, line, box in zip(tracks.ids.tolist(), lines, tracks.detections.boxes):
             np.testing.assert_allclose(line[-1], box[:3], atol=1e-4)
             seen.setdefault(number, []).append(at[:3, :3] @ box[:3] + at[:3, 3])
-            expected = np.array(seen[number])[-min(int(seconds * 10) + 1, TRAIL_POINTS):]
+            expected = np.array(seen[number])[-min(int(seconds * 10) + 1, TRAIL_POINTS) :]
             np.testing.assert_allclose(line @ at[:3, :3].T + at[:3, 3], expected, atol=1e-4)
     assert len(trails(tracks, tracker.pose, stamp, seconds)) == len(tracks)
 
@@ -38,7 +37,7 @@ def test_trails_last_equally_long_at_any_rate(rate, seconds):
     for i in range(round(1.5 * seconds * rate)):
         stamp = START + i * 10**9 // rate + 1000 * (i % 3)  # 1 or 2 us late
         tracks = tracker(cars(car(2 * i / rate)), stamp, pose(0))
-        line, = trails(tracks, tracker.pose, stamp, seconds)
+        (line,) = trails(tracks, tracker.pose, stamp, seconds)
         assert len(line) <= TRAIL_POINTS and line[-1, 0] == tracks.detections.boxes[0, 0]
         assert (np.diff(line[:, 0]) > 0).all()
     assert len(line) >= min(TRAIL_POINTS / 2, rate * seconds)
@@ -57,17 +56,21 @@ def test_pose_covariances_contain_position_and_heading(tracks):
     np.testing.assert_array_equal(square, square.transpose(0, 2, 1))
     for k in range(len(tracks)):
         own = tracks.covariances[k]
-        assert np.diag(square[k]).tolist() == [own[0, 0], own[1, 1], tracks.height_variances[k],
-                                               0, 0, own[4, 4]]
+        assert np.diag(square[k]).tolist() == [own[0, 0], own[1, 1], tracks.height_variances[k], 0, 0, own[4, 4]]
         assert square[k, 0, 5] == own[0, 4] and square[k, 1, 5] == own[1, 4]
 
 
 def test_detection_array_has_ids_and_covariances_of_tracks(tracks):
     found = tracks.detections
     array = to_detection_array(
-        found.boxes, [CLASSES[i] for i in found.class_ids], found.scores, ids=tracks.ids + 40,
-        covariances=tracks.to_pose_covariances(), make=bag_message,
-        header=make_header(START, "lidar", bag_message))
+        found.boxes,
+        [CLASSES[i] for i in found.class_ids],
+        found.scores,
+        ids=tracks.ids + 40,
+        covariances=tracks.to_pose_covariances(),
+        make=bag_message,
+        header=make_header(START, "lidar", bag_message),
+    )
     read = decode(encode(array), "vision_msgs/msg/Detection3DArray")
     assert [d.id for d in read.detections] == [str(i + 40) for i in tracks.ids.tolist()]
     for detection, square in zip(read.detections, tracks.to_pose_covariances(), strict=True):

@@ -35,12 +35,7 @@ from lidar_perception.training.augment import TrainingScene, raise_scene
 from lidar_perception.training.data import SceneReader
 from lidar_perception.training.params import ClusterAugmentParams
 from lidar_perception.training.pointnet import cut_scenes
-from lidar_perception.training.pointnet.cut_scenes import (
-    SPARSE_SHARES,
-    CutScene,
-    CutScenes,
-    cut_clusters,
-)
+from lidar_perception.training.pointnet.cut_scenes import SPARSE_SHARES, CutScene, CutScenes, cut_clusters
 from lidar_perception.training.pointnet.task import (
     MIN_POINTS_LEFT,
     ClusterPreparation,
@@ -49,21 +44,28 @@ from lidar_perception.training.pointnet.task import (
     make_loss,
     validate_network,
 )
-from lidar_perception.types import (
-    CLASSES,
-    SENSOR_HEIGHT,
-    Detections,
-    GroundTruth,
-    InputError,
-    PointCloud,
-)
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, GroundTruth, InputError, PointCloud
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = make_pointnet_config(**SMALL)
-STILL = ClusterAugmentParams(box_shift=0, farther=0, dropout=0, beam_noise=0, range_noise=0,
-                             scale=0, flip=0, intensity=0, no_intensity=0, fade=0,
-                             quantize=0, speckle=0, height=0, things_stretch=0,
-                             things_intensity=0, things_shine=0)
+STILL = ClusterAugmentParams(
+    box_shift=0,
+    farther=0,
+    dropout=0,
+    beam_noise=0,
+    range_noise=0,
+    scale=0,
+    flip=0,
+    intensity=0,
+    no_intensity=0,
+    fade=0,
+    quantize=0,
+    speckle=0,
+    height=0,
+    things_stretch=0,
+    things_intensity=0,
+    things_shine=0,
+)
 
 
 @pytest.fixture
@@ -81,15 +83,20 @@ def fill_boxes(rng, boxes, count=60):
     for box in boxes:
         unit = rng.uniform(-0.49, 0.49, (count, 3)) * box[3:6]
         cos, sin = np.cos(box[6]), np.sin(box[6])
-        turned = np.column_stack([cos * unit[:, 0] - sin * unit[:, 1],
-                                  sin * unit[:, 0] + cos * unit[:, 1], unit[:, 2]])
+        turned = np.column_stack([cos * unit[:, 0] - sin * unit[:, 1], sin * unit[:, 0] + cos * unit[:, 1], unit[:, 2]])
         parts.append(np.column_stack([turned + box[:3], rng.random(count)]))
     points = np.concatenate(parts).astype(np.float32)
     return Clusters(points, np.arange(len(boxes) + 1) * count, np.arange(1, len(boxes) + 1))
 
 
-BOXES = np.array([[10, 2, -0.9, 4, 1.7, 1.5, 0.4], [8, -6, -0.85, 0.7, 0.7, 1.75, 0],
-                  [15, 5, -0.85, 1.8, 0.7, 1.75, 2.0], [20, -9, -0.4, 5, 2, 2.5, -1]])
+BOXES = np.array(
+    [
+        [10, 2, -0.9, 4, 1.7, 1.5, 0.4],
+        [8, -6, -0.85, 0.7, 0.7, 1.75, 0],
+        [15, 5, -0.85, 1.8, 0.7, 1.75, 2.0],
+        [20, -9, -0.4, 5, 2, 2.5, -1],
+    ]
+)
 
 
 def test_cluster_gets_label_of_most_of_its_points(rng):
@@ -100,7 +107,7 @@ def test_cluster_gets_label_of_most_of_its_points(rng):
     # a third in the box is neither object nor background, a tenth is background
     for share, wanted in ((0.9, 0), (0.3, UNKNOWN), (0.1, 3)):
         points = clusters.points[:60].copy()
-        points[int(60 * share):, 2] += 5
+        points[int(60 * share) :, 2] += 5
         one = Clusters(points, np.array([0, 60]), np.array([1]))
         assert label_clusters(one, BOXES, names, CONFIG.classes)[0].tolist() == [wanted]
     none = label_clusters(clusters, np.zeros((0, 7)), ids(), CONFIG.classes)
@@ -121,14 +128,9 @@ def test_background_in_unlabelled_regions_is_unknown(rng):
     clusters = fill_boxes(rng, BOXES[:3], 10)
     truth = GroundTruth.of(np.zeros((0, 7)), [], notes=(("DontCare", {"bbox": whole}),))
     blind = find_unlabelled(truth, camera, clusters.points[:, :3])
-    assert blind.all() and not find_unlabelled(replace(truth, notes=()), camera,
-                                               clusters.points[:, :3]).any()
+    assert blind.all() and not find_unlabelled(replace(truth, notes=()), camera, clusters.points[:, :3]).any()
     blind[:14] = False  # the first cluster, and four tenths of the second
-    assert mask_unlabelled(np.array([3, 3, 3]), clusters, blind, 3).tolist() == [
-        3,
-        UNKNOWN,
-        UNKNOWN,
-    ]
+    assert mask_unlabelled(np.array([3, 3, 3]), clusters, blind, 3).tolist() == [3, UNKNOWN, UNKNOWN]
     assert mask_unlabelled(np.array([0, 1, 2]), clusters, blind, 3).tolist() == [0, 1, 2]
 
 
@@ -139,9 +141,11 @@ def test_cluster_and_point_scores_agree_with_hand_count(rng):
     labels = np.array([0, 0, 1, 3, 0])  # right, missed, right, wrong; too small to count
     numbers = np.array([1, 1, 2, 3, 0, 0])
     truth = np.array([0, 3, 0, 1, 1, UNKNOWN])
-    scores.update(count_confusions(clusters, labels, Predictions(found, found.argmax(1),
-                                                                 np.zeros((5, 7))), truth, numbers,
-                                   CONFIG.classes))
+    scores.update(
+        count_confusions(
+            clusters, labels, Predictions(found, found.argmax(1), np.zeros((5, 7))), truth, numbers, CONFIG.classes
+        )
+    )
     content = scores.compute()
     assert content["clusters"]["accuracy"] == 50.0
     assert content["clusters"]["object_accuracy"] == pytest.approx(200 / 3)
@@ -149,8 +153,7 @@ def test_cluster_and_point_scores_agree_with_hand_count(rng):
     assert (car["objects"], car["precision"], car["recall"]) == (2, 100.0, 50.0)
     assert content["clusters"]["by_class"]["Cyclist"]["recall"] is None
     car = content["points"]["by_class"]["Car"]  # of two one is found, and one is wrong
-    assert (car["precision"], car["recall"], car["f1"], car["iou"]) == (
-        50.0, 50.0, 50.0, pytest.approx(100 / 3))
+    assert (car["precision"], car["recall"], car["f1"], car["iou"]) == (50.0, 50.0, 50.0, pytest.approx(100 / 3))
     assert content["points"]["mean"]["recall"] == 50.0
     empty = ClusterScores(CONFIG.classes).compute()
     assert empty["clusters"]["accuracy"] is None and empty["points"]["mean"]["iou"] is None
@@ -165,12 +168,13 @@ def test_augmented_clusters_stay_in_boxes_and_thin_with_range(rng):
         params = ClusterAugmentParams(beam_noise=0, range_noise=0, intensity=0)
         made, boxes = augment_clusters(clusters, BOXES, no, params, np.random.default_rng(seed))
         for k in range(4):
-            own = made.points[made.first[k]:made.first[k + 1], :3]
+            own = made.points[made.first[k] : made.first[k + 1], :3]
             assert len(own) >= MIN_POINTS_LEFT and points_in_box(own, boxes[k], 1e-3).all()
         # objects that are moved away stay in their direction and have fewer points
         ratio = np.hypot(*boxes[:, :2].T) / np.hypot(*BOXES[:, :2].T)
-        assert np.allclose(np.abs(np.arctan2(boxes[:, 1], boxes[:, 0])),
-                           np.abs(np.arctan2(BOXES[:, 1], BOXES[:, 0])), atol=0.03)
+        assert np.allclose(
+            np.abs(np.arctan2(boxes[:, 1], boxes[:, 0])), np.abs(np.arctan2(BOXES[:, 1], BOXES[:, 0])), atol=0.03
+        )
         far = ratio > 1.3
         assert (made.sizes[far] < 400 / ratio[far] ** 2 + 60).all()
     flip = ClusterAugmentParams(**{**vars(STILL), "flip": 1.0})
@@ -190,11 +194,9 @@ def test_loose_clusters_are_cut_near_boxes_and_never_empty(rng):
 
 def a_scene(rng):
     """Return a car, a pedestrian and an unwanted cyclist on flat ground."""
-    flat = np.column_stack([rng.uniform(-20, 30, (12_000, 2)), rng.normal(-1.73, 0.01, 12_000),
-                            rng.random(12_000)])
+    flat = np.column_stack([rng.uniform(-20, 30, (12_000, 2)), rng.normal(-1.73, 0.01, 12_000), rng.random(12_000)])
     points = np.concatenate([flat, fill_boxes(rng, BOXES[:3], 500).points]).astype(np.float32)
-    return TrainingScene(points, BOXES[:3], ids("Car", "Pedestrian", "Cyclist"),
-                         np.array([True, True, False]))
+    return TrainingScene(points, BOXES[:3], ids("Car", "Pedestrian", "Cyclist"), np.array([True, True, False]))
 
 
 @dataclass(frozen=True)
@@ -242,11 +244,14 @@ def test_clusters_equal_those_of_detector_at_scene_height(rng):
     scene = raise_scene(replace(seen, points=points, height=3.5), SENSOR_HEIGHT - 3.5)
     classifier = make_classifier(make_pointnet(CONFIG), Header(CONFIG), "torch")
     read = []
-    classifier.network.network.register_forward_pre_hook(
-        lambda _, inputs: read.append(len(inputs[0])))
-    detector = PointNetDetector(classifier, with_values(
-        PointNetDetectorParams(ground=CONFIG.ground, clustering=CONFIG.clustering),
-        {"ground.sensor_pose.height": scene.height, "pointnet.min_points": 5}))
+    classifier.network.network.register_forward_pre_hook(lambda _, inputs: read.append(len(inputs[0])))
+    detector = PointNetDetector(
+        classifier,
+        with_values(
+            PointNetDetectorParams(ground=CONFIG.ground, clustering=CONFIG.clustering),
+            {"ground.sensor_pose.height": scene.height, "pointnet.min_points": 5},
+        ),
+    )
     detector(PointCloud(scene.points[:, :3].copy(), scene.points[:, 3].copy()))
     made = cut_clusters(scene, CONFIG, 5)
     assert sum(read) == (~made.loose).sum() > 3
@@ -254,8 +259,9 @@ def test_clusters_equal_those_of_detector_at_scene_height(rng):
 
 def test_share_of_scenes_is_sparse_and_always_the_same(rng, tmp_path):
     scene, count = a_scene(rng), 40
-    none, half, all_ = (CutScenes(RepeatedScene(scene, count), CONFIG, 5, tmp_path, sparse=sparse)
-                        for sparse in (0.0, 0.5, 1.0))
+    none, half, all_ = (
+        CutScenes(RepeatedScene(scene, count), CONFIG, 5, tmp_path, sparse=sparse) for sparse in (0.0, 0.5, 1.0)
+    )
     assert {none.draw_share(i) for i in range(count)} == {1.0}
     assert all(SPARSE_SHARES[0] <= all_.draw_share(i) <= SPARSE_SHARES[1] for i in range(count))
     shares = [half.draw_share(i) for i in range(count)]
@@ -274,15 +280,15 @@ def test_share_of_scenes_is_sparse_and_always_the_same(rng, tmp_path):
 
 
 def test_wrong_proposals_become_decoys_unless_they_touch_label(rng, tmp_path, monkeypatch):
-    flat = np.column_stack([rng.uniform(-20, 30, (12_000, 2)), rng.normal(-1.73, 0.01, 12_000),
-                            rng.random(12_000)])
+    flat = np.column_stack([rng.uniform(-20, 30, (12_000, 2)), rng.normal(-1.73, 0.01, 12_000), rng.random(12_000)])
     empty = BOXES[0] + [8, 8, 0, 0, 0, 0, 0]
     points = np.concatenate([flat, fill_boxes(rng, np.array([BOXES[0], empty]), 500).points])
     scene = TrainingScene(points.astype(np.float32), BOXES[:1], ids("Car"), np.array([True]))
     near = BOXES[0] + [1, 0.5, 0, 0, 0, 0, 0.2]
     found = Detections.of(np.array([near, empty]), ids("Car", "Pedestrian"), np.array([0.9, 0.5]))
-    monkeypatch.setattr(cut_scenes, "_load_proposer", lambda path: SimpleNamespace(
-        propose=lambda frame: DetectionResult(found)))
+    monkeypatch.setattr(
+        cut_scenes, "_load_proposer", lambda path: SimpleNamespace(propose=lambda frame: DetectionResult(found))
+    )
     plain, made = (cut_clusters(scene, CONFIG, 5, path) for path in (None, tmp_path))
     none = len(CONFIG.classes)
     boxes = made.boxes[made.loose & (made.labels == none)]
@@ -303,8 +309,11 @@ def test_half_of_background_is_decoys(rng):
 
 
 def sample_scene(rng, count=40):
-    clusters = fill_boxes(rng, np.tile(BOXES[:3], (count, 1)) + np.repeat(
-        rng.uniform(-1, 1, (count, 7)) * [3, 3, 0, 0, 0, 0, 0], 3, axis=0), 20)
+    clusters = fill_boxes(
+        rng,
+        np.tile(BOXES[:3], (count, 1)) + np.repeat(rng.uniform(-1, 1, (count, 7)) * [3, 3, 0, 0, 0, 0, 0], 3, axis=0),
+        20,
+    )
     labels = np.tile([0, 1, 3], count)
     boxes = np.tile(BOXES[:3], (count, 1)) * (labels < 3)[:, None]
     return CutScene(clusters, labels, boxes, np.zeros(len(labels), bool))
@@ -317,8 +326,7 @@ def test_sample_limits_each_class_and_drops_unknown(rng):
     sample = ClusterPreparation(CONFIG, params)(scene, rng)
     assert np.bincount(sample.labels, minlength=4).tolist() == [7, 7, 0, 5]
     assert np.array_equal(sample.has_box, sample.labels < 3)
-    nothing = CutScene(scene.clusters, np.full(len(scene.labels), UNKNOWN), scene.boxes,
-                       scene.loose)
+    nothing = CutScene(scene.clusters, np.full(len(scene.labels), UNKNOWN), scene.boxes, scene.loose)
     with pytest.raises(InputError, match="no cluster"):
         ClusterPreparation(CONFIG, params)(nothing, rng)
 
@@ -354,8 +362,7 @@ def test_network_learns_to_classify_clusters(rng):
 
 def test_validation_calibrates_and_names_broken_scenes(rng):
     scene = sample_scene(rng, 4)
-    truth = GroundTruth.of(BOXES[:3], ids("Car", "Pedestrian", "Cyclist"),
-                           [{"truncated": 0.0, "occluded": 0}] * 3)
+    truth = GroundTruth.of(BOXES[:3], ids("Car", "Pedestrian", "Cyclist"), [{"truncated": 0.0, "occluded": 0}] * 3)
 
     class Source:
         def __len__(self):

@@ -38,12 +38,7 @@ from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as proposer_file
 from lidar_perception.param_fields import with_values
 from lidar_perception.simulation.camera import FORWARD_CAMERA
-from lidar_perception.training.fusion_curves import (
-    MIN_SAMPLES,
-    Samples,
-    collect_samples,
-    fit_classes,
-)
+from lidar_perception.training.fusion_curves import MIN_SAMPLES, Samples, collect_samples, fit_classes
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -55,8 +50,7 @@ def draw_samples(rng, count: int, class_id: int, odds: float = -1.5) -> Samples:
     true = rng.normal(odds, 2.0, count)
     evidence = {name: np.clip(true + rng.normal(0, 0.5, count), -6.5, 6.5) for name in KNOTS}
     evidence["silhouette"][rng.random(count) < 0.2] = np.nan
-    return Samples(np.full(count, class_id), rng.random(count) < expit(true),
-                   rng.integers(0, 60, count), evidence)
+    return Samples(np.full(count, class_id), rng.random(count) < expit(true), rng.integers(0, 60, count), evidence)
 
 
 @settings(max_examples=5)
@@ -74,8 +68,7 @@ def test_fitted_scores_are_probabilities_in_any_order_of_scans(seed):
     assert fits["Pedestrian"].proposals == 4000
     assert fits["Pedestrian"].right == own.right.sum()
     again, _ = fit_classes(own.take(rng.permutation(4000)), load_shipped_models())
-    for curve, before in zip(again["Pedestrian"]["curves"].values(),
-                             models["Pedestrian"]["curves"].values()):
+    for curve, before in zip(again["Pedestrian"]["curves"].values(), models["Pedestrian"]["curves"].values()):
         np.testing.assert_allclose(curve["values"], before["values"], atol=0.02)
     # A class with too few samples keeps its curves.
     assert models["Car"] == load_shipped_models()["Car"] and fits["Car"].after is None
@@ -99,11 +92,12 @@ def test_object_counts_once_and_van_does_not_count(camera: Camera | None):
     car, person = [10, 0, -0.9, 4, 1.7, 1.5, 0], [12, 4, -0.8, 0.6, 0.6, 1.8, 0]
     behind, van = [-10, 0, -0.9, 4, 1.7, 1.5, 0], [10, 5, -0.7, 4.7, 1.9, 2.0, 0]
     nearly = np.add(person, [0.3, 0.2, 0, 0, 0, 0, 0])
-    found = Detections.of(np.array([car, car, behind, person, nearly, car, van]),
-                          [CAR] * 3 + [PEDESTRIAN] * 3 + [CAR],
-                          [0.3, 0.8, 0.9, 0.2, 0.5, 0.7, 0.9])
-    truth = GroundTruth.of(np.array([car, behind, person, van]),
-                           [CAR, CAR, PEDESTRIAN, CLASSES.index("Van")])
+    found = Detections.of(
+        np.array([car, car, behind, person, nearly, car, van]),
+        [CAR] * 3 + [PEDESTRIAN] * 3 + [CAR],
+        [0.3, 0.8, 0.9, 0.2, 0.5, 0.7, 0.9],
+    )
+    truth = GroundTruth.of(np.array([car, behind, person, van]), [CAR, CAR, PEDESTRIAN, CLASSES.index("Van")])
     scan = frame()
     look = Proposals(found, {"network": np.arange(7.0)}, scan.xyz, scan.xyz[:0], None, {})
     own = collect_samples(Frame.of("street", scan, truth, camera), look, 7)
@@ -166,8 +160,7 @@ def test_package_curves_warn_about_other_weights(others):
 def test_missing_class_and_foreign_sensor_are_reported(others):
     path, models = others
     classifier = path.parent / "own/pointnet.safetensors"
-    save_header(classifier, replace(read_header(classifier), training={
-        "sensor": {"name": "vlp-16", "height": 0.6}}))
+    save_header(classifier, replace(read_header(classifier), training={"sensor": {"name": "vlp-16", "height": 0.6}}))
     del models["Cyclist"]
     write_fusion(path, (None, classifier), models, {})
     never, other = check_weights(path, 1.73)
@@ -214,8 +207,22 @@ def test_fusion_file_is_compared_as_separate_detector(others):
 
 def test_train_fused_writes_usable_file(tmp_path, monkeypatch, capsys):
     out = tmp_path / "made/fused.json"
-    command = ["train", "fused", "--sensor", "vlp-16", "--mount-height", "1.0", "--scans", "2",
-               "--range", "around", "--jobs", "1", "--out", out]
+    command = [
+        "train",
+        "fused",
+        "--sensor",
+        "vlp-16",
+        "--mount-height",
+        "1.0",
+        "--scans",
+        "2",
+        "--range",
+        "around",
+        "--jobs",
+        "1",
+        "--out",
+        out,
+    ]
     assert exit_of(monkeypatch, *command) == 0
     printed = capsys.readouterr()
     assert "2 street scans of vlp-16 at 1 m, all around" in printed.err

@@ -27,17 +27,30 @@ SPEED = Speed(scan=0.4, cut=0.1, step=1.2, whole=3.0, frame=0.2)
 SIM = Data(True, True, 0, 0, 4, 500)
 speeds = st.builds(
     lambda scan, cut, step, share, frame: Speed(scan, cut, step, step / share, frame),
-    st.floats(0.05, 5), st.floats(0.01, 1), st.floats(0.01, 20), st.floats(0.2, 1),
-    st.floats(0.01, 2))
-data = st.one_of(st.builds(Data, st.just(True), st.just(True), st.integers(0, 5000), st.just(0),
-                           st.integers(1, 32), st.integers(0, 10**9)),
-                 st.builds(Data, st.just(False), st.just(False), st.integers(4, 5000),
-                           st.integers(1, 50), st.integers(1, 32), st.integers(0, 500)))
+    st.floats(0.05, 5),
+    st.floats(0.01, 1),
+    st.floats(0.01, 20),
+    st.floats(0.2, 1),
+    st.floats(0.01, 2),
+)
+data = st.one_of(
+    st.builds(
+        Data, st.just(True), st.just(True), st.integers(0, 5000), st.just(0), st.integers(1, 32), st.integers(0, 10**9)
+    ),
+    st.builds(
+        Data,
+        st.just(False),
+        st.just(False),
+        st.integers(4, 5000),
+        st.integers(1, 50),
+        st.integers(1, 32),
+        st.integers(0, 500),
+    ),
+)
 
 
 @given(speeds, data, st.floats(0.3, 100), st.integers(1, 64))
-def test_plan_fits_budget_or_error_names_sufficient_budget(
-        speed, data, hours, cores):
+def test_plan_fits_budget_or_error_names_sufficient_budget(speed, data, hours, cores):
     try:
         made = fit_plan(hours, cores, speed, data)
     except InputError as error:
@@ -68,8 +81,7 @@ def test_more_time_or_cores_give_larger_plan():
 
 
 def test_given_numbers_are_kept():
-    made = fit_plan(1.0, 2, SPEED, SIM, Plan(scans=30, val_scans=7, steps=5000, validate_steps=11,
-                                             part=False))
+    made = fit_plan(1.0, 2, SPEED, SIM, Plan(scans=30, val_scans=7, steps=5000, validate_steps=11, part=False))
     assert made == Plan(30, 7, 30, 5000, 11, False)  # it takes longer than the budget
     assert fit_plan(1.0, 2, SPEED, SIM, Plan(scans=100), epochs=3).steps == 75
     assert fit_plan(1.0, 2, SPEED, SIM, Plan(steps=10)).scans <= 40  # not more than the steps use

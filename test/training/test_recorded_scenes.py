@@ -74,8 +74,7 @@ def test_bag_of_folder_has_same_scenes(tmp_path):
 
 
 def test_scenes_without_camera_are_labelled_all_around(tmp_path):
-    frames = [Frame.of("0", PointCloud(two_objects()[:, :3].copy()), GroundTruth.of([WALKER],
-                                                                                    [PEDESTRIAN]))]
+    frames = [Frame.of("0", PointCloud(two_objects()[:, :3].copy()), GroundTruth.of([WALKER], [PEDESTRIAN]))]
     write_bag(tmp_path / "bag", frames)
     scene = open_labelled_frames(tmp_path / "bag").to_scenes().scene(0)
     assert scene.around and np.array_equal(scene.points[:, :3], two_objects()[:, :3])
@@ -97,10 +96,8 @@ def test_split_file_selects_frames(tmp_path):
         open_labelled_frames(root, tmp_path / "missing.txt")
 
 
-@given(st.lists(st.integers(1, 60), min_size=1, max_size=8).filter(lambda n: sum(n) > 1),
-       st.floats(0, 1), seeds)
-def test_share_is_held_out_as_whole_drives_and_one_end(
-        lengths, share, seed):
+@given(st.lists(st.integers(1, 60), min_size=1, max_size=8).filter(lambda n: sum(n) > 1), st.floats(0, 1), seeds)
+def test_share_is_held_out_as_whole_drives_and_one_end(lengths, share, seed):
     ends = np.cumsum(lengths)
     drives = [range(end - length, end) for end, length in zip(ends, lengths)]
     for draw, items in (draw_items, range(ends[-1])), (draw_drives, drives):
@@ -109,7 +106,7 @@ def test_share_is_held_out_as_whole_drives_and_one_end(
         assert 0 < len(held_out) < ends[-1] and abs(len(held_out) - share * ends[-1]) <= 1
     pieces = [sorted(set(held_out) & set(drive)) for drive in drives]  # of draw_drives
     cut = [(piece, drive) for piece, drive in zip(pieces, drives) if 0 < len(piece) < len(drive)]
-    assert len(cut) <= 1 and all(piece == [*drive[-len(piece):]] for piece, drive in cut)
+    assert len(cut) <= 1 and all(piece == [*drive[-len(piece) :]] for piece, drive in cut)
 
 
 def test_one_frame_cannot_be_split():
@@ -119,8 +116,14 @@ def test_one_frame_cannot_be_split():
 
 
 def test_labelled_end_of_drive_is_held_out(tmp_path):
-    frames = [Frame.of(str(i), replace(PointCloud(two_objects()[:, :3].copy()), stamp_ns=i * 10**8),
-                       walker_truth() if i < 8 else None) for i in range(10)]
+    frames = [
+        Frame.of(
+            str(i),
+            replace(PointCloud(two_objects()[:, :3].copy()), stamp_ns=i * 10**8),
+            walker_truth() if i < 8 else None,
+        )
+        for i in range(10)
+    ]
     write_bag(tmp_path / "bag", frames)
     training, held_out = open_labelled_frames(tmp_path / "bag").split(0.25, 0)
     assert [frame.stamp_ns // 10**8 for frame in held_out.frames] == [6, 7]
@@ -149,8 +152,10 @@ def low_bag(path: Path, height: float, count: int = 2) -> Path:
     person = rng.uniform(-0.25, 0.25, (300, 3)) * [1, 1, 3.4] + [8, 0.5, 0.85 - height]
     xyz = np.concatenate([ground, person]).astype(np.float32)
     truth = GroundTruth.of([[8, 0.5, 0.85 - height, 0.6, 0.6, 1.7, 0]], [PEDESTRIAN])
-    write_bag(path, [Frame.of(str(i), PointCloud(xyz, np.full(len(xyz), 0.3, np.float32),
-                                                 i * 10**8), truth) for i in range(count)])
+    write_bag(
+        path,
+        [Frame.of(str(i), PointCloud(xyz, np.full(len(xyz), 0.3, np.float32), i * 10**8), truth) for i in range(count)],
+    )
     return path
 
 

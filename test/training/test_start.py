@@ -30,10 +30,39 @@ SENSOR = "generic:16,-20,5,2,10"
 
 def small_training(out: Path, *more: str) -> list[str]:
     """Return the arguments of a training that is small in every way."""
-    return ["train", "pointpillars", "--version", "v0", "--ahead", "10", "--aside", "10", "--data",
-            "sim", "--data-people", "3", "--sensor", SENSOR, "--data-scans", "6",
-            "--data-val-scans", "1", "--steps", "4", "--validate-steps", "4", "--save-steps", "1",
-            "--batch", "1", "--jobs", "0", "--out", str(out), *more]
+    return [
+        "train",
+        "pointpillars",
+        "--version",
+        "v0",
+        "--ahead",
+        "10",
+        "--aside",
+        "10",
+        "--data",
+        "sim",
+        "--data-people",
+        "3",
+        "--sensor",
+        SENSOR,
+        "--data-scans",
+        "6",
+        "--data-val-scans",
+        "1",
+        "--steps",
+        "4",
+        "--validate-steps",
+        "4",
+        "--save-steps",
+        "1",
+        "--batch",
+        "1",
+        "--jobs",
+        "0",
+        "--out",
+        str(out),
+        *more,
+    ]
 
 
 def kill_when(condition, *arguments: str) -> None:
@@ -53,7 +82,7 @@ def kill_when(condition, *arguments: str) -> None:
 def tensors(out: Path) -> bytes:
     """Return the tensors without the header, which contains durations."""
     content = (out / "last.safetensors").read_bytes()
-    return content[8 + int.from_bytes(content[:8], "little"):]
+    return content[8 + int.from_bytes(content[:8], "little") :]
 
 
 def test_run_killed_twice_equals_unbroken_run(tmp_path, one_thread):
@@ -80,8 +109,7 @@ def test_run_killed_twice_equals_unbroken_run(tmp_path, one_thread):
 
 def refuse(tmp_path: Path, *more: str) -> str:
     """Return the one-line error for refused input; nothing may be written."""
-    result = CliRunner().invoke(cli, ["train", "pointnet", "--data", "sim", "--out",
-                                      str(tmp_path / "run"), *more])
+    result = CliRunner().invoke(cli, ["train", "pointnet", "--data", "sim", "--out", str(tmp_path / "run"), *more])
     assert result.exception is not None and not isinstance(result.exception, SystemExit)
     assert not list(tmp_path.glob("run/scans/*")) and not (tmp_path / "run" / RUN).exists()
     line = str(result.exception)
@@ -116,11 +144,14 @@ def test_bad_budget_is_refused(hours, tmp_path):
     assert "--budget" in refuse(tmp_path, "--budget", hours)
 
 
-@pytest.mark.parametrize("content, reason", [
-    ("elevations: [3, 2, 400]\nazimuth_step: 0.2\nrate: 10\n", "elevations"),
-    ("elevations: [3]\nazimuth_step: 0\nrate: 10\n", "azimuth_step"),
-    ("beams: 4\n", "beams"),
-])
+@pytest.mark.parametrize(
+    "content, reason",
+    [
+        ("elevations: [3, 2, 400]\nazimuth_step: 0.2\nrate: 10\n", "elevations"),
+        ("elevations: [3]\nazimuth_step: 0\nrate: 10\n", "azimuth_step"),
+        ("beams: 4\n", "beams"),
+    ],
+)
 def test_bad_sensor_file_is_refused(content, reason, tmp_path):
     path = write(tmp_path / "robot.yaml", content)
     assert reason in refuse(tmp_path, "--sensor", str(path))
@@ -132,19 +163,38 @@ def test_bad_mount_height_is_refused(tmp_path):
 
 def test_full_disk_is_refused_before_simulation(tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(planning.shutil, "disk_usage",
-                        lambda _: usage._replace(free=5 * 10**8))
+    monkeypatch.setattr(planning.shutil, "disk_usage", lambda _: usage._replace(free=5 * 10**8))
     line = refuse(tmp_path, "--sensor", SENSOR, "--data-scans", "1000", "--steps", "1")
     assert "GB are free" in line and "--data-scans" in line
 
 
 def test_resumed_run_keeps_plan_and_refuses_other_settings(tmp_path, one_thread):
     out = tmp_path / "run"
-    sensor = write(tmp_path / "robot.yaml",
-                   "elevations: [2, -3, -8, -13, -18]\nazimuth_step: 1.5\nrate: 10\nheight: 0.9\n")
-    arguments = ["train", "pointnet", "--data", "sim", "--sensor", str(sensor), "--data-scans", "2",
-                 "--data-val-scans", "1", "--steps", "2", "--batch", "1", "--jobs", "0", "--init",
-                 "package", "--out", str(out)]
+    sensor = write(
+        tmp_path / "robot.yaml", "elevations: [2, -3, -8, -13, -18]\nazimuth_step: 1.5\nrate: 10\nheight: 0.9\n"
+    )
+    arguments = [
+        "train",
+        "pointnet",
+        "--data",
+        "sim",
+        "--sensor",
+        str(sensor),
+        "--data-scans",
+        "2",
+        "--data-val-scans",
+        "1",
+        "--steps",
+        "2",
+        "--batch",
+        "1",
+        "--jobs",
+        "0",
+        "--init",
+        "package",
+        "--out",
+        str(out),
+    ]
     assert CliRunner().invoke(cli, [*arguments, "--mount-height", "0.6"]).exit_code == 0
     record = read_header(out / "last.safetensors").training
     assert record["sensor"] == {"name": str(sensor), "height": 0.6, "beams": 5}
@@ -161,10 +211,25 @@ def test_resumed_run_keeps_plan_and_refuses_other_settings(tmp_path, one_thread)
 
 def small_run(kind: str, out: Path, root: Path, *more: str):
     """Train one step on a KITTI folder and validate."""
-    return CliRunner().invoke(cli, ["train", kind, *(("--version", "v0", "--ahead", "10", "--aside",
-                                    "10") if kind == "pointpillars" else ()), "--data", str(root),
-                                    "--steps", "1", "--batch", "1", "--jobs", "0", "--out",
-                                    str(out), *more])
+    return CliRunner().invoke(
+        cli,
+        [
+            "train",
+            kind,
+            *(("--version", "v0", "--ahead", "10", "--aside", "10") if kind == "pointpillars" else ()),
+            "--data",
+            str(root),
+            "--steps",
+            "1",
+            "--batch",
+            "1",
+            "--jobs",
+            "0",
+            "--out",
+            str(out),
+            *more,
+        ],
+    )
 
 
 @pytest.mark.parametrize("kind", ["pointpillars", "pointnet"])
@@ -211,9 +276,23 @@ def test_run_is_not_resumed_with_changed_split_or_weights(tmp_path, monkeypatch)
     monkeypatch.setattr(start, "_prepare_scenes", stop)
     split = write(tmp_path / "split.txt", "000000\n000001\n000002\n")
     init = Path(shutil.copy(weights_file(PointNetParams()), tmp_path / "init.safetensors"))
-    arguments = ["train", "pointnet", "--data", str(object_folder(tmp_path / "kitti", count=5)),
-                 "--split", str(split), "--init", str(init), "--steps", "2", "--jobs", "0",
-                 "--out", str(tmp_path / "run"), "--resume"]
+    arguments = [
+        "train",
+        "pointnet",
+        "--data",
+        str(object_folder(tmp_path / "kitti", count=5)),
+        "--split",
+        str(split),
+        "--init",
+        str(init),
+        "--steps",
+        "2",
+        "--jobs",
+        "0",
+        "--out",
+        str(tmp_path / "run"),
+        "--resume",
+    ]
 
     def resume() -> str:
         return str(CliRunner().invoke(cli, arguments).exception)
@@ -230,6 +309,5 @@ def test_progress_without_terminal_prints_lines(monkeypatch, capsys):
     monkeypatch.setattr(terminal, "LOG_INTERVAL_S", 0.0)
     assert list(terminal.show_progress(iter("abc"), "cutting", 3)) == ["a", "b", "c"]
     lines = capsys.readouterr().err.splitlines()
-    assert [line.partition(",")[0] for line in lines] == [
-        f"cutting: {i} of 3" for i in (1, 2, 3)]
+    assert [line.partition(",")[0] for line in lines] == [f"cutting: {i} of 3" for i in (1, 2, 3)]
     assert "left" in lines[-1]

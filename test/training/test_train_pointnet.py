@@ -19,8 +19,7 @@ from lidar_perception.training.params import PointNetTraining
 from lidar_perception.types import InputError
 
 # covered by other tests
-pytestmark = [pytest.mark.no_cover,
-              pytest.mark.usefixtures("one_thread", "streets")]
+pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread", "streets")]
 SENSOR = "generic:16,-20,5,1.5,10"
 
 
@@ -31,9 +30,21 @@ def cache(tmp_path_factory):
 
 
 def train(cache, out, *more, **changes):
-    given = {"--data": "sim", "--sensor": SENSOR, "--data-scans": 2, "--data-val-scans": 1,
-             "--data-people": 1, "--steps": 3, "--validate-steps": 3, "--log-steps": 1,
-             "--batch": 1, "--jobs": 0, "--data-cache": cache, "--out": out, **changes}
+    given = {
+        "--data": "sim",
+        "--sensor": SENSOR,
+        "--data-scans": 2,
+        "--data-val-scans": 1,
+        "--data-people": 1,
+        "--steps": 3,
+        "--validate-steps": 3,
+        "--log-steps": 1,
+        "--batch": 1,
+        "--jobs": 0,
+        "--data-cache": cache,
+        "--out": out,
+        **changes,
+    }
     words = [str(word) for pair in given.items() for word in pair]
     return CliRunner().invoke(cli, ["train", "pointnet", *words, *more])
 
@@ -69,8 +80,7 @@ def test_proposer_is_recorded_and_must_be_pointpillars(cache, tmp_path):
     assert result.exit_code == 0, result.output
     training = read_header(tmp_path / "run/last.safetensors").training
     assert training["params"]["proposer"] == "package"
-    for file, words in ((tmp_path / "none", "no checkpoint"),
-                        (find_judge_weights(), "no PointPillars")):
+    for file, words in ((tmp_path / "none", "no checkpoint"), (find_judge_weights(), "no PointPillars")):
         result = train(cache, tmp_path / "bad", **{"--proposer": file})
         assert isinstance(result.exception, InputError) and words in str(result.exception)
         assert not (tmp_path / "bad").exists()

@@ -49,8 +49,10 @@ def test_average_is_validated_and_best_is_saved(unbroken):
     _, record = toy.saved["best"]
     scores = [float(row["score"]) for row in validated]
     assert record["best_step"] == int(validated[scores.index(max(scores))]["step"])
-    assert same({f"average.{k}": v for k, v in toy.saved["last"][0].items()},
-                {k: v for k, v in weights(folder).items() if k.startswith("average")})
+    assert same(
+        {f"average.{k}": v for k, v in toy.saved["last"][0].items()},
+        {k: v for k, v in weights(folder).items() if k.startswith("average")},
+    )
     losses = [float(row["loss"]) for row in rows(folder)]
     assert sum(losses[-4:]) < sum(losses[:4])
 
@@ -100,6 +102,7 @@ def kill_in(step: int):
     def kill(now):
         if now == step:
             os.kill(os.getpid(), signal.SIGKILL)
+
     return kill
 
 
@@ -172,6 +175,7 @@ def test_settings_without_effect_may_differ_when_resuming():
 
 # steps that are not finite
 
+
 def spoil_batch(toy: Toy, what: str):
     step, inputs, wanted = next(toy.batches(0))
     if what == "input":
@@ -188,17 +192,19 @@ def test_nonfinite_step_changes_only_counters(what):
     run = Run(toy.task(), PARAMS, CPU)
     good = next(toy.batches(1))
     run.step(good)
-    before = {**{f"m{k}": v.clone() for k, v in run.module.state_dict().items()},
-              **{f"a{k}": v.clone() for k, v in run.average.module.state_dict().items()},
-              **{f"o{i}{k}": v.clone() for i, s in run.optimizer.state_dict()["state"].items()
-                 for k, v in s.items()}}
+    before = {
+        **{f"m{k}": v.clone() for k, v in run.module.state_dict().items()},
+        **{f"a{k}": v.clone() for k, v in run.average.module.state_dict().items()},
+        **{f"o{i}{k}": v.clone() for i, s in run.optimizer.state_dict()["state"].items() for k, v in s.items()},
+    }
     loss, batch = toy.loss, spoil_batch(toy, what)
     run = _with_loss(run, toy.loss)
     assert run.step(batch) is None
-    after = {**{f"m{k}": v for k, v in run.module.state_dict().items()},
-             **{f"a{k}": v for k, v in run.average.module.state_dict().items()},
-             **{f"o{i}{k}": v for i, s in run.optimizer.state_dict()["state"].items()
-                for k, v in s.items()}}
+    after = {
+        **{f"m{k}": v for k, v in run.module.state_dict().items()},
+        **{f"a{k}": v for k, v in run.average.module.state_dict().items()},
+        **{f"o{i}{k}": v for i, s in run.optimizer.state_dict()["state"].items() for k, v in s.items()},
+    }
     assert same(before, after)
     assert (run.progress.step, run.progress.skipped, run.progress.in_a_row) == (2, 1, 1)
     run = _with_loss(run, loss)
@@ -224,14 +230,16 @@ def test_too_many_nonfinite_steps_in_a_row_are_an_error(tmp_path):
 
 # several processes
 
+
 def test_two_processes_with_half_batch_equal_one(tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
 
     def train_rank(number):
-        os.environ.update(RANK=str(number), LOCAL_RANK=str(number), WORLD_SIZE="2",
-                          MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
+        os.environ.update(
+            RANK=str(number), LOCAL_RANK=str(number), WORLD_SIZE="2", MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port)
+        )
         with join_process_group(CPU):
             train(Toy(plain=True, size=4).task(), PARAMS, tmp_path / "two", until=1e12)
 
@@ -242,8 +250,7 @@ def test_two_processes_with_half_batch_equal_one(tmp_path):
     train(Toy(plain=True, size=8).task(), PARAMS, tmp_path / "one")
     one, two = weights(tmp_path / "one"), weights(tmp_path / "two")
     assert all(torch.allclose(one[name], two[name], atol=1e-5) for name in one)
-    assert [row["step"] for row in rows(tmp_path / "two")] == [
-        row["step"] for row in rows(tmp_path / "one")]
+    assert [row["step"] for row in rows(tmp_path / "two")] == [row["step"] for row in rows(tmp_path / "one")]
 
 
 def test_one_process_without_torchrun():
@@ -252,6 +259,7 @@ def test_one_process_without_torchrun():
 
 
 # time limit
+
 
 def test_run_out_of_time_validates_saves_and_resumes(unbroken, tmp_path, monkeypatch):
     now = [0.0]

@@ -60,8 +60,9 @@ def random_scene(seed: int, around: bool = False) -> TrainingScene:
 
 def members(scene: TrainingScene, margin: float = 0.0) -> np.ndarray:
     """Return (M, N) bool: which points are in which box."""
-    return np.array([points_in_box(scene.points[:, :3], box, margin) for box in scene.boxes],
-                    bool).reshape(len(scene.boxes), len(scene.points))
+    return np.array([points_in_box(scene.points[:, :3], box, margin) for box in scene.boxes], bool).reshape(
+        len(scene.boxes), len(scene.points)
+    )
 
 
 def any_touch(boxes: np.ndarray) -> bool:
@@ -78,19 +79,24 @@ def test_find_points_in_box_agrees_with_points_in_box(seed, margin):
 
 # augmentation
 
+
 @given(seeds)
 def test_points_stay_in_their_boxes(seed):
     scene, rng = random_scene(seed), np.random.default_rng(seed)
     before = members(scene)
-    for changed in (flip_scene(scene), turn_scene(scene, rng.uniform(-4, 4)),
-                    scale_scene(scene, rng.uniform(0.8, 1.2)),
-                    raise_scene(scene, rng.uniform(-1, 1)),
-                    change_intensity(scene, rng.uniform(0.5, 1.5), rng.uniform(-0.3, 0.3)),
-                    move_objects(scene, 0.5, 0.5, rng)):
+    for changed in (
+        flip_scene(scene),
+        turn_scene(scene, rng.uniform(-4, 4)),
+        scale_scene(scene, rng.uniform(0.8, 1.2)),
+        raise_scene(scene, rng.uniform(-1, 1)),
+        change_intensity(scene, rng.uniform(0.5, 1.5), rng.uniform(-0.3, 0.3)),
+        move_objects(scene, 0.5, 0.5, rng),
+    ):
         assert changed.points.dtype == np.float32 and changed.points.shape == scene.points.shape
         assert not (before & ~members(changed, margin=2e-4)).any()
-        np.testing.assert_allclose(changed.boxes[:, 3:6] / scene.boxes[:, 3:6],
-                                   (changed.boxes[:1, 3:4] / scene.boxes[:1, 3:4]).sum() or 1)
+        np.testing.assert_allclose(
+            changed.boxes[:, 3:6] / scene.boxes[:, 3:6], (changed.boxes[:1, 3:4] / scene.boxes[:1, 3:4]).sum() or 1
+        )
         assert any_touch(changed.boxes) is False
 
 
@@ -99,25 +105,28 @@ def test_slope_keeps_heights_above_ground(seed, ahead, aside):
     scene = random_scene(seed)
     tilted = raise_scene(scene, 0.3, (ahead, aside))
     for before, after in ((scene.points, tilted.points), (scene.boxes, tilted.boxes)):
-        np.testing.assert_allclose(after[:, 2] - 0.3 - after[:, :2] @ [ahead, aside], before[:, 2],
-                                   atol=1e-5)
+        np.testing.assert_allclose(after[:, 2] - 0.3 - after[:, :2] @ [ahead, aside], before[:, 2], atol=1e-5)
         assert np.array_equal(np.delete(after, 2, axis=1), np.delete(before, 2, axis=1))
 
 
 @given(seeds, st.floats(-7, 7))
 def test_inverse_changes_restore_scene(seed, angle):
     scene = random_scene(seed)
-    for back in (flip_scene(flip_scene(scene)), turn_scene(turn_scene(scene, angle), -angle),
-                 scale_scene(scale_scene(scene, 1.25), 0.8),
-                 raise_scene(raise_scene(scene, 0.5, (0.02, -0.01)), -0.5, (-0.02, 0.01))):
+    for back in (
+        flip_scene(flip_scene(scene)),
+        turn_scene(turn_scene(scene, angle), -angle),
+        scale_scene(scale_scene(scene, 1.25), 0.8),
+        raise_scene(raise_scene(scene, 0.5, (0.02, -0.01)), -0.5, (-0.02, 0.01)),
+    ):
         np.testing.assert_allclose(back.points, scene.points, atol=1e-4)
         np.testing.assert_allclose(back.boxes[:, :6], scene.boxes[:, :6], atol=1e-9)
         np.testing.assert_allclose(wrap_angle(back.boxes[:, 6] - scene.boxes[:, 6]), 0, atol=1e-9)
 
 
 def test_turn_is_counter_clockwise():
-    scene = TrainingScene(np.array([[5, 0, 1, 0.5]], np.float32),
-                          np.array([[5.0, 0, 1, 4, 2, 1, 0.1]]), np.array([CAR]), np.ones(1, bool))
+    scene = TrainingScene(
+        np.array([[5, 0, 1, 0.5]], np.float32), np.array([[5.0, 0, 1, 4, 2, 1, 0.1]]), np.array([CAR]), np.ones(1, bool)
+    )
     changed = turn_scene(scene, np.pi / 2)
     np.testing.assert_allclose(changed.points, [[0, 5, 1, 0.5]], atol=1e-6)
     np.testing.assert_allclose(changed.boxes, [[0, 5, 1, 4, 2, 1, 0.1 + np.pi / 2]], atol=1e-9)
@@ -128,7 +137,7 @@ def test_drop_points_keeps_share_and_order(seed, share):
     scene = random_scene(seed)
     left = drop_points(scene, share, np.random.default_rng(seed))
     assert (len(left.points) == len(scene.points)) or share > 0
-    assert abs(len(left.points) - (1 - share) * len(scene.points)) < 6 * len(scene.points)**0.5
+    assert abs(len(left.points) - (1 - share) * len(scene.points)) < 6 * len(scene.points) ** 0.5
     places = iter(scene.points.tolist())
     assert all(point in places for point in left.points.tolist())
 
@@ -172,11 +181,12 @@ def test_augmentation_is_deterministic_and_zeros_do_nothing(seed, around):
 
 # pasted objects
 
+
 @given(seeds)
 def test_pasted_objects_touch_nothing_and_keep_points(seed):
-    database = join_databases([
-        cut_objects(random_scene(seed + k), ("Car", "Pedestrian", "Cyclist"), 5)
-        for k in range(1, 6)])
+    database = join_databases(
+        [cut_objects(random_scene(seed + k), ("Car", "Pedestrian", "Cyclist"), 5) for k in range(1, 6)]
+    )
     scene, rng = random_scene(seed), np.random.default_rng(seed)
     params = AugmentParams(cars=4, pedestrians=4, cyclists=0)
     fuller = paste_objects(scene, database, params, *AREA, rng)
@@ -200,25 +210,25 @@ def test_pasted_objects_touch_nothing_and_keep_points(seed):
     assert np.array_equal(again.points, fuller.points)
 
 
-def wall(x: float, y: tuple[float, float], z: tuple[float, float], apart: float = 0.02
-         ) -> np.ndarray:
+def wall(x: float, y: tuple[float, float], z: tuple[float, float], apart: float = 0.02) -> np.ndarray:
     """Return the points (N, 4) of a wall across the x axis."""
     sides, heights = np.meshgrid(np.arange(*y, apart), np.arange(*z, apart))
-    return np.column_stack([np.full(sides.size, x), sides.ravel(), heights.ravel(),
-                            np.zeros(sides.size)]).astype(np.float32)
+    return np.column_stack([np.full(sides.size, x), sides.ravel(), heights.ravel(), np.zeros(sides.size)]).astype(
+        np.float32
+    )
 
 
 def one_walker(x: float) -> Database:
     """Return a pedestrian x metres ahead, a flat grid of points."""
     own = wall(x, (-0.25, 0.25), (-1.7, 0))
-    return Database(np.array([[x, 0, -0.86, 0.8, 0.7, 1.74, 0]]),
-                    np.array([PEDESTRIAN], np.int32), own, np.array([0, len(own)]))
+    return Database(
+        np.array([[x, 0, -0.86, 0.8, 0.7, 1.74, 0]]), np.array([PEDESTRIAN], np.int32), own, np.array([0, len(own)])
+    )
 
 
 def street_with(*walls: np.ndarray) -> TrainingScene:
     ground = wall(-1.73, (-15, 15), (0, 15), 0.1)[:, [2, 1, 0, 3]]
-    return TrainingScene(np.concatenate([ground, *walls]), np.zeros((0, 7)), np.zeros(0, int),
-                         np.zeros(0, bool))
+    return TrainingScene(np.concatenate([ground, *walls]), np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool))
 
 
 @given(seeds)
@@ -260,9 +270,8 @@ def test_posts_are_pasted_without_boxes():
     params = replace(STILL, things=1, things_stretch=0, things_intensity=0, things_shine=0)
     fuller = paste_objects(street_with(), database, params, *AREA, np.random.default_rng(0))
     assert len(fuller.boxes) == len(fuller.class_ids) == len(fuller.wanted) == 0
-    added = fuller.points[-len(own):]
-    np.testing.assert_allclose(np.hypot(added[:, 0], added[:, 1]),
-                               np.hypot(own[:, 0], own[:, 1]), atol=1e-4)
+    added = fuller.points[-len(own) :]
+    np.testing.assert_allclose(np.hypot(added[:, 0], added[:, 1]), np.hypot(own[:, 0], own[:, 1]), atol=1e-4)
     assert added[:, 2].max() == pytest.approx(0.6, abs=0.1)
 
 
@@ -275,8 +284,7 @@ def test_range_noise_is_along_rays_and_shared_by_beams(seed):
     for beam, point in ((0.05, 0.0), (0.0, 0.05)):
         moved = blur_ranges(points, beam, point, rng)[:-1]
         after = np.linalg.norm(moved[:, :3], axis=1)
-        np.testing.assert_allclose(moved[:, :3] / after[:, None],
-                                   points[:-1, :3] / before[:, None], atol=1e-5)
+        np.testing.assert_allclose(moved[:, :3] / after[:, None], points[:-1, :3] / before[:, None], atol=1e-5)
         shift, (x, y, z) = after - before, points[:-1, :3].T
         assert 0.02 < shift.std() < 0.1
         beams = np.floor(np.arctan2(z, np.hypot(x, y)) / BEAM_STEP)
@@ -324,8 +332,11 @@ def test_early_crop_keeps_everything_that_may_move_into_range(seed, larger, high
     low, high = np.array([0, -10, -1.8]), np.array([10.0, 10, 0.5])
 
     def changed(scene: TrainingScene) -> TrainingScene:
-        scene = raise_scene(scale_scene(scene, 1 + larger * params.scale),
-                            higher * params.height, (higher * params.tilt, -larger * params.tilt))
+        scene = raise_scene(
+            scale_scene(scene, 1 + larger * params.scale),
+            higher * params.height,
+            (higher * params.tilt, -larger * params.tilt),
+        )
         return crop_scene(scene, low, high)
 
     part = turn_and_crop(scene, params, low, high, np.random.default_rng(seed))
@@ -338,18 +349,22 @@ def test_early_crop_keeps_everything_that_may_move_into_range(seed, larger, high
 
 def test_scenes_labelled_all_around_turn_by_any_angle():
     def bearings(around: bool) -> np.ndarray:
-        scene = TrainingScene(np.array([[5, 0, -1, 0.5]], np.float32), np.zeros((0, 7)),
-                              np.zeros(0, int), np.zeros(0, bool), around)
-        points = [turn_and_crop(scene, AugmentParams(), np.full(3, -9.0), np.full(3, 9.0),
-                                np.random.default_rng(seed)).points[0] for seed in range(60)]
+        scene = TrainingScene(
+            np.array([[5, 0, -1, 0.5]], np.float32), np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool), around
+        )
+        points = [
+            turn_and_crop(
+                scene, AugmentParams(), np.full(3, -9.0), np.full(3, 9.0), np.random.default_rng(seed)
+            ).points[0]
+            for seed in range(60)
+        ]
         return np.abs(np.arctan2(*np.array(points).T[1::-1]))
 
     assert bearings(True).max() > 2.5 and 0.6 < bearings(False).max() <= AugmentParams().turn
 
 
 def test_database_file_round_trip_and_broken_file_is_named(tmp_path):
-    database = join_databases([cut_objects(random_scene(k), ("Car", "Pedestrian"), 5)
-                               for k in range(4)])
+    database = join_databases([cut_objects(random_scene(k), ("Car", "Pedestrian"), 5) for k in range(4)])
     assert len(database) > 0 and set(database.class_ids) <= {CAR, PEDESTRIAN}
     database.save(tmp_path / "objects.npz")
     back = Database.load(tmp_path / "objects.npz")
@@ -362,7 +377,5 @@ def test_database_file_round_trip_and_broken_file_is_named(tmp_path):
 
 def test_nothing_is_pasted_without_ground():
     database = join_databases([cut_objects(random_scene(k), ("Car",), 5) for k in range(4)])
-    empty = TrainingScene(np.zeros((0, 4), np.float32), np.zeros((0, 7)), np.zeros(0, int),
-                          np.zeros(0, bool))
-    assert len(paste_objects(empty, database, AugmentParams(), *AREA,
-                             np.random.default_rng(0)).boxes) == 0
+    empty = TrainingScene(np.zeros((0, 4), np.float32), np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool))
+    assert len(paste_objects(empty, database, AugmentParams(), *AREA, np.random.default_rng(0)).boxes) == 0

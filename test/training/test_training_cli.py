@@ -20,8 +20,10 @@ from lidar_perception.training.params import PAPER_SHARE, DataParams, PointPilla
 from lidar_perception.training.sources import open_sources
 from lidar_perception.types import InputError
 
-pytestmark = [pytest.mark.no_cover,  # covered by other tests
-              pytest.mark.usefixtures("one_thread", "streets")]
+pytestmark = [
+    pytest.mark.no_cover,  # covered by other tests
+    pytest.mark.usefixtures("one_thread", "streets"),
+]
 SENSOR = "generic:16,-20,5,2,10"
 
 
@@ -36,14 +38,25 @@ def cache(tmp_path_factory):
 
 
 def sim(cache, out, **changes):
-    given = {"--data": "sim", "--sensor": SENSOR, "--data-scans": 1, "--data-val-scans": 1,
-             "--data-people": 1, "--steps": 4, "--validate-steps": 2, "--log-steps": 1,
-             "--batch": 2, "--jobs": 0, "--data-cache": cache, "--out": out, **changes}
+    given = {
+        "--data": "sim",
+        "--sensor": SENSOR,
+        "--data-scans": 1,
+        "--data-val-scans": 1,
+        "--data-people": 1,
+        "--steps": 4,
+        "--validate-steps": 2,
+        "--log-steps": 1,
+        "--batch": 2,
+        "--jobs": 0,
+        "--data-cache": cache,
+        "--out": out,
+        **changes,
+    }
     return [word for pair in given.items() for word in pair]
 
 
-def test_trained_network_opens_as_detector(
-        tmp_path, cache, tiny_size):
+def test_trained_network_opens_as_detector(tmp_path, cache, tiny_size):
     out = tmp_path / "run"
     result = train(*sim(cache, out), "--version", "v4", "--seed", 5)
     assert result.exit_code == 0, result.output
@@ -66,11 +79,21 @@ def test_trained_network_opens_as_detector(
     assert train(*sim(cache, out), "--version", "v4", "--seed", 5, "--resume").exit_code == 0
     assert (out / "last.safetensors").read_bytes() == before
     # another run can start from its weights
-    init = train(*sim(cache, tmp_path / "next", **{"--steps": 1}), "--version", "v4", "--init",
-                 out / "last.safetensors")
+    init = train(
+        *sim(cache, tmp_path / "next", **{"--steps": 1}), "--version", "v4", "--init", out / "last.safetensors"
+    )
     assert init.exit_code == 0, init.output
-    other = train(*sim(cache, tmp_path / "other", **{"--steps": 1}), "--version", "v0", "--init",
-                  out / "last.safetensors", "--ahead", 20, "--amp", "bf16")
+    other = train(
+        *sim(cache, tmp_path / "other", **{"--steps": 1}),
+        "--version",
+        "v0",
+        "--init",
+        out / "last.safetensors",
+        "--ahead",
+        20,
+        "--amp",
+        "bf16",
+    )
     assert other.exit_code == 0, other.output
     assert "the others begin at random" in other.output
     assert read_header(tmp_path / "other/last.safetensors").config.high == header.config.high
@@ -79,8 +102,17 @@ def test_trained_network_opens_as_detector(
 def test_kitti_and_simulated_scenes_mix_and_broken_ones_count(tmp_path, cache, tiny_size):
     root = object_folder(tmp_path / "kitti", walker_label() + "\n", 6)
     write(root / "training/label_2/000002.txt", "Pedestrian 0 0 x\n")
-    result = train(*sim(cache, tmp_path / "run"), "--data", root, "--version", "v0",
-                   "--data-val-share", 0.2, "--augment-cyclists", 0)
+    result = train(
+        *sim(cache, tmp_path / "run"),
+        "--data",
+        root,
+        "--version",
+        "v0",
+        "--data-val-share",
+        0.2,
+        "--augment-cyclists",
+        0,
+    )
     assert result.exit_code == 0, result.output
     assert "1 scenes could not be used" in result.output and "000002.txt" in result.output
     header = read_header(tmp_path / "run/best.safetensors")
@@ -102,8 +134,8 @@ def test_held_out_frames_are_not_trained_on(tmp_path):
     assert counts((folder, "sim"), (), None, None, params, 0) == ([3, 7], [2, 2])
     assert counts((folder,), ("sim",), None, None, params, 0) == ([5], [2])
     assert counts(("sim",), (folder,), None, None, params, 0) == ([7], [5])
-    streets, = open_sources(("sim",), (), None, None, params, 0)[0]
-    others, = open_sources(("sim",), (), None, None, params, 0)[1]
+    (streets,) = open_sources(("sim",), (), None, None, params, 0)[0]
+    (others,) = open_sources(("sim",), (), None, None, params, 0)[1]
     assert streets.first + streets.count <= others.first
     ours, theirs = write(tmp_path / "a", "000000\n000001\n"), write(tmp_path / "b", "000001\n")
     (train_on,), (held,) = open_sources((folder,), (folder,), ours, theirs, params, 0)
@@ -121,15 +153,17 @@ def test_held_out_frames_are_not_trained_on(tmp_path):
 def test_training_and_validation_share_no_frame_by_any_path(tmp_path, monkeypatch):
     root = object_folder(tmp_path / "kitti", walker_label() + "\n", 5)
     write_bag(tmp_path / "bag", open_recording(root))
-    file, = (tmp_path / "bag").glob("*.mcap")
+    (file,) = (tmp_path / "bag").glob("*.mcap")
     monkeypatch.chdir(tmp_path)
     some = write(tmp_path / "some.txt", "000000\n000001\n")
     three = [f"{i:06}" for i in (2, 3, 4)]
 
     def names(*arguments) -> list[list[str]]:
         """Return the names of the frames to train on and to validate on."""
-        return [sorted(name for source in sources for name in source.names)
-                for sources in open_sources(*arguments, DataParams(val_share=0.4), 0)]
+        return [
+            sorted(name for source in sources for name in source.names)
+            for sources in open_sources(*arguments, DataParams(val_share=0.4), 0)
+        ]
 
     for other in (str(root), "kitti", "kitti/training", "../" + tmp_path.name + "/kitti"):
         assert names((str(root),), (other,), some, None) == [["000000", "000001"], three]
@@ -142,17 +176,34 @@ def test_training_and_validation_share_no_frame_by_any_path(tmp_path, monkeypatc
         names(("bag",), (str(file),), None, None)
 
 
-@pytest.mark.parametrize("arguments, reason", [
-    (["--data", "nowhere"], "nowhere does not exist; give a bag or the folder of a data set"),
-    (["--data", "sim", "--sensor", "lidar9000"], "lidar9000"),
-    (["--data", "sim", "--device", "tpu"], "tpu"),
-    (["--data", "sim", "--lr", "0"], "lr = 0"),
-    (["--data", "sim", "--init", "missing.safetensors"], "missing.safetensors"),
-])
+@pytest.mark.parametrize(
+    "arguments, reason",
+    [
+        (["--data", "nowhere"], "nowhere does not exist; give a bag or the folder of a data set"),
+        (["--data", "sim", "--sensor", "lidar9000"], "lidar9000"),
+        (["--data", "sim", "--device", "tpu"], "tpu"),
+        (["--data", "sim", "--lr", "0"], "lr = 0"),
+        (["--data", "sim", "--init", "missing.safetensors"], "missing.safetensors"),
+    ],
+)
 def test_bad_input_is_refused_at_once(tmp_path, tiny_size, arguments, reason):
-    result = train(*arguments, "--out", tmp_path / "run", "--jobs", 0, "--data-scans", 1,
-                   "--augment-cars", 0, "--augment-pedestrians", 0, "--augment-cyclists", 0,
-                   "--augment-things", 0)
+    result = train(
+        *arguments,
+        "--out",
+        tmp_path / "run",
+        "--jobs",
+        0,
+        "--data-scans",
+        1,
+        "--augment-cars",
+        0,
+        "--augment-pedestrians",
+        0,
+        "--augment-cyclists",
+        0,
+        "--augment-things",
+        0,
+    )
     assert isinstance(result.exception, InputError) and reason in str(result.exception)
     assert not (tmp_path / "run" / "last.pt").exists()
 
@@ -168,6 +219,7 @@ def test_papers_share_is_held_out_and_every_field_has_flag():
 def test_out_that_is_file_fails_before_data_is_made(tmp_path, monkeypatch):
     def never(*_):
         raise AssertionError("data was prepared")
+
     monkeypatch.setattr("lidar_perception.training.planning.open_sources", never)
     file = write(tmp_path / "out", b"")
     for out in (file, file / "below"):

@@ -16,21 +16,27 @@ from lidar_perception.training.pointpillars.task import ScenePreparation, make_l
 from lidar_perception.training.run import Run, Task
 from lidar_perception.types import PEDESTRIAN
 
-pytestmark = [pytest.mark.no_cover,
-              pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")]
+pytestmark = [pytest.mark.no_cover, pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")]
 
 
 def run_on(device: str, version: str, amp: str) -> tuple[Run, list]:
     torch.manual_seed(0)
     config = tiny(version)
-    scene = TrainingScene(points=two_objects(), boxes=BOXES.numpy().astype(np.float64),
-                          wanted=np.ones(2, bool), class_ids=np.array([CAR, PEDESTRIAN]))
+    scene = TrainingScene(
+        points=two_objects(),
+        boxes=BOXES.numpy().astype(np.float64),
+        wanted=np.ones(2, bool),
+        class_ids=np.array([CAR, PEDESTRIAN]),
+    )
     batch = [ScenePreparation(config, STILL)(scene, np.random.default_rng(0))] * 2
     place = torch.device(device)
     network = channels_last(make_network(config).to(place))
     params = LoopParams(steps=40, batch=2, lr=0.01, amp=amp)
-    return Run(Task(network, make_loss(config, place), lambda step: [], lambda module: ({}, {}),
-                    lambda *_: None, 1), params, place), batch
+    return Run(
+        Task(network, make_loss(config, place), lambda step: [], lambda module: ({}, {}), lambda *_: None, 1),
+        params,
+        place,
+    ), batch
 
 
 @pytest.mark.parametrize("version", ["v0", "v3", "v4"])
@@ -49,5 +55,4 @@ def test_training_in_16_bits_lowers_loss():
     state = run.state()
     again, _ = run_on("cuda", "v4", "auto")
     again.load(state)
-    assert all(torch.equal(a, b) for a, b in zip(run.module.state_dict().values(),
-                                                 again.module.state_dict().values()))
+    assert all(torch.equal(a, b) for a, b in zip(run.module.state_dict().values(), again.module.state_dict().values()))

@@ -41,14 +41,7 @@ from lidar_perception.training.pointpillars.task import (
 )
 from lidar_perception.training.record import select_metrics
 from lidar_perception.training.scenes import SimulatedScenes
-from lidar_perception.types import (
-    CLASSES,
-    PEDESTRIAN,
-    SENSOR_HEIGHT,
-    Detections,
-    GroundTruth,
-    InputError,
-)
+from lidar_perception.types import CLASSES, PEDESTRIAN, SENSOR_HEIGHT, Detections, GroundTruth, InputError
 
 pytestmark = pytest.mark.no_cover  # covered by other tests
 
@@ -57,6 +50,7 @@ SENSOR = find_sensor("generic:8,-20,4,2,10")
 
 
 # simulated scenes
+
 
 def test_cached_scans_equal_simulated_ones(tmp_path, monkeypatch):
     plain = SimulatedScenes(7, 2, SENSOR)
@@ -69,7 +63,7 @@ def test_cached_scans_equal_simulated_ones(tmp_path, monkeypatch):
         assert np.array_equal(truth.boxes, again[1].boxes) and truth.extras == again[1].extras
         monkeypatch.setattr(scenes_module, "simulate_scan", None)  # the second comes from the cache
     monkeypatch.undo()
-    file, = (tmp_path / "cache").iterdir()
+    (file,) = (tmp_path / "cache").iterdir()
     file.write_bytes(file.read_bytes()[:100])  # a broken one is made again
     assert np.array_equal(cached.scan(1)[0].xyz, frame.xyz)
     full = SimulatedScenes(7, 2, SENSOR, cache=tmp_path / "cache", cache_gb=1e-9)
@@ -88,6 +82,7 @@ def test_hidden_simulated_objects_are_not_wanted():
 
 
 # the stream
+
 
 class Numbers:
     """Source of scenes that have one point, with the number of the scene."""
@@ -126,10 +121,15 @@ def test_stream_depends_only_on_seed():
 
 # PointPillars' samples
 
+
 def scene_of_two(**changes) -> TrainingScene:
     boxes = BOXES.numpy().astype(np.float64)
-    return TrainingScene(**{**dict(points=two_objects(), boxes=boxes, wanted=np.ones(2, bool),
-                                   class_ids=np.array([CAR, PEDESTRIAN])), **changes})
+    return TrainingScene(
+        **{
+            **dict(points=two_objects(), boxes=boxes, wanted=np.ones(2, bool), class_ids=np.array([CAR, PEDESTRIAN])),
+            **changes,
+        }
+    )
 
 
 def labels_of(sample: Sample, anchors: torch.Tensor) -> torch.Tensor:
@@ -146,6 +146,7 @@ def test_samples_have_inputs_of_version(version):
     np.testing.assert_allclose(sample.boxes, BOXES, atol=1e-5)
     loss = make_loss(config, torch.device("cpu"))
     from lidar_perception.detectors.pointpillars.network import make_network
+
     total, parts = loss(make_network(config), [sample, sample])
     assert torch.isfinite(total) and set(parts) == {"classes", "boxes", "directions"}
 
@@ -153,12 +154,12 @@ def test_samples_have_inputs_of_version(version):
 def test_share_of_scenes_gets_pasted_objects(tmp_path):
     cut_objects(scene_of_two(), tiny().classes, 1).save(tmp_path / "objects.npz")
     rng, scene = np.random.default_rng(0), scene_of_two()
-    scene = replace(scene, boxes=scene.boxes[:1], class_ids=scene.class_ids[:1],
-                    wanted=scene.wanted[:1])
+    scene = replace(scene, boxes=scene.boxes[:1], class_ids=scene.class_ids[:1], wanted=scene.wanted[:1])
 
     def numbers(crowded: float) -> list[int]:
-        prepare = ScenePreparation(tiny(), replace(STILL, pedestrians=1, crowded=crowded),
-                                   database=tmp_path / "objects.npz")
+        prepare = ScenePreparation(
+            tiny(), replace(STILL, pedestrians=1, crowded=crowded), database=tmp_path / "objects.npz"
+        )
         return [len(prepare(scene, rng).labels) for _ in range(10)]
 
     none, some, every = map(numbers, (0.0, 0.5, 1.0))
@@ -172,8 +173,9 @@ def test_anchors_on_uncounted_objects_are_ignored():
     whole = ScenePreparation(config, STILL)(scene_of_two(), rng)
     found = labels_of(whole, anchors)
     for scene, prepare in (
-            (scene_of_two(wanted=np.array([False, True])), ScenePreparation(config, STILL)),
-            (scene_of_two(class_ids=np.array([VAN, PEDESTRIAN])), ScenePreparation(config, STILL))):
+        (scene_of_two(wanted=np.array([False, True])), ScenePreparation(config, STILL)),
+        (scene_of_two(class_ids=np.array([VAN, PEDESTRIAN])), ScenePreparation(config, STILL)),
+    ):
         sample = prepare(scene, rng)
         assert sample.counted.tolist() == [False, True]
         labels = labels_of(sample, anchors)
@@ -190,15 +192,15 @@ def test_scene_without_points_in_range_is_refused():
     with pytest.raises(InputError, match="no point"):
         ScenePreparation(tiny(), STILL)(behind, np.random.default_rng(0))
     far = ScenePreparation(tiny(), STILL)(
-        scene_of_two(boxes=BOXES.numpy() + [90, 0, 0, 0, 0, 0, 0]), np.random.default_rng(0))
+        scene_of_two(boxes=BOXES.numpy() + [90, 0, 0, 0, 0, 0, 0]), np.random.default_rng(0)
+    )
     assert len(far.boxes) == 0 and len(far.labels) == 0
     assert (labels_of(far, anchor_tensors(tiny())[0]) == BACKGROUND).all()
 
 
 def test_validation_scores_perfect_and_blind_detectors(tmp_path):
     root = broken_folder(tmp_path)
-    scenes = SceneReader((open_labelled_frames(root).to_scenes(),),
-                         partial(load_validation_frame, tiny()))
+    scenes = SceneReader((open_labelled_frames(root).to_scenes(),), partial(load_validation_frame, tiny()))
     right = validate_detector(lambda frame: DetectionResult(Detections.of([WALKER])), scenes)
     blind = validate_detector(lambda frame: DetectionResult(Detections.none()), scenes)
     assert right.compute()["frames"] == 3 and len(right.skipped) == 2
@@ -230,15 +232,22 @@ class Workers:
 
 
 def test_workers_end_when_main_process_is_killed():
-    script = ("from test_training_data import Workers\n"
-              "from lidar_perception.training.data import load_items\n"
-              "for pids in load_items(Workers(), ([n] for n in range(10**6)), 1):\n"
-              "    print(pids[0], flush=True)\n"
-              "    input()\n")
-    with subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parent, text=True,
-                          env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-                          stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                          stderr=subprocess.DEVNULL) as run:
+    script = (
+        "from test_training_data import Workers\n"
+        "from lidar_perception.training.data import load_items\n"
+        "for pids in load_items(Workers(), ([n] for n in range(10**6)), 1):\n"
+        "    print(pids[0], flush=True)\n"
+        "    input()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script],
+        cwd=Path(__file__).parent,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    ) as run:
         worker = Path(f"/proc/{int(run.stdout.readline())}/stat")
         assert worker.exists()
         run.kill()
@@ -267,6 +276,7 @@ def test_killed_worker_ends_training_with_reason(jobs):
 
 
 # sensor height and range
+
 
 def test_samples_do_not_depend_on_sensor_height():
     scene = scene_of_two()
@@ -300,6 +310,5 @@ def test_labels_in_turned_camera_equal_those_of_turned_scene(quarter):
 def test_reduced_range_around_keeps_all_directions():
     around = make_config("v0", "compact", **RANGES["around"])
     part = reduce_range(around, 30.0, 20.0)
-    assert part.low[:2] == pytest.approx((-30.72, -20.48)) and part.high[:2] == pytest.approx(
-        (30.72, 20.48))
+    assert part.low[:2] == pytest.approx((-30.72, -20.48)) and part.high[:2] == pytest.approx((30.72, 20.48))
     assert reduce_range(around, 1000.0, 1000.0) == around

@@ -19,8 +19,10 @@ from lidar_perception.training.params import LoopParams
 from lidar_perception.training.run import Progress, Run
 from lidar_perception.training.schedule import WeightAverage, compute_one_cycle
 
-pytestmark = [pytest.mark.no_cover,  # covered by other tests
-              pytest.mark.usefixtures("one_thread_for_all")]
+pytestmark = [
+    pytest.mark.no_cover,  # covered by other tests
+    pytest.mark.usefixtures("one_thread_for_all"),
+]
 PLANNED = LoopParams(**{**vars(PARAMS), "steps": 300, "validate_steps": 60, "save_steps": 300})
 
 
@@ -30,8 +32,7 @@ def test_learning_rate_equals_one_cycle_of_torch(steps, warm):
     optimizer = torch.optim.AdamW([parameter], lr=1.0)
     if warm * steps <= 1.01:
         return  # torch divides by zero
-    scheduler = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, 0.01, total_steps=steps, pct_start=warm, div_factor=10)
+    scheduler = torch.optim.lr_scheduler.OneCycleLR(optimizer, 0.01, total_steps=steps, pct_start=warm, div_factor=10)
     for step in range(steps):
         group = optimizer.param_groups[0]
         rate, momentum = compute_one_cycle(step, steps, 0.01, warm)
@@ -89,8 +90,8 @@ def test_norm_statistics_begin_as_mean_over_steps():
 
 # a budget that is too short
 
-def run_timed(seconds, validation: float, folder: Path, monkeypatch,
-              **others) -> tuple[Toy, Progress]:
+
+def run_timed(seconds, validation: float, folder: Path, monkeypatch, **others) -> tuple[Toy, Progress]:
     """Run PLANNED on a fake clock, with steps of seconds(step)."""
     now = [0.0]
     monkeypatch.setattr(loop.time, "monotonic", lambda: now[0])
@@ -100,6 +101,7 @@ def run_timed(seconds, validation: float, folder: Path, monkeypatch,
     def validate_slowly(module):
         now[0] += validation
         return validate(module)
+
     toy.validate = validate_slowly
     return toy, train(toy.task(), PLANNED, folder, validation=validation, **others)
 
@@ -112,10 +114,10 @@ def planned(tmp_path_factory):
 
 
 @pytest.mark.parametrize("fits", [0.2, 0.5, 0.8])
-@pytest.mark.parametrize("seconds", [lambda _: 10.0, lambda step: 4.0 if step < 50 else 12.0,
-                                     lambda step: 6.0 + 6.0 * (step % 7)])
-def test_slow_run_ends_in_time_with_final_learning_rate(
-        seconds, fits, planned, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    "seconds", [lambda _: 10.0, lambda step: 4.0 if step < 50 else 12.0, lambda step: 6.0 + 6.0 * (step % 7)]
+)
+def test_slow_run_ends_in_time_with_final_learning_rate(seconds, fits, planned, tmp_path, monkeypatch, capsys):
     first = int(fits * 300)
     until = sum(seconds(step) for step in range(first)) + 30.0 * (first // 60 + 1)
     toy, progress = run_timed(seconds, 30.0, tmp_path, monkeypatch, until=until)
@@ -140,6 +142,7 @@ def test_shortened_run_resumes_where_it_stopped(tmp_path, monkeypatch):
         if step == 40:
             signal.raise_signal(signal.SIGTERM)
         return 10.0
+
     _, before = run_timed(stop, 0.0, tmp_path, monkeypatch, until=1500.0)
     assert before.stopped and before.left_out > 10
     progress = train(Toy().task(), PLANNED, tmp_path, resume=True)

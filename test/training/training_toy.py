@@ -15,8 +15,7 @@ from lidar_perception.training.params import AugmentParams, LoopParams
 from lidar_perception.training.run import Task
 from lidar_perception.training.run_directory import STATE
 
-PARAMS = LoopParams(steps=13, validate_steps=4, save_steps=3, log_steps=1, seed=3, lr=0.05,
-                    amp="off")
+PARAMS = LoopParams(steps=13, validate_steps=4, save_steps=3, log_steps=1, seed=3, lr=0.05, amp="off")
 
 
 class Toy:
@@ -41,7 +40,7 @@ class Toy:
         while True:
             rng = torch.Generator().manual_seed(step)
             inputs = torch.randn(self.size * get_world_size(), 4, generator=rng)
-            inputs = inputs[get_rank() * self.size:(get_rank() + 1) * self.size]
+            inputs = inputs[get_rank() * self.size : (get_rank() + 1) * self.size]
             yield step, inputs, inputs[:, :1] * 2 - inputs[:, 1:2]
             step += 1
 
@@ -59,8 +58,7 @@ class Toy:
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
     state = torch.load(folder / STATE, weights_only=True)
-    return {f"{part}.{name}": value for part in ("module", "average")
-            for name, value in state[part].items()}
+    return {f"{part}.{name}": value for part in ("module", "average") for name, value in state[part].items()}
 
 
 def same(a: dict, b: dict) -> bool:
@@ -74,14 +72,34 @@ def rows(folder: Path, name: str = "log.csv") -> list[dict]:
 
 def equals(folder: Path, other: Path) -> bool:
     """Return True if two runs wrote the same files, apart from durations."""
-    return (same(weights(folder), weights(other)) and rows(folder) == rows(other)
-            and rows(folder, "validation.csv") == rows(other, "validation.csv"))
+    return (
+        same(weights(folder), weights(other))
+        and rows(folder) == rows(other)
+        and rows(folder, "validation.csv") == rows(other, "validation.csv")
+    )
 
 
-STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
-                      flip=0, turn=0, scale=0, beam_noise=0, range_noise=0, dropout=0, intensity=0,
-                      no_intensity=0, fade=0, quantize=0, speckle=0,
-                      height=0, tilt=0)
+STILL = AugmentParams(
+    cars=0,
+    pedestrians=0,
+    cyclists=0,
+    things=0,
+    object_turn=0,
+    object_shift=0,
+    flip=0,
+    turn=0,
+    scale=0,
+    beam_noise=0,
+    range_noise=0,
+    dropout=0,
+    intensity=0,
+    no_intensity=0,
+    fade=0,
+    quantize=0,
+    speckle=0,
+    height=0,
+    tilt=0,
+)
 
 
 def broken_folder(root):

@@ -27,26 +27,38 @@ triples = st.tuples(numbers, numbers, numbers)
 pairs = st.tuples(numbers, numbers)
 float32s = st.floats(0, 1, width=32)
 texts = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=9)
-int32s = st.integers(-2**31, 2**31 - 1)
-rows = st.lists(st.builds(
-    MarkerRow, ns=texts, id=int32s, action=int32s, type=int32s, text=texts, position=triples,
-    quaternion=pairs, scale=triples, color=st.tuples(*4 * [float32s]),
-    points=st.none() | st.lists(triples, max_size=3).map(lambda p: np.reshape(p, (-1, 3)))),
-    max_size=4)
+int32s = st.integers(-(2**31), 2**31 - 1)
+rows = st.lists(
+    st.builds(
+        MarkerRow,
+        ns=texts,
+        id=int32s,
+        action=int32s,
+        type=int32s,
+        text=texts,
+        position=triples,
+        quaternion=pairs,
+        scale=triples,
+        color=st.tuples(*4 * [float32s]),
+        points=st.none() | st.lists(triples, max_size=3).map(lambda p: np.reshape(p, (-1, 3))),
+    ),
+    max_size=4,
+)
 
 
 def assert_equal_cdr(got: bytes, rows, stamp_ns=START, frame_id="velodyne", lifetime_ns=0):
     """Compare with both serializations; rclpy leaves the bytes of padding undefined."""
-    ours, theirs = (rows_to_message(rows, header(make, stamp_ns, frame_id), make, lifetime_ns)
-                    for make in (bag_message, make_ros_message))
+    ours, theirs = (
+        rows_to_message(rows, header(make, stamp_ns, frame_id), make, lifetime_ns)
+        for make in (bag_message, make_ros_message)
+    )
     assert got == encode(ours)
     serialization = pytest.importorskip("rclpy.serialization", reason="needs rclpy")
     raw = serialization.serialize_message(theirs)
     assert len(raw) == len(got) and encode(decode(raw, ARRAY)) == got
 
 
-@given(rows=rows, stamp_ns=st.integers(0, 2**60), frame_id=texts,
-       lifetime_ns=st.integers(0, 2**60))
+@given(rows=rows, stamp_ns=st.integers(0, 2**60), frame_id=texts, lifetime_ns=st.integers(0, 2**60))
 def test_markers_have_the_bytes_of_the_message(rows, stamp_ns, frame_id, lifetime_ns):
     head = header(bag_message, stamp_ns, frame_id)
     assert_equal_cdr(encode_markers(rows, head, lifetime_ns), rows, stamp_ns, frame_id, lifetime_ns)
@@ -58,8 +70,13 @@ def test_tracks_and_detections_have_the_bytes_of_the_message():
         stamp = START + i * TENTH
         tracks = tracker(found if i < 12 else Detections.none(), stamp)
         track_rows = make_track_rows(
-            tracks.ids, tracks.detections, tracks.velocities, tracks.moving,
-            trails(tracks, tracker.pose, stamp, 2.0), previous=shown)
+            tracks.ids,
+            tracks.detections,
+            tracks.velocities,
+            tracks.moving,
+            trails(tracks, tracker.pose, stamp, 2.0),
+            previous=shown,
+        )
         shown = list_marker_keys(track_rows)
         for rows in (track_rows, make_detection_rows(found)):
             assert_equal_cdr(encode_markers(rows, header(bag_message, stamp)), rows, stamp)
@@ -71,13 +88,15 @@ def test_array_without_boxes_has_the_bytes_of_the_message():
     assert_equal_cdr(encode_markers(rows, header(bag_message, START)), rows)
 
 
-@given(boxes=st.lists(st.tuples(*6 * [numbers], st.floats(-4, 4)), max_size=3), frame_id=texts,
-       seed=st.integers(0, 9))
+@given(boxes=st.lists(st.tuples(*6 * [numbers], st.floats(-4, 4)), max_size=3), frame_id=texts, seed=st.integers(0, 9))
 def test_detection_array_has_the_bytes_of_the_message(boxes, frame_id, seed):
     """vision_msgs is not in the wheels of ROS, so the reference is rosbags alone."""
     rng, count, boxes = np.random.default_rng(seed), len(boxes), np.reshape(boxes, (-1, 7))
-    given = dict(boxes=boxes, labels=rng.choice(CLASSES, count).tolist(), scores=rng.random(count),
-                 header=header(bag_message, START, frame_id),
-                 **({"ids": rng.integers(0, 10**5, count),
-                     "covariances": rng.random((count, 6, 6))} if seed % 2 else {}))
+    given = dict(
+        boxes=boxes,
+        labels=rng.choice(CLASSES, count).tolist(),
+        scores=rng.random(count),
+        header=header(bag_message, START, frame_id),
+        **({"ids": rng.integers(0, 10**5, count), "covariances": rng.random((count, 6, 6))} if seed % 2 else {}),
+    )
     assert encode_detection_array(**given) == encode(to_detection_array(**given, make=bag_message))

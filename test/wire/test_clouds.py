@@ -31,8 +31,7 @@ from msg_utils.stamps import to_ns
 
 def same_points(cloud, points):
     read = to_array(cloud)
-    return set(read.dtype.names) == {*points} and all(
-        np.array_equal(read[name], points[name]) for name in points)
+    return set(read.dtype.names) == {*points} and all(np.array_equal(read[name], points[name]) for name in points)
 
 
 @pytest.mark.parametrize("kind", LIVOX)
@@ -102,9 +101,13 @@ def test_compressed_clouds_are_decompressed(packing):
         assert cloud.__msgtype__ == POINT_CLOUD and to_ns(cloud.header.stamp) == STAMP
 
 
-@pytest.mark.parametrize("packing, words", [
-    ("draco", "compression 'draco' is not supported; supported are zlib and zstd: .*"
-              "in_transport:=draco"), ("", "compression '' is not supported")])
+@pytest.mark.parametrize(
+    "packing, words",
+    [
+        ("draco", "compression 'draco' is not supported; supported are zlib and zstd: .*in_transport:=draco"),
+        ("", "compression '' is not supported"),
+    ],
+)
 def test_unsupported_compression_is_reported(packing, words):
     message = compressed_message(POINTS, "draco")
     vars(message)["format"] = packing
@@ -117,28 +120,35 @@ def test_unsupported_compression_is_reported(packing, words):
 def test_damaged_or_huge_compressed_cloud_is_reported(packing, monkeypatch):
     monkeypatch.setattr(compression, "MAX_BYTES", 1000)
     message = compressed_message(POINTS, packing)
-    for content in message.compressed_data[:-9].tobytes(), b"text", COMPRESS[packing](
-            bytes(1001)):
+    for content in message.compressed_data[:-9].tobytes(), b"text", COMPRESS[packing](bytes(1001)):
         vars(message)["compressed_data"] = np.frombuffer(content, np.uint8)
         with pytest.raises(InputError, match=f"{packing}-compressed cloud is damaged|was cut"):
             to_point_cloud(decode_cloud(encode(message), COMPRESSED))
 
 
 def test_compressed_copy_of_a_topic_is_left_out():
-    topics = {"/a": POINT_CLOUD, "/a/zlib": COMPRESSED, "/b/zstd": COMPRESSED, "/c": LIVOX[0],
-              "/d": "std_msgs/msg/String"}
+    topics = {
+        "/a": POINT_CLOUD,
+        "/a/zlib": COMPRESSED,
+        "/b/zstd": COMPRESSED,
+        "/c": LIVOX[0],
+        "/d": "std_msgs/msg/String",
+    }
     assert find_cloud_topics(topics) == ["/a", "/b/zstd", "/c"]
 
 
-@pytest.mark.parametrize("kind, words", [
-    ("velodyne_msgs/msg/VelodyneScan", "VelodyneScan on /x .*raw packets.*velodyne_pointcloud"),
-    ("velodyne_msgs/VelodyneScan", "velodyne_pointcloud"),
-    ("ouster_sensor_msgs/msg/PacketMsg", "ouster_ros"),
-    ("nebula_msgs/msg/NebulaPackets", "nebula_ros"),
-    ("rslidar_msg/msg/RslidarPacket", "rslidar_sdk"),
-    ("sensor_msgs/msg/LaserScan", "laser_geometry"),
-    ("sensor_msgs/msg/PointCloud", "point_cloud_converter"),
-])
+@pytest.mark.parametrize(
+    "kind, words",
+    [
+        ("velodyne_msgs/msg/VelodyneScan", "VelodyneScan on /x .*raw packets.*velodyne_pointcloud"),
+        ("velodyne_msgs/VelodyneScan", "velodyne_pointcloud"),
+        ("ouster_sensor_msgs/msg/PacketMsg", "ouster_ros"),
+        ("nebula_msgs/msg/NebulaPackets", "nebula_ros"),
+        ("rslidar_msg/msg/RslidarPacket", "rslidar_sdk"),
+        ("sensor_msgs/msg/LaserScan", "laser_geometry"),
+        ("sensor_msgs/msg/PointCloud", "point_cloud_converter"),
+    ],
+)
 def test_sensor_packets_are_reported_with_their_driver(kind, words):
     problem = diagnose_packets({"/note": "std_msgs/msg/String", "/x": kind})
     assert re.search(words, problem) and "\n" not in problem

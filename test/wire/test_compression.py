@@ -12,8 +12,12 @@ import zstandard
 
 from lidar_perception.wire.compression import MAX_BYTES, decompress, decompress_message
 
-PACK = {"zstd": zstandard.ZstdCompressor().compress, "lz4": lz4.frame.compress,
-        "zlib": zlib.compress, "": lambda data: data}
+PACK = {
+    "zstd": zstandard.ZstdCompressor().compress,
+    "lz4": lz4.frame.compress,
+    "zlib": zlib.compress,
+    "": lambda data: data,
+}
 
 
 @pytest.mark.parametrize("packing", PACK)

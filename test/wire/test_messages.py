@@ -41,18 +41,23 @@ def test_extrinsics_are_read_in_either_direction(make):
 
 
 @each_make
-@pytest.mark.parametrize("change, words", [
-    (lambda info, tf: setattr(info.header, "frame_id", "rear"),
-     "'rear' but the transform links 'velodyne' and 'camera_optical'"),
-    (lambda info, tf: setattr(info, "width", 0), "no image size"),
-    (lambda info, tf: setattr(info, "p", np.zeros(12)), "no projection matrix"),
-    (lambda info, tf: setattr(tf.transform.rotation, "w", 5.0), "no unit quaternion"),
-    (lambda info, tf: setattr(tf.transform.rotation, "w", float("nan")), "no unit quaternion"),
-    (lambda info, tf: setattr(tf.transform.translation, "y", float("nan")), "not finite"),
-    (lambda info, tf: setattr(info, "p", np.full(12, np.nan)), "not finite"),
-    (lambda info, tf: setattr(info, "p", np.r_[info.p[:11], np.inf]), "not finite"),
-    (lambda info, tf: setattr(info, "width", 2**32 - 1), "4294967295 x 375 pixels"),
-])
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (
+            lambda info, tf: setattr(info.header, "frame_id", "rear"),
+            "'rear' but the transform links 'velodyne' and 'camera_optical'",
+        ),
+        (lambda info, tf: setattr(info, "width", 0), "no image size"),
+        (lambda info, tf: setattr(info, "p", np.zeros(12)), "no projection matrix"),
+        (lambda info, tf: setattr(tf.transform.rotation, "w", 5.0), "no unit quaternion"),
+        (lambda info, tf: setattr(tf.transform.rotation, "w", float("nan")), "no unit quaternion"),
+        (lambda info, tf: setattr(tf.transform.translation, "y", float("nan")), "not finite"),
+        (lambda info, tf: setattr(info, "p", np.full(12, np.nan)), "not finite"),
+        (lambda info, tf: setattr(info, "p", np.r_[info.p[:11], np.inf]), "not finite"),
+        (lambda info, tf: setattr(info, "width", 2**32 - 1), "4294967295 x 375 pixels"),
+    ],
+)
 def test_unusable_camera_is_an_input_error(make, change, words):
     info = make_camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
     transform = make_extrinsics(CALIBRATION, header(make), make)
@@ -63,19 +68,24 @@ def test_unusable_camera_is_an_input_error(make, change, words):
 
 def test_point_is_in_view_if_its_pixel_is_in_the_image():
     camera = Camera(np.array([[10.0, 0, 50, 0], [0, 10, 20, 0], [0, 0, 1, 0]]), 100, 40)
-    points = np.array([[0, 0, 1], [0, 0, -1], [-5.01, 0, 1], [4.99, 0, 1], [5.01, 0, 1],
-                       [0, 1.99, 1], [0, 2.01, 1], [0, -2.01, 1]], np.float32)
+    points = np.array(
+        [[0, 0, 1], [0, 0, -1], [-5.01, 0, 1], [4.99, 0, 1], [5.01, 0, 1], [0, 1.99, 1], [0, 2.01, 1], [0, -2.01, 1]],
+        np.float32,
+    )
     assert camera.in_view(points).tolist() == [True, False, False, True, False, True, False, False]
 
 
 MESSAGES = {
     "cloud": lambda make: from_array(
-        np.arange(24, dtype="<f4").view([("x", "<f4"), ("", "V4"), ("y", "<f4"), ("z", "<f4")])[
-            ["x", "y", "z"]], header(make), make, height=2),
+        np.arange(24, dtype="<f4").view([("x", "<f4"), ("", "V4"), ("y", "<f4"), ("z", "<f4")])[["x", "y", "z"]],
+        header(make),
+        make,
+        height=2,
+    ),
     "no points": lambda make: from_array(np.zeros(0, [("x", "<f4")]), header(make), make),
     "markers": lambda make: make_detection_markers(
-        Detections.of([[1, 2, 3, 4, 5, 6, 0.5]] * 2, [3, 0], [0.25, 1]), header(make), make,
-        {("Car", 9)}),
+        Detections.of([[1, 2, 3, 4, 5, 6, 0.5]] * 2, [3, 0], [0.25, 1]), header(make), make, {("Car", 9)}
+    ),
     "camera": lambda make: make_camera_info(CALIBRATION, header(make), make),
     "transform": lambda make: make_extrinsics(CALIBRATION, header(make), make),
 }
@@ -88,14 +98,20 @@ def test_ros_and_rosbags_read_each_others_bytes(build):
     name = ours.__msgtype__
     raw = serialization.serialize_message(theirs)
     as_ros = load_message_class(name)
-    assert serialization.deserialize_message(
-        encode(ours), as_ros) == serialization.deserialize_message(raw, as_ros)
+    assert serialization.deserialize_message(encode(ours), as_ros) == serialization.deserialize_message(raw, as_ros)
     assert encode(decode(raw, name)) == encode(ours)
 
 
-@pytest.mark.parametrize("name", ["sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/Pose",
-                                  "sensor_msgs/msg/CameraInfo", "visualization_msgs/msg/Marker",
-                                  "diagnostic_msgs/msg/DiagnosticArray"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "sensor_msgs/msg/PointCloud2",
+        "geometry_msgs/msg/Pose",
+        "sensor_msgs/msg/CameraInfo",
+        "visualization_msgs/msg/Marker",
+        "diagnostic_msgs/msg/DiagnosticArray",
+    ],
+)
 def test_message_fields_default_to_zero_as_in_ros(name):
     serialization = pytest.importorskip("rclpy.serialization", reason="needs rclpy")
     theirs = make_ros_message(name)
@@ -127,8 +143,7 @@ def test_field_with_several_numbers_per_point_is_rejected(make, name):
         read_column(msg, name, to_point_cloud(msg)[1])
 
 
-@pytest.mark.parametrize("kind, full", [("<f4", 1), ("<f4", 255), ("<f8", 65535), ("u1", 255),
-                                        ("<u2", 65535)])
+@pytest.mark.parametrize("kind, full", [("<f4", 1), ("<f4", 255), ("<f8", 65535), ("u1", 255), ("<u2", 65535)])
 def test_intensities_are_read_in_every_drivers_scale(kind, full):
     expected = np.random.default_rng(0).uniform(0, 1, 3000) ** 3
     expected[0] = 1.0

@@ -30,8 +30,10 @@ DRIVERS = {  # column, values
 
 def cloud(name, values, order="<"):
     kind = order + values.dtype.str[1:]
-    points = np.zeros(len(values), [("x", f"{order}f4"), ("y", f"{order}f4"), ("z", f"{order}f8"),
-                                    ("intensity", f"{order}f4"), (name, kind)])
+    points = np.zeros(
+        len(values),
+        [("x", f"{order}f4"), ("y", f"{order}f4"), ("z", f"{order}f8"), ("intensity", f"{order}f4"), (name, kind)],
+    )
     points["x"], points["y"], points[name] = 5.0, np.arange(len(values)), values
     return from_array(points, header(bag_message), bag_message)
 
@@ -50,8 +52,7 @@ def test_times_of_every_driver_are_read_in_seconds(driver, order):
     assert times.name == name
     np.testing.assert_allclose(times.seconds, expected, atol=2e-6)
     for some in ([7, 3, 999], [500], range(500, 505)):  # the last spans 0.4 ms only
-        np.testing.assert_array_equal(read_point_times(msg, np.array(some)).seconds,
-                                      times.seconds[some])
+        np.testing.assert_array_equal(read_point_times(msg, np.array(some)).seconds, times.seconds[some])
 
 
 @pytest.mark.parametrize("driver", DRIVERS)
@@ -67,16 +68,18 @@ def test_replaced_points_have_the_time_of_the_stamp(driver):
     assert (after.point_step, after.width) == (msg.point_step, msg.width)
     np.testing.assert_array_equal(to_point_cloud(after)[0].xyz[chosen], moved)
     others = np.setdiff1d(all_indices(msg), chosen)
-    np.testing.assert_array_equal(to_array(after)[others][["x", "y", "z", "intensity"]],
-                                  to_array(msg)[others][["x", "y", "z", "intensity"]])
+    np.testing.assert_array_equal(
+        to_array(after)[others][["x", "y", "z", "intensity"]], to_array(msg)[others][["x", "y", "z", "intensity"]]
+    )
     np.testing.assert_allclose(read_point_times(after, all_indices(msg)).seconds, 0.0, atol=1e-6)
 
 
 def test_short_cloud_has_the_unit_of_its_type():
-    for name, values, seconds in [("t", np.array([4_000_000, 4_000_001], "<u4"), [4e-3, 4e-3]),
-                                  ("time", np.array([0.01, 0.0105], "<f4"), [0.01, 0.0105]),
-                                  ("timestamp", np.array([STAMP, STAMP + 10**6], "<f8"),
-                                   [0.0, 1e-3])]:
+    for name, values, seconds in [
+        ("t", np.array([4_000_000, 4_000_001], "<u4"), [4e-3, 4e-3]),
+        ("time", np.array([0.01, 0.0105], "<f4"), [0.01, 0.0105]),
+        ("timestamp", np.array([STAMP, STAMP + 10**6], "<f8"), [0.0, 1e-3]),
+    ]:
         msg = cloud(name, values)
         times = read_point_times(msg, all_indices(msg))
         np.testing.assert_allclose(times.seconds, seconds, atol=1e-6)
@@ -89,16 +92,20 @@ def test_nan_times_stay_nan():
     np.testing.assert_array_equal(np.isnan(seconds), np.isnan(values))
 
 
-@pytest.mark.parametrize("name, values, words", [
-    ("ring", np.arange(9, dtype="<u2"), "no time column .*are: x, y, z, intensity, ring"),
-    ("timestamp", STAMP * 1e-9 + SECONDS + 37.0, "37.100 s from header.stamp; are the clocks"),
-    ("t", np.array([0, 3 * 10**9], "<u4"), "3.000 s from header.stamp"),
-    ("time", np.full(5, np.nan), "all times in the column 'time' are NaN"),
-    ("time", np.zeros((5, 2), "<f4"), "count > 1"),
-])
+@pytest.mark.parametrize(
+    "name, values, words",
+    [
+        ("ring", np.arange(9, dtype="<u2"), "no time column .*are: x, y, z, intensity, ring"),
+        ("timestamp", STAMP * 1e-9 + SECONDS + 37.0, "37.100 s from header.stamp; are the clocks"),
+        ("t", np.array([0, 3 * 10**9], "<u4"), "3.000 s from header.stamp"),
+        ("time", np.full(5, np.nan), "all times in the column 'time' are NaN"),
+        ("time", np.zeros((5, 2), "<f4"), "count > 1"),
+    ],
+)
 def test_unusable_times_are_reported(name, values, words):
-    points = np.zeros(len(values), [(n, "<f4") for n in ("x", "y", "z", "intensity")]
-                      + [(name, values.dtype, values.shape[1:])])
+    points = np.zeros(
+        len(values), [(n, "<f4") for n in ("x", "y", "z", "intensity")] + [(name, values.dtype, values.shape[1:])]
+    )
     points[name] = values
     msg = from_array(points, header(bag_message), bag_message)
     with pytest.raises(InputError, match=words):

@@ -12,13 +12,7 @@ from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import make_odometry, to_detections
-from lidar_perception.wire.track_markers import (
-    EXTRA_NAMESPACES,
-    MAX_ID,
-    NUMBER,
-    VELOCITY,
-    make_track_markers,
-)
+from lidar_perception.wire.track_markers import EXTRA_NAMESPACES, MAX_ID, NUMBER, VELOCITY, make_track_markers
 from msg_utils.markers import ADD, DELETE, from_marker_array, list_marker_keys
 
 
@@ -29,9 +23,16 @@ def make_frames(make, frames=20):
         stamp = START + i * TENTH
         tracks = tracker(found if i < 12 else Detections.none(), stamp)
         message = make_track_markers(
-            tracks.ids, tracks.detections, tracks.velocities, tracks.moving,
-            trails(tracks, tracker.pose, stamp, 2.0), header(make, stamp), make, previous=shown,
-            lifetime_ns=10**9)
+            tracks.ids,
+            tracks.detections,
+            tracks.velocities,
+            tracks.moving,
+            trails(tracks, tracker.pose, stamp, 2.0),
+            header(make, stamp),
+            make,
+            previous=shown,
+            lifetime_ns=10**9,
+        )
         shown = list_marker_keys(message)
         yield tracks, message
 
@@ -71,8 +72,15 @@ def test_each_array_deletes_outdated_markers(make):
 
 def test_large_ids_wrap_around():
     found = Detections.of([[1, 2, 3, 4, 5, 6, 0]], CAR, 0.5)
-    message = make_track_markers(np.array([MAX_ID + 7]), found, np.zeros((1, 2)), np.zeros(1),
-                                 [np.zeros((1, 3))], header(bag_message), bag_message)
+    message = make_track_markers(
+        np.array([MAX_ID + 7]),
+        found,
+        np.zeros((1, 2)),
+        np.zeros(1),
+        [np.zeros((1, 3))],
+        header(bag_message),
+        bag_message,
+    )
     assert {(m.ns, m.id) for m in message.markers} == {(CLASSES[CAR], 7), (NUMBER, 7)}
     assert set(EXTRA_NAMESPACES).isdisjoint(CLASSES)
 

@@ -11,13 +11,7 @@ import click
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import (
-    ScoringOptions,
-    no_labels_error,
-    out_file,
-    scoring_options,
-    with_recorded_height,
-)
+from lidar_perception.cli.data import ScoringOptions, no_labels_error, out_file, scoring_options, with_recorded_height
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.terminal import console, errors
@@ -29,6 +23,7 @@ def with_recorded_setup(recording: Any, params: PipelineParams) -> PipelineParam
     If the recording has no camera, the crop to its view is turned off and a note is printed.
     """
     from lidar_perception.data.frame import CAMERA
+
     params = with_recorded_height(recording, params)
     if params.view.enabled and CAMERA not in recording.has:
         errors.print(f"{recording.path} has no camera calibration: the whole scan is processed")
@@ -79,6 +74,7 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
     from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
     from lidar_perception.scoring.centres.report import load_pedestrians, make_seed_source
     from lidar_perception.types import PointCloud
+
     _, best = report.most_crowded
     if best is None:
         return
@@ -86,11 +82,17 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
     frame = next(frame for frame in recording if frame.name == best)
     truth = load_pedestrians(frame, params.view.enabled)
     scan = frame.load()
-    segmented, found = find_candidates(
-        scan, make_seed_source(truth, templates, params), frame.camera(), params
-    )
+    segmented, found = find_candidates(scan, make_seed_source(truth, templates, params), frame.camera(), params)
     stage = Stage.of(scan, params.ground.sensor_pose.height, params.view.enabled)
-    write_png(png, draw_frame(
-        stage, PointCloud(segmented.xyz), Boxes(found.final.boxes, found.final.class_ids), truth,
-        f"frame {frame.name}", colors=color_by_cluster(segmented.ground, segmented.cluster_ids)))
+    write_png(
+        png,
+        draw_frame(
+            stage,
+            PointCloud(segmented.xyz),
+            Boxes(found.final.boxes, found.final.class_ids),
+            truth,
+            f"frame {frame.name}",
+            colors=color_by_cluster(segmented.ground, segmented.cluster_ids),
+        ),
+    )
     console.print(f"picture: {png}")

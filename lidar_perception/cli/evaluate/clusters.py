@@ -28,9 +28,11 @@ def _file(weights: Path | None) -> Path:
 def _runs(weights: Path | None) -> Runs:
     """Return ground and clustering with the parameters that the network was trained with."""
     fields = collect_fields(default_params(_file(weights)))
-    return Runs("ground and clustering", {name: f for name, f in fields.items()
-                                          if name.startswith(("ground.", "clustering."))},
-                ("pointnet_detector",))
+    return Runs(
+        "ground and clustering",
+        {name: f for name, f in fields.items() if name.startswith(("ground.", "clustering."))},
+        ("pointnet_detector",),
+    )
 
 
 @click.command(cls=Command)
@@ -57,7 +59,7 @@ def clusters(options: ScoringOptions, weights: Path | None, settings: Settings) 
     from lidar_perception.scoring.points.clusters import ClusterScores, measure_network
 
     file = _file(weights)
-    values, = settings.values(_runs(weights)) if settings else [{}]
+    (values,) = settings.values(_runs(weights)) if settings else [{}]
     checked(default_params(file), values)
     scores = ClusterScores(read_header(file, PointNetConfig).config.classes)
     recording = options.open_recording(BOXES)

@@ -52,45 +52,50 @@ class DetectionRequest:
         if not self.errors:
             refuse_given(("errors_from",), "goes with --errors")
         if self.detector is None:
-            refuse_given(("min_score", "device"), "is for a detector that runs; --results DIR has "
-                         "its boxes already")
+            refuse_given(("min_score", "device"), "is for a detector that runs; --results DIR has its boxes already")
             if self.write_results is not None:
-                raise click.UsageError("--write-results writes the detections of a detector; "
-                                       "--results DIR has its files already")
+                raise click.UsageError(
+                    "--write-results writes the detections of a detector; --results DIR has its files already"
+                )
             if self.keep != 1:
-                raise click.UsageError("--keep thins the scans that a detector sees; --results DIR "
-                                       "sees none")
-        elif self.write_results is not None and self.write_results.is_dir() and any(
-                self.write_results.iterdir()):
+                raise click.UsageError("--keep thins the scans that a detector sees; --results DIR sees none")
+        elif self.write_results is not None and self.write_results.is_dir() and any(self.write_results.iterdir()):
             raise InputError(f"{self.write_results} has files already; give another name")
 
     def open_recording(self) -> Any:
         """Open the recording. Labels are required unless detections are written."""
         from lidar_perception.data.frame import BOXES, CAMERA
+
         recording = self.options.open_recording(
-            BOXES if self.write_results is None else None, scans=self.detector is not None,
-            sensor_height=self.mount_height or None)
+            BOXES if self.write_results is None else None,
+            scans=self.detector is not None,
+            sensor_height=self.mount_height or None,
+        )
         if self.results is not None and not self.results.is_dir():
             raise InputError(f"{self.results} is not a folder; give the folder of the result files")
         if self.detector is not None:
             from lidar_perception.detectors.open import check_weights
-            for warning in check_weights(Path(self.detector.weights),
-                                         recording.frames[0].sensor_height):
+
+            for warning in check_weights(Path(self.detector.weights), recording.frames[0].sensor_height):
                 terminal_errors.print(warning)
         if CAMERA not in recording.has and (self.results or self.write_results) is not None:
-            terminal_errors.print(f"{recording.path} has no camera calibration: result files are "
-                                  "in the frame of a nominal camera, as detect writes them",
-                                  style="dim")
+            terminal_errors.print(
+                f"{recording.path} has no camera calibration: result files are "
+                "in the frame of a nominal camera, as detect writes them",
+                style="dim",
+            )
         return recording
 
     def make_start(self, recording: Any) -> Any:
         """Return the function that scores a frame, see scoring.run.Start."""
         from lidar_perception.scoring.detections import measure_detector, measure_result_files
+
         if self.detector is None:
             assert self.results is not None
             return partial(measure_result_files, self.results)
-        open_detector = partial(self.detector.open, min_score=self.min_score,
-                                sensor_height=recording.frames[0].sensor_height)
+        open_detector = partial(
+            self.detector.open, min_score=self.min_score, sensor_height=recording.frames[0].sensor_height
+        )
         return partial(measure_detector, open_detector, self.keep, self.write_results)
 
     def compute(self, report: Any) -> dict[str, Any]:
@@ -98,13 +103,12 @@ class DetectionRequest:
         from lidar_perception.scoring.kitti.box_errors import measure_box_errors
         from lidar_perception.scoring.kitti.protocol import SCORED, Comparison
         from lidar_perception.scoring.kitti.reliability import measure_reliability
+
         content = {"source": self.source, "keep": self.keep, **report.compute()}
         if self.errors and report.frames:
             comparison = Comparison.of(report.frames)
-            content["errors"] = {name: measure_box_errors(report.frames, name, self.errors_from)
-                                 for name in SCORED}
-            content["reliability"] = {name: measure_reliability(comparison, name)
-                                      for name in SCORED}
+            content["errors"] = {name: measure_box_errors(report.frames, name, self.errors_from) for name in SCORED}
+            content["reliability"] = {name: measure_reliability(comparison, name) for name in SCORED}
         if self.intervals and report.frames:
             content["intervals"] = report.compute_intervals(self.intervals)
         return content
@@ -115,6 +119,7 @@ def _print(content: dict[str, Any]) -> None:
     from lidar_perception.scoring.kitti.box_errors import print_box_errors
     from lidar_perception.scoring.kitti.reliability import print_reliability
     from lidar_perception.scoring.kitti.tables import print_detection_report, print_intervals
+
     print_detection_report(content, console)
     if "errors" in content:
         print_box_errors(content["errors"], console)
@@ -125,25 +130,53 @@ def _print(content: dict[str, Any]) -> None:
 
 @click.command(cls=Command)
 @scoring_options()
-@a_path("--results", "Result files of any detector, in KITTI's format: DIR/000000.txt ...; "
-        "or the folder that `detect --format kitti` wrote.", "DIR")
+@a_path(
+    "--results",
+    "Result files of any detector, in KITTI's format: DIR/000000.txt ...; "
+    "or the folder that `detect --format kitti` wrote.",
+    "DIR",
+)
 @detector_options()
-@click.option("--min-score", type=click.FloatRange(0, 1), default=MIN_SCORE, show_default=True,
-              help="Leave out boxes of --weights with a lower score. Average precision needs "
-                   "precision at every recall, so keep this lower than a robot would.")
-@click.option("--keep", type=click.FloatRange(0, 1), default=1.0, metavar="SHARE",
-              help="Keep only this share of the points of each scan, 0..1, drawn at random but "
-              "always the same. Default: 1.")
-@click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
-              help="Height of the sensor above the ground. Default: that of the recording, or "
-              "measured on its first clouds.")
-@out_folder("Write the detections of --weights as KITTI result files, also for frames without "
-            "labels.", "--write-results")
-@click.option("--errors", is_flag=True, help="Also print how found boxes differ from the true "
-              "ones, by class and range, what each difference costs, and whether scores are "
-              "probabilities.")
-@click.option("--errors-from", type=click.FloatRange(0, 1), default=0.2, show_default=True,
-              metavar="SCORE", help="With --errors: look at boxes from this score on.")
+@click.option(
+    "--min-score",
+    type=click.FloatRange(0, 1),
+    default=MIN_SCORE,
+    show_default=True,
+    help="Leave out boxes of --weights with a lower score. Average precision needs "
+    "precision at every recall, so keep this lower than a robot would.",
+)
+@click.option(
+    "--keep",
+    type=click.FloatRange(0, 1),
+    default=1.0,
+    metavar="SHARE",
+    help="Keep only this share of the points of each scan, 0..1, drawn at random but always the same. Default: 1.",
+)
+@click.option(
+    "--mount-height",
+    type=click.FloatRange(0, 10),
+    default=0.0,
+    metavar="M",
+    help="Height of the sensor above the ground. Default: that of the recording, or measured on its first clouds.",
+)
+@out_folder(
+    "Write the detections of --weights as KITTI result files, also for frames without labels.", "--write-results"
+)
+@click.option(
+    "--errors",
+    is_flag=True,
+    help="Also print how found boxes differ from the true "
+    "ones, by class and range, what each difference costs, and whether scores are "
+    "probabilities.",
+)
+@click.option(
+    "--errors-from",
+    type=click.FloatRange(0, 1),
+    default=0.2,
+    show_default=True,
+    metavar="SCORE",
+    help="With --errors: look at boxes from this score on.",
+)
 @intervals_option
 def detection(options: ScoringOptions, **choices: Any) -> None:
     """Score boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
@@ -161,6 +194,7 @@ def detection(options: ScoringOptions, **choices: Any) -> None:
       lidar-perception evaluate detection drive --weights v4.safetensors --keep 0.1
     """
     from lidar_perception.scoring.kitti.report import DetectionReport
+
     request = DetectionRequest(options, **choices)
     request.check()
     recording = request.open_recording()

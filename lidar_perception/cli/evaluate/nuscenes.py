@@ -10,13 +10,7 @@ from typing import Any
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import (
-    ScoringOptions,
-    a_path,
-    no_labels_error,
-    out_file,
-    scoring_options,
-)
+from lidar_perception.cli.data import ScoringOptions, a_path, no_labels_error, out_file, scoring_options
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.detectors.params import MIN_SCORE
@@ -44,36 +38,37 @@ class NuscenesRequest:
         if (self.results is None) == (self.detector is None):
             raise click.UsageError("give either --results JSON or --weights FILE")
         if self.write_results is not None and self.detector is None:
-            raise click.UsageError("--write-results writes the detections of --weights; --results "
-                                   "JSON is such a file already")
+            raise click.UsageError(
+                "--write-results writes the detections of --weights; --results JSON is such a file already"
+            )
 
     def open_recording(self) -> Any:
         """Open the recording, which must be nuScenes."""
         from lidar_perception.data.nuscenes.folder import KeyFrame
+
         recording = self.options.open_recording(None)
         if not isinstance(recording.frames[0].native, KeyFrame):
-            raise InputError(f"{self.options.data} ({recording.layout}) is not nuScenes; use "
-                             "evaluate detection")
+            raise InputError(f"{self.options.data} ({recording.layout}) is not nuScenes; use evaluate detection")
         return recording
 
     def make_start(self, recording: Any) -> Any:
         """Return the function that scores a frame, see scoring.run.Start."""
         from lidar_perception.scoring.nuscenes.report import measure_key_frames, measure_result_file
+
         if self.detector is None:
             assert self.results is not None
             return partial(measure_result_file, self.results)
-        open_detector = partial(self.detector.open, min_score=MIN_SCORE,
-                                sensor_height=recording.frames[0].sensor_height)
+        open_detector = partial(
+            self.detector.open, min_score=MIN_SCORE, sensor_height=recording.frames[0].sensor_height
+        )
         return partial(measure_key_frames, open_detector, self.write_results is not None)
 
 
 @click.command(cls=Command)
 @scoring_options()
-@a_path("--results", "Result file of any detector, in the format of nuScenes' detection task.",
-        "JSON")
+@a_path("--results", "Result file of any detector, in the format of nuScenes' detection task.", "JSON")
 @detector_options(default=None)
-@out_file("--write-results", "Write the detections of --weights as a result file, also for frames "
-                             "without labels.")
+@out_file("--write-results", "Write the detections of --weights as a result file, also for frames without labels.")
 def nuscenes(options: ScoringOptions, **choices: Any) -> None:
     """Score boxes by the protocol of nuScenes' detection task.
 
@@ -91,6 +86,7 @@ def nuscenes(options: ScoringOptions, **choices: Any) -> None:
     from lidar_perception.data.nuscenes.results import write_results
     from lidar_perception.scoring.nuscenes.report import NuscenesReport
     from lidar_perception.scoring.nuscenes.tables import print_nuscenes_report
+
     request = NuscenesRequest(options, **choices)
     request.check()
     recording = request.open_recording()
@@ -101,8 +97,7 @@ def nuscenes(options: ScoringOptions, **choices: Any) -> None:
         console.print(f"result file: {request.write_results}")
     if not report.frames and (request.write_results is None or report.skipped):
         raise no_labels_error(recording, report.skipped)
-    content = {"source": request.source, "version": recording.layout.split()[-1],
-               **report.compute()}
+    content = {"source": request.source, "version": recording.layout.split()[-1], **report.compute()}
     if report.frames:
         print_nuscenes_report(content, console)
     options.write(content)

@@ -36,22 +36,23 @@ class MethodList(click.ParamType):
         names = value if isinstance(value, tuple) else tuple(str(value).split(","))
         known = GROUND_METHODS + CLUSTERING_METHODS
         if unknown := [name for name in names if name not in known]:
-            self.fail(f"there is no method {unknown[0]!r}{valid_names(unknown[0], known)}", param,
-                      ctx)
+            self.fail(f"there is no method {unknown[0]!r}{valid_names(unknown[0], known)}", param, ctx)
         return names
 
 
 @click.command(cls=Command)
 @scoring_options(data_argument(f"{WHAT} May be repeated.", several=True))
-@click.option("--methods", type=MethodList(), default=GROUND_METHODS + CLUSTERING_METHODS,
-              help="Methods to score, of ground and of clustering, with commas between. "
-              "Default: all.")
+@click.option(
+    "--methods",
+    type=MethodList(),
+    default=GROUND_METHODS + CLUSTERING_METHODS,
+    help="Methods to score, of ground and of clustering, with commas between. Default: all.",
+)
 @out_file("--png", "Draw the ground of the first scan with labelled points from above.")
-@parameter_options(SegmentationParams(), "segmentation",
-                   ("perception", "ground_segmentation", "clustering"),
-                   "ground.method=patchwork")
-def segmentation(options: ScoringOptions, methods: tuple, png: Path | None,
-                 params: SegmentationParams) -> None:
+@parameter_options(
+    SegmentationParams(), "segmentation", ("perception", "ground_segmentation", "clustering"), "ground.method=patchwork"
+)
+def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, params: SegmentationParams) -> None:
     """Score ground and clusters against labels.
 
     Ground: each method against the classes of SemanticKITTI's points. Clusters: each method, on
@@ -78,27 +79,29 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None,
         if recording not in labelled:
             recording.require(BOXES, "evaluate segmentation")
     if png is not None and not (labelled and grounds):
-        raise click.UsageError("--png draws the ground of a scan with labelled points: give "
-                               "SemanticKITTI and a method of ground")
+        raise click.UsageError(
+            "--png draws the ground of a scan with labelled points: give SemanticKITTI and a method of ground"
+        )
     if not (labelled or clusterings):
-        raise click.UsageError("ground is scored on labelled points only: give SemanticKITTI or a "
-                               "method of clustering")
+        raise click.UsageError("ground is scored on labelled points only: give SemanticKITTI or a method of clustering")
     report = SegmentationReport()
     for recording in recordings:
         report.source = recording.layout
         own = with_recorded_height(recording, params)
-        options.fill(report, recording, partial(measure_methods, own, grounds, clusterings),
-                     recording.layout)
+        options.fill(report, recording, partial(measure_methods, own, grounds, clusterings), recording.layout)
     if not (report.ground or report.clusters):
         raise no_labels_error(recordings[0], report.skipped)
     content = report.compute()
     if report.whole:
-        errors.print(f"{', '.join(map(str, options.data))}: {report.whole} frames "
-                     "without a camera calibration were scored as a whole")
+        errors.print(
+            f"{', '.join(map(str, options.data))}: {report.whole} frames "
+            "without a camera calibration were scored as a whole"
+        )
     print_scores(content, params.ground.method, console)
     options.write(content)
     if png is not None:
         from lidar_perception.scoring.points.report import segment_by_methods
+
         own = with_recorded_height(labelled[0], params)
         for frame in islice(labelled[0], options.limit):
             scan, labels, found = segment_by_methods(frame, own, grounds)

@@ -18,12 +18,16 @@ from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
 @click.command(cls=Command)
 @scoring_options(parallel=False)
 @detector_options(tracking=True)
-@click.option("--ego", type=Choice(RECORDED_EGO), default="auto", show_default=True,
-              help="The sensor's motion: from the recording's poses; from the scans, by KISS-ICP "
-              "(the extra [odometry]); or none: tracks are relative to the sensor. auto: the first "
-              "of these that is available, poses where one of the first frames has one.")
-def tracking(options: ScoringOptions, detector: DetectorChoice, tracking: TrackingParams,
-             ego: str) -> None:
+@click.option(
+    "--ego",
+    type=Choice(RECORDED_EGO),
+    default="auto",
+    show_default=True,
+    help="The sensor's motion: from the recording's poses; from the scans, by KISS-ICP "
+    "(the extra [odometry]); or none: tracks are relative to the sensor. auto: the first "
+    "of these that is available, poses where one of the first frames has one.",
+)
+def tracking(options: ScoringOptions, detector: DetectorChoice, tracking: TrackingParams, ego: str) -> None:
     """Score tracks of Car, Pedestrian and Cyclist: HOTA, CLEAR MOT and AB3DMOT.
 
     The labels need track ids, and the frames of a drive come one after the other, so this runs in
@@ -40,13 +44,16 @@ def tracking(options: ScoringOptions, detector: DetectorChoice, tracking: Tracki
     from lidar_perception.tracking.drive_tracker import choose_ego_source
 
     recording = options.open_recording(BOXES)
-    open_detector = partial(detector.open, min_score=tracking.min_score,
-                            sensor_height=recording.frames[0].sensor_height)
+    open_detector = partial(
+        detector.open, min_score=tracking.min_score, sensor_height=recording.frames[0].sensor_height
+    )
     report, source = TrackingReport(), choose_ego_source(recording, ego)
     if (ego, source) == ("auto", "kiss_icp") and POSES in recording.has:
-        console.print(Text("no pose", "yellow") + ": the first frames have none, so poses are by "
-                      "KISS-ICP; see whether the odometry or TF of the recording has the clock of "
-                      "its clouds")
+        console.print(
+            Text("no pose", "yellow") + ": the first frames have none, so poses are by "
+            "KISS-ICP; see whether the odometry or TF of the recording has the clock of "
+            "its clouds"
+        )
     options.fill(report, recording, partial(measure_tracking, open_detector, tracking, source))
     if not report.frames:
         raise no_labels_error(recording, report.skipped)

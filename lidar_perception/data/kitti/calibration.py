@@ -16,8 +16,13 @@ from lidar_perception.types import InputError
 
 # Size of the rectified images by focal length. It depends on the recording day, and is not stored
 # in the calibration files of the object and tracking benchmarks.
-IMAGE_SIZES = {721.5377: (1242, 375), 707.0493: (1224, 370), 718.3351: (1238, 374),
-               707.0912: (1226, 370), 718.856: (1241, 376)}
+IMAGE_SIZES = {
+    721.5377: (1242, 375),
+    707.0493: (1224, 370),
+    718.3351: (1238, 374),
+    707.0912: (1226, 370),
+    718.856: (1241, 376),
+}
 RAW_CALIB = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 MAX_SKEW = 0.01  # of a rounded rotation matrix, from R R^T = I
 
@@ -56,12 +61,12 @@ def read_raw_calibration(day: Path) -> Calibration:
     """Read the calibration (RAW_CALIB) of a day of raw recordings."""
     cameras, lidar = (day / name for name in RAW_CALIB)
     values, pose = read_matrices(cameras), read_matrices(lidar)
-    velodyne = np.column_stack([get_matrix(pose, lidar, "R", (3, 3)),
-                                get_matrix(pose, lidar, "T", (3,))])
+    velodyne = np.column_stack([get_matrix(pose, lidar, "R", (3, 3)), get_matrix(pose, lidar, "T", (3,))])
     width, height = get_matrix(values, cameras, "S_rect_02", (2,)).astype(int).tolist()
     rectify = get_matrix(values, cameras, "R_rect_00", (3, 3))
-    return Calibration(get_matrix(values, cameras, "P_rect_02", (3, 4)),
-                       _make_pose(day, rectify, velodyne), width, height)
+    return Calibration(
+        get_matrix(values, cameras, "P_rect_02", (3, 4)), _make_pose(day, rectify, velodyne), width, height
+    )
 
 
 def read_matrices(path: Path) -> dict[str, np.ndarray]:
@@ -77,13 +82,13 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
     return values
 
 
-def get_matrix(values: dict, path: Path, name: str, shape: tuple[int, ...],
-               other: str = "") -> np.ndarray:
+def get_matrix(values: dict, path: Path, name: str, shape: tuple[int, ...], other: str = "") -> np.ndarray:
     """Return the matrix called `name`, else `other`. InputError if it is missing."""
     found = values.get(name, values.get(other))
     if found is None or found.size != np.prod(shape) or not np.isfinite(found).all():
-        raise InputError(f"{path} has no {name} of {int(np.prod(shape))} finite numbers; download "
-                         "KITTI's calibration again")
+        raise InputError(
+            f"{path} has no {name} of {int(np.prod(shape))} finite numbers; download KITTI's calibration again"
+        )
     return found.reshape(shape)
 
 
@@ -95,8 +100,11 @@ def _make_pose(path: Path, rectify: np.ndarray, velodyne: np.ndarray) -> np.ndar
 def check_pose(pose: np.ndarray, path: Path) -> np.ndarray:
     """Return a pose (4, 4); raise InputError that names the file if it is not rigid."""
     rotation = pose[:3, :3]
-    if not (np.isfinite(pose).all() and np.allclose(rotation @ rotation.T, np.eye(3), atol=MAX_SKEW)
-            and np.linalg.det(rotation) > 0):
+    if not (
+        np.isfinite(pose).all()
+        and np.allclose(rotation @ rotation.T, np.eye(3), atol=MAX_SKEW)
+        and np.linalg.det(rotation) > 0
+    ):
         raise InputError(f"a pose in {path} is not a rotation and translation; download it again")
     return pose
 
@@ -104,7 +112,7 @@ def check_pose(pose: np.ndarray, path: Path) -> np.ndarray:
 def to_homogeneous(matrix: np.ndarray) -> np.ndarray:
     """Extend a matrix (3, 3) or (3, 4) to (4, 4)."""
     full = np.eye(4)
-    full[:3, :matrix.shape[1]] = matrix
+    full[:3, : matrix.shape[1]] = matrix
     return full
 
 

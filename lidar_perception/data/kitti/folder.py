@@ -20,9 +20,9 @@ from lidar_perception.types import GroundTruth, InputError, PointCloud
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 START_NS = 1_316_995_200 * 10**9  # 26 September 2011, the first day of KITTI's recordings
-PERIOD_NS = 10**8                 # the sensor turns at 10 Hz
-GAP_NS = 10 * 10**9               # between the drives of a recording
-OBJECT_DATA = "object data"       # the layout of unrelated frames
+PERIOD_NS = 10**8  # the sensor turns at 10 Hz
+GAP_NS = 10 * 10**9  # between the drives of a recording
+OBJECT_DATA = "object data"  # the layout of unrelated frames
 SCANS = ("velodyne_reduced", "velodyne")  # the full scan is preferred
 
 
@@ -46,8 +46,7 @@ def make_velodyne_scale_reader(scans: Sequence[Path]) -> Callable[[], float]:
 
 def is_layout(path: Path) -> bool:
     """Return True for a folder in the object or tracking layout, even without scans."""
-    return any((folder / name).is_dir() for folder in (path / "training", path)
-               for name in (*SCANS, "label_2"))
+    return any((folder / name).is_dir() for folder in (path / "training", path) for name in (*SCANS, "label_2"))
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
@@ -63,38 +62,55 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
         InputError: there are no scans; the message names the expected folders.
     """
     names = SCANS if scans else (*SCANS, "label_2")
-    folder = next((folder for folder in (path / "training", path)
-                   if any((folder / name).is_dir() for name in names)), path)
-    tracking = (folder / "label_02").is_dir() or any(
-        any(folder.glob(f"{name}/*/")) for name in SCANS)
+    folder = next(
+        (folder for folder in (path / "training", path) if any((folder / name).is_dir() for name in names)), path
+    )
+    tracking = (folder / "label_02").is_dir() or any(any(folder.glob(f"{name}/*/")) for name in SCANS)
     frames = _make_tracking_frames(folder) if tracking else _make_object_frames(folder, scans)
     if not frames:
-        raise InputError(f"{path} has no KITTI scans: expected training/velodyne/*.bin (object) or "
-                         "training/velodyne/0000/*.bin (tracking)")
+        raise InputError(
+            f"{path} has no KITTI scans: expected training/velodyne/*.bin (object) or "
+            "training/velodyne/0000/*.bin (tracking)"
+        )
     labelled = (folder / "label_02").is_dir() or (folder / "label_2").is_dir()
-    missing = _find_missing_tracking_scans(folder, frames) if tracking else [
-        (label.stem, str(label)) for label in sorted(folder.glob("label_2/*.txt"))
-        if not any((folder / name / f"{label.stem}.bin").exists() for name in SCANS)]
-    return Recording(path, f"KITTI {'tracking data' if tracking else OBJECT_DATA}", frames,
-                     frozenset({CAMERA} | ({BOXES} if labelled else set())),
-                     tuple((name, f"{label} has no scan; download it again")
-                           for name, label in missing) if scans else (), is_sequential=tracking)
+    missing = (
+        _find_missing_tracking_scans(folder, frames)
+        if tracking
+        else [
+            (label.stem, str(label))
+            for label in sorted(folder.glob("label_2/*.txt"))
+            if not any((folder / name / f"{label.stem}.bin").exists() for name in SCANS)
+        ]
+    )
+    return Recording(
+        path,
+        f"KITTI {'tracking data' if tracking else OBJECT_DATA}",
+        frames,
+        frozenset({CAMERA} | ({BOXES} if labelled else set())),
+        tuple((name, f"{label} has no scan; download it again") for name, label in missing) if scans else (),
+        is_sequential=tracking,
+    )
 
 
 def _find_missing_tracking_scans(folder: Path, frames: list[Frame]) -> list[tuple[str, str]]:
     known = {(frame.sequence, frame.index) for frame in frames}
     missing = []
     for label in sorted(folder.glob("label_02/*.txt")):
-        numbers = {int(number) for line in read_text(label, what="the labels").splitlines()
-                   if (number := line.partition(" ")[0]).isdecimal()}
-        missing += [(f"{label.stem}/{number:06}", f"frame {number} of {label}")
-                    for number in sorted(numbers) if (label.stem, number) not in known]
+        numbers = {
+            int(number)
+            for line in read_text(label, what="the labels").splitlines()
+            if (number := line.partition(" ")[0]).isdecimal()
+        }
+        missing += [
+            (f"{label.stem}/{number:06}", f"frame {number} of {label}")
+            for number in sorted(numbers)
+            if (label.stem, number) not in known
+        ]
     return missing
 
 
 def _make_object_frames(folder: Path, scans: bool) -> list[Frame]:
-    files = {} if scans else {p.stem: folder / f"velodyne/{p.stem}.bin"
-                              for p in folder.glob("label_2/*.txt")}
+    files = {} if scans else {p.stem: folder / f"velodyne/{p.stem}.bin" for p in folder.glob("label_2/*.txt")}
     files |= {p.stem: p for name in SCANS for p in folder.glob(f"{name}/*.bin")}
     frames, scale = [], make_velodyne_scale_reader([points for _, points in sorted(files.items())])
     for i, (name, points) in enumerate(sorted(files.items())):
@@ -102,10 +118,20 @@ def _make_object_frames(folder: Path, scans: bool) -> list[Frame]:
         calib = folder / f"calib/{name}.txt"
         calibration = functools.cache(partial(read_calibration, calib, image))
         stamp = START_NS + i * PERIOD_NS
-        frames.append(Frame(name, stamp, partial(load_velodyne, points, stamp, scale),
-                            partial(_read_object_truth, label, calibration),
-                            calibration=calibration, index=i, points=points, image=image,
-                            intensity_max=scale, files=(points, label, calib)))
+        frames.append(
+            Frame(
+                name,
+                stamp,
+                partial(load_velodyne, points, stamp, scale),
+                partial(_read_object_truth, label, calibration),
+                calibration=calibration,
+                index=i,
+                points=points,
+                image=image,
+                intensity_max=scale,
+                files=(points, label, calib),
+            )
+        )
     return frames
 
 
@@ -115,36 +141,44 @@ def _read_object_truth(label: Path, calibration: Callable[[], Calibration]) -> G
 
 def _make_tracking_frames(folder: Path) -> list[Frame]:
     frames, start = [], START_NS
-    drives = {drive.name: sorted(drive.glob("*.bin")) for name in SCANS
-              for drive in sorted(folder.glob(f"{name}/*/"))}
-    scale = make_velodyne_scale_reader([scan for _, scans in sorted(drives.items())
-                                        for scan in scans])
+    drives = {drive.name: sorted(drive.glob("*.bin")) for name in SCANS for drive in sorted(folder.glob(f"{name}/*/"))}
+    scale = make_velodyne_scale_reader([scan for _, scans in sorted(drives.items()) for scan in scans])
     for name, scans in sorted(drives.items()):
         images = folder / "image_02" / name
         calib, label = folder / f"calib/{name}.txt", folder / f"label_02/{name}.txt"
-        calibration = functools.cache(partial(
-            read_calibration, calib, images / f"{scans[0].stem}.png" if scans else None))
+        calibration = functools.cache(
+            partial(read_calibration, calib, images / f"{scans[0].stem}.png" if scans else None)
+        )
         truth = make_truth_reader(label, partial(_read_tracking_truth, calibration))
         for points in scans:
             number = parse_scan_number(points)
             stamp = start + (number - parse_scan_number(scans[0])) * PERIOD_NS
-            frames.append(Frame(f"{name}/{points.stem}", stamp,
-                                partial(load_velodyne, points, stamp, scale),
-                                partial(truth, number), calibration=calibration,
-                                sequence=name, index=number, points=points,
-                                image=images / f"{points.stem}.png",
-                                intensity_max=scale, files=(points, label, calib)))
+            frames.append(
+                Frame(
+                    f"{name}/{points.stem}",
+                    stamp,
+                    partial(load_velodyne, points, stamp, scale),
+                    partial(truth, number),
+                    calibration=calibration,
+                    sequence=name,
+                    index=number,
+                    points=points,
+                    image=images / f"{points.stem}.png",
+                    intensity_max=scale,
+                    files=(points, label, calib),
+                )
+            )
         start = frames[-1].stamp_ns + GAP_NS if frames else start
     return frames
 
 
-def _read_tracking_truth(calibration: Callable[[], Calibration], label: Path
-                         ) -> dict[int, GroundTruth]:
+def _read_tracking_truth(calibration: Callable[[], Calibration], label: Path) -> dict[int, GroundTruth]:
     return read_tracking_labels(label, calibration().lidar_to_camera)
 
 
-def make_truth_reader(path: Path, read: Callable[[Path], dict[int, GroundTruth]]
-                       ) -> Callable[[int], GroundTruth | None]:
+def make_truth_reader(
+    path: Path, read: Callable[[Path], dict[int, GroundTruth]]
+) -> Callable[[int], GroundTruth | None]:
     """Return a function that returns the labels of a frame by its number, or None without a file.
 
     The label file of the drive is read once.
@@ -153,6 +187,7 @@ def make_truth_reader(path: Path, read: Callable[[Path], dict[int, GroundTruth]]
 
     def truth(number: int) -> GroundTruth | None:
         return labels().get(number, _NO_OBJECTS) if path.exists() else None
+
     return truth
 
 
@@ -161,8 +196,7 @@ def parse_scan_number(scan: Path) -> int:
     try:
         return int(scan.stem)
     except ValueError:
-        raise InputError(f"{scan} is not a KITTI scan: its name is not a number; move it to "
-                         "another folder") from None
+        raise InputError(f"{scan} is not a KITTI scan: its name is not a number; move it to another folder") from None
 
 
 _NO_OBJECTS = GroundTruth.of([], [])

@@ -16,12 +16,7 @@ import numpy as np
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import CAMERA, POSES, Recording, return_none
 from lidar_perception.data.kitti import raw
-from lidar_perception.data.kitti.calibration import (
-    check_pose,
-    get_matrix,
-    read_matrices,
-    to_homogeneous,
-)
+from lidar_perception.data.kitti.calibration import check_pose, get_matrix, read_matrices, to_homogeneous
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
@@ -35,8 +30,14 @@ def is_layout(path: Path) -> bool:
 
 def _find_root(path: Path) -> Path | None:
     path = path.absolute()
-    return next((folder for folder in (path, *path.parents[:2]) if (folder / SCANS).is_dir()
-                 and (folder == path or path.relative_to(folder).parts[0] == SCANS)), None)
+    return next(
+        (
+            folder
+            for folder in (path, *path.parents[:2])
+            if (folder / SCANS).is_dir() and (folder == path or path.relative_to(folder).parts[0] == SCANS)
+        ),
+        None,
+    )
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
@@ -47,8 +48,9 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     root = _find_root(path)
     assert root is not None
     opened = path.absolute()
-    drives = sorted(data.parents[1] for data in (root / SCANS).glob(f"*/{raw.DATA}")
-                    if opened in (*data.parents, root / SCANS))
+    drives = sorted(
+        data.parents[1] for data in (root / SCANS).glob(f"*/{raw.DATA}") if opened in (*data.parents, root / SCANS)
+    )
     frames, has_times = raw.make_frames(drives)
     if not frames:
         raise InputError(f"{path} has no KITTI-360 scans: expected {SCANS}/DRIVE/{raw.DATA}/*.bin")
@@ -57,12 +59,22 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     has_poses = has_calibration and any(_find_pose_file(root, name) for name in poses)
     calibration = cache(partial(_read_calibration, root)) if has_calibration else return_none
     image = "data_2d_raw/{}/image_00/data_rect/{}.png"
-    return Recording(path, "KITTI-360", [replace(
-        frame, calibration=calibration,
-        pose=partial(_get_pose, poses[frame.sequence], frame.index) if has_poses else return_none,
-        image=root / image.format(frame.sequence, frame.name.rpartition("/")[2]), files=())
-        for frame in frames], frozenset([CAMERA] * has_calibration + [POSES] * has_poses),
-        has_times=has_times)
+    return Recording(
+        path,
+        "KITTI-360",
+        [
+            replace(
+                frame,
+                calibration=calibration,
+                pose=partial(_get_pose, poses[frame.sequence], frame.index) if has_poses else return_none,
+                image=root / image.format(frame.sequence, frame.name.rpartition("/")[2]),
+                files=(),
+            )
+            for frame in frames
+        ],
+        frozenset([CAMERA] * has_calibration + [POSES] * has_poses),
+        has_times=has_times,
+    )
 
 
 def _read_calibration(root: Path) -> Calibration:
@@ -71,8 +83,7 @@ def _read_calibration(root: Path) -> Calibration:
     values = read_matrices(path)
     width, height = get_matrix(values, path, "S_rect_00", (2,)).astype(int).tolist()
     lidar_to_camera = _read_rectification(root) @ np.linalg.inv(_read_camera_to_lidar(root))
-    return Calibration(get_matrix(values, path, "P_rect_00", (3, 4)), lidar_to_camera, width,
-                       height)
+    return Calibration(get_matrix(values, path, "P_rect_00", (3, 4)), lidar_to_camera, width, height)
 
 
 def _read_rectification(root: Path) -> np.ndarray:
@@ -101,13 +112,16 @@ def _read_poses(root: Path, drive: str) -> dict[int, np.ndarray]:
     to_camera = np.linalg.inv(_read_camera_to_lidar(root))
     if path.name == POSE_FILES[0]:  # of the rectified camera
         rectify = _read_rectification(root)
-        return {int(row[0]): check_pose(row[1:].reshape(4, 4), path) @ rectify @ to_camera
-                for row in _read_rows(path, 17)}
+        return {
+            int(row[0]): check_pose(row[1:].reshape(4, 4), path) @ rectify @ to_camera for row in _read_rows(path, 17)
+        }
     mount = root / CALIBRATION / "calib_cam_to_pose.txt"
     camera_mount = get_matrix(read_matrices(mount), mount, "image_00", (3, 4))
     to_vehicle = check_pose(to_homogeneous(camera_mount), mount)
-    return {int(row[0]): check_pose(to_homogeneous(row[1:].reshape(3, 4)), path)
-            @ to_vehicle @ to_camera for row in _read_rows(path, 13)}
+    return {
+        int(row[0]): check_pose(to_homogeneous(row[1:].reshape(3, 4)), path) @ to_vehicle @ to_camera
+        for row in _read_rows(path, 13)
+    }
 
 
 def _get_pose(poses: Callable[[], dict[int, np.ndarray]], number: int) -> np.ndarray | None:

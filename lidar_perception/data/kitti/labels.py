@@ -19,8 +19,15 @@ from lidar_perception.types import CLASSES, MAX_NUMBER, GroundTruth, InputError,
 COLUMNS = ("truncated", "occluded", "alpha", "bbox", "dimensions", "location", "rotation_y")
 NAME_BY_TRACKING_NAME = {"Person": "Person_sitting"}  # names that the tracking benchmark changed
 # An unlabelled region: only its 2D box is known.
-DONT_CARE = {"track_id": -1, "truncated": -1.0, "occluded": -1, "alpha": -10.0,
-             "dimensions": [-1.0] * 3, "location": [-1000.0] * 3, "rotation_y": -10.0}
+DONT_CARE = {
+    "track_id": -1,
+    "truncated": -1.0,
+    "occluded": -1,
+    "alpha": -10.0,
+    "dimensions": [-1.0] * 3,
+    "location": [-1000.0] * 3,
+    "rotation_y": -10.0,
+}
 
 
 def read_object_labels(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
@@ -28,8 +35,7 @@ def read_object_labels(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
     return to_ground_truth([label for _, label in parse_lines(path)], lidar_to_camera)
 
 
-def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray,
-                         known_only: bool = False) -> dict[int, GroundTruth]:
+def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray, known_only: bool = False) -> dict[int, GroundTruth]:
     """Read the objects of a label_02 file by frame number; frames without objects are left out."""
     frames: dict[int, list[dict]] = {}
     for _, frame, label in parse_tracking_lines(path, known_only):
@@ -56,8 +62,7 @@ def parse_tracking_lines(path: Path, known_only: bool = False) -> list[tuple[int
     for i, line in _read_lines(path):
         try:
             frame, track, rest = line.split(maxsplit=2)
-            labels.append((i, int(frame), dict(parse_label(rest, path, i, known_only),
-                                               track_id=int(track))))
+            labels.append((i, int(frame), dict(parse_label(rest, path, i, known_only), track_id=int(track))))
         except ValueError as error:
             if isinstance(error, InputError):
                 raise
@@ -65,8 +70,7 @@ def parse_tracking_lines(path: Path, known_only: bool = False) -> list[tuple[int
     return labels
 
 
-def parse_label(line: str, path: Path | str = "label", number: int = 0,
-                known_only: bool = False) -> dict:
+def parse_label(line: str, path: Path | str = "label", number: int = 0, known_only: bool = False) -> dict:
     """Parse a label line to a dict of class, COLUMNS, and score if the line has one.
 
     The class is the name in CLASSES, ignoring case as KITTI's own program does, else the text of
@@ -80,15 +84,22 @@ def parse_label(line: str, path: Path | str = "label", number: int = 0,
         if len(numbers) not in (14, 15) or not all(abs(n) <= MAX_NUMBER for n in numbers):
             raise ValueError
     except ValueError:
-        raise InputError(f"{path}:{number} is not a KITTI label (a class and 14 or 15 numbers): "
-                         f"{line[:200]!r}") from None
+        raise InputError(
+            f"{path}:{number} is not a KITTI label (a class and 14 or 15 numbers): {line[:200]!r}"
+        ) from None
     name = NAME_BY_TRACKING_NAME.get(text) or class_name(text)
     if name not in CLASSES and known_only:
-        raise InputError(f"{path}:{number} has the unknown class {text!r}; known classes: "
-                         f"{', '.join(CLASSES)}")
-    label = {"class": name, "truncated": numbers[0], "occluded": int(numbers[1]),
-             "alpha": numbers[2], "bbox": numbers[3:7], "dimensions": numbers[7:10],
-             "location": numbers[10:13], "rotation_y": numbers[13]}
+        raise InputError(f"{path}:{number} has the unknown class {text!r}; known classes: {', '.join(CLASSES)}")
+    label = {
+        "class": name,
+        "truncated": numbers[0],
+        "occluded": int(numbers[1]),
+        "alpha": numbers[2],
+        "bbox": numbers[3:7],
+        "dimensions": numbers[7:10],
+        "location": numbers[10:13],
+        "rotation_y": numbers[13],
+    }
     if len(numbers) == 15:
         label["score"] = numbers[14]
     return label
@@ -143,9 +154,13 @@ def to_labels(truth: GroundTruth, lidar_to_camera: np.ndarray) -> list[dict]:
     """
     labels = []
     for box, name, extra in zip(truth.boxes, truth.labels, truth.extras):
-        labels.append({"class": extra.get("class_name", name),
-                       **to_camera_box(box, lidar_to_camera),
-                       **{key: value for key, value in extra.items() if key != "class_name"}})
+        labels.append(
+            {
+                "class": extra.get("class_name", name),
+                **to_camera_box(box, lidar_to_camera),
+                **{key: value for key, value in extra.items() if key != "class_name"},
+            }
+        )
     return labels + [{"class": name, **extra} for name, extra in truth.notes]
 
 
@@ -160,14 +175,22 @@ def to_camera_box(box: np.ndarray, lidar_to_camera: np.ndarray) -> dict:
     # The rotation about the camera's y axis that has this yaw in the LiDAR frame; the vertical axes
     # of camera and LiDAR are not parallel.
     right, ahead = lidar_to_camera[0, :2], lidar_to_camera[2, :2]
-    rotation = float(np.arctan2(right[1] * np.cos(yaw) - right[0] * np.sin(yaw),
-                                ahead[1] * np.cos(yaw) - ahead[0] * np.sin(yaw)))
+    rotation = float(
+        np.arctan2(right[1] * np.cos(yaw) - right[0] * np.sin(yaw), ahead[1] * np.cos(yaw) - ahead[0] * np.sin(yaw))
+    )
     if (np.cos(rotation) * right - np.sin(rotation) * ahead) @ [np.cos(yaw), np.sin(yaw)] < 0:
         rotation = float(wrap_angle(rotation + np.pi))
     location = [float(centre[0]), float(centre[1] + h / 2), float(centre[2])]
     alpha = float(wrap_angle(rotation - np.arctan2(location[0], location[2])))
-    return {"truncated": 0.0, "occluded": 0, "alpha": alpha, "bbox": [0.0] * 4,
-            "dimensions": [h, w, length], "location": location, "rotation_y": rotation}
+    return {
+        "truncated": 0.0,
+        "occluded": 0,
+        "alpha": alpha,
+        "bbox": [0.0] * 4,
+        "dimensions": [h, w, length],
+        "location": location,
+        "rotation_y": rotation,
+    }
 
 
 def format_label(label: dict, decimals: int = 2, whole: bool = True) -> str:
@@ -176,12 +199,14 @@ def format_label(label: dict, decimals: int = 2, whole: bool = True) -> str:
     With `whole`, the -1, -10 and -1000 of DontCare are written as integers, as in the object
     layout.
     """
-    numbers = [label["alpha"], *label["bbox"], *label["dimensions"], *label["location"],
-               label["rotation_y"]] + ([label["score"]] if "score" in label else [])
+    numbers = [label["alpha"], *label["bbox"], *label["dimensions"], *label["location"], label["rotation_y"]] + (
+        [label["score"]] if "score" in label else []
+    )
     words = [label["class"], label["truncated"], str(label["occluded"]), *numbers]
     if label["class"] == "DontCare" and whole:
-        return " ".join(f"{w:g}" if w in (-1, -10, -1000) else f"{w:.{decimals}f}"
-                        if isinstance(w, float) else w for w in words)
+        return " ".join(
+            f"{w:g}" if w in (-1, -10, -1000) else f"{w:.{decimals}f}" if isinstance(w, float) else w for w in words
+        )
     return " ".join(f"{w:.{decimals}f}" if isinstance(w, float) else w for w in words)
 
 
@@ -220,8 +245,9 @@ def read_tracklets(path: Path) -> dict[int, GroundTruth]:
 
 def _to_tracklet_truth(rows: list, notes: list) -> GroundTruth:
     boxes, texts, extras = (list(column) for column in zip(*rows)) if rows else ([], [], [])
-    extras = [extra if class_name(text) in CLASSES else {**extra, "class_name": text}
-              for text, extra in zip(texts, extras)]
+    extras = [
+        extra if class_name(text) in CLASSES else {**extra, "class_name": text} for text, extra in zip(texts, extras)
+    ]
     return GroundTruth.of(boxes, class_ids(texts), extras, notes)
 
 

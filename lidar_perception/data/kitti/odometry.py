@@ -36,12 +36,14 @@ def is_layout(path: Path) -> bool:
     """Return True for a folder with sequences/ or dataset/sequences/, for sequences/, and for a
     sequence."""
     return any((path / folder).is_dir() for folder in ("sequences", "dataset/sequences")) or any(
-        map(_is_sequence, (path, *path.glob("*/"))))
+        map(_is_sequence, (path, *path.glob("*/")))
+    )
 
 
 def _is_sequence(path: Path) -> bool:
     return (path / "velodyne").is_dir() and (
-        (path / "labels").is_dir() or any((path / name).is_file() for name in FILES))
+        (path / "labels").is_dir() or any((path / name).is_file() for name in FILES)
+    )
 
 
 def list_sequences(path: Path) -> list[Path]:
@@ -60,12 +62,15 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     """
     sequences = [s for s in list_sequences(path) if any(s.glob("velodyne/*.bin"))]
     if not sequences:
-        raise InputError(f"{path} has no scans of KITTI odometry or SemanticKITTI: expected "
-                         "sequences/00/velodyne/*.bin")
+        raise InputError(
+            f"{path} has no scans of KITTI odometry or SemanticKITTI: expected sequences/00/velodyne/*.bin"
+        )
     if not any(map(_is_sequence, sequences)):
-        raise InputError(f"{path} has scans but no labels: expected sequences/00/labels/*.label of "
-                         "SemanticKITTI, or calib.txt and times.txt of KITTI odometry; download "
-                         "them too")
+        raise InputError(
+            f"{path} has scans but no labels: expected sequences/00/labels/*.label of "
+            "SemanticKITTI, or calib.txt and times.txt of KITTI odometry; download "
+            "them too"
+        )
     frames, has_times = make_frames(sequences)
     has = {POSES} if any(find_pose_file(s) for s in sequences) else set()
     if any((s / CALIBRATION).is_file() for s in sequences):
@@ -89,23 +94,34 @@ def make_frames(sequences: list[Path]) -> tuple[list[Frame], bool]:
         has_times = has_times and bool(times)
         poses, calib = cache(partial(_read_poses, sequence)), sequence / CALIBRATION
         image = sequence / "image_2"
-        calibration = cache(partial(
-            read_odometry_calibration, calib, image / f"{files[0].stem}.png")
-        ) if calib.is_file() else return_none
+        calibration = (
+            cache(partial(read_odometry_calibration, calib, image / f"{files[0].stem}.png"))
+            if calib.is_file()
+            else return_none
+        )
         if times and times[0] > SINCE_1970 * 10**9:
             start = 0
         for scan in files:
             number = parse_scan_number(scan)
             if times and number >= len(times):
-                raise InputError(f"{sequence / TIMES} has only {len(times)} lines, but there is a "
-                                 f"scan {number}; download it again")
-            stamp = start + (times[number] if times else
-                             (number - parse_scan_number(files[0])) * PERIOD_NS)
-            frames.append(Frame(
-                f"{sequence.name}/{scan.stem}", stamp, partial(load_velodyne, scan, stamp, scale),
-                calibration=calibration, pose=partial(_parse_pose, poses, number),
-                sequence=sequence.name, index=number, points=scan,
-                image=image / f"{scan.stem}.png", intensity_max=scale))
+                raise InputError(
+                    f"{sequence / TIMES} has only {len(times)} lines, but there is a scan {number}; download it again"
+                )
+            stamp = start + (times[number] if times else (number - parse_scan_number(files[0])) * PERIOD_NS)
+            frames.append(
+                Frame(
+                    f"{sequence.name}/{scan.stem}",
+                    stamp,
+                    partial(load_velodyne, scan, stamp, scale),
+                    calibration=calibration,
+                    pose=partial(_parse_pose, poses, number),
+                    sequence=sequence.name,
+                    index=number,
+                    points=scan,
+                    image=image / f"{scan.stem}.png",
+                    intensity_max=scale,
+                )
+            )
     return frames, has_times
 
 
@@ -116,8 +132,7 @@ def _read_times(path: Path) -> list[int]:
     try:
         return [int(Decimal(word) * 10**9) for word in read_text(path, what="the times").split()]
     except (InvalidOperation, ValueError, OverflowError):
-        raise InputError(f"{path} has a line that is not a number of seconds; download it again"
-                         ) from None
+        raise InputError(f"{path} has a line that is not a number of seconds; download it again") from None
 
 
 def find_pose_file(sequence: Path) -> Path | None:
@@ -141,8 +156,7 @@ def _read_poses(sequence: Path) -> tuple[np.ndarray, Path, list[str]] | None:
     return check_pose(to_camera, calibration), poses, lines
 
 
-def _parse_pose(poses: Callable[[], tuple[np.ndarray, Path, list[str]] | None],
-                i: int) -> np.ndarray | None:
+def _parse_pose(poses: Callable[[], tuple[np.ndarray, Path, list[str]] | None], i: int) -> np.ndarray | None:
     """Return the pose (4, 4) of scan i in the frame of scan 0; None without poses.
 
     Line i of the file has the pose of the camera. Raises InputError if it is missing or invalid.

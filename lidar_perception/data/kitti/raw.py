@@ -12,12 +12,7 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from lidar_perception.data.cloud_files import (
-    SUFFIXES,
-    is_cloud,
-    load_points,
-    make_cloud_scale_reader,
-)
+from lidar_perception.data.cloud_files import SUFFIXES, is_cloud, load_points, make_cloud_scale_reader
 from lidar_perception.data.frame import BOXES, CAMERA, Frame, Recording, return_none
 from lidar_perception.data.kitti.calibration import RAW_CALIB, read_raw_calibration
 from lidar_perception.data.kitti.folder import (
@@ -50,27 +45,36 @@ def list_drives(path: Path) -> list[Path]:
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
     """Open the drives in order of time; only the file lists and time stamps are read."""
     drives = list_drives(path.absolute())
-    with_camera = {drive: any((drive.parent / name).exists() for name in RAW_CALIB)
-                   for drive in drives}
+    with_camera = {drive: any((drive.parent / name).exists() for name in RAW_CALIB) for drive in drives}
     # A drive with a calibration is KITTI's, and has time stamps.
     frames, has_times = make_frames(drives, need_stamps=with_camera)
     if not frames:
         raise InputError(f"{path} has no KITTI scans: expected DATE/DRIVE_sync/{DATA}/*.bin")
     labels = {drive: make_truth_reader(drive / TRACKLETS, read_tracklets) for drive in drives}
-    calibrations = {drive: functools.cache(partial(read_raw_calibration, drive.parent))
-                    if with_camera[drive] else return_none for drive in drives}
-    frames = [replace(frame, truth=partial(labels[frame.native], frame.index),
-                      calibration=calibrations[frame.native],
-                      files=(*frame.files, frame.native / TRACKLETS,
-                             *(frame.native.parent / name for name in RAW_CALIB)))
-              for frame in frames]
+    calibrations = {
+        drive: functools.cache(partial(read_raw_calibration, drive.parent)) if with_camera[drive] else return_none
+        for drive in drives
+    }
+    frames = [
+        replace(
+            frame,
+            truth=partial(labels[frame.native], frame.index),
+            calibration=calibrations[frame.native],
+            files=(*frame.files, frame.native / TRACKLETS, *(frame.native.parent / name for name in RAW_CALIB)),
+        )
+        for frame in frames
+    ]
     has_labels = any((drive / TRACKLETS).exists() for drive in drives)
-    return Recording(path, "KITTI raw drives", frames, frozenset(
-        [CAMERA] * any(with_camera.values()) + [BOXES] * has_labels), has_times=has_times)
+    return Recording(
+        path,
+        "KITTI raw drives",
+        frames,
+        frozenset([CAMERA] * any(with_camera.values()) + [BOXES] * has_labels),
+        has_times=has_times,
+    )
 
 
-def make_frames(drives: Sequence[Path], need_stamps: dict[Path, bool] | None = None
-                ) -> tuple[list[Frame], bool]:
+def make_frames(drives: Sequence[Path], need_stamps: dict[Path, bool] | None = None) -> tuple[list[Frame], bool]:
     """Make the frames of drives with scans in DATA, in order of time, without labels and camera.
 
     Args:
@@ -94,18 +98,31 @@ def make_frames(drives: Sequence[Path], need_stamps: dict[Path, bool] | None = N
         start = frames[-1].stamp_ns + GAP_NS if frames else START_NS
         for i, (file, number) in enumerate(zip(scans, numbers)):
             stamp = stamps[i] if stamps else start + (number - numbers[0]) * PERIOD_NS
-            frames.append(Frame(
-                f"{drive.name}/{file.stem}", stamp, partial(load_scan, file, stamp, scale),
-                sequence=drive.name, index=number, points=file,
-                image=drive / f"image_02/data/{file.stem}.png", files=(file,), native=drive,
-                intensity_max=scale))
+            frames.append(
+                Frame(
+                    f"{drive.name}/{file.stem}",
+                    stamp,
+                    partial(load_scan, file, stamp, scale),
+                    sequence=drive.name,
+                    index=number,
+                    points=file,
+                    image=drive / f"image_02/data/{file.stem}.png",
+                    files=(file,),
+                    native=drive,
+                    intensity_max=scale,
+                )
+            )
     return sorted(frames, key=lambda frame: frame.stamp_ns), has_times
 
 
 def list_scans(drive: Path) -> list[Path]:
     """Return the scans of a drive by name, one of each name if there are several suffixes."""
-    files = {file.stem: file for suffix in SUFFIXES for file in (drive / DATA).glob("*")
-             if file.suffix.lower() == suffix and is_cloud(file)}
+    files = {
+        file.stem: file
+        for suffix in SUFFIXES
+        for file in (drive / DATA).glob("*")
+        if file.suffix.lower() == suffix and is_cloud(file)
+    }
     return [file for _, file in sorted(files.items())]
 
 
@@ -131,13 +148,15 @@ def read_frame_list(path: Path) -> dict[str, int]:
 
     Raises InputError if a line has another format.
     """
-    rows = [line.split(maxsplit=1) for line in read_text(path, what="the list").splitlines()
-            if line.strip() and not line.startswith("#")]
+    rows = [
+        line.split(maxsplit=1)
+        for line in read_text(path, what="the list").splitlines()
+        if line.strip() and not line.startswith("#")
+    ]
     try:
         return {Path(name.strip()).name: int(number) for number, name in rows}
     except ValueError as error:
-        raise InputError(f"{path} has a line other than NUMBER NAME ({error}); export the drive "
-                         "again") from None
+        raise InputError(f"{path} has a line other than NUMBER NAME ({error}); export the drive again") from None
 
 
 def _read_stamps(drive: Path, numbers: Sequence[int], required: bool) -> list[int]:
@@ -161,8 +180,7 @@ def _read_stamps(drive: Path, numbers: Sequence[int], required: bool) -> list[in
         stamp_lines = [lines[number] for number in numbers]
     elif len(stamp_lines) != len(numbers):
         missing = next(n for n in numbers if not (0 <= n < len(lines) and lines[n]))
-        raise InputError(f"{path} has {len(lines)} lines, but none for scan {missing}; download "
-                         "the drive again")
+        raise InputError(f"{path} has {len(lines)} lines, but none for scan {missing}; download the drive again")
     try:
         return [_parse_stamp(line) for line in stamp_lines]
     except ValueError as error:

@@ -25,8 +25,7 @@ DECIMALS = 6  # with fewer, the order of weak scores and overlaps would change
 
 def find_result_folder(folder: Path) -> Path:
     """Return the folder of result files: `folder`, or its kitti/ if it is a run of `detect`."""
-    return folder / FOLDER if (folder / journal.JOURNAL_NAME).is_file() and (
-        folder / FOLDER).is_dir() else folder
+    return folder / FOLDER if (folder / journal.JOURNAL_NAME).is_file() and (folder / FOLDER).is_dir() else folder
 
 
 def choose_calibration(frame: Frame) -> tuple[Calibration, bool]:
@@ -49,13 +48,14 @@ def read_results(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
         InputError: the file is missing, or a line is not a result.
     """
     if not path.exists():
-        raise InputError(f"the result file {path} does not exist; a frame without detections needs "
-                         "an empty file, and --split selects the frames to score")
+        raise InputError(
+            f"the result file {path} does not exist; a frame without detections needs "
+            "an empty file, and --split selects the frames to score"
+        )
     labels = []
     for number, label in parse_lines(path, known_only=True):
         if "score" not in label:
-            raise InputError(f"{path}:{number} is not a result: the score, the 15th number after "
-                             "the class, is missing")
+            raise InputError(f"{path}:{number} is not a result: the score, the 15th number after the class, is missing")
         labels.append(label)
     return to_ground_truth(labels, lidar_to_camera)
 
@@ -65,12 +65,14 @@ def write_results(path: Path, detections: Detections, calibration: Calibration) 
 
     Truncation and occlusion are -1. The 2D box is projected, and 0 outside the image.
     """
-    write_text(path, "".join(format_label(label, DECIMALS) + "\n"
-                             for label in _to_result_labels(detections, calibration)))
+    write_text(
+        path, "".join(format_label(label, DECIMALS) + "\n" for label in _to_result_labels(detections, calibration))
+    )
 
 
-def write_tracking_results(path: Path, frames: Iterable[tuple[int, np.ndarray, Detections]],
-                           calibration: Calibration) -> None:
+def write_tracking_results(
+    path: Path, frames: Iterable[tuple[int, np.ndarray, Detections]], calibration: Calibration
+) -> None:
     """Write the result file of one sequence of the tracking benchmark.
 
     Args:
@@ -81,14 +83,17 @@ def write_tracking_results(path: Path, frames: Iterable[tuple[int, np.ndarray, D
     """
     lines = []
     for number, ids, detections in frames:
-        lines += [format_tracking_line(number, int(track), label)
-                  for track, label in zip(ids, _to_result_labels(detections, calibration))]
+        lines += [
+            format_tracking_line(number, int(track), label)
+            for track, label in zip(ids, _to_result_labels(detections, calibration))
+        ]
     write_text(path, "".join(lines))
 
 
 def _to_result_labels(detections: Detections, calibration: Calibration) -> list[dict]:
     pixels = np.nan_to_num(project_boxes(detections.boxes, calibration)[0])
-    extras = [{"score": float(score), "bbox": box.tolist(), "truncated": "-1", "occluded": -1}
-              for score, box in zip(detections.scores, pixels)]
-    return to_labels(GroundTruth.of(detections.boxes, detections.class_ids, extras),
-                     calibration.lidar_to_camera)
+    extras = [
+        {"score": float(score), "bbox": box.tolist(), "truncated": "-1", "occluded": -1}
+        for score, box in zip(detections.scores, pixels)
+    ]
+    return to_labels(GroundTruth.of(detections.boxes, detections.class_ids, extras), calibration.lidar_to_camera)

@@ -19,18 +19,16 @@ from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import GroundTruth
 
 MIN_DEPTH_M = 0.1  # from the camera, of points in the image
-MIN_PIXELS = 2     # width and height of the smallest 2D box
+MIN_PIXELS = 2  # width and height of the smallest 2D box
 TRACKING_NAME_BY_NAME = {name: alias for alias, name in NAME_BY_TRACKING_NAME.items()}
 
 # The twelve edges of box_corners: bottom, top, vertical.
-EDGES = np.array([(i + up, (i + 1) % 4 + up) for up in (0, 4) for i in range(4)]
-                 + [(i, i + 4) for i in range(4)])
+EDGES = np.array([(i + up, (i + 1) % 4 + up) for up in (0, 4) for i in range(4)] + [(i, i + 4) for i in range(4)])
 # The IMU of KITTI's car, 0.81 m behind the LiDAR; calibration files must have it.
 IMU_TO_LIDAR = np.column_stack([np.eye(3), [-0.81, 0.32, -0.80]])
 
 
-def project_boxes(boxes: np.ndarray,
-                  calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
+def project_boxes(boxes: np.ndarray, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
     """Project LiDAR boxes (K, 7) to 2D boxes.
 
     Returns:
@@ -63,15 +61,13 @@ def keep_visible_objects(truth: GroundTruth, calibration: Calibration) -> Ground
     """Return the objects that are partly in the image, with bbox and truncated as in KITTI."""
     boxes, outside = project_boxes(truth.boxes, calibration)
     visible = np.flatnonzero(np.isfinite(boxes[:, 0]))
-    extras = [dict(truth.extras[i], bbox=boxes[i].tolist(), truncated=float(outside[i]))
-              for i in visible]
+    extras = [dict(truth.extras[i], bbox=boxes[i].tolist(), truncated=float(outside[i])) for i in visible]
     return GroundTruth.of(truth.boxes[visible], truth.class_ids[visible], extras)
 
 
 def format_object_labels(truth: GroundTruth, calibration: Calibration) -> str:
     """Return the text of a label_2 file, with two decimals."""
-    return "".join(f"{format_label(label)}\n"
-                   for label in to_labels(truth, calibration.lidar_to_camera))
+    return "".join(f"{format_label(label)}\n" for label in to_labels(truth, calibration.lidar_to_camera))
 
 
 def format_tracking_labels(number: int, truth: GroundTruth, calibration: Calibration) -> str:
@@ -79,9 +75,12 @@ def format_tracking_labels(number: int, truth: GroundTruth, calibration: Calibra
 
     Truncation is a level here: 0, 1 or 2 for a share of about none, half or all.
     """
-    return "".join(format_tracking_line(number, label["track_id"], {
-        **label, "truncated": str(max(-1, round(2 * label["truncated"])))})
-        for label in to_labels(truth, calibration.lidar_to_camera))
+    return "".join(
+        format_tracking_line(
+            number, label["track_id"], {**label, "truncated": str(max(-1, round(2 * label["truncated"])))}
+        )
+        for label in to_labels(truth, calibration.lidar_to_camera)
+    )
 
 
 def format_tracking_line(number: int, track: int, label: dict) -> str:
@@ -92,9 +91,12 @@ def format_tracking_line(number: int, track: int, label: dict) -> str:
 
 def format_calibration(calibration: Calibration) -> str:
     """Return the text of a calib file, with four identical rectified cameras."""
-    matrices = {**{f"P{i}": calibration.intrinsics for i in range(4)}, "R0_rect": np.eye(3),
-                "Tr_velo_to_cam": calibration.lidar_to_camera[:3],
-                "Tr_imu_to_velo": IMU_TO_LIDAR}
+    matrices = {
+        **{f"P{i}": calibration.intrinsics for i in range(4)},
+        "R0_rect": np.eye(3),
+        "Tr_velo_to_cam": calibration.lidar_to_camera[:3],
+        "Tr_imu_to_velo": IMU_TO_LIDAR,
+    }
     return "".join(f"{name}: {format_numbers(matrix)}\n" for name, matrix in matrices.items())
 
 
@@ -108,14 +110,12 @@ def write_velodyne(path: Path, cloud: np.ndarray) -> None:
     write_bytes(path, np.ascontiguousarray(cloud, np.float32).tobytes())
 
 
-def write_object(root: Path, number: int, cloud: np.ndarray, truth: GroundTruth,
-                 calibration: Calibration) -> None:
+def write_object(root: Path, number: int, cloud: np.ndarray, truth: GroundTruth, calibration: Calibration) -> None:
     """Write velodyne, calib and label_2 of one frame of an object data set to root/training."""
     write_object_text(root, number, cloud, format_object_labels(truth, calibration), calibration)
 
 
-def write_object_text(root: Path, number: int, cloud: np.ndarray, labels: str,
-                      calibration: Calibration) -> None:
+def write_object_text(root: Path, number: int, cloud: np.ndarray, labels: str, calibration: Calibration) -> None:
     """Write the same as write_object, with the given text of the label_2 file."""
     folder, name = root / "training", f"{number:06}"
     write_velodyne(folder / f"velodyne/{name}.bin", cloud)

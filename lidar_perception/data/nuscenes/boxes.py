@@ -14,20 +14,45 @@ from scipy.spatial.transform import Rotation
 from lidar_perception.types import MAX_NUMBER
 
 # The ten classes of the detection task.
-NAMES = ("car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle",
-         "bicycle", "traffic_cone", "barrier")
+NAMES = (
+    "car",
+    "truck",
+    "bus",
+    "trailer",
+    "construction_vehicle",
+    "pedestrian",
+    "motorcycle",
+    "bicycle",
+    "traffic_cone",
+    "barrier",
+)
 # Class of the categories of labels; other categories, such as animals, have none.
 CATEGORIES = {
-    "vehicle.car": "car", "vehicle.truck": "truck", "vehicle.bus.bendy": "bus",
-    "vehicle.bus.rigid": "bus", "vehicle.trailer": "trailer",
-    "vehicle.construction": "construction_vehicle", "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian", "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian", "vehicle.motorcycle": "motorcycle",
-    "vehicle.bicycle": "bicycle", "movable_object.trafficcone": "traffic_cone",
-    "movable_object.barrier": "barrier"}
-ATTRIBUTES = ("pedestrian.moving", "pedestrian.sitting_lying_down", "pedestrian.standing",
-              "cycle.with_rider", "cycle.without_rider", "vehicle.moving", "vehicle.parked",
-              "vehicle.stopped")
+    "vehicle.car": "car",
+    "vehicle.truck": "truck",
+    "vehicle.bus.bendy": "bus",
+    "vehicle.bus.rigid": "bus",
+    "vehicle.trailer": "trailer",
+    "vehicle.construction": "construction_vehicle",
+    "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian",
+    "vehicle.motorcycle": "motorcycle",
+    "vehicle.bicycle": "bicycle",
+    "movable_object.trafficcone": "traffic_cone",
+    "movable_object.barrier": "barrier",
+}
+ATTRIBUTES = (
+    "pedestrian.moving",
+    "pedestrian.sitting_lying_down",
+    "pedestrian.standing",
+    "cycle.with_rider",
+    "cycle.without_rider",
+    "vehicle.moving",
+    "vehicle.parked",
+    "vehicle.stopped",
+)
 WITH_RIDER = ATTRIBUTES.index("cycle.with_rider")
 
 
@@ -57,8 +82,9 @@ class GlobalBoxes:
     points: np.ndarray
 
     @staticmethod
-    def of(centres, sizes, rotations, class_ids, attributes=-1, velocities=np.nan, scores=0.0,
-           points=-1) -> GlobalBoxes:
+    def of(
+        centres, sizes, rotations, class_ids, attributes=-1, velocities=np.nan, scores=0.0, points=-1
+    ) -> GlobalBoxes:
         """Make boxes with the right dtypes and shapes; columns with a default may be scalars."""
         centres = np.asarray(centres, np.float64).reshape(-1, 3)
         count = len(centres)
@@ -66,11 +92,16 @@ class GlobalBoxes:
         def column(values, kind, *shape):
             return np.broadcast_to(np.asarray(values, kind), (count, *shape)).copy()
 
-        return GlobalBoxes(centres, np.asarray(sizes, np.float64).reshape(count, 3),
-                           np.asarray(rotations, np.float64).reshape(count, 4),
-                           column(class_ids, np.int32), column(attributes, np.int32),
-                           column(velocities, np.float64, 2), column(scores, np.float64),
-                           column(points, np.int32))
+        return GlobalBoxes(
+            centres,
+            np.asarray(sizes, np.float64).reshape(count, 3),
+            np.asarray(rotations, np.float64).reshape(count, 4),
+            column(class_ids, np.int32),
+            column(attributes, np.int32),
+            column(velocities, np.float64, 2),
+            column(scores, np.float64),
+            column(points, np.int32),
+        )
 
     @staticmethod
     def none() -> GlobalBoxes:
@@ -79,16 +110,19 @@ class GlobalBoxes:
     @staticmethod
     def concatenate(parts: list[GlobalBoxes]) -> GlobalBoxes:
         parts = parts or [GlobalBoxes.none()]
-        return GlobalBoxes(*(np.concatenate([getattr(part, field.name) for part in parts])
-                             for field in dataclasses.fields(GlobalBoxes)))
+        return GlobalBoxes(
+            *(
+                np.concatenate([getattr(part, field.name) for part in parts])
+                for field in dataclasses.fields(GlobalBoxes)
+            )
+        )
 
     def __len__(self) -> int:
         return len(self.centres)
 
     def __getitem__(self, index) -> GlobalBoxes:
         """Return the boxes under a mask, slice or index array."""
-        return GlobalBoxes(*(getattr(self, field.name)[index]
-                             for field in dataclasses.fields(self)))
+        return GlobalBoxes(*(getattr(self, field.name)[index] for field in dataclasses.fields(self)))
 
     @property
     def yaws(self) -> np.ndarray:
@@ -139,8 +173,7 @@ def are_tilted(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
     return alignment < (1 - 1e-12) * np.linalg.norm(boxes.rotations, axis=1)
 
 
-def to_global_boxes(boxes: np.ndarray,
-                    pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def to_global_boxes(boxes: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Transform boxes (K, 7) to the global frame, the inverse of to_local_boxes.
 
     Returns:
@@ -150,5 +183,8 @@ def to_global_boxes(boxes: np.ndarray,
     yaw, zero = boxes[:, 6], np.zeros(len(boxes))
     cos, sin = np.cos(yaw), np.sin(yaw)
     upright = np.stack([cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1], axis=1)
-    return (boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3], boxes[:, 3:6].copy(),
-            to_quaternions(pose[:3, :3] @ upright.reshape(-1, 3, 3)))
+    return (
+        boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3],
+        boxes[:, 3:6].copy(),
+        to_quaternions(pose[:3, :3] @ upright.reshape(-1, 3, 3)),
+    )

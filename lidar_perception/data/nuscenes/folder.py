@@ -26,8 +26,8 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 
 CHANNEL = "LIDAR_TOP"
 SWEEP = "x y z intensity ring"  # of a .pcd.bin file, float32
-EGO_RADIUS_M = 1.0      # points nearer than this in both x and y are on the vehicle itself
-FULL_REFLECTION = 255   # intensity
+EGO_RADIUS_M = 1.0  # points nearer than this in both x and y are on the vehicle itself
+FULL_REFLECTION = 255  # intensity
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +56,7 @@ def load_sweep(path: Path, rotation: np.ndarray, stamp_ns: int) -> PointCloud:
     off_vehicle = (np.abs(cloud[:, :2]) >= EGO_RADIUS_M).any(axis=1)
     cloud = cloud.compress(off_vehicle & usable_returns(cloud[:, :3]), axis=0)
     xyz = (cloud[:, :3].astype(np.float64) @ rotation.T).astype(np.float32)
-    return PointCloud(np.ascontiguousarray(xyz), to_unit(cloud[:, 3], FULL_REFLECTION),
-                      stamp_ns, LIDAR_FRAME)
+    return PointCloud(np.ascontiguousarray(xyz), to_unit(cloud[:, 3], FULL_REFLECTION), stamp_ns, LIDAR_FRAME)
 
 
 def _read_truth(key: KeyFrame) -> GroundTruth | None:
@@ -77,12 +76,15 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     else:
         root, (version, *others) = path, _list_versions(path)
         if others:
-            raise InputError(f"{path} has several versions; give one of them: " + ", ".join(
-                str(path / name) for name in (version, *others)))
+            raise InputError(
+                f"{path} has several versions; give one of them: "
+                + ", ".join(str(path / name) for name in (version, *others))
+            )
     frames = open_nuscenes(root, version)
     has_labels = (root / version / "sample_annotation.json").is_file()
-    return Recording(path, f"nuScenes {version}", frames,
-                     frozenset({POSES} | ({BOXES} if has_labels else set())), has_times=True)
+    return Recording(
+        path, f"nuScenes {version}", frames, frozenset({POSES} | ({BOXES} if has_labels else set())), has_times=True
+    )
 
 
 def _list_versions(root: Path) -> list[str]:
@@ -97,8 +99,11 @@ def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
     tables = Tables(root, version)
     names = dict(tables.rows("scene", "token", "name"))
     rank = {name: i for i, name in enumerate(names.values())}
-    samples = sorted((rank[names[scene]], time, token) for token, time, scene in tables.rows(
-        "sample", "token", "timestamp", "scene_token") if names.get(scene) in rank)
+    samples = sorted(
+        (rank[names[scene]], time, token)
+        for token, time, scene in tables.rows("sample", "token", "timestamp", "scene_token")
+        if names.get(scene) in rank
+    )
     if not samples:
         raise InputError(f"{tables.folder} has no key frames; download it again")
     scene_names, times = list(rank), {token: time for _, time, token in samples}
@@ -108,21 +113,27 @@ def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
     mounts = _read_poses(tables, "calibrated_sensor", {mount for _, _, _, mount in sweeps.values()})
     poses = _read_poses(tables, "ego_pose", {pose for _, _, pose, _ in sweeps.values()})
     all_labels = functools.cache(partial(read_labels, tables, times))
-    label_files = tuple(tables.path(name) for name in (
-        "sample_annotation", "calibrated_sensor", "ego_pose"))
+    label_files = tuple(tables.path(name) for name in ("sample_annotation", "calibrated_sensor", "ego_pose"))
     frames, counts = [], dict.fromkeys(rank.values(), 0)
     for number, (scene, _, token) in enumerate(samples):
         file, time, pose, mount = sweeps[token]
         sensor_pose, rotation = _make_sensor_pose(poses[pose], mounts[mount]), mounts[mount][:3, :3]
-        key = KeyFrame(token, sensor_pose, poses[pose][:3, 3],
-                       partial(_get_frame_labels, all_labels, number))
-        frames.append(Frame(
-            f"{scene_names[scene]}/{counts[scene]:02}", time * 1000,
-            partial(load_sweep, tables.root / file, rotation, time * 1000),
-            partial(_read_truth, key),
-            pose=sensor_pose.copy, sequence=scene_names[scene], index=counts[scene],
-            sensor_height=float(mounts[mount][2, 3]), points=tables.root / file,
-            files=(tables.root / file, *label_files), native=key))
+        key = KeyFrame(token, sensor_pose, poses[pose][:3, 3], partial(_get_frame_labels, all_labels, number))
+        frames.append(
+            Frame(
+                f"{scene_names[scene]}/{counts[scene]:02}",
+                time * 1000,
+                partial(load_sweep, tables.root / file, rotation, time * 1000),
+                partial(_read_truth, key),
+                pose=sensor_pose.copy,
+                sequence=scene_names[scene],
+                index=counts[scene],
+                sensor_height=float(mounts[mount][2, 3]),
+                points=tables.root / file,
+                files=(tables.root / file, *label_files),
+                native=key,
+            )
+        )
         counts[scene] += 1
     return frames
 
@@ -142,27 +153,36 @@ def _make_sensor_pose(ego: np.ndarray, mount: np.ndarray) -> np.ndarray:
 def _read_sweeps(tables: Tables, times: dict[str, int]) -> dict[str, tuple[str, int, str, str]]:
     """Return file, time in us, ego pose token and calibration token of the sweep of each key
     frame."""
-    sensors = {token for token, channel in tables.rows("sensor", "token", "channel")
-               if channel == CHANNEL}
-    mounts = {token for token, sensor in tables.rows("calibrated_sensor", "token", "sensor_token")
-              if sensor in sensors}
-    sweeps = {sample: (file, time, pose, mount) for sample, key, file, time, pose, mount
-              in tables.rows("sample_data", "sample_token", "is_key_frame", "filename", "timestamp",
-                             "ego_pose_token", "calibrated_sensor_token")
-              if key and mount in mounts and sample in times}
+    sensors = {token for token, channel in tables.rows("sensor", "token", "channel") if channel == CHANNEL}
+    mounts = {token for token, sensor in tables.rows("calibrated_sensor", "token", "sensor_token") if sensor in sensors}
+    sweeps = {
+        sample: (file, time, pose, mount)
+        for sample, key, file, time, pose, mount in tables.rows(
+            "sample_data",
+            "sample_token",
+            "is_key_frame",
+            "filename",
+            "timestamp",
+            "ego_pose_token",
+            "calibrated_sensor_token",
+        )
+        if key and mount in mounts and sample in times
+    }
     if missing := times.keys() - sweeps.keys():
-        raise InputError(f"{tables.path('sample_data')} has no {CHANNEL} for {len(missing)} of "
-                         f"{len(times)} key frames, such as {min(missing)}; download it again")
+        raise InputError(
+            f"{tables.path('sample_data')} has no {CHANNEL} for {len(missing)} of "
+            f"{len(times)} key frames, such as {min(missing)}; download it again"
+        )
     return sweeps
 
 
 def _read_poses(tables: Tables, table: str, wanted: set[str]) -> dict[str, np.ndarray]:
     """Return the poses (4, 4) in a table by token: sensor to vehicle, or vehicle to global."""
-    rows = {token: row for token, *row in tables.rows(table, "token", "translation", "rotation")
-            if token in wanted}
+    rows = {token: row for token, *row in tables.rows(table, "token", "translation", "rotation") if token in wanted}
     if missing := wanted - rows.keys():
-        raise InputError(f"{tables.path(table)} has no row {min(missing)} ({len(missing)} missing "
-                         "rows); download it again")
+        raise InputError(
+            f"{tables.path(table)} has no row {min(missing)} ({len(missing)} missing rows); download it again"
+        )
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, 3] = tables.numbers(table, "translation", [row[0] for row in rows.values()], 3)
     quaternions = tables.numbers(table, "rotation", [row[1] for row in rows.values()], 4)

@@ -22,7 +22,7 @@ from lidar_perception.types import CLASSES, GroundTruth, InputError
 TABLE = "sample_annotation"
 BLOCK_SIZE = 4096  # labels that are converted to columns at a time
 BIKE_RACK = "static_object.bicycle_rack"
-MAX_TIME_S = 1.5   # between two labels for a velocity; twice as long with one in between
+MAX_TIME_S = 1.5  # between two labels for a velocity; twice as long with one in between
 # In types.CLASSES. A bicycle with a rider is a Cyclist; other classes are Misc.
 CLASS_BY_NAME = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian"}
 
@@ -49,8 +49,13 @@ class NuscenesLabels:
 
     def __getitem__(self, index) -> NuscenesLabels:
         """Return the labels under a mask, slice or index array."""
-        return NuscenesLabels(self.boxes[index], self.categories[index], self.category_names,
-                              self.lidar_points[index], self.instances[index])
+        return NuscenesLabels(
+            self.boxes[index],
+            self.categories[index],
+            self.category_names,
+            self.lidar_points[index],
+            self.instances[index],
+        )
 
     def bicycle_racks(self) -> GlobalBoxes:
         """Return the bicycle racks."""
@@ -73,14 +78,19 @@ class NuscenesLabels:
             name = NAMES[boxes.class_ids[i]] if boxes.class_ids[i] >= 0 else None
             attribute = boxes.attributes[i]
             has_rider = name == "bicycle" and attribute == WITH_RIDER
-            ids.append(CLASSES.index(
-                "Cyclist" if has_rider else CLASS_BY_NAME.get(name or "", "Misc")))
-            extras.append({
-                "detection_name": name, "category": self.category_names[self.categories[i]],
-                "lidar_points": int(self.lidar_points[i]), "points": int(boxes.points[i]),
-                "velocity": boxes.velocities[i].tolist(), "track_id": int(self.instances[i]),
-                "attribute": ATTRIBUTES[attribute] if attribute >= 0 else None,
-                **({"rotation": boxes.rotations[i].tolist()} if tilted[i] else {})})
+            ids.append(CLASSES.index("Cyclist" if has_rider else CLASS_BY_NAME.get(name or "", "Misc")))
+            extras.append(
+                {
+                    "detection_name": name,
+                    "category": self.category_names[self.categories[i]],
+                    "lidar_points": int(self.lidar_points[i]),
+                    "points": int(boxes.points[i]),
+                    "velocity": boxes.velocities[i].tolist(),
+                    "track_id": int(self.instances[i]),
+                    "attribute": ATTRIBUTES[attribute] if attribute >= 0 else None,
+                    **({"rotation": boxes.rotations[i].tolist()} if tilted[i] else {}),
+                }
+            )
         return GroundTruth.of(to_local_boxes(boxes, pose), ids, extras)
 
 
@@ -104,27 +114,41 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
     frame_of = {token: number for number, token in enumerate(times)}
     names = dict(tables.rows("category", "token", "name"))
     number_of = {token: number for number, token in enumerate(names)}
-    attributes = {token: ATTRIBUTES.index(name) if name in ATTRIBUTES else -1
-                  for token, name in tables.rows("attribute", "token", "name")}
-    instances = {token: (number, number_of.get(category, -1)) for number, (token, category)
-                 in enumerate(tables.rows("instance", "token", "category_token"))}
+    attributes = {
+        token: ATTRIBUTES.index(name) if name in ATTRIBUTES else -1
+        for token, name in tables.rows("attribute", "token", "name")
+    }
+    instances = {
+        token: (number, number_of.get(category, -1))
+        for number, (token, category) in enumerate(tables.rows("instance", "token", "category_token"))
+    }
     own_links, links, in_frames, of_objects, of_categories = (array("q") for _ in range(5))
     tokens: dict[str, int] = {}  # number of each label, in order of first occurrence
     fields = ("translation", "size", "rotation")
     block, blocks = [], []
-    for (token, sample, instance, before, after, lidar, radar, labels, *box) in tables.rows(
-            TABLE, "token", "sample_token", "instance_token", "prev", "next", "num_lidar_pts",
-            "num_radar_pts", "attribute_tokens", *fields):
+    for token, sample, instance, before, after, lidar, radar, labels, *box in tables.rows(
+        TABLE,
+        "token",
+        "sample_token",
+        "instance_token",
+        "prev",
+        "next",
+        "num_lidar_pts",
+        "num_radar_pts",
+        "attribute_tokens",
+        *fields,
+    ):
         if sample not in frame_of:
             continue
         number, category = instances.get(instance, (-1, -1))
         if category < 0:
-            raise InputError(f"{tables.path(TABLE)}: the instance {instance} of {token} is not in "
-                             "the table of instances, or has no category; download the tables "
-                             "again")
+            raise InputError(
+                f"{tables.path(TABLE)}: the instance {instance} of {token} is not in "
+                "the table of instances, or has no category; download the tables "
+                "again"
+            )
         own_links.append(tokens.setdefault(token, len(tokens)))
-        links.extend([tokens.setdefault(other, len(tokens)) if other else -1
-                      for other in (before, after)])
+        links.extend([tokens.setdefault(other, len(tokens)) if other else -1 for other in (before, after)])
         in_frames.append(frame_of[sample])
         of_objects.append(number)
         of_categories.append(category)
@@ -140,18 +164,24 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
     seconds = np.fromiter(times.values(), np.int64, len(times))[frames] * 1e-6
     categories, classes = np.array(of_categories), [CATEGORIES.get(name) for name in names.values()]
     class_ids = np.array([NAMES.index(name) if name else -1 for name in classes])[categories]
-    boxes = GlobalBoxes.of(centres, sizes[:, [1, 0, 2]], rotations, class_ids, counts[:, 2],
-                           _compute_velocities(centres, seconds, neighbours),
-                           points=counts[:, 0] + counts[:, 1])
-    all_labels = NuscenesLabels(boxes, categories, tuple(names.values()),
-                                counts[:, 0].astype(np.int32), np.array(of_objects))
+    boxes = GlobalBoxes.of(
+        centres,
+        sizes[:, [1, 0, 2]],
+        rotations,
+        class_ids,
+        counts[:, 2],
+        _compute_velocities(centres, seconds, neighbours),
+        points=counts[:, 0] + counts[:, 1],
+    )
+    all_labels = NuscenesLabels(
+        boxes, categories, tuple(names.values()), counts[:, 0].astype(np.int32), np.array(of_objects)
+    )
     order = np.argsort(frames, kind="stable")
     bounds = np.searchsorted(frames[order], np.arange(1, len(times)))
     return [all_labels[rows] for rows in np.split(order, bounds)]
 
 
-def _link_neighbours(tables: Tables, tokens: dict[str, int], own: array,
-                     links: array) -> np.ndarray:
+def _link_neighbours(tables: Tables, tokens: dict[str, int], own: array, links: array) -> np.ndarray:
     """Return the rows (K, 2) of the previous and next label of the same object, -1 = none.
 
     Args:
@@ -165,8 +195,9 @@ def _link_neighbours(tables: Tables, tokens: dict[str, int], own: array,
     neighbours = row_of[linked]
     if (missing := (neighbours < 0) & (linked >= 0)).any():
         token = next(token for token, number in tokens.items() if number == linked[missing][0])
-        raise InputError(f"{tables.path(TABLE)}: the label {token}, which another one links to, "
-                         "is missing; download it again")
+        raise InputError(
+            f"{tables.path(TABLE)}: the label {token}, which another one links to, is missing; download it again"
+        )
     return neighbours
 
 
@@ -174,12 +205,12 @@ def _to_columns(tables: Tables, block: list[tuple]) -> np.ndarray:
     """Return (B, 13) float64: centre, size w l h, quaternion, points of LiDAR and radar,
     attribute."""
     fields = (("translation", 3), ("size", 3), ("rotation", 4), ("count of points", 3))
-    return np.hstack([tables.numbers(TABLE, name, [row[i] for row in block], width)
-                      for i, (name, width) in enumerate(fields)])
+    return np.hstack(
+        [tables.numbers(TABLE, name, [row[i] for row in block], width) for i, (name, width) in enumerate(fields)]
+    )
 
 
-def _compute_velocities(centres: np.ndarray, seconds: np.ndarray,
-                        neighbours: np.ndarray) -> np.ndarray:
+def _compute_velocities(centres: np.ndarray, seconds: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
     """Compute velocities (K, 2) m/s from the previous to the next label of the same object.
 
     A missing label is replaced by the label itself. NaN without neighbours, or if they are too far
@@ -191,5 +222,4 @@ def _compute_velocities(centres: np.ndarray, seconds: np.ndarray,
     max_time = np.where((neighbours >= 0).all(axis=1), 2 * MAX_TIME_S, MAX_TIME_S)
     valid = (time > 0) & (time <= max_time)
     distance = (centres[last] - centres[first])[:, :2]
-    return np.divide(distance, time[:, None], out=np.full_like(distance, np.nan),
-                     where=valid[:, None])
+    return np.divide(distance, time[:, None], out=np.full_like(distance, np.nan), where=valid[:, None])

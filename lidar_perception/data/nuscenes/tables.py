@@ -17,14 +17,31 @@ from lidar_perception.data.nuscenes.boxes import are_valid_rotations
 from lidar_perception.runs.files import check_regular, shorten_error
 from lidar_perception.types import MAX_NUMBER, InputError
 
-CHUNK_SIZE = 2**22   # characters read at a time; rows are shorter
+CHUNK_SIZE = 2**22  # characters read at a time; rows are shorter
 SEPARATORS = " \t\r\n,"
 MAX_TIME_US = 2**31 * 10**6  # since 1970; the limit of a header's seconds
 TYPE_BY_FIELD: dict[str, type] = {
-    **dict.fromkeys(("token", "sample_token", "instance_token", "scene_token", "sensor_token",
-                     "category_token", "ego_pose_token", "calibrated_sensor_token", "prev", "next",
-                     "name", "channel", "filename"), str),
-    "timestamp": int, "attribute_tokens": list}
+    **dict.fromkeys(
+        (
+            "token",
+            "sample_token",
+            "instance_token",
+            "scene_token",
+            "sensor_token",
+            "category_token",
+            "ego_pose_token",
+            "calibrated_sensor_token",
+            "prev",
+            "next",
+            "name",
+            "channel",
+            "filename",
+        ),
+        str,
+    ),
+    "timestamp": int,
+    "attribute_tokens": list,
+}
 PROBLEM_BY_TYPE = {str: "not a text", int: "not a time in microseconds", list: "not a list"}
 
 
@@ -38,9 +55,14 @@ class Tables:
             raise InputError(f"{root} is not a folder; give the folder of a nuScenes download")
         if not version or not self.folder.is_dir():
             versions = sorted(path.parent.name for path in self.root.glob("*/sample_data.json"))
-            raise InputError(f"{root} has no folder {version or 'without a name'}; " + (
-                f"its versions are: {', '.join(versions)}" if versions else
-                "give the folder that holds v1.0-mini or v1.0-trainval, and samples"))
+            raise InputError(
+                f"{root} has no folder {version or 'without a name'}; "
+                + (
+                    f"its versions are: {', '.join(versions)}"
+                    if versions
+                    else "give the folder that holds v1.0-mini or v1.0-trainval, and samples"
+                )
+            )
 
     def path(self, table: str) -> Path:
         return self.folder / f"{table}.json"
@@ -51,20 +73,21 @@ class Tables:
         Raises InputError if the table is missing, truncated or damaged, and if a field of a row is
         missing or has another type.
         """
-        kinds = [(column, TYPE_BY_FIELD[field]) for column, field in enumerate(fields)
-                 if field in TYPE_BY_FIELD]
+        kinds = [(column, TYPE_BY_FIELD[field]) for column, field in enumerate(fields) if field in TYPE_BY_FIELD]
         for number, row in enumerate(self._decode_rows(table)):
             try:
                 values = tuple([row[field] for field in fields])
             except (KeyError, TypeError):
                 missing = next(f for f in fields if not isinstance(row, dict) or f not in row)
-                raise InputError(f"{self.path(table)}: row {number} has no {missing}; is it a "
-                                 "table of nuScenes? download it again") from None
+                raise InputError(
+                    f"{self.path(table)}: row {number} has no {missing}; is it a table of nuScenes? download it again"
+                ) from None
             for column, kind in kinds:
-                if not isinstance(values[column], kind) or (
-                        kind is int and not 0 <= values[column] < MAX_TIME_US):
-                    raise InputError(f"{self.path(table)}: row {number}: {fields[column]} is "
-                                     f"{PROBLEM_BY_TYPE[kind]}; download it again")
+                if not isinstance(values[column], kind) or (kind is int and not 0 <= values[column] < MAX_TIME_US):
+                    raise InputError(
+                        f"{self.path(table)}: row {number}: {fields[column]} is "
+                        f"{PROBLEM_BY_TYPE[kind]}; download it again"
+                    )
             yield values
 
     def _decode_rows(self, table: str) -> Iterator[Any]:
@@ -73,8 +96,7 @@ class Tables:
             with open(check_regular(path), encoding="utf-8-sig") as stream:
                 text = stream.read(CHUNK_SIZE).lstrip()
                 if text[:1] != "[":
-                    raise InputError(f"{path} is not a list of rows; download the tables of "
-                                     f"{self.version} again")
+                    raise InputError(f"{path} is not a list of rows; download the tables of {self.version} again")
                 text, at, ended = text[1:], 0, False
                 while True:
                     while at < len(text) and text[at] in SEPARATORS:
@@ -87,16 +109,19 @@ class Tables:
                         continue
                     except ValueError as error:  # the row ends in the next chunk, or is damaged
                         if ended or len(text) - at > 2 * CHUNK_SIZE:
-                            raise InputError(f"{path} is truncated or damaged ({error}); download "
-                                             f"the tables of {self.version} again") from None
+                            raise InputError(
+                                f"{path} is truncated or damaged ({error}); download the tables of {self.version} again"
+                            ) from None
                     more = stream.read(CHUNK_SIZE)
                     text, at, ended = text[at:] + more, 0, not more
         except OSError as error:
-            raise InputError(f"cannot read the table {path}: {error.strerror}; unpack the "
-                             f"metadata of {self.version} there") from None
+            raise InputError(
+                f"cannot read the table {path}: {error.strerror}; unpack the metadata of {self.version} there"
+            ) from None
         except (UnicodeDecodeError, RecursionError) as error:
-            raise InputError(f"{path} is damaged ({shorten_error(error)}); download the tables of "
-                             f"{self.version} again") from None
+            raise InputError(
+                f"{path} is damaged ({shorten_error(error)}); download the tables of {self.version} again"
+            ) from None
 
     def numbers(self, table: str, field: str, values: list, width: int) -> np.ndarray:
         """Return the values of a field as (K, width) float64.
@@ -109,9 +134,11 @@ class Tables:
             column = np.zeros((len(values), 0))
         if len(values) == 0:
             return np.zeros((0, width))
-        if column.shape[1] != width or not (np.abs(column) <= MAX_NUMBER).all() or (
-                field == "rotation" and not are_valid_rotations(column).all()):
-            wanted = ("a quaternion" if field == "rotation" else
-                      f"{width} finite numbers within {MAX_NUMBER:g}")
+        if (
+            column.shape[1] != width
+            or not (np.abs(column) <= MAX_NUMBER).all()
+            or (field == "rotation" and not are_valid_rotations(column).all())
+        ):
+            wanted = "a quaternion" if field == "rotation" else f"{width} finite numbers within {MAX_NUMBER:g}"
             raise InputError(f"{self.path(table)}: a {field} is not {wanted}; download it again")
         return column

@@ -93,10 +93,15 @@ class FusedDetector(NetworkDetector):
     group = "fused"
     params: FusedDetectorParams
 
-    def __init__(self, proposer: PointPillarsProposer, classifier: PointNetClassifier,
-                 params: FusedDetectorParams = FusedDetectorParams(),
-                 models: Models | None = None, warning: str | None = None,
-                 load_blind: Callable[[str], FusedDetector] | None = None):
+    def __init__(
+        self,
+        proposer: PointPillarsProposer,
+        classifier: PointNetClassifier,
+        params: FusedDetectorParams = FusedDetectorParams(),
+        models: Models | None = None,
+        warning: str | None = None,
+        load_blind: Callable[[str], FusedDetector] | None = None,
+    ):
         super().__init__(params, warning)
         self.load_blind = load_blind
         self.proposer, self.classifier = proposer.with_raw_scores(), classifier
@@ -119,8 +124,7 @@ class FusedDetector(NetworkDetector):
         """Return this detector: its scores are not calibrated any further."""
         return self
 
-    def detect(self, frame: PointCloud, ground: np.ndarray | None,
-               cluster_ids: np.ndarray | None) -> DetectionResult:
+    def detect(self, frame: PointCloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None) -> DetectionResult:
         begin = perf_counter()
         wide = self._make_view(frame)
         chosen = self
@@ -131,23 +135,31 @@ class FusedDetector(NetworkDetector):
         begin = perf_counter()
         detections, best = chosen.decide(proposals)
         detections = restore_detections(detections, self.params.ground.sensor_pose)
-        timings = {STEPS[0]: preprocess * 1e3, **proposals.timings,
-                   STEPS[-1]: (perf_counter() - begin) * 1e3}
+        timings = {STEPS[0]: preprocess * 1e3, **proposals.timings, STEPS[-1]: (perf_counter() - begin) * 1e3}
         return DetectionResult(detections, timings, proposals.problem or chosen.fallback, best)
 
     def _make_view(self, frame: PointCloud) -> NormalizedView:
         """Return the points in the range of the network, and up to MAX_RELIEF_M above or below."""
         config, relief = self.proposer.config, np.array([0, 0, MAX_RELIEF_M])
-        return NormalizedView.of(frame, self.params.ground.sensor_pose, tuple(config.low - relief),
-                                 tuple(config.high + relief), self.settings.use_intensity)
+        return NormalizedView.of(
+            frame,
+            self.params.ground.sensor_pose,
+            tuple(config.low - relief),
+            tuple(config.high + relief),
+            self.settings.use_intensity,
+        )
 
     def propose(self, frame: PointCloud) -> Proposals:
         """Return all proposals for a cropped frame with the evidence of all sources."""
         return self._propose(self._make_view(frame))
 
-    def _propose(self, wide: NormalizedView, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None,
-                 min_scores: ScoreParams = ScoreParams.for_all_classes(0.0)) -> Proposals:
+    def _propose(
+        self,
+        wide: NormalizedView,
+        ground: np.ndarray | None = None,
+        cluster_ids: np.ndarray | None = None,
+        min_scores: ScoreParams = ScoreParams.for_all_classes(0.0),
+    ) -> Proposals:
         """Return the proposals for the result of _make_view() with the evidence of all sources.
 
         Args:
@@ -157,8 +169,7 @@ class FusedDetector(NetworkDetector):
         times = [perf_counter()]
         settings, params, config = self.settings, self.params, self.proposer.config
         view = wide.crop(config.low, config.high)
-        is_ground = (segment_view_ground(view.frame, params.ground) if ground is None
-                     else ground.take(view.indices))
+        is_ground = segment_view_ground(view.frame, params.ground) if ground is None else ground.take(view.indices)
         surface = fit_ground_surface(view.frame.xyz.compress(is_ground, axis=0), -SENSOR_HEIGHT)
         flat = wide.flatten(surface).crop(config.low, config.high)
         flat_ground = view.convert(is_ground, flat)
@@ -168,48 +179,59 @@ class FusedDetector(NetworkDetector):
         times.append(perf_counter())
         # Compiled code releases the GIL, and much of PointPillars runs in one thread.
         with ThreadPoolExecutor(1) as pool:
-            clusters = pool.submit(cluster_obstacles, flat.frame.xyz, flat_ground, params.people,
-                                   wide.source.xyz)
-            _, cluster_ids = run_experts(view.frame, config, is_ground, view.take(cluster_ids),
-                                         params.ground, params.clustering)
+            clusters = pool.submit(cluster_obstacles, flat.frame.xyz, flat_ground, params.people, wide.source.xyz)
+            _, cluster_ids = run_experts(
+                view.frame, config, is_ground, view.take(cluster_ids), params.ground, params.clustering
+            )
             found = self.proposer.propose(
-                flat, flat_ground, view.convert(cluster_ids, flat),
+                flat,
+                flat_ground,
+                view.convert(cluster_ids, flat),
                 ScoreParams.for_all_classes(settings.proposals),
-                replace(settings.nms, max_boxes=settings.max_proposals), settings.cpu_fallback)
+                replace(settings.nms, max_boxes=settings.max_proposals),
+                settings.cpu_fallback,
+            )
             people = clusters.result()[~flat_ground]
         times.append(perf_counter())
         proposed = drop_ego_vehicle(found.detections, view.pose.height)
-        evidence = {"network": to_log_odds(proposed.scores), "silhouette": to_log_odds(
-            find_silhouette_confidence(proposed.boxes, obstacles.xyz, floor, people))}
+        evidence = {
+            "network": to_log_odds(proposed.scores),
+            "silhouette": to_log_odds(find_silhouette_confidence(proposed.boxes, obstacles.xyz, floor, people)),
+        }
         limits = compute_max_probabilities(self.models, proposed.class_ids, evidence, "classifier")
         probability, boxes = self.classifier.classify(
-            proposed, obstacles, floor, min_scores.passes(replace(proposed, scores=limits)),
-            settings.cpu_fallback)
+            proposed, obstacles, floor, min_scores.passes(replace(proposed, scores=limits)), settings.cpu_fallback
+        )
         evidence["classifier"] = to_log_odds(probability)
         boxes = move_towards(proposed.boxes, boxes, settings.classifier_box).astype(np.float32)
         times.append(perf_counter())
-        return Proposals(replace(proposed, boxes=boxes), evidence, obstacles.xyz, surface,
-                         found.problem, dict(zip(STEPS[1:], (np.diff(times) * 1e3).tolist())))
+        return Proposals(
+            replace(proposed, boxes=boxes),
+            evidence,
+            obstacles.xyz,
+            surface,
+            found.problem,
+            dict(zip(STEPS[1:], (np.diff(times) * 1e3).tolist())),
+        )
 
     def decide(self, proposals: Proposals) -> tuple[Detections, dict[str, float]]:
         """Return the proposals that are detections, best first, in the coordinates of the view;
         without any, also the highest score of each class."""
         settings, class_ids = self.settings, proposals.detections.class_ids
-        scored = replace(proposals.detections,
-                         scores=compute_probabilities(self.models, class_ids, proposals.evidence),
-                         sources=compute_source_probabilities(self.models, class_ids,
-                                                              proposals.evidence))
+        scored = replace(
+            proposals.detections,
+            scores=compute_probabilities(self.models, class_ids, proposals.evidence),
+            sources=compute_source_probabilities(self.models, class_ids, proposals.evidence),
+        )
         found = scored[settings.scores.passes(scored)]
         if len(found) == 0:
             return found, {
-                name: float(scored.scores[class_ids == CLASSES.index(name)].max(initial=0.0))
-                for name in self.classes}
-        boxes = move_cars_to_points(found.boxes, found.class_ids, proposals.obstacles,
-                                    settings.on_points)
+                name: float(scored.scores[class_ids == CLASSES.index(name)].max(initial=0.0)) for name in self.classes
+            }
+        boxes = move_cars_to_points(found.boxes, found.class_ids, proposals.obstacles, settings.on_points)
         heights = proposals.surface.at(boxes)
         boxes[:, 2] += heights + SENSOR_HEIGHT
-        moved = replace(found, boxes=move_to_ground(boxes, heights, settings.on_ground).astype(
-            np.float32))
+        moved = replace(found, boxes=move_to_ground(boxes, heights, settings.on_ground).astype(np.float32))
         return moved[remove_duplicates(moved, settings)], {}
 
     def warm_up(self) -> None:
@@ -224,19 +246,20 @@ def remove_duplicates(detections: Detections, params: FusedParams) -> np.ndarray
     one if they overlap by more than same_car; people walk side by side, so they and cyclists are
     one if their centres are closer than same_place.
     """
-    order = rotated_nms(detections.boxes, detections.scores, detections.class_ids,
-                        params.nms.iou, params.nms.across_classes)
+    order = rotated_nms(
+        detections.boxes, detections.scores, detections.class_ids, params.nms.iou, params.nms.across_classes
+    )
     boxes, class_ids = detections.boxes[order], detections.class_ids[order]
-    duplicate = ((centre_distances(boxes, boxes) < params.same_place)
-                 & (class_ids[:, None] == class_ids))
+    duplicate = (centre_distances(boxes, boxes) < params.same_place) & (class_ids[:, None] == class_ids)
     cars = np.flatnonzero(class_ids == CAR)
     duplicate[cars] = False
     duplicate[np.ix_(cars, cars)] = bev_iou(boxes[cars], boxes[cars]) > params.same_car
-    return order[keep_first(duplicate)][:params.nms.max_boxes]
+    return order[keep_first(duplicate)][: params.nms.max_boxes]
 
 
-def load_fused_detector(path: str | Path = "", device: str = "auto",
-                        params: FusedDetectorParams = FusedDetectorParams()) -> FusedDetector:
+def load_fused_detector(
+    path: str | Path = "", device: str = "auto", params: FusedDetectorParams = FusedDetectorParams()
+) -> FusedDetector:
     """Load the fused detector.
 
     Args:
@@ -263,13 +286,31 @@ def _load_blind(device: str, params: FusedDetectorParams, range: str) -> FusedDe
 
 def _load_fusion(fusion: Fusion, device: str, params: FusedDetectorParams) -> FusedDetector:
     settings = params.fused
-    proposer = load_detector(fusion.proposer, device, DetectorParams(
-        pointpillars=PointPillarsParams(range=settings.range, amp=settings.amp, warm_up=False,
-                                        threads=settings.threads, engine=settings.engine,
-                                        cpu_fallback=settings.cpu_fallback))).proposer
-    classifier = load_pointnet_detector(fusion.classifier, device, PointNetDetectorParams(
-        pointnet=PointNetParams(warm_up=False, cpu_fallback=settings.cpu_fallback,
-                                engine="torch" if settings.engine == "torch" else "auto"))
+    proposer = load_detector(
+        fusion.proposer,
+        device,
+        DetectorParams(
+            pointpillars=PointPillarsParams(
+                range=settings.range,
+                amp=settings.amp,
+                warm_up=False,
+                threads=settings.threads,
+                engine=settings.engine,
+                cpu_fallback=settings.cpu_fallback,
+            )
+        ),
+    ).proposer
+    classifier = load_pointnet_detector(
+        fusion.classifier,
+        device,
+        PointNetDetectorParams(
+            pointnet=PointNetParams(
+                warm_up=False,
+                cpu_fallback=settings.cpu_fallback,
+                engine="torch" if settings.engine == "torch" else "auto",
+            )
+        ),
     ).classifier
-    return FusedDetector(proposer, classifier, params, fusion.models,
-                         "; ".join(fusion.find_warnings(proposer.classes)) or None)
+    return FusedDetector(
+        proposer, classifier, params, fusion.models, "; ".join(fusion.find_warnings(proposer.classes)) or None
+    )

@@ -14,11 +14,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import expit, logit
 
-from lidar_perception.candidates.confidence import (
-    compute_confidence,
-    compute_log_odds,
-    compute_shape_features,
-)
+from lidar_perception.candidates.confidence import compute_confidence, compute_log_odds, compute_shape_features
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.segmented_cloud import snap_to_ground
 from lidar_perception.clustering.shapes import fit_boxes
@@ -38,8 +34,9 @@ MIN_PROBABILITY, MAX_PROBABILITY = 0.001, 0.999  # no source is certain
 Evidence = dict[str, np.ndarray]
 
 
-def find_silhouette_confidence(boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray,
-                               cluster_ids: np.ndarray) -> np.ndarray:
+def find_silhouette_confidence(
+    boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray
+) -> np.ndarray:
     """Return the highest confidence that a cluster near each box is a pedestrian.
 
     Args:
@@ -53,8 +50,11 @@ def find_silhouette_confidence(boxes: np.ndarray, xyz: np.ndarray, ground: np.nd
         (K,) float64, 0..1; 0 for boxes without a cluster of a suitable size.
     """
     clusters = snap_to_ground(fit_boxes(xyz, cluster_ids, BEST.boxes.shape), fit_plane(ground))
-    chosen = np.flatnonzero((clusters[:, 5] >= MIN_HEIGHT_M) & (clusters[:, 5] <= MAX_HEIGHT_M)
-                            & (clusters[:, 3:5].max(axis=1, initial=0.0) <= MAX_LENGTH_M))
+    chosen = np.flatnonzero(
+        (clusters[:, 5] >= MIN_HEIGHT_M)
+        & (clusters[:, 5] <= MAX_HEIGHT_M)
+        & (clusters[:, 3:5].max(axis=1, initial=0.0) <= MAX_LENGTH_M)
+    )
     is_near = centre_distances(boxes, clusters[chosen]) <= MAX_DISTANCE_M
     has_box = is_near.any(axis=0)
     chosen, is_near = chosen[has_box], is_near[:, has_box]
@@ -78,14 +78,13 @@ def compute_probabilities(models: Models, class_ids: np.ndarray, evidence: Evide
     for class_id in np.unique(class_ids):
         own = class_ids == class_id
         if CLASSES[class_id] in models:
-            result[own] = expit(compute_log_odds(models[CLASSES[class_id]],
-                                                 {source: odds[own] for source,
-                                                  odds in evidence.items()}))
+            result[own] = expit(
+                compute_log_odds(models[CLASSES[class_id]], {source: odds[own] for source, odds in evidence.items()})
+            )
     return result
 
 
-def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence,
-                              source: str) -> np.ndarray:
+def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence, source: str) -> np.ndarray:
     """Return the highest probability (K,) float32 that each proposal can reach for any evidence of
     `source`.
 
@@ -100,14 +99,16 @@ def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: E
     return compute_probabilities(models, class_ids, {**evidence, source: best})
 
 
-def compute_source_probabilities(models: Models, class_ids: np.ndarray,
-                                 evidence: Evidence) -> dict[str, np.ndarray]:
+def compute_source_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence) -> dict[str, np.ndarray]:
     """Return, by source, the probability (K,) float32 from this source alone.
 
     It is NaN where the source gives no evidence, or is not part of the model of the class.
     """
-    used_for = {source: [i for i, name in enumerate(CLASSES)
-                         if source in models.get(name, {"curves": {}})["curves"]]
-                for source in evidence}
-    return {source: np.where(np.isin(class_ids, used_for[source]), expit(odds), np.nan).astype(
-        np.float32) for source, odds in evidence.items()}
+    used_for = {
+        source: [i for i, name in enumerate(CLASSES) if source in models.get(name, {"curves": {}})["curves"]]
+        for source in evidence
+    }
+    return {
+        source: np.where(np.isin(class_ids, used_for[source]), expit(odds), np.nan).astype(np.float32)
+        for source, odds in evidence.items()
+    }

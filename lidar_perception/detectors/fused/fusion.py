@@ -29,7 +29,7 @@ from lidar_perception.types import InputError
 
 PACKAGE = Path(__file__).with_name("fusion.json")
 NO_INTENSITY = PACKAGE.with_name("fusion_no_intensity.json")  # for clouds without intensity
-SUFFIX = ".json"        # distinguishes a fusion file from a checkpoint
+SUFFIX = ".json"  # distinguishes a fusion file from a checkpoint
 MAX_BYTES = 10**6
 MAX_LOG_ODDS = 1000.0
 MAX_KNOTS = 64
@@ -64,13 +64,18 @@ class Fusion:
     @property
     def curve_warning(self) -> str | None:
         """Warning if the curves were fitted to other weights, or None."""
-        others = [str(path) for path, known in zip((self.proposer, self.classifier), self.digests)
-                  if compute_digest(path) != known]
+        others = [
+            str(path)
+            for path, known in zip((self.proposer, self.classifier), self.digests)
+            if compute_digest(path) != known
+        ]
         if not others:
             return None
-        return (f"the curves of fused were fitted to other weights than {' and '.join(others)}, so "
-                "its scores are not calibrated probabilities; fit the curves with "
-                "`lidar-perception train fused`")
+        return (
+            f"the curves of fused were fitted to other weights than {' and '.join(others)}, so "
+            "its scores are not calibrated probabilities; fit the curves with "
+            "`lidar-perception train fused`"
+        )
 
     def find_warnings(self, classes: Iterable[str]) -> list[str]:
         """Return the curve_warning, if any, and a warning about classes without a curve.
@@ -79,10 +84,17 @@ class Fusion:
             classes: classes of the proposer.
         """
         others = [name for name in classes if name not in self.models]
-        return [*filter(None, [self.curve_warning]), *(
-            [f"fused detects no {' and no '.join(others)}, because it has curves only for "
-             f"{', '.join(self.models)}; use {self.proposer} alone to detect them"]
-            if others else [])]
+        return [
+            *filter(None, [self.curve_warning]),
+            *(
+                [
+                    f"fused detects no {' and no '.join(others)}, because it has curves only for "
+                    f"{', '.join(self.models)}; use {self.proposer} alone to detect them"
+                ]
+                if others
+                else []
+            ),
+        ]
 
 
 def compute_digest(path: Path) -> str:
@@ -106,9 +118,11 @@ def find_fusion(path: str | Path = "", params: FusedParams = FusedParams()) -> F
             raise InputError(f"{named} has its own PointNet weights; leave fused.classifier empty")
         return read_fusion(require_weights(named, "fused.weights"))
     own = read_fusion(PACKAGE)
-    return replace(own, proposer=require_weights(named, "fused.weights") if named else own.proposer,
-                   classifier=require_weights(params.classifier, "fused.classifier")
-                   if params.classifier else own.classifier)
+    return replace(
+        own,
+        proposer=require_weights(named, "fused.weights") if named else own.proposer,
+        classifier=require_weights(params.classifier, "fused.classifier") if params.classifier else own.classifier,
+    )
 
 
 def weights_file(params: FusedParams) -> Path:
@@ -139,23 +153,23 @@ def read_fusion(path: Path) -> Fusion:
         files, digests = ([str(part[key]) for part in known] for key in ("file", "sha256"))
         fitted_to = dict(content["fitted_to"])
         _check(models)
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError,
-            RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path} was not written by `lidar-perception train fused` "
-                         f"({shorten_error(error)})") from None
-    proposer, classifier = (path.parent / file if file else default
-                            for file, default in zip(files, _shipped()))
+        raise InputError(f"{path} was not written by `lidar-perception train fused` ({shorten_error(error)})") from None
+    proposer, classifier = (path.parent / file if file else default for file, default in zip(files, _shipped()))
     for part in (proposer, classifier):
         if not part.is_file():
-            raise InputError(f"{path} needs {part}, which does not exist; restore the file, or run "
-                             "`lidar-perception train fused` again")
+            raise InputError(
+                f"{path} needs {part}, which does not exist; restore the file, or run "
+                "`lidar-perception train fused` again"
+            )
     return Fusion(proposer, classifier, (digests[0], digests[1]), models, fitted_to)
 
 
-def write_fusion(path: Path, weights: tuple[Path | None, Path | None], models: Models,
-                 fitted_to: Mapping[str, Any]) -> None:
+def write_fusion(
+    path: Path, weights: tuple[Path | None, Path | None], models: Models, fitted_to: Mapping[str, Any]
+) -> None:
     """Write a fusion file. It refers to the weights by relative paths.
 
     Args:
@@ -166,8 +180,7 @@ def write_fusion(path: Path, weights: tuple[Path | None, Path | None], models: M
     """
     parts = {}
     for name, file, default in zip(NETWORKS, weights, _shipped()):
-        parts[name] = {"file": relpath(file, path.parent) if file else "",
-                       "sha256": compute_digest(file or default)}
+        parts[name] = {"file": relpath(file, path.parent) if file else "", "sha256": compute_digest(file or default)}
     write_text(path, json.dumps({**parts, "fitted_to": fitted_to, "classes": models}, indent=1))
 
 
@@ -187,8 +200,7 @@ def _check(models: Any) -> None:
                 raise ValueError(f"unknown source {source[:40]!r}")
             knots, values = _numbers(curve["knots"]), _numbers(curve["values"])
             _numbers([curve.get("unknown", 0.0)])
-            if (len(knots) != len(values) or not (np.diff(knots) > 0).all()
-                    or not (np.diff(values) >= 0).all()):
+            if len(knots) != len(values) or not (np.diff(knots) > 0).all() or not (np.diff(values) >= 0).all():
                 raise ValueError(f"the curve of {source} is not increasing")
 
 

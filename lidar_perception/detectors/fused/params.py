@@ -27,28 +27,31 @@ STEPS = ("preprocess", "ground", "proposals", "evidence", "fusion")
 class FusedParams(NetworkParams):
     """Networks, fusion and thresholds. A score is the probability that the object exists."""
 
-    weights: str = param("", "Output of `train fused`, which refers to both networks; a checkpoint "
-                         "of PointPillars; or a class of your own, module:Class. Empty: the "
-                         "shipped weights.", fixed=True)
+    weights: str = param(
+        "",
+        "Output of `train fused`, which refers to both networks; a checkpoint "
+        "of PointPillars; or a class of your own, module:Class. Empty: the "
+        "shipped weights.",
+        fixed=True,
+    )
 
     classifier: str = param("", "Checkpoint of PointNet; empty: the shipped one.", fixed=True)
     range: str = make_range_param()
     amp: str = make_amp_param()
-    engine: str = make_engine_param(" torch also runs PointNet in torch instead of compiled "
-                                    "kernels.")
-    proposals: float = param(0.02, "Minimum PointPillars score of a proposed box.", low=0.001,
-                             high=1.0)
-    max_proposals: int = param(200, "Maximum number of proposed boxes; the best scores are kept.",
-                               low=1, high=10_000)
+    engine: str = make_engine_param(" torch also runs PointNet in torch instead of compiled kernels.")
+    proposals: float = param(0.02, "Minimum PointPillars score of a proposed box.", low=0.001, high=1.0)
+    max_proposals: int = param(200, "Maximum number of proposed boxes; the best scores are kept.", low=1, high=10_000)
     nms: NmsParams = NmsParams(candidates=1000)
-    same_place: float = param(0.6, "Pedestrians, and cyclists, with centres closer than this are "
-                              "duplicates.", unit="m", low=0.0, high=10.0)
-    same_car: float = param(0.02, "Cars with a bird's-eye-view IoU above this are duplicates.",
-                            low=0.0, high=1.0)
-    classifier_box: float = param(0.5, "Weight of PointNet's box in the result. 0: PointPillars' "
-                                  "box, 1: PointNet's box.", low=0.0, high=1.0)
-    on_ground: float = param(0.25, "Move boxes towards the ground around them. 0: not at all, "
-                             "1: onto it.", low=0.0, high=1.0)
+    same_place: float = param(
+        0.6, "Pedestrians, and cyclists, with centres closer than this are duplicates.", unit="m", low=0.0, high=10.0
+    )
+    same_car: float = param(0.02, "Cars with a bird's-eye-view IoU above this are duplicates.", low=0.0, high=1.0)
+    classifier_box: float = param(
+        0.5, "Weight of PointNet's box in the result. 0: PointPillars' box, 1: PointNet's box.", low=0.0, high=1.0
+    )
+    on_ground: float = param(
+        0.25, "Move boxes towards the ground around them. 0: not at all, 1: onto it.", low=0.0, high=1.0
+    )
     on_points: float = make_on_points_param()
 
 

@@ -39,8 +39,9 @@ class BoxTargets(NamedTuple, Generic[Array]):
     yaw_residuals: Array
 
 
-def encode(boxes: np.ndarray, labels: np.ndarray, centres: np.ndarray, azimuths: np.ndarray,
-           config: PointNetConfig) -> BoxTargets[np.ndarray]:
+def encode(
+    boxes: np.ndarray, labels: np.ndarray, centres: np.ndarray, azimuths: np.ndarray, config: PointNetConfig
+) -> BoxTargets[np.ndarray]:
     """Encode boxes (K, 7) relative to their clusters.
 
     Args:
@@ -49,22 +50,22 @@ def encode(boxes: np.ndarray, labels: np.ndarray, centres: np.ndarray, azimuths:
     """
     offset = boxes[:, :3] - centres
     cos, sin = np.cos(azimuths), np.sin(azimuths)
-    turned = np.column_stack([cos * offset[:, 0] + sin * offset[:, 1],
-                              cos * offset[:, 1] - sin * offset[:, 0], offset[:, 2]])
+    turned = np.column_stack(
+        [cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0], offset[:, 2]]
+    )
     sizes = np.log(np.maximum(boxes[:, 3:6], 0.05) / np.array(config.sizes)[labels])
     width = 2 * np.pi / config.yaw_bins
     yaw = np.mod(boxes[:, 6] - azimuths, 2 * np.pi)
     bins = np.mod(np.round(yaw / width).astype(np.int64), config.yaw_bins)
     rest = wrap_angle(yaw - bins * width) / (width / 2)
-    return BoxTargets(turned.astype(np.float32), sizes.astype(np.float32), bins,
-                      rest.astype(np.float32))
+    return BoxTargets(turned.astype(np.float32), sizes.astype(np.float32), bins, rest.astype(np.float32))
 
 
-def decode(outputs: Outputs[np.ndarray], inputs: ClusterInput, config: PointNetConfig,
-           labels: np.ndarray) -> np.ndarray:
+def decode(
+    outputs: Outputs[np.ndarray], inputs: ClusterInput, config: PointNetConfig, labels: np.ndarray
+) -> np.ndarray:
     """Return boxes (K, 7) float32 for classes labels (K,), the inverse of encode."""
-    centres, logs, residuals = (x.astype(np.float64) for x in
-                                (outputs.centres, outputs.sizes, outputs.yaw_residuals))
+    centres, logs, residuals = (x.astype(np.float64) for x in (outputs.centres, outputs.sizes, outputs.yaw_residuals))
     bins = outputs.yaw_bins.argmax(axis=1)
     cos, sin = np.cos(inputs.azimuths), np.sin(inputs.azimuths)
     boxes = np.empty((len(bins), 7))

@@ -27,8 +27,7 @@ def calibrate(network: PointNet, logits: Tensor, labels: Tensor) -> None:
     logits, labels = logits[known].detach().double().cpu(), labels[known].cpu()
     log_temperature = torch.zeros(1, dtype=torch.double, requires_grad=True)
     offsets = torch.zeros(logits.shape[1], dtype=torch.double, requires_grad=True)
-    optimizer = torch.optim.LBFGS([log_temperature, offsets], max_iter=STEPS,
-                                  line_search_fn="strong_wolfe")
+    optimizer = torch.optim.LBFGS([log_temperature, offsets], max_iter=STEPS, line_search_fn="strong_wolfe")
 
     def loss() -> Tensor:
         optimizer.zero_grad()

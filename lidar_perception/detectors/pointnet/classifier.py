@@ -12,7 +12,7 @@ from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.types import CLASSES, Detections, PointCloud
 
 BOX_MARGIN_M = 0.2  # points up to this distance from a box are classified with it
-MIN_POINTS = 3      # boxes with fewer points are not classified
+MIN_POINTS = 3  # boxes with fewer points are not classified
 
 
 class PointNetClassifier(TrainedNetwork):
@@ -23,13 +23,18 @@ class PointNetClassifier(TrainedNetwork):
     def __init__(self, network: Network, header: Header, device: str = CPU):
         super().__init__(network, header, device)
 
-    def predict(self, clusters: Clusters, labels: np.ndarray | None = None,
-                cpu_fallback: bool = True) -> Predictions:
+    def predict(self, clusters: Clusters, labels: np.ndarray | None = None, cpu_fallback: bool = True) -> Predictions:
         """Return the predictions for K clusters, see predict.predict."""
         return self.run(lambda: predict(self.network, clusters, labels=labels), cpu_fallback)
 
-    def classify(self, proposals: Detections, obstacles: PointCloud, ground: np.ndarray,
-                 selected: np.ndarray, cpu_fallback: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    def classify(
+        self,
+        proposals: Detections,
+        obstacles: PointCloud,
+        ground: np.ndarray,
+        selected: np.ndarray,
+        cpu_fallback: bool = True,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Classify the points in boxes of a NormalizedView.
 
         Args:
@@ -48,8 +53,7 @@ class PointNetClassifier(TrainedNetwork):
         index_of = {CLASSES.index(name): i for i, name in enumerate(self.classes)}
         labels = np.array([index_of.get(int(i), -1) for i in proposals.class_ids], np.int64)
         chosen = np.flatnonzero(selected & (clusters.sizes >= MIN_POINTS) & (labels >= 0))
-        predictions = self.predict(clusters.take(chosen).with_ground(ground), labels[chosen],
-                                   cpu_fallback)
+        predictions = self.predict(clusters.take(chosen).with_ground(ground), labels[chosen], cpu_fallback)
         count = len(proposals)
         probabilities, boxes = np.full(count, np.nan), np.full((count, 7), np.nan)
         probabilities[chosen], boxes[chosen] = predictions.scores, predictions.boxes

@@ -52,8 +52,9 @@ class Clusters:
         sizes = self.sizes[chosen]
         first = np.concatenate([[0], np.cumsum(sizes)])
         rows = np.repeat(self.first[chosen] - first[:-1], sizes) + np.arange(first[-1])
-        return Clusters(self.points[rows], first, self.ids[chosen],
-                        None if self.ground is None else self.ground[chosen])
+        return Clusters(
+            self.points[rows], first, self.ids[chosen], None if self.ground is None else self.ground[chosen]
+        )
 
     def take_nearest(self, count: int) -> Clusters:
         """Return at most `count` clusters, those with means nearest to the sensor, in order."""
@@ -64,8 +65,7 @@ class Clusters:
 
     def with_ground(self, ground: np.ndarray) -> Clusters:
         """Return these clusters, none of them empty, with ground heights from points (G, 3)."""
-        return replace(self, ground=find_ground_heights(
-            ground, compute_centroids(self.points, self.first)))
+        return replace(self, ground=find_ground_heights(ground, compute_centroids(self.points, self.first)))
 
     @property
     def floor(self) -> np.ndarray:
@@ -94,8 +94,9 @@ class ClusterInput:
     azimuths: np.ndarray
 
 
-def make_clusters(frame: PointCloud, cluster_ids: np.ndarray, min_points: int = 1,
-                  ground: np.ndarray | None = None) -> Clusters:
+def make_clusters(
+    frame: PointCloud, cluster_ids: np.ndarray, min_points: int = 1, ground: np.ndarray | None = None
+) -> Clusters:
     """Return the clusters of a frame of N points, in the order of their ids.
 
     Args:
@@ -153,7 +154,7 @@ def _find_ground_heights(xyz, xy):
             for row in range(-cells, cells + 1):
                 for column in range(-cells, cells + 1):
                     own = _cell(x, row) * CELLS + _cell(y, column)
-                    for j in order[start[own]:start[own + 1]]:
+                    for j in order[start[own] : start[own + 1]]:
                         if (xyz[j, 0] - x) ** 2 + (xyz[j, 1] - y) ** 2 <= reach * reach:
                             count += 1
                             total += xyz[j, 2]
@@ -176,16 +177,14 @@ def compute_centroids(points: np.ndarray, first: np.ndarray) -> np.ndarray:
     return sums / np.diff(first)[:, None]
 
 
-def make_network_input(clusters: Clusters, count: int, seed: int = 0,
-                       farthest: int = 0) -> ClusterInput:
+def make_network_input(clusters: Clusters, count: int, seed: int = 0, farthest: int = 0) -> ClusterInput:
     """Make the network input from at most `count` random points of each cluster (Eq. 13).
 
     The sample of a cluster depends on `seed` and on its own points, not on the other clusters. Its
     first `farthest` points are in the order of farthest point sampling (Eq. 15 and 17): each is the
     farthest from those before it.
     """
-    points, valid, low_high, centres = _sample_points(clusters.points, clusters.first, count, seed,
-                                                      farthest)
+    points, valid, low_high, centres = _sample_points(clusters.points, clusters.first, count, seed, farthest)
     azimuths = np.arctan2(centres[:, 1], centres[:, 0])
     reach = np.maximum(np.hypot(centres[:, 0], centres[:, 1]), 1e-3)
     inputs = np.empty((*points.shape[:2], 5), np.float32)
@@ -195,9 +194,15 @@ def make_network_input(clusters: Clusters, count: int, seed: int = 0,
     inputs[..., 2:4] = points[..., 2:]
     floor = clusters.floor
     inputs[..., 4] = points[..., 2] + (centres[:, 2] - floor)[:, None].astype(np.float32)
-    context = np.column_stack([
-        reach / 50, centres[:, 2] - floor, low_high - floor[:, None],
-        np.log(np.maximum(clusters.sizes, 1)) / 5, np.log(reach) / 4])
+    context = np.column_stack(
+        [
+            reach / 50,
+            centres[:, 2] - floor,
+            low_high - floor[:, None],
+            np.log(np.maximum(clusters.sizes, 1)) / 5,
+            np.log(reach) / 4,
+        ]
+    )
     return ClusterInput(inputs, valid, context.astype(np.float32), centres, azimuths)
 
 
@@ -211,7 +216,7 @@ def _sample_points(points, first, count, seed, farthest):
         begin, size = first[k], first[k + 1] - first[k]
         if size == 0:
             continue
-        own = points[begin:begin + size]
+        own = points[begin : begin + size]
         low, high = np.inf, -np.inf
         for i in range(size):
             for axis in range(3):

@@ -14,14 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidar_perception.detectors.layer_weights import LayerWeights, Weights
-from lidar_perception.detectors.matrix_kernel import (
-    BLOCK,
-    LANES,
-    multiply,
-    pack_weights,
-    pad_bias,
-    pad_channels,
-)
+from lidar_perception.detectors.matrix_kernel import BLOCK, LANES, multiply, pack_weights, pad_bias, pad_channels
 from lidar_perception.detectors.parallel import run_in_parts
 from lidar_perception.detectors.pointnet import kernels
 from lidar_perception.detectors.pointnet.box_head import Outputs
@@ -61,8 +54,7 @@ class CompiledPointNet:
         assert LANES
         self.config = config
         weights = LayerWeights(tensors, NORM_EPS)
-        shallow, local, wide = (config.point_channels[-1], config.local_channels,
-                                config.global_channels)
+        shallow, local, wide = (config.point_channels[-1], config.local_channels, config.global_channels)
         self.points = _take_layers(weights, "points", POINT, *config.point_channels)
         self.raw = self.fine = self.local = self.coarse = None
         found = (shallow + (local if config.groups else 0)) if config.skip else 0
@@ -78,8 +70,10 @@ class CompiledPointNet:
             found += wide
         self.head = _take_layers(weights, "head", found + CONTEXT, *config.head_channels)
         self.widths = [len(config.classes) + 1, 3, 3, config.yaw_bins, config.yaw_bins]
-        outputs = [weights.take(name, (width, config.head_channels[-1])) for name, width in (
-            ("classes", self.widths[0]), ("box", sum(self.widths[1:])))]
+        outputs = [
+            weights.take(name, (width, config.head_channels[-1]))
+            for name, width in (("classes", self.widths[0]), ("box", sum(self.widths[1:])))
+        ]
         weight, bias = map(np.concatenate, zip(*outputs))
         self.outputs = _make_layer(weight, bias, relu=False)
         self.temperature = weights.array("temperature", (1,))
@@ -96,8 +90,7 @@ class CompiledPointNet:
         def compute(begin: int, end: int) -> None:
             for first in range(begin, end, CHUNK):
                 rows = slice(first, min(first + CHUNK, end))
-                values[rows] = self._evaluate(inputs.points[rows], inputs.valid[rows],
-                                              inputs.context[rows])
+                values[rows] = self._evaluate(inputs.points[rows], inputs.valid[rows], inputs.context[rows])
 
         run_in_parts(compute, len(values), -(-len(values) // CHUNK))
         return Outputs(*np.split(values, [*accumulate(self.widths[:-1])], axis=1))
@@ -121,13 +114,12 @@ class CompiledPointNet:
                 coarse = self.coarse(rows, first, local, first_centre, self.config.coarse)
                 found.append(coarse * (np.float32(0.5) + dense))
         if self.raw is not None:
-            raw = kernels.max_by_group(_apply_layers(self.raw, features), first,
-                                       self.raw[-1].channels)
+            raw = kernels.max_by_group(_apply_layers(self.raw, features), first, self.raw[-1].channels)
             found.append(raw * (np.float32(1.5) - dense) if self.config.mrg else raw)
         if self.config.skip:
             found += shallow
         joined = _concatenate_padded([*found, context])
-        return self.outputs(_apply_layers(self.head, joined))[:, :self.outputs.channels]
+        return self.outputs(_apply_layers(self.head, joined))[:, : self.outputs.channels]
 
 
 class _Local:
@@ -138,26 +130,26 @@ class _Local:
         self.in_ball = config.density == "ball"
         radii, counts = zip(*config.groups)
         self.radii, self.counts = np.array(radii, np.float32), np.array(counts)
-        self.nets = [_take_layers(weights, f"local.nets.{i}", POINT, *config.group_channels)
-                     for i in range(len(radii))]
-        self.join = _take_layers(weights, "local.join", len(radii) * config.group_channels[-1]
-                                 + self.shallow, config.local_channels)
+        self.nets = [_take_layers(weights, f"local.nets.{i}", POINT, *config.group_channels) for i in range(len(radii))]
+        self.join = _take_layers(
+            weights, "local.join", len(radii) * config.group_channels[-1] + self.shallow, config.local_channels
+        )
 
-    def __call__(self, rows: np.ndarray, first: np.ndarray, features: np.ndarray,
-                 most: int) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(
+        self, rows: np.ndarray, first: np.ndarray, features: np.ndarray, most: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return features (R, C) of the centres of all clusters, and the first centre of each
         cluster (K + 1,)."""
         relative, starts, density, first_centre = kernels.group_neighbours(
-            rows, first, most, self.radii, self.counts, self.in_ball)
+            rows, first, most, self.radii, self.counts, self.in_ball
+        )
         weights = density / density.sum(axis=1, keepdims=True) * np.float32(len(self.counts))
         scales = []
         for s, layers in enumerate(self.nets):
-            values = _apply_layers(layers, relative[s, :starts[s, -1]])
-            scales.append(kernels.max_by_group(values, starts[s], layers[-1].channels)
-                          * weights[:, s:s + 1])
-        own = np.repeat(first[:-1] - first_centre[:-1], np.diff(first_centre)) + np.arange(
-            first_centre[-1])
-        scales.append(features[own, :self.shallow])
+            values = _apply_layers(layers, relative[s, : starts[s, -1]])
+            scales.append(kernels.max_by_group(values, starts[s], layers[-1].channels) * weights[:, s : s + 1])
+        own = np.repeat(first[:-1] - first_centre[:-1], np.diff(first_centre)) + np.arange(first_centre[-1])
+        scales.append(features[own, : self.shallow])
         return _apply_layers(self.join, _concatenate_padded(scales)), first_centre
 
 
@@ -166,24 +158,27 @@ class _Coarse:
 
     def __init__(self, config: PointNetConfig, weights: LayerWeights):
         self.radius, self.count = np.float32(config.coarse_radius), config.coarse_neighbours
-        weight, bias = _take_norm_layer(weights, "coarse.net.0", 3 + config.local_channels,
-                                        config.global_channels)
+        weight, bias = _take_norm_layer(weights, "coarse.net.0", 3 + config.local_channels, config.global_channels)
         self.features = _make_layer(weight[:, 3:], bias, relu=False)
         self.position = np.zeros((3, len(self.features.bias)), np.float32)
-        self.position[:, :len(weight)] = weight[:, :3].T
+        self.position[:, : len(weight)] = weight[:, :3].T
 
-    def __call__(self, rows: np.ndarray, first: np.ndarray, local: np.ndarray,
-                 first_centre: np.ndarray, most: int) -> np.ndarray:
+    def __call__(
+        self, rows: np.ndarray, first: np.ndarray, local: np.ndarray, first_centre: np.ndarray, most: int
+    ) -> np.ndarray:
         """Return (K, C) from the features `local` (R, B) of the centres."""
-        greatest = kernels.coarse_maxima(rows, first, self.features(local), first_centre, most,
-                                         self.count, self.radius, self.position)
-        return greatest[:, :self.features.channels]
+        greatest = kernels.coarse_maxima(
+            rows, first, self.features(local), first_centre, most, self.count, self.radius, self.position
+        )
+        return greatest[:, : self.features.channels]
 
 
 def _take_layers(weights: LayerWeights, name: str, *channels: int) -> list[Layer]:
     """Take the layers of network.mlp(*channels)."""
-    return [_make_layer(*_take_norm_layer(weights, f"{name}.{i}", read, out), relu=True)
-            for i, (read, out) in enumerate(pairwise(channels))]
+    return [
+        _make_layer(*_take_norm_layer(weights, f"{name}.{i}", read, out), relu=True)
+        for i, (read, out) in enumerate(pairwise(channels))
+    ]
 
 
 def _take_norm_layer(weights: LayerWeights, name: str, channels: int, out: int) -> Weights:

@@ -78,11 +78,24 @@ class PointNetConfig:
     sizes: tuple[tuple[float, float, float], ...] = tuple(of.mean_size for of in DETECTED.values())
 
     def __post_init__(self) -> None:
-        numbers = (self.points, self.centroids, self.coarse, self.coarse_neighbours, self.yaw_bins,
-                   self.local_channels, self.global_channels, *self.neighbours,
-                   *self.point_channels, *self.group_channels, *self.head_channels)
-        if min(numbers) < 1 or min(self.coarse_radius, *self.radii) <= 0 or not (
-                self.point_channels and self.group_channels and self.head_channels):
+        numbers = (
+            self.points,
+            self.centroids,
+            self.coarse,
+            self.coarse_neighbours,
+            self.yaw_bins,
+            self.local_channels,
+            self.global_channels,
+            *self.neighbours,
+            *self.point_channels,
+            *self.group_channels,
+            *self.head_channels,
+        )
+        if (
+            min(numbers) < 1
+            or min(self.coarse_radius, *self.radii) <= 0
+            or not (self.point_channels and self.group_channels and self.head_channels)
+        ):
             raise ValueError("every count, width and radius must be above 0")
         if unknown := [name for name in self.classes if name not in CLASSES]:
             raise ValueError(f"there is no class {unknown[0]!r}; known are {', '.join(CLASSES)}")
@@ -95,11 +108,11 @@ class PointNetConfig:
         if list(self.radii) != sorted(self.radii) or max(self.neighbours) > self.points:
             raise ValueError("radii must be ascending, and neighbours at most points")
         if not max(self.coarse, self.coarse_neighbours) <= self.centroids <= self.points:
-            raise ValueError("coarse and coarse_neighbours must be at most centroids, and these at "
-                             "most points")
+            raise ValueError("coarse and coarse_neighbours must be at most centroids, and these at most points")
         if self.sampling not in SAMPLINGS or self.density not in DENSITIES:
-            raise ValueError(f"sampling must be one of {', '.join(SAMPLINGS)}, and density one of "
-                             f"{', '.join(DENSITIES)}")
+            raise ValueError(
+                f"sampling must be one of {', '.join(SAMPLINGS)}, and density one of {', '.join(DENSITIES)}"
+            )
         if self.points > MAX_POINTS:
             raise ValueError(f"points are more than {MAX_POINTS}")
 
@@ -134,8 +147,10 @@ class PointNetConfig:
         log_point_count it does not depend on the number of neighbours.
         """
         euclidean = EuclideanParams(
-            threshold="local" if self.dynamic_threshold else "fixed", gamma=0.0,
-            beta=EuclideanParams().beta if self.log_point_count else 0.0)
+            threshold="local" if self.dynamic_threshold else "fixed",
+            gamma=0.0,
+            beta=EuclideanParams().beta if self.log_point_count else 0.0,
+        )
         return ClusteringParams(method="euclidean", density=FULL_DENSITY, euclidean=euclidean)
 
     @property

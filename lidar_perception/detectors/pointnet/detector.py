@@ -20,11 +20,7 @@ from lidar_perception.detectors.devices import CPU, find_device
 from lidar_perception.detectors.layer_weights import WeightsMismatch
 from lidar_perception.detectors.matrix_kernel import LANES
 from lidar_perception.detectors.nms import rotated_nms
-from lidar_perception.detectors.normalized_view import (
-    NormalizedView,
-    restore_detections,
-    segment_view_ground,
-)
+from lidar_perception.detectors.normalized_view import NormalizedView, restore_detections, segment_view_ground
 from lidar_perception.detectors.pointnet.classifier import PointNetClassifier
 from lidar_perception.detectors.pointnet.clusters import Clusters, make_clusters
 from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
@@ -45,8 +41,7 @@ class PointNetDetector(NetworkDetector):
     group = "pointnet"
     params: PointNetDetectorParams
 
-    def __init__(self, classifier: PointNetClassifier,
-                 params: PointNetDetectorParams = PointNetDetectorParams()):
+    def __init__(self, classifier: PointNetClassifier, params: PointNetDetectorParams = PointNetDetectorParams()):
         super().__init__(params)
         self.classifier = classifier
 
@@ -63,35 +58,32 @@ class PointNetDetector(NetworkDetector):
         other.classifier = self.classifier.with_raw_scores()
         return other
 
-    def detect(self, frame: PointCloud, ground: np.ndarray | None,
-               cluster_ids: np.ndarray | None) -> DetectionResult:
+    def detect(self, frame: PointCloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None) -> DetectionResult:
         t0 = perf_counter()
         settings = self.settings
-        view = NormalizedView.of(frame, self.params.ground.sensor_pose,
-                                 use_intensity=settings.use_intensity)
+        view = NormalizedView.of(frame, self.params.ground.sensor_pose, use_intensity=settings.use_intensity)
         t1 = perf_counter()
         if ground is None:
             ground = segment_view_ground(view.frame, self.params.ground)
         t2 = perf_counter()
         if cluster_ids is None:
-            cluster_ids = cluster_obstacles(view.frame, ground, self.params.clustering,
-                                            view.source.xyz)
+            cluster_ids = cluster_obstacles(view.frame, ground, self.params.clustering, view.source.xyz)
         t3 = perf_counter()
         clusters = make_clusters(view.frame, cluster_ids, settings.min_points)
         dropped = max(len(clusters) - settings.max_clusters, 0)
-        clusters = clusters.take_nearest(settings.max_clusters).with_ground(
-            view.frame.xyz.compress(ground, axis=0))
+        clusters = clusters.take_nearest(settings.max_clusters).with_ground(view.frame.xyz.compress(ground, axis=0))
         t4 = self.classifier.now()
         predictions = self.classifier.predict(clusters, cpu_fallback=settings.cpu_fallback)
         t5 = self.classifier.now()
         detections, best, broken = self._make_detections(predictions)
-        boxes = move_cars_to_points(detections.boxes, detections.class_ids,
-                                    view.frame.xyz.compress(~ground, axis=0), settings.on_points)
-        detections = restore_detections(replace(detections, boxes=boxes.astype(np.float32)),
-                                        view.pose)
+        boxes = move_cars_to_points(
+            detections.boxes, detections.class_ids, view.frame.xyz.compress(~ground, axis=0), settings.on_points
+        )
+        detections = restore_detections(replace(detections, boxes=boxes.astype(np.float32)), view.pose)
         t6 = perf_counter()
-        timings = {step: seconds * 1e3 for step, seconds in zip(
-            STEPS, (t1 - t0 + t4 - t3, t2 - t1, t3 - t2, t5 - t4, t6 - t5))}
+        timings = {
+            step: seconds * 1e3 for step, seconds in zip(STEPS, (t1 - t0 + t4 - t3, t2 - t1, t3 - t2, t5 - t4, t6 - t5))
+        }
         problem = broken or self._find_problem(view, cluster_ids, clusters, dropped)
         return DetectionResult(detections, timings, problem or self.fallback, best)
 
@@ -101,32 +93,39 @@ class PointNetDetector(NetworkDetector):
         best: dict[str, float] = {}
         valid = np.isfinite(np.column_stack([predicted.probabilities, predicted.boxes])).all(axis=1)
         if not valid.all():
-            broken = (f"the network's outputs are NaN for {len(valid) - valid.sum()} of "
-                      f"{len(valid)} clusters; check the weights and the intensity")
+            broken = (
+                f"the network's outputs are NaN for {len(valid) - valid.sum()} of "
+                f"{len(valid)} clusters; check the weights and the intensity"
+            )
         predicted = predicted.take(np.flatnonzero(valid))
         detections = calibrate_scores(
-            select_detections(predicted, self.classifier.config,
-                              self.classifier.to_raw_scores(self.min_scores), self.settings.nms),
-            self.classifier.header.calibration)
+            select_detections(
+                predicted, self.classifier.config, self.classifier.to_raw_scores(self.min_scores), self.settings.nms
+            ),
+            self.classifier.header.calibration,
+        )
         if len(detections) == 0 and valid.any():
-            highest = predicted.probabilities[:, :len(self.classes)].max(axis=0)
+            highest = predicted.probabilities[:, : len(self.classes)].max(axis=0)
             best, nan = self.classifier.find_best_scores(highest.tolist())
             broken = nan or broken
         return detections, best, broken
 
-    def _find_problem(self, view: NormalizedView, cluster_ids: np.ndarray, clusters: Clusters,
-                      dropped: int) -> str | None:
+    def _find_problem(
+        self, view: NormalizedView, cluster_ids: np.ndarray, clusters: Clusters, dropped: int
+    ) -> str | None:
         if len(view.source) == 0:
             return "the cloud is empty or has no finite point, or crop.* leaves none"
         if not (cluster_ids > 0).any():
-            return ("no clusters; check ground.sensor_pose, and clustering.euclidean or "
-                    "clustering.dbscan for this sensor")
+            return (
+                "no clusters; check ground.sensor_pose, and clustering.euclidean or clustering.dbscan for this sensor"
+            )
         if len(clusters) == 0:
-            return (f"every cluster has fewer than {self.settings.min_points} points; lower "
-                    "pointnet.min_points")
+            return f"every cluster has fewer than {self.settings.min_points} points; lower pointnet.min_points"
         if dropped:
-            return (f"the farthest {dropped} of {len(clusters) + dropped} clusters are ignored; "
-                    "raise clustering's min_size or pointnet.max_clusters")
+            return (
+                f"the farthest {dropped} of {len(clusters) + dropped} clusters are ignored; "
+                "raise clustering's min_size or pointnet.max_clusters"
+            )
         return view.intensity_problem()
 
     def warm_up(self) -> None:
@@ -137,8 +136,9 @@ class PointNetDetector(NetworkDetector):
         rotated_nms(np.ones((2, 7)), np.ones(2), np.zeros(2, int), 0.5)
 
 
-def load_pointnet_detector(path: str | Path = "", device: str = "auto",
-                           params: PointNetDetectorParams | None = None) -> PointNetDetector:
+def load_pointnet_detector(
+    path: str | Path = "", device: str = "auto", params: PointNetDetectorParams | None = None
+) -> PointNetDetector:
     """Load a detector from a checkpoint.
 
     Args:
@@ -155,8 +155,7 @@ def load_pointnet_detector(path: str | Path = "", device: str = "auto",
     target = CPU if path.suffix == ".onnx" and device == "auto" else find_device(device)
     header, network = _load_network(path, target, settings.engine)
     if params is None:
-        params = PointNetDetectorParams(ground=header.config.ground,
-                                        clustering=header.config.clustering)
+        params = PointNetDetectorParams(ground=header.config.ground, clustering=header.config.clustering)
     classifier = PointNetClassifier(network, header)
     classifier.move(target, settings.cpu_fallback)
     detector = PointNetDetector(classifier, params)
@@ -169,9 +168,9 @@ def _load_network(path: Path, device: str, engine: str) -> tuple[Header, Network
     """Load a checkpoint, with torch only if no compiled kernels can run it; or an exported file."""
     if path.suffix == ".onnx":
         from lidar_perception.detectors.pointnet.onnx import OnnxPointNet
+
         if device != CPU:
-            raise InputError(f"{path} runs on the CPU only, not on {device!r}; give the "
-                             "checkpoint, or the device cpu")
+            raise InputError(f"{path} runs on the CPU only, not on {device!r}; give the checkpoint, or the device cpu")
         exported = OnnxPointNet(path)
         return exported.header, exported
     if device == CPU and engine == "auto" and LANES:
@@ -180,5 +179,6 @@ def _load_network(path: Path, device: str, engine: str) -> tuple[Header, Network
             return header, CompiledPointNet(header.config, tensors)
     from lidar_perception.detectors.pointnet.network import fuse_norms, load_pointnet
     from lidar_perception.detectors.pointnet.torch_network import TorchPointNet
+
     header, network = load_pointnet(path)
     return header, TorchPointNet(fuse_norms(network), engine)

@@ -88,8 +88,7 @@ def group_neighbours(points, first, most, radii, counts, in_ball):
     for k in range(clusters):
         for c in range(first_centre[k], first_centre[k + 1]):
             centre = first[k] + c - first_centre[k]
-            found = _find_nearest(points, first[k], first[k + 1], centre, counts.max(), distances,
-                                  indices)
+            found = _find_nearest(points, first[k], first[k + 1], centre, counts.max(), distances, indices)
             for s in range(scales):
                 row, radius = starts[s, c], radii[s]
                 for i in range(min(found, counts[s])):
@@ -128,8 +127,7 @@ def coarse_maxima(points, first, rows, first_row, most, count, radius, weights):
         if size == 0:
             greatest[k] = np.nan
         for centre in range(first[k], first[k] + min(most, size)):
-            found = _find_nearest(points, first[k], first[k] + size, centre, count, distances,
-                                  indices)
+            found = _find_nearest(points, first[k], first[k] + size, centre, count, distances, indices)
             for i in range(found):
                 if distances[i] > radius * radius:
                     break

@@ -34,8 +34,7 @@ class LinearNormRelu(nn.Sequential):
     """Linear layer, batch norm over all axes but the last, and ReLU."""
 
     def __init__(self, channels: int, out: int):
-        super().__init__(nn.Linear(channels, out, bias=False), nn.BatchNorm1d(out),
-                         nn.ReLU(inplace=True))
+        super().__init__(nn.Linear(channels, out, bias=False), nn.BatchNorm1d(out), nn.ReLU(inplace=True))
 
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(x.reshape(-1, x.shape[-1])).view(*x.shape[:-1], -1)
@@ -49,8 +48,7 @@ class LinearNormRelu(nn.Sequential):
         linear, norm, relu = self
         assert isinstance(linear, nn.Linear)
         of_own, of_rows = linear.weight.split([own.shape[-1], features.shape[-1]], dim=1)
-        x = functional.linear(own, of_own, linear.bias).add_(
-            gather_rows(functional.linear(features, of_rows), indices))
+        x = functional.linear(own, of_own, linear.bias).add_(gather_rows(functional.linear(features, of_rows), indices))
         return relu(norm(x.flatten(0, 2))).view(x.shape)
 
 
@@ -63,8 +61,7 @@ def squared_distances(centres: Tensor, xyz: Tensor, valid: Tensor) -> Tensor:
     """Return (B, M, N) of centres (B, M, 3) to points xyz (B, N, 3); inf to points not valid."""
     # Differences instead of a matrix product keep the distance of a point to itself exactly 0.
     # Separate axes: a sum over an axis of length 3 takes four times as long.
-    x, y, z = ((a[:, :, None] - b[:, None]).square() for a, b in zip(centres.unbind(-1),
-                                                                     xyz.unbind(-1)))
+    x, y, z = ((a[:, :, None] - b[:, None]).square() for a, b in zip(centres.unbind(-1), xyz.unbind(-1)))
     return (x + y + z).masked_fill(~valid[:, None], torch.inf)
 
 
@@ -91,8 +88,9 @@ class LocalNet(nn.Module):
     One neighbour search serves all radii.
     """
 
-    def __init__(self, groups: Sequence[tuple[float, int]], channels: Sequence[int],
-                 point_channels: int, out: int, density: str):
+    def __init__(
+        self, groups: Sequence[tuple[float, int]], channels: Sequence[int], point_channels: int, out: int, density: str
+    ):
         super().__init__()
         self.groups, self.density = list(groups), density
         self.nets = nn.ModuleList(mlp(POINT, *channels) for _ in groups)
@@ -100,19 +98,22 @@ class LocalNet(nn.Module):
 
     def forward(self, points: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
         xyz, centres = points[..., :3], points[:, :count, :3]
-        distances = squared_distances(centres, xyz, valid)                 # (B, M, N)
+        distances = squared_distances(centres, xyz, valid)  # (B, M, N)
         squared, indices = nearest(distances, max(k for _, k in self.groups))
         scales, density = [], []
         for (radius, k), net in zip(self.groups, self.nets):
-            within = squared[..., :k] <= radius * radius                   # (B, M, k)
+            within = squared[..., :k] <= radius * radius  # (B, M, k)
             near = gather_rows(points, torch.where(within, indices[..., :k], indices[..., :1]))
-            around = (near[..., :3] - centres[:, :, None]) / radius        # (B, M, k, 3)
+            around = (near[..., :3] - centres[:, :, None]) / radius  # (B, M, k, 3)
             scales.append(net(torch.cat([around, near[..., 3:]], dim=-1)).amax(dim=2))
-            density.append(within.sum(dim=-1) / (k * radius) if self.density == "neighbours" else
-                           (distances <= radius * radius).sum(dim=-1) / radius**3)
-        weights = torch.stack(density, dim=-1)                             # (B, M, scales)
+            density.append(
+                within.sum(dim=-1) / (k * radius)
+                if self.density == "neighbours"
+                else (distances <= radius * radius).sum(dim=-1) / radius**3
+            )
+        weights = torch.stack(density, dim=-1)  # (B, M, scales)
         weights = weights / weights.sum(dim=-1, keepdim=True) * len(self.groups)
-        scales = [scale * weights[..., i:i + 1] for i, scale in enumerate(scales)]
+        scales = [scale * weights[..., i : i + 1] for i, scale in enumerate(scales)]
         return self.join(torch.cat([*scales, features[:, :count]], dim=-1))  # (B, M, C)
 
 
@@ -144,8 +145,7 @@ class PointNet(nn.Module):
     def __init__(self, config: PointNetConfig):
         super().__init__()
         self.config = config
-        shallow, local, wide = (config.point_channels[-1], config.local_channels,
-                                config.global_channels)
+        shallow, local, wide = (config.point_channels[-1], config.local_channels, config.global_channels)
         self.points = mlp(POINT, *config.point_channels)
         self.local: LocalNet | None = None
         self.coarse: CoarseNet | None = None
@@ -153,8 +153,7 @@ class PointNet(nn.Module):
         self.fine: nn.Module | None = None
         found = 0
         if config.groups:
-            self.local = LocalNet(config.groups, config.group_channels, shallow, local,
-                                  config.density)
+            self.local = LocalNet(config.groups, config.group_channels, shallow, local, config.density)
             self.fine = mlp(local, wide)
             found += wide
         if config.mrg:
@@ -175,17 +174,17 @@ class PointNet(nn.Module):
 
     def forward(self, points: Tensor, valid: Tensor, context: Tensor) -> Outputs[Tensor]:
         config = self.config
-        features = self.points(points)                                     # (B, N, C)
+        features = self.points(points)  # (B, N, C)
         found, shallow = [], [features.amax(dim=1)]
         # Grouped features get more weight in dense clusters, single points in sparse ones (Eq. 17).
-        dense = valid.sum(dim=1, keepdim=True) / config.points             # (B, 1)
+        dense = valid.sum(dim=1, keepdim=True) / config.points  # (B, 1)
         if self.local is not None and self.fine is not None:
             local = self.local(points, features, valid, config.centroids)  # (B, M, C)
-            found.append(self.fine(local).amax(dim=1))                     # (B, C)
+            found.append(self.fine(local).amax(dim=1))  # (B, C)
             shallow.append(local.amax(dim=1))
         if self.coarse is not None:
-            centroids, real = points[:, :config.centroids, :3], valid[:, :config.centroids]
-            coarse = self.coarse(centroids, local, real, config.coarse)    # (B, M', C)
+            centroids, real = points[:, : config.centroids, :3], valid[:, : config.centroids]
+            coarse = self.coarse(centroids, local, real, config.coarse)  # (B, M', C)
             found.append(coarse.amax(dim=1) * (0.5 + dense))
         if self.raw is not None:
             raw = self.raw(features).amax(dim=1)
@@ -195,8 +194,7 @@ class PointNet(nn.Module):
         x = self.head(torch.cat([*found, context], dim=1))
         box = self.box(x)
         bins = config.yaw_bins
-        return Outputs(self.classes(x), box[:, :3], box[:, 3:6], box[:, 6:6 + bins],
-                       box[:, 6 + bins:])
+        return Outputs(self.classes(x), box[:, :3], box[:, 3:6], box[:, 6 : 6 + bins], box[:, 6 + bins :])
 
 
 def make_pointnet(config: PointNetConfig) -> PointNet:
@@ -215,8 +213,7 @@ def fuse_norms(network: PointNet) -> PointNet:
     return network
 
 
-def load_pointnet(path: str | Path,
-                  expected: PointNetConfig | None = None) -> tuple[Header, PointNet]:
+def load_pointnet(path: str | Path, expected: PointNetConfig | None = None) -> tuple[Header, PointNet]:
     """Load a checkpoint: header, and network in float32 on the CPU, in training mode.
 
     Raises:

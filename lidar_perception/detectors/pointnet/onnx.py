@@ -47,12 +47,20 @@ def export_onnx(network: PointNet, header: Header, path: str | Path) -> None:
         InputError: the packages of the extra [onnx] are not installed.
     """
     count = header.config.points
-    inputs = {"points": torch.randn(EXAMPLES, count, POINT),
-              "valid": torch.ones(EXAMPLES, count, dtype=torch.bool),
-              "context": torch.zeros(EXAMPLES, CONTEXT)}
+    inputs = {
+        "points": torch.randn(EXAMPLES, count, POINT),
+        "valid": torch.ones(EXAMPLES, count, dtype=torch.bool),
+        "context": torch.zeros(EXAMPLES, CONTEXT),
+    }
     clusters = torch.export.Dim("clusters", min=1)
-    write_onnx(path, CalibratedPointNet(fuse_norms(network)).eval(), header, inputs,
-               Outputs._fields, {name: {0: clusters} for name in inputs})
+    write_onnx(
+        path,
+        CalibratedPointNet(fuse_norms(network)).eval(),
+        header,
+        inputs,
+        Outputs._fields,
+        {name: {0: clusters} for name in inputs},
+    )
 
 
 class OnnxPointNet:
@@ -64,11 +72,9 @@ class OnnxPointNet:
         self.source = str(path)
         self.header = Header.from_json(text, self.source, PointNetConfig)
         self.config: PointNetConfig = self.header.config
-        found = ({i.name for i in self.session.get_inputs()},
-                 {o.name for o in self.session.get_outputs()})
+        found = ({i.name for i in self.session.get_inputs()}, {o.name for o in self.session.get_outputs()})
         if found != ({*INPUTS}, {*Outputs._fields}):
-            raise InputError(f"{path} has other inputs or outputs than a network of its header; "
-                             "export it again")
+            raise InputError(f"{path} has other inputs or outputs than a network of its header; export it again")
         self.temperature = np.ones(1, np.float32)  # the graph calibrates
         self.offsets = np.zeros(len(self.config.classes) + 1, np.float32)
 
@@ -77,5 +83,6 @@ class OnnxPointNet:
 
     def __call__(self, inputs: ClusterInput) -> Outputs[np.ndarray]:
         """Return the outputs for one or more clusters."""
-        return Outputs(*run_session(self.session, self.source, Outputs._fields, {
-            name: getattr(inputs, name) for name in INPUTS}))
+        return Outputs(
+            *run_session(self.session, self.source, Outputs._fields, {name: getattr(inputs, name) for name in INPUTS})
+        )

@@ -20,14 +20,22 @@ class PointNetParams(NetworkParams):
     """Network, device, clusters and thresholds of PointNet."""
 
     min_points: int = param(3, "Ignore clusters with fewer points.", low=1, high=1_000_000)
-    max_clusters: int = param(4000, "Maximum number of clusters; the nearest are kept and the "
-                              "diagnostics report the rest. A typical scan has a few hundred.",
-                              low=1, high=1_000_000)
+    max_clusters: int = param(
+        4000,
+        "Maximum number of clusters; the nearest are kept and the "
+        "diagnostics report the rest. A typical scan has a few hundred.",
+        low=1,
+        high=1_000_000,
+    )
     on_points: float = make_on_points_param()
-    engine: str = param("auto", "Implementation of the network on the CPU. torch: torch. auto: "
-                        "compiled kernels on x86-64 with AVX2, otherwise torch. Detections are the "
-                        "same.",
-                        choices=("auto", "torch"), fixed=True)
+    engine: str = param(
+        "auto",
+        "Implementation of the network on the CPU. torch: torch. auto: "
+        "compiled kernels on x86-64 with AVX2, otherwise torch. Detections are the "
+        "same.",
+        choices=("auto", "torch"),
+        fixed=True,
+    )
 
 
 INPUT = InputParams()

@@ -58,17 +58,18 @@ class Predictions:
         return Predictions(self.probabilities[chosen], self.labels[chosen], self.boxes[chosen])
 
 
-def select_detections(predictions: Predictions, config: PointNetConfig,
-                      min_scores: Sequence[float], nms: NmsParams = NmsParams()) -> Detections:
+def select_detections(
+    predictions: Predictions, config: PointNetConfig, min_scores: Sequence[float], nms: NmsParams = NmsParams()
+) -> Detections:
     """Return the boxes that reach the threshold of their class, min_scores (C,), after NMS."""
     chosen = np.flatnonzero(predictions.scores >= np.asarray(min_scores)[predictions.labels])
-    chosen = chosen[np.argsort(-predictions.scores[chosen], kind="stable")][:nms.candidates]
-    return apply_nms(predictions.boxes[chosen], predictions.scores[chosen],
-                     predictions.labels[chosen], config.classes, nms)
+    chosen = chosen[np.argsort(-predictions.scores[chosen], kind="stable")][: nms.candidates]
+    return apply_nms(
+        predictions.boxes[chosen], predictions.scores[chosen], predictions.labels[chosen], config.classes, nms
+    )
 
 
-def predict(network: Network, clusters: Clusters, seed: int = 0,
-            labels: np.ndarray | None = None) -> Predictions:
+def predict(network: Network, clusters: Clusters, seed: int = 0, labels: np.ndarray | None = None) -> Predictions:
     """Return the predictions for K clusters; K may be 0.
 
     Args:
@@ -76,8 +77,7 @@ def predict(network: Network, clusters: Clusters, seed: int = 0,
     """
     config, classes = network.config, len(network.config.classes)
     if len(clusters) == 0:
-        return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64),
-                           np.zeros((0, 7), np.float32))
+        return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64), np.zeros((0, 7), np.float32))
     inputs = make_network_input(clusters, config.points, seed, config.farthest)
     outputs = network(inputs)
     calibrated = compute_probabilities(outputs.logits, network.temperature, network.offsets)
@@ -86,8 +86,7 @@ def predict(network: Network, clusters: Clusters, seed: int = 0,
     return Predictions(calibrated, labels, decode(outputs, inputs, config, labels))
 
 
-def compute_probabilities(logits: np.ndarray, temperature: np.ndarray,
-                          offsets: np.ndarray) -> np.ndarray:
+def compute_probabilities(logits: np.ndarray, temperature: np.ndarray, offsets: np.ndarray) -> np.ndarray:
     """Return calibrated probabilities (B, K + 1) float32 of logits (B, K + 1), which are
     softmax(logits / temperature + offsets)."""
     with np.errstate(all="ignore"):  # broken weights are reported elsewhere

@@ -28,10 +28,10 @@ class TorchPointNet:
     def __init__(self, network: PointNet, engine: str = "torch"):
         set_torch_threads()
         self.network, self.config = network, network.config
-        self.temperature, self.offsets = (values.detach().cpu().numpy()
-                                          for values in (network.temperature, network.offsets))
-        self.compiled = CompiledPointNet(network.config, to_arrays(network)) if (
-            LANES and engine == "auto") else None
+        self.temperature, self.offsets = (
+            values.detach().cpu().numpy() for values in (network.temperature, network.offsets)
+        )
+        self.compiled = CompiledPointNet(network.config, to_arrays(network)) if (LANES and engine == "auto") else None
 
     def to(self, device: str) -> None:
         self.network.to(device)
@@ -39,8 +39,7 @@ class TorchPointNet:
     def __call__(self, inputs: ClusterInput) -> Outputs[np.ndarray]:
         if self.compiled and self.network.temperature.device.type == CPU:
             return self.compiled(inputs)
-        return Outputs(*(values.float().cpu().numpy()
-                         for values in run_network(self.network, inputs)))
+        return Outputs(*(values.float().cpu().numpy() for values in run_network(self.network, inputs)))
 
 
 @torch.inference_mode()
@@ -59,8 +58,14 @@ def run_network(network: PointNet, inputs: ClusterInput, chunk: int = CHUNK) -> 
     for rows in groups:
         width = sizes[rows].max()
         for begin in range(0, len(rows), chunk):
-            part = rows[begin:begin + chunk]
-            parts.append(network(*(torch.from_numpy(x).to(device) for x in (
-                inputs.points[part, :width], inputs.valid[part, :width], inputs.context[part]))))
+            part = rows[begin : begin + chunk]
+            parts.append(
+                network(
+                    *(
+                        torch.from_numpy(x).to(device)
+                        for x in (inputs.points[part, :width], inputs.valid[part, :width], inputs.context[part])
+                    )
+                )
+            )
     back = torch.from_numpy(np.argsort(order)).to(device)
     return Outputs(*(torch.cat(column)[back] for column in zip(*parts)))

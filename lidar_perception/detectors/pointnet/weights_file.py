@@ -26,6 +26,5 @@ def find_judge_weights() -> Path:
 
 def _shipped(path: Path) -> Path:
     if not path.is_file():
-        raise InputError("the package has no PointNet weights; set pointnet.weights to a "
-                         "checkpoint")
+        raise InputError("the package has no PointNet weights; set pointnet.weights to a checkpoint")
     return path

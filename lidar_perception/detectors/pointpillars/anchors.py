@@ -19,8 +19,10 @@ def make_anchors(config: NetworkConfig) -> np.ndarray:
     A = H * W * classes * yaws, in this order, with (H, W) = config.head_grid and rows along y.
     """
     height, width = config.head_grid
-    x, y = (_centres(config.low[axis], config.high[axis], count, config.anchors_at)
-            for axis, count in ((0, width), (1, height)))
+    x, y = (
+        _centres(config.low[axis], config.high[axis], count, config.anchors_at)
+        for axis, count in ((0, width), (1, height))
+    )
     of_cell = [[a.z, *a.size, yaw] for a in config.anchors for yaw in config.yaws]
     anchors = np.empty((height, width, len(of_cell), 7), np.float32)
     anchors[..., 0] = x[None, :, None]
@@ -57,9 +59,12 @@ def decode(codes: np.ndarray, bins: np.ndarray, anchors: np.ndarray, offset: flo
         diagonal = np.hypot(anchors[:, 3], anchors[:, 4])
         line = codes[:, 6] + anchors[:, 6] - offset
         yaw = line - np.floor(line / math.pi) * math.pi + offset + math.pi * bins.astype(line.dtype)
-        return np.column_stack([
-            codes[:, 0] * diagonal + anchors[:, 0],
-            codes[:, 1] * diagonal + anchors[:, 1],
-            codes[:, 2] * anchors[:, 5] + anchors[:, 2],
-            np.exp(np.minimum(codes[:, 3:6], 4.0)) * anchors[:, 3:6],
-            np.remainder(yaw + math.pi, 2 * math.pi) - math.pi])
+        return np.column_stack(
+            [
+                codes[:, 0] * diagonal + anchors[:, 0],
+                codes[:, 1] * diagonal + anchors[:, 1],
+                codes[:, 2] * anchors[:, 5] + anchors[:, 2],
+                np.exp(np.minimum(codes[:, 3:6], 4.0)) * anchors[:, 3:6],
+                np.remainder(yaw + math.pi, 2 * math.pi) - math.pi,
+            ]
+        )

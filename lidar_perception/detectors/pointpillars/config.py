@@ -23,11 +23,23 @@ VERSIONS = {  # paper B, Table 3
 }
 SIZES = {
     # Lang et al., CVPR 2019; neck with 2C = 64 channels as in paper B
-    "full": dict(pillar_channels=64, map_channels=(16, 32, 64), block_channels=(64, 128, 256),
-                 block_layers=(3, 5, 5), deconv_channels=128, fpn_channels=64),
+    "full": dict(
+        pillar_channels=64,
+        map_channels=(16, 32, 64),
+        block_channels=(64, 128, 256),
+        block_layers=(3, 5, 5),
+        deconv_channels=128,
+        fpn_channels=64,
+    ),
     # the same grid with an eighth of the operations, for two CPU cores
-    "compact": dict(pillar_channels=16, map_channels=(8, 8), block_channels=(32, 64, 96),
-                    block_layers=(1, 3, 3), deconv_channels=32, fpn_channels=32),
+    "compact": dict(
+        pillar_channels=16,
+        map_channels=(8, 8),
+        block_channels=(32, 64, 96),
+        block_layers=(1, 3, 3),
+        deconv_channels=32,
+        fpn_channels=32,
+    ),
 }
 
 
@@ -71,8 +83,10 @@ class AnchorClass:
 
 
 # All anchors stand on the ground.
-ANCHORS = tuple(AnchorClass(name, of.anchor, of.anchor[2] / 2 - SENSOR_HEIGHT, of.matched,
-                            of.unmatched) for name, of in DETECTED.items())
+ANCHORS = tuple(
+    AnchorClass(name, of.anchor, of.anchor[2] / 2 - SENSOR_HEIGHT, of.matched, of.unmatched)
+    for name, of in DETECTED.items()
+)
 
 
 @dataclass(frozen=True)
@@ -133,11 +147,20 @@ class NetworkConfig:
     direction_offset: float = 0.7853981633974483
 
     def __post_init__(self) -> None:
-        widths = (self.pillar_channels, self.deconv_channels, self.fpn_channels,
-                  *self.map_channels, *self.block_channels, *self.block_strides)
+        widths = (
+            self.pillar_channels,
+            self.deconv_channels,
+            self.fpn_channels,
+            *self.map_channels,
+            *self.block_channels,
+            *self.block_strides,
+        )
         if not (self.map_channels and self.block_channels and self.yaws and self.anchors) or (
-                min(widths) < 1 or min(self.block_layers, default=0) < 0
-                or min(min(anchor.size) for anchor in self.anchors) <= 0 or self.max_points < 0):
+            min(widths) < 1
+            or min(self.block_layers, default=0) < 0
+            or min(min(anchor.size) for anchor in self.anchors) <= 0
+            or self.max_points < 0
+        ):
             raise ValueError("every width and stride must be at least 1, and sizes above 0")
         if sum(self.block_layers) > MAX_LAYERS:
             raise ValueError(f"block_layers are more than {MAX_LAYERS} in all")
@@ -151,8 +174,10 @@ class NetworkConfig:
             raise ValueError(f"a grid of {width} x {height} cells is more than {MAX_CELLS}")
         total = math.prod(self.block_strides)
         if height % total or width % total or height < total or width < total:
-            raise ValueError(f"a grid of {width} x {height} cells cannot be divided by {total}, "
-                             "the product of block_strides; change low, high or cell")
+            raise ValueError(
+                f"a grid of {width} x {height} cells cannot be divided by {total}, "
+                "the product of block_strides; change low, high or cell"
+            )
         if not len(self.block_channels) == len(self.block_layers) == len(self.block_strides):
             raise ValueError("block_channels, block_layers and block_strides differ in length")
         if unknown := [name for name in self.classes if name not in CLASSES]:
@@ -174,8 +199,7 @@ class NetworkConfig:
     @property
     def grid(self) -> tuple[int, int]:
         """Size (H, W): numbers of cells along y and along x."""
-        return (round((self.high[1] - self.low[1]) / self.cell),
-                round((self.high[0] - self.low[0]) / self.cell))
+        return (round((self.high[1] - self.low[1]) / self.cell), round((self.high[0] - self.low[0]) / self.cell))
 
     @property
     def head_grid(self) -> tuple[int, int]:
@@ -198,9 +222,9 @@ class NetworkConfig:
         return 6 if self.middle_z else 5
 
 
-def make_config(version: str = "v0", size: str = "full",
-                classes: tuple[str, ...] = tuple(DETECTED),
-                **changes: Any) -> NetworkConfig:
+def make_config(
+    version: str = "v0", size: str = "full", classes: tuple[str, ...] = tuple(DETECTED), **changes: Any
+) -> NetworkConfig:
     """Make the config of a version and size.
 
     Args:
@@ -215,11 +239,17 @@ def make_config(version: str = "v0", size: str = "full",
             raise InputError(f"there is no {name!r}; choose one of {', '.join(choices)}")
     anchors = {anchor.name: anchor for anchor in ANCHORS}
     if not classes or (unknown := [name for name in classes if name not in anchors]):
-        raise InputError(f"there is no anchor for {unknown[0] if classes else 'no class'}; choose "
-                         f"some of {', '.join(anchors)}")
-    settings = dict(version=version, size=size, xy_scale=XY_SCALE,
-                    anchors=tuple(anchors[name] for name in classes), **VERSIONS[version],
-                    **SIZES[size])
+        raise InputError(
+            f"there is no anchor for {unknown[0] if classes else 'no class'}; choose some of {', '.join(anchors)}"
+        )
+    settings = dict(
+        version=version,
+        size=size,
+        xy_scale=XY_SCALE,
+        anchors=tuple(anchors[name] for name in classes),
+        **VERSIONS[version],
+        **SIZES[size],
+    )
     try:
         return NetworkConfig(**{**settings, **changes})
     except ValueError as error:

@@ -48,26 +48,24 @@ class PointPillarsDetector(NetworkDetector):
     def settings(self) -> PointPillarsParams:
         return self.params.pointpillars
 
-    def detect(self, frame: PointCloud, ground: np.ndarray | None,
-               cluster_ids: np.ndarray | None) -> DetectionResult:
+    def detect(self, frame: PointCloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None) -> DetectionResult:
         found = self.propose(frame, ground, cluster_ids)
-        return replace(found, detections=restore_detections(found.detections,
-                                                            self.params.ground.sensor_pose))
+        return replace(found, detections=restore_detections(found.detections, self.params.ground.sensor_pose))
 
-    def propose(self, frame: PointCloud, ground: np.ndarray | None = None,
-                cluster_ids: np.ndarray | None = None) -> DetectionResult:
+    def propose(
+        self, frame: PointCloud, ground: np.ndarray | None = None, cluster_ids: np.ndarray | None = None
+    ) -> DetectionResult:
         """Return what detect() returns, but in the coordinates of a NormalizedView and with the
         vehicle that carries the sensor."""
         t0 = perf_counter()
         config, settings = self.proposer.config, self.settings
-        view = NormalizedView.of(frame, self.params.ground.sensor_pose, config.low, config.high,
-                                 settings.use_intensity)
+        view = NormalizedView.of(frame, self.params.ground.sensor_pose, config.low, config.high, settings.use_intensity)
         t1 = perf_counter()
-        columns = run_experts(view.frame, config, view.take(ground), view.take(cluster_ids),
-                              self.params.ground, self.params.clustering)
+        columns = run_experts(
+            view.frame, config, view.take(ground), view.take(cluster_ids), self.params.ground, self.params.clustering
+        )
         t2 = perf_counter()
-        found = self.proposer.propose(view, *columns, settings.scores, settings.nms,
-                                      settings.cpu_fallback)
+        found = self.proposer.propose(view, *columns, settings.scores, settings.nms, settings.cpu_fallback)
         timings = {**dict.fromkeys(STEPS, 0.0), **found.timings}
         timings["preprocess"] += (t1 - t0) * 1e3
         timings["experts"] = (t2 - t1) * 1e3
@@ -92,8 +90,9 @@ class PointPillarsDetector(NetworkDetector):
         rotated_nms(np.ones((2, 7)), np.ones(2), np.zeros(2, int), 0.5)
 
 
-def load_detector(path: str | Path = "", device: str = "auto",
-                  params: DetectorParams = DetectorParams()) -> PointPillarsDetector:
+def load_detector(
+    path: str | Path = "", device: str = "auto", params: DetectorParams = DetectorParams()
+) -> PointPillarsDetector:
     """Load a detector from a checkpoint (.safetensors) or an exported network (.onnx).
 
     Args:
@@ -109,28 +108,33 @@ def load_detector(path: str | Path = "", device: str = "auto",
     network: Network
     if path.suffix == ".onnx":
         from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork
+
         header, network = OnnxNetwork.load(path)
         target = CPU
         if device not in ("auto", "cpu"):
-            raise InputError(f"{path} runs in ONNX Runtime on the CPU, not on {device!r}; use the "
-                             "checkpoint it was exported from")
+            raise InputError(
+                f"{path} runs in ONNX Runtime on the CPU, not on {device!r}; use the checkpoint it was exported from"
+            )
         if params.pointpillars.amp == "bf16":
-            raise InputError(f"{path} works in the numbers it was exported with; set amp: off, or "
-                             "use the checkpoint it was exported from")
+            raise InputError(
+                f"{path} works in the numbers it was exported with; set amp: off, or "
+                "use the checkpoint it was exported from"
+            )
         if params.pointpillars.engine != "auto":
-            raise InputError(f"{path} runs in ONNX Runtime; set engine: auto, or use the "
-                             "checkpoint it was exported from")
+            raise InputError(
+                f"{path} runs in ONNX Runtime; set engine: auto, or use the checkpoint it was exported from"
+            )
     else:
         target = find_device(device)
         if target != CPU and params.pointpillars.engine == "sparse":
-            raise InputError(f"the sparse engine runs on the CPU, not on {target}; set device: "
-                             "cpu, or engine: auto")
+            raise InputError(f"the sparse engine runs on the CPU, not on {target}; set device: cpu, or engine: auto")
         header, network = _load_network(path, target, params.pointpillars)
     for name in "version", "size":
         wanted, actual = getattr(params.pointpillars, name), getattr(header.config, name)
         if wanted not in ("auto", actual):
-            raise InputError(f"{path} has the {name} {actual}, not {wanted}; change "
-                             f"pointpillars.{name} or pointpillars.weights")
+            raise InputError(
+                f"{path} has the {name} {actual}, not {wanted}; change pointpillars.{name} or pointpillars.weights"
+            )
     proposer = PointPillarsProposer(network, header).with_range(params.pointpillars.range)
     proposer.move(target, params.pointpillars.cpu_fallback)
     detector = PointPillarsDetector(proposer, params)
@@ -148,10 +152,10 @@ def _load_network(path: Path, device: str, params: PointPillarsParams) -> tuple[
         if not reason:
             return _load_sparse(path)
         if params.engine == "sparse":
-            raise InputError(f"the sparse engine cannot run this network: {reason}; choose the "
-                             "engine auto or torch")
+            raise InputError(f"the sparse engine cannot run this network: {reason}; choose the engine auto or torch")
     from lidar_perception.detectors.pointpillars.network import load_network
     from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
+
     header, network = load_network(path)
     return header, TorchNetwork(network, CPU, params.amp)
 
@@ -162,5 +166,6 @@ def _load_sparse(path: Path) -> tuple[Header, SparseNetwork]:
         return header, SparseNetwork(header.config, tensors)
     except WeightsMismatch:  # torch reads more number formats, and names what does not fit
         from lidar_perception.detectors.pointpillars.network import load_network
+
         header, network = load_network(path)
         return header, SparseNetwork(header.config, to_arrays(network))

@@ -40,10 +40,14 @@ class NetworkInput:
     cluster_map: np.ndarray | None = None
 
 
-def make_network_input(view: PointCloud, config: NetworkConfig, ground: np.ndarray | None = None,
-                       cluster_ids: np.ndarray | None = None,
-                       ground_params: GroundParams = EXPERT_GROUND,
-                       clustering: ClusteringParams = EXPERT_CLUSTERING) -> NetworkInput:
+def make_network_input(
+    view: PointCloud,
+    config: NetworkConfig,
+    ground: np.ndarray | None = None,
+    cluster_ids: np.ndarray | None = None,
+    ground_params: GroundParams = EXPERT_GROUND,
+    clustering: ClusteringParams = EXPERT_CLUSTERING,
+) -> NetworkInput:
     """Make the input arrays of a version from the N points of a NormalizedView.
 
     Args:
@@ -65,14 +69,17 @@ def make_network_input(view: PointCloud, config: NetworkConfig, ground: np.ndarr
     cluster_ids, _ = renumber_ids(cluster_ids)
     if config.cluster_ids:
         points[:, 4] = cluster_ids
-    return NetworkInput(points, draw_clusters(view.xyz, cluster_ids, config)
-                        if config.pseudo_map else None)
+    return NetworkInput(points, draw_clusters(view.xyz, cluster_ids, config) if config.pseudo_map else None)
 
 
-def run_experts(view: PointCloud, config: NetworkConfig, ground: np.ndarray | None = None,
-                cluster_ids: np.ndarray | None = None, ground_params: GroundParams = EXPERT_GROUND,
-                clustering: ClusteringParams = EXPERT_CLUSTERING,
-                ) -> tuple[np.ndarray | None, np.ndarray | None]:
+def run_experts(
+    view: PointCloud,
+    config: NetworkConfig,
+    ground: np.ndarray | None = None,
+    cluster_ids: np.ndarray | None = None,
+    ground_params: GroundParams = EXPERT_GROUND,
+    clustering: ClusteringParams = EXPERT_CLUSTERING,
+) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Return ground (N,) bool and cluster ids (N,) int of the N points of a NormalizedView.
 
     They are computed if they are None and the version needs them. The ids are None if the version
@@ -105,8 +112,7 @@ def draw_clusters(xyz: np.ndarray, cluster_ids: np.ndarray, config: NetworkConfi
     """
     channels = CHANNELS[classify_by_diagonal(fit_boxes(xyz, cluster_ids, "min_area"))]
     image = np.zeros((len(MAP_KINDS), *config.grid), np.uint8)
-    _fill_ellipses(image, fit_ellipses(xyz, cluster_ids), channels, config.low[0], config.low[1],
-                   config.cell)
+    _fill_ellipses(image, fit_ellipses(xyz, cluster_ids), channels, config.low[0], config.low[1], config.cell)
     return image
 
 

@@ -21,12 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lidar_perception.detectors.pointpillars.config import (
-    ANCHORS,
-    AnchorClass,
-    NetworkConfig,
-    make_config,
-)
+from lidar_perception.detectors.pointpillars.config import ANCHORS, AnchorClass, NetworkConfig, make_config
 from lidar_perception.detectors.pointpillars.network import PointPillars, make_network
 from lidar_perception.types import InputError
 
@@ -40,34 +35,49 @@ class Project:
     """Names and conventions of the PointPillars of one project."""
 
     name: str
-    points: str            # prefix of the linear layer of points and its norm
-    block: str             # prefix of block i, {i}
-    first: int             # index of the first convolution in a block
-    neck: str              # prefix of the neck's branch i, {i}
+    points: str  # prefix of the linear layer of points and its norm
+    block: str  # prefix of block i, {i}
+    first: int  # index of the first convolution in a block
+    neck: str  # prefix of the neck's branch i, {i}
     head: tuple[str, str, str]
     classes: tuple[str, ...]
     bottoms: dict[str, float]  # z of the bottom face of the anchors
     anchors_at: str
     direction_offset: float
-    centred_xyz: bool      # inputs are x_p y_p z_p instead of x y z
+    centred_xyz: bool  # inputs are x_p y_p z_p instead of x y z
 
 
 PROJECTS = (
-    Project("OpenPCDet", "vfe.pfn_layers.0.", "backbone_2d.blocks.{i}.", 1,
-            "backbone_2d.deblocks.{i}.",
-            ("dense_head.conv_cls", "dense_head.conv_box", "dense_head.conv_dir_cls"),
-            ("Car", "Pedestrian", "Cyclist"), dict(Car=-1.78, Pedestrian=-0.6, Cyclist=-0.6),
-            "ends", 0.78539, False),
-    Project("mmdetection3d", "voxel_encoder.pfn_layers.0.", "backbone.blocks.{i}.", 0,
-            "neck.deblocks.{i}.",
-            ("bbox_head.conv_cls", "bbox_head.conv_reg", "bbox_head.conv_dir_cls"),
-            ("Pedestrian", "Cyclist", "Car"), dict(Car=-1.78, Pedestrian=-0.6, Cyclist=-0.6),
-            "cells", -math.pi / 2, True),
+    Project(
+        "OpenPCDet",
+        "vfe.pfn_layers.0.",
+        "backbone_2d.blocks.{i}.",
+        1,
+        "backbone_2d.deblocks.{i}.",
+        ("dense_head.conv_cls", "dense_head.conv_box", "dense_head.conv_dir_cls"),
+        ("Car", "Pedestrian", "Cyclist"),
+        dict(Car=-1.78, Pedestrian=-0.6, Cyclist=-0.6),
+        "ends",
+        0.78539,
+        False,
+    ),
+    Project(
+        "mmdetection3d",
+        "voxel_encoder.pfn_layers.0.",
+        "backbone.blocks.{i}.",
+        0,
+        "neck.deblocks.{i}.",
+        ("bbox_head.conv_cls", "bbox_head.conv_reg", "bbox_head.conv_dir_cls"),
+        ("Pedestrian", "Cyclist", "Car"),
+        dict(Car=-1.78, Pedestrian=-0.6, Cyclist=-0.6),
+        "cells",
+        -math.pi / 2,
+        True,
+    ),
 )
 
 
-def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[NetworkConfig,
-                                                                             PointPillars, str]:
+def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[NetworkConfig, PointPillars, str]:
     """Import a .pth file of a network with KITTI's range and 0.16 m pillars.
 
     Args:
@@ -84,8 +94,10 @@ def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[Net
     state = _load_state(path)
     project = next((p for p in PROJECTS if f"{p.points}linear.weight" in state), None)
     if project is None:
-        raise InputError(f"{path} is no PointPillars of {' or '.join(p.name for p in PROJECTS)}: "
-                         f"it has no tensor {PROJECTS[0].points}linear.weight")
+        raise InputError(
+            f"{path} is no PointPillars of {' or '.join(p.name for p in PROJECTS)}: "
+            f"it has no tensor {PROJECTS[0].points}linear.weight"
+        )
     config = _make_config(project, _count_anchors(state, project, path), classes, path)
     network = make_network(config)
     used, converted = {}, network.state_dict()
@@ -99,12 +111,15 @@ def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[Net
     converted["pillar_net.linear.weight"] = _convert_inputs(used[linear], project, path)
     for name, wanted in network.state_dict().items():
         if converted[name].shape != wanted.shape:
-            raise InputError(f"{path}: {name} has the shape {tuple(converted[name].shape)}, "
-                             f"PointPillars needs {tuple(wanted.shape)}")
+            raise InputError(
+                f"{path}: {name} has the shape {tuple(converted[name].shape)}, PointPillars needs {tuple(wanted.shape)}"
+            )
     left = [name for name in state if name not in used and state[name].is_floating_point()]
     if left:
-        raise InputError(f"{path} has {left[0]} and {len(left) - 1} more tensors that PointPillars "
-                         "does not have; it is another network")
+        raise InputError(
+            f"{path} has {left[0]} and {len(left) - 1} more tensors that PointPillars "
+            "does not have; it is another network"
+        )
     network.load_state_dict(converted)
     return config, network, project.name
 
@@ -116,14 +131,19 @@ def _load_state(path: Path) -> dict[str, Tensor]:
     try:
         content: Any = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many types for damaged files
-        raise InputError(f"{path} cannot be read as weights only: "
-                         f"{str(error).splitlines()[0] if str(error) else type(error).__name__}; "
-                         "save only its state_dict with torch.save and use that file") from None
+        raise InputError(
+            f"{path} cannot be read as weights only: "
+            f"{str(error).splitlines()[0] if str(error) else type(error).__name__}; "
+            "save only its state_dict with torch.save and use that file"
+        ) from None
     for key in "model_state", "state_dict":
         if isinstance(content, dict) and isinstance(content.get(key), dict):
             content = content[key]
-    state = {str(name).removeprefix("module."): value for name, value in content.items()
-             if isinstance(value, Tensor)} if isinstance(content, dict) else {}
+    state = (
+        {str(name).removeprefix("module."): value for name, value in content.items() if isinstance(value, Tensor)}
+        if isinstance(content, dict)
+        else {}
+    )
     if not state:
         raise InputError(f"{path} holds no state_dict")
     return state
@@ -139,35 +159,51 @@ def _count_anchors(state: dict[str, Tensor], project: Project, path: Path) -> in
     """Return the number of anchors per cell, from the seven outputs of each."""
     outputs = len(_get_tensor(state, f"{project.head[1]}.weight", path))
     if outputs % 14:
-        raise InputError(f"{path}: {project.head[1]} has {outputs} outputs, which is not 7 for "
-                         "each class and two headings")
+        raise InputError(
+            f"{path}: {project.head[1]} has {outputs} outputs, which is not 7 for each class and two headings"
+        )
     return outputs // 7
 
 
-def _make_config(project: Project, per_cell: int, classes: tuple[str, ...],
-                 path: Path) -> NetworkConfig:
+def _make_config(project: Project, per_cell: int, classes: tuple[str, ...], path: Path) -> NetworkConfig:
     names = classes or project.classes
     if not classes and per_cell == 2:
         names = ("Car",)
     if per_cell != 2 * len(names):
-        raise InputError(f"{path} has {per_cell} anchors per cell, so {per_cell // 2} classes; "
-                         f"name them in the order of training instead of {', '.join(names)}")
+        raise InputError(
+            f"{path} has {per_cell} anchors per cell, so {per_cell // 2} classes; "
+            f"name them in the order of training instead of {', '.join(names)}"
+        )
     known = {anchor.name: anchor for anchor in ANCHORS}
     if unknown := [name for name in names if name not in known]:
         raise InputError(f"there is no anchor for {unknown[0]!r}; choose of {', '.join(known)}")
-    anchors = tuple(AnchorClass(name, known[name].size, project.bottoms[name]
-                                + known[name].size[2] / 2, known[name].matched,
-                                known[name].unmatched) for name in names)
-    return make_config("v0", "full", xy_scale=1.0, anchors=anchors, max_points=MAX_POINTS,
-                       zero_row=True, middle_z=True, yaws=(0.0, 1.57),
-                       anchors_at=project.anchors_at,
-                       direction_offset=project.direction_offset)
+    anchors = tuple(
+        AnchorClass(
+            name,
+            known[name].size,
+            project.bottoms[name] + known[name].size[2] / 2,
+            known[name].matched,
+            known[name].unmatched,
+        )
+        for name in names
+    )
+    return make_config(
+        "v0",
+        "full",
+        xy_scale=1.0,
+        anchors=anchors,
+        max_points=MAX_POINTS,
+        zero_row=True,
+        middle_z=True,
+        yaws=(0.0, 1.57),
+        anchors_at=project.anchors_at,
+        direction_offset=project.direction_offset,
+    )
 
 
 def _map_names(project: Project, config: NetworkConfig) -> dict[str, str]:
     """Map our names of tensors to theirs, except that of the linear layer of points."""
-    names = {f"pillar_net.norm.{part}": f"{project.points}norm.{part}"
-             for part in (*NORM_PARTS, "num_batches_tracked")}
+    names = {f"pillar_net.norm.{part}": f"{project.points}norm.{part}" for part in (*NORM_PARTS, "num_batches_tracked")}
 
     def layer(ours: str, theirs: str, index: int) -> None:
         names[f"{ours}.0.weight"] = f"{theirs}{index}.weight"
@@ -187,10 +223,11 @@ def _map_names(project: Project, config: NetworkConfig) -> dict[str, str]:
 def _convert_inputs(weight: Tensor, project: Project, path: Path) -> Tensor:
     """Convert weights (C, 10) to the inputs of this package."""
     if weight.shape[1] != COLUMNS:
-        older = (" Weights of mmdetection3d 0.x have 9, and another order of box numbers."
-                 if project.centred_xyz else "")
-        raise InputError(f"{path}: the points have {weight.shape[1]} inputs; supported are "
-                         f"{COLUMNS}: x y z intensity and the offsets from mean and middle.{older}")
+        older = " Weights of mmdetection3d 0.x have 9, and another order of box numbers." if project.centred_xyz else ""
+        raise InputError(
+            f"{path}: the points have {weight.shape[1]} inputs; supported are "
+            f"{COLUMNS}: x y z intensity and the offsets from mean and middle.{older}"
+        )
     if project.centred_xyz:
         weight = weight.clone()
         weight[:, 7:10] += weight[:, 0:3]

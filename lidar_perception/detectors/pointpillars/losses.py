@@ -38,24 +38,21 @@ def detection_loss(outputs: Outputs, targets: Targets, classes_of: Tensor) -> Lo
     Args:
         classes_of: (A,) class of each anchor, see anchors.anchor_classes.
     """
-    positive = targets.labels >= 0                                       # (B, A)
+    positive = targets.labels >= 0  # (B, A)
     logits = outputs.logits.float()
     clouds, _, classes = logits.shape
     count = logits.new_zeros(classes).index_add_(0, classes_of, positive.sum(dim=0).to(logits))
-    share = (count.clamp(min=clouds) * classes).reciprocal()[classes_of]      # (A,)
+    share = (count.clamp(min=clouds) * classes).reciprocal()[classes_of]  # (A,)
     wanted = functional.one_hot(targets.labels.clamp(min=0), classes).to(logits.dtype)
     focal = focal_loss(logits, wanted * positive[..., None]).sum(dim=2)  # (B, A)
     scores = ((focal * (targets.labels != IGNORED)).sum(dim=0) * share).sum()
     number = count.sum().clamp(min=clouds)
-    codes, bins = targets.codes[positive], targets.bins[positive]        # (P, 7), (P,)
+    codes, bins = targets.codes[positive], targets.bins[positive]  # (P, 7), (P,)
     found = outputs.codes.float()[positive]
     # sin(a - b): rotation by half a turn is left to the direction loss
-    difference = torch.cat([found[:, :6] - codes[:, :6],
-                            torch.sin(found[:, 6:] - codes[:, 6:])], dim=1)
-    boxes = functional.smooth_l1_loss(difference, torch.zeros_like(difference), beta=SMOOTH,
-                                      reduction="sum") / number
-    headings = functional.cross_entropy(outputs.directions.float()[positive], bins,
-                                        reduction="sum") / number
+    difference = torch.cat([found[:, :6] - codes[:, :6], torch.sin(found[:, 6:] - codes[:, 6:])], dim=1)
+    boxes = functional.smooth_l1_loss(difference, torch.zeros_like(difference), beta=SMOOTH, reduction="sum") / number
+    headings = functional.cross_entropy(outputs.directions.float()[positive], bins, reduction="sum") / number
     total = CLASS_WEIGHT * scores + BOX_WEIGHT * boxes + DIRECTION_WEIGHT * headings
     return Losses(total, scores, boxes, headings)
 

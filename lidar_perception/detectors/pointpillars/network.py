@@ -24,8 +24,8 @@ from lidar_perception.detectors.checkpoint import Header, Net, load_checkpoint
 from lidar_perception.detectors.pointpillars.config import BINS, CODE, NORM_EPS, NetworkConfig
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 
-MOMENTUM = 0.01        # of batch norms
-PRIOR = 0.01           # score of every anchor before training
+MOMENTUM = 0.01  # of batch norms
+PRIOR = 0.01  # score of every anchor before training
 
 Conv = nn.Conv2d | nn.ConvTranspose2d
 
@@ -42,8 +42,7 @@ class ConvNormRelu(nn.Sequential):
     """Convolution, batch norm and ReLU."""
 
     def __init__(self, conv: Conv):
-        super().__init__(conv, nn.BatchNorm2d(conv.out_channels, NORM_EPS, MOMENTUM),
-                         nn.ReLU(inplace=True))
+        super().__init__(conv, nn.BatchNorm2d(conv.out_channels, NORM_EPS, MOMENTUM), nn.ReLU(inplace=True))
 
 
 def conv3x3(channels: int, out: int, stride: int = 1) -> ConvNormRelu:
@@ -57,8 +56,7 @@ class PillarNet(nn.Module):
     def __init__(self, config: NetworkConfig):
         super().__init__()
         self.config = config
-        self.linear = nn.Linear(config.point_columns + config.offset_columns,
-                                config.pillar_channels, bias=False)
+        self.linear = nn.Linear(config.point_columns + config.offset_columns, config.pillar_channels, bias=False)
         self.norm: nn.Module = nn.BatchNorm1d(config.pillar_channels, NORM_EPS, MOMENTUM)
 
     @torch.autocast("cuda", enabled=False)
@@ -66,12 +64,19 @@ class PillarNet(nn.Module):
     def forward(self, pillars: Pillars[Tensor]) -> Tensor:
         # Cluster ids come last, so that versions with and without them share the first inputs.
         points = pillars.points
-        inputs = torch.cat([points[:, :2] * self.config.xy_scale, points[:, 2:4], pillars.offsets,
-                            points[:, 4:] * self.config.id_scale], dim=1)      # (N, 9 to 11)
-        values = functional.relu(self.norm(self.linear(inputs)))   # (N, C)
+        inputs = torch.cat(
+            [
+                points[:, :2] * self.config.xy_scale,
+                points[:, 2:4],
+                pillars.offsets,
+                points[:, 4:] * self.config.id_scale,
+            ],
+            dim=1,
+        )  # (N, 9 to 11)
+        values = functional.relu(self.norm(self.linear(inputs)))  # (N, C)
         height, width = pillars.grid
         count = pillars.batch * height * width
-        image = values.new_zeros(count, values.shape[1])           # (B * H * W, C), empty is 0
+        image = values.new_zeros(count, values.shape[1])  # (B * H * W, C), empty is 0
         if self.config.zero_row:
             image = self._zero_rows(image, pillars.cells, inputs[:1])
         # Values are never below 0, so the initial zeros do not affect the maximum.
@@ -105,10 +110,10 @@ class DeconvNeck(nn.Module):
 
     def __init__(self, channels: Sequence[int], strides: Sequence[int], out: int):
         super().__init__()
-        scales = [math.prod(strides[1:i + 1]) for i in range(len(strides))]  # 1, 2, 4
+        scales = [math.prod(strides[1 : i + 1]) for i in range(len(strides))]  # 1, 2, 4
         self.ups = nn.ModuleList(
-            ConvNormRelu(nn.ConvTranspose2d(c, out, scale, scale, bias=False))
-            for c, scale in zip(channels, scales))
+            ConvNormRelu(nn.ConvTranspose2d(c, out, scale, scale, bias=False)) for c, scale in zip(channels, scales)
+        )
         self.channels = out * len(channels)
 
     def forward(self, maps: list[Tensor]) -> Tensor:  # finest first: H/2, H/4, H/8
@@ -153,9 +158,11 @@ class Head(nn.Module):
                 nn.init.normal_(layer.weight, std=std)
 
     def forward(self, features: Tensor) -> Outputs:
-        return Outputs(_by_anchor(self.scores(features), self.classes),
-                       _by_anchor(self.codes(features), CODE),
-                       _by_anchor(self.directions(features), BINS))
+        return Outputs(
+            _by_anchor(self.scores(features), self.classes),
+            _by_anchor(self.codes(features), CODE),
+            _by_anchor(self.directions(features), BINS),
+        )
 
     def logits(self, features: Tensor) -> Tensor:
         """Return the logits (B, A, K) of forward."""
@@ -164,7 +171,7 @@ class Head(nn.Module):
     def boxes_at(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
         """Return codes (M, 7) and directions (M, 2) at anchors (M,) of a single cloud."""
         rows = features[0].flatten(1)[:, anchors // self.per_cell].T  # (M, C)
-        numbers = anchors % self.per_cell                             # within the cell
+        numbers = anchors % self.per_cell  # within the cell
 
         def apply(conv: nn.Conv2d, width: int) -> Tensor:
             weight = conv.weight.view(self.per_cell, width, -1)[numbers]  # (M, width, C)
@@ -187,8 +194,14 @@ def _by_anchor(x: Tensor, width: int) -> Tensor:
 class PointPillars(nn.Module):
     """The complete network; make_network builds its parts from a config."""
 
-    def __init__(self, pillar_net: PillarNet, map_net: MapNet | None,
-                 blocks: Sequence[nn.Module], neck: DeconvNeck | FpnNeck, head: Head):
+    def __init__(
+        self,
+        pillar_net: PillarNet,
+        map_net: MapNet | None,
+        blocks: Sequence[nn.Module],
+        neck: DeconvNeck | FpnNeck,
+        head: Head,
+    ):
         super().__init__()
         self.pillar_net, self.map_net = pillar_net, map_net
         self.blocks, self.neck, self.head = nn.ModuleList(blocks), neck, head
@@ -196,12 +209,12 @@ class PointPillars(nn.Module):
     def features(self, pillars: Pillars[Tensor], maps: Tensor | None = None) -> Tensor:
         """Return the input of the head, (B, neck.channels, H/2, W/2); maps (B, 3, H, W) uint8 are
         for V4."""
-        x = self.pillar_net(pillars)                            # (B, C, H, W)
+        x = self.pillar_net(pillars)  # (B, C, H, W)
         if self.map_net is not None:
-            x = torch.cat([x, self.map_net(maps)], dim=1)       # (B, C + C', H, W)
+            x = torch.cat([x, self.map_net(maps)], dim=1)  # (B, C + C', H, W)
         levels = []
         for block in self.blocks:
-            x = block(x)                                        # H/2, H/4, H/8
+            x = block(x)  # H/2, H/4, H/8
             levels.append(x)
         return self.neck(levels)
 
@@ -214,15 +227,14 @@ def make_network(config: NetworkConfig) -> PointPillars:
     map_net = MapNet(config.map_channels) if config.pseudo_map else None
     channels = config.pillar_channels + (config.map_channels[-1] if config.pseudo_map else 0)
     blocks = []
-    for out, layers, stride in zip(config.block_channels, config.block_layers,
-                                   config.block_strides):
-        blocks.append(nn.Sequential(conv3x3(channels, out, stride),
-                                    *(conv3x3(out, out) for _ in range(layers))))
+    for out, layers, stride in zip(config.block_channels, config.block_layers, config.block_strides):
+        blocks.append(nn.Sequential(conv3x3(channels, out, stride), *(conv3x3(out, out) for _ in range(layers))))
         channels = out
-    neck = (DeconvNeck(config.block_channels, config.block_strides, config.deconv_channels)
-            if config.neck == "deconv" else
-            FpnNeck(config.block_channels, config.block_strides, config.fpn_channels,
-                    config.fusion))
+    neck = (
+        DeconvNeck(config.block_channels, config.block_strides, config.deconv_channels)
+        if config.neck == "deconv"
+        else FpnNeck(config.block_channels, config.block_strides, config.fpn_channels, config.fusion)
+    )
     head = Head(neck.channels, config.anchors_per_cell, len(config.anchors))
     return channels_last(PointPillars(PillarNet(config), map_net, blocks, neck, head))
 
@@ -247,8 +259,7 @@ def fuse_norms(network: PointPillars) -> PointPillars:
     return channels_last(network)
 
 
-def load_network(path: str | Path,
-                 expected: NetworkConfig | None = None) -> tuple[Header, PointPillars]:
+def load_network(path: str | Path, expected: NetworkConfig | None = None) -> tuple[Header, PointPillars]:
     """Load a checkpoint: header, and network in float32 on the CPU, in training mode.
 
     Raises:

@@ -34,8 +34,9 @@ class OneCloud(nn.Module):
         super().__init__()
         self.network, self.grid = network, grid
 
-    def forward(self, points: Tensor, offsets: Tensor, cells: Tensor,
-                cluster_map: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(
+        self, points: Tensor, offsets: Tensor, cells: Tensor, cluster_map: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         return tuple(self.network(Pillars(points, offsets, cells, 1, self.grid), cluster_map))
 
 
@@ -43,7 +44,9 @@ def _inputs(config: NetworkConfig) -> dict[str, tuple[str, tuple[int, ...]]]:
     """Return type and shape of each input, for COUNT points."""
     inputs: dict[str, tuple[str, tuple[int, ...]]] = {
         "points": ("float", (COUNT, config.point_columns)),
-        "offsets": ("float", (COUNT, config.offset_columns)), "cells": ("int64", (COUNT,))}
+        "offsets": ("float", (COUNT, config.offset_columns)),
+        "cells": ("int64", (COUNT,)),
+    }
     if config.pseudo_map:
         inputs["cluster_map"] = ("uint8", (1, 3, *config.grid))
     return inputs
@@ -60,13 +63,12 @@ def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None
         InputError: the packages of the extra [onnx] are not installed.
     """
     config = header.config
-    inputs = {name: torch.zeros(shape, dtype=getattr(torch, kind))
-              for name, (kind, shape) in _inputs(config).items()}
+    inputs = {name: torch.zeros(shape, dtype=getattr(torch, kind)) for name, (kind, shape) in _inputs(config).items()}
     inputs["cells"] += torch.arange(COUNT)
-    dynamic = {name: None if name == "cluster_map" else
-               {0: torch.export.Dim("points_in_range", min=1)} for name in inputs}
-    write_onnx(path, OneCloud(fuse_norms(network), config.grid).eval(), header, inputs, OUTPUTS,
-               dynamic)
+    dynamic = {
+        name: None if name == "cluster_map" else {0: torch.export.Dim("points_in_range", min=1)} for name in inputs
+    }
+    write_onnx(path, OneCloud(fuse_norms(network), config.grid).eval(), header, inputs, OUTPUTS, dynamic)
 
 
 class OnnxNetwork:
@@ -89,24 +91,25 @@ class OnnxNetwork:
         """
         session, text = open_session(path)
         header = Header.from_json(text, str(path), NetworkConfig)
-        wanted = {name: (f"tensor({kind})", len(shape)) for name, (kind, shape) in
-                  _inputs(header.config).items()}
+        wanted = {name: (f"tensor({kind})", len(shape)) for name, (kind, shape) in _inputs(header.config).items()}
         found = {i.name: (i.type, len(i.shape)) for i in session.get_inputs()}
         if found != wanted or not {*OUTPUTS} <= {o.name for o in session.get_outputs()}:
-            raise InputError(f"{path} has other inputs or outputs than a network of its header; "
-                             "export it again")
+            raise InputError(f"{path} has other inputs or outputs than a network of its header; export it again")
         return header, OnnxNetwork(session, str(path), header.config)
 
     def to(self, device: str) -> None:
         """Do nothing: the network stays on the CPU."""
 
     def __call__(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None) -> Prediction:
-        given = dict(points=pillars.points, offsets=pillars.offsets, cells=pillars.cells,
-                     cluster_map=maps)
-        logits, codes, directions = run_session(self.session, self.source, OUTPUTS, {
-            name: value for name, value in given.items()
-            if name in self.inputs and value is not None})
+        given = dict(points=pillars.points, offsets=pillars.offsets, cells=pillars.cells, cluster_map=maps)
+        logits, codes, directions = run_session(
+            self.session,
+            self.source,
+            OUTPUTS,
+            {name: value for name, value in given.items() if name in self.inputs and value is not None},
+        )
         if [x.shape for x in (logits, codes, directions)] != self.shapes:
-            raise InputError(f"the outputs of {self.source} have other shapes than a network of "
-                             "its header; export it again")
+            raise InputError(
+                f"the outputs of {self.source} have other shapes than a network of its header; export it again"
+            )
         return Prediction(logits[0], lambda anchors: (codes[0, anchors], directions[0, anchors]))

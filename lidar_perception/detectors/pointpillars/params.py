@@ -5,12 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams, DbscanParams
-from lidar_perception.detectors.params import (
-    NetworkParams,
-    make_amp_param,
-    make_engine_param,
-    make_range_param,
-)
+from lidar_perception.detectors.params import NetworkParams, make_amp_param, make_engine_param, make_range_param
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
 from lidar_perception.robot.params import CropParams
@@ -23,14 +18,22 @@ STEPS = ("preprocess", "experts", "network", "postprocess")  # keys of the timin
 class PointPillarsParams(NetworkParams):
     """Network, device and thresholds of PointPillars."""
 
-    weights: str = param("", "Checkpoint (.safetensors) or exported network (.onnx); empty: the "
-                         "shipped one.", fixed=True)
-    version: str = param("auto", "EG-PointPillars version: v0 (PointPillars), v1 ... v4. auto: "
-                         "that of the weights, by default v4.",
-                         choices=("auto", "v0", "v1", "v2", "v3", "v4"), fixed=True)
-    size: str = param("auto", "full: the paper's network, for a GPU. compact: for two CPU cores. "
-                      "auto: that of the weights, by default compact.",
-                      choices=("auto", "full", "compact"), fixed=True)
+    weights: str = param(
+        "", "Checkpoint (.safetensors) or exported network (.onnx); empty: the shipped one.", fixed=True
+    )
+    version: str = param(
+        "auto",
+        "EG-PointPillars version: v0 (PointPillars), v1 ... v4. auto: that of the weights, by default v4.",
+        choices=("auto", "v0", "v1", "v2", "v3", "v4"),
+        fixed=True,
+    )
+    size: str = param(
+        "auto",
+        "full: the paper's network, for a GPU. compact: for two CPU cores. "
+        "auto: that of the weights, by default compact.",
+        choices=("auto", "full", "compact"),
+        fixed=True,
+    )
     range: str = make_range_param()
     amp: str = make_amp_param()
     engine: str = make_engine_param()
@@ -40,8 +43,7 @@ class PointPillarsParams(NetworkParams):
 # chosen on simulated scans and keep a car in one cluster; those of paper A, for pedestrians, split
 # cars.
 EXPERT_GROUND = GroundParams(method="patchwork")
-EXPERT_CLUSTERING = ClusteringParams(density=FULL_DENSITY, dbscan=DbscanParams(
-    eps=(0.5, 0.7, 1.0), min_samples=5))
+EXPERT_CLUSTERING = ClusteringParams(density=FULL_DENSITY, dbscan=DbscanParams(eps=(0.5, 0.7, 1.0), min_samples=5))
 INPUT = InputParams()
 
 

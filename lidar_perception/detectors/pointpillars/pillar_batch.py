@@ -32,14 +32,18 @@ def make_pillar_batch(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillar
     if config.max_points:
         kept = keep_first_per_cell(cells, config.max_points)
         points, cells, column, row = points[kept], cells[kept], column[kept], row[kept]
-    middle = torch.stack([points[:, 0] - ((column + 0.5) * config.cell + low[0]),
-                          points[:, 1] - ((row + 0.5) * config.cell + low[1]),
-                          points[:, 2] - (low[2] + high[2]) / 2], dim=1)
+    middle = torch.stack(
+        [
+            points[:, 0] - ((column + 0.5) * config.cell + low[0]),
+            points[:, 1] - ((row + 0.5) * config.cell + low[1]),
+            points[:, 2] - (low[2] + high[2]) / 2,
+        ],
+        dim=1,
+    )
     # Means of offsets: their sums stay small, so the order of the points hardly matters.
     counted = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)
     sums = counted.new_zeros(len(clouds) * height * width, 4).index_add_(0, cells, counted)[cells]
-    offsets = torch.cat([middle - sums[:, :3] / sums[:, 3:],
-                         middle[:, :config.offset_columns - 3]], dim=1)
+    offsets = torch.cat([middle - sums[:, :3] / sums[:, 3:], middle[:, : config.offset_columns - 3]], dim=1)
     return Pillars(points, offsets, cells, len(clouds), config.grid)
 
 

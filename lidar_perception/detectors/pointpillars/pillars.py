@@ -38,9 +38,14 @@ def make_pillars(cloud: np.ndarray, config: NetworkConfig) -> Pillars[np.ndarray
     this many points of a pillar are kept.
     """
     points, offsets, cells = _make_pillars(
-        np.ascontiguousarray(cloud), np.array(config.low, np.float32),
-        np.array(config.high, np.float32), np.float32(config.cell), *config.grid,
-        config.max_points, config.offset_columns)
+        np.ascontiguousarray(cloud),
+        np.array(config.low, np.float32),
+        np.array(config.high, np.float32),
+        np.float32(config.cell),
+        *config.grid,
+        config.max_points,
+        config.offset_columns,
+    )
     return Pillars(points, offsets, cells, 1, config.grid)
 
 

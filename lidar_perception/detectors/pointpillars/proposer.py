@@ -61,8 +61,7 @@ class PointPillarsProposer(TrainedNetwork):
 
     network: Network
 
-    def __init__(self, network: Network, header: Header, device: str = CPU,
-                 pass_config: NetworkConfig | None = None):
+    def __init__(self, network: Network, header: Header, device: str = CPU, pass_config: NetworkConfig | None = None):
         super().__init__(network, header, device)
         self.pass_config = pass_config or self.config
         self.half_turns = (False,) if pass_config is None else (False, True)
@@ -73,21 +72,25 @@ class PointPillarsProposer(TrainedNetwork):
         if range == "auto" or (range == "around") == (self.config.low[0] < 0):
             return self
         if self.network.has_fixed_range:
-            raise InputError("an exported network has a fixed range; use the checkpoint for the "
-                             f"range {range}")
+            raise InputError(f"an exported network has a fixed range; use the checkpoint for the range {range}")
         try:
             config = replace(self.config, **RANGES[range])
             half = replace(self.config, **HALF) if range == "around" else None
         except ValueError as error:
             raise InputError(f"this network does not support the range {range}: {error}") from None
-        other = PointPillarsProposer(self.network, replace(self.header, config=config),
-                                     self.device, half)
+        other = PointPillarsProposer(self.network, replace(self.header, config=config), self.device, half)
         other.placement = self.placement
         return other
 
-    def propose(self, view: NormalizedView, ground: np.ndarray | None,
-                cluster_ids: np.ndarray | None, scores: ScoreParams, nms: NmsParams,
-                cpu_fallback: bool = True) -> DetectionResult:
+    def propose(
+        self,
+        view: NormalizedView,
+        ground: np.ndarray | None,
+        cluster_ids: np.ndarray | None,
+        scores: ScoreParams,
+        nms: NmsParams,
+        cpu_fallback: bool = True,
+    ) -> DetectionResult:
         """Propose boxes for a view of M points, in the coordinates of the view.
 
         Args:
@@ -104,22 +107,22 @@ class PointPillarsProposer(TrainedNetwork):
         inputs = self._make_inputs(view, ground, cluster_ids)
         problem = self._find_problem(view, inputs)
         if not inputs:
-            return DetectionResult(Detections.none(), dict.fromkeys(TIMED_STEPS, 0.0),
-                                   problem or self.placement.fallback)
+            return DetectionResult(
+                Detections.none(), dict.fromkeys(TIMED_STEPS, 0.0), problem or self.placement.fallback
+            )
 
         def work() -> tuple[list[float], DetectionResult]:
             times, predictions = self._predict(inputs)
-            found = self._decode(predictions, self.to_raw_scores(scores.get_all(self.classes)),
-                                 nms)
+            found = self._decode(predictions, self.to_raw_scores(scores.get_all(self.classes)), nms)
             return [begin, *times, self.now()], found
 
         times, found = self.run(work, cpu_fallback)
         steps = dict(zip(TIMED_STEPS, (np.diff(times) * 1e3).tolist()))
-        return replace(found, timings=steps,
-                       problem=found.problem or problem or self.placement.fallback)
+        return replace(found, timings=steps, problem=found.problem or problem or self.placement.fallback)
 
-    def _make_inputs(self, view: NormalizedView, ground: np.ndarray | None,
-                     cluster_ids: np.ndarray | None) -> dict[bool, NetworkInput]:
+    def _make_inputs(
+        self, view: NormalizedView, ground: np.ndarray | None, cluster_ids: np.ndarray | None
+    ) -> dict[bool, NetworkInput]:
         """Return the inputs of the passes that have points, by whether the cloud is rotated."""
         if len(self.half_turns) == 1:
             inputs = {False: make_network_input(view.frame, self.config, ground, cluster_ids)}
@@ -131,15 +134,15 @@ class PointPillarsProposer(TrainedNetwork):
                 cluster_ids = None if cluster_ids is None else cluster_ids.take(kept)
             for half_turn in self.half_turns:
                 indices, part = crop_to_range(
-                    rotate_half_turn(frame) if half_turn else frame,
-                    self.pass_config.low, self.pass_config.high)
-                own_ground, own_ids = (column if column is None else column.take(indices)
-                                       for column in (ground, cluster_ids))
+                    rotate_half_turn(frame) if half_turn else frame, self.pass_config.low, self.pass_config.high
+                )
+                own_ground, own_ids = (
+                    column if column is None else column.take(indices) for column in (ground, cluster_ids)
+                )
                 inputs[half_turn] = make_network_input(part, self.pass_config, own_ground, own_ids)
         return {half_turn: given for half_turn, given in inputs.items() if len(given.points)}
 
-    def _predict(self, inputs: dict[bool, NetworkInput]
-                 ) -> tuple[list[float], dict[bool, Prediction]]:
+    def _predict(self, inputs: dict[bool, NetworkInput]) -> tuple[list[float], dict[bool, Prediction]]:
         """Return the start and end times of the network, and its outputs."""
         arguments = []
         for given in inputs.values():
@@ -149,30 +152,26 @@ class PointPillarsProposer(TrainedNetwork):
         predictions = [self.network(*each) for each in arguments]
         return [begin, self.now()], dict(zip(inputs, predictions))
 
-    def _decode(self, predictions: dict[bool, Prediction], min_scores: list[float],
-                nms: NmsParams) -> DetectionResult:
+    def _decode(self, predictions: dict[bool, Prediction], min_scores: list[float], nms: NmsParams) -> DetectionResult:
         """Return the detections of all passes together."""
-        passes = [self._select_boxes(half_turn, prediction, min_scores, nms.candidates)
-                  for half_turn, prediction in predictions.items()]
+        passes = [
+            self._select_boxes(half_turn, prediction, min_scores, nms.candidates)
+            for half_turn, prediction in predictions.items()
+        ]
         boxes, best_logits, labels = map(np.concatenate, zip(*passes))
         best: dict[str, float] = {}
         problem: str | None = None
-        logits = [prediction.logits for prediction in predictions.values()
-                  if len(prediction.logits)]
-        if any(len(rows) > 1 and np.array_equal(rows[0], rows[-1]) and (rows == rows[0]).all()
-               for rows in logits):
+        logits = [prediction.logits for prediction in predictions.values() if len(prediction.logits)]
+        if any(len(rows) > 1 and np.array_equal(rows[0], rows[-1]) and (rows == rows[0]).all() for rows in logits):
             boxes, best_logits, labels = boxes[:0], best_logits[:0], labels[:0]
-            problem = ("the network returns the same scores everywhere; the weights are broken, "
-                       "use other weights")
+            problem = "the network returns the same scores everywhere; the weights are broken, use other weights"
         elif len(boxes) == 0 and logits:
             highest = expit(np.concatenate(logits).max(axis=0))
             best, problem = self.find_best_scores(highest.tolist())
         detections = apply_nms(boxes, expit(best_logits), labels, self.classes, nms)
-        return DetectionResult(calibrate_scores(detections, self.header.calibration),
-                               problem=problem, best=best)
+        return DetectionResult(calibrate_scores(detections, self.header.calibration), problem=problem, best=best)
 
-    def _select_boxes(self, half_turn: bool, prediction: Prediction, min_scores: list[float],
-                      max_boxes: int) -> Boxes:
+    def _select_boxes(self, half_turn: bool, prediction: Prediction, min_scores: list[float], max_boxes: int) -> Boxes:
         """Return the boxes of one pass that reach their thresholds, rotated back."""
         logits = prediction.logits
         limits = np.array([*map(_logit, min_scores)], np.float32)
@@ -187,8 +186,7 @@ class PointPillarsProposer(TrainedNetwork):
         codes, directions = prediction.boxes_at(chosen)
         if prediction.anchors is not None:
             chosen = prediction.anchors[chosen]
-        boxes = decode(codes, directions.argmax(axis=1), self.anchors[chosen],
-                       self.config.direction_offset)
+        boxes = decode(codes, directions.argmax(axis=1), self.anchors[chosen], self.config.direction_offset)
         found = Boxes(boxes, best, labels)
         if len(self.half_turns) > 1:
             own = boxes[:, 0] >= -SHARED_M
@@ -201,17 +199,22 @@ class PointPillarsProposer(TrainedNetwork):
             return "the cloud is empty or has no finite point, or crop.* leaves none"
         if len(view) == 0:
             low, high = self.config.low, self.config.high
-            return (f"no point lies in the network's range, x {low[0]:g} .. {high[0]:g}, y "
-                    f"{low[1]:g} .. {high[1]:g}, z {low[2]:g} .. {high[2]:g} m under a sensor "
-                    f"{SENSOR_HEIGHT} m high; is x forward, and ground.sensor_pose right?")
+            return (
+                f"no point lies in the network's range, x {low[0]:g} .. {high[0]:g}, y "
+                f"{low[1]:g} .. {high[1]:g}, z {low[2]:g} .. {high[2]:g} m under a sensor "
+                f"{SENSOR_HEIGHT} m high; is x forward, and ground.sensor_pose right?"
+            )
         intensity = view.frame.intensity
-        if intensity is not None and (
-                lost := len(view) - np.count_nonzero(np.isfinite(intensity))):
-            return (f"{lost} of {len(view)} points are ignored because their intensity is NaN; use "
-                    "0 for unknown intensities")
+        if intensity is not None and (lost := len(view) - np.count_nonzero(np.isfinite(intensity))):
+            return (
+                f"{lost} of {len(view)} points are ignored because their intensity is NaN; use "
+                "0 for unknown intensities"
+            )
         if not inputs:
-            return ("every point in the network's range is ground; is the sensor mounted at "
-                    "another height or angle? set ground.sensor_pose")
+            return (
+                "every point in the network's range is ground; is the sensor mounted at "
+                "another height or angle? set ground.sensor_pose"
+            )
         return view.intensity_problem()
 
 

@@ -16,27 +16,15 @@ from typing import NamedTuple
 import numpy as np
 
 from lidar_perception.detectors.layer_weights import LayerWeights, Weights
-from lidar_perception.detectors.matrix_kernel import (
-    BLOCK,
-    LANES,
-    pack_weights,
-    pad_bias,
-    pad_channels,
-)
+from lidar_perception.detectors.matrix_kernel import BLOCK, LANES, pack_weights, pad_bias, pad_channels
 from lidar_perception.detectors.parallel import run_in_parts
 from lidar_perception.detectors.pointpillars import sparse_kernels as kernels
 from lidar_perception.detectors.pointpillars.config import BINS, CODE, NORM_EPS, NetworkConfig
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 from lidar_perception.detectors.pointpillars.prediction import Prediction
-from lidar_perception.detectors.pointpillars.sparse_layers import (
-    Grid,
-    Layer,
-    dilate,
-    make_layers,
-    shrink,
-)
+from lidar_perception.detectors.pointpillars.sparse_layers import Grid, Layer, dilate, make_layers, shrink
 
-REACH = 6                 # the head is evaluated up to this many of its cells from a point
+REACH = 6  # the head is evaluated up to this many of its cells from a point
 MIN_PER_PART = 1_000_000  # multiplications per task of a thread
 
 
@@ -90,16 +78,16 @@ class SparseNetwork:
         self.has_map = config.pseudo_map
         self.first_block = 2 + len(config.map_channels) if config.pseudo_map else 1
         points, offsets = config.point_columns, config.offset_columns
-        linear, bias = weights.take("pillar_net.linear", (config.pillar_channels, points + offsets),
-                                    "pillar_net.norm")
+        linear, bias = weights.take("pillar_net.linear", (config.pillar_channels, points + offsets), "pillar_net.norm")
         self.layers = make_layers(config, weights)
         per_cell = config.anchors_per_cell
         self.codes, self.directions = (
             weights.take(f"head.{name}", (per_cell * width, config.fpn_channels, 1, 1))
-            for name, width in (("codes", CODE), ("directions", BINS)))
+            for name, width in (("codes", CODE), ("directions", BINS))
+        )
         weights.finish()
         scales = np.ones(points + offsets, np.float32)
-        scales[:2], scales[4 + offsets:] = config.xy_scale, config.id_scale
+        scales[:2], scales[4 + offsets :] = config.xy_scale, config.id_scale
         order = [*range(4), *range(4 + offsets, points + offsets), *range(4, 4 + offsets)]
         scaled = (linear * scales)[:, order]  # points, then offsets
         self.pillar_weights = pack_weights(scaled[:, :, None])
@@ -117,15 +105,18 @@ class SparseNetwork:
         anchors = (cells[:, None] * per_cell + np.arange(per_cell)).ravel()
 
         def boxes_at(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            rows = features.at(cells[chosen // per_cell])[:, :self.config.fpn_channels]
+            rows = features.at(cells[chosen // per_cell])[:, : self.config.fpn_channels]
             numbers = chosen % per_cell
-            return (_evaluate_at(self.codes, per_cell, numbers, rows),
-                    _evaluate_at(self.directions, per_cell, numbers, rows))
+            return (
+                _evaluate_at(self.codes, per_cell, numbers, rows),
+                _evaluate_at(self.directions, per_cell, numbers, rows),
+            )
 
         return Prediction(logits.reshape(-1, len(self.config.classes)), boxes_at, anchors)
 
-    def evaluate(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None,
-                 reach: int | None) -> tuple[np.ndarray, Map, np.ndarray]:
+    def evaluate(
+        self, pillars: Pillars[np.ndarray], maps: np.ndarray | None, reach: int | None
+    ) -> tuple[np.ndarray, Map, np.ndarray]:
         """Compute the network up to `reach` cells of the head from a point; None: everywhere.
 
         Args:
@@ -143,8 +134,7 @@ class SparseNetwork:
         empty = self._make_empty_maps(pillars.grid)
         chosen = self._choose_cells([of.numbers[1:-1, 1:-1] > 0 for of in inputs], reach)
         *_, features, scores = self._run(inputs, chosen, empty)
-        logits = scores.rows[len(empty[-1].rows):,
-                             :self.config.anchors_per_cell * len(self.config.classes)]
+        logits = scores.rows[len(empty[-1].rows) :, : self.config.anchors_per_cell * len(self.config.classes)]
         return np.flatnonzero(chosen[-1]), features, np.ascontiguousarray(logits)
 
     def _make_pillar_map(self, pillars: Pillars[np.ndarray]) -> Map:
@@ -153,8 +143,7 @@ class SparseNetwork:
         occupied.ravel()[cells] = True
         numbers, index = kernels.number_cells(occupied, _make_blank_index(pillars.grid), 1)
         rows = np.zeros((1 + len(numbers), self.pillar_columns), np.float32)
-        kernels.pillar_rows(points, offsets, cells, index, self.pillar_weights, self.pillar_bias,
-                            rows)
+        kernels.pillar_rows(points, offsets, cells, index, self.pillar_weights, self.pillar_bias, rows)
         return Map(index, rows)
 
     def _choose_cells(self, occupied: list[np.ndarray], reach: int | None) -> list[np.ndarray]:
@@ -169,23 +158,21 @@ class SparseNetwork:
             masks[-1] = dilate(shrink(occupied[0], scale), reach)
         # The layers before the blocks have few cells; selecting among them would cost more than
         # computing all.
-        needed = [None if i < self.first_block else np.zeros_like(mask)
-                  for i, mask in enumerate(masks)]
+        needed = [None if i < self.first_block else np.zeros_like(mask) for i, mask in enumerate(masks)]
         needed[-1] = masks[-1]
         for i, mask in reversed([*enumerate(needed)]):
             if mask is not None:
                 self.layers[i - len(occupied)].require(mask, needed)
                 masks[i] &= mask
-        return masks[len(occupied):]
+        return masks[len(occupied) :]
 
-    def _run(self, inputs: list[Map], chosen: Sequence[np.ndarray],
-             empty: Sequence[Map]) -> list[Map]:
+    def _run(self, inputs: list[Map], chosen: Sequence[np.ndarray], empty: Sequence[Map]) -> list[Map]:
         """Return the maps of all layers: new rows in the cells chosen, elsewhere those of an empty
         cloud."""
         maps = list(inputs)
         for layer, mask, background in zip(self.layers, chosen, empty):
             maps.append(_compute_map(layer, maps, mask, background))
-        return maps[len(inputs):]
+        return maps[len(inputs) :]
 
     def _make_empty_maps(self, grid: Grid) -> list[Map]:
         """Return the maps of all layers for an empty cloud.
@@ -200,25 +187,29 @@ class SparseNetwork:
                 margins.append(layer.margin(margins))
                 grids.append(layer.grid(grids))
             coarsest = grid[0] // min(height for height, _ in grids)
-            size = max((2 * margin + 1) * (grid[0] // height)
-                       for margin, (height, _) in zip(margins, grids))
+            size = max((2 * margin + 1) * (grid[0] // height) for margin, (height, _) in zip(margins, grids))
             size = -(-size // coarsest) * coarsest
             small = min(size, grid[0]), min(size, grid[1])
             small_grids = [small] * count
             for layer in self.layers:
                 small_grids.append(layer.grid(small_grids))
-            inputs = [Map(_make_blank_index(small), np.zeros((1, width), np.float32))
-                      for width in (self.pillar_columns, pad_channels(3))[:count]]
-            maps = self._run(inputs, [np.ones(g, bool) for g in small_grids[count:]],
-                             [Map(_make_blank_index(g), np.zeros((1, len(layer.bias)), np.float32))
-                              for g, layer in zip(small_grids[count:], self.layers)])
-            self._empty[grid] = [_enlarge_map(*each) for each in zip(
-                maps, margins[count:], grids[count:])]
+            inputs = [
+                Map(_make_blank_index(small), np.zeros((1, width), np.float32))
+                for width in (self.pillar_columns, pad_channels(3))[:count]
+            ]
+            maps = self._run(
+                inputs,
+                [np.ones(g, bool) for g in small_grids[count:]],
+                [
+                    Map(_make_blank_index(g), np.zeros((1, len(layer.bias)), np.float32))
+                    for g, layer in zip(small_grids[count:], self.layers)
+                ],
+            )
+            self._empty[grid] = [_enlarge_map(*each) for each in zip(maps, margins[count:], grids[count:])]
         return self._empty[grid]
 
 
-def _evaluate_at(layer: Weights, per_cell: int, numbers: np.ndarray, rows: np.ndarray
-                 ) -> np.ndarray:
+def _evaluate_at(layer: Weights, per_cell: int, numbers: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return the outputs (N, C / per_cell) of a layer of the head at anchors number (N,) of their
     cells, from the features (N, B) of these cells."""
     weight = layer.weight.reshape(per_cell, -1, rows.shape[1])[numbers]
@@ -255,8 +246,9 @@ def _compute_map(layer: Layer, maps: list[Map], chosen: np.ndarray, background: 
             bias = bias[:0]
         for i, (source, weights) in enumerate(zip(layer.sources, layer.weights), start=1):
             floor = layer.floor if i == len(layer.sources) else -np.inf
-            kernels.convolve(*maps[source], cells, width, layer.stride, weights, bias, sums,
-                             np.float32(floor), begin, end)
+            kernels.convolve(
+                *maps[source], cells, width, layer.stride, weights, bias, sums, np.float32(floor), begin, end
+            )
             bias = bias[:0]
 
     cost = len(cells) * sum(weights.size for weights in layer.weights)
@@ -266,8 +258,7 @@ def _compute_map(layer: Layer, maps: list[Map], chosen: np.ndarray, background: 
 
 def _enlarge_map(of: Map, margin: int, grid: Grid) -> Map:
     """Return the map of an empty cloud on a grid, made from that on a smaller grid."""
-    kept, places = zip(*(_find_axis_places(size, small - 2, margin)
-                         for size, small in zip(grid, of.numbers.shape)))
+    kept, places = zip(*(_find_axis_places(size, small - 2, margin) for size, small in zip(grid, of.numbers.shape)))
     rows = of.rows[of.numbers[1:-1, 1:-1][np.ix_(*kept)]].reshape(-1, of.rows.shape[1])
     index = _make_blank_index(grid)
     index[1:-1, 1:-1] = 1 + places[0][:, None] * len(kept[1]) + places[1]
@@ -279,6 +270,6 @@ def _find_axis_places(size: int, small: int, margin: int) -> tuple[np.ndarray, n
     each of `size` cells."""
     if small <= 2 * margin:
         return np.arange(size), np.arange(size)
-    kept = np.r_[:margin + 1, small - margin:small]
+    kept = np.r_[: margin + 1, small - margin : small]
     cell = np.arange(size)
     return kept, np.where(cell < size - margin, np.minimum(cell, margin), cell - size + len(kept))

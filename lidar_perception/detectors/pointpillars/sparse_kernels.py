@@ -11,7 +11,7 @@ from numba import njit
 
 from lidar_perception.detectors.matrix_kernel import BLOCK, ROWS, multiply, multiply_tile
 
-BATCH = 32    # tiles per table of addresses
+BATCH = 32  # tiles per table of addresses
 POINTS = 192  # points per call of multiply
 
 
@@ -49,16 +49,20 @@ def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, firs
                     addresses[tile, 0, i] = inputs + row_bytes * numbers[corner + across + 1]
                 else:
                     for tap in range(9):
-                        addresses[tile, tap, i] = inputs + row_bytes * numbers[
-                            corner + tap // 3 * across + tap % 3]
+                        addresses[tile, tap, i] = inputs + row_bytes * numbers[corner + tap // 3 * across + tap % 3]
                 places[tile, i] = outputs + sum_bytes * cell
         for block in range(blocks):
             starts[:] = start + 4 * BLOCK * block
             for tile in range(tiles):
-                multiply_tile(addresses.ctypes.data + 8 * tile * taps * ROWS, taps, channels,
-                              weight + 4 * block * taps * channels * BLOCK,
-                              places[tile].ctypes.data if begun else starts.ctypes.data,
-                              places[tile].ctypes.data, floor)
+                multiply_tile(
+                    addresses.ctypes.data + 8 * tile * taps * ROWS,
+                    taps,
+                    channels,
+                    weight + 4 * block * taps * channels * BLOCK,
+                    places[tile].ctypes.data if begun else starts.ctypes.data,
+                    places[tile].ctypes.data,
+                    floor,
+                )
             places[:tiles] += 4 * BLOCK
 
 

@@ -53,7 +53,7 @@ class Layer:
     def find_reached(self, occupied: Sequence[np.ndarray]) -> np.ndarray:
         """Return (H, W) bool, True where its value depends on an occupied cell of earlier maps."""
         read = np.logical_or.reduce([occupied[source] for source in self.sources])
-        mask = dilate(read, self.window)[::self.stride, ::self.stride]
+        mask = dilate(read, self.window)[:: self.stride, :: self.stride]
         if self.coarse is None:
             return mask
         return mask | dilate(enlarge(occupied[self.coarse], self.scale), (self.scale + 1) // 2)
@@ -64,7 +64,7 @@ class Layer:
         for source in self.sources:
             if (mask := masks[source]) is not None:
                 read = np.zeros_like(mask)
-                read[::self.stride, ::self.stride] = needed
+                read[:: self.stride, :: self.stride] = needed
                 mask |= dilate(read, self.window)
         if self.coarse is not None and (mask := masks[self.coarse]) is not None:
             mask |= dilate(shrink(needed, self.scale), 1)
@@ -109,17 +109,34 @@ def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
     per layer.
     """
     layers: list[Layer] = []
-    widths = [config.pillar_channels, 3][:2 if config.pseudo_map else 1]  # of each map
+    widths = [config.pillar_channels, 3][: 2 if config.pseudo_map else 1]  # of each map
 
-    def add(name: str, sources: Sequence[int], out: int, kernel: int = 3, stride: int = 1,
-            normed: bool = True, coarse: int | None = None, scale: int = 1) -> int:
+    def add(
+        name: str,
+        sources: Sequence[int],
+        out: int,
+        kernel: int = 3,
+        stride: int = 1,
+        normed: bool = True,
+        coarse: int | None = None,
+        scale: int = 1,
+    ) -> int:
         read = [widths[source] for source in sources]
         layer, norm = (f"{name}.0", f"{name}.1") if normed else (name, None)
         weight, bias = tensors.take(layer, (out, sum(read), kernel, kernel), norm)
         parts = np.split(weight.reshape(out, sum(read), -1), np.cumsum(read)[:-1], axis=1)
         weights = tuple(map(pack_weights, parts))
-        layers.append(Layer(tuple(sources), weights, pad_bias(bias, len(weights[0]) * BLOCK),
-                            stride, 0.0 if normed else -math.inf, coarse, scale))
+        layers.append(
+            Layer(
+                tuple(sources),
+                weights,
+                pad_bias(bias, len(weights[0]) * BLOCK),
+                stride,
+                0.0 if normed else -math.inf,
+                coarse,
+                scale,
+            )
+        )
         widths.append(out)
         return len(widths) - 1
 
@@ -130,16 +147,16 @@ def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
             last = add(f"map_net.{i}", [last], out)
         sources = [0, last]
     levels = []
-    for i, (out, more, stride) in enumerate(zip(config.block_channels, config.block_layers,
-                                                config.block_strides)):
+    for i, (out, more, stride) in enumerate(zip(config.block_channels, config.block_layers, config.block_strides)):
         for k in range(1 + more):
             sources = [add(f"blocks.{i}.{k}", sources, out, stride=1 if k else stride)]
         levels += sources
     joined: int | None = None
     scales = [*config.block_strides[1:], 1]
     for i in reversed(range(len(levels))):
-        joined = add(f"neck.laterals.{i}", [levels[i]], config.fpn_channels, 1, normed=False,
-                     coarse=joined, scale=scales[i])
+        joined = add(
+            f"neck.laterals.{i}", [levels[i]], config.fpn_channels, 1, normed=False, coarse=joined, scale=scales[i]
+        )
     assert joined is not None
     features = add("neck.out", [joined], config.fpn_channels)
     add("head.scores", [features], config.anchors_per_cell * len(config.classes), 1, normed=False)

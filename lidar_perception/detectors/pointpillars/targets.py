@@ -55,12 +55,16 @@ def encode(boxes: Tensor, anchors: Tensor, offset: float) -> tuple[Tensor, Tenso
         Codes (N, 7) float32 and bins (N,) int64, 0 or 1.
     """
     diagonal = torch.hypot(anchors[:, 3], anchors[:, 4])
-    codes = torch.stack([
-        (boxes[:, 0] - anchors[:, 0]) / diagonal,
-        (boxes[:, 1] - anchors[:, 1]) / diagonal,
-        (boxes[:, 2] - anchors[:, 2]) / anchors[:, 5],
-        *torch.log(boxes[:, 3:6] / anchors[:, 3:6]).unbind(1),
-        boxes[:, 6] - anchors[:, 6]], dim=1)
+    codes = torch.stack(
+        [
+            (boxes[:, 0] - anchors[:, 0]) / diagonal,
+            (boxes[:, 1] - anchors[:, 1]) / diagonal,
+            (boxes[:, 2] - anchors[:, 2]) / anchors[:, 5],
+            *torch.log(boxes[:, 3:6] / anchors[:, 3:6]).unbind(1),
+            boxes[:, 6] - anchors[:, 6],
+        ],
+        dim=1,
+    )
     return codes, find_heading_bin(boxes[:, 6], offset)
 
 
@@ -111,10 +115,10 @@ def find_near_anchors(anchors: Tensor, config: NetworkConfig, boxes: Tensor, ind
     per_cell = len(config.anchors) * len(config.yaws)
     cells = anchors.view(*config.head_grid, per_cell, 7)
     reach = (boxes[:, 3:5].amax(dim=1) + max(config.anchors[index].size[:2])) / 2
-    column = (cells[0, :, 0, 0, None] - boxes[:, 0]).abs() <= reach          # (W, M)
-    row = (cells[:, 0, 0, 1, None] - boxes[:, 1]).abs() <= reach             # (H, M)
-    near = (row[:, None] & column).any(dim=2).flatten()                      # (H * W,)
-    first = torch.nonzero(near) * per_cell + index * len(config.yaws)           # (cells, 1)
+    column = (cells[0, :, 0, 0, None] - boxes[:, 0]).abs() <= reach  # (W, M)
+    row = (cells[:, 0, 0, 1, None] - boxes[:, 1]).abs() <= reach  # (H, M)
+    near = (row[:, None] & column).any(dim=2).flatten()  # (H * W,)
+    first = torch.nonzero(near) * per_cell + index * len(config.yaws)  # (cells, 1)
     return (first + torch.arange(len(config.yaws), device=anchors.device)).reshape(-1)
 
 
@@ -127,8 +131,9 @@ def to_sparse(targets: Targets) -> SparseTargets:
 
 def to_dense(clouds: Sequence[SparseTargets], anchors: int, device: torch.device) -> Targets:
     """Convert the SparseTargets of B clouds with `anchors` anchors each to Targets on a device."""
-    indices = torch.from_numpy(np.concatenate(
-        [cloud.anchors + i * anchors for i, cloud in enumerate(clouds)])).to(device)
+    indices = torch.from_numpy(np.concatenate([cloud.anchors + i * anchors for i, cloud in enumerate(clouds)])).to(
+        device
+    )
 
     def scatter(parts: Sequence[np.ndarray], default: int) -> Tensor:
         values = torch.from_numpy(np.concatenate(parts)).to(device)
@@ -136,15 +141,18 @@ def to_dense(clouds: Sequence[SparseTargets], anchors: int, device: torch.device
         out = torch.full(shape, default, dtype=values.dtype, device=device)
         return out.index_copy_(0, indices, values).view(len(clouds), anchors, *values.shape[1:])
 
-    return Targets(scatter([c.labels for c in clouds], BACKGROUND),
-                   scatter([c.codes for c in clouds], 0), scatter([c.bins for c in clouds], 0))
+    return Targets(
+        scatter([c.labels for c in clouds], BACKGROUND),
+        scatter([c.codes for c in clouds], 0),
+        scatter([c.bins for c in clouds], 0),
+    )
 
 
 def nearest_axis_iou(boxes: Tensor, others: Tensor) -> Tensor:
     """Return the bird's-eye-view IoU (N, M) of boxes (N, 7) and others (M, 7), each rotated to the
     nearest axis."""
     (low, high), (other_low, other_high) = _align(boxes), _align(others)
-    shared = (torch.minimum(high[:, None], other_high) - torch.maximum(low[:, None], other_low))
+    shared = torch.minimum(high[:, None], other_high) - torch.maximum(low[:, None], other_low)
     shared = shared.clamp_(min=0).prod(dim=2)
     area, other_area = (high - low).prod(dim=1), (other_high - other_low).prod(dim=1)
     return shared / (area[:, None] + other_area - shared)

@@ -35,8 +35,7 @@ class TorchNetwork:
         own_maps = None if maps is None else torch.from_numpy(maps).to(self.device)
         numbers = choose_dtype(self.amp, self.device)
         with torch.autocast(torch.device(self.device).type, numbers, enabled=numbers is not None):
-            features = self.network.features(
-                Pillars(points, offsets, cells, *pillars[3:]), own_maps).float()
+            features = self.network.features(Pillars(points, offsets, cells, *pillars[3:]), own_maps).float()
         head = self.network.head
 
         @torch.inference_mode()

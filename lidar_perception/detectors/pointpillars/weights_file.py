@@ -23,6 +23,5 @@ def weights_file(params: PointPillarsParams) -> Path:
     size = "compact" if params.size == "auto" else params.size
     path = WEIGHTS / f"pointpillars_{version}_{size}.safetensors"
     if not path.is_file():
-        raise InputError(f"the package has no weights for {version} {size}; set "
-                         "pointpillars.weights to a checkpoint")
+        raise InputError(f"the package has no weights for {version} {size}; set pointpillars.weights to a checkpoint")
     return path

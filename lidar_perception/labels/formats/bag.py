@@ -36,8 +36,9 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
     with Bag(path) as bag:
         bag.require(topic)
         if bag.topics[topic] not in (MARKERS, DETECTIONS):
-            raise InputError(f"{path}: {topic} is {bag.topics[topic]}, but labels are {MARKERS} or "
-                             f"{DETECTIONS}; give another topic")
+            raise InputError(
+                f"{path}: {topic} is {bag.topics[topic]}, but labels are {MARKERS} or {DETECTIONS}; give another topic"
+            )
         markers = bag.topics[topic] == MARKERS
         found: dict[int, MarkedObjects] = {}
         poses = BagPoses(BagHandle(path), read_frame_id(frames))
@@ -46,36 +47,45 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
             stamp_ns = objects.stamp_ns or (0 if 0 in stamps else time)
             found[stamp_ns] = poses.to_cloud_frame(objects, topic)
     if unknown := sorted(found.keys() - stamps):
-        raise InputError(f"{path}: {topic} has labels at {unknown[0]} ns ({len(unknown)} of "
-                         f"{len(found)} such stamps), where the drive has no frame; give the drive "
-                         "that was labelled")
+        raise InputError(
+            f"{path}: {topic} has labels at {unknown[0]} ns ({len(unknown)} of "
+            f"{len(found)} such stamps), where the drive has no frame; give the drive "
+            "that was labelled"
+        )
     has_ids = markers or any(sorted(o.ids.tolist()) != list(range(len(o))) for o in found.values())
-    return DriveLabels([_make_frame_labels(frame, found.get(frame.stamp_ns), markers, has_ids,
-                                           f"{path}, {topic} at {frame.stamp_ns} ns")
-                        for frame in frames])
+    return DriveLabels(
+        [
+            _make_frame_labels(
+                frame, found.get(frame.stamp_ns), markers, has_ids, f"{path}, {topic} at {frame.stamp_ns} ns"
+            )
+            for frame in frames
+        ]
+    )
 
 
-def _make_frame_labels(frame: Frame, objects: MarkedObjects | None, markers: bool, has_ids: bool,
-                       where: str) -> FrameLabels:
+def _make_frame_labels(
+    frame: Frame, objects: MarkedObjects | None, markers: bool, has_ids: bool, where: str
+) -> FrameLabels:
     if objects is None:
         return FrameLabels.of(frame.name, frame.stamp_ns)
     extra = [dict(e) for e in objects.extras]
     ids = [NO_TRACK] * len(objects)
     for k, fields in enumerate(extra):
         if markers:
-            ids[k] = fields.pop("track_id", fields.pop("id", NO_TRACK) if "velocity" in fields
-                                else NO_TRACK)
+            ids[k] = fields.pop("track_id", fields.pop("id", NO_TRACK) if "velocity" in fields else NO_TRACK)
         elif has_ids:
             ids[k] = int(objects.ids[k])
     scores = [e.pop("score", np.nan) for e in extra] if markers else objects.scores
     names = [e.pop("class_name", label) for e, label in zip(extra, objects.labels)]
-    return FrameLabels.of(frame.name, frame.stamp_ns, objects.boxes, names, ids, scores, extra,
-                          objects.notes, where)
+    return FrameLabels.of(frame.name, frame.stamp_ns, objects.boxes, names, ids, scores, extra, objects.notes, where)
 
 
-def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False,
-          clouds: bool = True) -> None:
+def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False, clouds: bool = True) -> None:
     """Write a bag with the labels, poses, camera and, optionally, clouds of the frames to `out`."""
-    write_bag(out, (replace(frame, truth=partial(to_ground_truth, each))
-                    for frame, each in zip(frames, labels.frames)),
-              force=force, clouds=clouds, detections_3d=True)
+    write_bag(
+        out,
+        (replace(frame, truth=partial(to_ground_truth, each)) for frame, each in zip(frames, labels.frames)),
+        force=force,
+        clouds=clouds,
+        detections_3d=True,
+    )

@@ -34,8 +34,10 @@ def list_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[s
     names = list(group_by_sequence(frames))
     if path.suffix == suffix:
         if len(names) != 1:
-            raise InputError(f"{path} is one file, but the frames belong to {len(names)} drives, "
-                             f"such as {names[0]!r}; give a folder, or choose a drive with --split")
+            raise InputError(
+                f"{path} is one file, but the frames belong to {len(names)} drives, "
+                f"such as {names[0]!r}; give a folder, or choose a drive with --split"
+            )
         return {names[0]: path}
     return {name: path / f"{name or '0000'}{suffix}" for name in names}
 
@@ -51,8 +53,9 @@ def find_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[s
     return {drive: file for drive, file in files.items() if file == path or file.exists()}
 
 
-def write_drives(out: Path, frames: Sequence[Frame], suffix: str, force: bool,
-                 write: Callable[[Path, str, list[int]], None]) -> None:
+def write_drives(
+    out: Path, frames: Sequence[Frame], suffix: str, force: bool, write: Callable[[Path, str, list[int]], None]
+) -> None:
     """Call write(file, drive, positions of its frames) for each drive.
 
     out: file of the only drive if it has the suffix, else a folder, which appears when complete.
@@ -71,12 +74,10 @@ def write_drives(out: Path, frames: Sequence[Frame], suffix: str, force: bool,
 def list_frame_files(folder: Path, frames: Sequence[Frame], suffix: str) -> list[Path]:
     """Return the label file of each frame, FRAME.suffix, in a folder per drive if several."""
     several = len(group_by_sequence(frames)) > 1
-    return [folder / f"{frame.name if several else frame.name.rpartition('/')[2]}{suffix}"
-            for frame in frames]
+    return [folder / f"{frame.name if several else frame.name.rpartition('/')[2]}{suffix}" for frame in frames]
 
 
-def check_label_files(folder: Path, known: Sequence[Path], suffix: str,
-                      ignored: Sequence[str] = ()) -> None:
+def check_label_files(folder: Path, known: Sequence[Path], suffix: str, ignored: Sequence[str] = ()) -> None:
     """Raise InputError if a folder has no label files, or one that is not in `known`.
 
     Args:
@@ -86,16 +87,20 @@ def check_label_files(folder: Path, known: Sequence[Path], suffix: str,
     if not folder.is_dir():
         raise InputError(f"the folder {folder} does not exist; give the folder of the label files")
     names = {str(path.relative_to(folder)) for path in known}
-    existing = {str(path.relative_to(folder)) for path in folder.rglob(f"*{suffix}")
-                if path.name not in ignored and not path.name.startswith(".")}
+    existing = {
+        str(path.relative_to(folder))
+        for path in folder.rglob(f"*{suffix}")
+        if path.name not in ignored and not path.name.startswith(".")
+    }
     example = min(names, default="none")
     if unknown := sorted(existing - names):
-        raise InputError(f"{folder / unknown[0]} belongs to no frame of the drive "
-                         f"({len(unknown)} such files; those of the drive are named like "
-                         f"{example}); give the drive that was labelled, or move these files away")
+        raise InputError(
+            f"{folder / unknown[0]} belongs to no frame of the drive "
+            f"({len(unknown)} such files; those of the drive are named like "
+            f"{example}); give the drive that was labelled, or move these files away"
+        )
     if not existing:
-        raise InputError(f"{folder} has no label files (*{suffix}); those of this drive would be "
-                         f"named like {example}")
+        raise InputError(f"{folder} has no label files (*{suffix}); those of this drive would be named like {example}")
 
 
 def merge_extra(extra: dict[str, Any], own_names: Collection[str]) -> dict[str, Any]:
@@ -104,8 +109,10 @@ def merge_extra(extra: dict[str, Any], own_names: Collection[str]) -> dict[str, 
     Fields whose names the format uses itself are stored under KEPT.
     """
     conflicting = {key: value for key, value in extra.items() if key in own_names or key == KEPT}
-    return {**{key: value for key, value in extra.items() if key not in conflicting},
-            **({KEPT: conflicting} if conflicting else {})}
+    return {
+        **{key: value for key, value in extra.items() if key not in conflicting},
+        **({KEPT: conflicting} if conflicting else {}),
+    }
 
 
 def extract_extra(item: dict[str, Any], own_names: Collection[str]) -> dict[str, Any]:
@@ -133,8 +140,7 @@ def collect_track_names(frames: Iterable[FrameLabels], key: str) -> dict[int, st
     for labels in frames:
         for track, extra in zip(labels.track_ids.tolist(), labels.extra):
             name = extra.get(key)
-            if (track != NO_TRACK and track not in names and name is not None
-                    and str(name) not in used_names):
+            if track != NO_TRACK and track not in names and name is not None and str(name) not in used_names:
                 names[track] = str(name)
                 used_names.add(str(name))
     return names
@@ -151,8 +157,9 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
-        raise InputError(f"{path}:{error.lineno} is not valid JSON: {error.msg} at column "
-                         f"{error.colno}; write the file again") from None
+        raise InputError(
+            f"{path}:{error.lineno} is not valid JSON: {error.msg} at column {error.colno}; write the file again"
+        ) from None
     except RecursionError:
         raise InputError(f"{path} is nested too deeply; write the file again") from None
 

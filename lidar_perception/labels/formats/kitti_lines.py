@@ -38,9 +38,11 @@ def require_calibration(frame: Frame) -> Calibration:
     """Return the calibration of a frame; raise InputError if it has none."""
     calibration = frame.calibration()
     if calibration is None:
-        raise InputError(f"frame {frame.name} has no camera calibration, but KITTI's labels are in "
-                         "the camera frame; use labelcloud, sustech or openlabel, which are in the "
-                         "LiDAR frame")
+        raise InputError(
+            f"frame {frame.name} has no camera calibration, but KITTI's labels are in "
+            "the camera frame; use labelcloud, sustech or openlabel, which are in the "
+            "LiDAR frame"
+        )
     return calibration
 
 
@@ -64,8 +66,7 @@ def parse_frame_labels(frame: Frame, lines: Sequence[dict[str, Any]], where: obj
         if box is None:
             notes.append((line["class"], extra))
         else:
-            rows.append((box, line["class"], extra.pop("track_id", NO_TRACK),
-                         extra.pop("score", np.nan), extra))
+            rows.append((box, line["class"], extra.pop("track_id", NO_TRACK), extra.pop("score", np.nan), extra))
     return make_frame_labels(frame, rows, notes, where)
 
 
@@ -91,11 +92,13 @@ def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str
         occlusion = compute_occlusion_levels(pixels, depths)
     lines = []
     for k, (box, name, extra) in enumerate(zip(labels.boxes, labels.class_names, labels.extra)):
-        line = {"class": "_".join(name.split()) or "Misc",
-                **to_camera_box(box, calibration.lidar_to_camera),
-                "bbox": np.nan_to_num(pixels[k]).tolist(), "truncated": float(outside[k]),
-                "occluded": level if isinstance(level := extra.get("occluded"), int)
-                else int(occlusion[k])}
+        line = {
+            "class": "_".join(name.split()) or "Misc",
+            **to_camera_box(box, calibration.lidar_to_camera),
+            "bbox": np.nan_to_num(pixels[k]).tolist(),
+            "truncated": float(outside[k]),
+            "occluded": level if isinstance(level := extra.get("occluded"), int) else int(occlusion[k]),
+        }
         if _is_as_read(box, extra, to_lidar):
             line |= {column: extra[column] for column in COLUMNS}
             if not levels and _is_level(extra["truncated"], labels.track_ids[k]):
@@ -103,8 +106,7 @@ def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str
         lines.append({**line, **get_id_and_score(labels, k)})
     for line, track in zip(lines + notes, [*labels.track_ids, *[0] * len(notes)]) if levels else ():
         value = line["truncated"]
-        line["truncated"] = str(int(value) if _is_level(value, track)
-                                else max(-1, round(2 * value)))
+        line["truncated"] = str(int(value) if _is_level(value, track) else max(-1, round(2 * value)))
     return lines + notes
 
 
@@ -121,9 +123,12 @@ def _is_as_read(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndarray) ->
     """Return True if extra has all columns of the unchanged box."""
     try:
         kept = to_lidar_box(extra, to_lidar)
-        return (kept is not None and is_unchanged(box, kept)
-                and np.shape([extra[c] for c in ("truncated", "occluded", "alpha")]) == (3,)
-                and np.shape(extra["bbox"]) == (4,))
+        return (
+            kept is not None
+            and is_unchanged(box, kept)
+            and np.shape([extra[c] for c in ("truncated", "occluded", "alpha")]) == (3,)
+            and np.shape(extra["bbox"]) == (4,)
+        )
     except (KeyError, TypeError, ValueError):  # columns are missing, or have other contents
         return False
 

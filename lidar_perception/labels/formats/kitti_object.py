@@ -10,11 +10,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import format_label, parse_lines
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
 from lidar_perception.labels.formats.files import check_label_files, list_frame_files
-from lidar_perception.labels.formats.kitti_lines import (
-    find_label_folder,
-    make_lines,
-    parse_frame_labels,
-)
+from lidar_perception.labels.formats.kitti_lines import find_label_folder, make_lines, parse_frame_labels
 from lidar_perception.runs.files import write_bytes, write_folder
 
 # KITTI's files have two decimals; computed numbers have up to six.
@@ -26,9 +22,12 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     path = find_label_folder(path, "label_2")
     files = list_frame_files(path, frames, ".txt")
     check_label_files(path, files, ".txt")
-    return DriveLabels([parse_frame_labels(
-        frame, [line for _, line in parse_lines(file)] if file.exists() else [],
-        file) for frame, file in zip(frames, files)])
+    return DriveLabels(
+        [
+            parse_frame_labels(frame, [line for _, line in parse_lines(file)] if file.exists() else [], file)
+            for frame, file in zip(frames, files)
+        ]
+    )
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
@@ -41,5 +40,4 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
 
 def format_frame(labels: FrameLabels, frame: Frame) -> str:
     """Return the lines of a frame."""
-    return "".join(ZEROS.sub(r"\1", format_label(line, 6)) + "\n"
-                   for line in make_lines(labels, frame, levels=False))
+    return "".join(ZEROS.sub(r"\1", format_label(line, 6)) + "\n" for line in make_lines(labels, frame, levels=False))

@@ -13,12 +13,7 @@ from pathlib import Path
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import read_tracklets
 from lidar_perception.data.kitti.raw import FRAME_LIST, TRACKLETS, read_frame_list
-from lidar_perception.labels.drive_labels import (
-    DriveLabels,
-    FrameLabels,
-    make_frame_labels,
-    read_frame_labels,
-)
+from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels, make_frame_labels, read_frame_labels
 from lidar_perception.labels.formats.files import group_by_sequence
 from lidar_perception.types import InputError
 
@@ -30,8 +25,10 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     """
     drives = group_by_sequence(frames)
     if path.is_file() and len(drives) > 1:
-        raise InputError(f"{path} is one file, but the frames belong to {len(drives)} drives; give "
-                         "a folder, or choose a drive with --split")
+        raise InputError(
+            f"{path} is one file, but the frames belong to {len(drives)} drives; give "
+            "a folder, or choose a drive with --split"
+        )
     labels: list[FrameLabels] = []
     found = False
     for drive, positions in drives.items():
@@ -39,8 +36,11 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
         file = next((file for file in (*files, path / drive / TRACKLETS) if file.is_file()), None)
         found = found or file is not None
         drive_frames = [frames[i] for i in positions]
-        labels += ([make_frame_labels(frame, ()) for frame in drive_frames] if file is None
-                   else _read_drive(file, drive_frames))
+        labels += (
+            [make_frame_labels(frame, ()) for frame in drive_frames]
+            if file is None
+            else _read_drive(file, drive_frames)
+        )
     if not found:
         raise InputError(f"{path} has no {TRACKLETS}; give the folder that contains it")
     return DriveLabels(labels)
@@ -53,8 +53,11 @@ def _read_drive(path: Path, frames: Sequence[Frame]) -> list[FrameLabels]:
     truth = read_tracklets(path)
     # Tracks continue over missing scans, so numbers within the drive are allowed.
     if unknown := sorted(n for n in truth if not min(numbers) <= n <= max(numbers)):
-        raise InputError(f"{path} has the frame {unknown[0]} ({len(unknown)} unknown frames), but "
-                         f"the drive has {min(numbers)} to {max(numbers)}; give the drive that was "
-                         "labelled")
-    return [read_frame_labels(replace(frame, truth=partial(truth.get, number)))
-            for frame, number in zip(frames, numbers)]
+        raise InputError(
+            f"{path} has the frame {unknown[0]} ({len(unknown)} unknown frames), but "
+            f"the drive has {min(numbers)} to {max(numbers)}; give the drive that was "
+            "labelled"
+        )
+    return [
+        read_frame_labels(replace(frame, truth=partial(truth.get, number))) for frame, number in zip(frames, numbers)
+    ]

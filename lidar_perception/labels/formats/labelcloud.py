@@ -75,8 +75,9 @@ def _parse_objects(content: dict[str, Any], kind: str) -> list[Row]:
         box, tilted = _parse_box(item, kind)
         if tilted:
             extra[TILTED] = {**shape, "unit": kind, "box": box}
-        rows.append((box, str(item["name"]), int(item.get("track_id", NO_TRACK)),
-                     float(item.get("score", math.nan)), extra))
+        rows.append(
+            (box, str(item["name"]), int(item.get("track_id", NO_TRACK)), float(item.get("score", math.nan)), extra)
+        )
     return rows
 
 
@@ -84,24 +85,30 @@ def _parse_box(item: dict[str, Any], kind: str) -> tuple[list[float], bool]:
     """Return [x y z l w h yaw], and True if the box is tilted."""
     if "vertices" in item:
         corners = np.array(item["vertices"], float).reshape(8, 3)
-        edges = np.array([corners[3] - corners[0] + corners[2] - corners[1],
-                          corners[1] - corners[0] + corners[2] - corners[3],
-                          corners[4:].sum(axis=0) - corners[:4].sum(axis=0)])
+        edges = np.array(
+            [
+                corners[3] - corners[0] + corners[2] - corners[1],
+                corners[1] - corners[0] + corners[2] - corners[3],
+                corners[4:].sum(axis=0) - corners[:4].sum(axis=0),
+            ]
+        )
         sides = np.linalg.norm(edges, axis=1) / [2, 2, 4]
-        return ([*corners.mean(axis=0).tolist(), *sides.tolist(),
-                 math.atan2(edges[0, 1], edges[0, 0])],
-                bool(np.abs([*edges[:2, 2], *edges[2, :2]]).max() > 1e-6))
+        return (
+            [*corners.mean(axis=0).tolist(), *sides.tolist(), math.atan2(edges[0, 1], edges[0, 0])],
+            bool(np.abs([*edges[:2, 2], *edges[2, :2]]).max() > 1e-6),
+        )
     angles = [item["rotations"][axis] for axis in "xyz"]
     x, y, z = angles if kind == RELATIVE else np.radians(angles).tolist()
     yaw = z if math.cos(y) > 0 else z + math.pi
-    return ([item["centroid"][axis] for axis in "xyz"]
-            + [item["dimensions"][side] for side in ("length", "width", "height")]
-            + [math.remainder(yaw, 2 * math.pi)],
-            abs(math.sin(x)) + abs(math.sin(y)) > 1e-9 or math.cos(x) * math.cos(y) < 0)
+    return (
+        [item["centroid"][axis] for axis in "xyz"]
+        + [item["dimensions"][side] for side in ("length", "width", "height")]
+        + [math.remainder(yaw, 2 * math.pi)],
+        abs(math.sin(x)) + abs(math.sin(y)) > 1e-9 or math.cos(x) * math.cos(y) < 0,
+    )
 
 
-def _write(kind: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
-           force: bool = False) -> None:
+def _write(kind: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
     """Write FRAME.json of each frame and _classes.json to the folder `out`."""
     names = sorted({name for each in labels.frames for name in each.class_names})
     heads = labels.extra.get(ROOT, {})
@@ -110,14 +117,28 @@ def _write(kind: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
         for frame_labels, frame, file in zip(labels.frames, frames, files):
             cloud = frame.points or Path(f"{file.stem}.pcd")
             objects = [_make_object(frame_labels, k, kind) for k in range(len(frame_labels))]
-            write_json(file, {"folder": cloud.parent.name, "filename": cloud.name,
-                              "path": str(cloud), **heads.get(frame.name, {}),
-                              "objects": objects}, 1)
-        write_json(folder / CLASSES_FILE, {
-            "classes": [{"name": name, "id": i, "color": _to_hex_color(name)}
-                        for i, name in enumerate(names)],
-            "default": 0, "type": "object_detection", "format": kind,
-            "created_with": {"name": "lidar_perception", "version": ""}}, 1)
+            write_json(
+                file,
+                {
+                    "folder": cloud.parent.name,
+                    "filename": cloud.name,
+                    "path": str(cloud),
+                    **heads.get(frame.name, {}),
+                    "objects": objects,
+                },
+                1,
+            )
+        write_json(
+            folder / CLASSES_FILE,
+            {
+                "classes": [{"name": name, "id": i, "color": _to_hex_color(name)} for i, name in enumerate(names)],
+                "default": 0,
+                "type": "object_detection",
+                "format": kind,
+                "created_with": {"name": "lidar_perception", "version": ""},
+            },
+            1,
+        )
 
 
 def _make_object(labels: FrameLabels, k: int, kind: str) -> dict[str, Any]:
@@ -134,15 +155,16 @@ def _make_object(labels: FrameLabels, k: int, kind: str) -> dict[str, Any]:
         yaw = round(yaw, DECIMALS)
         shape = {"rotations": {"x": 0, "y": 0, "z": yaw % 360 if kind == ABSOLUTE else yaw}}
     if kind != VERTICES:
-        shape = {"centroid": {"x": x, "y": y, "z": z},
-                 "dimensions": {"length": length, "width": width, "height": height}, **shape}
-    return {**merge_extra(extra, OWN), "name": labels.class_names[k], **shape,
-            **get_id_and_score(labels, k)}
+        shape = {
+            "centroid": {"x": x, "y": y, "z": z},
+            "dimensions": {"length": length, "width": width, "height": height},
+            **shape,
+        }
+    return {**merge_extra(extra, OWN), "name": labels.class_names[k], **shape, **get_id_and_score(labels, k)}
 
 
 def _to_hex_color(name: str) -> str:
     return "#" + "".join(f"{round(255 * part):02x}" for part in COLORS.get(name, OTHER_COLOR))
 
 
-absolute_format, relative_format, vertices_format = (
-    (partial(_read, kind), partial(_write, kind)) for kind in KINDS)
+absolute_format, relative_format, vertices_format = ((partial(_read, kind), partial(_write, kind)) for kind in KINDS)

@@ -47,17 +47,15 @@ from lidar_perception.runs.files import check_unused, write_text
 from lidar_perception.types import InputError
 
 ROOT = "nuscenes"
-NO_SCORE = -1.0    # of labels, as in nuscenes-devkit
+NO_SCORE = -1.0  # of labels, as in nuscenes-devkit
 OUR_NAMES = {**CLASS_BY_NAME, **{name: our_name for our_name, name in NAME_BY_CLASS.items()}}
 NUSCENES_NAMES = {our_name: name for name, our_name in OUR_NAMES.items()}
 # nuScenes' classes for our classes that it lacks, such as vans; our name is written as a field.
-SIMILAR_NAMES = {row.name: NUSCENES_NAMES[row.looks_like] for row in TABLE
-                 if row.looks_like in NUSCENES_NAMES}
+SIMILAR_NAMES = {row.name: NUSCENES_NAMES[row.looks_like] for row in TABLE if row.looks_like in NUSCENES_NAMES}
 WRITTEN_NAMES = {**NUSCENES_NAMES, **SIMILAR_NAMES}
 # nuScenes' classes that are ours only with a rider.
 RIDDEN_CLASSES, NOT_RIDDEN = OUR_NAMES.keys() - CLASS_BY_NAME.keys(), "cycle.without_rider"
-OWN = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id",
-       "attribute_name"}
+OWN = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id", "attribute_name"}
 
 
 def _get_token(frame: Frame) -> str:
@@ -67,8 +65,10 @@ def _get_token(frame: Frame) -> str:
 def _require_pose(frame: Frame) -> np.ndarray:
     pose = frame.pose()
     if pose is None:
-        raise InputError(f"frame {frame.name} has no pose, but nuScenes' boxes are in a fixed "
-                         "frame; use openlabel, labelcloud or sustech, which need no poses")
+        raise InputError(
+            f"frame {frame.name} has no pose, but nuScenes' boxes are in a fixed "
+            "frame; use openlabel, labelcloud or sustech, which need no poses"
+        )
     return pose
 
 
@@ -77,11 +77,14 @@ def _read(task: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
     content = read_json(path)
     results = report_format_errors(str(path), lambda: dict(content["results"]))
     if not results.keys() & {_get_token(frame) for frame in frames}:
-        raise InputError(f"{path} has none of the drive's samples, the first of which is "
-                         f"{_get_token(frames[0])}; give the results of this drive")
-    ids = report_format_errors(str(path), lambda: assign_track_ids({str(row.get("tracking_id", ""))
-                                                                    for rows in results.values()
-                                                                    for row in rows} - {""}))
+        raise InputError(
+            f"{path} has none of the drive's samples, the first of which is "
+            f"{_get_token(frames[0])}; give the results of this drive"
+        )
+    ids = report_format_errors(
+        str(path),
+        lambda: assign_track_ids({str(row.get("tracking_id", "")) for rows in results.values() for row in rows} - {""}),
+    )
     labels = []
     for frame in frames:
         where = f"{path}, sample {_get_token(frame)}"
@@ -91,8 +94,7 @@ def _read(task: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
     return DriveLabels(labels, {ROOT: {key: v for key, v in content.items() if key != "results"}})
 
 
-def _parse_boxes(task: str, frame: Frame, boxes: list[dict[str, Any]],
-                 ids: dict[str, int]) -> list[Row]:
+def _parse_boxes(task: str, frame: Frame, boxes: list[dict[str, Any]], ids: dict[str, int]) -> list[Row]:
     rows: list[Row] = []
     pose = _require_pose(frame) if boxes else np.eye(4)  # without boxes, no pose is needed
     for row in boxes:
@@ -142,8 +144,7 @@ def find_read_rotation(labels: FrameLabels, k: int, pose: np.ndarray) -> list[fl
     return None
 
 
-def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
-           force: bool = False) -> None:
+def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
     """Write one JSON file.
 
     Missing velocities are computed from the tracks, else NaN, which nuscenes-devkit can read.
@@ -154,17 +155,19 @@ def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
     names = collect_track_names(labels.frames, "tracking_id")
     results = {}
     for i, (frame_labels, frame) in enumerate(zip(labels.frames, frames)):
-        placements = format_boxes(_get_token(frame), *to_global_boxes(
-            frame_labels.boxes, poses[i])) if len(frame_labels) else []
+        placements = (
+            format_boxes(_get_token(frame), *to_global_boxes(frame_labels.boxes, poses[i])) if len(frame_labels) else []
+        )
         results[_get_token(frame)] = [
-            {**placement, **_make_columns(task, frame_labels, k, poses[i],
-                                          velocities.get((i, k), [np.nan] * 2), names)}
-            for k, placement in enumerate(placements)]
+            {**placement, **_make_columns(task, frame_labels, k, poses[i], velocities.get((i, k), [np.nan] * 2), names)}
+            for k, placement in enumerate(placements)
+        ]
     write_text(out, json.dumps({"meta": META, **labels.extra.get(ROOT, {}), "results": results}))
 
 
-def _make_columns(task: str, labels: FrameLabels, k: int, pose: np.ndarray,
-                  velocity: list[float], names: dict[int, str]) -> dict[str, Any]:
+def _make_columns(
+    task: str, labels: FrameLabels, k: int, pose: np.ndarray, velocity: list[float], names: dict[int, str]
+) -> dict[str, Any]:
     """Return the fields of a box except its position and size, see _write."""
     kind, track = labels.class_names[k], int(labels.track_ids[k])
     extra = dict(labels.extra[k])
@@ -178,10 +181,12 @@ def _make_columns(task: str, labels: FrameLabels, k: int, pose: np.ndarray,
         extra["class_name"] = kind
     if isinstance(kept := extra.pop("velocity", None), list) and len(kept) == 2:
         velocity = _parse_velocity(kept) or velocity
-    columns = {"velocity": velocity, "attribute_name": attribute,
-               f"{task}_name": WRITTEN_NAMES.get(kind, kind),
-               f"{task}_score": (float(labels.scores[k]) if np.isfinite(labels.scores[k])
-                                 else NO_SCORE)}
+    columns = {
+        "velocity": velocity,
+        "attribute_name": attribute,
+        f"{task}_name": WRITTEN_NAMES.get(kind, kind),
+        f"{task}_score": (float(labels.scores[k]) if np.isfinite(labels.scores[k]) else NO_SCORE),
+    }
     if task == "tracking" or track != NO_TRACK:
         columns["tracking_id"] = "" if track == NO_TRACK else names.get(track, str(track))
     if rotation := find_read_rotation(labels, k, pose):
@@ -190,8 +195,9 @@ def _make_columns(task: str, labels: FrameLabels, k: int, pose: np.ndarray,
     return {**merge_extra(extra, OWN | columns.keys()), **columns}
 
 
-def _compute_velocities(labels: DriveLabels, frames: Sequence[Frame],
-                        poses: dict[int, np.ndarray]) -> dict[tuple[int, int], list[float]]:
+def _compute_velocities(
+    labels: DriveLabels, frames: Sequence[Frame], poses: dict[int, np.ndarray]
+) -> dict[tuple[int, int], list[float]]:
     """Compute velocities in m/s in the fixed frame from the previous to the next box of a track.
 
     poses: poses of the frames with boxes. Returns velocities by frame and box.
@@ -203,8 +209,7 @@ def _compute_velocities(labels: DriveLabels, frames: Sequence[Frame],
                 tracks.setdefault((frame.sequence, track), []).append((i, k))
     velocities = {}
     for boxes in tracks.values():
-        positions = np.array([(poses[i] @ [*labels.frames[i].boxes[k, :3], 1.0])[:2]
-                              for i, k in boxes])
+        positions = np.array([(poses[i] @ [*labels.frames[i].boxes[k, :3], 1.0])[:2] for i, k in boxes])
         stamps = np.array([frames[i].stamp_ns for i, _ in boxes], np.int64)
         for n, box in enumerate(boxes):
             first, last = max(n - 1, 0), min(n + 1, len(boxes) - 1)
@@ -213,5 +218,6 @@ def _compute_velocities(labels: DriveLabels, frames: Sequence[Frame],
     return velocities
 
 
-detection_format, tracking_format = ((partial(_read, task), partial(_write, task))
-                                     for task in ("detection", "tracking"))
+detection_format, tracking_format = (
+    (partial(_read, task), partial(_write, task)) for task in ("detection", "tracking")
+)

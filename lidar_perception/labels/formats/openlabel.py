@@ -65,23 +65,26 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
             continue
         where = str(files[drive])
         drive_labels, extra[drive] = report_format_errors(
-            where, partial(_read_drive, files[drive], drive_frames, where))
+            where, partial(_read_drive, files[drive], drive_frames, where)
+        )
         labels += drive_labels
     return DriveLabels(labels, {ROOT: extra})
 
 
-def _read_drive(path: Path, frames: list[Frame],
-                where: str) -> tuple[list[FrameLabels], dict[str, Any]]:
+def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[FrameLabels], dict[str, Any]]:
     """Return the labels of each frame, and the other content of the file."""
     content = dict(read_json(path)[ROOT])
     objects, systems = content.get("objects", {}), content.get("coordinate_systems", {})
     frame_contents = content.get("frames", {})
     if unknown := sorted(set(frame_contents) - {str(frame.index) for frame in frames}):
-        raise InputError(f"{where} has the frame {unknown[0]!r} ({len(unknown)} unknown frames), "
-                         f"but the drive has {frames[0].index} to {frames[-1].index}; give the "
-                         "drive that was labelled")
-    numbers = assign_track_ids([*objects, *(uid for frame in frame_contents.values()
-                                            for uid in frame.get("objects", {}))])
+        raise InputError(
+            f"{where} has the frame {unknown[0]!r} ({len(unknown)} unknown frames), "
+            f"but the drive has {frames[0].index} to {frames[-1].index}; give the "
+            "drive that was labelled"
+        )
+    numbers = assign_track_ids(
+        [*objects, *(uid for frame in frame_contents.values() for uid in frame.get("objects", {}))]
+    )
     labels = []
     for frame in frames:
         frame_content = frame_contents.get(str(frame.index), {})
@@ -91,8 +94,7 @@ def _read_drive(path: Path, frames: list[Frame],
             data = dict(element.get(DATA, {}))
             kind = class_name(str(objects.get(uid, {}).get("type", "")))
             uid_field = {} if str(numbers[uid]) == uid else {UID: uid}
-            cuboids = [cuboid for cuboid in data.get(CUBOIDS, ())
-                       if kind != REGION_CLASS and parts.has_size(cuboid)]
+            cuboids = [cuboid for cuboid in data.get(CUBOIDS, ()) if kind != REGION_CLASS and parts.has_size(cuboid)]
             if not cuboids:
                 notes += _make_region_notes(kind, uid, data)
                 continue
@@ -100,36 +102,55 @@ def _read_drive(path: Path, frames: list[Frame],
             data = {key: items for key, items in data.items() if items}
             for k, cuboid in enumerate(cuboids):
                 system = cuboid.get("coordinate_system", "")
-                box, upright = parts.cuboid_to_box(cuboid["val"], parts.find_transform_to_lidar(
-                    system, systems, frame_content, frame, where))
-                rows.append((box, *_parse_track(cuboid, kind, numbers[uid]),
-                             {**uid_field, **({OBJECT: data} if data and k == 0 else {}),
-                              **_parse_extra(cuboid, box, upright and system in (
-                                  "", parts.find_lidar_system(systems, where)))}))
+                box, upright = parts.cuboid_to_box(
+                    cuboid["val"], parts.find_transform_to_lidar(system, systems, frame_content, frame, where)
+                )
+                rows.append(
+                    (
+                        box,
+                        *_parse_track(cuboid, kind, numbers[uid]),
+                        {
+                            **uid_field,
+                            **({OBJECT: data} if data and k == 0 else {}),
+                            **_parse_extra(
+                                cuboid, box, upright and system in ("", parts.find_lidar_system(systems, where))
+                            ),
+                        },
+                    )
+                )
         labels.append(make_frame_labels(frame, rows, notes, f"{where}, frame {frame.index}"))
-    return labels, {**content, "frames": {
-        number: {**{key: value for key, value in frame.items() if key != "objects"},
-                 PROPERTIES: dict(frame.get(PROPERTIES, {}))}
-        for number, frame in frame_contents.items()}}
+    return labels, {
+        **content,
+        "frames": {
+            number: {
+                **{key: value for key, value in frame.items() if key != "objects"},
+                PROPERTIES: dict(frame.get(PROPERTIES, {})),
+            }
+            for number, frame in frame_contents.items()
+        },
+    }
 
 
-def _make_region_notes(kind: str, uid: str,
-                       data: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+def _make_region_notes(kind: str, uid: str, data: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
     """Return notes of an object without a cuboid: one with KITTI's columns per 2D box, of which the
     first has the data, or without 2D boxes, one of the data."""
     values, rest = parts.parse_named_values(data)
     columns = {name: DONT_CARE[name] for name in COLUMNS if name in DONT_CARE}
-    notes = [(kind, {**columns, **values, "bbox": box, UID: uid, REGION: {} if k else data})
-             for k, box in enumerate(parts.find_regions(data))]
-    return notes or [(kind, {**values, **({OBJECT: rest} if rest else {}),
-                             **({} if values else {UID: uid})})]
+    notes = [
+        (kind, {**columns, **values, "bbox": box, UID: uid, REGION: {} if k else data})
+        for k, box in enumerate(parts.find_regions(data))
+    ]
+    return notes or [(kind, {**values, **({OBJECT: rest} if rest else {}), **({} if values else {UID: uid})})]
 
 
 def _parse_track(cuboid: dict[str, Any], kind: str, number: int) -> tuple[str, int, float]:
     """Return class, track id and score of a cuboid."""
     values, _ = parts.parse_named_values(cuboid.get("attributes", {}))
-    return (class_name(values.get(TYPE, kind)), number if values.get(TRACKED, True) else NO_TRACK,
-            values.get(SCORE, np.nan))
+    return (
+        class_name(values.get(TYPE, kind)),
+        number if values.get(TRACKED, True) else NO_TRACK,
+        values.get(SCORE, np.nan),
+    )
 
 
 def _parse_extra(cuboid: dict[str, Any], box: list[float], plain: bool) -> dict[str, Any]:
@@ -152,20 +173,23 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
     write_drives(out, frames, SUFFIX, force, write_drive)
 
 
-def _make_content(labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[int],
-                  kept: dict[str, Any]) -> dict[str, Any]:
+def _make_content(
+    labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[int], kept: dict[str, Any]
+) -> dict[str, Any]:
     """Return the content of the file of a drive. kept: that of the file which was read, without
     cuboids."""
     own = [(frames[i], labels.frames[i]) for i in positions]
     named_tracks = collect_track_names((frame_labels for _, frame_labels in own), UID)
-    note_uids = {str(note[UID]) for _, frame_labels in own for _, note in frame_labels.notes
-                 if UID in note}
-    used = {str(i) for _, frame_labels in own for i in frame_labels.track_ids.tolist()} | {
-        *named_tracks.values()} | note_uids
-    objects = {uid: dict(o) for uid, o in kept.get("objects", {}).items()
-               if uid in used or not o.get("frame_intervals")}  # used, or not bound to frames
-    systems = kept if kept.get("coordinate_systems") else parts.make_coordinate_systems(
-        [frame for frame, _ in own])
+    note_uids = {str(note[UID]) for _, frame_labels in own for _, note in frame_labels.notes if UID in note}
+    used = (
+        {str(i) for _, frame_labels in own for i in frame_labels.track_ids.tolist()}
+        | {*named_tracks.values()}
+        | note_uids
+    )
+    objects = {
+        uid: dict(o) for uid, o in kept.get("objects", {}).items() if uid in used or not o.get("frame_intervals")
+    }  # used, or not bound to frames
+    systems = kept if kept.get("coordinate_systems") else parts.make_coordinate_systems([frame for frame, _ in own])
     lidar = parts.find_lidar_system(systems["coordinate_systems"], "the file that was read")
     numbers = [int(uid) for uid in (*used, *objects) if is_track_number(uid)]
     new_numbers = itertools.count(max([0, *numbers]) + 1)
@@ -177,8 +201,7 @@ def _make_content(labels: DriveLabels, frames: Sequence[Frame], positions: Seque
         if uid not in frames_by_object:
             known = objects.get(uid, {})
             same_class = class_name(str(known.get("type", ""))) == kind  # in any spelling
-            objects[uid] = {"name": f"{kind} {uid}", **known,
-                            "type": known["type"] if same_class else kind}
+            objects[uid] = {"name": f"{kind} {uid}", **known, "type": known["type"] if same_class else kind}
         frames_by_object.setdefault(uid, []).append(index)
         frame_objects = frame_contents[str(index)].setdefault("objects", {})
         data: dict[str, Any] = frame_objects.setdefault(uid, {DATA: {}})[DATA]
@@ -186,35 +209,48 @@ def _make_content(labels: DriveLabels, frames: Sequence[Frame], positions: Seque
 
     for frame, frame_labels in own:
         kept_content = kept.get("frames", {}).get(str(frame.index), {})
-        frame_contents[str(frame.index)] = {**kept_content, PROPERTIES: {
-            **({} if systems is kept else parts.make_transforms(frame)),
-            **kept_content.get(PROPERTIES, {}), "name": frame.name,
-            "timestamp": f"{frame.stamp_ns / 1e9:.9f}"}}
+        frame_contents[str(frame.index)] = {
+            **kept_content,
+            PROPERTIES: {
+                **({} if systems is kept else parts.make_transforms(frame)),
+                **kept_content.get(PROPERTIES, {}),
+                "name": frame.name,
+                "timestamp": f"{frame.stamp_ns / 1e9:.9f}",
+            },
+        }
         for k, (kind, extra) in enumerate(zip(frame_labels.class_names, frame_labels.extra)):
             track = int(frame_labels.track_ids[k])
             uid = named_tracks.get(track, str(next(new_numbers) if track == NO_TRACK else track))
             data = get_object_data(uid, kind, frame.index)
             data |= {key: value for key, value in extra.get(OBJECT, {}).items() if key not in data}
-            data.setdefault(CUBOIDS, []).append(
-                _make_cuboid(frame_labels, k, objects[uid]["type"], lidar))
+            data.setdefault(CUBOIDS, []).append(_make_cuboid(frame_labels, k, objects[uid]["type"], lidar))
         for kind, note in frame_labels.notes:
             values = {key: value for key, value in note.items() if key not in (UID, OBJECT)}
             get_object_data(str(note.get(UID, next(new_numbers))), kind, frame.index).update(
-                note[REGION] if REGION in note else
-                {**parts.to_named_values(values), **note.get(OBJECT, {})})
+                note[REGION] if REGION in note else {**parts.to_named_values(values), **note.get(OBJECT, {})}
+            )
     for uid, indices in frames_by_object.items():
         objects[uid]["frame_intervals"] = parts.find_intervals(indices)
-    return {ROOT: {"metadata": {"schema_version": "1.0.0"}, **kept, **systems,
-                   "frames": frame_contents, "objects": objects,
-                   "frame_intervals": parts.find_intervals([frame.index for frame, _ in own])}}
+    return {
+        ROOT: {
+            "metadata": {"schema_version": "1.0.0"},
+            **kept,
+            **systems,
+            "frames": frame_contents,
+            "objects": objects,
+            "frame_intervals": parts.find_intervals([frame.index for frame, _ in own]),
+        }
+    }
 
 
 def _make_cuboid(labels: FrameLabels, k: int, kind: str, lidar: str) -> dict[str, Any]:
     box, extra = labels.boxes[k], labels.extra[k]
     x, y, z, length, width, height, yaw = box.tolist()
-    cuboid = {"name": "box", "coordinate_system": lidar,
-              "val": [x, y, z, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2), length, width,
-                      height]}
+    cuboid = {
+        "name": "box",
+        "coordinate_system": lidar,
+        "val": [x, y, z, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2), length, width, height],
+    }
     if KEPT in extra and is_unchanged(box, extra[KEPT]["box"]):
         cuboid = {key: value for key, value in extra[KEPT].items() if key != "box"}
     values = {name: v for name, v in extra.items() if name not in (UID, OTHER, OBJECT, KEPT)}

@@ -38,18 +38,19 @@ def cuboid_to_box(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[floa
     """
     if len(val) not in (9, 10):
         raise ValueError(f"a cuboid has {len(val)} numbers instead of 10 or 9")
-    axes = to_lidar[:3, :3] @ (quaternion_to_matrix(val[3:7]) if len(val) == 10
-                               else _euler_to_matrix(*val[3:6]))
+    axes = to_lidar[:3, :3] @ (quaternion_to_matrix(val[3:7]) if len(val) == 10 else _euler_to_matrix(*val[3:6]))
     x, y, z = (to_lidar[:3, :3] @ np.array(val[:3], float) + to_lidar[:3, 3]).tolist()
     up = 2 - int(np.abs(axes[2, ::-1]).argmax())
     ahead, across = (axis for axis in range(3) if axis != up)
     same = np.array_equal(to_lidar, np.eye(4))
-    yaw = (2 * math.atan2(val[5], val[6]) if same and len(val) == 10 and val[3] == val[4] == 0
-           else math.atan2(axes[1, ahead], axes[0, ahead]))
+    yaw = (
+        2 * math.atan2(val[5], val[6])
+        if same and len(val) == 10 and val[3] == val[4] == 0
+        else math.atan2(axes[1, ahead], axes[0, ahead])
+    )
     yaw = (yaw + math.pi) % (2 * math.pi) - math.pi if abs(yaw) > math.pi else yaw
     sizes = [float(size) for size in val[-3:]]
-    return ([x, y, z, sizes[ahead], sizes[across], sizes[up], yaw],
-            bool(axes[2, 2] > 1 - MAX_TILT))
+    return ([x, y, z, sizes[ahead], sizes[across], sizes[up], yaw], bool(axes[2, 2] > 1 - MAX_TILT))
 
 
 def has_size(cuboid: dict[str, Any]) -> bool:
@@ -61,8 +62,12 @@ def find_regions(data: dict[str, Any]) -> list[list[float]]:
     """Return the 2D boxes [left top right bottom] of an object in pixels of its first camera."""
     boxes = [box for box in data.get("bbox", ()) if len(box["val"]) == 4]
     cameras = [box.get("coordinate_system") for box in boxes]
-    return [[x - w / 2, y - h / 2, x + w / 2, y + h / 2] for box, camera in zip(boxes, cameras)
-            if camera == cameras[0] for x, y, w, h in [map(float, box["val"])]]
+    return [
+        [x - w / 2, y - h / 2, x + w / 2, y + h / 2]
+        for box, camera in zip(boxes, cameras)
+        if camera == cameras[0]
+        for x, y, w, h in [map(float, box["val"])]
+    ]
 
 
 def quaternion_to_matrix(quaternion: Sequence[float]) -> np.ndarray:
@@ -72,13 +77,16 @@ def quaternion_to_matrix(quaternion: Sequence[float]) -> np.ndarray:
 
 def _euler_to_matrix(x: float, y: float, z: float) -> np.ndarray:
     """Return the rotation matrix (3, 3) of a rotation about x, then about y, then about z."""
-    a, b, c = (quaternion_to_matrix([*(math.sin(angle / 2) * np.eye(3)[i]), math.cos(angle / 2)])
-               for i, angle in enumerate((x, y, z)))
+    a, b, c = (
+        quaternion_to_matrix([*(math.sin(angle / 2) * np.eye(3)[i]), math.cos(angle / 2)])
+        for i, angle in enumerate((x, y, z))
+    )
     return c @ b @ a
 
 
-def find_transform_to_lidar(name: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame,
-                            where: str) -> np.ndarray:
+def find_transform_to_lidar(
+    name: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame, where: str
+) -> np.ndarray:
     """Return the transform (4, 4) from a coordinate system ("" for the LiDAR's) to the LiDAR's.
 
     It is computed from the poses of the systems and of the frame, else from the recording's pose;
@@ -96,28 +104,30 @@ def find_transform_to_lidar(name: str, systems: dict[str, Any], frame: dict[str,
         transform, system = np.eye(4), start
         for _ in systems:
             if system not in systems:
-                raise InputError(f"{where} does not define the coordinate system {system!r} of a "
-                                 "cuboid; write the file again")
+                raise InputError(
+                    f"{where} does not define the coordinate system {system!r} of a cuboid; write the file again"
+                )
             if not (parent := systems[system].get("parent")):
                 break
             pose = _find_pose(system, parent, systems, frame, own, where)
             transform, system = pose @ transform, parent
         roots.append((system, transform))
     if roots[0][0] != roots[1][0]:
-        raise InputError(f"{where}: the coordinate systems {name!r} and {lidar!r} are not "
-                         "connected; write the file again")
+        raise InputError(
+            f"{where}: the coordinate systems {name!r} and {lidar!r} are not connected; write the file again"
+        )
     return np.linalg.inv(roots[1][1]) @ roots[0][1]
 
 
 def find_lidar_system(systems: dict[str, Any], where: str) -> str:
     """Return the name of the LiDAR's coordinate system. Raises InputError if it is ambiguous."""
-    sensors = [name for name, s in systems.items()
-               if s.get("type") == "sensor_cs" and not _is_camera(name)]
-    lidars = [name for name in sensors if any(word in name.lower() for word in
-                                              ("lidar", "velo", "laser"))] or sensors
+    sensors = [name for name, s in systems.items() if s.get("type") == "sensor_cs" and not _is_camera(name)]
+    lidars = [name for name in sensors if any(word in name.lower() for word in ("lidar", "velo", "laser"))] or sensors
     if len(lidars) > 1:
-        raise InputError(f"{where} has several sensors that may be the LiDAR: {', '.join(lidars)}; "
-                         f"rename the right one to {LIDAR!r}, and the others to other names")
+        raise InputError(
+            f"{where} has several sensors that may be the LiDAR: {', '.join(lidars)}; "
+            f"rename the right one to {LIDAR!r}, and the others to other names"
+        )
     return lidars[0] if lidars else LIDAR
 
 
@@ -125,8 +135,9 @@ def _is_camera(name: str) -> bool:
     return "cam" in name.lower()
 
 
-def _find_pose(name: str, parent: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame,
-               where: str) -> np.ndarray:
+def _find_pose(
+    name: str, parent: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame, where: str
+) -> np.ndarray:
     for transform in frame.get("frame_properties", {}).get("transforms", {}).values():
         if transform["src"] == name and transform["dst"] == parent:
             return _parse_transform(transform["transform_src_to_dst"])
@@ -134,8 +145,9 @@ def _find_pose(name: str, parent: str, systems: dict[str, Any], frame: dict[str,
         return _parse_transform(systems[name]["pose_wrt_parent"])
     pose = own.pose()
     if pose is None:
-        raise InputError(f"{where}: the pose of {name!r} in {parent!r} is missing in frame "
-                         f"{own.index}; write the file again")
+        raise InputError(
+            f"{where}: the pose of {name!r} in {parent!r} is missing in frame {own.index}; write the file again"
+        )
     return pose
 
 
@@ -153,8 +165,7 @@ def make_coordinate_systems(frames: Sequence[Frame]) -> dict[str, Any]:
     fixed system and the camera."""
     calibration = frames[0].calibration() if frames else None
     has_poses = bool(frames) and frames[0].pose() is not None
-    lidar: dict[str, Any] = {"type": "sensor_cs", "parent": FIXED if has_poses else "",
-                             "children": []}
+    lidar: dict[str, Any] = {"type": "sensor_cs", "parent": FIXED if has_poses else "", "children": []}
     systems: dict[str, Any] = {LIDAR: lidar}
     streams: dict[str, Any] = {LIDAR: {"type": "lidar"}}
     if has_poses:
@@ -162,20 +173,41 @@ def make_coordinate_systems(frames: Sequence[Frame]) -> dict[str, Any]:
     if calibration is not None:
         pose = np.linalg.inv(calibration.lidar_to_camera)
         lidar["children"] = [CAMERA]
-        systems[CAMERA] = {"type": "sensor_cs", "parent": LIDAR, "children": [],
-                           "pose_wrt_parent": {"matrix4x4": pose.ravel().tolist()}}
-        streams[CAMERA] = {"type": "camera", "stream_properties": {"intrinsics_pinhole": {
-            "width_px": calibration.width, "height_px": calibration.height,
-            "camera_matrix_3x4": calibration.intrinsics.ravel().tolist()}}}
+        systems[CAMERA] = {
+            "type": "sensor_cs",
+            "parent": LIDAR,
+            "children": [],
+            "pose_wrt_parent": {"matrix4x4": pose.ravel().tolist()},
+        }
+        streams[CAMERA] = {
+            "type": "camera",
+            "stream_properties": {
+                "intrinsics_pinhole": {
+                    "width_px": calibration.width,
+                    "height_px": calibration.height,
+                    "camera_matrix_3x4": calibration.intrinsics.ravel().tolist(),
+                }
+            },
+        }
     return {"coordinate_systems": systems, "streams": streams}
 
 
 def make_transforms(frame: Frame) -> dict[str, Any]:
     """Return frame_properties with the pose of the LiDAR in a fixed frame; empty without a pose."""
     pose = frame.pose()
-    return {} if pose is None else {"transforms": {f"{LIDAR}_to_{FIXED}": {
-        "src": LIDAR, "dst": FIXED,
-        "transform_src_to_dst": {"matrix4x4": pose.ravel().tolist()}}}}
+    return (
+        {}
+        if pose is None
+        else {
+            "transforms": {
+                f"{LIDAR}_to_{FIXED}": {
+                    "src": LIDAR,
+                    "dst": FIXED,
+                    "transform_src_to_dst": {"matrix4x4": pose.ravel().tolist()},
+                }
+            }
+        }
+    )
 
 
 def to_named_values(values: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
@@ -184,7 +216,8 @@ def to_named_values(values: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
     for name, value in values.items():
         kind = next((kind for kind, fits in KINDS.items() if fits(value)), "")
         values_by_kind.setdefault(kind or "text", []).append(
-            {"name": name if kind else f"{name}.json", "val": value if kind else json.dumps(value)})
+            {"name": name if kind else f"{name}.json", "val": value if kind else json.dumps(value)}
+        )
     return values_by_kind
 
 
@@ -205,13 +238,15 @@ def parse_named_values(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str,
 
 def _is_number(value: Any) -> bool:
     """Return True for numbers within the range of float64, as other readers require."""
-    return (isinstance(value, int | float) and not isinstance(value, bool)
-            and abs(value) <= sys.float_info.max)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
-KINDS = {"boolean": lambda v: isinstance(v, bool), "num": _is_number,
-         "text": lambda v: isinstance(v, str),
-         "vec": lambda v: isinstance(v, list) and len(v) > 0 and all(map(_is_number, v))}
+KINDS = {
+    "boolean": lambda v: isinstance(v, bool),
+    "num": _is_number,
+    "text": lambda v: isinstance(v, str),
+    "vec": lambda v: isinstance(v, list) and len(v) > 0 and all(map(_is_number, v)),
+}
 
 
 def find_intervals(numbers: list[int]) -> list[dict[str, int]]:

@@ -18,5 +18,6 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     path = path / "labels" if (path / "labels").is_dir() else path
     files = list_frame_files(path, frames, ".txt")
     check_label_files(path, files, ".txt")
-    return DriveLabels([read_frame_labels(replace(frame, truth=partial(read_labels, file)))
-                        for frame, file in zip(frames, files)])
+    return DriveLabels(
+        [read_frame_labels(replace(frame, truth=partial(read_labels, file))) for frame, file in zip(frames, files)]
+    )

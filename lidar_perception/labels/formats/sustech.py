@@ -51,8 +51,10 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
         content = read_json(file) if file.exists() else []
         # Later versions of SUSTechPOINTS have the list inside an object.
         contents.append(content.get("objs", content) if isinstance(content, dict) else content)
-    ids = report_format_errors(str(path), lambda: assign_track_ids(
-        {str(item.get("obj_id", "")) for content in contents for item in content} - {""}))
+    ids = report_format_errors(
+        str(path),
+        lambda: assign_track_ids({str(item.get("obj_id", "")) for content in contents for item in content} - {""}),
+    )
     labels = []
     for frame, file, content in zip(frames, files, contents):
         rows = report_format_errors(str(file), partial(_parse_boxes, content, ids))
@@ -63,13 +65,18 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
 def _parse_boxes(content: list[dict[str, Any]], ids: dict[str, int]) -> list[Row]:
     rows: list[Row] = []
     for item in content:
-        position, scale, angles = ([float(item["psr"][part][axis]) for axis in "xyz"]
-                                   for part in ("position", "scale", "rotation"))
+        position, scale, angles = (
+            [float(item["psr"][part][axis]) for axis in "xyz"] for part in ("position", "scale", "rotation")
+        )
         x, y, z = angles
         upright = x == y == 0
-        yaw = z if upright else math.atan2(
-            math.cos(x) * math.sin(z) + math.sin(x) * math.sin(y) * math.cos(z),
-            math.cos(y) * math.cos(z))
+        yaw = (
+            z
+            if upright
+            else math.atan2(
+                math.cos(x) * math.sin(z) + math.sin(x) * math.sin(y) * math.cos(z), math.cos(y) * math.cos(z)
+            )
+        )
         box = [*position, *scale, math.remainder(yaw, math.tau)]
         extra = extract_extra(item, OWN)
         if not upright:
@@ -78,8 +85,7 @@ def _parse_boxes(content: list[dict[str, Any]], ids: dict[str, int]) -> list[Row
         track = ids.get(name, NO_TRACK)
         if name and name != str(track):
             extra["obj_id"] = name
-        rows.append((box, str(item.get("obj_type", "")), track,
-                     float(item.get("score", math.nan)), extra))
+        rows.append((box, str(item.get("obj_type", "")), track, float(item.get("score", math.nan)), extra))
     return rows
 
 
@@ -89,8 +95,7 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
     with write_folder(out, force) as folder:
         files = list_frame_files(folder, frames, SUFFIX)
         for frame_labels, file in zip(labels.frames, files):
-            write_json(file, [_make_object(frame_labels, k, names)
-                              for k in range(len(frame_labels))], 1)
+            write_json(file, [_make_object(frame_labels, k, names) for k in range(len(frame_labels))], 1)
 
 
 def _make_object(labels: FrameLabels, k: int, names: dict[int, str]) -> dict[str, Any]:
@@ -101,7 +106,15 @@ def _make_object(labels: FrameLabels, k: int, names: dict[int, str]) -> dict[str
     rotation = {"x": 0, "y": 0, "z": float(box[6])}
     if tilted and is_unchanged(box, tilted["box"]):
         rotation = tilted["rotation"]
-    psr = {"position": dict(zip("xyz", box[:3].tolist())),
-           "scale": dict(zip("xyz", box[3:6].tolist())), "rotation": rotation}
-    return {**merge_extra(extra, OWN), "psr": psr, "obj_type": labels.class_names[k],
-            "obj_id": names.get(track, str(track)), **fields}
+    psr = {
+        "position": dict(zip("xyz", box[:3].tolist())),
+        "scale": dict(zip("xyz", box[3:6].tolist())),
+        "rotation": rotation,
+    }
+    return {
+        **merge_extra(extra, OWN),
+        "psr": psr,
+        "obj_type": labels.class_names[k],
+        "obj_id": names.get(track, str(track)),
+        **fields,
+    }

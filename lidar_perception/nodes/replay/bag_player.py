@@ -51,39 +51,41 @@ class BagPlayer(LidarNode):
         for warning in caught:
             self.get_logger().warning(str(warning.message))
         # Topics with clouds that are played as PointCloud2
-        self.converted = {t for t in find_cloud_topics(self.bag.topics)
-                          if self.bag.topics[t] != POINT_CLOUD}
-        self.kinds = {t: POINT_CLOUD if t in self.converted else kind
-                      for t, kind in self.bag.topics.items()}
+        self.converted = {t for t in find_cloud_topics(self.bag.topics) if self.bag.topics[t] != POINT_CLOUD}
+        self.kinds = {t: POINT_CLOUD if t in self.converted else kind for t, kind in self.bag.topics.items()}
         self.follows = bool(self.params.follow and self.params.ahead)  # clouds wait for answers
         self.names = self._select_topics()
         self.publishers_by_topic = {t: p for t in self.names if (p := self._make_publisher(t))}
         if not self.publishers_by_topic:
-            raise InputError(f"{self.params.bag}: nothing to play; no topic is left of "
-                             f"{', '.join(self.bag.topics) or 'an empty bag'}")
+            raise InputError(
+                f"{self.params.bag}: nothing to play; no topic is left of "
+                f"{', '.join(self.bag.topics) or 'an empty bag'}"
+            )
         self.awaited = self._parse_wait_for()
         self.diagnostic_values: dict[str, dict[str, str]] = {}  # by node
         self.start_ns = self.bag.start_ns + int(self.params.start_offset * SECOND_NS)
         if self.start_ns > self.bag.end_ns:
-            raise InputError(f"start_offset {self.params.start_offset:g} s is after the end of "
-                             f"{self.params.bag}, which has "
-                             f"{(self.bag.end_ns - self.bag.start_ns) / SECOND_NS:.1f} s")
-        self.stop_ns = (self.start_ns + int(self.params.duration * SECOND_NS)
-                        if self.params.duration else None)
+            raise InputError(
+                f"start_offset {self.params.start_offset:g} s is after the end of "
+                f"{self.params.bag}, which has "
+                f"{(self.bag.end_ns - self.bag.start_ns) / SECOND_NS:.1f} s"
+            )
+        self.stop_ns = self.start_ns + int(self.params.duration * SECOND_NS) if self.params.duration else None
         self.paused = self.params.start_paused
         self.warned: set[str] = set()  # topics with skipped messages
         self.steps = 0
-        self.step_topic = max(self.publishers_by_topic, key=lambda t: (
-            self.kinds[t] == POINT_CLOUD, self.bag.counts[t]))
+        self.step_topic = max(
+            self.publishers_by_topic, key=lambda t: (self.kinds[t] == POINT_CLOUD, self.bag.counts[t])
+        )
         self.now_ns, self.anchor = self.start_ns, monotonic()
         self.pace = Pace(self, self.params.follow, self.params.ahead, self.params.follow_timeout)
         self.clock = self.params.clock_hz and self.create_publisher(Clock, "/clock", RELIABLE)
         self.next_clock, self.served_at = 0.0, 0.0  # monotonic
-        for name, action in (("pause", self._pause), ("resume", self._resume),
-                             ("step", self._step)):
+        for name, action in (("pause", self._pause), ("resume", self._resume), ("step", self._step)):
             self.create_service(Trigger, f"~/{name}", action)
         if importlib.util.find_spec("rosbag2_interfaces"):
             from rosbag2_interfaces.srv import SetRate
+
             self.create_service(SetRate, "~/set_rate", self._set_rate)
 
     def _select_topics(self) -> dict[str, str]:
@@ -94,16 +96,15 @@ class BagPlayer(LidarNode):
         for rule in self.params.remap:
             old, separator, new = rule.partition(":=")
             if not separator or old not in names:
-                raise InputError(f"remap '{rule}' must be OLD:=NEW with one of the topics "
-                                 f"{', '.join(names)}")
+                raise InputError(f"remap '{rule}' must be OLD:=NEW with one of the topics {', '.join(names)}")
             names[old] = new
-        expanded = {topic: self._expand_name(name, f"the topic {topic}")
-                    for topic, name in names.items()}
+        expanded = {topic: self._expand_name(name, f"the topic {topic}") for topic, name in names.items()}
         kinds: dict[str, str] = {}
         for topic, name in expanded.items():
             if kinds.setdefault(name, self.kinds[topic]) != self.kinds[topic]:
-                raise InputError(f"{name} would have the types {kinds[name]} and "
-                                 f"{self.kinds[topic]}; remap {topic} to another name")
+                raise InputError(
+                    f"{name} would have the types {kinds[name]} and {self.kinds[topic]}; remap {topic} to another name"
+                )
         return expanded
 
     def _expand_name(self, name: str, what: str) -> str:
@@ -128,8 +129,9 @@ class BagPlayer(LidarNode):
     def _make_publisher(self, topic: str) -> Any:
         kind = self.kinds[topic]
         try:
-            return self.output(self.names[topic], kind, _qos(
-                self.bag.qos(topic), self._count_latched(topic), lossless=self.follows)).publisher
+            return self.output(
+                self.names[topic], kind, _qos(self.bag.qos(topic), self._count_latched(topic), lossless=self.follows)
+            ).publisher
         except (ModuleNotFoundError, AttributeError):
             self.get_logger().warning(f"{topic} is not played: {kind} is not installed here")
             return None
@@ -163,7 +165,8 @@ class BagPlayer(LidarNode):
 
     def _wait_for_subscribers(self) -> None:
         diagnostics = self.awaited and self.create_subscription(
-            DiagnosticArray, "/diagnostics", self._on_status, RELIABLE)
+            DiagnosticArray, "/diagnostics", self._on_status, RELIABLE
+        )
         self._wait_until_connected()
         if diagnostics:
             self.destroy_subscription(diagnostics)
@@ -180,9 +183,12 @@ class BagPlayer(LidarNode):
             if not missing:
                 return
             if monotonic() > give_up:
-                self.report(WARN, f"too few subscribers of {', '.join(missing)} (or publishers of "
-                            f"topics in follow) after {self.params.wait_timeout:g} s; playing "
-                            "anyway")
+                self.report(
+                    WARN,
+                    f"too few subscribers of {', '.join(missing)} (or publishers of "
+                    f"topics in follow) after {self.params.wait_timeout:g} s; playing "
+                    "anyway",
+                )
                 return
             self._publish_clock()  # the awaited node may be waiting for the time
             self.serve(timeout_sec=0.02)
@@ -198,14 +204,14 @@ class BagPlayer(LidarNode):
         if played:
             return played[0].get_subscription_count()
         node = resolved.rsplit("/", 2)[0]
-        if resolved.endswith(UNCOUNTED_SUFFIXES) or not self.count_publishers(
-                f"{node}/debug/processing_time_ms"):
+        if resolved.endswith(UNCOUNTED_SUFFIXES) or not self.count_publishers(f"{node}/debug/processing_time_ms"):
             return self.count_subscribers(resolved)  # not an output of a node of this package
         values = self.diagnostic_values.get(node, {})  # with those in the process of the node
         return int(values.get(f"subscribers of {resolved}", 0))
 
     def _wait_until_delivered(self) -> None:
         from rclpy.duration import Duration
+
         for publisher in (*self.publishers_by_topic.values(), self._diagnostics):
             if not self.stop.done():
                 publisher.wait_for_all_acked(Duration(seconds=2))
@@ -213,8 +219,7 @@ class BagPlayer(LidarNode):
     def _play_once(self) -> None:
         self._publish_latched()
         self.now_ns, self.anchor = self.start_ns, monotonic()
-        for topic, stamp, data in self.bag.raw_messages(self.publishers_by_topic, self.start_ns,
-                                                        self.stop_ns):
+        for topic, stamp, data in self.bag.raw_messages(self.publishers_by_topic, self.start_ns, self.stop_ns):
             if not self._wait_until(stamp, topic):
                 return
             if (played := self._convert(topic, data)) is None:
@@ -255,12 +260,17 @@ class BagPlayer(LidarNode):
 
     def _count_pace(self) -> None:
         if latencies := sorted(self.pace.latencies_ms):
-            self.counts.update(latency_ms_median=f"{median(latencies):.1f}",
-                               latency_ms_p95=f"{latencies[int(0.95 * (len(latencies) - 1))]:.1f}")
+            self.counts.update(
+                latency_ms_median=f"{median(latencies):.1f}",
+                latency_ms_p95=f"{latencies[int(0.95 * (len(latencies) - 1))]:.1f}",
+            )
         if self.follows:
             played = max((self.now_ns - self.start_ns) / SECOND_NS / self.params.rate, 1e-9)
-            self.counts.update(unanswered=self.pace.unanswered, held_s=f"{self.pace.held:.2f}",
-                               slower=f"{(played + self.pace.held) / played:.2f}")
+            self.counts.update(
+                unanswered=self.pace.unanswered,
+                held_s=f"{self.pace.held:.2f}",
+                slower=f"{(played + self.pace.held) / played:.2f}",
+            )
 
     def _publish_latched(self) -> None:
         """Publish the latched messages that are valid at the start of the replay."""
@@ -325,6 +335,7 @@ class BagPlayer(LidarNode):
 
     def _set_rate(self, request: Any, response: Any) -> Any:
         from rclpy.parameter import Parameter
+
         self._advance()
         result = self.set_parameters([Parameter("rate", value=float(request.rate))])[0]
         response.success = result.successful
@@ -354,4 +365,5 @@ def _qos(profiles: list, latched_count: int, lossless: bool) -> QoSProfile:
     return QoSProfile(
         depth=max(latched_count * latched, 10, *(q.depth for q in profiles)),
         reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )

@@ -51,8 +51,9 @@ class BagRecorder(LidarNode):
 
     def _discover(self) -> None:
         if self.failure:
-            raise InputError(f"cannot write the bag {self.params.bag}: {self.failure}; the part "
-                             f"so far is in {self.writer.partial}")
+            raise InputError(
+                f"cannot write the bag {self.params.bag}: {self.failure}; the part so far is in {self.writer.partial}"
+            )
         types = dict(self.get_topic_names_and_types())
         for topic in [t for t in self.waiting if t in types]:
             offered = [i.qos_profile for i in self.get_publishers_info_by_topic(topic)]
@@ -60,13 +61,13 @@ class BagRecorder(LidarNode):
                 continue
             self.waiting.remove(topic)
             if (kind := self._find_class(types[topic][0])) is None:
-                self.get_logger().warning(f"{topic} is not recorded: {types[topic][0]} is not "
-                                          "installed here, or unknown")
+                self.get_logger().warning(
+                    f"{topic} is not recorded: {types[topic][0]} is not installed here, or unknown"
+                )
                 continue
             self._subscribe(topic, kind)
             latched = self.subscription_by_topic[topic].qos_profile.durability == LATCHED
-            self.queue.put(("topic", topic, types[topic][0],
-                            LATCHED_QOS if latched else SENSOR_QOS))
+            self.queue.put(("topic", topic, types[topic][0], LATCHED_QOS if latched else SENSOR_QOS))
         while self.incompatible:
             topic = self.incompatible.pop()
             before = self.subscription_by_topic[topic]
@@ -75,9 +76,12 @@ class BagRecorder(LidarNode):
         missing = self.counts["lost"] + self.counts["dropped"]
         if missing > self.reported:
             self.reported = missing
-            self.report(WARN, f"{self.counts['lost']} messages were lost on the way and "
-                        f"{self.counts['dropped']} dropped, because the disk is too slow: "
-                        "record fewer topics, or use a faster machine")
+            self.report(
+                WARN,
+                f"{self.counts['lost']} messages were lost on the way and "
+                f"{self.counts['dropped']} dropped, because the disk is too slow: "
+                "record fewer topics, or use a faster machine",
+            )
         elif self.waiting:
             self.report(WARN, f"waiting for {', '.join(self.waiting)}", expected=True)
         else:
@@ -98,11 +102,13 @@ class BagRecorder(LidarNode):
         offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
         qos = QoSProfile(  # each of several publishers may have latched its own message
             depth=DEPTH,
-            reliability=(ReliabilityPolicy.RELIABLE if all(
-                q.reliability == ReliabilityPolicy.RELIABLE for q in offered)
-                else ReliabilityPolicy.BEST_EFFORT),
-            durability=(LATCHED if all(q.durability == LATCHED for q in offered)
-                        else DurabilityPolicy.VOLATILE))
+            reliability=(
+                ReliabilityPolicy.RELIABLE
+                if all(q.reliability == ReliabilityPolicy.RELIABLE for q in offered)
+                else ReliabilityPolicy.BEST_EFFORT
+            ),
+            durability=(LATCHED if all(q.durability == LATCHED for q in offered) else DurabilityPolicy.VOLATILE),
+        )
 
         def enqueue(data: bytes) -> None:
             waiting = self.queued - self.written
@@ -114,9 +120,15 @@ class BagRecorder(LidarNode):
             self.queue.put(("message", topic, self.get_clock().now().nanoseconds, data))
 
         self.subscription_by_topic[topic] = self.create_subscription(
-            kind, topic, enqueue, qos, raw=True, event_callbacks=SubscriptionEventCallbacks(
-                message_lost=self.count_lost,
-                incompatible_qos=lambda _: self.incompatible.add(topic)))
+            kind,
+            topic,
+            enqueue,
+            qos,
+            raw=True,
+            event_callbacks=SubscriptionEventCallbacks(
+                message_lost=self.count_lost, incompatible_qos=lambda _: self.incompatible.add(topic)
+            ),
+        )
 
     def _write(self) -> None:
         try:

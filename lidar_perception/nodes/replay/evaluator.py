@@ -23,21 +23,14 @@ from lidar_perception.scoring.centres.report import CandidateReport, CandidateRe
 from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.kitti.camera_objects import select_in_image, to_scored_labels
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.types import (
-    CLASSES,
-    PEDESTRIAN,
-    Detections,
-    GroundTruth,
-    InputError,
-    unknown_name,
-)
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError, unknown_name
 from lidar_perception.wire.messages import read_calibration, to_detections, to_truth
 from msg_utils.markers import MarkedObjects, from_marker_array
 
 WRITE_PERIOD_S = 5.0
 MAX_INCOMPLETE_FRAMES = 100
 MAX_DONE_STAMPS = 100_000  # 2.8 hours at 10 Hz, 10 MB
-MAX_AP_FRAMES = 10_000     # kept for the average precision
+MAX_AP_FRAMES = 10_000  # kept for the average precision
 LOSSLESS_QOS = QoSProfile(depth=1000)  # small messages, none of which may be lost
 TRUTH = "ground_truth"
 
@@ -57,8 +50,10 @@ class Evaluator(LidarNode):
         self.inputs_of_frame = (TRUTH, *self.params.stages)
         _check(self.params)
         # Pedestrian first: its scores are at the top level of the file, those of others below.
-        self.results = {name: CandidateReport() for name in sorted(
-            self.params.classes, key=lambda name: name != CLASSES[PEDESTRIAN])}
+        self.results = {
+            name: CandidateReport()
+            for name in sorted(self.params.classes, key=lambda name: name != CLASSES[PEDESTRIAN])
+        }
         self.precision = {stage: DetectionReport() for stage in self.params.stages}
         self.camera_info: Any = None
         self.extrinsics: Any = None
@@ -71,14 +66,17 @@ class Evaluator(LidarNode):
             _warm_up()  # before the inputs, for which bag_player waits
         for name in self.inputs_of_frame:
             self.input(name, MARKERS, lambda m, n=name: self._add(n, m), LOSSLESS_QOS)
-        for topic, kind in (("camera_info", "sensor_msgs/msg/CameraInfo"),
-                            ("extrinsics", "geometry_msgs/msg/TransformStamped")):
+        for topic, kind in (
+            ("camera_info", "sensor_msgs/msg/CameraInfo"),
+            ("extrinsics", "geometry_msgs/msg/TransformStamped"),
+        ):
             self.input(topic, kind, partial(setattr, self, topic), LATCHED, SENSOR_DATA)
         for topic in self.params.timing:
             *_, node, _, what = topic.split("/")  # .../NODE/debug/WHAT
             name = node if what == "processing_time_ms" else what.removesuffix("_ms")
-            self.input(topic, "std_msgs/msg/Float64", lambda m, n=name: self._add_time(n, m.data),
-                       LOSSLESS_QOS, private=False)
+            self.input(
+                topic, "std_msgs/msg/Float64", lambda m, n=name: self._add_time(n, m.data), LOSSLESS_QOS, private=False
+            )
         self.add_steady_timer(WRITE_PERIOD_S, self.write)
 
     def _add_time(self, name: str, ms: float) -> None:
@@ -88,8 +86,10 @@ class Evaluator(LidarNode):
     def _add(self, name: str, msg: Any) -> None:
         objects = from_marker_array(msg)
         if not msg.markers:
-            raise InputError("an empty MarkerArray has no stamp, so it cannot be matched; send a "
-                             "DELETE marker with the header of the frame")
+            raise InputError(
+                "an empty MarkerArray has no stamp, so it cannot be matched; send a "
+                "DELETE marker with the header of the frame"
+            )
         stamp = objects.stamp_ns
         if stamp in self.done:  # a repeated bag, or a late message
             self.counts["repeated"] += 1
@@ -100,16 +100,23 @@ class Evaluator(LidarNode):
             self._finish(stamp)
             with self.frame(stamp):
                 self._score(frame)
-            self.report(OK, "scoring" if any(result.frames for result in self.results.values())
-                        else "no frame with a Pedestrian yet")
+            self.report(
+                OK,
+                "scoring"
+                if any(result.frames for result in self.results.values())
+                else "no frame with a Pedestrian yet",
+            )
         while len(self.waiting) > MAX_INCOMPLETE_FRAMES:
             oldest = next(iter(self.waiting))
             missing = [n for n in self.inputs_of_frame if n not in self.waiting[oldest]]
             self._finish(oldest)
             self.counts["incomplete"] += 1
-            self.report(WARN, f"frames are not scored that have no message on "
-                        f"{self._topics(missing)} with the same header.stamp; stamps must be equal "
-                        "to the nanosecond")
+            self.report(
+                WARN,
+                f"frames are not scored that have no message on "
+                f"{self._topics(missing)} with the same header.stamp; stamps must be equal "
+                "to the nanosecond",
+            )
 
     def _finish(self, stamp: int) -> None:
         del self.waiting[stamp]
@@ -120,30 +127,43 @@ class Evaluator(LidarNode):
     def _score(self, frame: dict[str, MarkedObjects]) -> None:
         truth, calibration = to_truth(frame[TRUTH]), self._calibration()
         stages = {s: to_scored_labels(to_detections(frame[s])) for s in self.params.stages}
-        visible_truth, visible = (truth, stages) if calibration is None else (
-            select_in_image(truth, calibration),
-            {s: select_in_image(objects, calibration) for s, objects in stages.items()})
+        visible_truth, visible = (
+            (truth, stages)
+            if calibration is None
+            else (
+                select_in_image(truth, calibration),
+                {s: select_in_image(objects, calibration) for s, objects in stages.items()},
+            )
+        )
         for name, result in self.results.items():
             self._score_class(name, result, visible_truth, visible)
         for stage, objects in stages.items():
             if len(self.precision[stage].frames) < MAX_AP_FRAMES:
-                self.precision[stage].update(FrameDetections(
-                    str(frame[TRUTH].stamp_ns), truth, objects, calibration))
+                self.precision[stage].update(FrameDetections(str(frame[TRUTH].stamp_ns), truth, objects, calibration))
         names = {name: objects.frame_id for name, objects in frame.items()}
-        self.frame_mismatch = None if len({*names.values()}) == 1 else ", ".join(
-            f"{self._topics([n])} in '{frame_id}'" for n, frame_id in names.items())
+        self.frame_mismatch = (
+            None
+            if len({*names.values()}) == 1
+            else ", ".join(f"{self._topics([n])} in '{frame_id}'" for n, frame_id in names.items())
+        )
 
-    def _score_class(self, name: str, result: CandidateReport, truth: GroundTruth,
-                     stages: dict[str, GroundTruth]) -> None:
+    def _score_class(
+        self, name: str, result: CandidateReport, truth: GroundTruth, stages: dict[str, GroundTruth]
+    ) -> None:
         class_id = CLASSES.index(name)
         suffix = "" if class_id == PEDESTRIAN else f", {name}"
         boxes = truth.of_class(class_id)
         if len(boxes) or suffix or not self.params.only_with_pedestrians:
-            result.update(CandidateResult(boxes, {
-                stage: objects.of_class(class_id) for stage, objects in stages.items()}, {}))
+            result.update(
+                CandidateResult(boxes, {stage: objects.of_class(class_id) for stage, objects in stages.items()}, {})
+            )
         self.counts[f"scored{suffix}"] = result.frames
-        self.counts.update({f"F1 of {stage}{suffix}": f"{score.make_rows()['all']['f1']:.3f}"
-                            for stage, score in result.scores.items()})
+        self.counts.update(
+            {
+                f"F1 of {stage}{suffix}": f"{score.make_rows()['all']['f1']:.3f}"
+                for stage, score in result.scores.items()
+            }
+        )
 
     def _calibration(self) -> Calibration | None:
         """Return the calibration of the camera, or None before its messages have arrived."""
@@ -167,14 +187,24 @@ class Evaluator(LidarNode):
         for name in self.inputs_of_frame:
             topic = self._topics([name])
             if (count := self.count_publishers(topic)) > 1:
-                found.append((f"publishers of {name}", WARN, f"{count} publishers on {topic}: only "
-                              "the first array of a frame counts; remap all but one"))
+                found.append(
+                    (
+                        f"publishers of {name}",
+                        WARN,
+                        f"{count} publishers on {topic}: only the first array of a frame counts; remap all but one",
+                    )
+                )
         if self.frame_mismatch:
-            found.append(("frames", WARN, f"the compared boxes are in different frames: "
-                          f"{self.frame_mismatch}; publish both in one frame (target_frame)"))
+            found.append(
+                (
+                    "frames",
+                    WARN,
+                    f"the compared boxes are in different frames: "
+                    f"{self.frame_mismatch}; publish both in one frame (target_frame)",
+                )
+            )
         if self.unwritten:
-            found.append(("file", ERROR, f"{self.unwritten}; retrying every "
-                          f"{WRITE_PERIOD_S:g} s"))
+            found.append(("file", ERROR, f"{self.unwritten}; retrying every {WRITE_PERIOD_S:g} s"))
         return found
 
     def write(self) -> None:
@@ -184,9 +214,11 @@ class Evaluator(LidarNode):
 
     def _content(self) -> dict[str, Any]:
         first, *others = self.results
-        return {**self.results[first].compute(),
-                "lost_frames": self.counts["incomplete"] + len(self.waiting),
-                "classes": {name: self.results[name].compute() for name in others}}
+        return {
+            **self.results[first].compute(),
+            "lost_frames": self.counts["incomplete"] + len(self.waiting),
+            "classes": {name: self.results[name].compute() for name in others},
+        }
 
     def _write(self, content: dict[str, Any]) -> None:
         try:
@@ -196,17 +228,18 @@ class Evaluator(LidarNode):
             self.unwritten = str(error)
 
     def close(self) -> None:
-        precision = {stage: {name: rows for name, rows in report.compute()["ap"].items()
-                             if name in self.results}
-                     for stage, report in self.precision.items()}
+        precision = {
+            stage: {name: rows for name, rows in report.compute()["ap"].items() if name in self.results}
+            for stage, report in self.precision.items()
+        }
         for name, result in self.results.items():
             for stage, score in result.scores.items():
                 row, ap = score.make_rows()["all"], precision[stage].get(name, {})
                 bev = ap.get("bev_relaxed", {}).get("moderate")
                 self.get_logger().info(
                     f"{name}, {stage}: {row['tp']} found, {row['fp']} false, {row['fn']} missed "
-                    f"within 1 m, F1 {100 * row['f1']:.1f}"
-                    + (f"; BEV AP {bev['r40']:.1f}" if bev else ""))
+                    f"within 1 m, F1 {100 * row['f1']:.1f}" + (f"; BEV AP {bev['r40']:.1f}" if bev else "")
+                )
         if self.params.file:
             self._write({**self._content(), "ap": precision})
         if self.unwritten:
@@ -224,8 +257,7 @@ def _warm_up() -> None:
 def _check(params: EvaluatorParams) -> None:
     """Raise InputError for parameters that prevent scoring or writing."""
     if TRUTH in params.stages or len({*params.stages}) < len(params.stages) or not params.stages:
-        raise InputError(f"stages: {list(params.stages)} must be distinct names of inputs "
-                         f"other than {TRUTH}")
+        raise InputError(f"stages: {list(params.stages)} must be distinct names of inputs other than {TRUTH}")
     if not params.classes:
         raise InputError(f"classes: give one or more of {', '.join(DETECTED)}")
     for name in params.classes:
@@ -233,6 +265,7 @@ def _check(params: EvaluatorParams) -> None:
             raise unknown_name("class", name, [*DETECTED])
     if short := [topic for topic in params.timing if topic.count("/") < 2]:
         raise InputError(f"timing: {short[0]} is not of the form .../NODE/debug/WHAT")
-    if params.file and (Path(params.file).is_dir() or (
-            Path(params.file).parent.exists() and not Path(params.file).parent.is_dir())):
+    if params.file and (
+        Path(params.file).is_dir() or (Path(params.file).parent.exists() and not Path(params.file).parent.is_dir())
+    ):
         raise InputError(f"file: {params.file} cannot be written; give the path of a file")

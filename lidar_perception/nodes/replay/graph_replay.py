@@ -37,14 +37,23 @@ from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POIN
 
 GRAPH = "graph"  # process with the nodes of a graph
 TRACKS = f"/{TRACKER}/output/tracks"
-START_TIMEOUT_S = 180.0   # for all nodes to compile, start and find each other
-AHEAD = 2                 # clouds in flight, so that stages can work in parallel
+START_TIMEOUT_S = 180.0  # for all nodes to compile, start and find each other
+AHEAD = 2  # clouds in flight, so that stages can work in parallel
 SILENCE_TIMEOUT_S = 10.0  # without a result after the last cloud
 
 
-def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = "candidates",
-           rate: float = 1.0, single: bool = False, real_time: bool = False,
-           processes: bool | None = None) -> dict:
+def replay(
+    drive: Path,
+    clouds: int,
+    out: Path,
+    params: Any,
+    *,
+    detector: str = "candidates",
+    rate: float = 1.0,
+    single: bool = False,
+    real_time: bool = False,
+    processes: bool | None = None,
+) -> dict:
     """Replay a bag through the graph of a detector and record the results.
 
     The nodes run on a private ROS domain. Logs and the result bag are left in `out`.
@@ -85,20 +94,26 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
     scores = out / "logs" / "scores.json"
     settings = {**flatten(params), **({} if real_time else {"input.queue": AHEAD})}
     nodes: dict[str, tuple[Mapping[str, str], dict[str, Any]]] = {
-        node: (remap, settings) for node, remap in graph.items()}
+        node: (remap, settings) for node, remap in graph.items()
+    }
     if "ground_segmentation" in graph:
-        nodes["ground_segmentation"] = graph["ground_segmentation"], settings | {
-            "range": find_expert_range([detector], settings)}
-    nodes[TRACKER] = graph[TRACKER], {
-        "ego.source": "odometry" if poses == "recording" else poses,
-        **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT_S})}
+        nodes["ground_segmentation"] = (
+            graph["ground_segmentation"],
+            settings | {"range": find_expert_range([detector], settings)},
+        )
+    nodes[TRACKER] = (
+        graph[TRACKER],
+        {
+            "ego.source": "odometry" if poses == "recording" else poses,
+            **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT_S}),
+        },
+    )
     if scored := detector == "candidates":
         nodes["evaluator"] = configure_evaluator(scores.resolve(), single)
     recorded = [cloud_topic(single, detector), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
     nodes["bag_recorder"] = {}, {"bag": str((out / "result").resolve()), "topics": recorded}
     one_process = runs_in_one_process(processes)
-    with (Processes(out / "logs", domain) as running,
-          GraphMonitor(domain, stages[FINAL]) as monitor):
+    with Processes(out / "logs", domain) as running, GraphMonitor(domain, stages[FINAL]) as monitor:
         with running.together(GRAPH) if one_process else nullcontext():
             for node in graph:
                 running.start(node, *nodes[node])
@@ -106,11 +121,12 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
             running.start(node, *nodes[node])
         outputs = find_connected_outputs({node: remap for node, (remap, _) in nodes.items()})
         with errors.status("starting the nodes"):
-            ready = monitor.spin_until(lambda: monitor.is_connected(outputs), START_TIMEOUT_S,
-                                       running.check)
+            ready = monitor.spin_until(lambda: monitor.is_connected(outputs), START_TIMEOUT_S, running.check)
         if not ready:
-            raise InputError(f"the nodes did not find each other in {START_TIMEOUT_S:.0f} s: "
-                             f"{list(monitor.diagnostics) or 'none'} reported; see {out}/logs")
+            raise InputError(
+                f"the nodes did not find each other in {START_TIMEOUT_S:.0f} s: "
+                f"{list(monitor.diagnostics) or 'none'} reported; see {out}/logs"
+            )
         # Besides the graph, the tracker and the recorder may subscribe to the clouds; the recorder
         # also subscribes to the labels.
         cloud_subscribers = 1 + (poses == "kiss_icp") + (POINTS in recorded)
@@ -119,9 +135,17 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         rules += [f"{relative_name(stages[FINAL])}:={3 + scored}"]
         rules += [relative_name(ODOMETRY)] if poses == "recording" else []
         first, last = CpuTimes(), CpuTimes()  # at the first and the last result
-        running.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
-                                         "wait_for": rules, "follow": [TRACKS],
-                                         "ahead": 0 if real_time else AHEAD})
+        running.start(
+            "bag_player",
+            {},
+            {
+                "bag": str(drive.resolve()),
+                "rate": rate,
+                "wait_for": rules,
+                "follow": [TRACKS],
+                "ahead": 0 if real_time else AHEAD,
+            },
+        )
         memory: dict[str, float] = {}
         with make_progress() as bar:
             task = bar.add_task("replaying", total=clouds)
@@ -137,32 +161,37 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
                     memory.update(running.memory_mb())
                 return monitor.frames >= clouds
 
-            while not finished() and (monitor.frames != before
-                                      or not running.has_ended("bag_player")):
+            while not finished() and (monitor.frames != before or not running.has_ended("bag_player")):
                 before = monitor.frames
-                monitor.spin_until(finished, SILENCE_TIMEOUT_S,
-                                   lambda: running.check("bag_player"))
+                monitor.spin_until(finished, SILENCE_TIMEOUT_S, lambda: running.check("bag_player"))
+
         # Both lag behind the results by their own processing time.
         def caught_up(node: str) -> bool:
             return int(monitor.get_value(node, "frames") or 0) >= monitor.frames
 
         for node in {"evaluator", TRACKER} & nodes.keys():
             monitor.spin_until(partial(caught_up, node), SILENCE_TIMEOUT_S)
-        stage_ms = {node: float(ms) for node in graph
-                    if (ms := monitor.get_value(node, "processing_ms_median"))}
+        stage_ms = {node: float(ms) for node in graph if (ms := monitor.get_value(node, "processing_ms_median"))}
         codes = running.stop(timeout=30)
     if failed := {node: code for node, code in codes.items() if code}:
         errors.print(Text(f"exit codes {failed}", "red") + f"; see {out}/logs")
     if monitor.frames == 0:
         raise InputError(f"no cloud of {drive} gave a result; see {out}/logs")
-    return {**(json.loads(scores.read_text()) if scored else {}),
-            "clouds": clouds, "results": monitor.frames,
-            "latency_ms": {name: float(monitor.get_value("bag_player", f"latency_ms_{name}") or 0.0)
-                           for name in ("median", "p95")},
-            "cpu_ms_by_process": last.ms_per_frame(first), "stage_ms": stage_ms,
-            "one_process": one_process,
-            "slower": float(monitor.get_value("bag_player", "slower") or 1.0),
-            "memory_mb": sum(memory.values()), "memory_mb_by_process": memory, "poses": poses}
+    return {
+        **(json.loads(scores.read_text()) if scored else {}),
+        "clouds": clouds,
+        "results": monitor.frames,
+        "latency_ms": {
+            name: float(monitor.get_value("bag_player", f"latency_ms_{name}") or 0.0) for name in ("median", "p95")
+        },
+        "cpu_ms_by_process": last.ms_per_frame(first),
+        "stage_ms": stage_ms,
+        "one_process": one_process,
+        "slower": float(monitor.get_value("bag_player", "slower") or 1.0),
+        "memory_mb": sum(memory.values()),
+        "memory_mb_by_process": memory,
+        "poses": poses,
+    }
 
 
 class CpuTimes:
@@ -179,5 +208,6 @@ class CpuTimes:
     def ms_per_frame(self, earlier: CpuTimes) -> dict[str, float]:
         """Return {process: its CPU time per result since an earlier reading, in ms}."""
         frames = max(self.frames - earlier.frames, 1)
-        return {name: 1e3 * (seconds - earlier.seconds.get(name, 0.0)) / frames
-                for name, seconds in self.seconds.items()}
+        return {
+            name: 1e3 * (seconds - earlier.seconds.get(name, 0.0)) / frames for name, seconds in self.seconds.items()
+        }

@@ -40,9 +40,13 @@ class Pace:
         self.unanswered, self.held = 0, 0.0
         self.topics = frozenset(topics)
         for topic in topics:
-            node.create_subscription(load_message_class(MARKERS), topic,
-                                     lambda data, t=topic: self.add_answer(data[8:16], t), RELIABLE,
-                                     raw=True)  # CDR: 8 bytes, then the first marker's stamp
+            node.create_subscription(
+                load_message_class(MARKERS),
+                topic,
+                lambda data, t=topic: self.add_answer(data[8:16], t),
+                RELIABLE,
+                raw=True,
+            )  # CDR: 8 bytes, then the first marker's stamp
 
     def add_cloud(self, cloud: bytes) -> None:
         """Register a cloud, as CDR, that is sent now."""

@@ -10,8 +10,9 @@ RANGE_LIMITS = np.array([15.0, 30.0, 45.0, 60.0])
 MAX_CENTRE_DISTANCE = 1.0  # metres, Section 3.8
 
 
-def match_centres(found: np.ndarray, truth: np.ndarray,
-                  max_distance: float = MAX_CENTRE_DISTANCE) -> tuple[np.ndarray, np.ndarray]:
+def match_centres(
+    found: np.ndarray, truth: np.ndarray, max_distance: float = MAX_CENTRE_DISTANCE
+) -> tuple[np.ndarray, np.ndarray]:
     """Match boxes one to one whose 3D centres are at most max_distance apart.
 
     As many pairs as possible, then the least total distance. Returns the rows (P,) of found (K,
@@ -38,8 +39,9 @@ def find_range_bins(boxes: np.ndarray) -> np.ndarray:
     return np.searchsorted(RANGE_LIMITS, np.hypot(boxes[:, 0], boxes[:, 1]), side="right")
 
 
-def count_by_range(found: np.ndarray, truth: np.ndarray, pairs: tuple[np.ndarray, np.ndarray],
-                   ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def count_by_range(
+    found: np.ndarray, truth: np.ndarray, pairs: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Count the detections of one frame by RANGE_NAMES.
 
     A true positive and a miss belong to the range of the label, a false positive to its own.
@@ -86,7 +88,12 @@ class Score:
 
     def _row(self, index) -> dict:
         tp, fp, fn = (int(np.sum(a[index])) for a in (self.tp, self.fp, self.fn))
-        return dict(tp=tp, fp=fp, fn=fn, precision=tp / (tp + fp) if tp + fp else 0.0,
-                    recall=tp / (tp + fn) if tp + fn else 0.0,
-                    f1=2 * tp / (2 * tp + fp + fn) if tp + fp + fn else 0.0,
-                    centre_error_m=float(np.sum(self.error[index])) / tp if tp else None)
+        return dict(
+            tp=tp,
+            fp=fp,
+            fn=fn,
+            precision=tp / (tp + fp) if tp + fp else 0.0,
+            recall=tp / (tp + fn) if tp + fn else 0.0,
+            f1=2 * tp / (2 * tp + fp + fn) if tp + fp + fn else 0.0,
+            centre_error_m=float(np.sum(self.error[index])) / tp if tp else None,
+        )

@@ -64,8 +64,7 @@ class CandidateResult:
     name: str = ""
 
 
-def measure_candidates(params: PipelineParams, recording: Recording
-                       ) -> Callable[[Frame], CandidateResult | None]:
+def measure_candidates(params: PipelineParams, recording: Recording) -> Callable[[Frame], CandidateResult | None]:
     """Run the candidate pipeline on every frame with a pedestrian, as in paper A.
 
     partial(measure_candidates, params) is a Start of scoring.run.
@@ -75,8 +74,9 @@ def measure_candidates(params: PipelineParams, recording: Recording
     return partial(measure_frame, params=params, templates=templates)
 
 
-def measure_frame(frame: Frame, params: PipelineParams,
-                  templates: Sequence[Seed] | None = None) -> CandidateResult | None:
+def measure_frame(
+    frame: Frame, params: PipelineParams, templates: Sequence[Seed] | None = None
+) -> CandidateResult | None:
     """Run the pipeline on one frame with the seeds of make_seed_source().
 
     Returns None for a frame without a pedestrian.
@@ -88,8 +88,7 @@ def measure_frame(frame: Frame, params: PipelineParams,
     try:
         _, found = find_candidates(scan, make_seed_source(truth, templates, params), camera, params)
     except InputError as error:  # no seed, or no camera: this frame has no candidates
-        return CandidateResult(truth, collect_boxes(Candidates.none()), {},
-                               f"{frame.name}: {error}")
+        return CandidateResult(truth, collect_boxes(Candidates.none()), {}, f"{frame.name}: {error}")
     return CandidateResult(truth, collect_boxes(found), found.ms, name=frame.name)
 
 
@@ -98,8 +97,7 @@ def collect_boxes(candidates: Candidates) -> dict[str, np.ndarray]:
     return {stage: getattr(candidates, stage).boxes for stage in STAGES}
 
 
-def make_seed_source(truth: np.ndarray, templates: Sequence[Seed] | None,
-                     params: PipelineParams) -> SeedSource:
+def make_seed_source(truth: np.ndarray, templates: Sequence[Seed] | None, params: PipelineParams) -> SeedSource:
     """Make the source of a frame's seeds.
 
     Without templates the seed is a true pedestrian, truth (M, 7), as in the paper; otherwise
@@ -147,8 +145,11 @@ class CandidateReport:
 
     def compute(self) -> dict:
         """Return the content of the JSON file."""
-        return {"frames": self.frames, "ground_truth": int(self.true_by_range.sum()),
-                "ground_truth_by_range": dict(zip(RANGE_NAMES, self.true_by_range.tolist())),
-                **{stage: score.make_rows() for stage, score in self.scores.items()},
-                "ms": {step: float(np.median(values)) for step, values in self.times.items()},
-                "skipped": self.skipped}
+        return {
+            "frames": self.frames,
+            "ground_truth": int(self.true_by_range.sum()),
+            "ground_truth_by_range": dict(zip(RANGE_NAMES, self.true_by_range.tolist())),
+            **{stage: score.make_rows() for stage, score in self.scores.items()},
+            "ms": {step: float(np.median(values)) for step, values in self.times.items()},
+            "skipped": self.skipped,
+        }

@@ -24,8 +24,7 @@ class CentreScores:
     frames: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
 
-    def update(self, truth: np.ndarray, boxes: np.ndarray, scores: np.ndarray,
-               name: str = "") -> None:
+    def update(self, truth: np.ndarray, boxes: np.ndarray, scores: np.ndarray, name: str = "") -> None:
         """Add one frame; ignore it if truth is empty, as in the paper."""
         if len(truth):
             order = np.lexsort([*boxes.T, -scores])
@@ -56,15 +55,18 @@ class CentreScores:
             total.update(boxes[scores >= min_score], truth)
         return total.make_rows()
 
-    def compute_f1_interval(self, min_score: float, count: int, follow: bool = False
-                            ) -> list[float] | None:
+    def compute_f1_interval(self, min_score: float, count: int, follow: bool = False) -> list[float] | None:
         """Return the interval [low, high] of F1 in percent for detections of min_score or more.
 
         It comes from `count` draws of group_frames(names, follow), see intervals.py.
         """
         found = [boxes[scores >= min_score] for _, boxes, scores in self.frames]
-        counts = np.array([[len(match_centres(boxes, truth)[0]), len(boxes), len(truth)]
-                           for boxes, (truth, _, _) in zip(found, self.frames)]).reshape(-1, 3)
+        counts = np.array(
+            [
+                [len(match_centres(boxes, truth)[0]), len(boxes), len(truth)]
+                for boxes, (truth, _, _) in zip(found, self.frames)
+            ]
+        ).reshape(-1, 3)
 
         def f1(frames: np.ndarray) -> float:
             hits, boxes, true = counts[frames].sum(axis=0)
@@ -75,6 +77,10 @@ class CentreScores:
     def compute(self) -> dict:
         """Return the content of the JSON file."""
         best = self.find_best_score()
-        return {"frames": len(self.frames), "ground_truth": sum(len(t) for t, _, _ in self.frames),
-                "of_all": self.make_rows(), "best_score": best,
-                "at_best_score": self.make_rows() if best is None else self.make_rows(best)}
+        return {
+            "frames": len(self.frames),
+            "ground_truth": sum(len(t) for t, _, _ in self.frames),
+            "of_all": self.make_rows(),
+            "best_score": best,
+            "at_best_score": self.make_rows() if best is None else self.make_rows(best),
+        }

@@ -12,7 +12,7 @@ from lidar_perception.data.kitti.write import project_boxes
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import Detections, GroundTruth, InputError, class_ids
 
-NO_ANGLE = -10.0          # KITTI's value of an unknown alpha
+NO_ANGLE = -10.0  # KITTI's value of an unknown alpha
 # Truncation levels of the tracking layout: 0 inside, 1 at the image border, 2 ends of tracks;
 # of the raw layout: 2 outside, 99 behind. Objects of level 2 or higher are ignored.
 IGNORED_LEVEL = 2
@@ -55,21 +55,24 @@ class CameraObjects:
 
     def take(self, indices: np.ndarray) -> CameraObjects:
         """Return the objects at indices (M,), with all regions."""
-        return CameraObjects(**{f.name: getattr(self, f.name).take(indices, axis=0)
-                                for f in fields(self) if f.name != "regions"},
-                             regions=self.regions)
+        return CameraObjects(
+            **{f.name: getattr(self, f.name).take(indices, axis=0) for f in fields(self) if f.name != "regions"},
+            regions=self.regions,
+        )
 
     @staticmethod
     def concatenate(parts: list[CameraObjects]) -> CameraObjects:
         """Concatenate the objects of several frames."""
-        return CameraObjects(*(np.concatenate([getattr(part, f.name) for part in parts])
-                               for f in fields(CameraObjects)))
+        return CameraObjects(
+            *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(CameraObjects))
+        )
 
 
 def to_scored_labels(detections: Detections) -> GroundTruth:
     """Convert detections to labels with a score."""
-    return GroundTruth.of(detections.boxes, detections.class_ids,
-                          [{"score": float(score)} for score in detections.scores])
+    return GroundTruth.of(
+        detections.boxes, detections.class_ids, [{"score": float(score)} for score in detections.scores]
+    )
 
 
 def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> CameraObjects:
@@ -84,16 +87,17 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
     """
     scores = np.array([extra.get("score", 1.0) for extra in _list_extras(objects)])
     bad = ~np.isfinite(scores)
-    bad[:len(objects)] |= ~np.isfinite(objects.boxes).all(axis=1)
+    bad[: len(objects)] |= ~np.isfinite(objects.boxes).all(axis=1)
     if bad.any():
-        raise InputError(f"box {np.argmax(bad) + 1} of {len(bad)} or its score is not finite; a "
-                         "detector must not return such boxes")
+        raise InputError(
+            f"box {np.argmax(bad) + 1} of {len(bad)} or its score is not finite; a detector must not return such boxes"
+        )
     if calibration is None:
-        return _make_without_camera(objects, scores[:len(objects)])
+        return _make_without_camera(objects, scores[: len(objects)])
     labels = to_labels(objects, calibration.lidar_to_camera)
     projected, outside = np.zeros((len(labels), 4)), np.zeros(len(labels))
-    pixels, outside[:len(objects)] = project_boxes(objects.boxes, calibration)
-    projected[:len(objects)] = np.nan_to_num(pixels)
+    pixels, outside[: len(objects)] = project_boxes(objects.boxes, calibration)
+    projected[: len(objects)] = np.nan_to_num(pixels)
 
     given = _read_columns(labels, "bbox", 4)
     has_pixels = (given[:, 2:] > given[:, :2]).all(axis=1, keepdims=True)
@@ -105,12 +109,12 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
     computed = np.where(whole, wrap_angle(turn - bearing), np.nan)
     return CameraObjects(
         class_ids=np.array(class_ids(label["class"] for label in labels), np.int32),
-        boxes=np.column_stack([location[:, 2], -location[:, 0], sides[:, 0] / 2 - location[:, 1],
-                               sides[:, [2, 1, 0]], -turn - np.pi / 2]),
+        boxes=np.column_stack(
+            [location[:, 2], -location[:, 0], sides[:, 0] / 2 - location[:, 1], sides[:, [2, 1, 0]], -turn - np.pi / 2]
+        ),
         image_boxes=np.where(has_pixels, given, projected),
         alpha=np.where(alpha > NO_ANGLE, alpha, computed),
-        truncated=np.array([_compute_truncation(e, o)
-                            for e, o in zip(_list_extras(objects), outside)]),
+        truncated=np.array([_compute_truncation(e, o) for e, o in zip(_list_extras(objects), outside)]),
         occluded=_read_columns(labels, "occluded").astype(int),
         scores=scores,
         regions=given[np.array([label["class"] == "DontCare" for label in labels], bool)],
@@ -119,18 +123,22 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
 
 def select_in_image(truth: GroundTruth, calibration: Calibration | None) -> GroundTruth:
     """Return the labels that are partly in the image, or all without a calibration."""
-    rows = np.flatnonzero(to_camera_objects(truth, calibration).pixels_high[:len(truth)] > 0)
-    return GroundTruth.of(truth.boxes[rows], truth.class_ids[rows],
-                          [truth.extras[i] for i in rows], truth.notes)
+    rows = np.flatnonzero(to_camera_objects(truth, calibration).pixels_high[: len(truth)] > 0)
+    return GroundTruth.of(truth.boxes[rows], truth.class_ids[rows], [truth.extras[i] for i in rows], truth.notes)
 
 
 def _make_without_camera(objects: GroundTruth, scores: np.ndarray) -> CameraObjects:
     count = len(objects)
     return CameraObjects(
-        objects.class_ids, objects.boxes, np.tile([-np.inf, -np.inf, np.inf, np.inf], (count, 1)),
-        np.full(count, np.nan), np.zeros(count),
-        np.array([extra.get("occluded", 0) for extra in objects.extras], int), scores,
-        np.zeros((0, 4)))
+        objects.class_ids,
+        objects.boxes,
+        np.tile([-np.inf, -np.inf, np.inf, np.inf], (count, 1)),
+        np.full(count, np.nan),
+        np.zeros(count),
+        np.array([extra.get("occluded", 0) for extra in objects.extras], int),
+        scores,
+        np.zeros((0, 4)),
+    )
 
 
 def _list_extras(objects: GroundTruth) -> list[dict]:

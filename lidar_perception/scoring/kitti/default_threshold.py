@@ -32,23 +32,41 @@ def score_at_threshold(frames: list[ComparedFrame]) -> dict[str, dict[str, float
 
 
 def _score_class(comparison: Comparison, name: str) -> dict[str, float]:
-    hits, wrong = (int(n[0]) for n in count_hits(comparison, name, "bev", RELAXED[name], LEVEL,
-                                                 np.array([-np.inf])))
+    hits, wrong = (int(n[0]) for n in count_hits(comparison, name, "bev", RELAXED[name], LEVEL, np.array([-np.inf])))
     labels = int((classify_labels(comparison.true, name, LEVEL) == COUNTED).sum())
-    return {"labels": labels, "hits": hits, "wrong": wrong, "missed": labels - hits,
-            "precision": hits / max(hits + wrong, 1), "recall": hits / max(labels, 1),
-            "f1": 2 * hits / max(hits + wrong + labels, 1)}
+    return {
+        "labels": labels,
+        "hits": hits,
+        "wrong": wrong,
+        "missed": labels - hits,
+        "precision": hits / max(hits + wrong, 1),
+        "recall": hits / max(labels, 1),
+        "f1": 2 * hits / max(hits + wrong + labels, 1),
+    }
 
 
-def print_scores_at_threshold(content: dict[str, dict[str, float]], frames: int,
-                              console: Console) -> None:
+def print_scores_at_threshold(content: dict[str, dict[str, float]], frames: int, console: Console) -> None:
     """Print the table of score_at_threshold(), without classes that have no objects."""
-    table = make_table(f"Detections at the default threshold, {frames} frames", "", "overlap",
-                       "labels", "hits", "wrong", "missed", "prec.", "recall", "F1", width=6)
+    table = make_table(
+        f"Detections at the default threshold, {frames} frames",
+        "",
+        "overlap",
+        "labels",
+        "hits",
+        "wrong",
+        "missed",
+        "prec.",
+        "recall",
+        "F1",
+        width=6,
+    )
     for name, row in content.items():
         if row["labels"] or row["wrong"]:
-            table.add_row(name, f"{RELAXED[name]:g}", *format_counts(row, "labels", "hits", "wrong",
-                                                                     "missed"),
-                          *format_percent(row, "precision", "recall", "f1"))
+            table.add_row(
+                name,
+                f"{RELAXED[name]:g}",
+                *format_counts(row, "labels", "hits", "wrong", "missed"),
+                *format_percent(row, "precision", "recall", "f1"),
+            )
     table.caption = "BEV, by the protocol of KITTI, moderate."
     console.print(table)

@@ -19,21 +19,17 @@ from numba import njit
 
 from lidar_perception.classes import DETECTED, TABLE
 from lidar_perception.geometry import bev_and_3d_iou
-from lidar_perception.scoring.average_precision import (
-    average_curve,
-    choose_thresholds,
-    sample_curve,
-)
+from lidar_perception.scoring.average_precision import average_curve, choose_thresholds, sample_curve
 from lidar_perception.scoring.kitti.camera_objects import CameraObjects
 from lidar_perception.types import CLASSES
 
 SCORED = tuple(DETECTED)
 NEIGHBOURS = {row.looks_like: row.name for row in TABLE if row.looks_like}
 METRICS = ("image", "bev", "3d")
-STRICT = {name: of.strict for name, of in DETECTED.items()}    # overlap of a hit
+STRICT = {name: of.strict for name, of in DETECTED.items()}  # overlap of a hit
 RELAXED = {name: of.relaxed for name, of in DETECTED.items()}  # in BEV and 3D
 DIFFICULTIES = ("easy", "moderate", "hard")
-MIN_PIXELS = (40, 25, 25)        # height of the 2D box
+MIN_PIXELS = (40, 25, 25)  # height of the 2D box
 MAX_OCCLUDED = (0, 1, 2)
 MAX_TRUNCATED = (0.15, 0.3, 0.5)
 
@@ -60,8 +56,9 @@ class ComparedFrame:
 def compare_objects(true: CameraObjects, found: CameraObjects) -> ComparedFrame:
     """Compute the overlaps of a frame. The order of the detections does not matter."""
     found = found.take(np.lexsort([*found.boxes.T, *found.image_boxes.T, -found.scores]))
-    overlaps = np.stack([compute_image_iou(found.image_boxes, true.image_boxes),
-                         *bev_and_3d_iou(found.boxes, true.boxes)])
+    overlaps = np.stack(
+        [compute_image_iou(found.image_boxes, true.image_boxes), *bev_and_3d_iou(found.boxes, true.boxes)]
+    )
     excused = compute_image_iou(found.image_boxes, true.regions, of_first=True)
     return ComparedFrame(true, found, overlaps, excused.max(axis=1, initial=0.0))
 
@@ -106,10 +103,14 @@ class Comparison:
         """Concatenate at least one frame."""
         true, found = [f.true for f in frames], [f.found for f in frames]
         return Comparison(
-            CameraObjects.concatenate(true), CameraObjects.concatenate(found),
+            CameraObjects.concatenate(true),
+            CameraObjects.concatenate(found),
             np.concatenate([f.overlaps.reshape(len(METRICS), -1) for f in frames], axis=1),
-            np.concatenate([f.excused for f in frames]), _find_starts(map(len, true)),
-            _find_starts(map(len, found)), _find_starts(f.overlaps[0].size for f in frames))
+            np.concatenate([f.excused for f in frames]),
+            _find_starts(map(len, true)),
+            _find_starts(map(len, found)),
+            _find_starts(f.overlaps[0].size for f in frames),
+        )
 
 
 def _find_starts(sizes) -> np.ndarray:
@@ -121,9 +122,11 @@ def classify_labels(objects: CameraObjects, name: str, difficulty: str) -> np.nd
     level = DIFFICULTIES.index(difficulty)
     own = objects.class_ids == CLASSES.index(name)
     like = objects.class_ids == CLASSES.index(NEIGHBOURS.get(name, name))
-    fit = ((objects.occluded <= MAX_OCCLUDED[level])
-           & (objects.truncated <= MAX_TRUNCATED[level])
-           & (objects.pixels_high >= MIN_PIXELS[level]))
+    fit = (
+        (objects.occluded <= MAX_OCCLUDED[level])
+        & (objects.truncated <= MAX_TRUNCATED[level])
+        & (objects.pixels_high >= MIN_PIXELS[level])
+    )
     return np.where(own & fit, COUNTED, np.where(own | like, IGNORED, OTHER)).astype(np.int8)
 
 
@@ -154,8 +157,7 @@ class Precision:
     official_r40: float
 
 
-def compute_precision(frames: Comparison, name: str, metric: str, overlap: float,
-                      difficulty: str) -> Precision | None:
+def compute_precision(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str) -> Precision | None:
     """Compute the average precision of a class at an overlap above the given one.
 
     Returns None without counted labels. Orientation is NaN if a hit has no angle.
@@ -168,13 +170,17 @@ def compute_precision(frames: Comparison, name: str, metric: str, overlap: float
     hits, wrong, similarity = _count(frames, pairs, metric, thresholds)
     right = hits / np.maximum(hits + wrong, 1)
     oriented = similarity / np.maximum(hits + wrong, 1)
-    return Precision(objects, *average_curve(sample_curve(right, objects)),
-                     *average_curve(sample_curve(oriented, objects)),
-                     *average_curve(sample_curve(right, objects, official=True)))
+    return Precision(
+        objects,
+        *average_curve(sample_curve(right, objects)),
+        *average_curve(sample_curve(oriented, objects)),
+        *average_curve(sample_curve(right, objects, official=True)),
+    )
 
 
-def count_hits(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str,
-               thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def count_hits(
+    frames: Comparison, name: str, metric: str, overlap: float, difficulty: str, thresholds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Count hits and wrong detections, each (T,) float64, with at least each score of thresholds.
 
     The rules are those of compute_precision(); ignored detections do not count.
@@ -200,17 +206,21 @@ class _Pairs(NamedTuple):
     first_pair: np.ndarray
 
 
-def _collect_pairs(frames: Comparison, name: str, metric: str, overlap: float,
-                   difficulty: str) -> _Pairs:
-    return _Pairs(frames.overlaps[METRICS.index(metric)], overlap,
-                  classify_labels(frames.true, name, difficulty),
-                  classify_detections(frames.found, name, difficulty),
-                  frames.found.scores, frames.first_true, frames.first_found, frames.first_pair)
+def _collect_pairs(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str) -> _Pairs:
+    return _Pairs(
+        frames.overlaps[METRICS.index(metric)],
+        overlap,
+        classify_labels(frames.true, name, difficulty),
+        classify_detections(frames.found, name, difficulty),
+        frames.found.scores,
+        frames.first_true,
+        frames.first_found,
+        frames.first_pair,
+    )
 
 
 def _count(frames: Comparison, pairs: _Pairs, metric: str, thresholds: np.ndarray) -> tuple:
-    excused = (frames.excused if metric == "image"
-               else np.zeros(len(frames.found))) > pairs.min_overlap
+    excused = (frames.excused if metric == "image" else np.zeros(len(frames.found))) > pairs.min_overlap
     return _count_hits(pairs, thresholds, excused, frames.true.alpha, frames.found.alpha)
 
 
@@ -231,8 +241,12 @@ def _find_hit_scores(pairs):
             best = -1
             for j in range(first_found[f], first_found[f + 1]):
                 pair = first_pair[f] + (j - first_found[f]) * count + i - first_true[f]
-                if (detections[j] != OTHER and not taken[j] and overlaps[pair] > min_overlap
-                        and (best < 0 or scores[j] > scores[best])):
+                if (
+                    detections[j] != OTHER
+                    and not taken[j]
+                    and overlaps[pair] > min_overlap
+                    and (best < 0 or scores[j] > scores[best])
+                ):
                     best = j
             if best >= 0:
                 taken[best] = True
@@ -263,8 +277,7 @@ def _count_hits(pairs, thresholds, excused, true_alpha, found_alpha):
                     continue
                 best, most = -1, 0.0
                 for j in range(first_found[f], end):
-                    overlap = overlaps[first_pair[f] + (j - first_found[f]) * count
-                                       + i - first_true[f]]
+                    overlap = overlaps[first_pair[f] + (j - first_found[f]) * count + i - first_true[f]]
                     if detections[j] == OTHER or taken[j] == t + 1 or not overlap > min_overlap:
                         continue
                     if detections[j] == COUNTED and overlap > most:

@@ -22,17 +22,17 @@ from lidar_perception.scoring.tables import (
 # The EG-PointPillars paper, Table 5: 3D AP at 0.7 (Car) and 0.5; easy, moderate, hard. The number
 # of recall points is not given.
 COLUMNS = tuple(CLASSES[i] for i in (CAR, CYCLIST, PEDESTRIAN))
-PAPER = {"PointPillars": ((84.00, 72.89, 68.24), (80.57, 61.96, 58.32), (52.66, 47.09, 43.21)),
-         "V1": ((86.94, 76.06, 68.77), (79.53, 61.85, 58.18), (56.12, 50.96, 46.56)),
-         "V2": ((86.16, 76.01, 68.69), (82.79, 65.31, 62.01), (55.68, 50.05, 44.68)),
-         "V3": ((84.23, 74.82, 68.13), (81.37, 64.81, 61.37), (55.60, 50.81, 45.47)),
-         "V4": ((86.69, 76.44, 74.93), (81.21, 66.74, 61.91), (56.73, 52.31, 46.92))}
+PAPER = {
+    "PointPillars": ((84.00, 72.89, 68.24), (80.57, 61.96, 58.32), (52.66, 47.09, 43.21)),
+    "V1": ((86.94, 76.06, 68.77), (79.53, 61.85, 58.18), (56.12, 50.96, 46.56)),
+    "V2": ((86.16, 76.01, 68.69), (82.79, 65.31, 62.01), (55.68, 50.05, 44.68)),
+    "V3": ((84.23, 74.82, 68.13), (81.37, 64.81, 61.37), (55.60, 50.81, 45.47)),
+    "V4": ((86.69, 76.44, 74.93), (81.21, 66.74, 61.91), (56.73, 52.31, 46.92)),
+}
 PAPER_MAP = {"PointPillars": 63.21, "V1": 65.00, "V2": 65.71, "V3": 65.18, "V4": 67.09}
 # The STM-CPA paper, Tables 6 and 7: F1 of pedestrians within 1.0 m.
-CENTRE_F1 = {"STM-CPA": 0.521, "PointPillars": 0.52, "AVOD": 0.48, "PointCNN": 0.37,
-             "F-PointNet": 0.33}
-TITLES = {"image": "2D box", "aos": "orientation", "bev": "BEV", "3d": "3D",
-          "bev_relaxed": "BEV", "3d_relaxed": "3D"}
+CENTRE_F1 = {"STM-CPA": 0.521, "PointPillars": 0.52, "AVOD": 0.48, "PointCNN": 0.37, "F-PointNet": 0.33}
+TITLES = {"image": "2D box", "aos": "orientation", "bev": "BEV", "3d": "3D", "bev_relaxed": "BEV", "3d_relaxed": "3D"}
 
 
 def print_detection_report(content: dict, console: Console) -> None:
@@ -47,54 +47,53 @@ def print_detection_report(content: dict, console: Console) -> None:
 
 
 def _print_precision(content: dict, console: Console) -> None:
-    table = make_table(f"KITTI average precision, {content['frames']} frames", "", "overlap",
-                       "", "R40", "", "", "R11", "", width=6)
+    table = make_table(
+        f"KITTI average precision, {content['frames']} frames", "", "overlap", "", "R40", "", "", "R11", "", width=6
+    )
     table.add_row("", "", *("easy", "mod.", "hard") * 2, style="dim")
     for name, rows in content["ap"].items():
         objects = [level["objects"] if level else 0 for level in _list_levels(rows["3d"])]
-        table.add_row(name, "", *(f"{n}{'*' * (0 < n < MIN_OBJECTS)}" for n in objects), "", "", "",
-                      style="bold")
+        table.add_row(name, "", *(f"{n}{'*' * (0 < n < MIN_OBJECTS)}" for n in objects), "", "", "", style="bold")
         for row, title in TITLES.items():
             if row in rows:
                 overlap = rows["image" if row == "aos" else row]["overlap"]
                 table.add_row(
                     f"  {title}",
                     f"{overlap:g}",
-                    *(
-                        _format_cell(level, key)
-                        for key in ("r40", "r11")
-                        for level in _list_levels(rows[row])
-                    ),
+                    *(_format_cell(level, key) for key in ("r40", "r11") for level in _list_levels(rows[row])),
                 )
         table.add_section()
-    table.caption = ("Next to the class: labels of each difficulty. * too few for KITTI's own "
-                     "sampling of recall; the whole curve is sampled.")
+    table.caption = (
+        "Next to the class: labels of each difficulty. * too few for KITTI's own "
+        "sampling of recall; the whole curve is sampled."
+    )
     console.print(table)
 
 
 def _print_paper(content: dict, console: Console) -> None:
     titles = [f"{name[:3]} {level[0].upper()}" for name in COLUMNS for level in DIFFICULTIES]
-    table = make_table("3D AP and Table 5 of the EG-PointPillars paper", "", *titles,
-                       "mAP", width=5)
+    table = make_table("3D AP and Table 5 of the EG-PointPillars paper", "", *titles, "mAP", width=5)
     for key in ("r40", "r11"):
-        cells = [_format_cell(level, key) for name in COLUMNS
-                 for level in _list_levels(content["ap"][name]["3d"])]
+        cells = [_format_cell(level, key) for name in COLUMNS for level in _list_levels(content["ap"][name]["3d"])]
         mean = content["map_3d"]
-        table.add_row(f"here, {key.upper()}", *cells, format_number(mean[key] if mean else None),
-                      style="bold")
+        table.add_row(f"here, {key.upper()}", *cells, format_number(mean[key] if mean else None), style="bold")
     for name, classes in PAPER.items():
-        table.add_row(name, *(f"{v:.2f}" for levels in classes for v in levels),
-                      f"{PAPER_MAP[name]:.2f}", style="dim")
-    table.caption = ("Easy, moderate, hard; Car at overlap 0.7, the others at 0.5. The paper does "
-                     "not say whether it used 11 or 40 recall points.")
+        table.add_row(name, *(f"{v:.2f}" for levels in classes for v in levels), f"{PAPER_MAP[name]:.2f}", style="dim")
+    table.caption = (
+        "Easy, moderate, hard; Car at overlap 0.7, the others at 0.5. The paper does "
+        "not say whether it used 11 or 40 recall points."
+    )
     console.print(table)
 
 
 def print_intervals(content: dict[str, dict], console: Console) -> None:
     """Print the intervals of AP that DetectionReport.compute_intervals returns."""
-    table = make_table(f"{INTERVAL_PERCENT} % intervals of AP (R40, moderate), drawn by drive", "",
-                       *(TITLES[row] + overlap for row, overlap in zip(
-                             INTERVALS, (", relaxed", "", ""))), width=10)
+    table = make_table(
+        f"{INTERVAL_PERCENT} % intervals of AP (R40, moderate), drawn by drive",
+        "",
+        *(TITLES[row] + overlap for row, overlap in zip(INTERVALS, (", relaxed", "", ""))),
+        width=10,
+    )
     for name, rows in content.items():
         table.add_row(name, *(format_interval(rows[row]) for row in INTERVALS))
     console.print(table)
@@ -105,15 +104,21 @@ def _print_centres(centres: dict, console: Console) -> None:
         return
     table = make_table(
         f"Pedestrians within 1.0 m: {centres['ground_truth']} in {centres['frames']} frames",
-        "detections", "TP", "FP", "FN", "prec.", "recall", "F1", width=7)
+        "detections",
+        "TP",
+        "FP",
+        "FN",
+        "prec.",
+        "recall",
+        "F1",
+        width=7,
+    )
     rows = {"all": centres["of_all"]["all"]}
     if centres["best_score"] is not None:
         rows[f"score {centres['best_score']:.3g} and more"] = centres["at_best_score"]["all"]
     for title, row in rows.items():
-        table.add_row(title, *format_counts(row, "tp", "fp", "fn"),
-                      *format_percent(row, "precision", "recall", "f1"))
-    table.caption = "F1 in the STM-CPA paper: " + ", ".join(
-        f"{name} {100 * f1:.1f}" for name, f1 in CENTRE_F1.items())
+        table.add_row(title, *format_counts(row, "tp", "fp", "fn"), *format_percent(row, "precision", "recall", "f1"))
+    table.caption = "F1 in the STM-CPA paper: " + ", ".join(f"{name} {100 * f1:.1f}" for name, f1 in CENTRE_F1.items())
     console.print(table)
 
 

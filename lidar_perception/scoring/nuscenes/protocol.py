@@ -19,15 +19,24 @@ from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
 from lidar_perception.geometry import points_in_box
 
 # maximum distance from the vehicle, metres
-RANGES = {"car": 50.0, "truck": 50.0, "bus": 50.0, "trailer": 50.0, "construction_vehicle": 50.0,
-          "pedestrian": 40.0, "motorcycle": 40.0, "bicycle": 40.0, "traffic_cone": 30.0,
-          "barrier": 30.0}
-DISTANCES = (0.5, 1.0, 2.0, 4.0)    # of centres of a hit, metres
-ERROR_DISTANCE = 2.0                # of hits that errors are computed for
+RANGES = {
+    "car": 50.0,
+    "truck": 50.0,
+    "bus": 50.0,
+    "trailer": 50.0,
+    "construction_vehicle": 50.0,
+    "pedestrian": 40.0,
+    "motorcycle": 40.0,
+    "bicycle": 40.0,
+    "traffic_cone": 30.0,
+    "barrier": 30.0,
+}
+DISTANCES = (0.5, 1.0, 2.0, 4.0)  # of centres of a hit, metres
+ERROR_DISTANCE = 2.0  # of hits that errors are computed for
 RECALLS = np.linspace(0.0, 1.0, 101)
-FIRST_RECALL_INDEX = 11             # of the first of RECALLS above 0.1
+FIRST_RECALL_INDEX = 11  # of the first of RECALLS above 0.1
 MIN_PRECISION = 0.1
-MAP_WEIGHT = 5                      # of mAP in NDS; each of ERRORS has weight 1
+MAP_WEIGHT = 5  # of mAP in NDS; each of ERRORS has weight 1
 RACK_CLASSES = ("bicycle", "motorcycle")  # ignored inside a bicycle rack
 
 # translation m, scale 1 - IoU of the aligned boxes, orientation rad, velocity m/s, attribute
@@ -74,8 +83,9 @@ class ClassScores:
         return float(np.mean([*self.ap.values()]))
 
 
-def score_class(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: GlobalBoxes,
-                found_frames: np.ndarray) -> ClassScores:
+def score_class(
+    name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: GlobalBoxes, found_frames: np.ndarray
+) -> ClassScores:
     """Score a class over the counted boxes of all frames.
 
     Args:
@@ -117,8 +127,7 @@ def _match(centres, frames, true_centres, first, max_distance):
     for i in range(len(centres)):
         best, nearest = -1, np.inf
         for j in range(first[frames[i]], first[frames[i] + 1]):
-            away = np.sqrt((centres[i, 0] - true_centres[j, 0]) ** 2
-                           + (centres[i, 1] - true_centres[j, 1]) ** 2)
+            away = np.sqrt((centres[i, 0] - true_centres[j, 0]) ** 2 + (centres[i, 1] - true_centres[j, 1]) ** 2)
             if not taken[j] and away < nearest:
                 best, nearest = j, away
         if nearest < max_distance:
@@ -126,8 +135,7 @@ def _match(centres, frames, true_centres, first, max_distance):
     return indices
 
 
-def _interpolate_curves(hit: np.ndarray, scores: np.ndarray,
-                        objects: int) -> tuple[np.ndarray, np.ndarray]:
+def _interpolate_curves(hit: np.ndarray, scores: np.ndarray, objects: int) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate precision and score at RECALLS, (101,) each, 0 at recall that is not reached.
 
     Detections (K,) are sorted by descending score.
@@ -137,8 +145,7 @@ def _interpolate_curves(hit: np.ndarray, scores: np.ndarray,
     hits = np.cumsum(hit)
     recall = hits / objects
     precision = hits / np.arange(1, len(hit) + 1)
-    return (np.interp(RECALLS, recall, precision, right=0),
-            np.interp(RECALLS, recall, scores, right=0))
+    return (np.interp(RECALLS, recall, precision, right=0), np.interp(RECALLS, recall, scores, right=0))
 
 
 def _average_error(values: np.ndarray, scores: np.ndarray, confidence: np.ndarray) -> float:
@@ -154,11 +161,10 @@ def _average_error(values: np.ndarray, scores: np.ndarray, confidence: np.ndarra
     known = np.cumsum(~np.isnan(values))
     so_far = np.nancumsum(values) / np.maximum(known, 1)
     curve = np.interp(confidence[::-1], scores[::-1], so_far[::-1])[::-1]
-    return float(curve[FIRST_RECALL_INDEX:last + 1].mean())
+    return float(curve[FIRST_RECALL_INDEX : last + 1].mean())
 
 
-def compute_errors(truth: GlobalBoxes, found: GlobalBoxes,
-                   half_turns: bool) -> dict[str, np.ndarray]:
+def compute_errors(truth: GlobalBoxes, found: GlobalBoxes, half_turns: bool) -> dict[str, np.ndarray]:
     """Compute the ERRORS (H,) float64 of pairs of boxes.
 
     An error is NaN where the true velocity or attribute, or the detected velocity, is unknown. With
@@ -169,9 +175,13 @@ def compute_errors(truth: GlobalBoxes, found: GlobalBoxes,
     period = np.pi if half_turns else 2 * np.pi
     rotation = (truth.yaws - found.yaws + period / 2) % period - period / 2
     differs = (truth.attributes != found.attributes).astype(float)
-    return {"ate": np.hypot(*(truth.centres - found.centres)[:, :2].T), "ase": 1 - shared / union,
-            "aoe": np.abs(rotation), "ave": np.hypot(*(truth.velocities - found.velocities).T),
-            "aae": np.where(truth.attributes < 0, np.nan, differs)}
+    return {
+        "ate": np.hypot(*(truth.centres - found.centres)[:, :2].T),
+        "ase": 1 - shared / union,
+        "aoe": np.abs(rotation),
+        "ave": np.hypot(*(truth.velocities - found.velocities).T),
+        "aae": np.where(truth.attributes < 0, np.nan, differs),
+    }
 
 
 def summarize(scores: dict[str, ClassScores]) -> dict[str, float]:
@@ -180,9 +190,10 @@ def summarize(scores: dict[str, ClassScores]) -> dict[str, float]:
     nds is nuScenes' detection score, the mean of mAP with weight MAP_WEIGHT and 1 - error (at least
     0) of each error.
     """
-    result = {"map": float(np.mean([s.mean_ap for s in scores.values()])),
-              **{error: float(np.nanmean([s.errors[error] for s in scores.values()]))
-                 for error in ERRORS}}
+    result = {
+        "map": float(np.mean([s.mean_ap for s in scores.values()])),
+        **{error: float(np.nanmean([s.errors[error] for s in scores.values()])) for error in ERRORS},
+    }
     parts = [max(0.0, 1.0 - result[error]) for error in ERRORS]
     result["nds"] = (MAP_WEIGHT * result["map"] + sum(parts)) / (MAP_WEIGHT + len(parts))
     return result

@@ -14,12 +14,7 @@ from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
 from lidar_perception.data.nuscenes.results import NAME_BY_CLASS, read_results, to_results
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.detections import run_detector
-from lidar_perception.scoring.nuscenes.protocol import (
-    ClassScores,
-    score_class,
-    select_counted,
-    summarize,
-)
+from lidar_perception.scoring.nuscenes.protocol import ClassScores, score_class, select_counted, summarize
 from lidar_perception.types import InputError
 
 DETECTED_NAMES = tuple(NAME_BY_CLASS.values())
@@ -43,21 +38,28 @@ class KeyFrameResult:
     problem: str | None = None
 
 
-def select_boxes(frame: Frame, boxes: GlobalBoxes, ms: float | None = None,
-                 problem: str | None = None) -> KeyFrameResult:
+def select_boxes(
+    frame: Frame, boxes: GlobalBoxes, ms: float | None = None, problem: str | None = None
+) -> KeyFrameResult:
     """Select the boxes and labels of a nuScenes frame that count."""
     key = frame.native
     labels = key.labels()
     if labels is None:
         return KeyFrameResult(key.token, boxes, None, None, ms, problem)
     racks = labels.bicycle_racks()
-    return KeyFrameResult(key.token, boxes,
-                          labels.boxes[select_counted(labels.boxes, key.ego, racks)],
-                          boxes[select_counted(boxes, key.ego, racks)], ms, problem)
+    return KeyFrameResult(
+        key.token,
+        boxes,
+        labels.boxes[select_counted(labels.boxes, key.ego, racks)],
+        boxes[select_counted(boxes, key.ego, racks)],
+        ms,
+        problem,
+    )
 
 
-def measure_key_frames(open_: Callable[[], Detector], unlabelled: bool,
-                       recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
+def measure_key_frames(
+    open_: Callable[[], Detector], unlabelled: bool, recording: Recording
+) -> Callable[[Frame], KeyFrameResult | None]:
     """Run the detector of open_() on every key frame with labels, or with unlabelled on all.
 
     partial(measure_key_frames, open_, unlabelled) is a Start of scoring.run.
@@ -73,20 +75,18 @@ def measure_key_frames(open_: Callable[[], Detector], unlabelled: bool,
             boxes = to_results(result.detections, frame)
         except InputError as error:
             problem = str(error)
-        return select_boxes(frame, boxes, result.ms,
-                            None if problem is None else f"{frame.name}: {problem}")
+        return select_boxes(frame, boxes, result.ms, None if problem is None else f"{frame.name}: {problem}")
+
     return measure
 
 
-def measure_result_file(path: Path,
-                        recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
+def measure_result_file(path: Path, recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
     """Read a result file of nuScenes' detection task.
 
     partial(measure_result_file, path) is a Start of scoring.run.
     """
     boxes = read_results(path, list(recording))
-    return lambda frame: (None if frame.native.labels() is None
-                          else select_boxes(frame, boxes[frame.name]))
+    return lambda frame: None if frame.native.labels() is None else select_boxes(frame, boxes[frame.name])
 
 
 @dataclass
@@ -127,15 +127,21 @@ class NuscenesReport:
         all is the mean over the ten classes, as in nuScenes' ranking; ours is the mean over the
         three classes that the package's detectors know.
         """
-        result = {"frames": self.frames, "classes": {}, "all": None, "ours": None,
-                  "ms": float(np.median(self.ms)) if self.ms else None, "skipped": self.skipped}
+        result = {
+            "frames": self.frames,
+            "classes": {},
+            "all": None,
+            "ours": None,
+            "ms": float(np.median(self.ms)) if self.ms else None,
+            "skipped": self.skipped,
+        }
         if self.frames:
-            truth, found = (GlobalBoxes.concatenate(parts)
-                            for parts in (self.truth, self.detections))
-            numbers = [np.repeat(np.arange(self.frames), [len(part) for part in parts])
-                       for parts in (self.truth, self.detections)]
-            scores = {name: score_class(name, truth, numbers[0], found, numbers[1])
-                      for name in NAMES}
+            truth, found = (GlobalBoxes.concatenate(parts) for parts in (self.truth, self.detections))
+            numbers = [
+                np.repeat(np.arange(self.frames), [len(part) for part in parts])
+                for parts in (self.truth, self.detections)
+            ]
+            scores = {name: score_class(name, truth, numbers[0], found, numbers[1]) for name in NAMES}
             result["classes"] = {name: _to_class_content(s) for name, s in scores.items()}
             result["all"] = _to_percent(summarize(scores))
             result["ours"] = _to_percent(summarize({name: scores[name] for name in DETECTED_NAMES}))
@@ -143,12 +149,14 @@ class NuscenesReport:
 
 
 def _to_class_content(scores: ClassScores) -> dict:
-    return {"objects": scores.objects, "detections": scores.detections,
-            "ap": {f"{distance:g}": 100 * ap for distance, ap in scores.ap.items()},
-            "mean_ap": 100 * scores.mean_ap,
-            **{name: None if math.isnan(error) else error for name, error in scores.errors.items()}}
+    return {
+        "objects": scores.objects,
+        "detections": scores.detections,
+        "ap": {f"{distance:g}": 100 * ap for distance, ap in scores.ap.items()},
+        "mean_ap": 100 * scores.mean_ap,
+        **{name: None if math.isnan(error) else error for name, error in scores.errors.items()},
+    }
 
 
 def _to_percent(figures: dict[str, float]) -> dict[str, float]:
-    return {name: 100 * value if name in ("map", "nds") else value
-            for name, value in figures.items()}
+    return {name: 100 * value if name in ("map", "nds") else value for name, value in figures.items()}

@@ -15,26 +15,38 @@ PAPER = {"map": 92.68, "ate": 0.298, "ase": 0.218, "nds": 83.45}
 
 def print_nuscenes_report(content: dict, console: Console) -> None:
     """Print AP at each distance and the errors, by class and overall."""
-    table = make_table(f"nuScenes detection, {content['frames']} frames", "", "labels",
-                       *(f"{d:g}m" for d in DISTANCES), "mAP", *(e.upper() for e in ERRORS),
-                       "NDS", width=4)
+    table = make_table(
+        f"nuScenes detection, {content['frames']} frames",
+        "",
+        "labels",
+        *(f"{d:g}m" for d in DISTANCES),
+        "mAP",
+        *(e.upper() for e in ERRORS),
+        "NDS",
+        width=4,
+    )
     for name, row in content["classes"].items():
-        table.add_row(name.replace("construction_vehicle", "constr. veh.").replace("_", " "),
-                      str(row["objects"]), *(f"{ap:.3g}" for ap in row["ap"].values()),
-                      format_number(row["mean_ap"]), *_errors(row),
-                      style="" if name in DETECTED_NAMES else "dim")
+        table.add_row(
+            name.replace("construction_vehicle", "constr. veh.").replace("_", " "),
+            str(row["objects"]),
+            *(f"{ap:.3g}" for ap in row["ap"].values()),
+            format_number(row["mean_ap"]),
+            *_errors(row),
+            style="" if name in DETECTED_NAMES else "dim",
+        )
     table.add_section()
     for key, title in ("all", "all ten"), ("ours", "our three"):
-        objects = sum(row["objects"] for name, row in content["classes"].items()
-                      if key == "all" or name in DETECTED_NAMES)
-        table.add_row(title, str(objects), *[""] * len(DISTANCES), *_means(content[key]),
-                      style="bold")
+        objects = sum(
+            row["objects"] for name, row in content["classes"].items() if key == "all" or name in DETECTED_NAMES
+        )
+        table.add_row(title, str(objects), *[""] * len(DISTANCES), *_means(content[key]), style="bold")
     table.add_row("the paper", "", *[""] * len(DISTANCES), *_means(PAPER), style="dim")
     table.caption = (
         "AP in percent by centre distance; ATE m, ASE 1 - IoU, AOE rad, AVE m/s, AAE 1 - accuracy. "
         "A class that is not detected has AP 0 and errors 1. Our three: car, pedestrian, bicycle "
         "(our Cyclist), no figure of nuScenes' ranking. Without velocities and attributes AVE and "
-        "AAE are 1, and NDS is 80 at most. The paper names neither its classes nor its split.")
+        "AAE are 1, and NDS is 80 at most. The paper names neither its classes nor its split."
+    )
     console.print(table)
     print_time(content["ms"], console)
     print_skipped(content["skipped"], console)

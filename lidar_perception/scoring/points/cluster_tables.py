@@ -16,18 +16,23 @@ def print_cluster_scores(content: dict[str, Any], out: Console) -> None:
     """Print the confusion of clusters, and the paper's scores."""
     names = content["classes"]
     rows = content["clusters"]
-    table = make_table(f"Clusters of {content['min_points']} points or more, "
-                       f"{content['frames']} frames", "is \\ found", *names, "recall", "prec.")
+    table = make_table(
+        f"Clusters of {content['min_points']} points or more, {content['frames']} frames",
+        "is \\ found",
+        *names,
+        "recall",
+        "prec.",
+    )
     for name, counts in zip(names, rows["confusion"]):
         row = rows["by_class"].get(name, {})
-        table.add_row(name, *map(str, counts), _format_number(row.get("recall")),
-                      _format_number(row.get("precision")))
-    table.caption = (f"{_format_number(rows['accuracy'])} % of the clusters, and "
-                     f"{_format_number(rows['object_accuracy'])} % of the objects among them, are "
-                     "classified correctly.")
+        table.add_row(name, *map(str, counts), _format_number(row.get("recall")), _format_number(row.get("precision")))
+    table.caption = (
+        f"{_format_number(rows['accuracy'])} % of the clusters, and "
+        f"{_format_number(rows['object_accuracy'])} % of the objects among them, are "
+        "classified correctly."
+    )
     out.print(table)
-    table = make_table("Points in the image, in percent", "", "accuracy", "precision", "recall",
-                       "F1", "IoU")
+    table = make_table("Points in the image, in percent", "", "accuracy", "precision", "recall", "F1", "IoU")
     points = content["points"]
     table.add_row(
         "mean of the classes",
@@ -35,10 +40,8 @@ def print_cluster_scores(content: dict[str, Any], out: Console) -> None:
         *(_format_number(points["mean"][key]) for key in ("precision", "recall", "f1", "iou")),
     )
     for name, row in points["by_class"].items():
-        table.add_row(f"  {name}", "", *(_format_number(row[key]) for key in
-                                         ("precision", "recall", "f1", "iou")))
-    table.add_row("paper C, KITTI", *(_format_number(value) for value in PAPER.values()),
-                  style="dim")
+        table.add_row(f"  {name}", "", *(_format_number(row[key]) for key in ("precision", "recall", "f1", "iou")))
+    table.add_row("paper C, KITTI", *(_format_number(value) for value in PAPER.values()), style="dim")
     table.caption = "The paper does not define how points are counted."
     out.print(table)
     print_skipped(content["skipped"], out)

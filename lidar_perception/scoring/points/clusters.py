@@ -25,17 +25,19 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, GroundTruth
 
 UNKNOWN = -1  # label of clusters and points that are not scored
-MIN_OBJECT_SHARE = 0.5       # of its points in a box, for a cluster to be that object
+MIN_OBJECT_SHARE = 0.5  # of its points in a box, for a cluster to be that object
 MAX_BACKGROUND_SHARE = 0.15  # of its points in any box, for a cluster to be background
 BOX_MARGIN = 0.05  # metres; labels are rounded, so points this near to a box belong to it
 # Classes that resemble a scored class, and DontCare
-IGNORED_CLASSES = [row.name for row in TABLE if row.numbers is None
-                   and (row.looks_like or row.vehicle)] + [CLASSES[DONT_CARE]]
+IGNORED_CLASSES = [row.name for row in TABLE if row.numbers is None and (row.looks_like or row.vehicle)] + [
+    CLASSES[DONT_CARE]
+]
 MIN_POINTS = 10  # clusters with fewer do not count
 
 
-def label_clusters(clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray,
-                   classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def label_clusters(
+    clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray, classes: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
     """Label K clusters by the box with the largest share of their points.
 
     Args:
@@ -62,8 +64,7 @@ def label_clusters(clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray,
     return labels, owners
 
 
-def label_points(xyz: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
-                 classes: Sequence[str]) -> np.ndarray:
+def label_points(xyz: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
     """Label points (N, 3) by the class of their box, as (N,) int64.
 
     len(classes) is background, UNKNOWN a box of an ignored class.
@@ -80,8 +81,7 @@ def find_unlabelled(truth: GroundTruth, camera: Camera, xyz: np.ndarray) -> np.n
     return camera.in_regions(xyz, np.array(regions, float))
 
 
-def mask_unlabelled(labels: np.ndarray, clusters: Clusters, unlabelled: np.ndarray,
-                    background: int) -> np.ndarray:
+def mask_unlabelled(labels: np.ndarray, clusters: Clusters, unlabelled: np.ndarray, background: int) -> np.ndarray:
     """Set the labels (K,) of background clusters to UNKNOWN if half of their points are unlabelled.
 
     unlabelled (P,) bool is a mask of the points of all clusters.
@@ -96,14 +96,23 @@ def map_labels(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
 
     len(classes) is background; classes of IGNORED_CLASSES are UNKNOWN.
     """
-    return np.array([classes.index(name) if name in classes else
-                     UNKNOWN if name in IGNORED_CLASSES else len(classes)
-                     for name in (CLASSES[i] for i in class_ids)], np.int64)
+    return np.array(
+        [
+            classes.index(name) if name in classes else UNKNOWN if name in IGNORED_CLASSES else len(classes)
+            for name in (CLASSES[i] for i in class_ids)
+        ],
+        np.int64,
+    )
 
 
-def count_confusions(clusters: Clusters, labels: np.ndarray, predictions: Predictions,
-                     point_truth: np.ndarray, cluster_ids: np.ndarray,
-                     classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+def count_confusions(
+    clusters: Clusters,
+    labels: np.ndarray,
+    predictions: Predictions,
+    point_truth: np.ndarray,
+    cluster_ids: np.ndarray,
+    classes: Sequence[str],
+) -> tuple[np.ndarray, np.ndarray]:
     """Count the clusters and points of one frame by true and predicted class.
 
     Args:
@@ -127,8 +136,7 @@ def count_confusions(clusters: Clusters, labels: np.ndarray, predictions: Predic
     return of_clusters, of_points
 
 
-def measure_network(weights: Path, settings: Mapping[str, Any],
-                    recording: Recording) -> Callable[[Frame], Any]:
+def measure_network(weights: Path, settings: Mapping[str, Any], recording: Recording) -> Callable[[Frame], Any]:
     """Run a cluster network on the points in the image of every frame with labelled boxes.
 
     partial(measure_network, weights, settings) is a Start of scoring.run.
@@ -137,8 +145,9 @@ def measure_network(weights: Path, settings: Mapping[str, Any],
         settings: ground and clustering parameters by dotted name that differ from those of
             training.
     """
-    classifier = load_pointnet_detector(weights, "cpu", PointNetDetectorParams(
-        pointnet=PointNetParams(warm_up=False))).classifier
+    classifier = load_pointnet_detector(
+        weights, "cpu", PointNetDetectorParams(pointnet=PointNetParams(warm_up=False))
+    ).classifier
     config, background = classifier.config, len(classifier.classes)
     params = with_values(default_params(weights), settings)
 
@@ -153,8 +162,7 @@ def measure_network(weights: Path, settings: Mapping[str, Any],
         if camera is None:  # labels cover all directions
             indices, hidden = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)
         else:
-            indices, hidden = (np.flatnonzero(camera.in_view(scan.xyz)),
-                               partial(find_unlabelled, truth, camera))
+            indices, hidden = (np.flatnonzero(camera.in_view(scan.xyz)), partial(find_unlabelled, truth, camera))
         seen, ids = scan.take(indices), ids[indices]
         made = make_clusters(seen, ids, ground=ground[indices])
         labels, _ = label_clusters(made, truth.boxes, truth.class_ids, config.classes)
@@ -162,6 +170,7 @@ def measure_network(weights: Path, settings: Mapping[str, Any],
         points = label_points(seen.xyz, truth.boxes, truth.class_ids, config.classes)
         points[(points == background) & hidden(seen.xyz)] = UNKNOWN
         return count_confusions(made, labels, classifier.predict(made), points, ids, config.classes)
+
     return measure
 
 
@@ -190,9 +199,14 @@ class ClusterScores:
 
     def compute(self) -> dict[str, Any]:
         """Return the scores as JSON; shares in percent, None without objects."""
-        return {"frames": self.frames, "classes": [*self.classes, "background"],
-                "min_points": MIN_POINTS, "clusters": _compute_scores(self.clusters, self.classes),
-                "points": _compute_scores(self.points, self.classes), "skipped": self.skipped}
+        return {
+            "frames": self.frames,
+            "classes": [*self.classes, "background"],
+            "min_points": MIN_POINTS,
+            "clusters": _compute_scores(self.clusters, self.classes),
+            "points": _compute_scores(self.points, self.classes),
+            "skipped": self.skipped,
+        }
 
 
 def _compute_scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, Any]:
@@ -201,17 +215,26 @@ def _compute_scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, 
     true, predicted = confusion.sum(axis=1), confusion.sum(axis=0)
     rows = {}
     for i, name in enumerate(classes):
-        rows[name] = {"objects": int(true[i]), "precision": _to_percent(right[i], predicted[i]),
-                      "recall": _to_percent(right[i], true[i]),
-                      "f1": _to_percent(2 * right[i], true[i] + predicted[i]),
-                      "iou": _to_percent(right[i], true[i] + predicted[i] - right[i])}
+        rows[name] = {
+            "objects": int(true[i]),
+            "precision": _to_percent(right[i], predicted[i]),
+            "recall": _to_percent(right[i], true[i]),
+            "f1": _to_percent(2 * right[i], true[i] + predicted[i]),
+            "iou": _to_percent(right[i], true[i] + predicted[i] - right[i]),
+        }
     found = [row for row in rows.values() if row["objects"]]
-    mean = {key: float(np.mean([row[key] or 0.0 for row in found])) if found else None
-            for key in ("precision", "recall", "f1", "iou")}
+    mean = {
+        key: float(np.mean([row[key] or 0.0 for row in found])) if found else None
+        for key in ("precision", "recall", "f1", "iou")
+    }
     count = len(classes)
-    return {"confusion": confusion.tolist(), "accuracy": _to_percent(right.sum(), confusion.sum()),
-            "object_accuracy": _to_percent(right[:count].sum(), true[:count].sum()),
-            "by_class": rows, "mean": mean}
+    return {
+        "confusion": confusion.tolist(),
+        "accuracy": _to_percent(right.sum(), confusion.sum()),
+        "object_accuracy": _to_percent(right[:count].sum(), true[:count].sum()),
+        "by_class": rows,
+        "mean": mean,
+    }
 
 
 def _to_percent(part: int, whole: int) -> float | None:

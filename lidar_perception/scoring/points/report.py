@@ -49,9 +49,9 @@ class SegmentationResult:
     whole: bool = False
 
 
-def measure_methods(params: SegmentationParams, grounds: tuple[str, ...],
-                    clusterings: tuple[str, ...],
-                    recording: Recording) -> Callable[[Frame], SegmentationResult | None]:
+def measure_methods(
+    params: SegmentationParams, grounds: tuple[str, ...], clusterings: tuple[str, ...], recording: Recording
+) -> Callable[[Frame], SegmentationResult | None]:
     """Run ground and clustering methods on every labelled frame.
 
     Ground is scored on labelled points. Clusters are scored on labelled instances or boxes; with
@@ -78,15 +78,16 @@ def measure_methods(params: SegmentationParams, grounds: tuple[str, ...],
         scan, camera = frame.load(), frame.camera()
         if camera is not None:
             _, scan = crop_to_view(scan, camera, params.view)
-        return SegmentationResult({}, score_methods(scan, segment_ground(scan, params.ground),
-                                                    find_objects_in_boxes(scan.xyz, truth)),
-                                  whole=camera is None and params.view.enabled)
+        return SegmentationResult(
+            {},
+            score_methods(scan, segment_ground(scan, params.ground), find_objects_in_boxes(scan.xyz, truth)),
+            whole=camera is None and params.view.enabled,
+        )
 
     def score_methods(scan: PointCloud, ground: np.ndarray, objects: Objects) -> dict:
         scores = {}
         for name in clusterings:
-            ids, ms = timer(cluster_obstacles, scan.xyz, ground,
-                            replace(params.clustering, method=name))
+            ids, ms = timer(cluster_obstacles, scan.xyz, ground, replace(params.clustering, method=name))
             scores[name] = objects.classes, objects.ranges, score_clusters(ids, objects), ms
         return scores
 
@@ -96,6 +97,7 @@ def measure_methods(params: SegmentationParams, grounds: tuple[str, ...],
             return measure_points(frame, labels)
         truth = frame.truth()
         return None if truth is None or not clusterings else measure_boxes(frame, truth)
+
     return measure
 
 
@@ -136,21 +138,28 @@ class SegmentationReport:
         for name, counts in result.ground.items():
             self.ground.setdefault(name, GroundReport()).update(*counts)
         for name, scores in result.clusters.items():
-            self.clusters.setdefault(self.source, {}).setdefault(
-                name, ClusterReport()).update(*scores)
+            self.clusters.setdefault(self.source, {}).setdefault(name, ClusterReport()).update(*scores)
         self.whole += result.whole
 
     def compute(self) -> dict[str, Any]:
         """Return the content of the JSON file."""
-        return {"ground": {name: report.compute() for name, report in self.ground.items()},
-                "clusters": {source: {name: report.compute() for name, report in reports.items()}
-                             for source, reports in self.clusters.items()},
-                "skipped": self.skipped}
+        return {
+            "ground": {name: report.compute() for name, report in self.ground.items()},
+            "clusters": {
+                source: {name: report.compute() for name, report in reports.items()}
+                for source, reports in self.clusters.items()
+            },
+            "skipped": self.skipped,
+        }
 
 
-def segment_by_methods(frame: Frame, params: SegmentationParams, grounds: tuple[str, ...]
-                       ) -> tuple[PointCloud, PointTruth | None, dict[str, np.ndarray]]:
+def segment_by_methods(
+    frame: Frame, params: SegmentationParams, grounds: tuple[str, ...]
+) -> tuple[PointCloud, PointTruth | None, dict[str, np.ndarray]]:
     """Return a frame, its labels, and the ground (N,) bool by each method, for a picture."""
     scan = frame.load()
-    return scan, frame.point_truth(), {
-        name: segment_ground(scan, replace(params.ground, method=name)) for name in grounds}
+    return (
+        scan,
+        frame.point_truth(),
+        {name: segment_ground(scan, replace(params.ground, method=name)) for name in grounds},
+    )

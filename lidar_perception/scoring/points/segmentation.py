@@ -28,16 +28,15 @@ PROTOCOLS = ("without vegetation", "with vegetation", "vegetation not ground")
 LOW_VEGETATION_Z = -1.3  # metres in the LiDAR frame of KITTI, 1.73 m above the road
 
 HIT_IOU = 0.5
-MIN_POINTS = 10        # objects with fewer points are ignored
-BOTTOM_MARGIN = 0.2    # metres above the bottom of a box; points below it may be road
-BOX_MARGIN = 0.2       # metres; a cluster is scored if most of it is in boxes enlarged by this
+MIN_POINTS = 10  # objects with fewer points are ignored
+BOTTOM_MARGIN = 0.2  # metres above the bottom of a box; points below it may be road
+BOX_MARGIN = 0.2  # metres; a cluster is scored if most of it is in boxes enlarged by this
 MIN_PIECE_SHARE = 0.1  # of an object's points in a cluster that is a piece of it
 RANGE_NAMES = ("0-15", "15-30", "30-45", "45+")
 RANGE_LIMITS = np.array([15.0, 30.0, 45.0])
 
 
-def select_true_ground(semantic: np.ndarray, z: np.ndarray,
-                       protocol: str) -> tuple[np.ndarray, np.ndarray]:
+def select_true_ground(semantic: np.ndarray, z: np.ndarray, protocol: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the masks ground (N,) and counted (N,) of points.
 
     Args:
@@ -60,8 +59,7 @@ def count_ground(found: np.ndarray, ground: np.ndarray, counted: np.ndarray) -> 
     return np.bincount(case.compress(counted), minlength=4)
 
 
-def count_by_protocol(found: np.ndarray, semantic: np.ndarray,
-                      z: np.ndarray) -> dict[str, np.ndarray]:
+def count_by_protocol(found: np.ndarray, semantic: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:
     """Count the predicted ground, found (N,) bool, by protocol; see select_true_ground."""
     return {name: count_ground(found, *select_true_ground(semantic, z, name)) for name in PROTOCOLS}
 
@@ -69,17 +67,23 @@ def count_by_protocol(found: np.ndarray, semantic: np.ndarray,
 def to_ground_row(counts: np.ndarray) -> dict:
     """Return counts (4,) and their ratios for the JSON file. A ratio without cases is 0."""
     tp, fp, fn, tn = counts.tolist()
-    return dict(tp=tp, fp=fp, fn=fn, tn=tn, precision=_divide(tp, tp + fp),
-                recall=_divide(tp, tp + fn), f1=_divide(2 * tp, 2 * tp + fp + fn),
-                accuracy=_divide(tp + tn, tp + fp + fn + tn))
+    return dict(
+        tp=tp,
+        fp=fp,
+        fn=fn,
+        tn=tn,
+        precision=_divide(tp, tp + fp),
+        recall=_divide(tp, tp + fn),
+        f1=_divide(2 * tp, 2 * tp + fp + fn),
+        accuracy=_divide(tp + tn, tp + fp + fn + tn),
+    )
 
 
 @dataclass
 class GroundReport:
     """Counts of one ground method by protocol, over the points of all scans."""
 
-    counts: dict[str, np.ndarray] = field(
-        default_factory=lambda: {name: np.zeros(4, np.int64) for name in PROTOCOLS})
+    counts: dict[str, np.ndarray] = field(default_factory=lambda: {name: np.zeros(4, np.int64) for name in PROTOCOLS})
     ms: list[float] = field(default_factory=list)
 
     def update(self, counts: dict[str, np.ndarray], ms: float) -> None:
@@ -90,8 +94,11 @@ class GroundReport:
 
     def compute(self) -> dict:
         """Return the content of the JSON file."""
-        return {"scans": len(self.ms), "ms": _compute_median(self.ms),
-                "protocols": {name: to_ground_row(c) for name, c in self.counts.items()}}
+        return {
+            "scans": len(self.ms),
+            "ms": _compute_median(self.ms),
+            "protocols": {name: to_ground_row(c) for name, c in self.counts.items()},
+        }
 
 
 @dataclass(frozen=True)
@@ -132,9 +139,14 @@ def find_objects_in_boxes(xyz: np.ndarray, truth: GroundTruth) -> Objects:
     near = np.zeros(len(xyz), bool)
     for box in truth.boxes[chosen]:
         near |= points_in_box(xyz, box, BOX_MARGIN)
-    return Objects(_renumber(owner, chosen + 1), _renumber(region, chosen + 1), near,
-                   np.ones(len(xyz), bool), tuple(truth.labels[k] for k in chosen),
-                   np.hypot(*truth.boxes[chosen, :2].T))
+    return Objects(
+        _renumber(owner, chosen + 1),
+        _renumber(region, chosen + 1),
+        near,
+        np.ones(len(xyz), bool),
+        tuple(truth.labels[k] for k in chosen),
+        np.hypot(*truth.boxes[chosen, :2].T),
+    )
 
 
 def find_instances(xyz: np.ndarray, semantic: np.ndarray, instance: np.ndarray) -> Objects:
@@ -147,17 +159,22 @@ def find_instances(xyz: np.ndarray, semantic: np.ndarray, instance: np.ndarray) 
     table[list(THINGS)] = list(THINGS)
     table[list(MOVING)] = list(MOVING.values())
     thing = table[semantic]
-    keys, which, counts = np.unique(np.where((thing > 0) & (instance > 0),
-                                             thing << 16 | instance, 0),
-                                    return_inverse=True, return_counts=True)
+    keys, which, counts = np.unique(
+        np.where((thing > 0) & (instance > 0), thing << 16 | instance, 0), return_inverse=True, return_counts=True
+    )
     chosen = np.flatnonzero((keys > 0) & (counts >= MIN_POINTS))
     owner = _renumber(which.reshape(-1), chosen)
     sums = [np.bincount(owner, axis, minlength=len(chosen) + 1)[1:] for axis in xyz[:, :2].T]
     centres = np.stack(sums, axis=1) / counts[chosen, None]
     counted = (owner > 0) | ((thing == 0) & ~np.isin(semantic, UNLABELLED))
-    return Objects(owner, owner, owner > 0, counted,
-                   tuple(THINGS[key >> 16] for key in keys[chosen].tolist()),
-                   horizontal_range(centres))
+    return Objects(
+        owner,
+        owner,
+        owner > 0,
+        counted,
+        tuple(THINGS[key >> 16] for key in keys[chosen].tolist()),
+        horizontal_range(centres),
+    )
 
 
 @dataclass(frozen=True)
@@ -186,8 +203,9 @@ def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
     objects and clusters that share points only.
     """
     labels, numbers = renumber_ids(cluster_ids)
-    ids, owner, region, near = (a.compress(objects.counted).astype(np.int64) for a in (
-        labels, objects.owner, objects.region, objects.near))
+    ids, owner, region, near = (
+        a.compress(objects.counted).astype(np.int64) for a in (labels, objects.owner, objects.region, objects.near)
+    )
     size, rows = np.bincount(ids, minlength=len(numbers) + 1), len(objects.classes) + 1
     points = np.bincount(owner, minlength=rows)
     both = (owner > 0) & (ids > 0)
@@ -202,8 +220,9 @@ def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
     several = np.bincount(cluster[piece], minlength=len(size)) > 1
     shared = np.bincount(thing[(iou == best[thing]) & piece & several[cluster]], minlength=rows) > 0
     judged = 2 * np.bincount(ids, near, minlength=len(size))[1:] > size[1:]
-    return ClusterScore(best[1:], np.bincount(thing[piece], minlength=rows)[1:], shared[1:],
-                        len(numbers), int(judged.sum()))
+    return ClusterScore(
+        best[1:], np.bincount(thing[piece], minlength=rows)[1:], shared[1:], len(numbers), int(judged.sum())
+    )
 
 
 @dataclass
@@ -213,8 +232,7 @@ class ClusterReport:
     frames: list[tuple[tuple[str, ...], np.ndarray, ClusterScore]] = field(default_factory=list)
     ms: list[float] = field(default_factory=list)
 
-    def update(self, classes: tuple[str, ...], ranges: np.ndarray, score: ClusterScore,
-               ms: float) -> None:
+    def update(self, classes: tuple[str, ...], ranges: np.ndarray, score: ClusterScore, ms: float) -> None:
         """Add one frame: classes and ranges (K,) of its Objects, its score, and the duration."""
         self.frames.append((classes, ranges, score))
         self.ms.append(ms)
@@ -224,31 +242,43 @@ class ClusterReport:
         classes = np.array([c for names, _, _ in self.frames for c in names], str)
         ranges = _concatenate(each for _, each, _ in self.frames)
         bins = np.searchsorted(RANGE_LIMITS, ranges, "right")
-        columns = [_concatenate(getattr(score, name) for _, _, score in self.frames)
-                   for name in ("iou", "pieces", "shared")]
+        columns = [
+            _concatenate(getattr(score, name) for _, _, score in self.frames) for name in ("iou", "pieces", "shared")
+        ]
         everything = _to_object_row(*columns)
-        clusters, judged = (sum(getattr(score, name) for _, _, score in self.frames)
-                            for name in ("clusters", "judged"))
+        clusters, judged = (sum(getattr(score, name) for _, _, score in self.frames) for name in ("clusters", "judged"))
         hits = everything["hits"]
-        return {"frames": len(self.frames), "ms": _compute_median(self.ms), "clusters": clusters,
-                "clusters_per_frame": _divide(clusters, len(self.frames)),
-                "judged_clusters": judged, **everything, "precision": _divide(hits, judged),
-                "f1": _divide(2 * hits, judged + everything["objects"]),
-                "by_class": {str(name): _to_object_row(*(c[classes == name] for c in columns))
-                             for name in np.unique(classes)},
-                "by_range": {name: _to_object_row(*(c[bins == i] for c in columns))
-                             for i, name in enumerate(RANGE_NAMES)}}
+        return {
+            "frames": len(self.frames),
+            "ms": _compute_median(self.ms),
+            "clusters": clusters,
+            "clusters_per_frame": _divide(clusters, len(self.frames)),
+            "judged_clusters": judged,
+            **everything,
+            "precision": _divide(hits, judged),
+            "f1": _divide(2 * hits, judged + everything["objects"]),
+            "by_class": {
+                str(name): _to_object_row(*(c[classes == name] for c in columns)) for name in np.unique(classes)
+            },
+            "by_range": {name: _to_object_row(*(c[bins == i] for c in columns)) for i, name in enumerate(RANGE_NAMES)},
+        }
 
 
 def _to_object_row(iou: np.ndarray, pieces: np.ndarray, shared: np.ndarray) -> dict:
     """mean_pieces is the mean over objects with a piece; 1 is no over-segmentation."""
     count, hits = len(iou), int(np.sum(iou > HIT_IOU))
     over, under = int(np.sum(pieces > 1)), int(np.sum(shared))
-    return dict(objects=count, hits=hits, recall=_divide(hits, count),
-                mean_iou=_divide(float(np.sum(iou)), count),
-                over_segmented=over, over_segmentation=_divide(over, count),
-                mean_pieces=float(np.mean(pieces[pieces > 0])) if (pieces > 0).any() else None,
-                under_segmented=under, under_segmentation=_divide(under, count))
+    return dict(
+        objects=count,
+        hits=hits,
+        recall=_divide(hits, count),
+        mean_iou=_divide(float(np.sum(iou)), count),
+        over_segmented=over,
+        over_segmentation=_divide(over, count),
+        mean_pieces=float(np.mean(pieces[pieces > 0])) if (pieces > 0).any() else None,
+        under_segmented=under,
+        under_segmentation=_divide(under, count),
+    )
 
 
 def _renumber(ids: np.ndarray, chosen: np.ndarray) -> np.ndarray:

@@ -8,12 +8,7 @@ import numpy as np
 from rich.console import Console
 
 from lidar_perception.scoring.pictures import save_picture
-from lidar_perception.scoring.points.segmentation import (
-    HIT_IOU,
-    MIN_POINTS,
-    PROTOCOLS,
-    select_true_ground,
-)
+from lidar_perception.scoring.points.segmentation import HIT_IOU, MIN_POINTS, PROTOCOLS, select_true_ground
 from lidar_perception.scoring.tables import format_counts, format_percent, make_table, print_skipped
 from lidar_perception.types import PointCloud
 
@@ -29,54 +24,86 @@ def print_scores(content: dict, ground_method: str, console: Console) -> None:
     if content["ground"]:
         _print_ground(content["ground"], console)
     for source, reports in content["clusters"].items():
-        _print_clusters(reports, f"Clusters of {source}, ground by {ground_method}",
-                        console)
+        _print_clusters(reports, f"Clusters of {source}, ground by {ground_method}", console)
     print_skipped(content["skipped"], console)
 
 
 def _print_ground(reports: dict, console: Console) -> None:
     scans = max(report["scans"] for report in reports.values())
-    table = make_table(f"Ground of SemanticKITTI, {_format_count(scans, 'scan')}", "vegetation is",
-                       "prec.", "recall", "F1", "acc.", "TP", "FP", "FN", "ms")
+    table = make_table(
+        f"Ground of SemanticKITTI, {_format_count(scans, 'scan')}",
+        "vegetation is",
+        "prec.",
+        "recall",
+        "F1",
+        "acc.",
+        "TP",
+        "FP",
+        "FN",
+        "ms",
+    )
     titles = dict(zip(PROTOCOLS, ("left out", "ground if below -1.3 m", "not ground")))
     for protocol in PROTOCOLS:
         table.add_row(titles[protocol], style="bold")
         for name, report in reports.items():
             row = report["protocols"][protocol]
-            table.add_row(f"  {name}",
-                          *format_percent(row, "precision", "recall", "f1", "accuracy"),
-                          *format_counts(row, "tp", "fp", "fn"), _format_ms(report))
+            table.add_row(
+                f"  {name}",
+                *format_percent(row, "precision", "recall", "f1", "accuracy"),
+                *format_counts(row, "tp", "fp", "fn"),
+                _format_ms(report),
+            )
         if protocol in PUBLISHED:
-            table.add_row("  Patchwork++ published", *(f"{v:.1f}" for v in PUBLISHED[protocol]),
-                          style="dim")
-    table.caption = ("Ground: road, parking, sidewalk, other-ground, lane-marking, terrain. ms are "
-                     "for one scan. Published: mean of the sequences 00 to 10.")
+            table.add_row("  Patchwork++ published", *(f"{v:.1f}" for v in PUBLISHED[protocol]), style="dim")
+    table.caption = (
+        "Ground: road, parking, sidewalk, other-ground, lane-marking, terrain. ms are "
+        "for one scan. Published: mean of the sequences 00 to 10."
+    )
     console.print(table)
 
 
 def _print_clusters(reports: dict, title: str, console: Console) -> None:
     frames = max(report["frames"] for report in reports.values())
-    table = make_table(f"{title}, {_format_count(frames, 'frame')}", "method", "objects", "hits",
-                       "recall", "prec.", "F1", "IoU", "over", "under", "found", "ms")
+    table = make_table(
+        f"{title}, {_format_count(frames, 'frame')}",
+        "method",
+        "objects",
+        "hits",
+        "recall",
+        "prec.",
+        "F1",
+        "IoU",
+        "over",
+        "under",
+        "found",
+        "ms",
+    )
     for name, report in reports.items():
-        table.add_row(name, *_format_object(report), f"{report['clusters_per_frame']:.1f}",
-                      _format_ms(report), style="bold")
+        table.add_row(
+            name, *_format_object(report), f"{report['clusters_per_frame']:.1f}", _format_ms(report), style="bold"
+        )
         parts = {**report["by_class"], **{f"{r} m": row for r, row in report["by_range"].items()}}
         for part, row in parts.items():
             if row["objects"]:
                 table.add_row(f"  {part}", *_format_object(row))
         table.add_section()
-    table.caption = (f"Objects with {MIN_POINTS} points or more; hit: IoU above {HIT_IOU} with one "
-                     "cluster. over: cut in pieces; under: in one cluster with another; found: "
-                     "clusters a frame; ms: a frame.")
+    table.caption = (
+        f"Objects with {MIN_POINTS} points or more; hit: IoU above {HIT_IOU} with one "
+        "cluster. over: cut in pieces; under: in one cluster with another; found: "
+        "clusters a frame; ms: a frame."
+    )
     console.print(table)
 
 
 def _format_object(row: dict) -> list[str]:
     """Precision and F1 exist only for all objects together."""
     judged = format_percent(row, "precision", "f1") if "precision" in row else ("", "")
-    return [*format_counts(row, "objects", "hits"), *format_percent(row, "recall"), *judged,
-            *format_percent(row, "mean_iou", "over_segmentation", "under_segmentation")]
+    return [
+        *format_counts(row, "objects", "hits"),
+        *format_percent(row, "recall"),
+        *judged,
+        *format_percent(row, "mean_iou", "over_segmentation", "under_segmentation"),
+    ]
 
 
 def _format_ms(report: dict) -> str:
@@ -87,31 +114,44 @@ def _format_count(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def draw_ground(path: Path, name: str, frame: PointCloud, semantic: np.ndarray,
-                found: dict[str, np.ndarray]) -> None:
+def draw_ground(path: Path, name: str, frame: PointCloud, semantic: np.ndarray, found: dict[str, np.ndarray]) -> None:
     """Draw the ground (N,) of each method in a BEV picture, and write it as PNG.
 
     x (forward) points up, y (left) to the left, metres. Vegetation is not counted.
     """
     import matplotlib
+
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     true, counted = select_true_ground(semantic, frame.xyz[:, 2], "without vegetation")
-    figure, rows = plt.subplots(1, len(found), figsize=(7 * len(found), 7.6), dpi=110,
-                                squeeze=False, layout="constrained")
+    figure, rows = plt.subplots(
+        1, len(found), figsize=(7 * len(found), 7.6), dpi=110, squeeze=False, layout="constrained"
+    )
     for axes, (method, ground) in zip(rows[0], found.items()):
         for mask, color, label, size in (
-                (~counted, "#dddddd", "not counted", 0.2),
-                (counted & ~true & ~ground, "#b0b0b0", "not ground", 0.3),
-                (counted & true & ground, "#009e73", "ground, found", 0.3),
-                (counted & true & ~ground, "#0072b2", "ground, missed", 1.2),
-                (counted & ~true & ground, "#d55e00", "found, but not ground", 1.2)):
-            axes.scatter(-frame.xyz[mask, 1], frame.xyz[mask, 0], s=size, c=color, linewidths=0,
-                         label=f"{label} ({int(mask.sum())})")
-        axes.set(xlim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE), ylim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE),
-                 aspect="equal", xlabel="right [m]", ylabel="forward [m]",
-                 title=f"{method}, scan {name}")
+            (~counted, "#dddddd", "not counted", 0.2),
+            (counted & ~true & ~ground, "#b0b0b0", "not ground", 0.3),
+            (counted & true & ground, "#009e73", "ground, found", 0.3),
+            (counted & true & ~ground, "#0072b2", "ground, missed", 1.2),
+            (counted & ~true & ground, "#d55e00", "found, but not ground", 1.2),
+        ):
+            axes.scatter(
+                -frame.xyz[mask, 1],
+                frame.xyz[mask, 0],
+                s=size,
+                c=color,
+                linewidths=0,
+                label=f"{label} ({int(mask.sum())})",
+            )
+        axes.set(
+            xlim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE),
+            ylim=(-MAX_DRAWN_RANGE, MAX_DRAWN_RANGE),
+            aspect="equal",
+            xlabel="right [m]",
+            ylabel="forward [m]",
+            title=f"{method}, scan {name}",
+        )
         for handle in axes.legend(loc="upper right", framealpha=0.9).legend_handles:
             handle.set_sizes([30])
     save_picture(path, figure)

@@ -40,9 +40,12 @@ class ClearCounts:
     def compute_scores(self) -> dict[str, float]:
         """Return MOTA (at most 1, may be negative), MOTP, recall and precision; 0 without cases."""
         objects = max(1, self.tp + self.fn)
-        return {"MOTA": (self.tp - self.fp - self.switches) / objects,
-                "MOTP": self.located / max(1, self.tp),
-                "recall": self.tp / objects, "precision": self.tp / max(1, self.tp + self.fp)}
+        return {
+            "MOTA": (self.tp - self.fp - self.switches) / objects,
+            "MOTP": self.located / max(1, self.tp),
+            "recall": self.tp / objects,
+            "precision": self.tp / max(1, self.tp + self.fp),
+        }
 
 
 def count_clear(frames: list[Pairs], alike: float = MIN_SIMILARITY) -> ClearCounts:
@@ -76,6 +79,14 @@ def count_clear(frames: list[Pairs], alike: float = MIN_SIMILARITY) -> ClearCoun
         located += float(f.similarity[rows, columns].sum())
     share = found / np.maximum(seen, 1)
     most, some = int((share > 0.8).sum()), int((share >= 0.2).sum())
-    return ClearCounts(tp, int(seen.sum()) - tp, fp, switches,
-                       int(np.maximum(runs - 1, 0).sum()), most, some - most,
-                       len(true_ids) - some, located)
+    return ClearCounts(
+        tp,
+        int(seen.sum()) - tp,
+        fp,
+        switches,
+        int(np.maximum(runs - 1, 0).sum()),
+        most,
+        some - most,
+        len(true_ids) - some,
+        located,
+    )

@@ -24,8 +24,9 @@ def count_recorded_tracks(frames: Sequence[RecordedResult]) -> dict[str, int]:
     return {name: len(ids[name]) for name in sorted(ids)}
 
 
-def score_recorded_tracks(frames: Sequence[RecordedResult], calibration: Calibration | None
-                          ) -> dict[str, dict[str, Any] | None]:
+def score_recorded_tracks(
+    frames: Sequence[RecordedResult], calibration: Calibration | None
+) -> dict[str, dict[str, Any] | None]:
     """Score the recorded tracks by class as in TrackingReport.
 
     Raises:
@@ -35,6 +36,13 @@ def score_recorded_tracks(frames: Sequence[RecordedResult], calibration: Calibra
     for i, frame in enumerate(frames):
         drive += not is_same_drive(before, frame.stamp_ns)
         before = frame.stamp_ns
-        report.update(observe(f"drive {drive}", i, to_truth(frame.truth), to_tracked_labels(
-            np.asarray(frame.found.ids), to_detections(frame.found)), calibration))
+        report.update(
+            observe(
+                f"drive {drive}",
+                i,
+                to_truth(frame.truth),
+                to_tracked_labels(np.asarray(frame.found.ids), to_detections(frame.found)),
+                calibration,
+            )
+        )
     return report.compute()["classes"]

@@ -44,10 +44,14 @@ class HotaCounts:
         """
         det_a = self.tp / np.maximum(1.0, self.tp + self.fn + self.fp)
         ass_a = self.associated / np.maximum(1.0, self.tp)
-        curves = {"HOTA": np.sqrt(det_a * ass_a), "DetA": det_a, "AssA": ass_a,
-                  "DetRe": self.tp / np.maximum(1.0, self.tp + self.fn),
-                  "DetPr": self.tp / np.maximum(1.0, self.tp + self.fp),
-                  "LocA": np.maximum(1e-10, self.located) / np.maximum(1e-10, self.tp)}
+        curves = {
+            "HOTA": np.sqrt(det_a * ass_a),
+            "DetA": det_a,
+            "AssA": ass_a,
+            "DetRe": self.tp / np.maximum(1.0, self.tp + self.fn),
+            "DetPr": self.tp / np.maximum(1.0, self.tp + self.fp),
+            "LocA": np.maximum(1e-10, self.located) / np.maximum(1e-10, self.tp),
+        }
         return {name: float(curve.mean()) for name, curve in curves.items()}
 
 
@@ -55,8 +59,7 @@ def count_hota(frames: list[Pairs]) -> HotaCounts:
     """Count one sequence; its frames in order, as returned by drop_ignored."""
     true_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.true_ids for f in frames)]))
     track_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.track_ids for f in frames)]))
-    indices = [(np.searchsorted(true_ids, f.true_ids), np.searchsorted(track_ids, f.track_ids))
-               for f in frames]
+    indices = [(np.searchsorted(true_ids, f.true_ids), np.searchsorted(track_ids, f.track_ids)) for f in frames]
     together = np.zeros((len(true_ids), len(track_ids)))  # summed share of each pair
     true_count, track_count = np.zeros((len(true_ids), 1)), np.zeros((1, len(track_ids)))
     for f, (i, j) in zip(frames, indices):
@@ -77,5 +80,6 @@ def count_hota(frames: list[Pairs]) -> HotaCounts:
         located += (is_match * alike).sum(axis=1)
     tp = matches.sum(axis=(1, 2))
     either = np.maximum(1.0, true_count + track_count - matches)
-    return HotaCounts(tp, true_count.sum() - tp, track_count.sum() - tp,
-                      (matches * matches / either).sum(axis=(1, 2)), located)
+    return HotaCounts(
+        tp, true_count.sum() - tp, track_count.sum() - tp, (matches * matches / either).sum(axis=(1, 2)), located
+    )

@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from lidar_perception.scoring.tracking.pairs import Pairs
 
 MIN_OVERLAP = 0.25  # IoU of a match
-STEPS = 40      # recall 1/40, 2/40, .. 1
+STEPS = 40  # recall 1/40, 2/40, .. 1
 FORBIDDEN = 1e6  # cost of a pair below MIN_OVERLAP
 
 
@@ -61,15 +61,20 @@ def score_over_recall(sequences: list[list[Pairs]]) -> dict[str, float | None]:
     matched = [[np.zeros(len(f.track_ids), bool) for f in frames] for frames in sequences]
     hits: list[float] = []
     first = _count_at_threshold(sequences, means, matched, -np.inf, 1.0, hits)
-    points = [_count_at_threshold(sequences, means, matched, threshold, recall, [])
-              for threshold, recall in _choose_thresholds(np.array(hits), first.tp + first.fn)]
+    points = [
+        _count_at_threshold(sequences, means, matched, threshold, recall, [])
+        for threshold, recall in _choose_thresholds(np.array(hits), first.tp + first.fn)
+    ]
     best = max(points, key=lambda p: p.mota, default=None)
     if best is None or best.mota <= 0:
         best = None
-    return {"sAMOTA": sum(p.smota for p in points) / STEPS,
-            "AMOTA": sum(p.mota for p in points if p.objects) / STEPS,
-            "AMOTP": sum(p.overlap / max(p.tp, 1) for p in points) / STEPS,
-            "best_MOTA": best.mota if best else 0.0, "best_score": best.threshold if best else None}
+    return {
+        "sAMOTA": sum(p.smota for p in points) / STEPS,
+        "AMOTA": sum(p.mota for p in points if p.objects) / STEPS,
+        "AMOTP": sum(p.overlap / max(p.tp, 1) for p in points) / STEPS,
+        "best_MOTA": best.mota if best else 0.0,
+        "best_score": best.threshold if best else None,
+    }
 
 
 def _average_scores(frames: list[Pairs]) -> dict[int, float]:
@@ -93,9 +98,14 @@ def _choose_thresholds(scores: np.ndarray, objects: int) -> list[tuple[float, fl
     return chosen[1:]
 
 
-def _count_at_threshold(sequences: list[list[Pairs]], means: list[dict[int, float]],
-                        matched: list[list[np.ndarray]], threshold: float, recall: float,
-                        hits: list[float]) -> RecallPoint:
+def _count_at_threshold(
+    sequences: list[list[Pairs]],
+    means: list[dict[int, float]],
+    matched: list[list[np.ndarray]],
+    threshold: float,
+    recall: float,
+    hits: list[float],
+) -> RecallPoint:
     """Count at one threshold.
 
     The score of each hit is appended to hits. matched is updated in place: a track that matched

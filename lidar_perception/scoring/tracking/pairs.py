@@ -20,10 +20,10 @@ from lidar_perception.scoring.kitti.protocol import EPS, NEIGHBOURS, compute_ima
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 
 MAX_OCCLUSION, MAX_TRUNCATION = 2, 0  # levels of the tracking layout
-MIN_HEIGHT = 25.0          # pixels
-MAX_REGION_SHARE = 0.5     # of a box inside a DontCare region
+MIN_HEIGHT = 25.0  # pixels
+MAX_REGION_SHARE = 0.5  # of a box inside a DontCare region
 MAX_CENTRE_DISTANCE = 2.0  # metres; farther centres have the similarity 0
-MIN_SIMILARITY = 0.5       # of a match in CLEAR MOT, and with an ignored label
+MIN_SIMILARITY = 0.5  # of a match in CLEAR MOT, and with an ignored label
 
 SIMILARITIES = ("centres", "3d", "image")
 
@@ -52,12 +52,16 @@ class Pairs:
 
 def to_tracked_labels(ids: np.ndarray, detections: Detections) -> GroundTruth:
     """Convert tracks with ids (K,) to labels with track_id and score."""
-    return GroundTruth.of(detections.boxes, detections.class_ids, [
-        {"track_id": int(i), "score": float(s)} for i, s in zip(ids, detections.scores)])
+    return GroundTruth.of(
+        detections.boxes,
+        detections.class_ids,
+        [{"track_id": int(i), "score": float(s)} for i, s in zip(ids, detections.scores)],
+    )
 
 
-def make_pairs(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None,
-               similarity: str = "centres") -> dict[str, Pairs]:
+def make_pairs(
+    truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None, similarity: str = "centres"
+) -> dict[str, Pairs]:
     """Make the pairs of one frame by detected class.
 
     Args:
@@ -77,14 +81,20 @@ def make_pairs(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration
     true, found = (to_camera_objects(objects, calibration) for objects in (truth, tracks))
     # regions without a box come last and are in .regions
     true_objects, objects = true.take(np.arange(len(truth))), found.take(np.arange(len(tracks)))
-    ignored = np.array([extra.get("occluded", 0) > MAX_OCCLUSION or round(
-        extra.get("truncated", 0)) > MAX_TRUNCATION for extra in truth.extras], bool)
+    ignored = np.array(
+        [
+            extra.get("occluded", 0) > MAX_OCCLUSION or round(extra.get("truncated", 0)) > MAX_TRUNCATION
+            for extra in truth.extras
+        ],
+        bool,
+    )
     ignored |= true_objects.pixels_high == 0
     in_region = compute_image_iou(objects.image_boxes, true.regions, of_first=True)
-    excused = ((objects.pixels_high <= MIN_HEIGHT + EPS)
-               | (in_region > MAX_REGION_SHARE + EPS).any(axis=1))
-    return {name: _make_class_pairs(name, true_objects, objects, true_ids, track_ids, ignored,
-                                    excused, similarity) for name in DETECTED}
+    excused = (objects.pixels_high <= MIN_HEIGHT + EPS) | (in_region > MAX_REGION_SHARE + EPS).any(axis=1)
+    return {
+        name: _make_class_pairs(name, true_objects, objects, true_ids, track_ids, ignored, excused, similarity)
+        for name in DETECTED
+    }
 
 
 def read_track_ids(objects: GroundTruth, what: str) -> np.ndarray:
@@ -96,14 +106,20 @@ def read_track_ids(objects: GroundTruth, what: str) -> np.ndarray:
     if (ids < 0).any():
         raise InputError(f"a {what} has no track id; tracking scores need one in each")
     if len(np.unique(ids)) < len(ids):
-        raise InputError(f"a frame has the {what} id "
-                         f"{np.sort(ids)[:-1][np.diff(np.sort(ids)) == 0][0]} twice")
+        raise InputError(f"a frame has the {what} id {np.sort(ids)[:-1][np.diff(np.sort(ids)) == 0][0]} twice")
     return ids
 
 
-def _make_class_pairs(name: str, true: CameraObjects, found: CameraObjects, true_ids: np.ndarray,
-                      track_ids: np.ndarray, ignored: np.ndarray, excused: np.ndarray,
-                      similarity: str) -> Pairs:
+def _make_class_pairs(
+    name: str,
+    true: CameraObjects,
+    found: CameraObjects,
+    true_ids: np.ndarray,
+    track_ids: np.ndarray,
+    ignored: np.ndarray,
+    excused: np.ndarray,
+    similarity: str,
+) -> Pairs:
     own, other = CLASSES.index(name), CLASSES.index(NEIGHBOURS.get(name, name))
     rows = np.flatnonzero(np.isin(true.class_ids, [own, other]))
     columns = np.flatnonzero(found.class_ids == own)
@@ -113,10 +129,16 @@ def _make_class_pairs(name: str, true: CameraObjects, found: CameraObjects, true
         apart = np.linalg.norm(labels.boxes[:, None, :3] - tracks.boxes[None, :, :3], axis=2)
         alike = np.maximum(1.0 - apart / MAX_CENTRE_DISTANCE, 0.0)
     else:
-        alike = overlap if similarity == "3d" else compute_image_iou(labels.image_boxes,
-                                                                     tracks.image_boxes)
-    return Pairs(true_ids[rows], ignored[rows] | (labels.class_ids != own), track_ids[columns],
-                 tracks.scores, excused[columns], alike, overlap)
+        alike = overlap if similarity == "3d" else compute_image_iou(labels.image_boxes, tracks.image_boxes)
+    return Pairs(
+        true_ids[rows],
+        ignored[rows] | (labels.class_ids != own),
+        track_ids[columns],
+        tracks.scores,
+        excused[columns],
+        alike,
+        overlap,
+    )
 
 
 def drop_ignored(pairs: Pairs) -> Pairs:
@@ -124,16 +146,21 @@ def drop_ignored(pairs: Pairs) -> Pairs:
 
     Ignored labels, tracks matched to them, and excused tracks that match nothing are dropped.
     """
-    rows, columns = find_best_pairs(np.where(pairs.similarity < MIN_SIMILARITY - EPS, 0.0,
-                                             pairs.similarity))
+    rows, columns = find_best_pairs(np.where(pairs.similarity < MIN_SIMILARITY - EPS, 0.0, pairs.similarity))
     dropped = pairs.excused.copy()
     dropped[columns] = pairs.ignored[rows]
     labels, tracks = np.flatnonzero(~pairs.ignored), np.flatnonzero(~dropped)
     both = np.ix_(labels, tracks)
-    return replace(pairs, true_ids=pairs.true_ids[labels], ignored=pairs.ignored[labels],
-                   track_ids=pairs.track_ids[tracks], scores=pairs.scores[tracks],
-                   excused=pairs.excused[tracks], similarity=pairs.similarity[both],
-                   overlap=pairs.overlap[both])
+    return replace(
+        pairs,
+        true_ids=pairs.true_ids[labels],
+        ignored=pairs.ignored[labels],
+        track_ids=pairs.track_ids[tracks],
+        scores=pairs.scores[tracks],
+        excused=pairs.excused[tracks],
+        similarity=pairs.similarity[both],
+        overlap=pairs.overlap[both],
+    )
 
 
 def find_best_pairs(gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

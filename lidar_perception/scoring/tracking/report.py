@@ -12,13 +12,7 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.tracking.clear import ClearCounts, count_clear
 from lidar_perception.scoring.tracking.hota import HotaCounts, count_hota
 from lidar_perception.scoring.tracking.over_recall import score_over_recall
-from lidar_perception.scoring.tracking.pairs import (
-    Pairs,
-    drop_ignored,
-    make_pairs,
-    read_track_ids,
-    to_tracked_labels,
-)
+from lidar_perception.scoring.tracking.pairs import Pairs, drop_ignored, make_pairs, read_track_ids, to_tracked_labels
 from lidar_perception.tracking.drive_tracker import DriveTracker
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import GroundTruth, InputError
@@ -37,8 +31,14 @@ class Observation:
     has_pose: bool = True
 
 
-def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
-            calibration: Calibration | None = None, similarity: str = "centres") -> Observation:
+def observe(
+    sequence: str,
+    index: int,
+    truth: GroundTruth,
+    tracks: GroundTruth,
+    calibration: Calibration | None = None,
+    similarity: str = "centres",
+) -> Observation:
     """Make the Observation of a frame; see make_pairs.
 
     Raises InputError that names the sequence and frame if it cannot be scored.
@@ -49,8 +49,9 @@ def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
         raise InputError(f"{sequence}/{index}: {error}") from None
 
 
-def measure_tracking(open_: Callable[[], Detector], params: TrackingParams, ego: str,
-                     recording: Recording) -> Callable[[Frame], Observation | None]:
+def measure_tracking(
+    open_: Callable[[], Detector], params: TrackingParams, ego: str, recording: Recording
+) -> Callable[[Frame], Observation | None]:
     """Make a function that tracks the detections of open_(), see DriveTracker.
 
     Frames must be measured in order of time, in one process. partial(measure_tracking, open_,
@@ -68,8 +69,10 @@ def measure_tracking(open_: Callable[[], Detector], params: TrackingParams, ego:
         if truth is None:
             return None
         found = to_tracked_labels(tracks.ids, tracks.detections)
-        return replace(observe(tracker.drive, frame.index, truth, found, frame.calibration()),
-                       has_pose=tracker.has_pose)
+        return replace(
+            observe(tracker.drive, frame.index, truth, found, frame.calibration()), has_pose=tracker.has_pose
+        )
+
     return measure
 
 
@@ -93,13 +96,17 @@ class TrackingReport:
         Scores are 0..1. A class without labels and tracks is None.
         """
         names = sorted({sequence for sequence, _ in self.frames})
-        ordered = {name: [self.frames[key] for key in sorted(self.frames) if key[0] == name]
-                   for name in names}
-        return {"frames": len(self.frames), "without_pose": len(self.without_pose),
-                "sequences": len(names), "skipped": self.skipped,
-                "classes": {name: _score_class([[frame[name] for frame in frames]
-                                                for frames in ordered.values()])
-                            for name in DETECTED}}
+        ordered = {name: [self.frames[key] for key in sorted(self.frames) if key[0] == name] for name in names}
+        return {
+            "frames": len(self.frames),
+            "without_pose": len(self.without_pose),
+            "sequences": len(names),
+            "skipped": self.skipped,
+            "classes": {
+                name: _score_class([[frame[name] for frame in frames] for frames in ordered.values()])
+                for name in DETECTED
+            },
+        }
 
 
 def _score_class(sequences: list[list[Pairs]]) -> dict | None:
@@ -109,16 +116,24 @@ def _score_class(sequences: list[list[Pairs]]) -> dict | None:
         hota, clear = hota + count_hota(frames), clear + count_clear(frames)
     if clear.tp + clear.fn + clear.fp == 0:
         return None
-    return {**hota.compute_scores(), **clear.compute_scores(), **score_over_recall(sequences),
-            "labels": clear.tp + clear.fn, "boxes": clear.tp + clear.fp,
-            "true_tracks": _count_tracks(counted, "true_ids"),
-            "tracks": _count_tracks(counted, "track_ids"),
-            "hits": clear.tp, "misses": clear.fn, "false": clear.fp,
-            "switches": clear.switches, "fragments": clear.fragments,
-            "mostly_tracked": clear.mostly_tracked, "partly_tracked": clear.partly_tracked,
-            "mostly_lost": clear.mostly_lost}
+    return {
+        **hota.compute_scores(),
+        **clear.compute_scores(),
+        **score_over_recall(sequences),
+        "labels": clear.tp + clear.fn,
+        "boxes": clear.tp + clear.fp,
+        "true_tracks": _count_tracks(counted, "true_ids"),
+        "tracks": _count_tracks(counted, "track_ids"),
+        "hits": clear.tp,
+        "misses": clear.fn,
+        "false": clear.fp,
+        "switches": clear.switches,
+        "fragments": clear.fragments,
+        "mostly_tracked": clear.mostly_tracked,
+        "partly_tracked": clear.partly_tracked,
+        "mostly_lost": clear.mostly_lost,
+    }
 
 
 def _count_tracks(sequences: list[list[Pairs]], name: str) -> int:
-    return sum(len({i for f in frames for i in getattr(f, name).tolist()})
-               for frames in sequences)
+    return sum(len({i for f in frames for i in getattr(f, name).tolist()}) for frames in sequences)

@@ -13,20 +13,20 @@ from lidar_perception.sensor_setup.measurement.scans import Scan
 
 MIN_BEAM_POINTS = 30  # of a beam in a scan that is fitted
 MAX_BEAMS = 300
-BIN = 0.02            # degrees, of the histogram of elevations
-MIN_RANGE_M = 2.0     # at shorter range, small offsets of a beam change its elevation much
+BIN = 0.02  # degrees, of the histogram of elevations
+MIN_RANGE_M = 2.0  # at shorter range, small offsets of a beam change its elevation much
 # Largest scatter of the points of one beam about it in degrees, the median of the beams, if beams
 # are identified by the ring column, the order of the points, or the elevation.
 MAX_SPREAD = {"ring": 3.0, "order": 0.12, "elevation": 0.01}
 MIN_PEAK_SHARE = 0.75  # of the points in the inner half of the space between peaks
 MIN_USUAL_SHARE = 0.2  # of the scans with a number of beams that counts
-SECTORS = 72          # of a turn
+SECTORS = 72  # of a turn
 MAX_LIFT_ERROR_M = 0.01
-MIN_LIFT_M = 0.03     # beams that start nearer to each other start at one point
-MAX_LIFT_M = 0.5      # more than the height of a sensor
+MIN_LIFT_M = 0.03  # beams that start nearer to each other start at one point
+MAX_LIFT_M = 0.5  # more than the height of a sensor
 ANGLE_RESOLUTION = 1e-3  # degrees
-MAX_GAP_STEPS = 3.5   # of a gap whose lost returns are counted
-PIECE_POINTS = 9      # neighbouring returns that a parabola is fitted to
+MAX_GAP_STEPS = 3.5  # of a gap whose lost returns are counted
+PIECE_POINTS = 9  # neighbouring returns that a parabola is fitted to
 
 
 class Beams(NamedTuple):
@@ -57,8 +57,7 @@ def find_beams(scans: Sequence[Scan]) -> Beams | None:
         The beams; None if none are found, for example with a non-repeating scan pattern, or if the
         frame is rotated relative to the sensor.
     """
-    for method, label in (("ring", _label_by_ring), ("order", _label_by_order),
-                          ("elevation", _label_by_elevation)):
+    for method, label in (("ring", _label_by_ring), ("order", _label_by_order), ("elevation", _label_by_elevation)):
         labels = label(scans)
         if labels is None:
             continue
@@ -90,13 +89,11 @@ def _label_by_order(scans: Sequence[Scan]) -> list[np.ndarray] | None:
             forward = step if np.median(step) >= 0 else -step
             starts = forward < -30.0  # back to the start of a turn
             count = int(starts.sum()) + 1
-            if not 4 <= count <= MAX_BEAMS or len(azimuth) / count < MIN_BEAM_POINTS or (
-                    (forward < 0).mean() > 0.1):
+            if not 4 <= count <= MAX_BEAMS or len(azimuth) / count < MIN_BEAM_POINTS or ((forward < 0).mean() > 0.1):
                 continue
             label = np.concatenate([[0], np.cumsum(starts)])
             parts = np.split(scan.elevation, np.flatnonzero(starts) + 1)
-            spread = float(np.median([_mad(part) for part in parts[::4]
-                                      if len(part) >= MIN_BEAM_POINTS] or [np.inf]))
+            spread = float(np.median([_mad(part) for part in parts[::4] if len(part) >= MIN_BEAM_POINTS] or [np.inf]))
             if best is None or spread < best[0]:
                 best = spread, label
         if best is None:
@@ -162,9 +159,13 @@ def _fit_beams(scans: Sequence[Scan], labels: list[np.ndarray], method: str) -> 
                 own = order[i:j]
                 far = scan.ground_range[own] > MIN_RANGE_M
                 own = own[far] if far.sum() >= MIN_BEAM_POINTS else own
-                rows[k].append(_Points(scan.ground_range[own], scan.xyz[own, 2],
-                                       number * SECTORS + (scan.azimuth[own] * (SECTORS / 360)
-                                                           ).astype(int) % SECTORS))
+                rows[k].append(
+                    _Points(
+                        scan.ground_range[own],
+                        scan.xyz[own, 2],
+                        number * SECTORS + (scan.azimuth[own] * (SECTORS / 360)).astype(int) % SECTORS,
+                    )
+                )
     known = [k for k, row in enumerate(rows) if row]
     if len(known) < 2:
         return None
@@ -187,8 +188,7 @@ def _fit_beams(scans: Sequence[Scan], labels: list[np.ndarray], method: str) -> 
     keep = down[np.unique(rank[down], return_index=True)[1]]
     table = np.full(int(names.max()) + 2, -1)
     table[names[known]] = rank
-    return Beams(elevations[keep], lifts[keep], spread[keep], error[keep],
-                 [table[label] for label in labels], method)
+    return Beams(elevations[keep], lifts[keep], spread[keep], error[keep], [table[label] for label in labels], method)
 
 
 def _fit_lifts(beams: list[_Points]) -> tuple[np.ndarray, np.ndarray]:
@@ -215,8 +215,7 @@ def _fit_lifts(beams: list[_Points]) -> tuple[np.ndarray, np.ndarray]:
         reach = float(np.subtract(*np.percentile(weight, [90, 10])))
         scatter = 1.4826 * float(np.median(off))
         # Returns of one sector are similar and count as one.
-        sure[n] = reach > 0.04 and scatter / reach / np.sqrt(
-            len(np.unique(beam.sector))) < MAX_LIFT_ERROR_M
+        sure[n] = reach > 0.04 and scatter / reach / np.sqrt(len(np.unique(beam.sector))) < MAX_LIFT_ERROR_M
     if not sure.any() or np.median(np.abs(lift[sure])) < MIN_LIFT_M:
         return np.zeros(len(beams)), sure
     known = np.flatnonzero(sure)
@@ -276,12 +275,11 @@ def measure_range_noise(scans: Sequence[Scan], beams: Beams, step: float) -> flo
     for scan, label in zip(scans, beams.labels):
         order = np.lexsort((scan.azimuth, label))
         gaps = np.diff(scan.azimuth[order])
-        follows = (np.diff(label[order]) == 0) & (label[order][1:] >= 0) & (gaps < 1.6 * step) & (
-            gaps > 0.2 * step)
+        follows = (np.diff(label[order]) == 0) & (label[order][1:] >= 0) & (gaps < 1.6 * step) & (gaps > 0.2 * step)
         runs = np.lib.stride_tricks.sliding_window_view(follows, n - 1)[::n].all(axis=1)
         pieces = np.lib.stride_tricks.sliding_window_view(scan.range[order], n)[::n][runs]
         rest = pieces - (pieces @ basis) @ basis.T
-        found.append(np.sqrt((rest ** 2).sum(axis=1) / (n - 3)))
+        found.append(np.sqrt((rest**2).sum(axis=1) / (n - 3)))
     scatter = np.concatenate(found) if found else np.zeros(0)
     scatter = scatter[(scatter > 1e-4) & (scatter < 1.0)]
     if len(scatter) < 50:

@@ -13,25 +13,25 @@ from lidar_perception.sensor_setup.measurement.beams import Beams
 from lidar_perception.sensor_setup.measurement.mount import Mount
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-SECTORS = 360            # of a turn
-NEAR_BODY_M = 1.0        # constant returns this near are the robot's, even if it stands still
-MAX_BODY_M = 4.0         # constant returns this near are the robot's if it moves
+SECTORS = 360  # of a turn
+NEAR_BODY_M = 1.0  # constant returns this near are the robot's, even if it stands still
+MAX_BODY_M = 4.0  # constant returns this near are the robot's if it moves
 MAX_ROBOT_SIZE_M = (5.5, 2.6)  # length and width, up to a van
-MAX_BODY_SHARE = 0.3     # of all points; more are walls along the robot's path
+MAX_BODY_SHARE = 0.3  # of all points; more are walls along the robot's path
 MAX_FOREIGN_SHARE = 0.2  # of the points in the box of the robot's body
-MIN_BODY_SCANS = 0.7     # share of the scans with a return of the body
+MIN_BODY_SCANS = 0.7  # share of the scans with a return of the body
 MAX_BODY_VARIATION_M = 0.06  # of its range
 MIN_BODY_HEIGHT_M = 0.15  # above the ground
-MIN_CELLS = 20           # of sector and beam; fewer are chance
-MARGIN_M = 0.05          # around the body
-MIN_FAR_M = 4.0          # far returns show whether the robot moves:
-MIN_CHANGE_M = 0.3       # they have changed if their range differs this much between scans,
-QUANTILES = (0.1, 0.9)   # namely between these shares of the scans, since people pass by;
-MAX_STILL_SHARE = 0.3    # if less of them changed, the robot stands still
+MIN_CELLS = 20  # of sector and beam; fewer are chance
+MARGIN_M = 0.05  # around the body
+MIN_FAR_M = 4.0  # far returns show whether the robot moves:
+MIN_CHANGE_M = 0.3  # they have changed if their range differs this much between scans,
+QUANTILES = (0.1, 0.9)  # namely between these shares of the scans, since people pass by;
+MAX_STILL_SHARE = 0.3  # if less of them changed, the robot stands still
 MAX_GROUND_RANGE_M = 30.0  # nearer ground gives a return
-MIN_BLIND = 3            # degrees; narrower gaps are chance
-MIN_SEEN_SHARE = 0.35    # of the sectors with a return, for a beam that can show blind sectors
-ROW_STEP = 2.0           # degrees between rows if there are no beams
+MIN_BLIND = 3  # degrees; narrower gaps are chance
+MIN_SEEN_SHARE = 0.35  # of the sectors with a return, for a beam that can show blind sectors
+ROW_STEP = 2.0  # degrees between rows if there are no beams
 
 
 class Coverage(NamedTuple):
@@ -65,9 +65,11 @@ class Coverage(NamedTuple):
     @property
     def can_crop(self) -> bool:
         """True if the box can be cropped: it has no walls, and few other points or a small size."""
-        return len(self.box) > 0 and not self.has_walls and (
-            self.foreign_share <= MAX_FOREIGN_SHARE
-            or float(np.abs(self.box).max()) < NEAR_BODY_M)
+        return (
+            len(self.box) > 0
+            and not self.has_walls
+            and (self.foreign_share <= MAX_FOREIGN_SHARE or float(np.abs(self.box).max()) < NEAR_BODY_M)
+        )
 
 
 class NearestReturns(NamedTuple):
@@ -90,13 +92,13 @@ def find_nearest_returns(scans: Sequence[Scan], beams: Beams | None) -> NearestR
     ranges = np.full((len(scans), len(rows), SECTORS), np.inf, np.float32)
     for image, scan, label in zip(ranges, scans, labels):
         known = label >= 0
-        np.minimum.at(image, (label[known], _to_sectors(scan)[known]),
-                      scan.range[known].astype(np.float32))
+        np.minimum.at(image, (label[known], _to_sectors(scan)[known]), scan.range[known].astype(np.float32))
     return NearestReturns(rows, labels, ranges)
 
 
-def measure_coverage(scans: Sequence[Scan], nearest: NearestReturns, mount: Mount | None,
-                     still: bool | None) -> Coverage:
+def measure_coverage(
+    scans: Sequence[Scan], nearest: NearestReturns, mount: Mount | None, still: bool | None
+) -> Coverage:
     """Measure the coverage of all scans together.
 
     Args:
@@ -109,37 +111,52 @@ def measure_coverage(scans: Sequence[Scan], nearest: NearestReturns, mount: Moun
     own, box = _select_body(scans, labels, body, middle)
     total = sum(len(scan.xyz) for scan in scans)
     wide, long = np.sort(box[3:5] - box[:2]) if len(box) else (0.0, 0.0)
-    has_walls = bool(long > MAX_ROBOT_SIZE_M[0] or wide > MAX_ROBOT_SIZE_M[1]
-                     or sum(m.sum() for m in own) > MAX_BODY_SHARE * total)
+    has_walls = bool(
+        long > MAX_ROBOT_SIZE_M[0] or wide > MAX_ROBOT_SIZE_M[1] or sum(m.sum() for m in own) > MAX_BODY_SHARE * total
+    )
     if has_walls:
         body = _drop_small(body & (middle < NEAR_BODY_M))
         own, box = _select_body(scans, labels, body, middle)
     # Only cells that should see the ground can be blind: a tilted sensor sees the sky in others.
-    sees_ground = np.zeros(seen.shape, bool) if mount is None else (
-        _cell_directions(rows) @ mount.normal * MAX_GROUND_RANGE_M < -mount.height)
+    sees_ground = (
+        np.zeros(seen.shape, bool)
+        if mount is None
+        else (_cell_directions(rows) @ mount.normal * MAX_GROUND_RANGE_M < -mount.height)
+    )
     sees_ground |= not sees_ground.any()  # unknown, as from high above the ground
     open_ = (seen > 0).any(axis=0) | ~sees_ground.any(axis=0)
     inside = [~select_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
-    foreign = float(sum((i & ~m).sum() for i, m in zip(inside, own))
-                    / max(1, sum(i.sum() for i in inside)))
-    coverage = Coverage(rows, seen, body, box, foreign, sum(m.sum() for m in own) / max(1, total),
-                        has_walls, still, [], _find_view(open_))
+    foreign = float(sum((i & ~m).sum() for i, m in zip(inside, own)) / max(1, sum(i.sum() for i in inside)))
+    coverage = Coverage(
+        rows,
+        seen,
+        body,
+        box,
+        foreign,
+        sum(m.sum() for m in own) / max(1, total),
+        has_walls,
+        still,
+        [],
+        _find_view(open_),
+    )
     # Without motion it may be a person next to the robot.
     hiding = body & (coverage.can_crop and still is False)
-    return coverage._replace(blocked=_find_blocked(((seen == 0) & sees_ground) | hiding, open_,
-                                                   seen, hiding))
+    return coverage._replace(blocked=_find_blocked(((seen == 0) & sees_ground) | hiding, open_, seen, hiding))
 
 
-def _select_body(scans: Sequence[Scan], labels: Sequence[np.ndarray], body: np.ndarray,
-                 middle: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+def _select_body(
+    scans: Sequence[Scan], labels: Sequence[np.ndarray], body: np.ndarray, middle: np.ndarray
+) -> tuple[list[np.ndarray], np.ndarray]:
     """Select the points in cells of the body (R, 360) at the cells' ranges.
 
     Returns:
         (N,) bool for each scan, and the box (6,) around these points, empty without any.
     """
-    own = [_look_up(scan, label, body, False)
-           & (np.abs(scan.range - _look_up(scan, label, middle, 0.0)) < 3 * MAX_BODY_VARIATION_M)
-           for scan, label in zip(scans, labels)]
+    own = [
+        _look_up(scan, label, body, False)
+        & (np.abs(scan.range - _look_up(scan, label, middle, 0.0)) < 3 * MAX_BODY_VARIATION_M)
+        for scan, label in zip(scans, labels)
+    ]
     points = np.concatenate([scan.xyz[m] for scan, m in zip(scans, own)])
     if not len(points):
         return own, np.zeros(0)
@@ -152,8 +169,7 @@ def _assign_rows(scans: Sequence[Scan], beams: Beams | None) -> tuple[np.ndarray
     if beams is not None:
         return beams.elevations, beams.labels
     rows = np.arange(90.0 - ROW_STEP / 2, -90.0, -ROW_STEP)
-    return rows, [np.clip(((90.0 - scan.elevation) / ROW_STEP).astype(int), 0, len(rows) - 1)
-                  for scan in scans]
+    return rows, [np.clip(((90.0 - scan.elevation) / ROW_STEP).astype(int), 0, len(rows) - 1) for scan in scans]
 
 
 def _to_sectors(scan: Scan) -> np.ndarray:
@@ -179,16 +195,18 @@ def is_standing_still(ranges: np.ndarray) -> bool | None:
     count = np.isfinite(ranges).sum(axis=0)
     frequent = count >= max(2, 0.6 * len(ranges))
     ordered, last = np.sort(ranges[:, frequent], axis=0), count[frequent] - 1
-    first, last = (np.take_along_axis(ordered, np.round(share * last).astype(int)[None], axis=0)[0]
-                   for share in QUANTILES)
+    first, last = (
+        np.take_along_axis(ordered, np.round(share * last).astype(int)[None], axis=0)[0] for share in QUANTILES
+    )
     far = first + last > 2 * MIN_FAR_M
     if far.sum() < 100:
         return None
     return bool(((last - first)[far] > MIN_CHANGE_M).mean() < MAX_STILL_SHARE)
 
 
-def _find_body(ranges: np.ndarray, rows: np.ndarray, mount: Mount | None,
-               still: bool | None) -> tuple[np.ndarray, np.ndarray]:
+def _find_body(
+    ranges: np.ndarray, rows: np.ndarray, mount: Mount | None, still: bool | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (R, 360) bool of cells with a constant near return, and the median ranges."""
     found = np.isfinite(ranges)
     share = found.mean(axis=0)
@@ -200,8 +218,7 @@ def _find_body(ranges: np.ndarray, rows: np.ndarray, mount: Mount | None,
     steady = (share >= MIN_BODY_SCANS) & (varies <= MAX_BODY_VARIATION_M) & (len(ranges) >= 3)
     if still is False and len(ranges) >= 5 and mount is not None:  # else the floor would count
         body = steady & (middle < MAX_BODY_M)
-        body &= (middle * (_cell_directions(rows) @ mount.normal) + mount.height
-                 > MIN_BODY_HEIGHT_M)
+        body &= middle * (_cell_directions(rows) @ mount.normal) + mount.height > MIN_BODY_HEIGHT_M
     else:
         body = steady & (middle < NEAR_BODY_M)
     return _drop_small(body), middle
@@ -214,18 +231,17 @@ def _drop_small(body: np.ndarray) -> np.ndarray:
 def _cell_directions(rows: np.ndarray) -> np.ndarray:
     """Return (R, 360, 3) unit vectors to the cells in the sensor's frame."""
     up, aside = np.radians(rows)[:, None], np.radians(np.arange(SECTORS) + 0.5)
-    return np.stack(np.broadcast_arrays(np.cos(up) * np.cos(aside), np.cos(up) * np.sin(aside),
-                                        np.sin(up)), axis=-1)
+    return np.stack(np.broadcast_arrays(np.cos(up) * np.cos(aside), np.cos(up) * np.sin(aside), np.sin(up)), axis=-1)
 
 
-def _find_blocked(blind: np.ndarray, open_: np.ndarray, seen: np.ndarray,
-                  body: np.ndarray) -> list[tuple[int, float, float]]:
+def _find_blocked(
+    blind: np.ndarray, open_: np.ndarray, seen: np.ndarray, body: np.ndarray
+) -> list[tuple[int, float, float]]:
     """Return sectors in which a beam and all lower ones are blind; all beams outside open_ (360,).
 
     Beams with few returns, such as those to the sky, show no blind sectors.
     """
-    informative = ((seen[:, open_] > 0).mean(axis=1) >= MIN_SEEN_SHARE if open_.any()
-                   else np.zeros(len(seen), bool))
+    informative = (seen[:, open_] > 0).mean(axis=1) >= MIN_SEEN_SHARE if open_.any() else np.zeros(len(seen), bool)
     if not informative.any():
         return []
     # The lowest informative beam that sees something in each sector, from below.
@@ -245,8 +261,7 @@ def _find_blocked(blind: np.ndarray, open_: np.ndarray, seen: np.ndarray,
     starts = np.flatnonzero(np.diff(rolled, prepend=-1) != 0)
     for start, end in zip(starts, [*starts[1:], SECTORS]):
         if rolled[start] < len(blind) and end - start >= MIN_BLIND:
-            out.append((int(rolled[start]), float((start + turn) % 360),
-                        float((end + turn - 1) % 360 + 1)))
+            out.append((int(rolled[start]), float((start + turn) % 360), float((end + turn - 1) % 360 + 1)))
     return sorted(out)
 
 

@@ -11,12 +11,7 @@ import numpy as np
 from lidar_perception.robot.crop import select_points
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.poses import invert_pose, transform_points
-from lidar_perception.sensor_setup.measurement.beams import (
-    Beams,
-    find_beams,
-    measure_azimuth_step,
-    measure_range_noise,
-)
+from lidar_perception.sensor_setup.measurement.beams import Beams, find_beams, measure_azimuth_step, measure_range_noise
 from lidar_perception.sensor_setup.measurement.coverage import (
     Coverage,
     find_nearest_returns,
@@ -34,12 +29,7 @@ from lidar_perception.sensor_setup.measurement.motion import (
 )
 from lidar_perception.sensor_setup.measurement.mount import Mount, is_on_ground, measure_mount
 from lidar_perception.sensor_setup.measurement.recorded_poses import NO_POSES, RecordedPoses
-from lidar_perception.sensor_setup.measurement.scans import (
-    IntensityScale,
-    Scan,
-    measure_intensity,
-    require_3d,
-)
+from lidar_perception.sensor_setup.measurement.scans import IntensityScale, Scan, measure_intensity, require_3d
 from lidar_perception.sensor_setup.measurement.timing import Timing, measure_timing
 from lidar_perception.simulation.sensor import SENSOR_NAMES, find_sensor
 from lidar_perception.types import InputError
@@ -48,10 +38,10 @@ MAX_MODEL_ERROR = 0.15  # degrees between the beams of sensors of one model, the
 # The same for a different number of beams, as a share of the model's beam distance. Beams of any
 # sensor are a quarter of it from the nearest beam.
 MAX_PARTIAL_ERROR = 1 / 6
-MIN_SCANS = 5        # fewer cannot separate the robot from its surroundings
+MIN_SCANS = 5  # fewer cannot separate the robot from its surroundings
 MIN_OUTDOOR_RANGE_M = 30.0  # if nothing is farther, the room limits the range and not the sensor
 MAX_OWN_SPREAD = 0.01  # degrees between points of a beam, beyond which they have been moved
-MIN_MOTION_M = 0.1   # a robot that moved less stands still
+MIN_MOTION_M = 0.1  # a robot that moved less stands still
 MIN_POSE_MOTION_M = 2.0  # by its poses, which drift while it stands
 PEOPLE_ELEVATIONS = (-15.0, 5.0)  # degrees of the beams that hit people
 
@@ -159,9 +149,15 @@ class SensorMeasurement:
         return float(np.median(steps)) if len(steps) else np.nan
 
 
-def measure_sensor(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: int,
-                   stamps_ns: np.ndarray | None, recorded: RecordedPoses = NO_POSES,
-                   height_hint: float | None = None) -> SensorMeasurement:
+def measure_sensor(
+    scans: Sequence[Scan],
+    numbers: Sequence[int],
+    source: str,
+    total: int,
+    stamps_ns: np.ndarray | None,
+    recorded: RecordedPoses = NO_POSES,
+    height_hint: float | None = None,
+) -> SensorMeasurement:
     """Measure a sensor and its mounting.
 
     Args:
@@ -176,8 +172,10 @@ def measure_sensor(scans: Sequence[Scan], numbers: Sequence[int], source: str, t
         InputError: The clouds are of several drivers, or of a 2D scanner.
     """
     if len({scan.columns for scan in scans}) > 1:
-        raise InputError(f"{source} has clouds of several layouts ({', '.join(scans[0].columns)} "
-                         "and others), as of several sensors; give those of one")
+        raise InputError(
+            f"{source} has clouds of several layouts ({', '.join(scans[0].columns)} "
+            "and others), as of several sensors; give those of one"
+        )
     require_3d(np.concatenate([scan.elevation for scan in scans]), source)
     pattern = _measure_pattern(scans)
     mount = measure_mount(scans)
@@ -186,15 +184,18 @@ def measure_sensor(scans: Sequence[Scan], numbers: Sequence[int], source: str, t
     still = False if recorded.distance >= MIN_POSE_MOTION_M else is_standing_still(nearest.ranges)
     heading = _find_heading(scans, numbers, mount, still, recorded)
     # People and doors change the surroundings of a standing robot.
-    still = True if len(scans) > 1 and _measure_distance(
-        scans, mount, heading, recorded) < MIN_MOTION_M else still
+    still = True if len(scans) > 1 and _measure_distance(scans, mount, heading, recorded) < MIN_MOTION_M else still
     view = _measure_view(scans, measure_coverage(scans, nearest, mount, still))
     # Level beams of the sensor itself are in a plane through its origin, too.
     may_be_on_ground = mount is None and (pattern.beams is None or pattern.is_moved)
     return SensorMeasurement(
-        CloudSource(source, tuple(scans), total), pattern, measure_intensity(scans), view,
+        CloudSource(source, tuple(scans), total),
+        pattern,
+        measure_intensity(scans),
+        view,
         Mounting(mount, may_be_on_ground and is_on_ground(scans), heading, recorded, height_hint),
-        measure_timing(scans, stamps_ns))
+        measure_timing(scans, stamps_ns),
+    )
 
 
 def _measure_pattern(scans: Sequence[Scan]) -> ScanPattern:
@@ -208,14 +209,19 @@ def _measure_pattern(scans: Sequence[Scan]) -> ScanPattern:
 
 def _measure_view(scans: Sequence[Scan], coverage: Coverage) -> View:
     ranges = np.concatenate([s.range for s in scans])
-    outside = ranges[select_points(np.concatenate([s.xyz for s in scans]), CropParams(
-        body=tuple(coverage.box.tolist()) if coverage.can_crop else ()))]
+    outside = ranges[
+        select_points(
+            np.concatenate([s.xyz for s in scans]),
+            CropParams(body=tuple(coverage.box.tolist()) if coverage.can_crop else ()),
+        )
+    ]
     low, high = np.percentile(outside if len(outside) else ranges, [0.02, 99.995])
     return View(coverage, float(low), float(high))
 
 
-def _find_heading(scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None,
-                  still: bool | None, recorded: RecordedPoses) -> Heading | None:
+def _find_heading(
+    scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None, still: bool | None, recorded: RecordedPoses
+) -> Heading | None:
     if mount is None:
         return None
     shifts = find_shifts(draw_images(_level_scans(scans, mount), moves=still is False), numbers)
@@ -231,8 +237,9 @@ def _level_scans(scans: Sequence[Scan], mount: Mount) -> list[np.ndarray]:
     return [transform_points(scan.xyz, mount.pose) for scan in scans]
 
 
-def _measure_distance(scans: Sequence[Scan], mount: Mount | None, heading: Heading | None,
-                      recorded: RecordedPoses) -> float:
+def _measure_distance(
+    scans: Sequence[Scan], mount: Mount | None, heading: Heading | None, recorded: RecordedPoses
+) -> float:
     """Return the distance that the robot covered in metres, NaN if unclear.
 
     It comes from the poses, else from clouds near each other and from the first and the last one,
@@ -256,14 +263,13 @@ def match_model(beams: Beams | None) -> str:
         return best
     for name in SENSOR_NAMES:
         elevations = np.degrees(find_sensor(name).elevations)
-        if find_sensor(name).wander or not (
-                0.75 <= len(beams.elevations) / len(elevations) <= 1.05):
+        if find_sensor(name).wander or not (0.75 <= len(beams.elevations) / len(elevations) <= 1.05):
             continue
         is_complete = len(beams.elevations) == len(elevations)
-        difference = np.abs(beams.elevations - elevations if is_complete else
-                            np.abs(beams.elevations[:, None] - elevations).min(axis=1))
-        limit = error if is_complete else min(
-            error, MAX_PARTIAL_ERROR * float(np.median(-np.diff(elevations))))
+        difference = np.abs(
+            beams.elevations - elevations if is_complete else np.abs(beams.elevations[:, None] - elevations).min(axis=1)
+        )
+        limit = error if is_complete else min(error, MAX_PARTIAL_ERROR * float(np.median(-np.diff(elevations))))
         if np.median(difference) < limit and np.percentile(difference, 90) < 5 * MAX_MODEL_ERROR:
             best, error = name, float(np.median(difference))
     return best

@@ -12,17 +12,17 @@ from lidar_perception.geometry import wrap_angle
 
 CELL_M, HALF_SIZE_M = 0.2, 40.0  # of the images from above
 LOW_M, HIGH_M = 0.3, 3.0  # heights above the ground of points that are drawn
-MIN_SHIFT_M = 0.3         # smaller shifts show no direction
-MIN_PEAK_RATIO = 1.2      # of a clear peak to the rest of the correlation
-PEAK_HALF_SIZE = 5        # cells around a peak that do not count as the rest
+MIN_SHIFT_M = 0.3  # smaller shifts show no direction
+MIN_PEAK_RATIO = 1.2  # of a clear peak to the rest of the correlation
+PEAK_HALF_SIZE = 5  # cells around a peak that do not count as the rest
 # Cells occupied in this share of the scans move with the robot, as lines of a beam on a straight
 # wall do. Only with this many scans.
 LOCKED_SHARE, MIN_LOCKED_SCANS = 0.7, 5
-GAPS = (1, 2, 4, 8, 16)   # from a cloud to the one that it is compared with
-MIN_AGREEMENT = 0.8       # length of the mean direction, 0 .. 1
-MAX_STRAIGHT_TURN = 5.0   # degrees between scans; in turns, a sensor off the origin moves sideways
-MIN_ERROR = 7.0           # degrees: surroundings may mislead all pairs of one place, as walls do
-MAX_OFF_AXIS = 10.0       # degrees between x and the heading, beyond twice the error
+GAPS = (1, 2, 4, 8, 16)  # from a cloud to the one that it is compared with
+MIN_AGREEMENT = 0.8  # length of the mean direction, 0 .. 1
+MAX_STRAIGHT_TURN = 5.0  # degrees between scans; in turns, a sensor off the origin moves sideways
+MIN_ERROR = 7.0  # degrees: surroundings may mislead all pairs of one place, as walls do
+MAX_OFF_AXIS = 10.0  # degrees between x and the heading, beyond twice the error
 
 
 class Shift(NamedTuple):
@@ -93,8 +93,7 @@ def find_shift(before: np.ndarray, after: np.ndarray) -> Shift | None:
     rest[np.ix_(rows, columns)] = 0.0
     if peak <= 0 or peak < MIN_PEAK_RATIO * rest.max():
         return None
-    x, y = ((int(b) + size // 2) % size - size // 2 + _refine_peak(match, best, axis)
-            for axis, b in enumerate(best))
+    x, y = ((int(b) + size // 2) % size - size // 2 + _refine_peak(match, best, axis) for axis, b in enumerate(best))
     return Shift(x * CELL_M, y * CELL_M)
 
 
@@ -119,8 +118,7 @@ def draw_images(scans: Sequence[np.ndarray], moves: bool) -> np.ndarray:
     """
     images = np.zeros((len(scans), *[int(2 * HALF_SIZE_M / CELL_M)] * 2), np.float32)
     for image, xyz in zip(images, scans):
-        drawn = (xyz[:, 2] > LOW_M) & (xyz[:, 2] < HIGH_M) & (
-            np.abs(xyz[:, :2]) < HALF_SIZE_M).all(axis=1)
+        drawn = (xyz[:, 2] > LOW_M) & (xyz[:, 2] < HIGH_M) & (np.abs(xyz[:, :2]) < HALF_SIZE_M).all(axis=1)
         cells = ((xyz[drawn, :2] + HALF_SIZE_M) / CELL_M).astype(int)
         image[cells[:, 0], cells[:, 1]] = 1.0
     if moves and len(scans) >= MIN_LOCKED_SCANS:
@@ -161,10 +159,13 @@ def compute_shifts(poses: Mapping[int, np.ndarray], pairs: Shifts) -> Shifts:
     Returns:
         Shifts, None if the base turned by more than MAX_STRAIGHT_TURN.
     """
-    steps = {pair: np.linalg.solve(poses[pair[0]], poses[pair[1]]) for pair in pairs
-             if set(pair) <= poses.keys()}
-    return {pair: Shift(*map(float, step[:2, 3])) if abs(np.degrees(np.arctan2(
-        step[1, 0], step[0, 0]))) <= MAX_STRAIGHT_TURN else None for pair, step in steps.items()}
+    steps = {pair: np.linalg.solve(poses[pair[0]], poses[pair[1]]) for pair in pairs if set(pair) <= poses.keys()}
+    return {
+        pair: Shift(*map(float, step[:2, 3]))
+        if abs(np.degrees(np.arctan2(step[1, 0], step[0, 0]))) <= MAX_STRAIGHT_TURN
+        else None
+        for pair, step in steps.items()
+    }
 
 
 def estimate_heading(shifts: Shifts, base: Shifts) -> Heading:
@@ -176,26 +177,35 @@ def estimate_heading(shifts: Shifts, base: Shifts) -> Heading:
             them, the heading is the direction of the base's x axis.
     """
     every = np.array([complex(*shift) for shift in shifts.values() if shift is not None])
-    far = {pair: complex(*shift) for pair, shift in shifts.items()
-           if shift is not None and np.hypot(*shift) >= MIN_SHIFT_M}
+    far = {
+        pair: complex(*shift) for pair, shift in shifts.items() if shift is not None and np.hypot(*shift) >= MIN_SHIFT_M
+    }
     distance = float(np.abs(every).max(initial=0.0))
     if not far and 2 * len(every) <= len(shifts):
-        return Heading(np.nan, np.nan, np.nan, "the surroundings have too few features, or too "
-                       "similar ones, to see how the robot moved")
+        return Heading(
+            np.nan,
+            np.nan,
+            np.nan,
+            "the surroundings have too few features, or too similar ones, to see how the robot moved",
+        )
     if not far:
-        return Heading(np.nan, np.nan, distance, f"the robot moved only {distance:.1f} m "
-                       "between the clouds that were compared")
-    by_base = {pair: far[pair] / complex(*step) for pair, step in base.items()
-               if pair in far and step is not None and np.hypot(*step) >= MIN_SHIFT_M / 2}
+        return Heading(
+            np.nan, np.nan, distance, f"the robot moved only {distance:.1f} m between the clouds that were compared"
+        )
+    by_base = {
+        pair: far[pair] / complex(*step)
+        for pair, step in base.items()
+        if pair in far and step is not None and np.hypot(*step) >= MIN_SHIFT_M / 2
+    }
     turns = np.array(list((by_base or far).values()))
     mean = complex((turns / np.abs(turns)).mean())
     agreement = min(abs(mean), 1.0)
     if agreement < MIN_AGREEMENT:
-        problem = ("the motion in the clouds and in the odometry does not agree" if by_base else
-                   f"the robot turned, or drove to and fro: {len(turns)} shifts have different "
-                   "directions")
+        problem = (
+            "the motion in the clouds and in the odometry does not agree"
+            if by_base
+            else f"the robot turned, or drove to and fro: {len(turns)} shifts have different directions"
+        )
         return Heading(np.nan, np.nan, distance, problem, bool(by_base))
-    error = max(float(np.degrees(np.sqrt(-2 * np.log(agreement)) / np.sqrt(len(turns)))),
-                MIN_ERROR)
-    return Heading(float(np.degrees(np.angle(mean))), error, distance, "",
-                   bool(by_base))
+    error = max(float(np.degrees(np.sqrt(-2 * np.log(agreement)) / np.sqrt(len(turns)))), MIN_ERROR)
+    return Heading(float(np.degrees(np.angle(mean))), error, distance, "", bool(by_base))

@@ -15,18 +15,18 @@ from lidar_perception.sensor_setup.measurement.scans import Scan
 
 # The largest tilt of a sensor against the ground; beyond, its frame is another one.
 STEEP = ThresholdParams(max_slope=45.0, inlier_distance=0.08)
-MIN_DISTANCE_M = 0.3        # of ground, beyond the robot
-REACH_RATIO = 2.5           # ground is fitted up to this many times the distance of its nearest
+MIN_DISTANCE_M = 0.3  # of ground, beyond the robot
+REACH_RATIO = 2.5  # ground is fitted up to this many times the distance of its nearest
 MIN_REACH_M, MAX_REACH_M = 5.0, 25.0  # part, within these limits
-MIN_SHARE = 0.12            # of the low points there that are on the plane
+MIN_SHARE = 0.12  # of the low points there that are on the plane
 MIN_POINTS = 60
-INLIER_DISTANCE_M = 0.05    # of the points that the final plane is fitted to
+INLIER_DISTANCE_M = 0.05  # of the points that the final plane is fitted to
 MIN_DEPTH_M, MAX_BEYOND_SHARE = 0.3, 0.25  # points this far below, as a share of those on it
-SECTORS = 6                 # of a scan, each of which is left out once to estimate the error
-MIN_HEIGHT_M = 0.1          # a nearer surface is what the sensor stands on
-UPSIDE_DOWN_RATIO = 8.0     # of points overhead to those below: a floor overhead, not a ceiling
-MIN_EXTENT_M = 1.5          # of the plane
-LOWERED_M = 1.0             # clouds are lowered by this to find a floor at their origin
+SECTORS = 6  # of a scan, each of which is left out once to estimate the error
+MIN_HEIGHT_M = 0.1  # a nearer surface is what the sensor stands on
+UPSIDE_DOWN_RATIO = 8.0  # of points overhead to those below: a floor overhead, not a ceiling
+MIN_EXTENT_M = 1.5  # of the plane
+LOWERED_M = 1.0  # clouds are lowered by this to find a floor at their origin
 
 
 class Plane(NamedTuple):
@@ -127,9 +127,12 @@ def find_ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:
     on = around & (np.abs(off) <= INLIER_DISTANCE_M)
     beyond = around & ((off < -MIN_DEPTH_M) if below else (off > MIN_DEPTH_M))  # below a table
     share = on.sum() / max(1, (around & ((off if below else -off) < 1.0)).sum())
-    if on.sum() < MIN_POINTS or share < MIN_SHARE or (
-            beyond.sum() > MAX_BEYOND_SHARE * on.sum()) or (
-            np.percentile(distance[on], 90) < MIN_EXTENT_M):
+    if (
+        on.sum() < MIN_POINTS
+        or share < MIN_SHARE
+        or (beyond.sum() > MAX_BEYOND_SHARE * on.sum())
+        or (np.percentile(distance[on], 90) < MIN_EXTENT_M)
+    ):
         return None
     error = _estimate_error(xyz[on])
     normal = _compute_normal(plane, below)
@@ -137,14 +140,13 @@ def find_ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:
 
 
 def _compute_normal(plane: np.ndarray, below: bool) -> np.ndarray:
-    normal = np.array([-plane[0], -plane[1], 1.0]) / np.sqrt(plane[0]**2 + plane[1]**2 + 1.0)
+    normal = np.array([-plane[0], -plane[1], 1.0]) / np.sqrt(plane[0] ** 2 + plane[1] ** 2 + 1.0)
     return normal if below else -normal
 
 
 def _thin_by_cells(xyz: np.ndarray, cell: float = 0.25) -> np.ndarray:
     """Return one point of each cell, since near ground has many points."""
-    _, first = np.unique(np.floor(xyz / cell).astype(np.int64) @ [1 << 40, 1 << 20, 1],
-                         return_index=True)
+    _, first = np.unique(np.floor(xyz / cell).astype(np.int64) @ [1 << 40, 1 << 20, 1], return_index=True)
     return xyz[np.sort(first)]
 
 
@@ -176,8 +178,7 @@ def _estimate_error(xyz: np.ndarray) -> np.ndarray:
 def is_on_ground(scans: Sequence[Scan]) -> bool:
     """Return True if the ground contains the origin of most scans, as in base_footprint."""
     planes = [find_ground_plane(scan.xyz - [0.0, 0.0, LOWERED_M], True) for scan in scans]
-    return 2 * sum(p is not None and abs(p.height - LOWERED_M) < MIN_HEIGHT_M
-                   for p in planes) > len(planes)
+    return 2 * sum(p is not None and abs(p.height - LOWERED_M) < MIN_HEIGHT_M for p in planes) > len(planes)
 
 
 def _median_points(planes: Sequence[Plane | None]) -> float:
@@ -197,18 +198,17 @@ def measure_mount(scans: Sequence[Scan]) -> Mount | None:
     below, above = ([find_ground_plane(scan.xyz, down) for scan in scans] for down in (True, False))
     under, over = (sum(p is not None for p in planes) for planes in (below, above))
     upside_down = over > 2 * under or (
-        over >= under and _median_points(above) > UPSIDE_DOWN_RATIO * _median_points(below))
+        over >= under and _median_points(above) > UPSIDE_DOWN_RATIO * _median_points(below)
+    )
     planes = above if upside_down else below
     found = [p for p in planes if p is not None]
     if len(found) * 2 < len(scans) or not found:
         return None
-    rows = np.array([[p.height, np.unwrap([np.pi if upside_down else 0.0, p.roll])[1], p.pitch]
-                     for p in found])
+    rows = np.array([[p.height, np.unwrap([np.pi if upside_down else 0.0, p.roll])[1], p.pitch] for p in found])
     middle = np.median(rows, axis=0)
     spread = 1.4826 * np.median(np.abs(rows - middle), axis=0)
     own = np.median([p.error for p in found], axis=0)
     # In one place the error is that of a scan; in many places it is that of their agreement.
     error = np.maximum(1.2533 * spread / np.sqrt(len(found)), own / np.sqrt(len(found)))
     roll = (middle[1] + np.pi) % (2 * np.pi) - np.pi
-    return Mount(float(middle[0]), float(roll), float(middle[2]), error, spread, list(planes),
-                 upside_down)
+    return Mount(float(middle[0]), float(roll), float(middle[2]), error, spread, list(planes), upside_down)

@@ -51,21 +51,18 @@ class RecordedPoses(NamedTuple):
     @property
     def heading(self) -> float:
         """Angle from x of the levelled sensor to x of the base in degrees; NaN if unknown."""
-        return np.nan if self.mount is None else float(
-            -np.degrees(np.arctan2(self.mount[1, 0], self.mount[0, 0])))
+        return np.nan if self.mount is None else float(-np.degrees(np.arctan2(self.mount[1, 0], self.mount[0, 0])))
 
     @property
     def distance(self) -> float:
         """Distance that the robot covered along x or y in metres; NaN without poses."""
-        return float(np.ptp([pose[:2, 3] for pose in self.poses.values()], axis=0).max()
-                     ) if self.poses else np.nan
+        return float(np.ptp([pose[:2, 3] for pose in self.poses.values()], axis=0).max()) if self.poses else np.nan
 
 
 NO_POSES = RecordedPoses()
 
 
-def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int],
-                        stamps_ns: np.ndarray | None) -> RecordedPoses:
+def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int], stamps_ns: np.ndarray | None) -> RecordedPoses:
     """Return what the odometry and TF of a bag contain.
 
     Args:
@@ -84,11 +81,16 @@ def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int],
         pose = _find_base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))
         if pose is not None:
             by_cloud[number] = pose
-    problem = "" if 2 * len(by_cloud) >= len(numbers) or not poses.available else (
-        "the odometry has no child_frame_id" if is_nameless else
-        f"{len(numbers) - len(by_cloud)} of {len(numbers)} clouds have no pose at their time")
-    return RecordedPoses(base, mount, poses.find_mount(FOOTPRINT), by_cloud, poses.invalid_count,
-                         problem)
+    problem = (
+        ""
+        if 2 * len(by_cloud) >= len(numbers) or not poses.available
+        else (
+            "the odometry has no child_frame_id"
+            if is_nameless
+            else f"{len(numbers) - len(by_cloud)} of {len(numbers)} clouds have no pose at their time"
+        )
+    )
+    return RecordedPoses(base, mount, poses.find_mount(FOOTPRINT), by_cloud, poses.invalid_count, problem)
 
 
 def _find_base_pose(poses: BagPoses, stamp_ns: int, mount: np.ndarray | None) -> np.ndarray | None:

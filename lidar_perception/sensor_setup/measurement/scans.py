@@ -21,7 +21,7 @@ RING_FIELDS = ("ring", "channel", "line", "laser_id", "laser_number", "row")
 MAX_MEDIAN_RANGE_M = 250.0  # of a cloud in metres, in the sensor's frame
 MAX_SPREAD_M = 200.0  # median distance to the cloud's centre if it is in metres in another frame
 MIN_ELEVATION_SPAN = 1.0  # degrees; a sensor with less scans a plane
-MIN_POINTS = 100    # usable points of a cloud
+MIN_POINTS = 100  # usable points of a cloud
 
 
 class Scan(NamedTuple):
@@ -67,8 +67,10 @@ def read_scan(msg: Any, name: str = "the cloud") -> Scan:
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
     if len(frame) < MIN_POINTS:
-        raise InputError(f"{name} has {len(frame)} usable points, too few to measure the sensor; "
-                         "record while it turns, in a place with walls or ground in view")
+        raise InputError(
+            f"{name} has {len(frame)} usable points, too few to measure the sensor; "
+            "record while it turns, in a place with walls or ground in view"
+        )
     xyz = frame.xyz.astype(np.float64)
     ranges = np.linalg.norm(xyz, axis=1)
     _require_metres(xyz, name)
@@ -81,11 +83,20 @@ def read_scan(msg: Any, name: str = "the cloud") -> Scan:
         except InputError as error:
             problem = str(error)
     ground_range = np.hypot(xyz[:, 0], xyz[:, 1])
-    return Scan(xyz, np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) % 360.0,
-                np.degrees(elevation_angles(xyz)), ranges, ground_range,
-                _read_column(points, indices, INTENSITY_FIELDS, float),
-                _read_column(points, indices, RING_FIELDS, np.int64), seconds, frame.stamp_ns,
-                frame.frame_id, columns, problem)
+    return Scan(
+        xyz,
+        np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) % 360.0,
+        np.degrees(elevation_angles(xyz)),
+        ranges,
+        ground_range,
+        _read_column(points, indices, INTENSITY_FIELDS, float),
+        _read_column(points, indices, RING_FIELDS, np.int64),
+        seconds,
+        frame.stamp_ns,
+        frame.frame_id,
+        columns,
+        problem,
+    )
 
 
 def _require_metres(xyz: np.ndarray, name: str) -> None:
@@ -94,22 +105,24 @@ def _require_metres(xyz: np.ndarray, name: str) -> None:
     if median_range <= MAX_MEDIAN_RANGE_M:
         return
     if np.median(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)) < MAX_SPREAD_M:
-        raise InputError(f"{name}: half of its points are farther than {median_range:.0f} m from "
-                         "the origin and near each other, so it is in a frame such as map; give "
-                         "the driver's own cloud")
-    raise InputError(f"{name}: half of its points are farther than {median_range:.0f} m, so its "
-                     "coordinates seem to be millimetres; divide x y z by 1000 in the driver")
+        raise InputError(
+            f"{name}: half of its points are farther than {median_range:.0f} m from "
+            "the origin and near each other, so it is in a frame such as map; give "
+            "the driver's own cloud"
+        )
+    raise InputError(
+        f"{name}: half of its points are farther than {median_range:.0f} m, so its "
+        "coordinates seem to be millimetres; divide x y z by 1000 in the driver"
+    )
 
 
 def require_3d(degrees: np.ndarray, name: str) -> None:
     """Raise InputError if elevations (N,), N > 0, in degrees, are all in one plane."""
     if np.subtract(*np.percentile(degrees, [99, 1])) < MIN_ELEVATION_SPAN:
-        raise InputError(f"{name}: all points are in one plane, as from a 2D scanner; give clouds "
-                         "of a 3D LiDAR")
+        raise InputError(f"{name}: all points are in one plane, as from a 2D scanner; give clouds of a 3D LiDAR")
 
 
-def _read_column(points: np.ndarray, indices: np.ndarray, names: Sequence[str],
-                 kind: type) -> np.ndarray | None:
+def _read_column(points: np.ndarray, indices: np.ndarray, names: Sequence[str], kind: type) -> np.ndarray | None:
     name = next((n for n in names if n in (points.dtype.names or ())), None)
     if name is None or points.dtype[name].shape:
         return None
@@ -143,11 +156,10 @@ def measure_intensity(scans: Sequence[Scan]) -> IntensityScale | None:
     if not len(values) or values.min() == values.max():
         return None
     greatest = float(values.max())
-    sample = values[::max(1, len(values) // 10_000)]  # of all scans: one may begin with zeros
+    sample = values[:: max(1, len(values) // 10_000)]  # of all scans: one may begin with zeros
     whole = bool((sample == np.round(sample)).all())
     # No known driver sends whole numbers up to 1 as floats, so they count as integers.
     full = infer_full_scale(values, np.int64 if whole else values.dtype)
     if greatest > MAX_UNIT * full:
         full = greatest
-    return IntensityScale(full, full <= 1.0 or greatest > 0.5 * full, whole, greatest,
-                          float((values == 0).mean()))
+    return IntensityScale(full, full <= 1.0 or greatest > 0.5 * full, whole, greatest, float((values == 0).mean()))

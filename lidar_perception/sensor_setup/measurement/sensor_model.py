@@ -29,26 +29,42 @@ def make_sensor(m: SensorMeasurement) -> Sensor:
 def _turn_upside_down(sensor: Sensor) -> Sensor:
     """Turn a sensor, whose blocked sectors are of all beams, about its x axis by half a turn."""
     return replace(
-        sensor, elevations=tuple(sensor.wander - up for up in reversed(sensor.elevations)),
+        sensor,
+        elevations=tuple(sensor.wander - up for up in reversed(sensor.elevations)),
         lifts=tuple(-lift for lift in reversed(sensor.lifts)),
-        blocked=tuple((first, -end % 360, -start % 360 or 360.0)
-                      for first, start, end in sensor.blocked))
+        blocked=tuple((first, -end % 360, -start % 360 or 360.0) for first, start, end in sensor.blocked),
+    )
 
 
 def _make_in_own_frame(m: SensorMeasurement) -> Sensor:
     pattern, coverage, mounting = m.pattern, m.view.coverage, m.mounting
     model = find_sensor(pattern.model) if pattern.model else None
-    fields: dict[str, Any] = {} if model is None else {name: getattr(model, name) for name in (
-        "divergence", "reach", "pulse", "min_range", "max_range", "range_noise", "rate", "silent",
-        "floor", "fade")}
+    fields: dict[str, Any] = (
+        {}
+        if model is None
+        else {
+            name: getattr(model, name)
+            for name in (
+                "divergence",
+                "reach",
+                "pulse",
+                "min_range",
+                "max_range",
+                "range_noise",
+                "rate",
+                "silent",
+                "floor",
+                "fade",
+            )
+        }
+    )
     if m.intensity is None:
         fields["silent"] = 1.0
     if np.isfinite(pattern.range_noise):
         fields["range_noise"] = round(pattern.range_noise, 4)
     if m.view.max_range > MIN_OUTDOOR_RANGE_M or model is None:
         fields["max_range"] = float(np.ceil(max(m.view.max_range, MIN_OUTDOOR_RANGE_M)))
-    fields["rate"] = round(m.timing.rate, 2) if np.isfinite(m.timing.rate) else fields.get(
-        "rate", 10.0)
+    fields["rate"] = round(m.timing.rate, 2) if np.isfinite(m.timing.rate) else fields.get("rate", 10.0)
     if mounting.mount is not None:
         fields["height"] = round(mounting.mount.height, 3)
     elif mounting.height_hint is not None:
@@ -61,8 +77,11 @@ def _make_in_own_frame(m: SensorMeasurement) -> Sensor:
         return _make_grid(m, fields)
     # Surroundings of a single place hide more than the robot does, so only the ends of the view
     # count there. The same holds if lower beams do not point lower.
-    has_moved = coverage.still is False and not m.source.has_few_scans and (
-        mounting.mount is not None and mounting.mount.is_level)
+    has_moved = (
+        coverage.still is False
+        and not m.source.has_few_scans
+        and (mounting.mount is not None and mounting.mount.is_level)
+    )
     fields["blocked"] = tuple(b for b in coverage.blocked if has_moved or b[0] == 0)
     up, lifts = _select_beams(pattern.beams, model if pattern.prefers_model else None, fields)
     if lifts.any():
@@ -71,15 +90,15 @@ def _make_in_own_frame(m: SensorMeasurement) -> Sensor:
     return Sensor(tuple(up.tolist()), float(np.radians(step)), **fields)
 
 
-def _select_beams(beams: Beams, model: Sensor | None,
-                  fields: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _select_beams(beams: Beams, model: Sensor | None, fields: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """Return elevations in rad and lifts, measured or of a model, and adapt the blocked sectors."""
     elevations = np.radians(np.round(beams.elevations, 4))
     if model is None:
         return elevations, np.round(beams.lifts, 4)
     fields["blocked"] = tuple(
         (first and int(np.abs(np.array(model.elevations) - elevations[first]).argmin()), start, end)
-        for first, start, end in fields["blocked"])
+        for first, start, end in fields["blocked"]
+    )
     return np.array(model.elevations), np.array(model.lifts)
 
 
@@ -94,5 +113,9 @@ def _make_grid(m: SensorMeasurement, fields: dict[str, Any]) -> Sensor:
     columns = int(np.clip(points / share / rows, 90, 4000))
     if share < 1:
         fields["blocked"] = ((0, end, start),)
-    return Sensor(tuple(np.radians(high - gap * np.arange(rows)).tolist()), 2 * np.pi / columns,
-                  wander=float(np.radians(gap)), **fields)
+    return Sensor(
+        tuple(np.radians(high - gap * np.arange(rows)).tolist()),
+        2 * np.pi / columns,
+        wander=float(np.radians(gap)),
+        **fields,
+    )

@@ -9,10 +9,10 @@ import numpy as np
 
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-MIN_GAP = 1.5         # times the usual distance of two stamps, from which on clouds are missing
-MAX_GAP = 1000        # times; longer gaps separate drives
+MIN_GAP = 1.5  # times the usual distance of two stamps, from which on clouds are missing
+MAX_GAP = 1000  # times; longer gaps separate drives
 RATES = (0.5, 100.0)  # turns per second of real sensors
-MIN_STAMPS = 4        # for a rate
+MIN_STAMPS = 4  # for a rate
 
 
 class Timing(NamedTuple):
@@ -38,8 +38,7 @@ def measure_timing(scans: Sequence[Scan], stamps_ns: np.ndarray | None) -> Timin
         scans: Scans, whose points may have times.
         stamps_ns: (M,) stamps of all clouds in ns; None without any.
     """
-    spans = [float(np.nanmax(s.seconds) - np.nanmin(s.seconds)) for s in scans
-             if s.seconds is not None]
+    spans = [float(np.nanmax(s.seconds) - np.nanmin(s.seconds)) for s in scans if s.seconds is not None]
     if stamps_ns is not None and len(stamps_ns) >= MIN_STAMPS:
         steps = np.diff(stamps_ns) * 1e-9
         forward = steps[steps > 0]

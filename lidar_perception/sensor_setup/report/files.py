@@ -21,23 +21,41 @@ def format_sensor(m: SensorMeasurement) -> str:
     """Return the text of sensor.yaml, see simulation.sensor.load_sensor."""
     sensor = make_sensor(m)
     comments = _explain_sensor(m, sensor)
-    values = {"name": m.pattern.model or "measured", "height": sensor.height, "rate": sensor.rate,
-              "azimuth_step": round(float(np.degrees(sensor.azimuth_step)), 6)}
+    values = {
+        "name": m.pattern.model or "measured",
+        "height": sensor.height,
+        "rate": sensor.rate,
+        "azimuth_step": round(float(np.degrees(sensor.azimuth_step)), 6),
+    }
     default = Sensor((0.0,), 0.1)
-    values |= {"min_range": sensor.min_range, "max_range": sensor.max_range,
-               "range_noise": sensor.range_noise, "reach": sensor.reach,
-               "divergence": round(float(np.degrees(sensor.divergence)), 6)}
-    values |= {name: getattr(sensor, name) for name in ("silent", "floor", "pulse", "dropout")
-               if getattr(sensor, name) != getattr(default, name)}
+    values |= {
+        "min_range": sensor.min_range,
+        "max_range": sensor.max_range,
+        "range_noise": sensor.range_noise,
+        "reach": sensor.reach,
+        "divergence": round(float(np.degrees(sensor.divergence)), 6),
+    }
+    values |= {
+        name: getattr(sensor, name)
+        for name in ("silent", "floor", "pulse", "dropout")
+        if getattr(sensor, name) != getattr(default, name)
+    }
     if sensor.wander:
         values["wander"] = round(float(np.degrees(sensor.wander)), 4)
     if sensor.fade != default.fade:
         values["fade"] = list(sensor.fade)
-    text = _format_header(m, _describe_origin(m), "Angles in degrees, lengths in metres; "
-                          "docs/how-to/own-sensor.md describes every field.") + "\n"
-    text += "".join(f"{key}: {_format_scalar(value)}"
-                    + (f"  # {comments[key]}" if key in comments else "") + "\n"
-                    for key, value in values.items())
+    text = (
+        _format_header(
+            m,
+            _describe_origin(m),
+            "Angles in degrees, lengths in metres; docs/how-to/own-sensor.md describes every field.",
+        )
+        + "\n"
+    )
+    text += "".join(
+        f"{key}: {_format_scalar(value)}" + (f"  # {comments[key]}" if key in comments else "") + "\n"
+        for key, value in values.items()
+    )
     text += _format_list("elevations", np.degrees(sensor.elevations), 4)
     if sensor.lifts:
         text += _format_list("lifts", sensor.lifts, 4)
@@ -50,8 +68,14 @@ def format_sensor(m: SensorMeasurement) -> str:
 def format_params(m: SensorMeasurement) -> str:
     """Return the text of robot.param.yaml, with the reason of each parameter."""
     chosen = choose_params(m)
-    lines = [_format_header(m, f"{_describe_origin(m)} All other parameters keep their defaults. "
-                            "Nodes ignore parameters that they do not have."), "/**:"]
+    lines = [
+        _format_header(
+            m,
+            f"{_describe_origin(m)} All other parameters keep their defaults. "
+            "Nodes ignore parameters that they do not have.",
+        ),
+        "/**:",
+    ]
     tree: dict[str, Any] = {}
     for name, (value, reason) in chosen.items():
         *path, last = name.split(".")
@@ -59,8 +83,7 @@ def format_params(m: SensorMeasurement) -> str:
         for part in path:
             branch = branch.setdefault(part, {})
         branch[last] = (value, reason)
-    lines += (["  ros__parameters:", *_format_tree(tree, 4)] if chosen
-              else ["  ros__parameters: {}"])
+    lines += ["  ros__parameters:", *_format_tree(tree, 4)] if chosen else ["  ros__parameters: {}"]
     return "\n".join(lines) + "\n"
 
 
@@ -69,29 +92,39 @@ def _explain_sensor(m: SensorMeasurement, sensor: Sensor) -> dict[str, str]:
     pattern, mounting, view = m.pattern, m.mounting, m.view
     unmeasured = "not measured; " + (f"that of {pattern.model}" if pattern.model else "a default")
     return {
-        "height": f"+- {mounting.mount.error[0]:.3f}" if mounting.mount is not None else
-        "not measured: no ground in view" if mounting.height_hint is None else HINT_REASON,
+        "height": f"+- {mounting.mount.error[0]:.3f}"
+        if mounting.mount is not None
+        else "not measured: no ground in view"
+        if mounting.height_hint is None
+        else HINT_REASON,
         "rate": f"from {m.timing.source}" if np.isfinite(m.timing.rate) else "not measured",
         "azimuth_step": f"{sensor.columns} firings in a turn",
         "min_range": "the nearest return that is not the robot's own"
-        if view.min_range < sensor.min_range + 0.01 else unmeasured,
-        "max_range": "the farthest return" if view.max_range >= MIN_OUTDOOR_RANGE_M
+        if view.min_range < sensor.min_range + 0.01
         else unmeasured,
+        "max_range": "the farthest return" if view.max_range >= MIN_OUTDOOR_RANGE_M else unmeasured,
         "range_noise": unmeasured if np.isnan(pattern.range_noise) else "about smooth surfaces",
-        "divergence": unmeasured, "reach": unmeasured,
-        "silent": "no intensity was seen" if m.intensity is None else unmeasured}
+        "divergence": unmeasured,
+        "reach": unmeasured,
+        "silent": "no intensity was seen" if m.intensity is None else unmeasured,
+    }
 
 
 def _describe_origin(m: SensorMeasurement) -> str:
-    return (f"Measured by 'lidar-perception setup' from {len(m.source.scans)} of {m.source.total} "
-            f"clouds of {m.source.name}.")
+    return (
+        f"Measured by 'lidar-perception setup' from {len(m.source.scans)} of {m.source.total} "
+        f"clouds of {m.source.name}."
+    )
 
 
 def _format_header(m: SensorMeasurement, *about: str) -> str:
     """Return comments that describe the file, followed by the warnings."""
     lines = (*about, *(f"Warning: {line}" for line in find_warnings(m)))
-    return "\n".join(part for line in lines for part in textwrap.wrap(
-        line, LINE_WIDTH, initial_indent="# ", subsequent_indent="#   "))
+    return "\n".join(
+        part
+        for line in lines
+        for part in textwrap.wrap(line, LINE_WIDTH, initial_indent="# ", subsequent_indent="#   ")
+    )
 
 
 def _format_scalar(value: Any) -> str:
@@ -101,8 +134,7 @@ def _format_scalar(value: Any) -> str:
 
 def _format_list(name: str, values: Sequence[float] | np.ndarray, digits: int) -> str:
     text = ", ".join(f"{round(float(v), digits) + 0.0:g}" for v in values)
-    return textwrap.fill(f"{name}: [{text}]", LINE_WIDTH, subsequent_indent="  ",
-                         break_on_hyphens=False) + "\n"
+    return textwrap.fill(f"{name}: [{text}]", LINE_WIDTH, subsequent_indent="  ", break_on_hyphens=False) + "\n"
 
 
 def _format_tree(tree: Mapping[str, Any], indent: int) -> list[str]:
@@ -112,7 +144,12 @@ def _format_tree(tree: Mapping[str, Any], indent: int) -> list[str]:
             lines += [f"{pad}{name}:", *_format_tree(value, indent + 2)]
             continue
         number, reason = value
-        lines += [line for part in reason.split("\n") for line in textwrap.wrap(
-            part, LINE_WIDTH - indent, initial_indent=f"{pad}# ", subsequent_indent=f"{pad}# ")]
+        lines += [
+            line
+            for part in reason.split("\n")
+            for line in textwrap.wrap(
+                part, LINE_WIDTH - indent, initial_indent=f"{pad}# ", subsequent_indent=f"{pad}# "
+            )
+        ]
         lines.append(f"{pad}{name}: {format_value(number)}")
     return lines

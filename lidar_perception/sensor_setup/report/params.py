@@ -23,9 +23,9 @@ Reasons = dict[str, tuple[Any, str]]  # value and reason by name of the paramete
 # distance of the HDL-64E's beams at the end of each band.
 EPS_BEAMS = 1.33
 RANGE_LIMITS_M = (15.0, 30.0, 45.0)  # of the bands; the paper has the first two
-MAX_EPS_M = (0.5, 0.7, 0.9, 1.0)     # larger ones join people who walk side by side
+MAX_EPS_M = (0.5, 0.7, 0.9, 1.0)  # larger ones join people who walk side by side
 MIN_SAMPLES = 3
-DENSITY_SHARE = 0.75   # of the sensor's density, so that none of its clouds counts as thin
+DENSITY_SHARE = 0.75  # of the sensor's density, so that none of its clouds counts as thin
 NO_INTENSITY_MAX = 1e9  # full scale at which every intensity counts as 0
 MIN_RANGE_SHARE = 0.9  # of the distance of the nearest ground: where Patchwork++ begins
 PATCHWORK_RANGE_M = 80.0  # default of ground.patchwork.max_range
@@ -42,31 +42,41 @@ def choose_params(m: SensorMeasurement) -> Reasons:
     scans = m.source.scans
     if m.intensity is not None:
         chosen["input.intensity_max"] = (
-            m.intensity.full, f"intensities are up to {m.intensity.greatest:.4g}"
-            + ("" if m.intensity.sure else "; a guess"))
+            m.intensity.full,
+            f"intensities are up to {m.intensity.greatest:.4g}" + ("" if m.intensity.sure else "; a guess"),
+        )
     elif scans[0].intensity is not None and scans[0].intensity.any():
         chosen["input.intensity_max"] = (
-            NO_INTENSITY_MAX, "intensities are constant and carry no information: read as 0, as "
-            "in sensor.yaml")
+            NO_INTENSITY_MAX,
+            "intensities are constant and carry no information: read as 0, as in sensor.yaml",
+        )
     coverage, mount = m.view.coverage, m.mounting.mount
     if coverage.can_crop:
         chosen["crop.body"] = (
             tuple(round(float(v), 2) for v in coverage.box),
             f"around the robot's own returns, {100 * coverage.body_share:.1f} % of all; "
-            f"{100 * coverage.foreign_share:.0f} % of the points in it are not its own"
-            + _describe_base_box(m))
+            f"{100 * coverage.foreign_share:.0f} % of the points in it are not its own" + _describe_base_box(m),
+        )
     if mount is not None:
-        chosen["ground.sensor_pose.height"] = (round(mount.height, 3),
-                                               f"+- {mount.error[0]:.3f} m")
-        for name, value, error in (("roll", mount.roll, mount.error[1]),
-                                   ("pitch", mount.pitch, mount.error[2])):
+        chosen["ground.sensor_pose.height"] = (round(mount.height, 3), f"+- {mount.error[0]:.3f} m")
+        for name, value, error in (("roll", mount.roll, mount.error[1]), ("pitch", mount.pitch, mount.error[2])):
             chosen[f"ground.sensor_pose.{name}"] = (
-                round(value, 4), f"{np.degrees(value):.2f} +- {np.degrees(error):.2f} degrees")
-        nearest = float(np.median([
-            np.percentile(np.hypot(*transform_points(s.xyz[p.on], mount.pose)[:, :2].T), 1)
-            for s, p in zip(scans, mount.planes) if p is not None]))
+                round(value, 4),
+                f"{np.degrees(value):.2f} +- {np.degrees(error):.2f} degrees",
+            )
+        nearest = float(
+            np.median(
+                [
+                    np.percentile(np.hypot(*transform_points(s.xyz[p.on], mount.pose)[:, :2].T), 1)
+                    for s, p in zip(scans, mount.planes)
+                    if p is not None
+                ]
+            )
+        )
         chosen["ground.patchwork.min_range"] = (
-            round(MIN_RANGE_SHARE * nearest, 1), f"the nearest ground is {nearest:.1f} m away")
+            round(MIN_RANGE_SHARE * nearest, 1),
+            f"the nearest ground is {nearest:.1f} m away",
+        )
     elif m.mounting.height_hint is not None:
         chosen["ground.sensor_pose.height"] = (m.mounting.height_hint, HINT_REASON)
     reach = float(np.clip(np.ceil(m.view.max_range), 20.0, 200.0))
@@ -77,8 +87,10 @@ def choose_params(m: SensorMeasurement) -> Reasons:
     try:
         with_values(PipelineParams(), {name: value for name, (value, _) in chosen.items()})
     except ValueError as error:
-        raise InputError(f"{m.source.name}: the measured values are out of range: {error}; give "
-                         "clouds, in metres, of a sensor on a robot or a vehicle") from None
+        raise InputError(
+            f"{m.source.name}: the measured values are out of range: {error}; give "
+            "clouds, in metres, of a sensor on a robot or a vehicle"
+        ) from None
     heading, recorded = m.mounting.heading, m.mounting.recorded
     if heading is not None and heading.is_off_axis and not heading.may_be_reversed:
         agrees = abs(wrap_degrees(recorded.heading - heading.degrees)) <= MAX_OFF_AXIS
@@ -86,7 +98,8 @@ def choose_params(m: SensorMeasurement) -> Reasons:
             float(round(recorded.heading if agrees else heading.degrees)),
             "direction in which detectors look, not the clouds' x axis: "
             f"{heading.degrees:.0f} +- {heading.error:.0f} degrees by the clouds"
-            + (f", {recorded.heading:.0f} by TF" if np.isfinite(recorded.heading) else ""))
+            + (f", {recorded.heading:.0f} by TF" if np.isfinite(recorded.heading) else ""),
+        )
     return chosen
 
 
@@ -105,47 +118,57 @@ def _describe_base_box(m: SensorMeasurement) -> str:
     pose, frame = m.mounting.recorded.footprint, f"in '{FOOTPRINT}' by TF"
     if pose is None and m.mounting.mount is not None:
         pose = m.mounting.mount.pose
-        frame = ("in a frame below the sensor with the same heading (else add the sensor's "
-                 "position)")
+        frame = "in a frame below the sensor with the same heading (else add the sensor's position)"
     if pose is None:
         return "\nIt is in the sensor's frame. Nodes with base_frame read it in that frame."
     low, high = np.reshape(m.view.coverage.box, (2, 3))
     corners = transform_points(np.array([*itertools.product(*zip(low, high))]), pose)
     box = (*corners.min(axis=0).round(2), *corners.max(axis=0).round(2))
-    return ("\nIt is in the sensor's frame. Nodes with base_frame read it in that frame; "
-            f"{frame}:\nbody: {format_value(box)}")
+    return (
+        "\nIt is in the sensor's frame. Nodes with base_frame read it in that frame; "
+        f"{frame}:\nbody: {format_value(box)}"
+    )
 
 
 def _choose_clustering(m: SensorMeasurement) -> Reasons:
     elevation_step, azimuth_step = m.elevation_step, m.pattern.azimuth_step
     default = flatten(PipelineParams())
-    relative_density = (default["resolution.elevation_step"]
-                        * default["resolution.azimuth_step"]) / (elevation_step * azimuth_step)
-    gaps = [np.radians(elevation_step) * limit
-            for limit in (*RANGE_LIMITS_M, RANGE_LIMITS_M[-1] * 1.3)]
+    relative_density = (default["resolution.elevation_step"] * default["resolution.azimuth_step"]) / (
+        elevation_step * azimuth_step
+    )
+    gaps = [np.radians(elevation_step) * limit for limit in (*RANGE_LIMITS_M, RANGE_LIMITS_M[-1] * 1.3)]
     paper = (*default["clustering.dbscan.eps"], 0.7)
-    eps = tuple(round(float(min(max(EPS_BEAMS * gap, low), high)), 2)
-                for gap, low, high in zip(gaps, paper, MAX_EPS_M))
-    samples = int(np.clip(round(default["clustering.dbscan.min_samples"] * relative_density),
-                          MIN_SAMPLES, default["clustering.dbscan.min_samples"]))
+    eps = tuple(round(float(min(max(EPS_BEAMS * gap, low), high)), 2) for gap, low, high in zip(gaps, paper, MAX_EPS_M))
+    samples = int(
+        np.clip(
+            round(default["clustering.dbscan.min_samples"] * relative_density),
+            MIN_SAMPLES,
+            default["clustering.dbscan.min_samples"],
+        )
+    )
     density = 1.0 / (elevation_step * azimuth_step)
     adapted = adapt_to_density(ClusteringParams(density=FULL_DENSITY), density).euclidean
     return {
-        "clustering.dbscan.range_limits": (RANGE_LIMITS_M,
-                                           "a fourth band, as the resolution allows"),
-        "clustering.dbscan.eps": (eps, f"{EPS_BEAMS} times the distance of the beams at the end "
-                                  "of each band, at least the paper's, and small enough not to "
-                                  "join people"),
+        "clustering.dbscan.range_limits": (RANGE_LIMITS_M, "a fourth band, as the resolution allows"),
+        "clustering.dbscan.eps": (
+            eps,
+            f"{EPS_BEAMS} times the distance of the beams at the end "
+            "of each band, at least the paper's, and small enough not to "
+            "join people",
+        ),
         "clustering.dbscan.join_bands": (True, "no cluster is cut at the end of a band"),
-        "clustering.dbscan.min_samples": (samples, "10 for the HDL-64E; the sensor has "
-                                          f"{relative_density:.2f} times as many points on a "
-                                          "surface"),
-        "clustering.density": (round(min(FULL_DENSITY, DENSITY_SHARE * density), 2),
-                               f"the values here are for {density:.1f} points per square degree; "
-                               "in thinner clouds they adapt to the density"),
+        "clustering.dbscan.min_samples": (
+            samples,
+            f"10 for the HDL-64E; the sensor has {relative_density:.2f} times as many points on a surface",
+        ),
+        "clustering.density": (
+            round(min(FULL_DENSITY, DENSITY_SHARE * density), 2),
+            f"the values here are for {density:.1f} points per square degree; "
+            "in thinner clouds they adapt to the density",
+        ),
         "clustering.euclidean.min_size": (samples, "as for dbscan"),
         "clustering.euclidean.radius": (round(adapted.radius, 2), "adapted to the density"),
         "clustering.euclidean.beta": (round(adapted.beta, 2), "adapted to the density"),
-        "resolution.elevation_step": (round(elevation_step, 3),
-                                      "between beams where people are, the median"),
-        "resolution.azimuth_step": (round(azimuth_step, 3), "between points of a beam")}
+        "resolution.elevation_step": (round(elevation_step, 3), "between beams where people are, the median"),
+        "resolution.azimuth_step": (round(azimuth_step, 3), "between points of a beam"),
+    }

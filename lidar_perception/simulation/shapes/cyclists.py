@@ -26,7 +26,7 @@ from lidar_perception.simulation.solids import BOX, ELLIPSOID, compute_extents, 
 
 BICYCLE, MOTORCYCLE, BICYCLIST, MOTORCYCLIST = 11, 15, 31, 32
 CRANK_M, GEAR_M = 0.17, 5.0  # length of a crank, distance per turn of the cranks
-SPOKE_TRANSMISSION = 0.5            # share of the beams that pass between the spokes
+SPOKE_TRANSMISSION = 0.5  # share of the beams that pass between the spokes
 FRAME_TRANSMISSION = 0.6  # between stays, chain and pedals, and through the rack
 THIGH, SHANK = 0.26, 0.27  # lengths as shares of the rider's height, down to the pedal
 
@@ -55,9 +55,16 @@ class RiderBuild(NamedTuple):
 def make_cyclist(rng: np.random.Generator) -> Thing:
     """Make a riding cyclist; the box has the length of the bicycle and width of the handlebar."""
     size = draw_size(rng, CLASSES[CYCLIST])
-    rider = RiderBuild(size, rng.uniform(0.15, 0.6), rng.uniform(0, 2 * pi), rng.uniform(0.1, 0.8),
-                       rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75), rng.uniform(0.15, 0.75),
-                       ("", "basket", "backpack")[rng.integers(3)])
+    rider = RiderBuild(
+        size,
+        rng.uniform(0.15, 0.6),
+        rng.uniform(0, 2 * pi),
+        rng.uniform(0.1, 0.8),
+        rng.uniform(0.2, 0.85),
+        rng.uniform(0.15, 0.75),
+        rng.uniform(0.15, 0.75),
+        ("", "basket", "backpack")[rng.integers(3)],
+    )
     return Thing(partial(pose_rider, rider=rider), size, CLASSES[CYCLIST])
 
 
@@ -80,31 +87,49 @@ def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
     head = (neck[0] + 0.03, 0.0, height - 0.075 * trunk)
     rows = [
         *_bicycle_parts(length, width / 2, (bar_x, bar_z), rider.frame),
-        part(ELLIPSOID, head, (0.057 * trunk, 0.047 * trunk, 0.075 * trunk),
-             reflectance=(SKIN + rider.head) / 2),
-        part(ELLIPSOID, (along(0.15)[0], 0.0, along(0.15)[1]),
-             (0.08 * trunk, min(0.125 * trunk, 0.42 * width), 0.17 * trunk), pitch=rider.lean,
-             reflectance=rider.coat),
-        part(ELLIPSOID, (hip[0], 0.0, seat + 0.02), (0.16, min(0.17, 0.4 * width), 0.11),
-             reflectance=rider.trousers)]
+        part(ELLIPSOID, head, (0.057 * trunk, 0.047 * trunk, 0.075 * trunk), reflectance=(SKIN + rider.head) / 2),
+        part(
+            ELLIPSOID,
+            (along(0.15)[0], 0.0, along(0.15)[1]),
+            (0.08 * trunk, min(0.125 * trunk, 0.42 * width), 0.17 * trunk),
+            pitch=rider.lean,
+            reflectance=rider.coat,
+        ),
+        part(ELLIPSOID, (hip[0], 0.0, seat + 0.02), (0.16, min(0.17, 0.4 * width), 0.11), reflectance=rider.trousers),
+    ]
     turn = rider.phase + 2 * pi * travelled / GEAR_M
     for side, at in ((-1, turn), (1, turn + pi)):
         foot = (-0.02 * length + CRANK_M * sin(at), 0.17 * height + CRANK_M * cos(at))
         thigh, shank = THIGH * trunk, SHANK * trunk
         x, z = find_knee(hip, foot, thigh, shank)
         y = side * 0.11
-        rows += [rod((*hip[:1], y, seat), (x, y, z), 0.085, reflectance=rider.trousers),
-                 rod((x, y, z), (foot[0], y, foot[1] + 0.03), 0.06, reflectance=rider.trousers),
-                 part(BOX, (foot[0] + 0.05, y, foot[1]), (0.13, 0.045, 0.03), reflectance=RUBBER),
-                 rod((shoulder[0], side * min(0.11 * trunk, 0.36 * width), shoulder[1]),
-                     (bar_x, side * (width / 2 - 0.06), bar_z), 0.05, reflectance=rider.coat)]
+        rows += [
+            rod((*hip[:1], y, seat), (x, y, z), 0.085, reflectance=rider.trousers),
+            rod((x, y, z), (foot[0], y, foot[1] + 0.03), 0.06, reflectance=rider.trousers),
+            part(BOX, (foot[0] + 0.05, y, foot[1]), (0.13, 0.045, 0.03), reflectance=RUBBER),
+            rod(
+                (shoulder[0], side * min(0.11 * trunk, 0.36 * width), shoulder[1]),
+                (bar_x, side * (width / 2 - 0.06), bar_z),
+                0.05,
+                reflectance=rider.coat,
+            ),
+        ]
     if rider.load == "basket":
-        rows.append(block((bar_x + 0.05, -0.16, bar_z - 0.3), (bar_x + 0.33, 0.16, bar_z - 0.05),
-                          reflectance=METAL, transmission=0.4))
+        rows.append(
+            block(
+                (bar_x + 0.05, -0.16, bar_z - 0.3),
+                (bar_x + 0.33, 0.16, bar_z - 0.05),
+                reflectance=METAL,
+                transmission=0.4,
+            )
+        )
     elif rider.load == "backpack":
         x, z = along(0.18)
-        rows.append(part(ELLIPSOID, (x - 0.17 * up, 0.0, z + 0.17 * ahead), (0.1, 0.14, 0.22),
-                         pitch=rider.lean, reflectance=0.2))
+        rows.append(
+            part(
+                ELLIPSOID, (x - 0.17 * up, 0.0, z + 0.17 * ahead), (0.1, 0.14, 0.22), pitch=rider.lean, reflectance=0.2
+            )
+        )
     return parts(rows, BICYCLIST)
 
 
@@ -117,43 +142,51 @@ def _bicycle_parts(length: float, half_bar: float, bar: tuple, frame: float) -> 
     radius = 0.19 * length
     axle, crank = length / 2 - radius, (-0.02 * length, 0.0, 0.88 * radius)
     wheel = dict(reflectance=0.3, transmission=SPOKE_TRANSMISSION)
-    return [disc((-axle, 0, radius), radius, 0.03, **wheel),
-            disc((axle, 0, radius), radius, 0.03, **wheel),
-            block((-axle - 0.2, -0.06, 0.5 * radius), (crank[0] + 0.1, 0.06, 2 * radius + 0.1),
-                  reflectance=frame, transmission=FRAME_TRANSMISSION),
-            rod((axle, 0, radius), (bar[0], 0, bar[1]), 0.04, reflectance=frame),
-            rod(crank, (0.85 * bar[0], 0, 0.8 * bar[1]), 0.05, reflectance=frame),
-            rod((bar[0], -half_bar, bar[1]), (bar[0], half_bar, bar[1]), 0.018, reflectance=METAL)]
+    return [
+        disc((-axle, 0, radius), radius, 0.03, **wheel),
+        disc((axle, 0, radius), radius, 0.03, **wheel),
+        block(
+            (-axle - 0.2, -0.06, 0.5 * radius),
+            (crank[0] + 0.1, 0.06, 2 * radius + 0.1),
+            reflectance=frame,
+            transmission=FRAME_TRANSMISSION,
+        ),
+        rod((axle, 0, radius), (bar[0], 0, bar[1]), 0.04, reflectance=frame),
+        rod(crank, (0.85 * bar[0], 0, 0.8 * bar[1]), 0.05, reflectance=frame),
+        rod((bar[0], -half_bar, bar[1]), (bar[0], half_bar, bar[1]), 0.018, reflectance=METAL),
+    ]
 
 
 def make_bicycle(rng: np.random.Generator) -> np.ndarray:
     """Make a parked bicycle (P,) PART with a reflector."""
     length = rng.uniform(1.6, 1.85)
     seat = (-0.15 * length, 0.92)
-    rows = [*_bicycle_parts(length, 0.3, (0.22 * length, 1.02), rng.uniform(0.05, 0.5)),
-            part(ELLIPSOID, (seat[0], 0, seat[1]), (0.13, 0.08, 0.05), reflectance=RUBBER),
-            block((seat[0] - 0.4, -0.04, 0.68), (seat[0] - 0.38, 0.04, 0.74), reflectance=PLATE)]
+    rows = [
+        *_bicycle_parts(length, 0.3, (0.22 * length, 1.02), rng.uniform(0.05, 0.5)),
+        part(ELLIPSOID, (seat[0], 0, seat[1]), (0.13, 0.08, 0.05), reflectance=RUBBER),
+        block((seat[0] - 0.4, -0.04, 0.68), (seat[0] - 0.38, 0.04, 0.74), reflectance=PLATE),
+    ]
     return parts(rows, BICYCLE)
 
 
 def make_motorcycle(rng: np.random.Generator) -> np.ndarray:
     """Make a parked motorcycle or scooter (P,) PART."""
-    return parts(_motorcycle_parts(rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5),
-                                   rng.uniform(0.25, 0.31)), MOTORCYCLE)
+    return parts(_motorcycle_parts(rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5), rng.uniform(0.25, 0.31)), MOTORCYCLE)
 
 
 def _motorcycle_parts(length: float, paint: float, radius: float) -> list[tuple]:
     """Return the rows of a motorcycle; radius: of the wheels, in metres."""
     axle = length / 2 - radius
-    return [disc((-axle, 0, radius), radius, 0.07, reflectance=RUBBER),
-            disc((axle, 0, radius), radius, 0.06, reflectance=RUBBER),
-            part(ELLIPSOID, (0, 0, 0.5), (0.45, 0.18, 0.28), reflectance=paint),
-            part(ELLIPSOID, (-0.45, 0, 0.78), (0.4, 0.15, 0.09), reflectance=RUBBER),
-            part(ELLIPSOID, (0.18, 0, 0.85), (0.28, 0.17, 0.14), reflectance=paint),
-            rod((axle, 0, radius), (axle - 0.3, 0, 1.02), 0.06, reflectance=METAL),
-            rod((axle - 0.3, -0.36, 1.02), (axle - 0.3, 0.36, 1.02), 0.02, reflectance=METAL),
-            block((-length / 2 + 0.05, -0.1, 0.55), (-length / 2 + 0.07, 0.1, 0.7),
-                  reflectance=PLATE)]
+    return [
+        disc((-axle, 0, radius), radius, 0.07, reflectance=RUBBER),
+        disc((axle, 0, radius), radius, 0.06, reflectance=RUBBER),
+        part(ELLIPSOID, (0, 0, 0.5), (0.45, 0.18, 0.28), reflectance=paint),
+        part(ELLIPSOID, (-0.45, 0, 0.78), (0.4, 0.15, 0.09), reflectance=RUBBER),
+        part(ELLIPSOID, (0.18, 0, 0.85), (0.28, 0.17, 0.14), reflectance=paint),
+        rod((axle, 0, radius), (axle - 0.3, 0, 1.02), 0.06, reflectance=METAL),
+        rod((axle - 0.3, -0.36, 1.02), (axle - 0.3, 0.36, 1.02), 0.02, reflectance=METAL),
+        block((-length / 2 + 0.05, -0.1, 0.55), (-length / 2 + 0.07, 0.1, 0.7), reflectance=PLATE),
+    ]
 
 
 def make_motorcyclist(rng: np.random.Generator) -> Thing:
@@ -168,16 +201,28 @@ def make_motorcyclist(rng: np.random.Generator) -> Thing:
         coat, trousers, helmet = rng.uniform((0.15, 0.1, 0.1), (0.85, 0.7, 0.8))
         shoulder = (hip + sin(lean) * trunk, 0.82 + cos(lean) * trunk)
         head = (shoulder[0] + 0.04, 0.0, shoulder[1] + 0.17)
-        rows += [part(ELLIPSOID, ((hip + shoulder[0]) / 2, 0.0, (0.82 + shoulder[1]) / 2),
-                      (0.14, 0.21, 0.6 * trunk), pitch=lean, reflectance=coat),
-                 part(ELLIPSOID, head, (0.14, 0.12, 0.14), reflectance=helmet)]
+        rows += [
+            part(
+                ELLIPSOID,
+                ((hip + shoulder[0]) / 2, 0.0, (0.82 + shoulder[1]) / 2),
+                (0.14, 0.21, 0.6 * trunk),
+                pitch=lean,
+                reflectance=coat,
+            ),
+            part(ELLIPSOID, head, (0.14, 0.12, 0.14), reflectance=helmet),
+        ]
         for side in (-1, 1):
             knee_x, foot = hip + 0.42, (hip + 0.3, side * 0.2, 0.3)
-            rows += [rod((hip, side * 0.1, 0.82), (knee_x, side * 0.2, 0.74), 0.085,
-                         reflectance=trousers),
-                     rod((knee_x, side * 0.2, 0.74), foot, 0.06, reflectance=trousers),
-                     rod((shoulder[0], side * 0.19, shoulder[1] - 0.05),
-                         (min(bar, shoulder[0] + 0.55), side * 0.3, 1.0), 0.05, reflectance=coat)]
+            rows += [
+                rod((hip, side * 0.1, 0.82), (knee_x, side * 0.2, 0.74), 0.085, reflectance=trousers),
+                rod((knee_x, side * 0.2, 0.74), foot, 0.06, reflectance=trousers),
+                rod(
+                    (shoulder[0], side * 0.19, shoulder[1] - 0.05),
+                    (min(bar, shoulder[0] + 0.55), side * 0.3, 1.0),
+                    0.05,
+                    reflectance=coat,
+                ),
+            ]
     made = parts(rows, MOTORCYCLIST)
     _, high = compute_extents(made)
     size = (length, 2 * float(high[:, 1].max()), float(high[:, 2].max()))

@@ -22,21 +22,27 @@ def make_pole(rng: np.random.Generator) -> np.ndarray:
 def make_lamp(rng: np.random.Generator) -> np.ndarray:
     """Make a street lamp of 4 to 8 m: mast, base with a door, arm to +x, head."""
     height, arm = rng.uniform(4.0, 8.0), rng.uniform(0.4, 1.5)
-    return parts([_post(height, 0.06), _post(1.1, 0.09),
-                  rod((0, 0, height), (arm, 0, height + 0.1), 0.03, reflectance=METAL),
-                  part(ELLIPSOID, (arm + 0.25, 0, height + 0.08), (0.35, 0.14, 0.08),
-                       reflectance=METAL)], POLE)
+    return parts(
+        [
+            _post(height, 0.06),
+            _post(1.1, 0.09),
+            rod((0, 0, height), (arm, 0, height + 0.1), 0.03, reflectance=METAL),
+            part(ELLIPSOID, (arm + 0.25, 0, height + 0.08), (0.35, 0.14, 0.08), reflectance=METAL),
+        ],
+        POLE,
+    )
 
 
 def make_traffic_light(rng: np.random.Generator) -> np.ndarray:
     """Make a mast with lights at 2.2 m, a button, and up to two signs below."""
     height, own = rng.uniform(3.0, 3.5), rng.spawn(1)[0]
-    rows = [_post(height, 0.07),
-            block((0.08, -0.15, height - 0.95), (0.3, 0.15, height), reflectance=0.05),
-            block((0.06, -0.28, height - 1.0), (0.08, 0.28, height + 0.05), reflectance=0.1),
-            block((-0.16, -0.06, 1.0), (-0.06, 0.06, 1.25), reflectance=0.4)]
-    return parts(rows + [_plate(0.1, *own.uniform((0.5, 0.2), (1.6, 0.35)))
-                         for _ in range(own.integers(3))], POLE)
+    rows = [
+        _post(height, 0.07),
+        block((0.08, -0.15, height - 0.95), (0.3, 0.15, height), reflectance=0.05),
+        block((0.06, -0.28, height - 1.0), (0.08, 0.28, height + 0.05), reflectance=0.1),
+        block((-0.16, -0.06, 1.0), (-0.06, 0.06, 1.25), reflectance=0.4),
+    ]
+    return parts(rows + [_plate(0.1, *own.uniform((0.5, 0.2), (1.6, 0.35))) for _ in range(own.integers(3))], POLE)
 
 
 def make_sign(rng: np.random.Generator) -> np.ndarray:
@@ -64,22 +70,24 @@ def make_fence(rng: np.random.Generator, length: float) -> np.ndarray:
     Beams at flatter angles hit the bars more often.
     """
     height, x = rng.uniform(0.8, 1.9), length / 2
-    rows = [rod((at, 0, -0.5), (at, 0, height), 0.04, reflectance=METAL)
-            for at in np.linspace(0.04 - x, x - 0.04, 5)]
-    rows += [block((-x, -0.02, share * height), (x, 0.02, share * height + 0.05),
-                   reflectance=METAL) for share in (0.15, 0.9)]
-    rows.append(block((-x, -0.012, 0.05), (x, 0.012, 0.98 * height), reflectance=0.3,
-                      density=rng.choice((12.0, 25.0, 80.0))))  # passes 0.75, 0.55, 0.15
+    rows = [rod((at, 0, -0.5), (at, 0, height), 0.04, reflectance=METAL) for at in np.linspace(0.04 - x, x - 0.04, 5)]
+    rows += [
+        block((-x, -0.02, share * height), (x, 0.02, share * height + 0.05), reflectance=METAL) for share in (0.15, 0.9)
+    ]
+    rows.append(
+        block((-x, -0.012, 0.05), (x, 0.012, 0.98 * height), reflectance=0.3, density=rng.choice((12.0, 25.0, 80.0)))
+    )  # passes 0.75, 0.55, 0.15
     return parts(rows, FENCE)
 
 
 def make_wall(rng: np.random.Generator, length: float) -> np.ndarray:
     """Make a garden wall along x, centred, with a coping and piers at its ends."""
     height, x, tone = rng.uniform(0.5, 2.2), length / 2, rng.uniform(0.3, 0.5)
-    rows = [block((-x, -0.12, -0.6), (x, 0.12, height), reflectance=tone),
-            block((-x, -0.16, height), (x, 0.16, height + 0.06), reflectance=0.4)]
-    rows += [block((s * x, -0.2, -0.6), (s * (x - 0.4), 0.2, height + 0.2), reflectance=tone)
-             for s in (-1, 1)]
+    rows = [
+        block((-x, -0.12, -0.6), (x, 0.12, height), reflectance=tone),
+        block((-x, -0.16, height), (x, 0.16, height + 0.06), reflectance=0.4),
+    ]
+    rows += [block((s * x, -0.2, -0.6), (s * (x - 0.4), 0.2, height + 0.2), reflectance=tone) for s in (-1, 1)]
     return parts(rows, FENCE)
 
 
@@ -88,27 +96,37 @@ def make_litter_bin(rng: np.random.Generator) -> np.ndarray:
     grey = rng.uniform(0.1, 0.5)
     if rng.random() < 0.5:
         high, radius = rng.uniform(0.7, 1.2), rng.uniform(0.2, 0.35)
-        return parts([_cylinder(0.0, high, radius, grey),
-                      part(ELLIPSOID, (0, 0, high), (radius, radius, 0.15), reflectance=grey)],
-                     OTHER)
-    return parts([_post(1.15, 0.03), part(CYLINDER, (0.22, 0, 0.8), (0.19, 0.19, 0.28),
-                                          reflectance=grey)], OTHER)
+        return parts(
+            [
+                _cylinder(0.0, high, radius, grey),
+                part(ELLIPSOID, (0, 0, high), (radius, radius, 0.15), reflectance=grey),
+            ],
+            OTHER,
+        )
+    return parts([_post(1.15, 0.03), part(CYLINDER, (0.22, 0, 0.8), (0.19, 0.19, 0.28), reflectance=grey)], OTHER)
 
 
 def make_wheelie_bin(rng: np.random.Generator) -> np.ndarray:
     """Make a bin on wheels, of 120 l or 1100 l."""
     half, high = ((0.25, 0.24), 0.93) if rng.random() < 0.75 else ((0.55, 0.65), 1.3)
     x, y = half
-    return parts([block((-x, -0.9 * y, 0.1), (x, 0.9 * y, high), reflectance=rng.uniform(0.1, 0.4)),
-                  block((-x - 0.05, -y, high), (x + 0.04, y, high + 0.08), reflectance=0.2),
-                  disc((0.1 - x, 0, 0.1), 0.1, y, reflectance=RUBBER)], OTHER)
+    return parts(
+        [
+            block((-x, -0.9 * y, 0.1), (x, 0.9 * y, high), reflectance=rng.uniform(0.1, 0.4)),
+            block((-x - 0.05, -y, high), (x + 0.04, y, high + 0.08), reflectance=0.2),
+            disc((0.1 - x, 0, 0.1), 0.1, y, reflectance=RUBBER),
+        ],
+        OTHER,
+    )
 
 
 def make_bollard(rng: np.random.Generator) -> np.ndarray:
     """Make a bollard of 0.6 to 1.1 m, some with a retroreflective band."""
     high, radius = rng.uniform(0.6, 1.1), rng.uniform(0.05, 0.14)
-    rows = [_cylinder(FOOT_M, high, radius, rng.uniform(0.1, 0.5)),
-            part(ELLIPSOID, (0, 0, high), (radius, radius, 0.06), reflectance=0.3)]
+    rows = [
+        _cylinder(FOOT_M, high, radius, rng.uniform(0.1, 0.5)),
+        part(ELLIPSOID, (0, 0, high), (radius, radius, 0.06), reflectance=0.3),
+    ]
     if rng.random() < 0.3:
         rows.append(_cylinder(high - 0.2, high - 0.1, radius + 0.003, PLATE))
     return parts(rows, POLE)
@@ -124,132 +142,164 @@ def make_beacon(rng: np.random.Generator) -> np.ndarray:
     if rng.random() < 0.5:
         rows = [_cylinder(FOOT_M, low, 0.8 * half, 0.3), _cylinder(low, high, half, PLATE)]
     else:
-        rows = [_post(low, 0.04),
-                block((-0.03, -half, low), (0.03, half, high), reflectance=PLATE)]
+        rows = [_post(low, 0.04), block((-0.03, -half, low), (0.03, half, high), reflectance=PLATE)]
     if rng.random() < 0.4:
         rows.append(block((-0.4, -0.2, 0.0), (0.4, 0.2, 0.1), reflectance=RUBBER))
     if rng.random() < 0.3:
-        rows += [_post(high + 0.5, 0.04),
-                 part(ELLIPSOID, (0, 0, high + 0.3), (0.03, 0.3, 0.3), reflectance=PLATE)]
+        rows += [_post(high + 0.5, 0.04), part(ELLIPSOID, (0, 0, high + 0.3), (0.03, 0.3, 0.3), reflectance=PLATE)]
     return parts(rows, SIGN)
 
 
 def make_cabinet(rng: np.random.Generator) -> np.ndarray:
     """Make a telephone or power cabinet of 0.8 to 1.7 m."""
     x, y, high = rng.uniform((0.15, 0.2, 0.8), (0.3, 0.8, 1.7))
-    return parts([block((-x, -y, FOOT_M), (x, y, high), reflectance=rng.uniform(0.2, 0.5)),
-                  block((-x - 0.03, -y - 0.03, high), (x + 0.03, y + 0.03, high + 0.05),
-                        reflectance=0.35)], OTHER)
+    return parts(
+        [
+            block((-x, -y, FOOT_M), (x, y, high), reflectance=rng.uniform(0.2, 0.5)),
+            block((-x - 0.03, -y - 0.03, high), (x + 0.03, y + 0.03, high + 0.05), reflectance=0.35),
+        ],
+        OTHER,
+    )
 
 
 def make_bench(rng: np.random.Generator) -> np.ndarray:
     """Make a bench with a back, facing +x; the seat is 0.45 m high."""
     y = rng.uniform(0.7, 1.0)
     wood = dict(reflectance=rng.uniform(0.2, 0.4))
-    rows = [block((-0.22, -y, 0.41), (0.25, y, 0.45), transmission=0.2, **wood),
-            block((-0.29, -y, 0.55), (-0.25, y, 0.85), transmission=0.2, **wood)]
-    rows += [block((-0.27, s * y * 0.75, FOOT_M), (-0.2, s * (y * 0.75 - 0.06), 0.85), **wood)
-             for s in (-1, 1)]
-    rows += [block((0.15, s * y * 0.75, FOOT_M), (0.22, s * (y * 0.75 - 0.06), 0.42), **wood)
-             for s in (-1, 1)]
+    rows = [
+        block((-0.22, -y, 0.41), (0.25, y, 0.45), transmission=0.2, **wood),
+        block((-0.29, -y, 0.55), (-0.25, y, 0.85), transmission=0.2, **wood),
+    ]
+    rows += [block((-0.27, s * y * 0.75, FOOT_M), (-0.2, s * (y * 0.75 - 0.06), 0.85), **wood) for s in (-1, 1)]
+    rows += [block((0.15, s * y * 0.75, FOOT_M), (0.22, s * (y * 0.75 - 0.06), 0.42), **wood) for s in (-1, 1)]
     return parts(rows, OTHER)
 
 
 def make_shopping_trolley(rng: np.random.Generator) -> np.ndarray:
     """Make a shopping trolley with a wire basket."""
-    rows = [block((-0.4, -0.28, 0.55), (0.45, 0.28, 1.0), reflectance=METAL,
-                  density=rng.uniform(0.7, 1.2)),
-            rod((-0.5, -0.27, 1.05), (-0.5, 0.27, 1.05), 0.02, reflectance=0.2),
-            block((-0.4, -0.25, 0.15), (0.45, 0.25, 0.25), reflectance=METAL, transmission=0.6)]
-    rows += [rod((-0.35, s * 0.25, 0.1), (-0.45, s * 0.25, 1.0), 0.02, reflectance=METAL)
-             for s in (-1, 1)]
-    rows += [disc((x, 0.0, 0.06), 0.06, 0.27, reflectance=RUBBER, transmission=0.7)
-             for x in (-0.35, 0.4)]
+    rows = [
+        block((-0.4, -0.28, 0.55), (0.45, 0.28, 1.0), reflectance=METAL, density=rng.uniform(0.7, 1.2)),
+        rod((-0.5, -0.27, 1.05), (-0.5, 0.27, 1.05), 0.02, reflectance=0.2),
+        block((-0.4, -0.25, 0.15), (0.45, 0.25, 0.25), reflectance=METAL, transmission=0.6),
+    ]
+    rows += [rod((-0.35, s * 0.25, 0.1), (-0.45, s * 0.25, 1.0), 0.02, reflectance=METAL) for s in (-1, 1)]
+    rows += [disc((x, 0.0, 0.06), 0.06, 0.27, reflectance=RUBBER, transmission=0.7) for x in (-0.35, 0.4)]
     return parts(rows, OTHER)
 
 
 def make_phone_box(rng: np.random.Generator) -> np.ndarray:
     """Make a phone box: four posts, panes, a roof and the telephone."""
     half, high = 0.45, rng.uniform(2.2, 2.4)
-    rows = [rod((sx * half, sy * half, FOOT_M), (sx * half, sy * half, high), 0.04,
-                reflectance=METAL) for sx in (-1, 1) for sy in (-1, 1)]
-    rows += [block((-half, s * half, 0.3), (half, s * (half - 0.01), high), reflectance=GLASS,
-                   transmission=0.7) for s in (-1, 1)]
-    rows += [block((-half - 0.05, -half - 0.05, high), (half + 0.05, half + 0.05, high + 0.15),
-                   reflectance=0.3),
-             block((-half, -half + 0.05, FOOT_M), (-half + 0.25, half - 0.05, 1.7),
-                   reflectance=0.3)]
+    rows = [
+        rod((sx * half, sy * half, FOOT_M), (sx * half, sy * half, high), 0.04, reflectance=METAL)
+        for sx in (-1, 1)
+        for sy in (-1, 1)
+    ]
+    rows += [
+        block((-half, s * half, 0.3), (half, s * (half - 0.01), high), reflectance=GLASS, transmission=0.7)
+        for s in (-1, 1)
+    ]
+    rows += [
+        block((-half - 0.05, -half - 0.05, high), (half + 0.05, half + 0.05, high + 0.15), reflectance=0.3),
+        block((-half, -half + 0.05, FOOT_M), (-half + 0.25, half - 0.05, 1.7), reflectance=0.3),
+    ]
     return parts(rows, OTHER)
 
 
 def make_advertising_column(rng: np.random.Generator) -> np.ndarray:
     """Make a round advertising column of 2.5 to 3.6 m."""
     high, radius = rng.uniform(2.5, 3.6), rng.uniform(0.5, 0.7)
-    return parts([_cylinder(FOOT_M, high, radius, rng.uniform(0.3, 0.5)),
-                  _cylinder(high, high + 0.15, radius + 0.08, 0.3),
-                  part(ELLIPSOID, (0, 0, high + 0.15), (radius, radius, 0.25), reflectance=0.3)],
-                 OTHER)
+    return parts(
+        [
+            _cylinder(FOOT_M, high, radius, rng.uniform(0.3, 0.5)),
+            _cylinder(high, high + 0.15, radius + 0.08, 0.3),
+            part(ELLIPSOID, (0, 0, high + 0.15), (radius, radius, 0.25), reflectance=0.3),
+        ],
+        OTHER,
+    )
 
 
 def make_cone(rng: np.random.Generator) -> np.ndarray:
     """Make a traffic cone of 0.5 to 0.75 m with a retroreflective band."""
     high = rng.uniform(0.5, 0.75)
-    return parts([block((-0.19, -0.19, 0), (0.19, 0.19, 0.03), reflectance=0.3),
-                  _cylinder(0.03, 0.4 * high, 0.13, 0.4), _cylinder(0.4 * high, 0.7 * high, 0.09,
-                                                                    PLATE),
-                  _cylinder(0.7 * high, high, 0.05, 0.4)], OTHER)
+    return parts(
+        [
+            block((-0.19, -0.19, 0), (0.19, 0.19, 0.03), reflectance=0.3),
+            _cylinder(0.03, 0.4 * high, 0.13, 0.4),
+            _cylinder(0.4 * high, 0.7 * high, 0.09, PLATE),
+            _cylinder(0.7 * high, high, 0.05, 0.4),
+        ],
+        OTHER,
+    )
 
 
 def make_planter(rng: np.random.Generator) -> np.ndarray:
     """Make a tub with a plant, together as high as a person."""
     high = rng.uniform(0.35, 0.6)
     tall = rng.uniform(0.35, 0.65)
-    return parts([_cylinder(0.0, high, 0.32, rng.uniform(0.25, 0.45)),
-                  part(ELLIPSOID, (0, 0, high + 0.9 * tall), (0.3, 0.28, tall), reflectance=0.34,
-                       semantic=VEGETATION, density=rng.uniform(2, 6))], OTHER)
+    return parts(
+        [
+            _cylinder(0.0, high, 0.32, rng.uniform(0.25, 0.45)),
+            part(
+                ELLIPSOID,
+                (0, 0, high + 0.9 * tall),
+                (0.3, 0.28, tall),
+                reflectance=0.34,
+                semantic=VEGETATION,
+                density=rng.uniform(2, 6),
+            ),
+        ],
+        OTHER,
+    )
 
 
 def make_parasol(rng: np.random.Generator) -> np.ndarray:
     """Make a cafe table with two chairs under a parasol."""
     high = rng.uniform(2.1, 2.5)
-    rows = [rod((0, 0, 0), (0, 0, high), 0.025, reflectance=METAL),
-            part(ELLIPSOID, (0, 0, high), (1.3, 1.3, 0.2), reflectance=0.35),
-            _cylinder(0.7, 0.74, 0.4, 0.35)]
+    rows = [
+        rod((0, 0, 0), (0, 0, high), 0.025, reflectance=METAL),
+        part(ELLIPSOID, (0, 0, high), (1.3, 1.3, 0.2), reflectance=0.35),
+        _cylinder(0.7, 0.74, 0.4, 0.35),
+    ]
     for s in (-1, 1):
-        rows += [block((s * 0.55, -0.2, 0.0), (s * 0.95, 0.2, 0.45), reflectance=0.25,
-                       transmission=0.6),
-                 block((s * 0.92, -0.2, 0.45), (s * 0.95, 0.2, 0.9), reflectance=0.25,
-                       transmission=0.3)]
+        rows += [
+            block((s * 0.55, -0.2, 0.0), (s * 0.95, 0.2, 0.45), reflectance=0.25, transmission=0.6),
+            block((s * 0.92, -0.2, 0.45), (s * 0.95, 0.2, 0.9), reflectance=0.25, transmission=0.3),
+        ]
     return parts(rows, OTHER)
 
 
 def make_hydrant(rng: np.random.Generator) -> np.ndarray:
     """Make a pump, hydrant or parking meter: a post with a thicker head."""
     high = rng.uniform(0.9, 1.5)
-    return parts([_cylinder(FOOT_M, high, rng.uniform(0.04, 0.12), 0.3),
-                  part(ELLIPSOID, (0, 0, high - 0.15), (0.14, 0.17, 0.22),
-                       reflectance=rng.uniform(0.1, 0.4))], OTHER)
+    return parts(
+        [
+            _cylinder(FOOT_M, high, rng.uniform(0.04, 0.12), 0.3),
+            part(ELLIPSOID, (0, 0, high - 0.15), (0.14, 0.17, 0.22), reflectance=rng.uniform(0.1, 0.4)),
+        ],
+        OTHER,
+    )
 
 
 def make_stairs(rng: np.random.Generator, length: float) -> np.ndarray:
     """Make stairs along x, centred, up to +y from y = 0, with a landing and handrails."""
     x, count, rise = length / 2, int(rng.integers(2, 7)), rng.uniform(0.12, 0.17)
     end = 0.3 * count + rng.uniform(0.5, 2.0)
-    rows = [block((-x, 0.3 * i, FOOT_M), (x, end, rise * (i + 1)), reflectance=0.4)
-            for i in range(count)]
+    rows = [block((-x, 0.3 * i, FOOT_M), (x, end, rise * (i + 1)), reflectance=0.4) for i in range(count)]
     for at in np.linspace(-x + 0.05, x - 0.05, max(2, int(length / 4) + 1)):
         top = (at, 0.3 * count, rise * count + 0.9)
-        rows += [rod((at, 0.0, 0.9), top, 0.025, reflectance=METAL),
-                 rod((at, 0.05, 0.0), (at, 0.05, 0.9), 0.02, reflectance=METAL),
-                 rod((at, 0.3 * count, 0.0), top, 0.02, reflectance=METAL)]
+        rows += [
+            rod((at, 0.0, 0.9), top, 0.025, reflectance=METAL),
+            rod((at, 0.05, 0.0), (at, 0.05, 0.9), 0.02, reflectance=METAL),
+            rod((at, 0.3 * count, 0.0), top, 0.02, reflectance=METAL),
+        ]
     return parts(rows, BUILDING)
 
 
 def make_bicycle_stand(rng: np.random.Generator) -> np.ndarray:
     """Make a hoop that bicycles are locked to."""
     high = rng.uniform(0.7, 0.9)
-    rows = [rod((s * 0.35, 0, FOOT_M), (s * 0.35, 0, high), 0.025, reflectance=METAL)
-            for s in (-1, 1)]
+    rows = [rod((s * 0.35, 0, FOOT_M), (s * 0.35, 0, high), 0.025, reflectance=METAL) for s in (-1, 1)]
     return parts([*rows, rod((-0.35, 0, high), (0.35, 0, high), 0.025, reflectance=METAL)], POLE)
 
 
@@ -258,11 +308,24 @@ def _post(height: float, radius: float) -> tuple:
 
 
 def _cylinder(low: float, high: float, radius: float, reflectance: float) -> tuple:
-    return part(CYLINDER, (0, 0, (low + high) / 2), (radius, radius, (high - low) / 2),
-                reflectance=reflectance)
+    return part(CYLINDER, (0, 0, (low + high) / 2), (radius, radius, (high - low) / 2), reflectance=reflectance)
 
 
 # Things that a detector may confuse with a person.
-PERSON_SIZED = (make_sign, make_beacon, make_litter_bin, make_wheelie_bin, make_bollard,
-                make_cabinet, make_shopping_trolley, make_phone_box, make_advertising_column,
-                make_cone, make_planter, make_parasol, make_hydrant, make_traffic_light, make_bench)
+PERSON_SIZED = (
+    make_sign,
+    make_beacon,
+    make_litter_bin,
+    make_wheelie_bin,
+    make_bollard,
+    make_cabinet,
+    make_shopping_trolley,
+    make_phone_box,
+    make_advertising_column,
+    make_cone,
+    make_planter,
+    make_parasol,
+    make_hydrant,
+    make_traffic_light,
+    make_bench,
+)

@@ -34,8 +34,7 @@ def make_truck(rng: np.random.Generator) -> Thing:
     return make_rigid(made, size, "Truck")
 
 
-def _truck_parts(length: float, width: float, load: float, cab: float, colour: float,
-                 cargo: float) -> np.ndarray:
+def _truck_parts(length: float, width: float, load: float, cab: float, colour: float, cargo: float) -> np.ndarray:
     """Return the parts of a truck. load, cab: heights of load and cab above the road, m."""
     x, y, radius, floor = length / 2, width / 2, 0.48, 1.15
     back, belt, roof = x - min(2.2, 0.24 * length), 0.62 * cab, cab - 0.25
@@ -51,20 +50,20 @@ def _truck_parts(length: float, width: float, load: float, cab: float, colour: f
         block((back + 0.6, 0.2 * y, 1.2), (back + 0.75, 0.75 * y, roof - 0.3), reflectance=0.12),
         part(ELLIPSOID, (back + 0.95, 0.47 * y, belt), (0.15, 0.23, 0.45), reflectance=0.25),
         block((0.05 - x, -0.9 * y, 0.5), (0.12 - x, 0.9 * y, 0.62), reflectance=0.2),
-        block((-x + 0.02, -0.3, 0.65), (-x + 0.04, 0.3, 0.78), reflectance=PLATE)]
+        block((-x + 0.02, -0.3, 0.65), (-x + 0.04, 0.3, 0.78), reflectance=PLATE),
+    ]
     for side in (-1, 1):
         rows += [
-            upright_pane((back + 0.5, x - 0.15), (side * 0.96 * y, belt), (side * 0.96 * y, roof),
-                         **pane),
+            upright_pane((back + 0.5, x - 0.15), (side * 0.96 * y, belt), (side * 0.96 * y, roof), **pane),
             rod((x - 0.13, side * 0.94 * y, belt), (x - 0.2, side * 0.94 * y, roof), 0.05, **shell),
-            block((x - 0.5, side * (y + 0.05), belt + 0.1), (x - 0.4, side * (y + 0.25),
-                                                             belt + 0.6), reflectance=0.1),
-            block((-0.1 * x, side * 0.9 * y, 0.5), (0.25 * x, side * 0.5 * y, 1.0),
-                  reflectance=METAL),
-            block((-x, side * 0.7 * y, 0.85), (0.02 - x, side * 0.98 * y, 1.0),
-                  reflectance=PLATE)]
-        rows += [disc((place, side * (y - 0.2), radius), radius, 0.18, reflectance=RUBBER)
-                 for place in (x - 1.2, 1.4 - x, 2.6 - x)]
+            block((x - 0.5, side * (y + 0.05), belt + 0.1), (x - 0.4, side * (y + 0.25), belt + 0.6), reflectance=0.1),
+            block((-0.1 * x, side * 0.9 * y, 0.5), (0.25 * x, side * 0.5 * y, 1.0), reflectance=METAL),
+            block((-x, side * 0.7 * y, 0.85), (0.02 - x, side * 0.98 * y, 1.0), reflectance=PLATE),
+        ]
+        rows += [
+            disc((place, side * (y - 0.2), radius), radius, 0.18, reflectance=RUBBER)
+            for place in (x - 1.2, 1.4 - x, 2.6 - x)
+        ]
     return parts(rows, TRUCK)
 
 
@@ -82,8 +81,9 @@ def make_tram(rng: np.random.Generator) -> Thing:
     return make_rigid(made, size, "Tram")
 
 
-def _coach_parts(size: tuple[float, float, float], colour: float, semantic: int, radius: float,
-                 axles: tuple[float, float]) -> np.ndarray:
+def _coach_parts(
+    size: tuple[float, float, float], colour: float, semantic: int, radius: float, axles: tuple[float, float]
+) -> np.ndarray:
     """Return the parts of a long body with windows, pillars and seats.
 
     axles: positions as shares of the length, from the tail.
@@ -94,23 +94,30 @@ def _coach_parts(size: tuple[float, float, float], colour: float, semantic: int,
     shell, pane = Surface(reflectance=colour), Surface(reflectance=GLASS, transmission=0.7)
     rows = [
         block((0.4 - x, -0.97 * y, top), (x - 0.4, 0.97 * y, height), **shell),
-        block((0.3 - x, -0.95 * y, 0.25), (x - 0.3, 0.95 * y, floor), reflectance=0.15)]
+        block((0.3 - x, -0.95 * y, 0.25), (x - 0.3, 0.95 * y, floor), reflectance=0.15),
+    ]
     for end in (-1, 1):
         screen = (end * (x - 0.15), belt), (end * (x - 0.4), top + 0.1)
         rows += [
-            part(ELLIPSOID, (end * (x - 0.6), 0, 0.22 + belt / 2), (0.6, 0.98 * y, belt / 2),
-                 **shell),
+            part(ELLIPSOID, (end * (x - 0.6), 0, 0.22 + belt / 2), (0.6, 0.98 * y, belt / 2), **shell),
             block((end * (x - 0.7), -0.93 * y, 0.25), (end * (x - 0.2), 0.93 * y, belt), **shell),
-            slope(max(screen), min(screen), 0.93 * y, **pane)]
+            slope(max(screen), min(screen), 0.93 * y, **pane),
+        ]
     for side in (-1, 1):
         rows += [
             block((0.6 - x, side * y, 0.28), (x - 0.6, side * (y - 0.06), belt), **shell),
-            upright_pane((0.4 - x, x - 0.4), (side * 0.99 * y, belt), (side * 0.95 * y, top),
-                         **pane)]
-        rows += [disc(((share - 0.5) * length, side * (y - 0.16), radius), radius, 0.15,
-                      reflectance=RUBBER) for share in axles]
-        rows += [rod((place, side * 0.93 * y, belt), (place, side * 0.91 * y, top), 0.07, **shell)
-                 for place in np.linspace(0.45 - x, x - 0.45, 6)]
-    rows += [block((place, -0.85 * y, floor), (place + 0.2, 0.85 * y, belt + 0.35),
-                   reflectance=0.2, transmission=0.4) for place in np.linspace(1.5 - x, x - 3, 3)]
+            upright_pane((0.4 - x, x - 0.4), (side * 0.99 * y, belt), (side * 0.95 * y, top), **pane),
+        ]
+        rows += [
+            disc(((share - 0.5) * length, side * (y - 0.16), radius), radius, 0.15, reflectance=RUBBER)
+            for share in axles
+        ]
+        rows += [
+            rod((place, side * 0.93 * y, belt), (place, side * 0.91 * y, top), 0.07, **shell)
+            for place in np.linspace(0.45 - x, x - 0.45, 6)
+        ]
+    rows += [
+        block((place, -0.85 * y, floor), (place + 0.2, 0.85 * y, belt + 0.35), reflectance=0.2, transmission=0.4)
+        for place in np.linspace(1.5 - x, x - 3, 3)
+    ]
     return parts(rows, semantic)

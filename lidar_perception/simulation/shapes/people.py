@@ -9,17 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidar_perception.classes import CLASSES, PEDESTRIAN
-from lidar_perception.simulation.shapes.thing import (
-    METAL,
-    RUBBER,
-    SKIN,
-    Thing,
-    block,
-    disc,
-    draw_size,
-    make_rigid,
-    rod,
-)
+from lidar_perception.simulation.shapes.thing import METAL, RUBBER, SKIN, Thing, block, disc, draw_size, make_rigid, rod
 from lidar_perception.simulation.solids import BOX, ELLIPSOID, compute_hull, part, parts
 
 PERSON, OTHER = 30, 99
@@ -30,8 +20,7 @@ STANCE = 0.54  # share of a stride with the foot on the ground; 0.6 for real wal
 MIN_LENGTH_SHARE = 0.3  # shortest box as a share of the height, in KITTI
 HEEL_OFF = 0.6  # share of the stance after which the heel rises
 # Lengths as shares of the height, after Drillis and Contini (1966); radii with clothes.
-THIGH, SHANK, ANKLE, FOOT, SHOULDER, UPPER_ARM, FOREARM = (0.245, 0.246, 0.039, 0.152, 0.818,
-                                                           0.186, 0.2)
+THIGH, SHANK, ANKLE, FOOT, SHOULDER, UPPER_ARM, FOREARM = (0.245, 0.246, 0.039, 0.152, 0.818, 0.186, 0.2)
 REACH = 0.99 * (THIGH + SHANK)
 HIP = REACH + ANKLE
 
@@ -59,8 +48,7 @@ class PersonBuild(NamedTuple):
     shift: float = 0.0
 
 
-def make_pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
-                    carried: str = "") -> Thing:
+def make_pedestrian(rng: np.random.Generator, speed: float, child: bool = False, carried: str = "") -> Thing:
     """Make a person who walks at speed (m/s), or stands.
 
     The length of the box covers the body over a whole stride, without a bag, umbrella, trolley or
@@ -72,9 +60,16 @@ def make_pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
         shrink = rng.uniform(0.62, 0.8)
         width, height = width * max(shrink, 0.7), height * shrink
     step = min(sqrt(60 * 0.0065 * abs(speed)) * height / 1.72, 0.5 * height)
-    build = PersonBuild(height, max(width, 0.27 * height), step, rng.uniform(),
-                        rng.uniform(0.03, 0.3), rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75),
-                        carried)
+    build = PersonBuild(
+        height,
+        max(width, 0.27 * height),
+        step,
+        rng.uniform(),
+        rng.uniform(0.03, 0.3),
+        rng.uniform(0.2, 0.85),
+        rng.uniform(0.15, 0.75),
+        carried,
+    )
     low, high = _measure_stride(build)
     build = build._replace(shift=-(low + high) / 2)
     size = (max(high - low, MIN_LENGTH_SHARE * height), build.width, height)
@@ -109,24 +104,27 @@ def _trunk_parts(build: PersonBuild, up: float) -> list[tuple]:
     """Return head, neck, chest, hips and load, raised by `up` metres."""
     h, w = build.height, build.width
     return [
-        part(ELLIPSOID, (0.012 * h, 0, 0.93 * h + up), (0.055 * h, 0.045 * h, 0.068 * h),
-             reflectance=SKIN),
-        part(ELLIPSOID, (-0.012 * h, 0, 0.948 * h + up), (0.05 * h, 0.047 * h, 0.052 * h),
-             reflectance=build.hair),
+        part(ELLIPSOID, (0.012 * h, 0, 0.93 * h + up), (0.055 * h, 0.045 * h, 0.068 * h), reflectance=SKIN),
+        part(ELLIPSOID, (-0.012 * h, 0, 0.948 * h + up), (0.05 * h, 0.047 * h, 0.052 * h), reflectance=build.hair),
         rod((0, 0, 0.8 * h + up), (0.005 * h, 0, 0.89 * h + up), 0.032 * h, reflectance=SKIN),
-        part(ELLIPSOID, (0, 0, 0.70 * h + up), (0.08 * h, min(0.125 * h, 0.42 * w), 0.15 * h),
-             reflectance=build.coat),
-        part(ELLIPSOID, (0, 0, 0.54 * h + up), (0.075 * h, min(0.105 * h, 0.38 * w), 0.11 * h),
-             reflectance=build.trousers),
-        *_load_parts(build.carried, h, w, up, build.coat)]
+        part(ELLIPSOID, (0, 0, 0.70 * h + up), (0.08 * h, min(0.125 * h, 0.42 * w), 0.15 * h), reflectance=build.coat),
+        part(
+            ELLIPSOID,
+            (0, 0, 0.54 * h + up),
+            (0.075 * h, min(0.105 * h, 0.38 * w), 0.11 * h),
+            reflectance=build.trousers,
+        ),
+        *_load_parts(build.carried, h, w, up, build.coat),
+    ]
 
 
 def _limb_parts(turns: float, build: PersonBuild) -> tuple[list[tuple], float]:
     """Return arms, legs and feet after a number of strides, and the rise of the hips in m."""
     h = build.height
     feet = [_pose_foot((turns + half) % 1.0, 2 * build.step, h) for half in (0.0, 0.5)]
-    hip = min(HIP * h, *(z + sqrt((REACH * h) ** 2 - min(0.88 * abs(x), 0.9 * REACH * h) ** 2)
-                         for _, _, (x, z) in feet))
+    hip = min(
+        HIP * h, *(z + sqrt((REACH * h) ** 2 - min(0.88 * abs(x), 0.9 * REACH * h) ** 2) for _, _, (x, z) in feet)
+    )
     up, rows = hip - HIP * h, []
     for side, (u, left) in zip((-1, 1), ((turns + 0.5, False), (turns, True))):
         rows += _arm_parts(side, u, build, up, left)
@@ -134,9 +132,15 @@ def _limb_parts(turns: float, build: PersonBuild) -> tuple[list[tuple], float]:
         rows += _leg_parts(side, ankle, hip, h, build.trousers)
     for side, (toe, tilt, _) in zip((-1, 1), feet):
         flat, steep, half = cos(tilt), sin(tilt), FOOT * h / 2
-        rows.append(part(BOX, (toe[0] - half * flat + 0.02 * h * steep, side * 0.055 * h,
-                               toe[1] + half * steep + 0.02 * h * flat),
-                         (half, 0.03 * h, 0.02 * h), pitch=tilt, reflectance=RUBBER))
+        rows.append(
+            part(
+                BOX,
+                (toe[0] - half * flat + 0.02 * h * steep, side * 0.055 * h, toe[1] + half * steep + 0.02 * h * flat),
+                (half, 0.03 * h, 0.02 * h),
+                pitch=tilt,
+                reflectance=RUBBER,
+            )
+        )
     return rows, up
 
 
@@ -167,8 +171,10 @@ def _leg_parts(side: int, ankle: tuple, hip: float, h: float, trousers: float) -
     start = (0.12 * ankle[0], hip)
     x, z = find_knee(start, ankle, THIGH * h, SHANK * h)
     y = side * 0.055 * h
-    return [rod((start[0], y, hip), (x, y, z), 0.05 * h, reflectance=trousers),
-            rod((x, y, z), (ankle[0], y, ankle[1]), 0.037 * h, reflectance=trousers)]
+    return [
+        rod((start[0], y, hip), (x, y, z), 0.05 * h, reflectance=trousers),
+        rod((x, y, z), (ankle[0], y, ankle[1]), 0.037 * h, reflectance=trousers),
+    ]
 
 
 def find_knee(hip: tuple, ankle: tuple, thigh: float, shank: float) -> tuple[float, float]:
@@ -177,8 +183,8 @@ def find_knee(hip: tuple, ankle: tuple, thigh: float, shank: float) -> tuple[flo
     far = hypot(x, z)
     x, z = x / far, z / far
     far = min(far, 0.9999 * (thigh + shank))
-    along = (thigh ** 2 - shank ** 2 + far ** 2) / (2 * far)
-    bend = sqrt(max(thigh ** 2 - along ** 2, 0.0))
+    along = (thigh**2 - shank**2 + far**2) / (2 * far)
+    bend = sqrt(max(thigh**2 - along**2, 0.0))
     return hip[0] + along * x - bend * z, hip[1] + along * z + bend * x
 
 
@@ -198,42 +204,44 @@ def _arm_parts(side: int, u: float, build: PersonBuild, up: float, left: bool) -
     y = side * (w / 2 - radius)
     shoulder = (0.0, side * min(0.115 * h, w / 2 - 2 * radius), SHOULDER * h + up)
     elbow = (UPPER_ARM * h * sin(swing), y, shoulder[2] - UPPER_ARM * h * cos(swing))
-    hand = (elbow[0] + FOREARM * h * sin(swing + bend), y,
-            elbow[2] - FOREARM * h * cos(swing + bend))
-    return [rod(shoulder, elbow, radius, reflectance=coat),
-            rod(elbow, hand, radius, reflectance=coat)]
+    hand = (elbow[0] + FOREARM * h * sin(swing + bend), y, elbow[2] - FOREARM * h * cos(swing + bend))
+    return [rod(shoulder, elbow, radius, reflectance=coat), rod(elbow, hand, radius, reflectance=coat)]
 
 
 def _load_parts(carried: str, h: float, w: float, up: float, coat: float) -> list[tuple]:
     """Return the load that is carried, pulled or pushed; bag and trolley are on the right."""
     if carried == "backpack":
-        return [part(ELLIPSOID, (-0.1 * h, 0, 0.7 * h + up), (0.07 * h, 0.085 * h, 0.13 * h),
-                     reflectance=0.5 * coat)]
+        return [part(ELLIPSOID, (-0.1 * h, 0, 0.7 * h + up), (0.07 * h, 0.085 * h, 0.13 * h), reflectance=0.5 * coat)]
     if carried == "bag":
-        return [block((-0.15, -w / 2 - 0.05, 0.28 * h), (0.15, -w / 2 + 0.05, 0.28 * h + 0.3),
-                      reflectance=0.35, semantic=OTHER)]
+        return [
+            block(
+                (-0.15, -w / 2 - 0.05, 0.28 * h),
+                (0.15, -w / 2 + 0.05, 0.28 * h + 0.3),
+                reflectance=0.35,
+                semantic=OTHER,
+            )
+        ]
     if carried == "umbrella":
         top = h + 0.25
-        return [part(ELLIPSOID, (0.08, 0, top - 0.11), (0.5, 0.5, 0.11), reflectance=coat),
-                rod((0.1, w / 2 - 0.06, 0.7 * h), (0.08, 0.02, top - 0.1), 0.01,
-                    reflectance=METAL)]
+        return [
+            part(ELLIPSOID, (0.08, 0, top - 0.11), (0.5, 0.5, 0.11), reflectance=coat),
+            rod((0.1, w / 2 - 0.06, 0.7 * h), (0.08, 0.02, top - 0.1), 0.01, reflectance=METAL),
+        ]
     if carried == "trolley":
         y = -w / 2 + 0.03
-        return [block((-0.85, y - 0.18, 0.05), (-0.6, y + 0.18, 0.6), reflectance=0.25,
-                      semantic=OTHER),
-                rod((-0.6, y, 0.6), (-0.25, y, 0.47 * h), 0.015, reflectance=METAL,
-                    semantic=OTHER),
-                disc((-0.72, y, 0.05), 0.05, 0.18, reflectance=RUBBER, semantic=OTHER)]
+        return [
+            block((-0.85, y - 0.18, 0.05), (-0.6, y + 0.18, 0.6), reflectance=0.25, semantic=OTHER),
+            rod((-0.6, y, 0.6), (-0.25, y, 0.47 * h), 0.015, reflectance=METAL, semantic=OTHER),
+            disc((-0.72, y, 0.05), 0.05, 0.18, reflectance=RUBBER, semantic=OTHER),
+        ]
     if carried == "pram":
-        return [part(ELLIPSOID, (0.85, 0, 0.72), (0.42, 0.22, 0.2), reflectance=0.3,
-                     semantic=OTHER),
-                part(ELLIPSOID, (0.66, 0, 0.88), (0.25, 0.23, 0.2), reflectance=0.25,
-                     semantic=OTHER),
-                rod((0.25, 0, 0.6 * h), (1.1, 0, 0.3), 0.02, reflectance=METAL, semantic=OTHER),
-                disc((0.55, 0, 0.14), 0.14, 0.27, reflectance=RUBBER, transmission=0.6,
-                     semantic=OTHER),
-                disc((1.15, 0, 0.12), 0.12, 0.25, reflectance=RUBBER, transmission=0.6,
-                     semantic=OTHER)]
+        return [
+            part(ELLIPSOID, (0.85, 0, 0.72), (0.42, 0.22, 0.2), reflectance=0.3, semantic=OTHER),
+            part(ELLIPSOID, (0.66, 0, 0.88), (0.25, 0.23, 0.2), reflectance=0.25, semantic=OTHER),
+            rod((0.25, 0, 0.6 * h), (1.1, 0, 0.3), 0.02, reflectance=METAL, semantic=OTHER),
+            disc((0.55, 0, 0.14), 0.14, 0.27, reflectance=RUBBER, transmission=0.6, semantic=OTHER),
+            disc((1.15, 0, 0.12), 0.12, 0.25, reflectance=RUBBER, transmission=0.6, semantic=OTHER),
+        ]
     return []
 
 
@@ -249,30 +257,33 @@ def make_sitting_person(rng: np.random.Generator, chair: bool = True) -> Thing:
     knees, radius = front - 0.18, 0.05
     rows = [
         part(ELLIPSOID, (hip + 0.04, 0, height - 0.115), (0.095, 0.08, 0.115), reflectance=SKIN),
-        part(ELLIPSOID, (hip, 0, seat + 0.42 * trunk), (0.13, min(0.2, 0.36 * width),
-                                                        0.38 * trunk), reflectance=coat),
-        part(ELLIPSOID, (hip, 0, seat + 0.1), (0.15, min(0.18, 0.36 * width), 0.11),
-             reflectance=trousers)]
+        part(ELLIPSOID, (hip, 0, seat + 0.42 * trunk), (0.13, min(0.2, 0.36 * width), 0.38 * trunk), reflectance=coat),
+        part(ELLIPSOID, (hip, 0, seat + 0.1), (0.15, min(0.18, 0.36 * width), 0.11), reflectance=trousers),
+    ]
     for side in (-1, 1):
         y = side * 0.1
-        rows += [rod((hip, y, seat + 0.09), (knees, y, seat + 0.07), 0.075, reflectance=trousers),
-                 rod((knees, y, seat + 0.07), (knees, y, 0.07), 0.055, reflectance=trousers),
-                 block((front - 0.26, y - 0.05, 0.0), (front, y + 0.05, 0.08),
-                       reflectance=RUBBER)]
+        rows += [
+            rod((hip, y, seat + 0.09), (knees, y, seat + 0.07), 0.075, reflectance=trousers),
+            rod((knees, y, seat + 0.07), (knees, y, 0.07), 0.055, reflectance=trousers),
+            block((front - 0.26, y - 0.05, 0.0), (front, y + 0.05, 0.08), reflectance=RUBBER),
+        ]
         y = side * (width / 2 - radius)
         elbow, hand = (hip, y, seat + 0.32 * trunk), (knees - 0.05, y, seat + 0.2)
-        rows += [rod((hip, side * 0.3 * width, seat + 0.68 * trunk), elbow, radius,
-                     reflectance=coat), rod(elbow, hand, radius, reflectance=coat)]
+        rows += [
+            rod((hip, side * 0.3 * width, seat + 0.68 * trunk), elbow, radius, reflectance=coat),
+            rod(elbow, hand, radius, reflectance=coat),
+        ]
     if chair:
-        rows += [block((back + 0.03, -0.22, seat - 0.04), (hip + 0.28, 0.22, seat),
-                       reflectance=METAL, semantic=OTHER),
-                 block((back, -0.22, seat), (back + 0.03, 0.22, seat + 0.42), reflectance=METAL,
-                       semantic=OTHER)]
-        rows += [rod((x, 0.0, 0.0), (x, 0.0, seat), 0.02, reflectance=METAL, semantic=OTHER)
-                 for x in (back + 0.05, hip + 0.25)]
+        rows += [
+            block((back + 0.03, -0.22, seat - 0.04), (hip + 0.28, 0.22, seat), reflectance=METAL, semantic=OTHER),
+            block((back, -0.22, seat), (back + 0.03, 0.22, seat + 0.42), reflectance=METAL, semantic=OTHER),
+        ]
+        rows += [
+            rod((x, 0.0, 0.0), (x, 0.0, seat), 0.02, reflectance=METAL, semantic=OTHER)
+            for x in (back + 0.05, hip + 0.25)
+        ]
     else:
-        rows.append(part(ELLIPSOID, (back + 0.1, 0, seat + 0.45 * trunk), (0.1, 0.1, 0.2),
-                         reflectance=coat))
+        rows.append(part(ELLIPSOID, (back + 0.1, 0, seat + 0.45 * trunk), (0.1, 0.1, 0.2), reflectance=coat))
     return make_rigid(parts(rows, PERSON), size, "Person_sitting")
 
 
@@ -281,11 +292,13 @@ def make_wheelchair(rng: np.random.Generator) -> Thing:
     person = make_sitting_person(rng, chair=False)
     (length, width, height), radius = person.size, rng.uniform(0.28, 0.32)
     y, back = width / 2 - 0.03, -length / 2 + 0.3
-    wheels = [disc((back, s * y, radius), radius, 0.02, reflectance=RUBBER,
-                   transmission=WHEEL_TRANSMISSION) for s in (-1, 1)]
-    wheels += [disc((length / 2 - 0.15, s * 0.8 * y, 0.1), 0.1, 0.02, reflectance=RUBBER)
-               for s in (-1, 1)]
-    seat = [block((back - 0.2, -0.9 * y, 0.4), (back + 0.25, 0.9 * y, 0.44), reflectance=METAL),
-            block((back - 0.25, -0.9 * y, 0.44), (back - 0.2, 0.9 * y, 0.9), reflectance=METAL)]
+    wheels = [
+        disc((back, s * y, radius), radius, 0.02, reflectance=RUBBER, transmission=WHEEL_TRANSMISSION) for s in (-1, 1)
+    ]
+    wheels += [disc((length / 2 - 0.15, s * 0.8 * y, 0.1), 0.1, 0.02, reflectance=RUBBER) for s in (-1, 1)]
+    seat = [
+        block((back - 0.2, -0.9 * y, 0.4), (back + 0.25, 0.9 * y, 0.44), reflectance=METAL),
+        block((back - 0.25, -0.9 * y, 0.44), (back - 0.2, 0.9 * y, 0.9), reflectance=METAL),
+    ]
     made = np.concatenate([person.parts(0.0), parts(wheels + seat, OTHER)])
     return make_rigid(made, (length, width, height), person.label)

@@ -53,11 +53,10 @@ def _return_parts(made: np.ndarray, travelled: float) -> np.ndarray:
 
 
 def draw_size(rng: np.random.Generator, label: str) -> tuple[float, float, float]:
-    """Draw length, width and height in m like those of KITTI's boxes, within 2 standard deviations.
-    """
+    """Draw length, width and height in m like those of KITTI's boxes, within 2 standard deviations."""
     mean, spread, together = SIZES[label]
     z = rng.normal(size=3)
-    z[2] = together * z[0] + np.sqrt(1 - together ** 2) * z[2]
+    z[2] = together * z[0] + np.sqrt(1 - together**2) * z[2]
     length, width, height = np.asarray(mean) + np.clip(z, -2, 2) * spread
     return float(length), float(width), float(height)
 
@@ -74,34 +73,41 @@ def rod(start: tuple, end: tuple, radius: float, **surface) -> tuple:
     """Return a cylinder from start to end (x, y, z)."""
     x, y, z = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     level = hypot(x, y)
-    return part(CYLINDER, _midpoint(start, end), (radius, radius, hypot(level, z) / 2),
-                yaw=atan2(y, x), pitch=atan2(level, z), **surface)
+    return part(
+        CYLINDER,
+        _midpoint(start, end),
+        (radius, radius, hypot(level, z) / 2),
+        yaw=atan2(y, x),
+        pitch=atan2(level, z),
+        **surface,
+    )
 
 
 def disc(centre: tuple, radius: float, half_width: float, **surface) -> tuple:
     """Return a cylinder along y, such as a wheel."""
-    return part(CYLINDER, centre, (radius, radius, half_width), pitch=pi / 2, yaw=pi / 2,
-                **surface)
+    return part(CYLINDER, centre, (radius, radius, half_width), pitch=pi / 2, yaw=pi / 2, **surface)
 
 
 def block(corner: tuple, opposite: tuple, **surface) -> tuple:
     """Return an upright box between two corners (x, y, z)."""
     (a, b, c), (x, y, z) = corner, opposite
-    return part(BOX, _midpoint(corner, opposite), (abs(x - a) / 2, abs(y - b) / 2, abs(z - c) / 2),
-                **surface)
+    return part(BOX, _midpoint(corner, opposite), (abs(x - a) / 2, abs(y - b) / 2, abs(z - c) / 2), **surface)
 
 
 def _midpoint(one: tuple, other: tuple) -> tuple:
     return (one[0] + other[0]) / 2, (one[1] + other[1]) / 2, (one[2] + other[2]) / 2
 
 
-def slope(front: tuple, back: tuple, half_width: float, thickness: float = 0.01,
-          **surface) -> tuple:
+def slope(front: tuple, back: tuple, half_width: float, thickness: float = 0.01, **surface) -> tuple:
     """Return a thin board across y from front (x, z) to back (x, z), such as a windscreen."""
     (x0, z0), (x1, z1) = front, back
-    return part(BOX, ((x0 + x1) / 2, 0.0, (z0 + z1) / 2),
-                (hypot(x0 - x1, z0 - z1) / 2, half_width, thickness / 2),
-                pitch=atan2(z1 - z0, x0 - x1), **surface)
+    return part(
+        BOX,
+        ((x0 + x1) / 2, 0.0, (z0 + z1) / 2),
+        (hypot(x0 - x1, z0 - z1) / 2, half_width, thickness / 2),
+        pitch=atan2(z1 - z0, x0 - x1),
+        **surface,
+    )
 
 
 def upright_pane(x: tuple, low: tuple, high: tuple, thickness: float = 0.01, **surface) -> tuple:
@@ -110,6 +116,11 @@ def upright_pane(x: tuple, low: tuple, high: tuple, thickness: float = 0.01, **s
     Such as the side window of a cabin that is narrower at the top.
     """
     (y0, z0), (y1, z1) = low, high
-    return part(BOX, ((x[0] + x[1]) / 2, (y0 + y1) / 2, (z0 + z1) / 2),
-                (thickness / 2, (x[1] - x[0]) / 2, hypot(y1 - y0, z1 - z0) / 2), yaw=pi / 2,
-                pitch=atan2(y1 - y0, z1 - z0), **surface)
+    return part(
+        BOX,
+        ((x[0] + x[1]) / 2, (y0 + y1) / 2, (z0 + z1) / 2),
+        (thickness / 2, (x[1] - x[0]) / 2, hypot(y1 - y0, z1 - z0) / 2),
+        yaw=pi / 2,
+        pitch=atan2(y1 - y0, z1 - z0),
+        **surface,
+    )

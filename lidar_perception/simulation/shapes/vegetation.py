@@ -23,8 +23,7 @@ def make_tree(rng: np.random.Generator, height: float | None = None) -> np.ndarr
     height = rng.uniform(4.0, 11.0) if height is None else height
     fork, radius = height * rng.uniform(0.33, 0.42), height * rng.uniform(0.016, 0.026)
     top = (*rng.uniform(-0.03, 0.03, 2) * height, 0.75 * height)
-    rows = [rod((0, 0, -0.3), (0, 0, fork), radius, **WOOD),
-            rod((0, 0, fork), top, 0.6 * radius, **WOOD)]
+    rows = [rod((0, 0, -0.3), (0, 0, fork), radius, **WOOD), rod((0, 0, fork), top, 0.6 * radius, **WOOD)]
     turn, spread = rng.uniform(0, 2 * np.pi), height * rng.uniform(0.1, 0.2)
     for at in (turn, turn + pi):
         end = (spread * cos(at), spread * sin(at), 0.62 * height)
@@ -33,10 +32,12 @@ def make_tree(rng: np.random.Generator, height: float | None = None) -> np.ndarr
     leaves = [_draw_foliage(rng, (0, 0, fork + 0.55 * tall), (wide, wide, 0.45 * tall), (0.4, 1.0))]
     for i, (a, b, c, up, *rest) in enumerate(rng.random((3, 7)).tolist()):
         at = turn + 1.0 + 2.1 * i
-        centre = (0.7 * wide * cos(at), 0.7 * wide * sin(at),
-                  fork + tall * interpolate(up, 0.25, 0.7))
-        half = (height * interpolate(a, 0.12, 0.2), height * interpolate(b, 0.12, 0.2),
-                height * interpolate(c, 0.1, 0.16))
+        centre = (0.7 * wide * cos(at), 0.7 * wide * sin(at), fork + tall * interpolate(up, 0.25, 0.7))
+        half = (
+            height * interpolate(a, 0.12, 0.2),
+            height * interpolate(b, 0.12, 0.2),
+            height * interpolate(c, 0.1, 0.16),
+        )
         leaves.append(_leaf_ball(rest, centre, half, (0.6, 2.0)))
     return parts(rows + leaves, VEGETATION)
 
@@ -46,9 +47,10 @@ def make_conifer(rng: np.random.Generator) -> np.ndarray:
     height = rng.uniform(2.5, 9.0)
     stem = rod((0, 0, -0.3), (0, 0, 0.8 * height), 0.015 * height, **WOOD)
     tall = 0.2 * height
-    rows = [_draw_foliage(rng, (0, 0, max(z * height, tall + 0.1)), (r * height, r * height, tall),
-                          (1.0, 2.0))
-            for z, r in ((0.2, 0.2), (0.4, 0.16), (0.6, 0.11), (0.8, 0.06))]
+    rows = [
+        _draw_foliage(rng, (0, 0, max(z * height, tall + 0.1)), (r * height, r * height, tall), (1.0, 2.0))
+        for z, r in ((0.2, 0.2), (0.4, 0.16), (0.6, 0.11), (0.8, 0.06))
+    ]
     return parts([stem, *rows], VEGETATION)
 
 
@@ -57,20 +59,27 @@ def make_bush(rng: np.random.Generator) -> np.ndarray:
     high = rng.uniform(0.3, 1.0)
     rows = []
     for x, y, a, b, c, *rest in rng.random((3, 8)).tolist():
-        half = (high * interpolate(a, 0.6, 1.1), high * interpolate(b, 0.6, 1.1),
-                high * interpolate(c, 0.8, 1.2))
-        rows.append(_leaf_ball(rest, ((x - 0.5) * high, (y - 0.5) * high, 0.8 * high), half,
-                               (1.5, 5.0)))
+        half = (high * interpolate(a, 0.6, 1.1), high * interpolate(b, 0.6, 1.1), high * interpolate(c, 0.8, 1.2))
+        rows.append(_leaf_ball(rest, ((x - 0.5) * high, (y - 0.5) * high, 0.8 * high), half, (1.5, 5.0)))
     return parts(rows, VEGETATION)
 
 
 def make_hedge(rng: np.random.Generator, length: float) -> np.ndarray:
     """Make a hedge (P,) PART along x, centred, with an uneven top, from 0.3 m below the ground."""
     height, half = rng.uniform(0.8, 2.0), rng.uniform(0.25, 0.5)
-    rows = [part(BOX, (0, 0, height / 2 - 0.15), (length / 2, half, height / 2 + 0.15),
-                 reflectance=LEAVES, density=rng.uniform(4, 10))]
-    rows += [_draw_foliage(rng, (x, 0, height), (length / 8, 1.1 * half, rng.uniform(0.08, 0.2)),
-                           (2, 6)) for x in np.linspace(-0.38, 0.38, 4) * length]
+    rows = [
+        part(
+            BOX,
+            (0, 0, height / 2 - 0.15),
+            (length / 2, half, height / 2 + 0.15),
+            reflectance=LEAVES,
+            density=rng.uniform(4, 10),
+        )
+    ]
+    rows += [
+        _draw_foliage(rng, (x, 0, height), (length / 8, 1.1 * half, rng.uniform(0.08, 0.2)), (2, 6))
+        for x in np.linspace(-0.38, 0.38, 4) * length
+    ]
     return parts(rows, VEGETATION)
 
 
@@ -81,6 +90,11 @@ def _draw_foliage(rng: np.random.Generator, centre: tuple, half: tuple, density:
 def _leaf_ball(drawn: list[float], centre: tuple, half: tuple, density: tuple) -> tuple:
     """Return a ball of leaves; drawn: numbers 0 .. 1 for its yaw, reflectance and density."""
     turn, tone, thick = drawn
-    return part(ELLIPSOID, centre, half, yaw=turn * pi,
-                reflectance=LEAVES * interpolate(tone, 0.8, 1.25),
-                density=interpolate(thick, *density))
+    return part(
+        ELLIPSOID,
+        centre,
+        half,
+        yaw=turn * pi,
+        reflectance=LEAVES * interpolate(tone, 0.8, 1.25),
+        density=interpolate(thick, *density),
+    )

@@ -24,25 +24,25 @@ from lidar_perception.simulation.shapes.thing import (
 from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, Surface, part, parts
 
 CAR = 10
-PILLAR = 0.035   # radius, m
-LIGHTS = 0.9     # reflectance
+PILLAR = 0.035  # radius, m
+LIGHTS = 0.9  # reflectance
 # Only the middle of a bumper reaches the end of the box. On KITTI's cars seen from the front,
 # points of the middle third are 0.06 m behind the end of the box at 0.25 to 0.35 of the height,
 # 0.2 m at 0.45, 0.33 m at 0.52 and 0.84 m at 0.62; points 0.43 of the width from the middle are
 # 0.3 m further behind (medians of 25 to 38 cars up to 40 m away). Tails are upright: 0.06 m in the
 # middle third up to 0.7 of the height; round at their corners: 0.15 m at 0.86 of the half width,
 # 0.4 m at 0.96. Sides are 0.04 m inside the box, which may be as wide as the mirrors.
-BUMPER = 0.29    # height of the foremost point, as a share of the height
-BONNET = 0.13    # m from the front of the box to the middle of the bonnet's edge,
-CORNER = 0.3     # m and to the sides of the edge
-TAIL = 0.07      # m from the rear of the box to the flat part of the tail
+BUMPER = 0.29  # height of the foremost point, as a share of the height
+BONNET = 0.13  # m from the front of the box to the middle of the bonnet's edge,
+CORNER = 0.3  # m and to the sides of the edge
+TAIL = 0.07  # m from the rear of the box to the flat part of the tail
 TAIL_FLAT, TAIL_SIDE = 0.59, 0.95  # ends of the flat and the round part, of the half width
 TAIL_ROUND = 0.45  # m: length of the round part
 TAIL_LOW, TAIL_TOP = 0.22, 0.67  # ends of the closed part of the tail, of the height
-SIDE = 0.035     # m from the side of the box to the body
-DOME = 0.09      # m: rise of the roof in its middle
-MOTTLE = 0.7     # standard deviation of the logarithm of the reflectance of parts of one body
-LEGS = 0.5       # m: smallest distance from a bench to the front seats
+SIDE = 0.035  # m from the side of the box to the body
+DOME = 0.09  # m: rise of the roof in its middle
+MOTTLE = 0.7  # standard deviation of the logarithm of the reflectance of parts of one body
+LEGS = 0.5  # m: smallest distance from a bench to the front seats
 
 
 class Style(NamedTuple):
@@ -119,8 +119,9 @@ def _vary_reflectance(solids: np.ndarray, rng: np.random.Generator) -> np.ndarra
     return solids
 
 
-def make_body(size: tuple[float, float, float], style: Style, colour: float, glass: float,
-              driver: bool = True) -> np.ndarray:
+def make_body(
+    size: tuple[float, float, float], style: Style, colour: float, glass: float, driver: bool = True
+) -> np.ndarray:
     """Make a body (P,) PART.
 
     Below the belt are door panels, boxes over the axles and a floor with sills between the wheels.
@@ -148,17 +149,20 @@ def make_body(size: tuple[float, float, float], style: Style, colour: float, gla
     rows = [
         block((rear, -0.98 * y, clear), (front, 0.98 * y, arch), **shell),
         *_bonnet_parts((low, bonnet), x, 0.97 * y, height, shell),
-        block((TAIL - x, -TAIL_FLAT * y, TAIL_LOW * height), (load, TAIL_FLAT * y, deck - 0.02),
-              **shell),
-        block((TAIL + TAIL_ROUND - x, -TAIL_SIDE * y, clear), (load, TAIL_SIDE * y, deck - 0.02),
-              **shell),
+        block((TAIL - x, -TAIL_FLAT * y, TAIL_LOW * height), (load, TAIL_FLAT * y, deck - 0.02), **shell),
+        block((TAIL + TAIL_ROUND - x, -TAIL_SIDE * y, clear), (load, TAIL_SIDE * y, deck - 0.02), **shell),
         *_corner_parts(TAIL - x, y, (TAIL_LOW * height, deck - 0.02), shell),
         _bumper_part(x, 0.97 * y, height, shell),
         _bumper_part(-x, 0.97 * y, height, shell),
         block((roof, -narrow, height - 0.13), (high, narrow, height - DOME), **shell),
-        part(ELLIPSOID, ((roof + high) / 2, 0.0, height - DOME), ((high - roof) / 2, narrow, DOME),
-             reflectance=0.25 * colour),
-        slope((low, bonnet), (high, top), 0.9 * y, **pane)]
+        part(
+            ELLIPSOID,
+            ((roof + high) / 2, 0.0, height - DOME),
+            ((high - roof) / 2, narrow, DOME),
+            reflectance=0.25 * colour,
+        ),
+        slope((low, bonnet), (high, top), 0.9 * y, **pane),
+    ]
     if style.load:
         rows.append(block((0.02 - x, -0.95 * y, belt), (0.2 - x, 0.95 * y, top), **shell))
     else:
@@ -171,35 +175,44 @@ def make_body(size: tuple[float, float, float], style: Style, colour: float, gla
             rod((low, side * 0.94 * y, bonnet), (high, side * narrow, top), PILLAR, **shell),
             disc((axle, side * (y - 0.1), radius), radius, 0.1, reflectance=0.2),
             disc((-axle, side * (y - 0.1), radius), radius, 0.1, reflectance=0.2),
-            part(ELLIPSOID, (low - 0.1, side * (y + 0.08), belt + 0.05), (0.07, 0.1, 0.08),
-                 **shell)]
+            part(ELLIPSOID, (low - 0.1, side * (y + 0.08), belt + 0.05), (0.07, 0.1, 0.08), **shell),
+        ]
         if not style.load:
-            rows.append(rod((max(tail, 0.06 - x), side * 0.9 * y, belt),
-                            (max(roof, 0.06 - x), side * narrow, top - 0.02), 0.06, **shell))
+            rows.append(
+                rod(
+                    (max(tail, 0.06 - x), side * 0.9 * y, belt),
+                    (max(roof, 0.06 - x), side * narrow, top - 0.02),
+                    0.06,
+                    **shell,
+                )
+            )
     plate = BUMPER * height
     rows += [  # plates in front and behind; the tail lights are at its corners
         block((x - 0.05, -0.26, plate - 0.055), (x, 0.26, plate + 0.055), reflectance=PLATE),
-        block((TAIL - 0.02 - x, -0.26, 0.4 * height), (TAIL - x, 0.26, 0.4 * height + 0.11),
-              reflectance=PLATE),
-        *_corner_parts(TAIL - 0.005 - x, y + 0.005, (0.38 * height, 0.44 * height),
-                       Surface(reflectance=LIGHTS))]
-    rows += _seat_parts(0.5 * (low + high) - 0.75, load, 0.75 * y, arch, 0.45 * belt + 0.55 * top,
-                        driver)
+        block((TAIL - 0.02 - x, -0.26, 0.4 * height), (TAIL - x, 0.26, 0.4 * height + 0.11), reflectance=PLATE),
+        *_corner_parts(TAIL - 0.005 - x, y + 0.005, (0.38 * height, 0.44 * height), Surface(reflectance=LIGHTS)),
+    ]
+    rows += _seat_parts(0.5 * (low + high) - 0.75, load, 0.75 * y, arch, 0.45 * belt + 0.55 * top, driver)
     return parts(rows, CAR)
 
 
 def _bumper_part(x: float, y: float, height: float, surface: Surface) -> tuple:
     """Return a bumper that reaches x in its middle, rounded from above and from the side."""
-    return part(ELLIPSOID, (x - copysign(0.5, x), 0.0, BUMPER * height), (0.5, y, 0.17 * height),
-                **surface)
+    return part(ELLIPSOID, (x - copysign(0.5, x), 0.0, BUMPER * height), (0.5, y, 0.17 * height), **surface)
 
 
 def _corner_parts(x: float, y: float, heights: tuple, surface: Surface) -> list[tuple]:
     """Return the two corners of a tail at x, round from above, between two heights."""
     low, high = heights
-    return [part(CYLINDER, (x + TAIL_ROUND, side * TAIL_FLAT * y, (low + high) / 2),
-                 (TAIL_ROUND, (TAIL_SIDE - TAIL_FLAT) * y, (high - low) / 2), **surface)
-            for side in (-1, 1)]
+    return [
+        part(
+            CYLINDER,
+            (x + TAIL_ROUND, side * TAIL_FLAT * y, (low + high) / 2),
+            (TAIL_ROUND, (TAIL_SIDE - TAIL_FLAT) * y, (high - low) / 2),
+            **surface,
+        )
+        for side in (-1, 1)
+    ]
 
 
 def _bonnet_parts(foot: tuple, x: float, y: float, height: float, surface: Surface) -> list[tuple]:
@@ -208,13 +221,13 @@ def _bonnet_parts(foot: tuple, x: float, y: float, height: float, surface: Surfa
     Its edge has a step of 0.2 m; the crown is 0.04 of the height above the foot.
     """
     low, top = foot
-    return [slope((x - CORNER, 0.44 * height - 0.08), (low, top - 0.08), y, 0.2, **surface),
-            part(ELLIPSOID, (low, 0.0, 0.4 * height), (x - BONNET - low, y, top - 0.36 * height),
-                 **surface)]
+    return [
+        slope((x - CORNER, 0.44 * height - 0.08), (low, top - 0.08), y, 0.2, **surface),
+        part(ELLIPSOID, (low, 0.0, 0.4 * height), (x - BONNET - low, y, top - 0.36 * height), **surface),
+    ]
 
 
-def _seat_parts(x: float, rear: float, y: float, low: float, high: float,
-                driver: bool) -> list[tuple]:
+def _seat_parts(x: float, rear: float, y: float, low: float, high: float, driver: bool) -> list[tuple]:
     """Return the backs of the front seats at x, of the bench if there is room, and the driver.
 
     Most beams end on none of them, since returns through two panes are weak. On KITTI's cars seen
@@ -225,6 +238,12 @@ def _seat_parts(x: float, rear: float, y: float, low: float, high: float,
     if x - rear > LEGS:
         rows.append(block((rear + 0.1, -y, low), (rear + 0.25, y, high - 0.05), **cloth))
     if driver:
-        rows.append(part(ELLIPSOID, (x + 0.18, y / 2 + 0.06, (low + high) / 2 + 0.05),
-                         (0.13, 0.2, (high - low) / 2 + 0.08), reflectance=0.05))
+        rows.append(
+            part(
+                ELLIPSOID,
+                (x + 0.18, y / 2 + 0.06, (low + high) / 2 + 0.05),
+                (0.13, 0.2, (high - low) / 2 + 0.08),
+                reflectance=0.05,
+            )
+        )
     return rows

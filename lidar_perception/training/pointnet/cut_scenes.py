@@ -15,12 +15,7 @@ import numpy as np
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.fused.params import FusedParams
-from lidar_perception.detectors.pointnet.clusters import (
-    Clusters,
-    compute_centroids,
-    crop_boxes,
-    make_clusters,
-)
+from lidar_perception.detectors.pointnet.clusters import Clusters, compute_centroids, crop_boxes, make_clusters
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, load_detector
 from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
@@ -34,11 +29,11 @@ from lidar_perception.training.cache import cache_path, file_fingerprint, load_o
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, PointCloud
 
 SPARSE_SHARES = 0.08, 0.7  # smallest and largest share of the points left in a sparse scene
-MIN_POINTS_LEFT = 3        # of a cluster in a sparse or augmented scene
-OBJECT_MARGIN_M = 0.3      # points this near to an object are cut out with it
-MAX_DECOYS = 24            # random decoys in a scene without a proposer
-MAX_PROPOSALS = 14         # of each class in a scene with a proposer,
-MAX_RANDOM_DECOYS = 8      # and random decoys there
+MIN_POINTS_LEFT = 3  # of a cluster in a sparse or augmented scene
+OBJECT_MARGIN_M = 0.3  # points this near to an object are cut out with it
+MAX_DECOYS = 24  # random decoys in a scene without a proposer
+MAX_PROPOSALS = 14  # of each class in a scene with a proposer,
+MAX_RANDOM_DECOYS = 8  # and random decoys there
 
 
 @dataclass(frozen=True)
@@ -96,9 +91,16 @@ class CutScenes:
         """Return the cache file of scene i."""
         proposer = [] if self.proposer is None else [file_fingerprint(self.proposer)]
         sparse = [share] if (share := self.draw_share(i)) < 1 else []
-        return cache_path(self.cache, self.scenes.key(i), self.config.ground,
-                          self.config.clustering, self.config.classes, self.min_points, *proposer,
-                          *sparse)
+        return cache_path(
+            self.cache,
+            self.scenes.key(i),
+            self.config.ground,
+            self.config.clustering,
+            self.config.classes,
+            self.min_points,
+            *proposer,
+            *sparse,
+        )
 
     def keep(self, i: int) -> None:
         """Put the clusters of scene i into the cache."""
@@ -117,8 +119,9 @@ class CutScenes:
         return cut_clusters(scene, self.config, min_points, self.proposer)
 
 
-def cut_clusters(scene: TrainingScene, config: PointNetConfig, min_points: int,
-                 proposer: Path | None = None) -> CutScene:
+def cut_clusters(
+    scene: TrainingScene, config: PointNetConfig, min_points: int, proposer: Path | None = None
+) -> CutScene:
     """Cut a scene into labelled clusters, as from a sensor at SENSOR_HEIGHT.
 
     After the clusters come the loose ones: the points around each wanted object, and decoys, which
@@ -131,39 +134,42 @@ def cut_clusters(scene: TrainingScene, config: PointNetConfig, min_points: int,
     """
     sensed = scene.points[:, :3]  # clustering uses the density that the sensor sees
     scene = raise_scene(scene, scene.height - SENSOR_HEIGHT)
-    frame = PointCloud(np.ascontiguousarray(scene.points[:, :3]),
-                       normalize_intensity(scene.points[:, 3]))
+    frame = PointCloud(np.ascontiguousarray(scene.points[:, :3]), normalize_intensity(scene.points[:, 3]))
     ground = segment_ground(frame, config.ground)
-    clusters = make_clusters(frame, cluster_obstacles(frame.xyz, ground, config.clustering, sensed),
-                             min_points, ground)
+    clusters = make_clusters(frame, cluster_obstacles(frame.xyz, ground, config.clustering, sensed), min_points, ground)
     labels, owners = label_clusters(clusters, scene.boxes, scene.class_ids, config.classes)
     unwanted = (owners >= 0) & ~np.append(scene.wanted, False)[owners]
     labels[unwanted], owners[unwanted] = UNKNOWN, -1
     boxes = np.zeros((len(clusters), 7))
     boxes[owners >= 0] = scene.boxes[owners[owners >= 0]]
     background = len(config.classes)
-    wanted = [i for i in np.flatnonzero(scene.wanted)
-              if CLASSES[scene.class_ids[i]] in config.classes]
-    decoys = drop_touching(make_decoys(clusters.take(np.flatnonzero(labels == background)), config),
-                           scene.boxes)
+    wanted = [i for i in np.flatnonzero(scene.wanted) if CLASSES[scene.class_ids[i]] in config.classes]
+    decoys = drop_touching(make_decoys(clusters.take(np.flatnonzero(labels == background)), config), scene.boxes)
     proposed = np.zeros((0, 7))
     if proposer is not None:
         decoys = decoys[:MAX_RANDOM_DECOYS]
         proposed = drop_touching(propose_boxes(frame, proposer), scene.boxes)
     cut_boxes = np.concatenate([scene.boxes[wanted].reshape(-1, 7), proposed, decoys])
-    cut_labels = np.append([config.classes.index(CLASSES[scene.class_ids[i]]) for i in wanted],
-                           np.full(len(cut_boxes) - len(wanted), background)).astype(np.int64)
+    cut_labels = np.append(
+        [config.classes.index(CLASSES[scene.class_ids[i]]) for i in wanted],
+        np.full(len(cut_boxes) - len(wanted), background),
+    ).astype(np.int64)
     obstacles = frame.take(np.flatnonzero(~ground))
     loose = crop_boxes(cut_boxes, obstacles, OBJECT_MARGIN_M)
     kept = np.flatnonzero(loose.sizes >= min_points)
     loose = loose.take(kept).with_ground(frame.xyz.compress(ground, axis=0))
-    both = Clusters(np.concatenate([clusters.points, loose.points]),
-                    np.concatenate([clusters.first, clusters.first[-1] + loose.first[1:]]),
-                    np.concatenate([clusters.ids, np.full(len(loose), -1)]),
-                    np.concatenate([clusters.ground, loose.ground]))
-    return CutScene(both, np.concatenate([labels, cut_labels[kept]]),
-                    np.concatenate([boxes, cut_boxes[kept]]),
-                    np.arange(len(both)) >= len(clusters))
+    both = Clusters(
+        np.concatenate([clusters.points, loose.points]),
+        np.concatenate([clusters.first, clusters.first[-1] + loose.first[1:]]),
+        np.concatenate([clusters.ids, np.full(len(loose), -1)]),
+        np.concatenate([clusters.ground, loose.ground]),
+    )
+    return CutScene(
+        both,
+        np.concatenate([labels, cut_labels[kept]]),
+        np.concatenate([boxes, cut_boxes[kept]]),
+        np.arange(len(both)) >= len(clusters),
+    )
 
 
 def make_decoys(background: Clusters, config: PointNetConfig) -> np.ndarray:
@@ -177,9 +183,14 @@ def make_decoys(background: Clusters, config: PointNetConfig) -> np.ndarray:
     centres = compute_centroids(own.points, own.first)
     sizes = np.array(config.sizes)[rng.integers(len(config.sizes), size=len(own))]
     sizes = sizes * rng.uniform(0.9, 1.15, sizes.shape)
-    return np.column_stack([centres + rng.normal(0, 0.2, centres.shape),
-                            own.floor + sizes[:, 2] / 2, sizes,
-                            rng.uniform(-np.pi, np.pi, len(own))])
+    return np.column_stack(
+        [
+            centres + rng.normal(0, 0.2, centres.shape),
+            own.floor + sizes[:, 2] / 2,
+            sizes,
+            rng.uniform(-np.pi, np.pi, len(own)),
+        ]
+    )
 
 
 def propose_boxes(frame: PointCloud, proposer: Path) -> np.ndarray:
@@ -193,16 +204,14 @@ def propose_boxes(frame: PointCloud, proposer: Path) -> np.ndarray:
         The best MAX_PROPOSALS boxes of each class.
     """
     found = _load_proposer(proposer).propose(frame).detections
-    return np.concatenate([found.boxes[found.class_ids == i][:MAX_PROPOSALS]
-                           for i in range(len(CLASSES))])
+    return np.concatenate([found.boxes[found.class_ids == i][:MAX_PROPOSALS] for i in range(len(CLASSES))])
 
 
 @lru_cache(maxsize=1)
 def _load_proposer(path: Path) -> PointPillarsDetector:
     """Load a proposer with the lowest score that `fused` uses, once in each process."""
     params = DetectorParams(pointpillars=PointPillarsParams(warm_up=False))
-    return load_detector(path, "cpu", params).with_raw_scores().with_min_score(
-        FusedParams().proposals)
+    return load_detector(path, "cpu", params).with_raw_scores().with_min_score(FusedParams().proposals)
 
 
 def drop_touching(found: np.ndarray, boxes: np.ndarray) -> np.ndarray:

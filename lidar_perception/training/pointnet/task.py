@@ -15,12 +15,7 @@ from lidar_perception.detectors.normalized_view import restore_detections
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.box_head import BoxTargets, encode
 from lidar_perception.detectors.pointnet.calibration import calibrate, calibration_error
-from lidar_perception.detectors.pointnet.clusters import (
-    ClusterInput,
-    Clusters,
-    compute_centroids,
-    make_network_input,
-)
+from lidar_perception.detectors.pointnet.clusters import ClusterInput, Clusters, compute_centroids, make_network_input
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.losses import cluster_loss
 from lidar_perception.detectors.pointnet.network import PointNet
@@ -82,11 +77,9 @@ class ClusterPreparation:
         feet = np.column_stack([compute_centroids(clusters.points, clusters.first), clusters.floor])
         for k in background:
             own = slice(clusters.first[k], clusters.first[k + 1])
-            clusters.points[own], _ = vary_thing(clusters.points[own], feet[k], self.augment,
-                                                 rng)
+            clusters.points[own], _ = vary_thing(clusters.points[own], feet[k], self.augment, rng)
         clusters, boxes = augment_clusters(clusters, boxes, scene.loose[chosen], self.augment, rng)
-        inputs = make_network_input(clusters, self.config.points, int(rng.integers(1 << 30)),
-                                    self.config.farthest)
+        inputs = make_network_input(clusters, self.config.points, int(rng.integers(1 << 30)), self.config.farthest)
         has_box = (labels >= 0) & (labels < len(self.config.classes))
         classes = np.where(has_box, labels, 0)
         targets = encode(boxes, classes, inputs.centres, inputs.azimuths, self.config)
@@ -96,19 +89,18 @@ class ClusterPreparation:
         """Draw objects up to a number of each class, and some background."""
         chosen = []
         for label in range(len(self.config.classes) + 1):
-            limit = (self.augment.background if label == len(self.config.classes)
-                     else self.augment.objects)
+            limit = self.augment.background if label == len(self.config.classes) else self.augment.objects
             own = rng.permutation(np.flatnonzero(scene.labels == label))
             if self.with_decoys and label == len(self.config.classes):
-                decoys = own[scene.loose[own]][:limit // 2]
+                decoys = own[scene.loose[own]][: limit // 2]
                 own = np.concatenate([decoys, own[~scene.loose[own]]])
             chosen.append(own[:limit])
         return np.sort(np.concatenate(chosen))
 
 
-def augment_clusters(clusters: Clusters, boxes: np.ndarray, loose: np.ndarray,
-                     params: ClusterAugmentParams, rng: np.random.Generator
-                     ) -> tuple[Clusters, np.ndarray]:
+def augment_clusters(
+    clusters: Clusters, boxes: np.ndarray, loose: np.ndarray, params: ClusterAugmentParams, rng: np.random.Generator
+) -> tuple[Clusters, np.ndarray]:
     """Change clusters at random.
 
     All are flipped and scaled in the same way. Each loses points, gets noise, and may be moved away
@@ -171,19 +163,24 @@ def _group_means(values: np.ndarray, number: np.ndarray, count: int) -> np.ndarr
 
 def make_loss(config: PointNetConfig, device: torch.device) -> Callable:
     """Return loss(network, samples) -> (total, parts), see Task."""
+
     def tensor(arrays: Sequence[np.ndarray]) -> Tensor:
         return torch.from_numpy(np.concatenate(arrays)).to(device)
 
-    def loss(network: nn.Module, samples: Sequence[ClusterSample]
-             ) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(network: nn.Module, samples: Sequence[ClusterSample]) -> tuple[Tensor, dict[str, Tensor]]:
         inputs = [s.inputs for s in samples]
-        outputs = network(tensor([i.points for i in inputs]), tensor([i.valid for i in inputs]),
-                          tensor([i.context for i in inputs]))
+        outputs = network(
+            tensor([i.points for i in inputs]), tensor([i.valid for i in inputs]), tensor([i.context for i in inputs])
+        )
         targets = BoxTargets(*(tensor(parts) for parts in zip(*(s.targets for s in samples))))
-        losses = cluster_loss(outputs, tensor([s.labels for s in samples]), targets,
-                              tensor([s.has_box for s in samples]))
-        return losses.total, {"classes": losses.classes.detach(), "boxes": losses.boxes.detach(),
-                              "yaw_bins": losses.yaw_bins.detach()}
+        losses = cluster_loss(
+            outputs, tensor([s.labels for s in samples]), targets, tensor([s.has_box for s in samples])
+        )
+        return losses.total, {
+            "classes": losses.classes.detach(),
+            "boxes": losses.boxes.detach(),
+            "yaw_bins": losses.yaw_bins.detach(),
+        }
 
     return loss
 
@@ -208,8 +205,14 @@ def load_validation_clusters(source: CutScenes, i: int) -> ValidationClusters:
     scene = source.scene(i)
     made = np.flatnonzero(~scene.loose)
     frame = source.frame(i)
-    return ValidationClusters(frame.name, scene.clusters.take(made), scene.labels[made],
-                              frame.truth(), frame.calibration(), frame.sensor_height)
+    return ValidationClusters(
+        frame.name,
+        scene.clusters.take(made),
+        scene.labels[made],
+        frame.truth(),
+        frame.calibration(),
+        frame.sensor_height,
+    )
 
 
 def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) -> Validation:
@@ -225,10 +228,15 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
     labels = np.concatenate([s.labels for s in scenes])
     sizes = np.concatenate([s.clusters.sizes for s in scenes])
     if len(labels):
-        logits = torch.cat([
-            run_network(network, make_network_input(s.clusters, config.points,
-                                                    farthest=config.farthest)).logits.cpu()
-            for s in scenes if len(s.clusters)])
+        logits = torch.cat(
+            [
+                run_network(
+                    network, make_network_input(s.clusters, config.points, farthest=config.farthest)
+                ).logits.cpu()
+                for s in scenes
+                if len(s.clusters)
+            ]
+        )
         calibrate(network, logits, torch.from_numpy(labels))
     report, predictions = DetectionReport(), []
     for scene in show_progress(scenes, "validating", len(scenes)):
@@ -239,8 +247,10 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
     metrics, calibration = summarize_report(report, "bev", config.classes)
     known = (labels >= 0) & (sizes >= MIN_SCORED_POINTS)
     probabilities = np.concatenate([p.probabilities for p in predictions])[known]
-    right, objects = probabilities.argmax(axis=1) == labels[known], labels[known] < len(
-        config.classes)
-    return {**metrics, "accuracy": 100 * float(right.mean()) if len(right) else math.nan,
-            "object_accuracy": 100 * float(right[objects].mean()) if objects.any() else math.nan,
-            "calibration_error": calibration_error(probabilities, labels[known])}, calibration
+    right, objects = probabilities.argmax(axis=1) == labels[known], labels[known] < len(config.classes)
+    return {
+        **metrics,
+        "accuracy": 100 * float(right.mean()) if len(right) else math.nan,
+        "object_accuracy": 100 * float(right[objects].mean()) if objects.any() else math.nan,
+        "calibration_error": calibration_error(probabilities, labels[known]),
+    }, calibration

@@ -33,12 +33,7 @@ from lidar_perception.training.pointnet.task import (
 from lidar_perception.training.record import load_initial_weights, make_save, report_skipped
 from lidar_perception.training.request import PACKAGE
 from lidar_perception.training.run import Task, Validation
-from lidar_perception.training.timing import (
-    find_readable_frame,
-    measure_duration,
-    measure_step,
-    select_usable_scenes,
-)
+from lidar_perception.training.timing import find_readable_frame, measure_duration, measure_step, select_usable_scenes
 from lidar_perception.training.trainer import Cuts, StepSpeed
 from lidar_perception.types import InputError
 
@@ -82,8 +77,9 @@ class PointNetTrainer:
         """Return nothing: clusters are used at any range."""
         return {}
 
-    def measure_speed(self, params: PointNetTraining, scenes: Iterable[Item],
-                      held_out: Sequence[Any], device: torch.device) -> StepSpeed:
+    def measure_speed(
+        self, params: PointNetTraining, scenes: Iterable[Item], held_out: Sequence[Any], device: torch.device
+    ) -> StepSpeed:
         """Measure durations with clusters of the first usable scenes."""
         prepare = ClusterPreparation(self.config, params.augment)
         make_rng, proposer = partial(np.random.default_rng, 0), find_proposer(params)
@@ -97,54 +93,76 @@ class PointNetTrainer:
         chosen = select_usable_scenes(scenes, prepare_scene)  # compiles, too
         cutting, parts = measure_duration(lambda: [cut_scene(scene) for scene in chosen])
         network = make_pointnet(self.config).to(device)
-        step = measure_step(network, make_loss(self.config, device),
-                            lambda: [prepare(part, make_rng()) for part in parts], params, device)
-        frame = find_readable_frame(SceneReader(tuple(
-            CutScenes(source, self.config, params.data.min_points) for source in held_out),
-            load_validation_clusters), lambda frame: len(frame.clusters) > 0)
+        step = measure_step(
+            network,
+            make_loss(self.config, device),
+            lambda: [prepare(part, make_rng()) for part in parts],
+            params,
+            device,
+        )
+        frame = find_readable_frame(
+            SceneReader(
+                tuple(CutScenes(source, self.config, params.data.min_points) for source in held_out),
+                load_validation_clusters,
+            ),
+            lambda frame: len(frame.clusters) > 0,
+        )
         network.eval()
         with torch.no_grad():
             validate_network(network, [frame])
-            validation, _ = measure_duration(
-                lambda: validate_network(network, [frame] * TIMED_FRAMES))
+            validation, _ = measure_duration(lambda: validate_network(network, [frame] * TIMED_FRAMES))
         return StepSpeed(cutting / len(chosen), step, step, validation / TIMED_FRAMES)
 
-    def make_cuts(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any],
-                  cache: Path) -> Cuts:
+    def make_cuts(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any], cache: Path) -> Cuts:
         """Return the clusters of all scenes."""
-        cut = partial(CutScenes, config=self.config, min_points=params.data.min_points,
-                      cache=cache / "clusters", proposer=find_proposer(params))
-        cuts = [*(cut(source, sparse=params.augment.sparse) for source in sources),
-                *map(cut, held_out)]
+        cut = partial(
+            CutScenes,
+            config=self.config,
+            min_points=params.data.min_points,
+            cache=cache / "clusters",
+            proposer=find_proposer(params),
+        )
+        cuts = [*(cut(source, sparse=params.augment.sparse) for source in sources), *map(cut, held_out)]
         return Cuts(cuts, [range(len(source)) for source in cuts])
 
     def collect_cuts(self, params: PointNetTraining, cuts: Cuts, out: Path) -> None:
         """Do nothing: training reads the cache."""
 
-    def make_streams(self, params: PointNetTraining, sources: Sequence[Any],
-                     held_out: Sequence[Any], cuts: Cuts,
-                     out: Path) -> tuple[Stream, SceneReader]:
-        training, validation = cuts.sources[:len(sources)], cuts.sources[len(sources):]
+    def make_streams(
+        self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any], cuts: Cuts, out: Path
+    ) -> tuple[Stream, SceneReader]:
+        training, validation = cuts.sources[: len(sources)], cuts.sources[len(sources) :]
         prepare = ClusterPreparation(self.config, params.augment, bool(params.proposer))
-        return (Stream(tuple(training), prepare, params.seed),
-                SceneReader(tuple(validation), load_validation_clusters))
+        return (Stream(tuple(training), prepare, params.seed), SceneReader(tuple(validation), load_validation_clusters))
 
-    def make_task(self, params: PointNetTraining, batches: Batches, held_out: SceneReader,
-                  out: Path, device: torch.device, about: dict[str, Any], commit: str,
-                  init: Path | None) -> Task:
+    def make_task(
+        self,
+        params: PointNetTraining,
+        batches: Batches,
+        held_out: SceneReader,
+        out: Path,
+        device: torch.device,
+        about: dict[str, Any],
+        commit: str,
+        init: Path | None,
+    ) -> Task:
         torch.manual_seed(params.seed)
         network = load_initial_weights(make_pointnet(self.config), init, PointNetConfig).to(device)
         scenes: list[ValidationClusters] = []
 
         def validate(module: PointNet) -> Validation:
             if not scenes:
-                items = [item for item, in load_items(
-                    held_out, ([n] for n in range(len(held_out))), batches.jobs)]
+                items = [item for (item,) in load_items(held_out, ([n] for n in range(len(held_out))), batches.jobs)]
                 scenes.extend(item.sample for item in items if item.sample is not None)
-                report_skipped([reason for item in items for reason in item.skipped], len(scenes),
-                               set())
+                report_skipped([reason for item in items for reason in item.skipped], len(scenes), set())
             return validate_network(module, scenes)
 
-        return Task(network, make_loss(self.config, device), batches, validate,
-                    make_save(out, self.config, params, batches, about, commit), batches.epoch,
-                    about)
+        return Task(
+            network,
+            make_loss(self.config, device),
+            batches,
+            validate,
+            make_save(out, self.config, params, batches, about, commit),
+            batches.epoch,
+            about,
+        )

@@ -40,28 +40,17 @@ from lidar_perception.runs.terminal import show_progress
 from lidar_perception.scoring.detections import FrameDetections, run_detector
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.training.augment import (
-    TrainingScene,
-    augment_scene,
-    raise_scene,
-    turn_and_crop,
-)
+from lidar_perception.training.augment import TrainingScene, augment_scene, raise_scene, turn_and_crop
 from lidar_perception.training.data import SceneReader, load_items
 from lidar_perception.training.database import Database, paste_objects
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pasting import find_points_in_box
-from lidar_perception.types import (
-    CLASSES,
-    SENSOR_HEIGHT,
-    Detections,
-    GroundTruth,
-    InputError,
-    PointCloud,
-)
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, GroundTruth, InputError, PointCloud
 
 # Boxes of low score hardly change the AP, and validation is quicker without them.
-VALIDATION_PARAMS = DetectorParams(pointpillars=PointPillarsParams(
-    scores=ScoreParams.for_all_classes(0.1), warm_up=False))
+VALIDATION_PARAMS = DetectorParams(
+    pointpillars=PointPillarsParams(scores=ScoreParams.for_all_classes(0.1), warm_up=False)
+)
 # Similar class: the class, such as Van: Car, Person_sitting: Pedestrian.
 CLASS_BY_SIMILAR = {other: name for name, other in NEIGHBOURS.items()}
 MIN_TOUCH_IOU = 1e-6  # of an anchor that touches a box
@@ -124,8 +113,7 @@ class ScenePreparation:
             scene = paste_objects(scene, self._objects, self.augment, low, high, rng)
         scene = augment_scene(scene, self.augment, rng)
         frame = PointCloud(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
-        seen = NormalizedView.of(frame, SensorPoseParams(height=scene.height), self.config.low,
-                                 self.config.high).frame
+        seen = NormalizedView.of(frame, SensorPoseParams(height=scene.height), self.config.low, self.config.high).frame
         inputs = make_network_input(seen, self.config)
         if len(inputs.points) < 2:
             raise InputError("a scene has no point in the detection range")
@@ -136,13 +124,15 @@ class ScenePreparation:
     def _select_objects(self, scene: TrainingScene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
         low, high = np.array(self.config.low), np.array(self.config.high)
         names = [CLASSES[i] for i in scene.class_ids]
-        labels = np.array([self._label(CLASS_BY_SIMILAR.get(name, name)) for name in names],
-                          np.int64)
+        labels = np.array([self._label(CLASS_BY_SIMILAR.get(name, name)) for name in names], np.int64)
         kept = np.flatnonzero(is_within(scene.boxes, low, high) & (labels != -1))
-        counted = [bool(scene.wanted[i]) and names[i] not in CLASS_BY_SIMILAR
-                   and labels[i] != DONT_CARE_LABEL
-                   and len(find_points_in_box(xyz, scene.boxes[i], 0.0)) >= self.min_points
-                   for i in kept]
+        counted = [
+            bool(scene.wanted[i])
+            and names[i] not in CLASS_BY_SIMILAR
+            and labels[i] != DONT_CARE_LABEL
+            and len(find_points_in_box(xyz, scene.boxes[i], 0.0)) >= self.min_points
+            for i in kept
+        ]
         return scene.boxes[kept].astype(np.float32), labels[kept], np.array(counted, bool)
 
     def _label(self, name: str) -> int:
@@ -173,8 +163,9 @@ def reduce_range(config: NetworkConfig, ahead: float, aside: float) -> NetworkCo
     return replace(config, low=(back, right, bottom), high=(front, left, top))
 
 
-def _assign_targets(boxes: np.ndarray, labels: np.ndarray, counted: np.ndarray, anchors: Tensor,
-                    config: NetworkConfig) -> Targets:
+def _assign_targets(
+    boxes: np.ndarray, labels: np.ndarray, counted: np.ndarray, anchors: Tensor, config: NetworkConfig
+) -> Targets:
     """Return the targets of one sample.
 
     Anchors on objects that do not count, and those of any class that touch a DontCare region, are
@@ -184,12 +175,13 @@ def _assign_targets(boxes: np.ndarray, labels: np.ndarray, counted: np.ndarray, 
     targets = assign(anchors, config, all_boxes[wanted], classes[wanted])
     anchor_labels = targets.labels[0]
     for index, spec in enumerate(config.anchors):
-        for others, min_iou in ((all_boxes[~wanted & (classes == index)], spec.unmatched),
-                                (all_boxes[classes == DONT_CARE_LABEL], MIN_TOUCH_IOU)):
+        for others, min_iou in (
+            (all_boxes[~wanted & (classes == index)], spec.unmatched),
+            (all_boxes[classes == DONT_CARE_LABEL], MIN_TOUCH_IOU),
+        ):
             candidates = find_near_anchors(anchors, config, others, index)
             if len(candidates):
-                ignored = (nearest_axis_iou(anchors[candidates], others).max(dim=1).values
-                           >= min_iou)
+                ignored = nearest_axis_iou(anchors[candidates], others).max(dim=1).values >= min_iou
                 ignored &= anchor_labels[candidates] == BACKGROUND
                 anchor_labels[candidates[ignored]] = IGNORED
     return targets
@@ -200,14 +192,16 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     classes = torch.from_numpy(anchor_classes(config)).to(device)
 
     def loss(network: nn.Module, samples: Sequence[Sample]) -> tuple[Tensor, dict[str, Tensor]]:
-        pillars = make_pillar_batch([torch.from_numpy(s.points).to(device) for s in samples],
-                                    config)
+        pillars = make_pillar_batch([torch.from_numpy(s.points).to(device) for s in samples], config)
         cluster_maps = [s.cluster_map for s in samples if s.cluster_map is not None]
         maps = torch.from_numpy(np.stack(cluster_maps)).to(device) if cluster_maps else None
         targets = to_dense([sample.targets for sample in samples], len(classes), device)
         losses = detection_loss(network(pillars, maps), targets, classes)
-        return losses.total, {"classes": losses.classes.detach(), "boxes": losses.boxes.detach(),
-                              "directions": losses.directions.detach()}
+        return losses.total, {
+            "classes": losses.classes.detach(),
+            "boxes": losses.boxes.detach(),
+            "directions": losses.directions.detach(),
+        }
 
     return loss
 
@@ -225,17 +219,15 @@ def load_validation_frame(config: NetworkConfig, source: Any, i: int) -> Frame:
     truth, calibration = frame.truth(), frame.calibration()
     if calibration is None and truth is not None:
         kept = np.flatnonzero(is_within(truth.boxes, config.low, config.high))
-        truth = GroundTruth.of(truth.boxes[kept], truth.class_ids[kept],
-                               [truth.extras[k] for k in kept], truth.notes)
-    return Frame.of(frame.name, frame.load(), truth, calibration,
-                    sensor_height=frame.sensor_height)
+        truth = GroundTruth.of(truth.boxes[kept], truth.class_ids[kept], [truth.extras[k] for k in kept], truth.notes)
+    return Frame.of(frame.name, frame.load(), truth, calibration, sensor_height=frame.sensor_height)
 
 
 def validate_detector(detector: Detector, scenes: SceneReader, jobs: int = 0) -> DetectionReport:
     """Evaluate a detector on every scene by KITTI's protocol."""
     report = DetectionReport()
     items = load_items(scenes, ([n] for n in range(len(scenes))), jobs)
-    for item, in show_progress(items, "validating", len(scenes)):
+    for (item,) in show_progress(items, "validating", len(scenes)):
         report.skipped += item.skipped
         if item.sample is not None:
             report.update(detect_in_frame(item.sample, detector))

@@ -16,11 +16,7 @@ import torch
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
-from lidar_perception.detectors.pointpillars.network import (
-    PointPillars,
-    channels_last,
-    make_network,
-)
+from lidar_perception.detectors.pointpillars.network import PointPillars, channels_last, make_network
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
@@ -38,19 +34,9 @@ from lidar_perception.training.pointpillars.task import (
     reduce_range,
     validate_detector,
 )
-from lidar_perception.training.record import (
-    load_initial_weights,
-    make_save,
-    report_skipped,
-    summarize_report,
-)
+from lidar_perception.training.record import load_initial_weights, make_save, report_skipped, summarize_report
 from lidar_perception.training.run import Task, Validation
-from lidar_perception.training.timing import (
-    find_readable_frame,
-    measure_duration,
-    measure_step,
-    select_usable_scenes,
-)
+from lidar_perception.training.timing import find_readable_frame, measure_duration, measure_step, select_usable_scenes
 from lidar_perception.training.trainer import Cuts, StepSpeed
 from lidar_perception.types import InputError
 
@@ -77,8 +63,7 @@ class PointPillarsTrainer:
     def max_cuts(self, params: PointPillarsTraining) -> int:
         """Return the number of scenes that objects are cut from; 0 if none are pasted."""
         augment = params.augment
-        pasted = augment.crowded and (augment.cars or augment.pedestrians or augment.cyclists
-                                      or augment.things)
+        pasted = augment.crowded and (augment.cars or augment.pedestrians or augment.cyclists or augment.things)
         return augment.database_scans if pasted else 0
 
     def reduced_range(self, params: PointPillarsTraining) -> dict[str, Any]:
@@ -86,45 +71,54 @@ class PointPillarsTrainer:
         ahead, aside = REDUCED_RANGES[params.range]
         return {} if params.ahead or params.aside else {"ahead": ahead, "aside": aside}
 
-    def measure_speed(self, params: PointPillarsTraining, scenes: Iterable[Item],
-                      held_out: Sequence[Any], device: torch.device) -> StepSpeed:
+    def measure_speed(
+        self, params: PointPillarsTraining, scenes: Iterable[Item], held_out: Sequence[Any], device: torch.device
+    ) -> StepSpeed:
         """Measure durations, with objects pasted from the scenes themselves."""
-        def cut_all() -> list[Database]:
-            return [cut_objects(scene, self.config.classes, params.data.min_points)
-                    for scene in chosen]
 
-        reduced = reduce_range(self.config, **(self.reduced_range(params) or {
-            "ahead": params.ahead, "aside": params.aside}))
+        def cut_all() -> list[Database]:
+            return [cut_objects(scene, self.config.classes, params.data.min_points) for scene in chosen]
+
+        reduced = reduce_range(
+            self.config, **(self.reduced_range(params) or {"ahead": params.ahead, "aside": params.aside})
+        )
         prepare = ScenePreparation(reduced, params.augment, params.data.min_points)
-        chosen = select_usable_scenes(scenes, lambda scene: prepare(
-            scene, np.random.default_rng(0)))
+        chosen = select_usable_scenes(scenes, lambda scene: prepare(scene, np.random.default_rng(0)))
         cut_objects(chosen[0], self.config.classes, params.data.min_points)  # compiles
         cutting, parts = measure_duration(cut_all)
         network = make_network(self.config).to(device)
         channels_last(network)
         with tempfile.TemporaryDirectory() as folder:
             join_databases(parts).save(Path(folder) / OBJECTS)
-            prepare_pasted = replace(
-                prepare, database=Path(folder) / OBJECTS if self.max_cuts(params) else None)
-            step = measure_step(network, make_loss(reduced, device), lambda: [
-                prepare_pasted(scene, np.random.default_rng(0)) for scene in chosen],
-                                params, device)
+            prepare_pasted = replace(prepare, database=Path(folder) / OBJECTS if self.max_cuts(params) else None)
+            step = measure_step(
+                network,
+                make_loss(reduced, device),
+                lambda: [prepare_pasted(scene, np.random.default_rng(0)) for scene in chosen],
+                params,
+                device,
+            )
         detector = self._make_detector(network, device)
-        frame = find_readable_frame(self._make_reader(held_out), lambda frame: detect_in_frame(
-            frame, detector).problem is None)
+        frame = find_readable_frame(
+            self._make_reader(held_out), lambda frame: detect_in_frame(frame, detector).problem is None
+        )
         whole = step * np.prod(self.config.grid) / np.prod(reduced.grid)
         validation, _ = measure_duration(lambda: detect_in_frame(frame, detector))
         return StepSpeed(cutting / len(chosen), step, float(whole), validation)
 
-    def make_cuts(self, params: PointPillarsTraining, sources: Sequence[Any],
-                  held_out: Sequence[Any], cache: Path) -> Cuts:
+    def make_cuts(
+        self, params: PointPillarsTraining, sources: Sequence[Any], held_out: Sequence[Any], cache: Path
+    ) -> Cuts:
         """Return the objects of some scenes, which are drawn with the seed."""
         ends = np.cumsum([0, *map(len, sources)])
-        chosen = np.random.default_rng(params.seed).permutation(ends[-1])[:self.max_cuts(params)]
-        cuts = [CutObjects(source, self.config.classes, params.data.min_points, cache / "objects")
-                for source in sources]
-        return Cuts(cuts, [np.sort(chosen[(chosen >= first) & (chosen < end)] - first).tolist()
-                           for first, end in pairwise(ends)])
+        chosen = np.random.default_rng(params.seed).permutation(ends[-1])[: self.max_cuts(params)]
+        cuts = [
+            CutObjects(source, self.config.classes, params.data.min_points, cache / "objects") for source in sources
+        ]
+        return Cuts(
+            cuts,
+            [np.sort(chosen[(chosen >= first) & (chosen < end)] - first).tolist() for first, end in pairwise(ends)],
+        )
 
     def collect_cuts(self, params: PointPillarsTraining, cuts: Cuts, out: Path) -> None:
         """Write all cut objects into OBJECTS."""
@@ -139,17 +133,28 @@ class PointPillarsTrainer:
                     continue
         join_databases(parts).save(out / OBJECTS)
 
-    def make_streams(self, params: PointPillarsTraining, sources: Sequence[Any],
-                     held_out: Sequence[Any], cuts: Cuts,
-                     out: Path) -> tuple[Stream, SceneReader]:
+    def make_streams(
+        self, params: PointPillarsTraining, sources: Sequence[Any], held_out: Sequence[Any], cuts: Cuts, out: Path
+    ) -> tuple[Stream, SceneReader]:
         prepare = ScenePreparation(
-            reduce_range(self.config, params.ahead, params.aside), params.augment,
-            params.data.min_points, out / OBJECTS if self.max_cuts(params) else None)
+            reduce_range(self.config, params.ahead, params.aside),
+            params.augment,
+            params.data.min_points,
+            out / OBJECTS if self.max_cuts(params) else None,
+        )
         return Stream(tuple(sources), prepare, params.seed), self._make_reader(held_out)
 
-    def make_task(self, params: PointPillarsTraining, batches: Batches, held_out: SceneReader,
-                  out: Path, device: torch.device, about: dict[str, Any], commit: str,
-                  init: Path | None) -> Task:
+    def make_task(
+        self,
+        params: PointPillarsTraining,
+        batches: Batches,
+        held_out: SceneReader,
+        out: Path,
+        device: torch.device,
+        about: dict[str, Any],
+        commit: str,
+        init: Path | None,
+    ) -> Task:
         torch.manual_seed(params.seed)
         network = load_initial_weights(make_network(self.config), init, NetworkConfig)
         network = channels_last(network.to(device))
@@ -162,13 +167,18 @@ class PointPillarsTrainer:
             return summarize_report(report, params.score, self.config.classes)
 
         reduced = reduce_range(self.config, params.ahead, params.aside)
-        return Task(network, make_loss(reduced, device), batches, validate,
-                    make_save(out, self.config, params, batches, about, commit), batches.epoch,
-                    about)
+        return Task(
+            network,
+            make_loss(reduced, device),
+            batches,
+            validate,
+            make_save(out, self.config, params, batches, about, commit),
+            batches.epoch,
+            about,
+        )
 
     def _make_detector(self, network: PointPillars, device: torch.device) -> PointPillarsDetector:
-        proposer = PointPillarsProposer(TorchNetwork(network, str(device)), Header(self.config),
-                                        str(device))
+        proposer = PointPillarsProposer(TorchNetwork(network, str(device)), Header(self.config), str(device))
         return PointPillarsDetector(proposer, VALIDATION_PARAMS)
 
     def _make_reader(self, held_out: Sequence[Any]) -> SceneReader:
