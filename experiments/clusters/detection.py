@@ -44,7 +44,7 @@ CHANGES = {
     "noise 2 cm": Change(noise=0.02),
     "noise 5 cm": Change(noise=0.05),
     "noise 10 cm": Change(noise=0.1),
-}  # of Table 8; the paper gives no amount of noise
+}  # changes of Table 8; the paper does not state the amount of noise
 
 
 def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[str, Any]:

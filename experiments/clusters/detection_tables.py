@@ -19,7 +19,7 @@ from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
 
 REPLICATES = 100
 STRICT_3D, RELAXED_BEV, MEAN = 0, 1, len(CELLS)  # indices into the result of draw_cells()
-MAX_MS = 100.0  # the period of a frame of KITTI's sensor, for Eq. 1
+MAX_MS = 100.0  # frame period of KITTI's sensor, for Eq. 1
 MAP = ("mAP 3D [%]", "mAP BEV, relaxed [%]")
 ABOUT_MAP = (
     "mAP is the mean of the average precision (KITTI, 40 recall points) of cars, "
@@ -27,7 +27,7 @@ ABOUT_MAP = (
     "BEV at 0.5 and 0.25. The paper does not name its protocol; its values are next to "
     "3D."
 )
-Draws = Mapping[str, np.ndarray]  # network -> (1 + R, 2, 10), see draw_cells()
+Draws = Mapping[str, np.ndarray]  # network -> array (1 + R, 2, 10) from draw_cells()
 
 
 def make_detection_sections(

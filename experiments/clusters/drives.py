@@ -29,9 +29,9 @@ from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES
 
-FIRST_DRIVE = 41_000_000  # seed; no training uses scenes near it
+FIRST_DRIVE = 41_000_000  # first seed; no training uses seeds near it
 SIMULATED_DRIVES, SCANS = 2, 12
-MAX_TRACK_DISTANCE_M = 1.0  # of a track that gives a detection its velocity
+MAX_TRACK_DISTANCE_M = 1.0  # maximum distance from a detection to the track that gives it a velocity
 REPLICATES = 100
 SCORES = ("map", *ERRORS, "nds")
 TITLES = ("mAP [%]", "ATE [m]", "ASE", "AOE [rad]", "AVE [m/s]", "AAE", "NDS [%]")

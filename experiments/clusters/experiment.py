@@ -28,7 +28,7 @@ SETTINGS = {
     "study": asdict(STUDY),
     "range image": asdict(RangeImageParams()),
 }
-EPOCHS = 120  # on recorded frames; the text of the paper lacks its Table 1, with the settings
+EPOCHS = 120  # for recorded frames; Table 1 of the paper, with the settings, is missing in its text
 
 
 def measure_segmented_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:
@@ -59,7 +59,7 @@ def measure_frame(frames: Sequence[Frame], number: int, *, models: Mapping[str, 
     }
     try:
         record["segmentation"] = measure_segmentation(frame)
-    except InputError:  # the objects that have points are detected all the same
+    except InputError:  # objects with points are detected nevertheless
         pass
     return record
 

@@ -11,7 +11,7 @@ from lidar_perception.training.params import PointNetTraining
 
 OURS = "improved"
 BASELINES = ("pointnet", "pointnet2")
-COMPARED = (OURS, *BASELINES)  # at all difficulties, on changed clouds and on drives
+COMPARED = (OURS, *BASELINES)  # networks compared by difficulty, on modified clouds and on drives
 RADII = {
     "radii-halved": "0.05, 0.1, 0.2",
     OURS: "0.1, 0.2, 0.4",

@@ -11,8 +11,8 @@ Values = tuple[float | None, ...]
 
 DATA_SETS = ("KITTI", "nuScenes")
 
-# Figures 6 (after 240 "iterations") and 8, and Table 3: accuracy, precision, recall, F1, IoU, ms.
-# For EC and FCC the text has differences of precision and IoU that fit neither table, so only their
+# Figure 6 (after 240 "iterations"), Figure 8 and Table 3: accuracy, precision, recall, F1, IoU, ms.
+# For EC and FCC the differences in precision and IoU in the text fit neither table, so only their
 # accuracy and time are listed.
 SEGMENTATION: dict[str, dict[str, Values]] = {
     "KITTI": {
@@ -31,12 +31,12 @@ SEGMENTATION: dict[str, dict[str, Values]] = {
     },
 }
 
-# Table 2: the best values and their IoU and time; the other rows are not in the text.
+# Table 2: best values with their IoU and time; the text omits the other rows.
 BEST = {"alpha": 1.2, "beta": 0.5, "gamma": 0.8}
 
-# Detection. mAP in percent, of an unknown protocol. Table 5 also has minutes of training, of which
+# Detection: mAP in percent, protocol not stated. Table 5 also has minutes of training, of which
 # the text states those of the full network.
-TABLE_4 = {"KITTI": (90.36, 81.07), "nuScenes": (89.03, 80.15)}  # mAP and NDS of 0.1, 0.2, 0.4 m
+TABLE_4 = {"KITTI": (90.36, 81.07), "nuScenes": (89.03, 80.15)}  # mAP and NDS with radii of 0.1, 0.2 and 0.4 m
 TABLE_5 = {
     "KITTI": {
         "base": 75.52,
@@ -66,7 +66,7 @@ FIGURE_10: dict[str, dict[str, Values]] = {
     "improved": {"Car": (97.21, None, 90.89), "Pedestrian": (89.24, None, 76.61), "Cyclist": (None, None, 79.06)},
     "pointnet": {"Car": (88.92, None, 76.35), "Pedestrian": (75.68, None, 62.13), "Cyclist": (None, None, 65.13)},
 }
-TABLE_7 = {"map": 92.68, "ate": 0.298, "ase": 0.218, "nds": 83.45}  # of improved, nuScenes
+TABLE_7 = {"map": 92.68, "ate": 0.298, "ase": 0.218, "nds": 83.45}  # `improved` network on nuScenes
 # Table 8: change -> mAP
 TABLE_8: dict[str, dict[str, dict[str, float]]] = {
     "KITTI": {"improved": {"10 %": 84.37, "50 %": 91.85}, "pointnet": {"10 %": 68.21}},

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-STEPS = ((0, 1), (0, 2), (1, 0), (2, 0))  # rows and columns to a neighbour; 2 bridges a lost return
+STEPS = ((0, 1), (0, 2), (1, 0), (2, 0))  # (row, column) offsets of neighbours; an offset of 2 bridges a lost return
 
 
 @dataclass(frozen=True)

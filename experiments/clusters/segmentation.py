@@ -21,7 +21,7 @@ from lidar_perception.scoring.points.clusters import find_unlabelled
 from lidar_perception.scoring.points.segmentation import Objects, find_objects_in_boxes, score_clusters
 from lidar_perception.types import InputError, PointCloud
 
-PAPER = EuclideanParams()  # alpha 1.2, beta 0.5, gamma 0.8, the threshold of Eq. 11
+PAPER = EuclideanParams()  # alpha 1.2, beta 0.5, gamma 0.8; threshold of Eq. 11
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def _euclidean(**changes: Any) -> Callable[[np.ndarray], np.ndarray]:
     return partial(cluster, params=params)
 
 
-# Name -> function of the points (N, 3) without ground. The first is the reference of differences.
+# Name -> function of the points (N, 3) without ground. Differences are relative to the first one.
 METHODS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "Euclidean, fixed": _euclidean(threshold="fixed", distance=STUDY.distance, beta=0.0, gamma=0.0),
     "DBSCAN": partial(cluster, params=ClusteringParams(method="dbscan")),
@@ -62,7 +62,7 @@ SWEEPS: dict[str, dict[str, Callable[[np.ndarray], np.ndarray]]] = {
     name: {f"{value:g}": _euclidean(**{name: value}) for value in getattr(STUDY, name)}
     for name in ("alpha", "beta", "gamma")
 }
-# Of a frame and method, see count_points.
+# Result of count_points() for one frame and method.
 COUNTS = ("points", "right", "both", "found", "true", "objects", "hits", "judged", "iou")
 
 

@@ -20,10 +20,10 @@ from experiments.framework.statistics import (
 )
 
 SCORES = ("accuracy [%]", "precision [%]", "recall [%]", "F1 [%]", "IoU [%]")
-IOU = 4  # of SCORES
-MEAN_IOU = 3  # of compute_object_scores()
+IOU = 4  # index into SCORES
+MEAN_IOU = 3  # index into the result of compute_object_scores()
 REFERENCE = next(iter(METHODS))
-# Our methods and the paper's name of the same kind of method.
+# Our methods, and the paper's names for the same kinds of method.
 PUBLISHED = {"ours": "ours", REFERENCE: "EC", "range image": "FCC"}
 DEFINITIONS = (
     "The paper does not say how points are counted. Here every labelled object is paired with at "

@@ -36,7 +36,7 @@ NO_WEIGHTS = "no weights come with the package; give some with --weights"
 PERSON = CLASSES[PEDESTRIAN]
 CANDIDATES = "candidates"
 
-Settings = Mapping[str, Mapping[str, Any]]  # kind of a detector -> dotted name -> value
+Settings = Mapping[str, Mapping[str, Any]]  # kind of detector -> dotted parameter name -> value
 NO_SETTINGS: Settings = {}
 
 

@@ -54,7 +54,7 @@ def start_comparison(
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None:
             return None
-        frame = Frame.of(frame.name, frame.load(), truth, calibration)  # read once for all
+        frame = Frame.of(frame.name, frame.load(), truth, calibration)  # read once for all detectors
         if state["turn"] == 0:
             for contender in contenders:
                 _detect(contender, frame)

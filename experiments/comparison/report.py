@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SHORT = {"bev": "BEV", "3d": "3D", "bev_relaxed": "BEV", "3d_relaxed": "3D"}
-FAMILIES = {  # start of a name -> colour (Okabe and Ito, 2008) and marker; the first match counts
+FAMILIES = {  # prefix of a name -> colour (Okabe and Ito, 2008) and marker; the first match is used
     "STM-CPA +": ("#cc79a7", "D"),
     "PP ": ("#cc79a7", "D"),
     "STM-CPA": ("#009e73", "s"),
@@ -251,7 +251,7 @@ def _draw(axes: Axes, points: dict[str, tuple[float, float, float]], legend: str
 def _make_ticks(low: float, high: float):
     from matplotlib.ticker import FixedLocator
 
-    steps = (1, 2, 5) if high < 1e3 * low else (1, 3)  # numbers that do not overlap
+    steps = (1, 2, 5) if high < 1e3 * low else (1, 3)  # tick positions whose labels do not overlap
     return FixedLocator(
         [step * 10.0**power for power in range(-3, 7) for step in steps if low <= step * 10.0**power <= high]
     )
@@ -267,7 +267,7 @@ def spread_heights(values: Sequence[float], low: float, high: float, gap: float)
     count = len(values)
     gap = min(gap, (high - low) / max(count - 1, 1))
     order, heights = np.argsort(values, kind="stable"), np.empty(count)
-    # With the gaps subtracted, the heights only have to be non-decreasing.
+    # After the gaps are subtracted, the heights only need to be non-decreasing.
     level = isotonic_regression(np.asarray(values, float)[order] - gap * np.arange(count))
     heights[order] = np.clip(level, low, high - gap * (count - 1)) + gap * np.arange(count)
     return heights

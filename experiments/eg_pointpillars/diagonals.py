@@ -14,7 +14,7 @@ from lidar_perception.types import CLASSES
 
 NAMES = tuple(paper.TABLE_2)
 BACKGROUND = "background"
-BINS = np.arange(0.0, 8.01, 0.2)  # of Figure 13, metres
+BINS = np.arange(0.0, 8.01, 0.2)  # bin edges of Figure 13, in metres
 PERCENTILES = (5, 50, 95)
 
 

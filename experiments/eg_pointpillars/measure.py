@@ -24,8 +24,8 @@ from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.scoring.kitti.camera_objects import to_camera_objects, to_scored_labels
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
 
-MIN_SCORE = 0.05  # boxes of lower score hardly change the average precision
-MIN_SHARE = 0.5  # of the points of a cluster that are in a box, so that it is of the box's class
+MIN_SCORE = 0.05  # minimum score; weaker boxes hardly change the average precision
+MIN_SHARE = 0.5  # minimum fraction of a cluster's points in a box for the cluster to get the box's class
 NO_CLASS = -1
 
 
@@ -45,7 +45,7 @@ def measure_frame(frames: Sequence[Frame], number: int, models: Mapping[str, Tra
     scan = frame.load()
     found, ms = {}, {}
     names = [*models]
-    turn = number % max(len(names), 1)  # so that warm caches help no network more than others
+    turn = number % max(len(names), 1)  # rotates the order so that warm caches favour no network
     for name in (*names[turn:], *names[:turn]):
         detector = open_network(str(models[name].weights), frame.sensor_height)
         begun = perf_counter()

@@ -12,7 +12,7 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.training.params import PointPillarsTraining
 
 TRAINING = PointPillarsTraining()
-# Whole range, full size and number of epochs as in Section 4.1.
+# Full range, network size and number of epochs as in Section 4.1.
 PROTOCOL = {
     "size": "full",
     "score": "map",
@@ -21,8 +21,8 @@ PROTOCOL = {
     "ahead": 1000.0,
     "aside": 1000.0,
 }
-STUDIED = "v0", "v4"  # in the study of labels
-SHARES = (0.5, 0.25, 0.1)  # of the labelled scenes, beside all
+STUDIED = "v0", "v4"  # versions in the study of label counts
+SHARES = (0.5, 0.25, 0.1)  # fractions of the labelled scenes, in addition to all of them
 ALL_SHARES = (*reversed(SHARES), 1.0)
 
 

@@ -5,7 +5,7 @@ Average precision in percent, times in milliseconds on one RTX 4090 of four.
 
 from __future__ import annotations
 
-# Table 5: Car at an overlap of 0.7, Cyclist and Pedestrian at 0.5, each easy, moderate, hard.
+# Table 5: Car at IoU 0.7, Cyclist and Pedestrian at IoU 0.5; easy, moderate and hard for each.
 TABLE_5 = {
     "v0": {"Car": (84.00, 72.89, 68.24), "Cyclist": (80.57, 61.96, 58.32), "Pedestrian": (52.66, 47.09, 43.21)},
     "v1": {"Car": (86.94, 76.06, 68.77), "Cyclist": (79.53, 61.85, 58.18), "Pedestrian": (56.12, 50.96, 46.56)},
@@ -20,7 +20,7 @@ MS = {"v0": 13.1, "v1": 13.9, "v2": 24.4, "v3": 32.5, "v4": 46.4}
 IMPROVEMENT = {"v1": 1.79, "v2": 2.50, "v3": 1.97, "v4": 3.88}
 OVERHEAD_MS = {"v1": 0.8, "v2": 11.3, "v3": 19.4, "v4": 11.3}
 
-# Table 2: limits of the diagonal of a cluster's box in x-y, metres.
+# Table 2: limits of the BEV diagonal of a cluster's box, in metres.
 TABLE_2 = {"Car": (3.00, 6.40), "Cyclist": (1.72, 2.99), "Pedestrian": (0.40, 1.71)}
 
-EPOCHS, VALIDATION_EPOCHS = 300, 5  # Section 4.1
+EPOCHS, VALIDATION_EPOCHS = 300, 5  # as in Section 4.1

@@ -25,8 +25,8 @@ from lidar_perception.scoring.kitti.protocol import (
 from lidar_perception.types import CLASSES, InputError
 
 SHOWN_SCORE = 0.3
-SIZE = (960, 540)  # of one half, pixels
-BETTER, WORSE = 2, 1  # numbers of frames in which V4 has fewer errors, and more
+SIZE = (960, 540)  # size of each half of the picture, in pixels
+BETTER, WORSE = 2, 1  # number of frames to show in which V4 makes fewer errors, and more errors
 
 
 def make_picture_sections(

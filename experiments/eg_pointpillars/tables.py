@@ -16,11 +16,11 @@ from experiments.framework.statistics import compute_sampled_p, estimate, make_c
 from experiments.framework.trained_models import TrainedModel
 from lidar_perception.detectors.pointpillars.config import VERSIONS
 
-MEAN = len(CELLS)  # column of the mean, see precision.compute_cells()
-STRICT, RELAXED = 0, 1  # see precision.PROTOCOLS
-MIN_AP = 1.0  # percent; below it the report says that the training was too short
+MEAN = len(CELLS)  # index of the mean column, see precision.compute_cells()
+STRICT, RELAXED = 0, 1  # indices into precision.PROTOCOLS
+MIN_AP = 1.0  # in percent; for a lower AP the report says that the training was too short
 TITLES = {"v0": "PointPillars", **{v: f"EG-PointPillars {v.upper()}" for v in VERSIONS if v != "v0"}}
-Draws = dict[tuple[str, float], np.ndarray]  # (version, share) -> (1 + R, 2, 10)
+Draws = dict[tuple[str, float], np.ndarray]  # (version, fraction of the labels) -> array (1 + R, 2, 10)
 
 
 def make_sections(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> list[Section]:
@@ -105,7 +105,7 @@ def make_table_5(draws: Draws, frames: int) -> Section:
         "are paired. The paper does not say which recall points it uses."
     )
     best = max((values[0, RELAXED, MEAN] for values in draws.values()), default=np.nan)
-    if not best >= MIN_AP:  # or NaN
+    if not best >= MIN_AP:  # also true for NaN
         text = (
             "No version was trained long enough, or the frames have too few objects (mean BEV "
             f"AP {best:.1f}), so neither the versions nor the study of labels can be compared. " + text

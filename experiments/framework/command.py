@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from experiments.framework.trained_models import ModelRequest
 
 SIM = "sim"
-EXPERIMENTS = {  # name -> module:attribute of an Experiment; the first is the default
+EXPERIMENTS = {  # name -> "module:attribute" of an Experiment; the first is the default
     "stm-cpa": "experiments.stm_cpa.experiment:STM_CPA",
     "stm-cpa-configurations": "experiments.stm_cpa.configurations:CONFIGURATIONS",
     "eg-pointpillars": "experiments.eg_pointpillars.experiment:EG_POINTPILLARS",

@@ -8,9 +8,9 @@ from typing import Any
 
 from experiments.framework.experiment import Figure, Line, Picture
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito, 2008
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # palette of Okabe and Ito, 2008
 GREY = "#888888"
-MAX_COLUMNS = 3  # panels side by side
+MAX_COLUMNS = 3  # maximum number of panels side by side
 
 
 def encode_figure(figure: Figure | Picture, *, dark: bool = False) -> str:
@@ -63,7 +63,7 @@ def draw_figure(figure: Figure, kind: str = "svg", *, dark: bool = False) -> byt
     with matplotlib.rc_context(style):
         columns = min(MAX_COLUMNS, len(figure.panels))
         rows = -(-len(figure.panels) // columns)
-        legend_at_right = columns == 1  # one panel leaves room for the legend
+        legend_at_right = columns == 1  # a single panel leaves room for the legend
         size = (8.0, 3.4) if legend_at_right else (3.7 * columns, 2.9 * rows + 0.5)
         canvas = Canvas(figsize=size, dpi=130, layout="constrained")
         FigureCanvasAgg(canvas)

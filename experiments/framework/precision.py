@@ -27,7 +27,7 @@ from lidar_perception.scoring.kitti.protocol import (
 
 CELLS = tuple((name, level) for name in SCORED for level in DIFFICULTIES)
 STRICT_3D, RELAXED_BEV = ("3d", STRICT), ("bev", RELAXED)
-PROTOCOLS = (STRICT_3D, RELAXED_BEV)  # metric, and overlap of a hit by class
+PROTOCOLS = (STRICT_3D, RELAXED_BEV)  # (metric, minimum overlap of a match by class)
 REPLICATES = 200
 NO_CAMERA = (-np.inf, -np.inf, np.inf, np.inf)
 COLUMNS = ("class_ids", "boxes", "truncated", "occluded", "scores", "regions")

@@ -25,8 +25,8 @@ LEGEND = (
     "A value, [its 95 % interval] by a bootstrap over frames, and the paper's value. An "
     "interval from few frames, or from frames that all agree, is too narrow."
 )
-MAX_ROWS = 30  # a longer table is folded in the page
-MAX_NAMES = 10  # of frames skipped for the same reason
+MAX_ROWS = 30  # longer tables are collapsed in the page
+MAX_NAMES = 10  # maximum number of frame names listed for one reason
 
 
 def write_report(

@@ -85,7 +85,7 @@ def _open_run(
 ) -> Iterator[Journal]:
     """Open the journal in out, see run_experiment."""
     names = [frame.name for frame in recording]
-    path = recording.path.resolve() if recording.path.exists() else recording.path  # simulated
+    path = recording.path.resolve() if recording.path.exists() else recording.path  # a simulated data set has no path
     plan = {
         "experiment": experiment.name,
         "version": __version__,
@@ -122,7 +122,7 @@ def _measure(
 
 def _make_measure(experiment: Experiment, recording: Recording) -> Callable[[Frame], str]:
     """Return a function that measures a frame and returns its record as JSON."""
-    if experiment.training is None:  # trained detectors warm up when they are opened
+    if experiment.training is None:  # trained detectors warm up when opened
         warm_up()
     number = {frame.name: i for i, frame in enumerate(recording)}
 

@@ -24,7 +24,7 @@ from lidar_perception.training.params import PAPER_SHARE
 from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.training.sources import SIM
 
-FIRST_TEST_SCENE = 40_000_000  # no training uses scenes near it
+FIRST_TEST_SCENE = 40_000_000  # first seed; no training uses seeds near it
 TEST_SCANS = 120
 SPLIT_SEED = 0
 
@@ -166,7 +166,7 @@ def open_simulated(params: Any, folder: Path, count: int) -> Recording:
 class TestFrames(ComputedFrames):
     """Simulated frames whose scans are computed when their content is read."""
 
-    __test__ = False  # for pytest
+    __test__ = False  # keeps pytest from collecting the class
 
     def __init__(self, source: SimulatedScenes) -> None:
         self.source = source

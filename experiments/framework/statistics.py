@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments.framework.experiment import Cell, Line
 
-MAX_DRAWS = 4_000_000  # frames drawn at once; bounds the memory
+MAX_DRAWS = 4_000_000  # maximum number of frames drawn at once; bounds the memory
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def bootstrap(
     step = max(1, MAX_DRAWS // frames)
     for first in range(0, params.replicates, step):
         rows = min(step, params.replicates - first)
-        # How often each frame was drawn: the multinomial weights of its counts.
+        # Number of times each frame was drawn, used as the weight of its counts.
         indices = rng.integers(frames, size=(rows, frames)) + frames * np.arange(rows)[:, None]
         weights = np.bincount(indices.ravel(), minlength=rows * frames).reshape(rows, frames)
         replicates.append(compute((weights @ flat).reshape(rows, *shape)))
@@ -130,7 +130,7 @@ def _compute_limits(replicates: np.ndarray, level: float) -> np.ndarray:
     """Return the ends (2, *V) of the interval of replicates (R, *V); NaN where all are NaN."""
     empty = np.isnan(replicates).all(axis=0)
     ends = np.nanpercentile(
-        np.where(empty, 0.0, replicates),  # NumPy warns about columns of NaN
+        np.where(empty, 0.0, replicates),  # avoids NumPy's warning about all-NaN columns
         [50 - 50 * level, 50 + 50 * level],
         axis=0,
     )

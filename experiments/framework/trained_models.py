@@ -28,9 +28,9 @@ from lidar_perception.training.plan import Plan, Speed, fit_plan, training_durat
 from lidar_perception.training.request import TrainingRequest
 
 Training = PointPillarsTraining | PointNetTraining
-DEFAULT_BUDGET_H = 2.0  # with simulated scans
+DEFAULT_BUDGET_H = 2.0  # default training budget with simulated scans
 MAX_SEEDS = 3
-STEPS_PER_SEED = 4000  # from this many steps of each model on, another seed is worth more
+STEPS_PER_SEED = 4000  # steps per model above which another seed is worth more
 NORM_STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
 
 
@@ -145,7 +145,7 @@ class SharedPlan:
 
     def apply(self, model: Model) -> Model:
         """Return the model with the numbers of the plan."""
-        scans = self.values["data.scans"]  # 0 without simulated ones
+        scans = self.values["data.scans"]  # number of simulated scans, 0 for none
         return replace(
             model,
             params=with_values(

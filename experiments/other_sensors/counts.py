@@ -12,13 +12,11 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.geometry import centre_distances
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, PointCloud
 
-MAX_RANGE_M, MIN_POINTS = 40.0, 10  # of the objects that must be found
-MAX_DISTANCE_M = {"Pedestrian": 1.0, "Cyclist": 1.0, "Car": 2.0}  # from a centre to its label
-UNLABELLED = {
-    "nuscenes_seg": ("Car", "Cyclist"),
-    "aachen": ("Car", "Cyclist"),
-    "logictronix": ("Cyclist",),
-}  # classes without labels in a data set
+MAX_RANGE_M, MIN_POINTS = 40.0, 10  # limits of the objects that must be detected
+# Maximum distance from a detection's centre to its label.
+MAX_DISTANCE_M = {"Pedestrian": 1.0, "Cyclist": 1.0, "Car": 2.0}
+# Data set -> classes that it does not label.
+UNLABELLED = {"nuscenes_seg": ("Car", "Cyclist"), "aachen": ("Car", "Cyclist"), "logictronix": ("Cyclist",)}
 
 
 @dataclass(frozen=True)

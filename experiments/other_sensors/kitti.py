@@ -14,7 +14,7 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.detections import run_detector
 from lidar_perception.scoring.kitti.report import DetectionReport
 
-MIN_SCORE = 0.05  # of the boxes that average precision is computed from
+MIN_SCORE = 0.05  # minimum score of boxes used for the average precision
 
 Change = Callable[[np.ndarray], np.ndarray | None]
 
@@ -38,7 +38,7 @@ def evaluate_kitti(detector: Detector, folder: Path, change: Change, every: int 
     low = detector.with_min_score(MIN_SCORE)
     for frame in recording.frames[::every]:
         cloud = frame.load()
-        assert cloud.intensity is not None  # KITTI has it
+        assert cloud.intensity is not None  # KITTI clouds have an intensity
         truth, calibration = frame.truth(), frame.calibration()
         changed = Frame.of(frame.name, replace(cloud, intensity=change(cloud.intensity)), truth, calibration)
         report.update(run_detector(low, changed, truth, calibration))

@@ -37,7 +37,7 @@ from lidar_perception.scoring.centres.report import CandidateReport, measure_fra
 from lidar_perception.training.frames import may_have_labels
 from lidar_perception.types import InputError
 
-MAX_SCANS = 500  # taken evenly from a larger recording
+MAX_SCANS = 500  # maximum number of scans, evenly spaced in a longer recording
 MIN_SAMPLES = 5
 WITHIN = (0.8, 1.2)
 
@@ -69,7 +69,7 @@ class ScanMeasurements:
         """
         scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
         protocol = set_sensor_height(protocol, frame.sensor_height)
-        # Sorted points, because the trial planes of the ground threshold depend on their order.
+        # The points are sorted because the trial planes of the ground threshold depend on their order.
         scan = scan.take(np.lexsort(scan.xyz.T))
         frame = Frame.of(frame.name, scan, truth, calibration)
         self.scans += 1

@@ -14,7 +14,7 @@ from lidar_perception.scoring.tables import format_number, make_table, print_ski
 
 WORST = 25
 REAL, SIMULATED, WRONG = "#0072b2", "#d55e00", "#b00000"
-PANELS = 5  # in a row
+PANELS = 5  # number of panels in a row
 
 
 def print_realism(content: dict, console: Console) -> None:
@@ -153,7 +153,7 @@ def _draw_curve(axes, curve: dict, log: bool) -> None:
     for side, color, shift in (("real", REAL, -0.08), ("simulated", SIMULATED, 0.08)):
         median, low, high = (_column(curve, side, key) for key in ("median", "low", "high"))
         x = [p + shift for p in positions]
-        ranges = len(x) - (curve["bins"][-1]["bin"] == "all")  # no line leads to `all`
+        ranges = len(x) - (curve["bins"][-1]["bin"] == "all")  # the line stops before the bin `all`
         axes.plot(x[:ranges], median[:ranges], color=color, linewidth=1.6)
         axes.plot(x, median, "o", color=color, markersize=4)
         spread = [[max(m - a, 0) for m, a in zip(median, low)], [max(b - m, 0) for m, b in zip(median, high)]]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-CELL = 1.0  # m
-MIN_IN_CELL = 8  # points
-MIN_GROUND = 0.6  # smallest share of low points in a ground cell
-LOW_SHARE, MAX_ABOVE_LOW = 0.2, 0.35  # low: up to 0.35 m above this quantile of a cell
-MIN_CELLS = 20  # in a range bin, to measure its roughness
-ROUGH_QUANTILE = 0.75  # most cells are on the road, which is smooth
-REGULARIZATION = 1e-6  # m2, added to the scatter along x and y: a line of points has a plane, too
+CELL = 1.0  # cell size in metres
+MIN_IN_CELL = 8  # minimum number of points in a cell
+MIN_GROUND = 0.6  # minimum fraction of low points in a ground cell
+LOW_SHARE, MAX_ABOVE_LOW = 0.2, 0.35  # low points: at most 0.35 m above this quantile of the cell
+MIN_CELLS = 20  # minimum number of cells in a range bin to measure its roughness
+ROUGH_QUANTILE = 0.75  # high, because most cells are on the smooth road
+REGULARIZATION = 1e-6  # in m2, added to the scatter along x and y so that a plane fits even collinear points
 
 
 def measure_cell_scatter(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

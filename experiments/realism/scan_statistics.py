@@ -25,24 +25,24 @@ from lidar_perception.scoring.centres.matching import RANGE_NAMES
 from lidar_perception.types import GroundTruth, PointCloud
 
 CLASSES = tuple(DETECTED)
-PERSON_HEIGHT = 1.7  # metres; seed height of the height filter in stage 1 of the STM-CPA paper
-SECTORS, MIN_SECTORS = 36, 27  # of a turn; a scan with points in fewer is cropped to a view
-MIN_POINTS = 5  # of an object, to measure its extent or intensity
-MIN_IN_BIN = 50  # points in a range bin, to measure its ground share
-MAX_QUERIES, MIN_QUERIES = 600, 10  # points in a range bin, to measure neighbours
+PERSON_HEIGHT = 1.7  # seed height in metres for the height filter in stage 1 of the STM-CPA paper
+SECTORS, MIN_SECTORS = 36, 27  # sectors of a revolution; a scan with points in fewer sectors is cropped to a view
+MIN_POINTS = 5  # minimum number of points to measure an object's extent or intensity
+MIN_IN_BIN = 50  # minimum number of points in a range bin to measure its ground fraction
+MAX_QUERIES, MIN_QUERIES = 600, 10  # number of points in a range bin whose neighbours are measured
 RANGES = np.array([0.0, 5, 10, 15, 20, 30, 40, 60, 80, np.inf])
 OBJECT_RANGES = np.array([0.0, 10, 20, 30, 45, 60])
 ELEVATIONS = np.arange(-26.0, 4.1, 2.0)
 QUANTILES = (5, 25, 50, 75, 95)
-INTENSITIES = np.arange(20) * 0.05 - 0.005  # between the steps of KITTI's reflectance
+INTENSITIES = np.arange(20) * 0.05 - 0.005  # bin edges between the steps of KITTI's reflectance
 INTENSITY_STEP = 0.01
-ROUGH_STEP = 0.002  # metres
-BELT = 0.65  # share of an object's height; above it a car has windows
+ROUGH_STEP = 0.002  # bin width in metres
+BELT = 0.65  # fraction of an object's height; a car has windows above it
 CAR_NAME = CLASSES[CAR]
 CAR_FROM = f"{CAR_NAME} from "
-# Directions from which a sensor sees only one face of a car, degrees from its front.
+# Directions from which a sensor sees only one face of a car, in degrees from its front.
 FACES = {"behind": (160.0, 180.0), "the side": (45.0, 135.0), "the front": (0.0, 20.0)}
-MIN_FACE_POINTS, FACE_QUANTILES, FACE_STEP = 20, (10, 25, 50), 0.01  # the step in metres
+MIN_FACE_POINTS, FACE_QUANTILES, FACE_STEP = 20, (10, 25, 50), 0.01  # FACE_STEP in metres
 SCORES = {"precision": ("tp", "fp"), "recall": ("tp", "fn"), "f1": ("tp", "fp", "fn")}
 
 

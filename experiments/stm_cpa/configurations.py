@@ -30,10 +30,10 @@ VARIANTS = {
     for source, title in SOURCES.items()
     for name, params in (("paper", PAPER), ("best", BEST))
 }
-# Variants that are also scored without the seed pedestrian, which is given: finding it is no merit.
+# Variants that are also scored without the seed pedestrian, because its position is given.
 WITHOUT_SEED = {f"{name}, nearest truth, it left out": f"{name}, nearest truth" for name in ("paper", "best")}
-SHOWN = RANGE_NAMES[:4]  # beyond 60 m there is hardly anything to score
-RANGE_MIDDLES = (7.5, 22.5, 37.5, 52.5)  # of SHOWN, metres
+SHOWN = RANGE_NAMES[:4]  # there are hardly any pedestrians beyond 60 m
+RANGE_MIDDLES = (7.5, 22.5, 37.5, 52.5)  # centres of the ranges SHOWN, in metres
 COUNTS = ("tp", "fp", "fn")
 ANY_SCORE = {"stm.threshold": 0.0, "confidence.threshold": 0.0}
 
@@ -195,7 +195,7 @@ def find_best_f1(ranked: list[list], truth: float) -> float | None:
         return None
     order = np.argsort(-pairs[:, 0], kind="stable")
     hits = np.cumsum(pairs[order, 1])
-    last = np.append(np.diff(pairs[order, 0]) != 0, True)[: len(pairs)]  # of equal scores
+    last = np.append(np.diff(pairs[order, 0]) != 0, True)[: len(pairs)]  # True at the last pair of each score
     f1 = 2 * hits / (np.arange(1, len(pairs) + 1) + truth)
     return 100 * float(f1[last].max(initial=0.0))
 

@@ -50,7 +50,7 @@ def load_labelled_frame(frame: Frame) -> LabelledFrame:
     Raises:
         InputError: a file is missing, empty or unreadable, or no Pedestrian is labelled.
     """
-    truth = frame.truth()  # first: most frames of KITTI end here
+    truth = frame.truth()  # checked first because most frames of KITTI end here
     if truth is None:
         raise InputError(f"{frame.points or frame.name} has no labels; put them beside the scans")
     if PEDESTRIAN not in truth.class_ids:

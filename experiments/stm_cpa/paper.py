@@ -9,15 +9,15 @@ from __future__ import annotations
 
 Scores = tuple[float | None, ...]
 
-FRAMES = 1779  # with a Pedestrian label, of KITTI's 7481 training frames (Section 3.1)
+FRAMES = 1779  # frames with a Pedestrian label among KITTI's 7481 training frames (Section 3.1)
 PEDESTRIANS = 4487
 TABLE_1 = {"0-15": 2093, "15-30": 1771, "30-45": 468, "45-60": 118, "60+": 37}
 
-# Figure 7 as the text of Section 4.2 describes it: eps with a high recall, and the chosen eps.
+# Figure 7 as described in Section 4.2: eps with a high recall, and the chosen eps.
 FIGURE_7 = {"0-15": ((0.15, 0.20), 0.15), "15-30": ((0.25, 0.35), 0.30), "30-45": ((0.40, 0.50), 0.50)}
 MIN_SAMPLES = 10  # "increasing min_samples consistently reduces recall"
 
-# Table 4 by range, the columns of PAPER_TABLE_6. The F1 of `final` is from Section 4.5.
+# Table 4 by range, with the columns of PAPER_TABLE_6. The F1 of `final` is from Section 4.5.
 TABLE_4: dict[str, dict[str, Scores]] = {
     "0-15": {"stage1": (76.2, 53.7, 63.0, None, 0.12), "stage2": (73.0, 69.4, 71.2, 95.8, 0.12)},
     "15-30": {
@@ -30,7 +30,7 @@ TABLE_4: dict[str, dict[str, Scores]] = {
     "60+": {"stage1": (0.0, 0.0, 0.0, None, None)},
 }
 
-# Table 5: CPA at 15 to 60 m with 0 to 8 steps, same columns.
+# Table 5: CPA at 15 to 60 m with 0 to 8 steps, with the same columns.
 TABLE_5 = (
     (44.7, 60.5, 51.4, 80.6, 0.14),
     (46.4, 56.6, 51.0, 83.1, 0.14),
@@ -43,14 +43,14 @@ TABLE_5 = (
     (49.8, 41.1, 45.1, 88.8, 0.14),
 )
 
-# Points of Figure 8 given in the text or in Table 4: steps -> recall, precision, F1.
+# Figure 8, points stated in the text or in Table 4: steps -> recall, precision, F1.
 FIGURE_8: dict[str, dict[int, Scores]] = {
     "15-30": {0: (24.7, 48.4, 32.7), 2: (None, None, 35.6)},
     "30-45": {0: (8.5, 22.1, 12.3)},
     "45-60": {0: (0.8, 4.3, 1.4)},
 }
 
-# Table 8: share of hits with a 3D IoU of at least 0.10 and 0.25, the same in BEV, and the mean IoU
+# Table 8: fraction of matches with a 3D IoU of at least 0.10 and 0.25, the same in BEV, and the mean IoU
 # in 3D and in BEV.
 TABLE_8 = {
     "stage1": (88.4, 76.7, 88.6, 79.7, 0.346, 0.371),

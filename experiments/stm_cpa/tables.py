@@ -105,7 +105,7 @@ def _make_stages_section(records: list[dict]) -> Section:
             )
             for k, name in enumerate(RANGE_NAMES)
         ]
-    by_range.sort(key=lambda row: RANGE_NAMES.index(row[0]))  # stable: the stages stay in order
+    by_range.sort(key=lambda row: RANGE_NAMES.index(row[0]))  # the sort is stable, so the stages stay in order
     note = (
         "Kept: share of the hits of stage 1 that are still hits. A hit: 3D "
         f"centres within {MAX_CENTRE_DISTANCE:g} m, one to one."

@@ -4,7 +4,7 @@ import importlib
 from typing import Any
 
 _BOXES, _DETECTIONS = "params.BoxNodeParams", "params.DetectionNodeParams"
-# Executable -> its class (relative to lidar_perception.nodes) and the dataclasses of its parameters
+# Executable -> node class (relative to lidar_perception.nodes) and parameter dataclasses
 # (relative to lidar_perception). scripts/nodes has a link for each name.
 NODES = {
     "bag_player": ("replay.bag_player.BagPlayer", "params.PlayerParams"),

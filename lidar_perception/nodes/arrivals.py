@@ -7,9 +7,9 @@ from collections import deque
 import numpy as np
 
 DEPTH = 5
-WINDOW = 100  # sent clouds, for the shares of lost and dropped ones
-RATE_SAMPLES = 20  # intervals between clouds, whose median is the expected one
-RATE_INTERVALS = 10  # intervals, whose mean gives the present rate
+WINDOW = 100  # number of sent clouds over which loss and drop rates are computed
+RATE_SAMPLES = 20  # number of intervals whose median is the expected interval
+RATE_INTERVALS = 10  # number of intervals whose mean gives the current rate
 
 
 class Arrivals:
@@ -24,7 +24,7 @@ class Arrivals:
         self.sent = self.dropped = self.lost = 0
         self.sequence: int | None = None  # number of the last cloud
         self.window: deque[tuple[int, int, int]] = deque([(0, 0, 0)], WINDOW + 1)
-        self.stamps: deque[tuple[int, int]] = deque(maxlen=RATE_SAMPLES + 1)  # sent, ns
+        self.stamps: deque[tuple[int, int]] = deque(maxlen=RATE_SAMPLES + 1)  # (sequence number, time of sending in ns)
         self.learned: float | None = None  # expected rate, Hz
 
     def add(self, infos: list[dict], dropped: int, one_publisher: bool = True) -> None:

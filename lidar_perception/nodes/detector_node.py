@@ -27,8 +27,8 @@ class DetectorNode(ManagedNode):
     Without a network the node publishes nothing, as an empty array would mean an empty scene.
     """
 
-    group: ClassVar[str]  # name of the parameter group, a NetworkParams
-    steps: ClassVar[tuple[str, ...]]  # timed steps
+    group: ClassVar[str]  # name of the parameter group (a NetworkParams)
+    steps: ClassVar[tuple[str, ...]]  # names of the timed steps
 
     def configure(self) -> None:
         self.sensor = SensorCheck(self)

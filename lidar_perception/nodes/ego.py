@@ -18,11 +18,11 @@ from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_point_cloud
 from msg_utils.stamps import SECOND_NS, to_ns
 
-START, SCAN = "start", "scan"  # frames of KISS-ICP
+START, SCAN = "start", "scan"  # frame names used by KISS-ICP
 ICP_MS = "kiss_icp_cpu_ms_median"
-PAUSE_S = 1.0  # without waiting, after waiting for a pose has timed out
-GRACE_NS = SECOND_NS  # without a pose, before ego.source auto uses the scans
-TIMED_SCANS = 100  # for the median time of KISS-ICP
+PAUSE_S = 1.0  # clouds are not held for this long after a wait for a pose has timed out
+GRACE_NS = SECOND_NS  # time without a pose until ego.source auto switches to KISS-ICP
+TIMED_SCANS = 100  # number of scans for the median CPU time of KISS-ICP
 ODOMETRY_TIMEOUT_S = 2.0
 MAX_OFFSET_NS = 10 * SECOND_NS  # a larger offset of odometry and detections means different clocks
 
@@ -47,13 +47,13 @@ class EgoInput:
         self.source, self.is_mounting_known = NO_SOURCE, True
         self.icp: Odometry | None = None
         self.scans = TransformTree()
-        self.scan_ns, self.scan_frame = 0, ""  # of the last scan of KISS-ICP
-        self.is_disconnected = False  # TF does not connect its frame and that of the detections
-        self.icp_restarts = 0  # each restart has a new origin
-        self.icp_ms: deque[float] = deque(maxlen=TIMED_SCANS)  # CPU time of the last scans
+        self.scan_ns, self.scan_frame = 0, ""  # stamp and frame of the last scan given to KISS-ICP
+        self.is_disconnected = False  # True if TF has no transform from the scan's frame to the detections' frame
+        self.icp_restarts = 0  # counted because each restart has a new origin
+        self.icp_ms: deque[float] = deque(maxlen=TIMED_SCANS)  # CPU time of KISS-ICP for the last scans
         self.pose_problem = ""  # why the last frame has no pose
-        self.without_ns: int | None = None  # stamp of the first frame without a pose, with auto
-        self.late_since: float | None = None  # monotonic, since when poses have been late
+        self.without_ns: int | None = None  # stamp of the first frame without a pose (ego.source auto)
+        self.late_since: float | None = None  # monotonic time at which poses began to be late
         wanted = params().source
         if wanted in ("auto", "odometry"):
             self.transforms.subscribe_to_odometry()
@@ -162,7 +162,7 @@ class EgoInput:
             if not self.is_mounting_known:
                 self.transforms.subscribe_to_tf()
         if not self._uses_scans():
-            self.icp = None  # frees its map
+            self.icp = None  # release the memory of the map
             self.node.counts.pop(ICP_MS, None)
         return self.source
 
@@ -229,13 +229,13 @@ class EgoInput:
     def _register(self, header: Any, xyz: np.ndarray) -> None:
         stamp_ns = to_ns(header.stamp)
         if self.scan_ns - JUMP_NS <= stamp_ns <= self.scan_ns:
-            return  # repeated or late; the tracker rejects and reports it
+            return  # repeated or late stamp, which the tracker rejects and reports
         gap = (stamp_ns - self.scan_ns) / SECOND_NS
-        if not 0 < gap <= 2 * self.params().max_gap:  # the map is of another place or time
+        if not 0 < gap <= 2 * self.params().max_gap:  # the map is from another place or time
             self.icp, self.scans = Odometry(), TransformTree()
             self.icp_restarts += 1
         self.scan_ns, self.scan_frame = stamp_ns, header.frame_id.lstrip("/")
-        assert self.icp is not None  # made by the first scan
+        assert self.icp is not None  # created with the first scan
         begin = thread_time()
         pose = self.icp(xyz)
         self.icp_ms.append((thread_time() - begin) * 1e3)

@@ -27,7 +27,7 @@ from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 from lidar_perception.wire.clouds import diagnose_packets, find_cloud_topics
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
-Graph = Mapping[str, Mapping[str, str]]  # node -> remapping of its topics
+Graph = Mapping[str, Mapping[str, str]]  # node -> its topic remappings
 
 
 def relative_name(topic: str) -> str:
@@ -41,23 +41,23 @@ CLOUDS = {"~/input/points": relative_name(POINTS)}
 ODOMETRY_INPUT = {"~/input/odometry": relative_name(ODOMETRY)}
 TRACKER = "tracker"
 MAX_CORES_FOR_ONE_PROCESS = 4
-SEPARATOR = "---"  # between the arguments of the nodes of one process
-FINAL = "final"  # the last stage of a detector, whose boxes are its detections
+SEPARATOR = "---"  # separates the arguments of nodes that share a process
+FINAL = "final"  # name of a detector's last stage, whose boxes are the detections
 CLUSTERED = {"~/input/points": "clustering/output/points"}
 
-# Ground and clusters, computed once for all detectors.
+# Nodes for ground and clusters, shared by all detectors.
 EXPERTS = {
     "ground_segmentation": {**CLOUDS, **CAMERA},
     "clustering": {"~/input/points": "ground_segmentation/output/points"},
 }
-# Detector -> its node downstream of EXPERTS ...
+# Detector -> its node downstream of EXPERTS.
 DETECTOR_NODES = {
     "candidates": {"candidate_refinement": {**CLUSTERED, **TRUTH_INPUT}},
     "pointpillars": {"pointpillars_detector": CLUSTERED},
     "pointnet": {"pointnet_detector": CLUSTERED},
     "fused": {"fused_detector": CLUSTERED},
 }
-# ... and the one that finds ground and clusters itself.
+# Detector -> its standalone node, which computes ground and clusters itself.
 SINGLE_PROCESS_NODES = {
     "candidates": {"perception": {**CLOUDS, **TRUTH_INPUT, **CAMERA}},
     "pointpillars": {"pointpillars_detector": CLOUDS},
@@ -66,7 +66,7 @@ SINGLE_PROCESS_NODES = {
 }
 
 
-# Detectors with a network; each has a parameter group of the same name.
+# Detectors with a network, each with a parameter group of the same name.
 NETWORKS = tuple(name for name, nodes in SINGLE_PROCESS_NODES.items() if f"{name}_detector" in nodes)
 
 
@@ -267,7 +267,7 @@ def choose_cloud_topic(bag: str, types: Mapping[str, str], wanted: str = "") -> 
     )
 
 
-_domain_locks: list[Any] = []  # open lock files of our domains, until this process ends
+_domain_locks: list[Any] = []  # lock files of our domains, held open until this process ends
 
 
 def reserve_domain() -> int:
@@ -302,8 +302,8 @@ class Processes:
         self.environment = dict(os.environ)
         if domain is not None:
             self.environment.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
-        self.running: dict[str, Any] = {}  # as subprocess.Popen
-        self._gathered: list[list[str]] | None = None  # arguments of nodes, see together()
+        self.running: dict[str, Any] = {}  # Popen objects of the running processes
+        self._gathered: list[list[str]] | None = None  # node arguments collected by together()
 
     def __enter__(self) -> Processes:
         self.logs.mkdir(parents=True, exist_ok=True)
@@ -374,7 +374,7 @@ class Processes:
         """Return the CPU time of each running process; empty without /proc."""
         seconds = {}
         for node, process in self.running.items():
-            try:  # proc(5): fields 14 and 15, counted from the state, the third, after the name
+            try:  # proc(5): fields 14 (utime) and 15 (stime); the text after the name starts with field 3
                 fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
                 seconds[node] = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
             except (OSError, IndexError):

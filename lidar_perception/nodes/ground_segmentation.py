@@ -54,7 +54,7 @@ class GroundSegmentation(ManagedNode):
             visible = usable.take(indices)
             if self.node_params.range == "all":
                 segmented, indices, ground = (visible_frame, visible, segment_ground(visible_frame, params.ground))
-            else:  # as the detector does without ground
+            else:  # same fallback as in the detector
                 view = NormalizedView.of(visible_frame, params.ground.sensor_pose, **RANGES[self.node_params.range])
                 segmented, indices, ground = (
                     view.frame,

@@ -7,14 +7,14 @@ import threading
 import numpy as np
 from numba import njit, types
 
-REACTION_S = 5.0  # for the current work
-# For the shutdown of DDS after the results are written. An interrupted one may leave a port in
+REACTION_S = 5.0  # time to finish the current work
+# Time for DDS to shut down after the results are written. An interrupted shutdown may leave a port in
 # shared memory that others wait for. launch sends SIGTERM after 5 s.
 TEARDOWN_S = 3.0
 RUNNING, CLOSING, CLOSED = range(3)
 TICK_S = 0.02
 
-SIGINFO = 128  # bytes of one signal, struct signalfd_siginfo
+SIGINFO = 128  # size of struct signalfd_siginfo, in bytes
 
 _read = types.ExternalFunction("read", types.intp(types.int32, types.uintp, types.uintp))
 _write = types.ExternalFunction("write", types.intp(types.int32, types.uintp, types.uintp))

@@ -157,7 +157,7 @@ class SeedInput:
         node.input(relative_name(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE, private=False)
         node.inputs.append(self)
         if self.params.source in ("file", "automatic"):
-            self._load_templates()  # reports a missing file before the first cloud
+            self._load_templates()  # a missing file is reported before the first cloud
 
     def open(self) -> None:
         """Do nothing: the subscriptions of the node are opened by the node."""
@@ -224,7 +224,7 @@ class SeedInput:
             try:
                 seed = self._make_clicked_seed(self.new_clicks[0], header, segmented)
             except InputError:
-                if len(self.new_clicks) == 1:  # reported until the next click
+                if len(self.new_clicks) == 1:  # the message stays until the next click
                     raise
             else:
                 self.clicked_seeds = (*self.clicked_seeds, seed)

@@ -51,8 +51,8 @@ from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
 from lidar_perception.types import InputError, unknown_name
 from lidar_perception.wire.topics import ODOMETRY, POINTS
 
-LAUNCH_ARGUMENTS = ("launch-prefix", "launch-prefix-filter")  # arguments of launch itself
-RESPAWN_DELAY_S = 2.0  # keeps a node that cannot start from filling the log
+LAUNCH_ARGUMENTS = ("launch-prefix", "launch-prefix-filter")  # arguments that launch itself defines
+RESPAWN_DELAY_S = 2.0  # long enough that a node that cannot start does not fill the log
 
 SWITCHES: dict[str, Any] = dict(default_value="false", choices=["true", "false"])
 ARGUMENTS: dict[str, dict[str, Any]] = {
@@ -241,7 +241,7 @@ def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
                 *add_arguments(files[base], node, list_argument_parameters(value, base, detectors)),
                 *(_list_expert_range(value, files) if base == "ground_segmentation" else ()),
             ],
-            # A parameter file may make any node read odometry; for the others the remapping is void.
+            # A parameter file may make any node read odometry; other nodes ignore the remapping.
             remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_INPUT}.items()],
         )
         for node, remap in graph.items()
@@ -382,7 +382,7 @@ def _rename_rviz_topic(topic: str, value: dict[str, str]) -> str:
     detectors, single = _detectors(value), value["single"] == "true"
     if topic == relative_name(POINTS):
         return value["points"]
-    if node == TRACKER:  # of the first detector
+    if node == TRACKER:  # the tracker follows the first detector
         node = next(iter(SINGLE_PROCESS_NODES[detectors[0]] if single else find_trackers(detectors)))
     elif single and node in STAGES:
         node = next(iter(SINGLE))

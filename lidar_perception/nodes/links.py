@@ -13,7 +13,7 @@ from lidar_perception.wire.array_codec import encode_markers
 from lidar_perception.wire.codec import encode
 from msg_utils.markers import MarkerRows
 
-Receive = Callable[[Any, dict[str, int]], None]  # gets a message and its info, see Output
+Receive = Callable[[Any, dict[str, int]], None]  # called with a message and its info, see Output
 
 
 class Output:
@@ -31,7 +31,7 @@ class Output:
     def __init__(self, publisher: Any, links: Links | None):
         self.publisher, self.links = publisher, links
         self.receivers: tuple[Receive, ...] = ()
-        self.count = 0  # of messages for linked nodes
+        self.count = 0  # number of messages passed to linked nodes
         latched = publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         self.always_publishes = links is None or latched
         if links is not None:
@@ -75,7 +75,7 @@ class Links:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._outputs: dict[str, tuple[Output, ...]] = {}
-        self._waiting: dict[str, tuple[Callable[[], None], ...]] = {}  # called at a change
+        self._waiting: dict[str, tuple[Callable[[], None], ...]] = {}  # callbacks to call when the outputs change
 
     def add(self, output: Output) -> None:
         """Add an output and tell the inputs of its topic."""

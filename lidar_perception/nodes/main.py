@@ -51,7 +51,7 @@ def run(name: str, arguments: list[str]) -> int:
     from lidar_perception.runs.memory import keep_freed_memory
     from lidar_perception.runs.threads import default_to_one_thread
 
-    default_to_one_thread()  # nodes share the cores
+    default_to_one_thread()  # because several nodes share the cores
     keep_freed_memory()
     from lidar_perception.nodes.stopping import Stop
 
@@ -59,7 +59,7 @@ def run(name: str, arguments: list[str]) -> int:
     if {"-h", "--help"} & set(arguments[1:]):
         try:
             print(help_text(name), flush=True)
-        except BrokenPipeError:  # `| head`: keep Python from flushing again at exit
+        except BrokenPipeError:  # output piped to `head`: keep Python from flushing again at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     nodes, shared = split_arguments(arguments)
@@ -121,7 +121,7 @@ def _find_misspelt_sections(arguments: list[str], node: str) -> list[str]:
 
     lines = []
     for path in [b for a, b in pairwise(arguments) if a == "--params-file"]:
-        with suppress(InputError):  # for example too large for us; rcl has read it
+        with suppress(InputError):  # for example a file too large for us; rcl has already read it
             lines += describe_unknown_nodes(path, [node], only_similar=True)
     return lines
 
@@ -182,7 +182,7 @@ def _run_nodes(given: list[tuple[type, list[str], dict[str, Any]]], shared: list
             node.stop.set_result(None)
 
     try:
-        stop.on_signal = lambda: None  # DDS must be shut down from here on, see stop.requested
+        stop.on_signal = lambda: None  # a signal must now let DDS shut down, see stop.requested
         rclpy.init(args=shared, signal_handler_options=SignalHandlerOptions.NO)
         for node_class, arguments, options in given:
             log = get_logger(_logger_name(arguments))
@@ -217,13 +217,13 @@ def _run_nodes(given: list[tuple[type, list[str], dict[str, Any]]], shared: list
         for node in nodes:
             try:
                 node.close()
-            except InputError as error:  # its results cannot be written
+            except InputError as error:  # the results cannot be written
                 node.get_logger().fatal(str(error))
                 code = code or 1
         stop.finish_closing(code)
         for node in nodes:
             node.destroy_node()
-        del kept  # shuts down DDS, which may hang; then the guard ends the process
+        del kept  # DDS shuts down; the guard ends the process if it hangs
         rclpy.try_shutdown()
     return code
 
@@ -237,7 +237,7 @@ def _spin_node(node: LidarNode, arguments: list[str], begin: float) -> None:
 
     undeclared = [name for name in parameter_overrides(node) if not node.has_parameter(name)]
     for line in [*describe_misspelt_parameters(undeclared), *_find_misspelt_sections(arguments, node.get_name())]:
-        node.get_logger().warning(line)  # before any long work
+        node.get_logger().warning(line)  # logged before any long work
     if not node.stop.done():
         node.start()
     if not node.stop.done():
@@ -252,4 +252,4 @@ if __name__ == "__main__":
     code = run(sys.argv[1], sys.argv[1:])
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(code)  # DDS is down; unloading torch would take seconds
+    os._exit(code)  # DDS is shut down; skip unloading torch, which takes seconds

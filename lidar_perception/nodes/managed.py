@@ -28,8 +28,8 @@ from lidar_perception.types import InputError
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 MIN_RETRY_PERIOD_S = 5.0
-RETRY_FACTOR = 10.0  # retry period over the duration of an attempt
-MANAGER_TIMEOUT_S = 10.0  # after the start, for the first request of a lifecycle manager
+RETRY_FACTOR = 10.0  # ratio of the retry period to the duration of an attempt
+MANAGER_TIMEOUT_S = 10.0  # time after the start for a lifecycle manager to send its first request
 UNCONFIGURED, INACTIVE = "not configured", "not active"
 ENTITIES: dict[str, Any] = {
     "publishers": Node.destroy_publisher,
@@ -52,7 +52,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
     no lifecycle manager has requested anything, for example after a restart.
     """
 
-    waits_for: ClassVar[tuple[str, ...]] = ("points",)  # inputs below ~/input
+    waits_for: ClassVar[tuple[str, ...]] = ("points",)  # names of the inputs below ~/input
 
     def __init__(self, name: str, params: Any, node_params: Any, **options: Any):
         LidarNode.__init__(self, name, params, node_params, **options)
@@ -60,9 +60,9 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         self.active = False
         self.state = (OK, UNCONFIGURED)
         self._retry_at: float | None = None
-        self._unmanaged_since: float | None = None  # monotonic; None after a request
-        self._own_attributes: set[str] = set()  # kept by a cleanup
-        self._own_entities: list[Any] = []  # publishers and so on, kept by a cleanup
+        self._unmanaged_since: float | None = None  # monotonic time of the start; None once a request has arrived
+        self._own_attributes: set[str] = set()  # attributes that a cleanup keeps
+        self._own_entities: list[Any] = []  # publishers, timers and other entities that a cleanup keeps
         wrap_change_state(self, self._change)
 
     def configure(self) -> None:
@@ -198,7 +198,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
                 step()
         except InputError as error:
             return str(error)
-        except Exception as error:  # of torch or its drivers, for example
+        except Exception as error:  # torch and its drivers raise many types
             problem = f"{type(error).__name__}: {error}"
             if not self.state[1].endswith(problem):
                 self.get_logger().error(traceback.format_exc())
@@ -227,6 +227,6 @@ def release_memory() -> None:
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():
         torch.cuda.empty_cache()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # exists in glibc only
     if trim is not None:
         trim(0)

@@ -11,8 +11,8 @@ from typing import Any
 from lidar_perception.nodes import NODES
 from lidar_perception.param_fields import collect_fields
 
-MIN_SIMILARITY = 0.85  # 0..1, ratio of difflib above which a name is a misspelling
-MAX_NAMES = 200  # that are checked
+MIN_SIMILARITY = 0.85  # difflib ratio (0 to 1) above which a name counts as a misspelling
+MAX_NAMES = 200  # maximum number of names to check
 
 
 def find_node_parameters(name: str) -> dict[str, Any]:

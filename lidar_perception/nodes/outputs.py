@@ -47,7 +47,7 @@ class ClusterBoxes:
     def publish(self, header: Any, boxes: Callable[[], np.ndarray]) -> None:
         if self.publisher.get_subscription_count():
             header, output = to_output_frame(self.node, header, boxes())
-            ids = range(1, len(output) + 1)  # as in the column cluster_id
+            ids = range(1, len(output) + 1)  # same ids as in the column cluster_id
             rows = make_marker_rows(
                 output, ["cluster"] * len(output), ids=ids, previous=self.marker_keys, extras=_marker_texts(output, ids)
             )

@@ -14,8 +14,8 @@ from lidar_perception.runs.files import read_text, shorten_error
 from lidar_perception.types import InputError, closest_name
 
 MAX_BYTES = 10**6
-MAX_KEYS = 10_000  # as YAML anchors can nest a group in itself
-MAX_LINES = 20  # of messages for one file
+MAX_KEYS = 10_000  # limit needed because YAML anchors can nest a group in itself
+MAX_LINES = 20  # maximum number of messages for one file
 EVERY_NODE = "/**"
 
 

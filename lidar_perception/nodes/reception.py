@@ -22,12 +22,12 @@ from lidar_perception.params import ReceptionParams
 
 WARN, ERROR, STALE = DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
-MAX_HOLD_S = 1.0  # for which newer clouds do not replace a waiting one
-RETRY_PERIOD_S = 5.0  # between attempts to wait again after waiting has timed out
-RETRY_DURATION_S = 0.3  # of such an attempt
-# Periods without a cloud before the state is ERROR and STALE, respectively.
+MAX_HOLD_S = 1.0  # time during which newer clouds do not replace a waiting one
+RETRY_PERIOD_S = 5.0  # pause before waiting again after a timeout
+RETRY_DURATION_S = 0.3  # duration of the renewed wait
+# Number of missed periods after which the state becomes ERROR and STALE, respectively.
 SILENT_PERIODS, STALE_PERIODS = 3.0, 6.0
-# Kind of publisher -> what to check when no clouds arrive, and when too few do.
+# Kind of publisher -> (hint when no clouds arrive, hint when too few arrive).
 QUESTIONS = {
     "sensor": ("is the sensor{} running, and connected?", "is the sensor{} overloaded?"),
     "detector": (
@@ -42,7 +42,7 @@ QUESTIONS = {
 }
 FASTDDS_PROFILE = files("lidar_perception.nodes") / "fastdds.xml"
 
-Problem = tuple[str, bytes, str]  # kind, level, message
+Problem = tuple[str, bytes, str]  # (kind, level, message)
 
 
 class Reception:
@@ -83,17 +83,17 @@ class Reception:
         self.fixed = f"qos_overrides.{self.topic}.subscription.reliability" in parameter_overrides(node)
         self.reliability = BEST_EFFORT if params().reliability == "best_effort" else RELIABLE
         self.waiting: deque[Any] = deque()
-        self.linked: deque[tuple[Any, dict]] = deque()  # messages of a link, see _receive
+        self.linked: deque[tuple[Any, dict]] = deque()  # messages received through a link, see _receive
         self.deliver_trigger = node.create_guard_condition(self._deliver_one)
         self.adapt_trigger = node.create_guard_condition(self.adapt)
         self.link_trigger = node.create_guard_condition(self._take_linked)
         self.last_time: float | None = None  # monotonic time of the last cloud
-        self.needs: str | None = None  # what the waiting or the last cloud needs
-        self.needed_since: float | None = None  # monotonic
-        self.waiting_since: float | None = None  # monotonic, of the first waiting cloud
-        self.output: Output | None = None  # to which the topic is linked, without a subscription
+        self.needs: str | None = None  # data that the waiting or the last cloud still needs
+        self.needed_since: float | None = None  # monotonic time at which that need arose
+        self.waiting_since: float | None = None  # monotonic time of arrival of the first waiting cloud
+        self.output: Output | None = None  # in-process source of the topic, used instead of a subscription
         self.subscription: Any = None
-        self.last_publishers: list[Any] = []  # the last ones, if there were any
+        self.last_publishers: list[Any] = []  # the publishers last seen, if any
         self.arrivals = Arrivals()
 
     @property
@@ -146,7 +146,7 @@ class Reception:
         events = SubscriptionEventCallbacks(
             matched=lambda _: self.adapt_trigger.trigger(), incompatible_qos=lambda _: self.adapt_trigger.trigger()
         )
-        on_message: Any = self._on_message  # the annotation of rclpy lacks the message info
+        on_message: Any = self._on_message  # rclpy's type annotation lacks the message info
         profile = QoSProfile(depth=max(DEPTH, self.params().queue), reliability=self.reliability)
         self.subscription = self.node.create_subscription(
             self.kind,
@@ -232,7 +232,7 @@ class Reception:
         since = self.needed_since
         may_wait = since is None or self._may_wait(monotonic() - since)
         self.needs = self.deliver(self.waiting[0], may_wait)
-        self.last_time = monotonic()  # after the work, which is not silence
+        self.last_time = monotonic()  # set after the work, so that processing time does not count as silence
         self.needed_since = None if self.needs is None else since or self.last_time
         if since and self.needs is None:
             self.arrivals.reset_window()
@@ -308,7 +308,7 @@ class Reception:
                 )
             )
         sent, lost, dropped = self.arrivals.count_recent()
-        total = max(sent, WINDOW)  # so that one lost cloud of the first two is not a half
+        total = max(sent, WINDOW)  # so that one lost cloud of the first two does not count as 50 %
         if lost > params.max_lost * total:
             remedy = self._suggest_remedy(publishers or self.last_publishers)
             problems.append(
@@ -346,7 +346,7 @@ class Reception:
         """Return the questions of QUESTIONS for the current publishers."""
         names = sorted({_name(p) for p in self.last_publishers})
         if names and all(name.endswith("_player") for name in names):
-            kind = "player"  # bag_player, rosbag2_player
+            kind = "player"  # matches bag_player and rosbag2_player
         elif self.what != "cloud":
             kind = "detector"
         else:  # nodes of this package publish NODE/output/points

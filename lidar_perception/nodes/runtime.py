@@ -42,10 +42,10 @@ RELIABLE = QoSProfile(depth=10)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-JUMP_NS = 10**9  # a stamp that is earlier by more than this means that a bag has restarted
+JUMP_NS = 10**9  # a stamp that goes back by more than this means that a bag has restarted
 WAITING = "waiting for input"
-LOG_PERIOD_S = 60.0  # before the same problem is logged again
-MAX_LOGGED_KINDS = 1000  # kinds of messages with a remembered time
+LOG_PERIOD_S = 60.0  # pause before the same problem is logged again
+MAX_LOGGED_KINDS = 1000  # maximum number of message kinds whose last log time is stored
 
 
 class LidarNode(Node):
@@ -61,8 +61,8 @@ class LidarNode(Node):
         options: further arguments of rclpy.node.Node.
     """
 
-    transforms: Any = None  # of type Transforms for nodes that subscribe to clouds
-    writes_files: ClassVar[bool] = False  # True: after a signal the work is finished, for close()
+    transforms: Any = None  # a Transforms object for nodes that subscribe to clouds
+    writes_files: ClassVar[bool] = False  # True if close() writes files, so a signal must not cut off the work
 
     def __init__(self, name: str, params: Any, node_params: Any = None, links: Links | None = None, **options: Any):
         super().__init__(name, **options)
@@ -72,11 +72,11 @@ class LidarNode(Node):
         self.node_params = node_params and declare_parameters(self, node_params)
         self.add_pre_set_parameters_callback(self._before_set)
         self.add_on_set_parameters_callback(self._on_set)
-        self.stop = Future()  # set from any thread to end the node
+        self.stop = Future()  # any thread may set it to end the node
         self.state = (WARN, WAITING)
-        self.active = True  # subscribed to its inputs
+        self.active = True  # True while the node subscribes to its inputs
         self.reset_state()
-        self._present: set[str] = set()  # kinds of present problems
+        self._present: set[str] = set()  # kinds of the current problems
         self._logged: dict[str, float] = {}  # kind of message -> time of its last log line
         self._last_logged = ""
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
@@ -88,8 +88,8 @@ class LidarNode(Node):
         self.counts: dict[str, Any] = {"frames": 0, "lost": 0}
         self.last_stamp_ns = 0
         self.times: list[float] = []
-        self.frame_id = ""  # of the last cloud
-        self.inputs: list[Any] = []  # with open() and close()
+        self.frame_id = ""  # frame of the last cloud
+        self.inputs: list[Any] = []  # objects with open() and close()
         for output in self._outputs:
             output.close()
         self._outputs = []
@@ -178,12 +178,12 @@ class LidarNode(Node):
                     reception.retry()
             return missing
 
-        untyped_receive: Any = receive  # the annotation of rclpy has no result
+        untyped_receive: Any = receive  # rclpy's type annotation lacks the return value
         kind, what = load_message_class(type_name), "cloud" if type_name == CLOUD else "array"
 
         def report_incompatible(event: Any) -> None:
             if len(qos) > 1:
-                return  # another profile matches
+                return  # another QoS profile matches
             topic = self.resolve_topic_name(name)
             remedy = (
                 "let it publish transient local (ros2 bag play: --qos-profile-overrides-path)"
@@ -341,7 +341,7 @@ class LidarNode(Node):
 
     def _tick(self) -> None:
         for reception in self._receptions():
-            reception.adapt()  # for middleware without events
+            reception.adapt()  # needed for middleware without QoS events
             reception.retry()
         self.publish_diagnostics()
 

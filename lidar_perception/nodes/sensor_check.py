@@ -14,7 +14,7 @@ from lidar_perception.robot.params import CropParams
 from lidar_perception.types import PointCloud
 from lidar_perception.wire.messages import to_point_cloud
 
-MEASURED_CLOUDS = 5  # for the sensor height
+MEASURED_CLOUDS = 5  # number of clouds used to measure the sensor height
 
 
 class SensorCheck:

@@ -11,10 +11,10 @@ from pathlib import Path
 
 SHARED_MEMORY = Path("/dev/shm")
 LOCK_NAME = re.compile(r"(fastrtps_[0-9a-f]{16})_el")
-MIN_AGE_S = 60.0  # younger segments are kept
+MIN_AGE_S = 60.0  # minimum age of a segment that may be removed
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-PROFILES = {256 * 2**20: "fastdds.xml", 40 * 2**20: "fastdds_small.xml"}  # by required free bytes
-DRIVER_PROFILE, SOCKET_BUFFER = "fastdds_driver.xml", 2 * 2**20  # bytes of net.core.rmem_max
+PROFILES = {256 * 2**20: "fastdds.xml", 40 * 2**20: "fastdds_small.xml"}  # required free bytes -> profile
+DRIVER_PROFILE, SOCKET_BUFFER = "fastdds_driver.xml", 2 * 2**20  # profile, and the net.core.rmem_max it needs, in bytes
 
 
 def use_large_shared_memory(from_driver: bool = False) -> None:

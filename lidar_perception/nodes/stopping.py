@@ -9,8 +9,8 @@ import signal
 import threading
 from collections.abc import Callable, Collection
 
-WORK_TIMEOUT_S = 0.7  # for the current work, before force_exit() ends the process
-POLL_PERIOD_S = 0.05  # while the guard is loaded
+WORK_TIMEOUT_S = 0.7  # time for the current work before force_exit() ends the process
+POLL_PERIOD_S = 0.05  # polling period while the guard is loading
 
 
 class Stop:
@@ -39,11 +39,11 @@ class Stop:
         self._awake, pipe = os.pipe()
         threading.Thread(target=self._wait, daemon=True).start()
         # A descriptor, because a thread in sigwait(3) does not block the signals.
-        mask = sum(1 << number - 1 for number in signals).to_bytes(128, "little")  # sigset_t
+        mask = sum(1 << number - 1 for number in signals).to_bytes(128, "little")  # laid out as a sigset_t
         arrived, loaded = ctypes.CDLL(None).signalfd(-1, mask, os.O_CLOEXEC), threading.Event()
         listener = threading.Thread(target=_relay_first_signal, args=(arrived, loaded, pipe), daemon=True)
         listener.start()
-        from lidar_perception.nodes import guard  # takes seconds, as it imports NumPy and Numba
+        from lidar_perception.nodes import guard  # takes seconds because it imports NumPy and Numba
 
         loaded.set()
         listener.join()
@@ -72,7 +72,7 @@ class Stop:
         """Let the process end with this code within guard.TEARDOWN_S seconds."""
         self._state[:] = self._closed_phase, code
         self.on_signal = lambda: None
-        os.kill(os.getpid(), signal.SIGTERM)  # wakes the guard, if no signal has
+        os.kill(os.getpid(), signal.SIGTERM)  # wakes the guard in case no signal has
 
 
 def _relay_first_signal(arrived: int, loaded: threading.Event, pipe: int) -> None:

@@ -25,9 +25,9 @@ from msg_utils.messages import load_message_class
 from msg_utils.stamps import SECOND_NS, to_ns
 
 DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
-MIN_LIFETIME_PERIODS = 2.5  # lifetime of markers in periods of the input
-MAX_LIFETIME_S = 1e6  # messages have 32 bits for the seconds
-RATE_WINDOW_S = 10.0  # for the rates of new and ended tracks
+MIN_LIFETIME_PERIODS = 2.5  # minimum lifetime of markers, in periods of the input
+MAX_LIFETIME_S = 1e6  # fits into the 32-bit seconds of a Duration message
+RATE_WINDOW_S = 10.0  # averaging window for the rates of new and ended tracks
 
 
 class TrackOutputs:
@@ -45,7 +45,7 @@ class TrackOutputs:
             warm_up()
         self.tracker = Tracker(params().tracking)
         self.ego = EgoInput(node, lambda: params().ego, clouds)
-        self.pose_source = NO_SOURCE, True, 0  # of the last frame
+        self.pose_source = NO_SOURCE, True, 0  # pose source of the last frame
         self.trails = Trails()
         self.frame_id: str | None = None
         self.marker_keys: Any = ()
@@ -55,7 +55,7 @@ class TrackOutputs:
             if has_detections_3d()
             else None
         )
-        self.count_history: deque[tuple[float, int, int]] = deque()  # seconds, born, ended
+        self.count_history: deque[tuple[float, int, int]] = deque()  # (time in seconds, tracks started, tracks ended)
 
     def publish(self, header: Any, detections: Detections, xyz: np.ndarray | None = None) -> str | None:
         """Track the detections of one frame and publish the tracks.
@@ -75,7 +75,7 @@ class TrackOutputs:
         pose = self.ego.find_pose(header, xyz)
         self.pose_source = self.ego.source, self.ego.is_mounting_known, self.ego.icp_restarts
         if before[0] != NO_SOURCE and before != self.pose_source:
-            tracker.reset()  # another fixed frame
+            tracker.reset()  # the fixed frame has changed
         problem = sensor_problem or self.ego.find_problem(header.frame_id, stamp)
         tracker.params = self.params().tracking
         tracks = tracker(detections, stamp, pose)
@@ -124,7 +124,7 @@ class TrackOutputs:
     def _count(self, stamp: int, reported: int) -> None:
         tracker, now = self.tracker, stamp / 1e9
         if self.count_history and not 0 <= now - self.count_history[-1][0] <= RATE_WINDOW_S:
-            self.count_history.clear()  # time jumped, or there are no stamps
+            self.count_history.clear()  # time has jumped, or the clouds have no stamps
         self.count_history.append((now, tracker.started, tracker.ended))
         while now - self.count_history[0][0] > RATE_WINDOW_S or len(self.count_history) > 1000:
             self.count_history.popleft()

@@ -32,8 +32,8 @@ from msg_utils.stamps import SECOND_NS, to_ns
 
 TF_QOS = QoSProfile(depth=100)
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-ODOMETRY_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # matches any
-ODOMETRY_TIMEOUT_S = 2.0  # without an odometry, before one in another frame replaces it
+ODOMETRY_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # best effort matches every publisher
+ODOMETRY_TIMEOUT_S = 2.0  # silence after which odometry in another frame is accepted
 NO_TF = "tf2_msgs is not installed, so TF is not available; install ROS 2's tf2_msgs"
 
 
@@ -53,15 +53,16 @@ class Transforms:
         self.tree, self.odometry = TransformTree(), TransformTree()
         self.base_frame = params.base_frame.lstrip("/")
         self.target_frame = getattr(params, "target_frame", "").lstrip("/")
-        self.odometry_child = self.odometry_frame = ""  # child frame and frame of the odometry
-        self.odometry_ns: int | None = None  # stamp of the last one
-        self.odometry_arrival = self.ignored_arrival = -inf  # monotonic
-        self.more_needs: list[Callable[[Any], str | None]] = []  # other inputs of a header
-        self.sweep: float | None = None  # seconds from the stamp to the last point of a cloud
-        self.problem_by_source: dict[str, str] = {}  # problems by the parameter that causes them
+        self.odometry_child = self.odometry_frame = ""  # child frame and parent frame of the odometry
+        self.odometry_ns: int | None = None  # stamp of the last odometry message
+        self.odometry_arrival = self.ignored_arrival = -inf  # monotonic times of arrival
+        # Further checks of whether the inputs for a header are available.
+        self.more_needs: list[Callable[[Any], str | None]] = []
+        self.sweep: float | None = None  # time from the stamp to the last point of a cloud, in seconds
+        self.problem_by_source: dict[str, str] = {}  # parameter that causes the problem -> message
         self.diagnostic_values: dict[str, Any] = {}
         self._last: tuple[tuple[str, int], Placement] = (("", -1), Placement(""))
-        self._connected_pairs: set[tuple[str, str]] = set()  # frames seen connected
+        self._connected_pairs: set[tuple[str, str]] = set()  # pairs of frames that TF has connected before
         self._has_tf_subscription = self._has_odometry_subscription = False
         self._installed = has_tf()
         if self._installed:
@@ -169,7 +170,7 @@ class Transforms:
         if self.sweep is None:
             try:
                 seconds = read_point_times(cloud, to_point_cloud(cloud)[1]).seconds
-            except InputError:  # deskew_cloud() reports it
+            except InputError:  # reported by deskew_cloud()
                 return 0.0
             self.sweep = float(seconds[np.isfinite(seconds)].max(initial=0.0))
         return self.sweep
@@ -193,7 +194,7 @@ class Transforms:
             base = None
         ahead = np.radians(self.node.node_params.input.ahead)
         upright = base
-        if upright is None and ahead:  # the turn follows the tilt, so both are applied here
+        if upright is None and ahead:  # the yaw rotation comes after levelling, so both are applied here
             upright = self._configured_pose()
             upright = np.eye(4) if upright is None else upright
         level = None if upright is None else find_level_transform(upright, ahead)
@@ -285,7 +286,7 @@ class Transforms:
         if source == "tf":
             fixed_frame = self.node.node_params.input.fixed_frame
             return self.tree.lookup_many(fixed_frame, frame_id, at, max_gap)
-        if frame_id.lstrip("/") == self.odometry_frame != "":  # it does not move
+        if frame_id.lstrip("/") == self.odometry_frame != "":  # the sensor does not move in its own odometry frame
             return np.tile(np.eye(4), (len(at), 1, 1))
         return self.odometry_poses(at, max_gap) @ self._find_child_poses(frame_id, at, max_gap)
 

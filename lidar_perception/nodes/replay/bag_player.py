@@ -28,10 +28,10 @@ from lidar_perception.wire.transforms import TF_MESSAGE
 from msg_utils.messages import make_ros_message
 from msg_utils.stamps import SECOND_NS, make_time
 
-SERVICE_PERIOD_S = 0.05  # between calls of services while messages are late
+SERVICE_PERIOD_S = 0.05  # minimum service period while the replay is behind schedule
 MIN_LOOP_S = 0.1
-ANSWER_POLL_S = 0.2  # while waiting for answers, which end a wait earlier
-UNCOUNTED_SUFFIXES = "_ms", "_3d"  # topics whose subscribers are not in the diagnostics
+ANSWER_POLL_S = 0.2  # polling period while waiting for answers; an answer ends the wait early
+UNCOUNTED_SUFFIXES = "_ms", "_3d"  # suffixes of topics whose subscribers the diagnostics do not list
 
 
 class BagPlayer(LidarNode):
@@ -50,10 +50,11 @@ class BagPlayer(LidarNode):
             self.bag = Bag(self.params.bag)
         for warning in caught:
             self.get_logger().warning(str(warning.message))
-        # Topics with clouds that are played as PointCloud2
+        # Topics with clouds that are published as PointCloud2
         self.converted = {t for t in find_cloud_topics(self.bag.topics) if self.bag.topics[t] != POINT_CLOUD}
         self.kinds = {t: POINT_CLOUD if t in self.converted else kind for t, kind in self.bag.topics.items()}
-        self.follows = bool(self.params.follow and self.params.ahead)  # clouds wait for answers
+        # True if each cloud waits for the answers to earlier ones.
+        self.follows = bool(self.params.follow and self.params.ahead)
         self.names = self._select_topics()
         self.publishers_by_topic = {t: p for t in self.names if (p := self._make_publisher(t))}
         if not self.publishers_by_topic:
@@ -62,7 +63,7 @@ class BagPlayer(LidarNode):
                 f"{', '.join(self.bag.topics) or 'an empty bag'}"
             )
         self.awaited = self._parse_wait_for()
-        self.diagnostic_values: dict[str, dict[str, str]] = {}  # by node
+        self.diagnostic_values: dict[str, dict[str, str]] = {}  # node -> key -> value
         self.start_ns = self.bag.start_ns + int(self.params.start_offset * SECOND_NS)
         if self.start_ns > self.bag.end_ns:
             raise InputError(
@@ -80,7 +81,7 @@ class BagPlayer(LidarNode):
         self.now_ns, self.anchor = self.start_ns, monotonic()
         self.pace = Pace(self, self.params.follow, self.params.ahead, self.params.follow_timeout)
         self.clock = self.params.clock_hz and self.create_publisher(Clock, "/clock", RELIABLE)
-        self.next_clock, self.served_at = 0.0, 0.0  # monotonic
+        self.next_clock, self.served_at = 0.0, 0.0  # monotonic times
         for name, action in (("pause", self._pause), ("resume", self._resume), ("step", self._step)):
             self.create_service(Trigger, f"~/{name}", action)
         if importlib.util.find_spec("rosbag2_interfaces"):
@@ -190,7 +191,7 @@ class BagPlayer(LidarNode):
                     "anyway",
                 )
                 return
-            self._publish_clock()  # the awaited node may be waiting for the time
+            self._publish_clock()  # the awaited node may itself be waiting for the clock
             self.serve(timeout_sec=0.02)
 
     def _count_subscribers(self, topic: str) -> int:
@@ -205,8 +206,8 @@ class BagPlayer(LidarNode):
             return played[0].get_subscription_count()
         node = resolved.rsplit("/", 2)[0]
         if resolved.endswith(UNCOUNTED_SUFFIXES) or not self.count_publishers(f"{node}/debug/processing_time_ms"):
-            return self.count_subscribers(resolved)  # not an output of a node of this package
-        values = self.diagnostic_values.get(node, {})  # with those in the process of the node
+            return self.count_subscribers(resolved)  # another package publishes the topic
+        values = self.diagnostic_values.get(node, {})  # includes subscribers inside the node's process
         return int(values.get(f"subscribers of {resolved}", 0))
 
     def _wait_until_delivered(self) -> None:
@@ -295,7 +296,7 @@ class BagPlayer(LidarNode):
             behind = (stamp - self.now_ns) / SECOND_NS / self.params.rate
             late = behind <= 0 and not self.paused
             if late and monotonic() - self.served_at < SERVICE_PERIOD_S:
-                return True  # otherwise serve first, however far behind the replay is
+                return True  # otherwise handle service calls first, however late the replay is
             wait = 0.05 if self.paused else min(max(behind, 0.0), 0.05)
             if self.clock:
                 wait = min(wait, max(self.next_clock - monotonic(), 0.0))

@@ -17,8 +17,8 @@ from lidar_perception.wire.codec import load_typestore
 from msg_utils.messages import load_message_class
 
 LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
-DEPTH = 100  # messages of a topic that DDS holds while the machine is busy
-MAX_QUEUED = 256 * 2**20  # bytes that wait for the file; further messages are dropped and counted
+DEPTH = 100  # queue depth of each topic in DDS, for when the machine is busy
+MAX_QUEUED = 256 * 2**20  # maximum bytes waiting to be written; further messages are dropped and counted
 DISCOVERY_PERIOD_S = 0.2  # between searches for topics without a publisher so far
 
 
@@ -40,9 +40,9 @@ class BagRecorder(LidarNode):
         self.subscription_by_topic: dict[str, Any] = {}
         self.incompatible: set[str] = set()  # topics with a publisher of weaker QoS
         self.queue: queue.Queue = queue.Queue()
-        self.queued, self.written = 0, 0  # bytes, each counted by one thread
+        self.queued, self.written = 0, 0  # bytes; each counter is updated by one thread only
         self.counts.update(lost=0, dropped=0)
-        self.reported = 0  # lost and dropped messages
+        self.reported = 0  # number of lost and dropped messages already reported
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._write)
         self.thread.start()
@@ -100,7 +100,7 @@ class BagRecorder(LidarNode):
     def _subscribe(self, topic: str, kind: type) -> None:
         """Subscribe with a QoS that all present publishers match."""
         offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
-        qos = QoSProfile(  # each of several publishers may have latched its own message
+        qos = QoSProfile(  # several publishers may each have latched a message
             depth=DEPTH,
             reliability=(
                 ReliabilityPolicy.RELIABLE
@@ -139,7 +139,7 @@ class BagRecorder(LidarNode):
                 else:
                     self.writer.write(topic, *rest)
                     self.written += len(rest[1])
-        except Exception as error:  # a full disk; the timer ends the node
+        except Exception as error:  # such as a full disk; the timer ends the node
             self.failure = error
 
     def close(self) -> None:

@@ -29,9 +29,9 @@ from msg_utils.markers import MarkedObjects, from_marker_array
 
 WRITE_PERIOD_S = 5.0
 MAX_INCOMPLETE_FRAMES = 100
-MAX_DONE_STAMPS = 100_000  # 2.8 hours at 10 Hz, 10 MB
-MAX_AP_FRAMES = 10_000  # kept for the average precision
-LOSSLESS_QOS = QoSProfile(depth=1000)  # small messages, none of which may be lost
+MAX_DONE_STAMPS = 100_000  # enough for 2.8 hours at 10 Hz; takes 10 MB
+MAX_AP_FRAMES = 10_000  # maximum number of frames kept for the average precision
+LOSSLESS_QOS = QoSProfile(depth=1000)  # for small messages that must not be lost
 TRUTH = "ground_truth"
 
 
@@ -49,7 +49,7 @@ class Evaluator(LidarNode):
         super().__init__("evaluator", EvaluatorParams(), **options)
         self.inputs_of_frame = (TRUTH, *self.params.stages)
         _check(self.params)
-        # Pedestrian first: its scores are at the top level of the file, those of others below.
+        # Pedestrian comes first because its scores are at the top level of the file.
         self.results = {
             name: CandidateReport()
             for name in sorted(self.params.classes, key=lambda name: name != CLASSES[PEDESTRIAN])
@@ -58,12 +58,12 @@ class Evaluator(LidarNode):
         self.camera_info: Any = None
         self.extrinsics: Any = None
         self.waiting: dict[int, dict[str, MarkedObjects]] = {}
-        self.done: dict[int, None] = {}  # stamps of scored and lost frames, in order
+        self.done: dict[int, None] = {}  # ordered set of the stamps of scored and lost frames
         self.unwritten: str | None = None  # reason why the file is not written
-        self.frame_mismatch: str | None = None  # of the last frame
+        self.frame_mismatch: str | None = None  # description of the mismatch in the last frame
         self.counts.update(incomplete=0, repeated=0)
         with lock_compilation(self.get_logger().info):
-            _warm_up()  # before the inputs, for which bag_player waits
+            _warm_up()  # must precede the inputs, because bag_player starts once they exist
         for name in self.inputs_of_frame:
             self.input(name, MARKERS, lambda m, n=name: self._add(n, m), LOSSLESS_QOS)
         for topic, kind in (
@@ -91,7 +91,7 @@ class Evaluator(LidarNode):
                 "DELETE marker with the header of the frame"
             )
         stamp = objects.stamp_ns
-        if stamp in self.done:  # a repeated bag, or a late message
+        if stamp in self.done:  # the bag was repeated, or the message is late
             self.counts["repeated"] += 1
             return
         frame = self.waiting.setdefault(stamp, {})

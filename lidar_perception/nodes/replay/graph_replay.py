@@ -35,11 +35,11 @@ from lidar_perception.tracking.ego import choose_recorded_source
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
-GRAPH = "graph"  # process with the nodes of a graph
+GRAPH = "graph"  # name of the process that runs the nodes of a graph
 TRACKS = f"/{TRACKER}/output/tracks"
-START_TIMEOUT_S = 180.0  # for all nodes to compile, start and find each other
-AHEAD = 2  # clouds in flight, so that stages can work in parallel
-SILENCE_TIMEOUT_S = 10.0  # without a result after the last cloud
+START_TIMEOUT_S = 180.0  # time for all nodes to compile, start and discover each other
+AHEAD = 2  # number of clouds in flight, so that stages can work in parallel
+SILENCE_TIMEOUT_S = 10.0  # time without a result after the last cloud until the replay ends
 
 
 def replay(
@@ -134,7 +134,7 @@ def replay(
         # The detections have four subscribers: monitor, recorder, tracker, evaluator.
         rules += [f"{relative_name(stages[FINAL])}:={3 + scored}"]
         rules += [relative_name(ODOMETRY)] if poses == "recording" else []
-        first, last = CpuTimes(), CpuTimes()  # at the first and the last result
+        first, last = CpuTimes(), CpuTimes()  # CPU times at the first and the last result
         running.start(
             "bag_player",
             {},
@@ -165,7 +165,7 @@ def replay(
                 before = monitor.frames
                 monitor.spin_until(finished, SILENCE_TIMEOUT_S, lambda: running.check("bag_player"))
 
-        # Both lag behind the results by their own processing time.
+        # Both timings lag behind the results by their own processing time.
         def caught_up(node: str) -> bool:
             return int(monitor.get_value(node, "frames") or 0) >= monitor.frames
 

@@ -10,8 +10,8 @@ from typing import Any
 from lidar_perception.nodes.runtime import MARKERS, RELIABLE
 from msg_utils.messages import load_message_class
 
-MAX_WAITING = 1000  # clouds without an answer, and timed answers
-SHORT_TIMEOUT_S = 1.0  # for a detection, after one has timed out
+MAX_WAITING = 1000  # maximum number of unanswered clouds and of timed answers
+SHORT_TIMEOUT_S = 1.0  # timeout for a detection after an earlier one has timed out
 
 
 class Pace:
@@ -34,8 +34,8 @@ class Pace:
 
     def __init__(self, node: Any, topics: Sequence[str], ahead: int, timeout: float):
         self.ahead, self.timeout, self.patience = ahead, timeout, timeout
-        self.waiting: dict[bytes, set[str]] = {}  # stamp as in CDR -> missing topics; oldest first
-        self.sent: dict[bytes, float] = {}  # their monotonic times
+        self.waiting: dict[bytes, set[str]] = {}  # stamp in CDR encoding -> missing topics, oldest first
+        self.sent: dict[bytes, float] = {}  # stamp -> monotonic time of publication
         self.latencies_ms: deque[float] = deque(maxlen=MAX_WAITING)
         self.unanswered, self.held = 0, 0.0
         self.topics = frozenset(topics)
@@ -46,7 +46,7 @@ class Pace:
                 lambda data, t=topic: self.add_answer(data[8:16], t),
                 RELIABLE,
                 raw=True,
-            )  # CDR: 8 bytes, then the first marker's stamp
+            )  # CDR layout: 8 bytes, then the first marker's stamp
 
     def add_cloud(self, cloud: bytes) -> None:
         """Register a cloud, as CDR, that is sent now."""
