@@ -2,4 +2,4 @@
 
 from lidar_perception.runs.threads import use_passive_waiting
 
-use_passive_waiting()  # before __main__ loads torch, as OpenMP reads its environment once
+use_passive_waiting()  # must precede the import of torch, because OpenMP reads its environment once

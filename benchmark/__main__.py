@@ -38,8 +38,8 @@ from lidar_perception.scoring.centres.report import select_pedestrians
 from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
-FULL_SCAN = 60_000  # points; a scan cut to the camera's view has some 20,000
-FEW = 3  # with fewer pedestrian frames, frames without pedestrians are used too
+FULL_SCAN = 60_000  # minimum points of a full scan; one cropped to the camera's view has about 20,000
+FEW = 3  # minimum number of pedestrian frames; with fewer, other frames are used too
 
 
 @click.command(context_settings=dict(help_option_names=["-h", "--help"]))

@@ -16,7 +16,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.scoring.centres.report import select_pedestrians
 
-SAME = 0.02  # metres between boxes of the same candidate; planes of two RANSACs differ a little
+SAME = 0.02  # max distance in metres between equal boxes; two RANSAC planes differ a little
 
 
 def compare_candidates(frames: list[Frame], repeat: int) -> dict:
@@ -42,7 +42,7 @@ def compare_candidates(frames: list[Frame], repeat: int) -> dict:
             best, [find_candidates(scan, make_truth_source(truth), camera, BEST)[1].ms for _ in range(repeat)]
         )
         result = theirs[0]
-        # The same ground for both: then clusters must be identical, and so the candidates.
+        # Given the same ground, the clusters and candidates must be identical.
         ids = cluster_obstacles(result["points"], result["ground"], PAPER.clustering)
         agree["labels_identical"] += np.array_equal(ids, result["labels"])
         boxes = fit_grounded_boxes(result["points"], result["ground"], ids)
@@ -52,7 +52,7 @@ def compare_candidates(frames: list[Frame], repeat: int) -> dict:
             len(getattr(found, s)) == len(result[s]) == _count_shared(getattr(found, s).boxes, result[s])
             for s in STAGES
         )
-        # Each with its own RANSAC.
+        # Each implementation with its own RANSAC.
         agree["candidates"] += max(len(mine[0][1].final), len(result["final"]))
         agree["candidates_same"] += _count_shared(mine[0][1].final.boxes, result["final"])
     medians = {

@@ -33,10 +33,10 @@ from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.runs.threads import set_thread_count, thread_count
 from lidar_perception.types import PointCloud
 
-PAPER_TO_V0 = {"v0": 1.0, "v1": 1.06, "v2": 1.86, "v3": 2.48, "v4": 3.54}  # paper B, RTX 4090
-TARGET = 1.6  # of v4 to v0, less than
-CANDIDATES = 200  # anchors that pass, as in a street
-FEW = 3  # scans for full on a CPU, where a frame takes half a second
+PAPER_TO_V0 = {"v0": 1.0, "v1": 1.06, "v2": 1.86, "v3": 2.48, "v4": 3.54}  # time relative to V0 in paper B, RTX 4090
+TARGET = 1.6  # target: V4 takes less than this factor times V0
+CANDIDATES = 200  # anchors above the threshold, typical of a street
+FEW = 3  # scans for the full network on a CPU, which takes half a second per frame
 
 
 def measure_detection(scans: list[PointCloud], repeat: int, sizes: Sequence[str] = tuple(SIZES)) -> dict:

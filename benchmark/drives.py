@@ -41,7 +41,7 @@ from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import Detections, InputError
 
-# Detector -> its classes, and the score from which on the peer gets its detections.
+# Detector -> (classes, minimum score of the detections passed to the peer).
 NETWORKS = ("fused", "pointpillars", "pointnet")
 DETECTORS = {
     **dict.fromkeys(NETWORKS, (tuple(DETECTED), ScoreParams().car)),
@@ -73,7 +73,7 @@ def detect(street: int, frames: int, people: float) -> Drive:
 def _detect_street(detector: Detector, frame) -> Detections:
     try:
         return detector(frame).detections
-    except InputError:  # no seed in this frame
+    except InputError:  # the frame has no seed
         return Detections.none()
 
 

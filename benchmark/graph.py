@@ -23,7 +23,7 @@ from lidar_perception.wire.topics import POINTS
 
 CANDIDATES: dict[str, Any] = {"detector": "candidates", "params": PAPER}
 FUSED: dict[str, Any] = {"detector": "fused", "params": FusedDetectorParams()}
-RUNS: dict[str, tuple[dict[str, Any], int]] = {  # arguments of replay(), and busy processes
+RUNS: dict[str, tuple[dict[str, Any], int]] = {  # name -> (arguments of replay(), number of busy processes)
     "candidates, a process per node": (CANDIDATES | {"processes": True}, 0),
     "candidates, one process": (CANDIDATES | {"processes": False}, 0),
     "candidates, one node": (CANDIDATES | {"single": True, "processes": True}, 0),

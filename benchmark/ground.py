@@ -21,7 +21,8 @@ from lidar_perception.scoring.points.segmentation import PROTOCOLS, GroundReport
 from lidar_perception.types import SENSOR_HEIGHT, PointCloud
 
 PARAMS = GroundParams()
-MAX_Z = PARAMS.threshold.max_height - SENSOR_HEIGHT  # of the points that both fit a plane to
+# Upper limit of the points that both implementations fit a plane to.
+MAX_Z = PARAMS.threshold.max_height - SENSOR_HEIGHT
 
 
 def measure_threshold(title: str, clouds: list[np.ndarray], repeat: int) -> dict:
@@ -31,7 +32,7 @@ def measure_threshold(title: str, clouds: list[np.ndarray], repeat: int) -> dict
         return make_measurement(title, len(clouds), points, [make_row(peer.name, note=peer.missing())])
 
     def calls(xyz):
-        # The low points are selected within the measured time, as ours does.
+        # Selecting the low points is part of the measured time, as in ours.
         return {peer.name: lambda: peer.run(xyz, xyz[:, 2] < MAX_Z), "ours": partial(segment_by_threshold, xyz)}
 
     clock = Clock(repeat, calls(thin(clouds[0])))

@@ -40,7 +40,7 @@ class Peer:
         return self.missing() or metadata.version(self.package)
 
 
-# DBSCAN: points (N, 3) float32, eps, min_samples -> (N,) labels, -1 noise.
+# DBSCAN: points (N, 3) float32, eps, min_samples -> (N,) labels, -1 for noise.
 
 
 def _sklearn(jobs: int | None) -> Callable:
@@ -70,7 +70,7 @@ SKLEARN = (
     Peer("sklearn, n_jobs=-1", "scikit-learn", "sklearn", _sklearn(-1)),
 )
 OPEN3D = Peer("Open3D", "open3d", "open3d", _open3d)
-# Its threads go on polling after the call, a quarter of a core for the rest of the process.
+# Its threads keep polling after the call and use a quarter of a core until the process ends.
 WHEEL = Peer("dbscan", "dbscan", "dbscan", _wheel)
 DBSCANS = (*SKLEARN, WHEEL, OPEN3D)
 
@@ -88,9 +88,9 @@ def by_bands(run: Callable, xyz: np.ndarray, params: DbscanParams = DbscanParams
     return labels
 
 
-# RANSAC: points (N, 3), mask (N,) of the low ones to fit a plane to -> mask (N,) of the ground.
+# RANSAC: points (N, 3), mask (N,) of low points to fit a plane to -> ground mask (N,).
 
-TRIALS = 2000  # maximum, as in paper A
+TRIALS = 2000  # maximum number of trials, as in paper A
 
 
 def _ransac(xyz: np.ndarray, low: np.ndarray) -> np.ndarray:
@@ -105,7 +105,7 @@ def _ransac(xyz: np.ndarray, low: np.ndarray) -> np.ndarray:
 RANSAC = Peer("scikit-learn's RANSAC", "scikit-learn", "sklearn", _ransac)
 
 
-# Ground. Both print on file descriptor 1.
+# Ground segmentation. Both libraries print on file descriptor 1.
 
 
 @contextmanager

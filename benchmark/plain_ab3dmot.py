@@ -18,7 +18,7 @@ MIN_HITS, MAX_AGE = 3, 2
 GATES = {"Car": 6.0, "Pedestrian": 1.0, "Cyclist": 6.0}
 OTHER_GATE = 6.0
 
-# State: x y z yaw l w h and the change of x y z a frame.
+# State: x y z yaw l w h, and the change of x y z per frame.
 STEP = np.eye(10)
 STEP[:3, 7:] = np.eye(3)
 SEEN = np.eye(7, 10)
@@ -42,7 +42,7 @@ class _Track:
 
     def update(self, measured: np.ndarray, score: float) -> None:
         turn = (measured[3] - self.state[3] + np.pi) % (2 * np.pi) - np.pi
-        if abs(turn) > np.pi / 2:  # the detector took the other end for the front
+        if abs(turn) > np.pi / 2:  # the detector confused front and back
             self.state[3] += np.pi
             turn -= np.sign(turn) * np.pi
         difference = measured - self.state[:7]

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from lidar_perception.clustering.params import EuclideanParams
 
-AT_ONCE = 4_000_000  # neighbours that are held at a time: about 300 MB
+AT_ONCE = 4_000_000  # maximum number of neighbours held in memory: about 300 MB
 
 
 def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams()) -> np.ndarray:
@@ -34,7 +34,7 @@ def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams()) -> n
 def _thresholds(tree: cKDTree, params: EuclideanParams) -> np.ndarray:
     """Compute the thresholds (N,) of Eq. 6 or Eq. 11, rounded to float32."""
     if params.threshold == "global":
-        nearest = tree.query(tree.data, k=2)[0][:, 1]  # inf for a single point
+        nearest = tree.query(tree.data, k=2)[0][:, 1]  # inf if there is only one point
         mean = np.full(tree.n, nearest.mean() if tree.n > 1 else 0.0)
     else:
         total, count = np.zeros(tree.n), np.zeros(tree.n, np.int64)
@@ -51,7 +51,7 @@ def _neighbours(tree: cKDTree, wanted: np.ndarray, radius: float) -> Iterator[tu
 
     A few more points at the border are included. The search runs in parts to bound memory.
     """
-    rows = tree.indices[wanted[tree.indices]]  # in the order of the tree: parts are compact
+    rows = tree.indices[wanted[tree.indices]]  # in tree order, so that each part is spatially compact
     if len(rows) == 0:
         return
     count = tree.query_ball_point(tree.data[rows], radius, return_length=True)

@@ -109,7 +109,7 @@ def _silhouette(cluster: np.ndarray, steps: int) -> np.ndarray:
     centroid = cluster.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov(cluster[:, :2].T))
     lateral = axes[:, 1]
-    if lateral @ [-centroid[1], centroid[0]] < 0:  # left as the sensor sees it
+    if lateral @ [-centroid[1], centroid[0]] < 0:  # "left" is as seen from the sensor
         lateral = -lateral
     y, z = (cluster - centroid)[:, :2] @ lateral, cluster[:, 2] - centroid[2]
     scales = [1.0] + [max(CPA_MIN, 1 - k * CPA_DECREMENT) for k in range(1, steps + 1)]

@@ -26,8 +26,8 @@ from lidar_perception.runs.terminal import console
 from lidar_perception.runs.threads import thread_count
 from lidar_perception.types import PointCloud
 
-COUNT = 100  # clusters
-NETWORK, WHOLE = 40.0, 120.0  # ms, targets
+COUNT = 100  # number of clusters
+NETWORK, WHOLE = 40.0, 120.0  # targets in ms for the network and for the whole detector
 
 
 def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 Calls = dict[str, Callable[[], Any]]
-SLOW_REPEAT = 2  # runs per frame at most for slow peers
+SLOW_REPEAT = 2  # maximum runs per frame of a slow peer
 
 
 def time_interleaved(

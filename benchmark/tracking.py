@@ -23,7 +23,7 @@ from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, GroundTruth
 
-OPERATING = ScoreParams().car  # lowest score for the peer, which ignores scores
+OPERATING = ScoreParams().car  # minimum score of the peer's input, because the peer ignores scores
 SHOWN = ("HOTA", "DetA", "AssA", "MOTA", "sAMOTA", "AMOTA", "switches", "fragments", "labels", "true_tracks", "tracks")
 Step = Callable[["TrackedFrame"], tuple[np.ndarray, Detections]]
 

@@ -59,7 +59,7 @@ class Command(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         for param in self.params:
             if isinstance(param, HelpfulOption) and param.asks_for_help(args):
-                ctx.resilient_parsing = True  # required options may be missing
+                ctx.resilient_parsing = True  # allows required options to be missing
                 super().parse_args(ctx, [*args])
                 click.echo(param.listing(ctx.params))
                 ctx.exit()

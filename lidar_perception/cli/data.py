@@ -23,7 +23,7 @@ WHAT = (
     "files, or the output of `simulate`. BAG:/TOPIC names the clouds of a bag that has "
     "several."
 )
-MAX_DEFAULT_JOBS = 16  # processes; enough to feed a GPU
+MAX_DEFAULT_JOBS = 16  # maximum default number of processes, enough to feed a GPU
 
 
 def a_path(name: str, what: str, metavar: str = "FILE", **more: Any) -> Callable:
@@ -146,7 +146,7 @@ browser_option = click.option(
 class ScoringOptions:
     """Options of all commands that score frames: the frames, the processes and the output file."""
 
-    data: Any  # a path, or several
+    data: Any  # one path, or a list of paths
     split: Path | None
     limit: int | None
     jobs: int

@@ -55,9 +55,9 @@ from lidar_perception.wire.track_markers import read_trails
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import to_ns
 
-RECORD = "demo.json"  # in the output folder: data and detector
-BEHIND_M = 2.0  # detections this far behind need a picture of all sides
-REPLACED = ("drive", "result", "logs")  # folders that the next demo replaces
+RECORD = "demo.json"  # file in the output folder that names the data and the detector
+BEHIND_M = 2.0  # a detection farther behind the sensor than this requires an all-around picture
+REPLACED = ("drive", "result", "logs")  # subfolders that the next demo replaces
 
 
 def _runs(detector: str) -> Runs:
@@ -136,7 +136,7 @@ def demo(
     if detector == CANDIDATES and (range != "auto" or device != "auto"):
         raise click.UsageError("--range and --device are for a detector with a network")
     chosen = chosen_detector(detector, range, device, values, PAPER if detector == CANDIDATES else None)
-    require_rclpy()  # before the drive is made
+    require_rclpy()  # checked before the drive is simulated
     recording = None if data is None else open_and_describe(data)
     if recording is not None:
         recording.require(BOXES, "demo")
@@ -317,7 +317,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
     }
     if not hits:
         return False
-    best = max(hits, key=lambda s: (hits[s], s))  # the last of them: its trails are longest
+    best = max(hits, key=lambda s: (hits[s], s))  # the last such frame, because its trails are the longest
     truth, found = frames[best]
     trails: dict[int, np.ndarray] = {}
     drawing = None

@@ -186,7 +186,7 @@ def detect(
         split=None if split is None else str(split),
         device=detector.device,
     )
-    if track and min_score is None:  # the tracker is given weak ones too
+    if track and min_score is None:  # the tracker also uses weak detections
         open_ = partial(detector.open, sensor_height=height, min_score=tracking.min_score)
         opened_detector = open_()
     run = Run(recording, out, header, count)

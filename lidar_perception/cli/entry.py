@@ -8,7 +8,7 @@ import sys
 
 def main() -> None:
     if sys.argv[1:2] == ["run"]:
-        # Before click and the rest are loaded. The node replaces this process and inherits the
+        # Runs before click and the rest are loaded. The node replaces this process and inherits the
         # blocked signals, and those that have arrived.
         from lidar_perception.nodes.main import STOP_SIGNALS
 

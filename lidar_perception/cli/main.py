@@ -11,7 +11,7 @@ import click
 from lidar_perception import __version__
 from lidar_perception.cli.command import Group
 
-COMMANDS = {  # verb -> module.function, and its line in the overview
+COMMANDS = {  # verb -> (module.function, description in the overview)
     "demo": ("lidar_perception.cli.demo.demo", "Replay a drive through the ROS 2 nodes and score the result."),
     "convert": ("lidar_perception.cli.convert.convert", "Turn recordings and labels into bags and other formats."),
     "detect": ("lidar_perception.cli.detect.detect", "Run a detector on a recording and write its results."),

@@ -16,8 +16,8 @@ from lidar_perception.nodes.node_parameters import describe_misspelt_parameters
 from lidar_perception.runs.files import read_text, shorten_error
 from lidar_perception.types import InputError, did_you_mean, valid_names
 
-MAX_BYTES, MAX_NAMES = 10**6, 10_000  # of a parameter file; aliases in YAML make many of few bytes
-MAX_DEPTH = 20  # groups in each other
+MAX_BYTES, MAX_NAMES = 10**6, 10_000  # limits of a parameter file; YAML aliases turn few bytes into many names
+MAX_DEPTH = 20  # maximum nesting of groups
 
 Fields = Mapping[str, Field[Any]]
 

@@ -21,5 +21,5 @@ def run_node(node: str, arguments: tuple[str, ...]) -> None:
     Example:
       lidar-perception run bag_player --ros-args -p bag:=drive.bag -p rate:=0.5
     """
-    # In place of this process, some of whose threads block no signal: one would end it at once.
+    # Replaces this process: some of its threads do not block signals, so a signal would end it at once.
     os.execv(sys.executable, [sys.executable, "-P", "-m", "lidar_perception.nodes.main", node, *arguments])

@@ -118,7 +118,7 @@ def _layouts(topic: str, frame: str) -> dict[str, str]:
     Empty if the layouts are not installed.
     """
     places = (
-        Path(__file__).parents[2] / "config",  # of a checkout; else where it is installed
+        Path(__file__).parents[2] / "config",  # folder of a checkout; otherwise the installed folder is used
         *(p / "share/lidar_perception/config" for p in Path(__file__).parents),
     )
     folder = next((p for p in places if (p / FILES[-1]).is_file()), None)

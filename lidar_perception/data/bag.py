@@ -44,9 +44,9 @@ __all__ = ["LATCHED_QOS", "SENSOR_QOS", "Bag", "BagHandle", "BagWriter"]
 
 # A KITTI cloud has 1.9 MB. Chunks of several clouds compress better and are faster to read.
 CHUNK_BYTES = 8 * 2**20
-MAX_SHOWN = 3  # differences between metadata.yaml and the files that a warning lists
+MAX_SHOWN = 3  # maximum number of differences between metadata.yaml and the files listed in a warning
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-# mcap always takes level 3 (mcap/writer.py, Writer.__finalize_chunk). Level 1 takes half the time
+# mcap always uses level 3 (mcap/writer.py, Writer.__finalize_chunk). Level 1 takes half the time
 # for a cloud and gives about the same size.
 _library: Any = mcap.writer
 _library.zstandard = SimpleNamespace(compress=partial(zstandard.compress, level=1))
@@ -97,7 +97,7 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         with ExitStack() as stack, self._name_write_error():
             stack.enter_context(lock_folder(self.partial))
-            self._check_target()  # another process may just have written it
+            self._check_target()  # another process may have written the file in the meantime
             for old in self.partial.iterdir():
                 shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
             self.file = stack.enter_context(RecordFile(self.partial / f"{self.path.name}.mcap"))
@@ -157,7 +157,7 @@ class BagWriter:
                 (self.partial / "metadata.yaml").unlink(missing_ok=True)
                 if kind is None:
                     raise
-                return  # the exception that ended the context is raised
+                return  # the exception that ended the context propagates
             if kind is None:
                 if self.path.exists():
                     shutil.rmtree(self.path)
@@ -380,7 +380,7 @@ class BagHandle:
 
     def bag(self) -> Bag:
         """Return the bag, opened by the first call in this thread."""
-        if getattr(self._local, "process", None) != os.getpid():  # a fork shares open files
+        if getattr(self._local, "process", None) != os.getpid():  # a forked process must not share open files
             self._local.bag, self._local.process = Bag(self.path, warn=self.warn), os.getpid()
             self.warn = False
         bag: Bag = self._local.bag

@@ -30,14 +30,14 @@ from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, INSTANCE, POIN
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import SECOND_NS
 
-# Required topics by content
+# Topics required by the kind of content.
 TOPICS_BY_CONTENT = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}}
 
 
 def is_layout(path: Path) -> bool:
     """Return True for a bag file, or a folder with one."""
     if path.is_file():
-        return not is_cloud(path)  # all other layouts are folders
+        return not is_cloud(path)  # the only other single files are clouds
     return (path / NAME).is_file() or bool(list_storage_files(path))
 
 
@@ -172,7 +172,7 @@ class BagFrames(Sequence):
             if topic == TRUTH:
                 objects = from_marker_array(msg)
                 truth[objects.stamp_ns or time] = to_truth(objects)
-                if not objects.stamp_ns:  # no stamp, or the start of simulated time
+                if not objects.stamp_ns:  # stamp missing, or at the start of simulated time
                     truth.setdefault(0, truth[time])
             else:
                 (infos if topic == CAMERA_INFO else transforms).append((time, msg))

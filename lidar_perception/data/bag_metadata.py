@@ -21,9 +21,9 @@ from lidar_perception.types import InputError
 
 NAME = "metadata.yaml"
 MAX_BYTES = 2**26
-TOLERANCE_NS = 10**6  # between times in metadata.yaml and in the files
+TOLERANCE_NS = 10**6  # maximum difference between times in metadata.yaml and in the files
 
-# Keys and values of rosbag2. Late subscribers get the last message of a latched topic.
+# QoS keys and values of rosbag2. Late subscribers get the last message of a latched topic.
 SENSOR_QOS = dict(history="keep_last", depth=10, reliability="reliable", durability="volatile")
 LATCHED_QOS = dict(history="keep_last", depth=1, reliability="reliable", durability="transient_local")
 

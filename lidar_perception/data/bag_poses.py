@@ -18,9 +18,9 @@ from lidar_perception.wire.topics import ODOMETRY, ODOMETRY_FRAME, TF, TF_STATIC
 from lidar_perception.wire.transforms import FIXED, MOVING, ODOMETRY_MESSAGE, TF_MESSAGE, add_odometry, add_transforms
 from msg_utils.markers import MarkedObjects
 
-FILTERED = "/odometry/filtered"  # of robot_localization
-MIN_TF_MESSAGES = 500  # of /tf that are read to find the frames above the sensor
-MAX_POSE_GAP_S = 0.5  # between two poses, before the first and after the last
+FILTERED = "/odometry/filtered"  # topic of robot_localization
+MIN_TF_MESSAGES = 500  # /tf messages to read before looking for the sensor's parent frames
+MAX_POSE_GAP_S = 0.5  # maximum gap between two poses, and before the first and after the last one
 
 
 def choose_odometry_topic(topics: Mapping[str, str]) -> str:
@@ -63,7 +63,7 @@ class BagPoses:
         Raises MissingTransform if one of them is unknown.
         """
         if self.odometry:
-            if self.frame_id == self._first.header.frame_id.lstrip("/"):  # clouds in a fixed frame
+            if self.frame_id == self._first.header.frame_id.lstrip("/"):  # the clouds are already in a fixed frame
                 return np.tile(np.eye(4), (len(times), 1, 1))
             return self.odometry_poses(times) @ self._sensor_in_odometry_child(times)
         if not self.fixed:
@@ -119,7 +119,7 @@ class BagPoses:
         sensor is fixed; "" without TF."""
         if self.odometry_child and self.odometry_child != self.frame_id:
             return self.odometry_child
-        # Stop at the first moving link: above it, odom may be fixed in a map.
+        # Stop at the first moving link, because odom may be static in a map above it.
         fixed = len([*takewhile(self._first_transforms.is_fixed, self._above[:-1])])
         return self._above[fixed] if fixed else ""
 
@@ -187,7 +187,7 @@ class BagPoses:
             if i >= MIN_TF_MESSAGES and (
                 self.odometry or not all(map(tree.is_fixed, _find_chain(tree, self.frame_id)))
             ):
-                break  # for a long time, only wheels may move
+                break  # later messages may only concern the wheels
             self._add(tree, msg, False)
         return tree
 

@@ -22,10 +22,10 @@ from msg_utils.point_cloud2 import from_array, read_xyz
 from msg_utils.stamps import make_header
 
 KITTI = "x y z intensity"
-MAX_COLUMNS = 16  # of a .npy file; an array with more is probably transposed
+MAX_COLUMNS = 16  # maximum columns of a .npy file; an array with more is probably transposed
 MAX_RING = 256
-SAMPLE_SIZE = 2000  # points from which the columns of a .bin file are inferred
-MAX_NEGATIVE_SHARE = 0.1  # of the intensities in the sample, if the columns are as assumed
+SAMPLE_SIZE = 2000  # number of points from which the columns of a .bin file are inferred
+MAX_NEGATIVE_SHARE = 0.1  # maximum fraction of negative intensities for a plausible assumption about the columns
 REFLECTANCE = ("reflectance", "remission")  # other names for the intensity
 
 
@@ -137,7 +137,7 @@ def read_npy(file: Path) -> np.ndarray:
         SyntaxError,
         TokenError,
         RecursionError,
-    ) as error:  # the header is Python source
+    ) as error:  # the header is Python source, so that parsing raises many types
         raise InputError(
             f"{file} is not a readable .npy file ({shorten_error(error)}); save it again with numpy.save"
         ) from None

@@ -13,7 +13,7 @@ from lidar_perception.data.cloud_files import is_cloud, load_points, make_cloud_
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS
 
-UNIT_NS_BY_DIGITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}  # by the digits of a Unix time
+UNIT_NS_BY_DIGITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}  # number of digits of a Unix time -> its unit in ns
 NANOSECOND_DIGITS = 9
 
 

@@ -118,7 +118,7 @@ def _identity(value: Any) -> Any:
     return value
 
 
-MAX_GAP_S = 2.0  # between two frames of a drive
+MAX_GAP_S = 2.0  # maximum time between two frames of a drive
 BOXES, POINT_LABELS, CAMERA, POSES = "labelled boxes", "labelled points", "a camera", "poses"
 
 

@@ -26,14 +26,14 @@ from lidar_perception.wire.compression import MAX_BYTES, decompress
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, CHUNK_INDEX, DATA_END = 7, 8, 15
-HEAD_BYTES = 64  # that are read of a record before its content
-RECORD = struct.Struct("<BQ")  # kind of a record, and number of bytes that follow
+HEAD_BYTES = 64  # bytes to read from a record before its content
+RECORD = struct.Struct("<BQ")  # kind of record, and number of bytes that follow
 FOOTER_BYTES = RECORD.size + 20
 NO_INDEX = (
     RECORD.pack(DATA_END, 4) + bytes(4) + RECORD.pack(FOOTER, 20) + bytes(20) + MAGIC
 )  # end of a file without an index
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, number, log time, publish time
-ENTRY_BYTES = 16  # per message in a message index
+ENTRY_BYTES = 16  # bytes per message in a message index
 LOCATION = np.dtype([("time", np.int64), ("channel", np.uint16), ("at", np.int64), ("bytes", np.int64)])
 
 

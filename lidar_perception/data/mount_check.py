@@ -15,14 +15,14 @@ from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
 # The floor is fitted beyond the vehicle, and close enough for one plane.
 MIN_RANGE_M, MAX_RANGE_M = 2.5, 12.0
-CELL_M = 0.5  # size of a cell of the grid, of which the lowest point counts
+CELL_M = 0.5  # cell size of the grid; the lowest point of each cell is used
 FLOOR_PLANE = ThresholdParams(max_slope=10.0)
-STEEP_FLOOR_PLANE = ThresholdParams(max_slope=30.0)  # for a sensor that leans
+STEEP_FLOOR_PLANE = ThresholdParams(max_slope=30.0)  # settings for a tilted sensor
 MIN_CELLS = 10
-MIN_FLOOR_SHARE = 0.25  # minimum share of the cells whose lowest point must be on the plane
-FIRST_CLOUDS = 3  # number of clouds of a recording that are checked
-HEIGHT_TOLERANCE_M = 0.25  # between the parameter and the measured height
-MAX_LEAN_DEG = 5.0  # slope of roads
+MIN_FLOOR_SHARE = 0.25  # minimum fraction of cells whose lowest point is on the plane
+FIRST_CLOUDS = 3  # number of clouds to check at the start of a recording
+HEIGHT_TOLERANCE_M = 0.25  # tolerance between the parameter and the measured height
+MAX_LEAN_DEG = 5.0  # maximum tilt that the slope of a road explains
 
 
 def measure_sensor_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPoseParams()) -> float | None:

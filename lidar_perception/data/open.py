@@ -39,7 +39,7 @@ LIVOX_VIEWER = (
     "Livox Viewer",
     "convert it to a bag with livox_ros_driver's lvx_to_rosbag.launch, or export PCD files in Livox Viewer",
 )
-# Name and converter of unsupported formats, by their suffixes.
+# Suffix of an unsupported format -> its name and a converter.
 CONVERTERS = {
     ".las": ("LAS", "convert it with PDAL: pdal translate IN.las OUT.pcd"),
     ".laz": ("LAZ", "convert it with PDAL: pdal translate IN.laz OUT.pcd"),
@@ -56,13 +56,13 @@ CONVERTERS = {
     ".lvx2": LIVOX_VIEWER,
     ".osf": ("Ouster OSF", "convert it with ouster-cli: ouster-cli source IN.osf save OUT.pcd"),
 }
-MAX_FILES = 10_000  # of a folder that are searched for these suffixes
+MAX_FILES = 10_000  # maximum number of files of a folder to inspect for these suffixes
 
-# Sensor height of a folder in one of KITTI's layouts, which do not store it.
+# File with the sensor height of a folder in one of KITTI's layouts, which do not store it.
 HEIGHT_FILE = "mount.json"  # written by `convert`
-SIMULATION_KEY = "sensor_digest"  # only in a record of `simulate`
+SIMULATION_KEY = "sensor_digest"  # key that exists only in a record of `simulate`
 MAX_HEIGHT_FILE_BYTES = 1 << 16
-MAX_DEPTH = 3  # of an opened folder below the file, as of training/velodyne/0000
+MAX_DEPTH = 3  # maximum depth of an opened folder below the file, e.g. training/velodyne/0000
 MAX_HEIGHT_M = 50.0
 
 

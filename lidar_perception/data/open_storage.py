@@ -21,13 +21,13 @@ from lidar_perception.runs.files import check_regular, shorten_error
 from lidar_perception.types import InputError
 from lidar_perception.wire.compression import ZSTD_MAGIC
 
-# Magic bytes, reader and recovery command of storage files, by suffix.
+# Suffix of a storage file -> magic bytes, reader and recovery command.
 FORMATS: dict[str, tuple[bytes, Callable[[Path], StorageFile], str]] = {
     ".mcap": (mcap_file.MAGIC, McapFile, "mcap recover"),
     ".db3": (sqlite_file.MAGIC, SqliteFile, "sqlite3 FILE .recover"),
     ".bag": (ros1_bag.MAGIC, Ros1File, "rosbag reindex"),
 }
-COMPRESSED_SUFFIX = ".zstd"  # of files compressed by rosbag2
+COMPRESSED_SUFFIX = ".zstd"  # suffix of files compressed by rosbag2
 SUPPORTED = "give the folder of a rosbag2 bag, an .mcap, a .db3 or a ROS 1 .bag file"
 
 

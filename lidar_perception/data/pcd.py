@@ -12,7 +12,7 @@ from lidar_perception.runs.files import check_regular
 from lidar_perception.types import InputError
 
 MAX_HEADER_BYTES = 1 << 16
-MAX_CLOUD_BYTES = 2**31  # of the points, as declared by a file
+MAX_CLOUD_BYTES = 2**31  # maximum size of the points declared by a file
 KIND_CODES = {"F": "f", "I": "i", "U": "u"}
 
 
@@ -47,7 +47,7 @@ def _parse_points(content: bytes) -> np.ndarray:
         start = end + 1
         if words and not words[0].startswith("#"):
             header[words[0].upper()] = words[1:]
-    names = header.get("FIELDS") or header.get("COLUMNS")  # COLUMNS up to version .5
+    names = header.get("FIELDS") or header.get("COLUMNS")  # named COLUMNS up to version .5
     if not names:
         raise ValueError("the line FIELDS is missing")
     types, sizes, counts = (
@@ -119,9 +119,9 @@ def _parse_numbers(words: np.ndarray, kind: np.dtype, name: str) -> np.ndarray:
     if kind.kind == "f":
         return words.astype("f8").astype(kind)
     try:
-        numbers = words.astype(kind.kind + "8")  # 64-bit times keep their last digits
+        numbers = words.astype(kind.kind + "8")  # float64 would lose the last digits of 64-bit times
     except ValueError:
-        numbers = words.astype("f8")  # some writers have 12.000000, or 0.35, for a uint8
+        numbers = words.astype("f8")  # some writers write 12.000000 or 0.35 for a uint8
         if not np.array_equal(numbers, np.floor(numbers)):
             return numbers.astype("<f4")
     limits = np.iinfo(kind)

@@ -23,7 +23,7 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
 
-PAIR_DISTANCE = 8  # clouds, see choose_clouds
+PAIR_DISTANCE = 8  # distance in clouds, see choose_clouds
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ class RecordFile:
     def __init__(self, path: Path):
         self.file = open(path, "wb", buffering=0)
         self.failure: OSError | None = None
-        self.records = [(-1, 0)]  # (first byte, end offset) of each
+        self.records = [(-1, 0)]  # (first byte, end offset) of each record
 
     def __enter__(self) -> RecordFile:
         return self

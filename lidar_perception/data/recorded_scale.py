@@ -12,8 +12,8 @@ import numpy as np
 from lidar_perception.intensity import StreamScale
 from lidar_perception.types import InputError
 
-SAMPLE_SIZE = 10  # clouds from which the scale of a recording is inferred
-MAX_READ = 100  # clouds of a bag that are read to find them
+SAMPLE_SIZE = 10  # number of clouds from which the scale of a recording is inferred
+MAX_READ = 100  # maximum number of clouds of a bag to read to find them
 
 Item = TypeVar("Item")
 Column = tuple[np.ndarray, np.dtype] | None  # see wire.messages.read_raw_intensity

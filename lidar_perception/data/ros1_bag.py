@@ -53,7 +53,7 @@ class Ros1File:
             if topic.encoding == "cdr"
         }
         for topic in self.topics:
-            if topic.type in LIVOX:  # rosbags converts point by point
+            if topic.type in LIVOX:  # slow in rosbags, which converts point by point
                 self.converters[topic.id] = livox_ros1_to_cdr
         self.times = (self.reader.start_time, self.reader.end_time - 1) if self.reader.message_count else None
 

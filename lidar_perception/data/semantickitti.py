@@ -17,11 +17,11 @@ from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError, usable_returns
 
-UNLABELLED = (0, 1)  # unlabelled, and outlier, such as a reflection
-# road, parking, sidewalk, other-ground, lane-marking, terrain
+UNLABELLED = (0, 1)  # labels "unlabelled" and "outlier" (such as a reflection)
+# Labels road, parking, sidewalk, other-ground, lane-marking, terrain.
 GROUND = (40, 44, 48, 49, 60, 72)
-VEGETATION = 70  # from grass to tree tops: partly ground
-# Classes with instances. MOVING maps the numbers of moving objects to these classes.
+VEGETATION = 70  # includes grass and tree tops, so it is partly ground
+# Classes with instances. MOVING maps the labels of moving objects to these classes.
 THINGS = {
     10: "car",
     11: "bicycle",

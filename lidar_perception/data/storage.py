@@ -10,9 +10,9 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from heapq import heappop, heappush, heapreplace
 from typing import Any, NamedTuple, Protocol
 
-START, END = -(2**63), 2**63 - 1  # before and after all times in ns
-Message = tuple[Any, int, bytes]  # topic id, log time in ns, data
-Stream = Iterator[Message]  # in order of time
+START, END = -(2**63), 2**63 - 1  # limits before and after all times, in ns
+Message = tuple[Any, int, bytes]  # (topic id, log time in ns, data)
+Stream = Iterator[Message]  # sorted by time
 
 
 class Topic(NamedTuple):

@@ -101,9 +101,9 @@ class FrameWriter:
         self, bag: BagWriter, *, images: bool = False, clouds: bool = True, detections_3d: bool = False
     ) -> None:
         self.bag, self.images, self.clouds, self.detections_3d = bag, images, clouds, detections_3d
-        self._marker_keys: frozenset[tuple[str, int]] = frozenset()  # of the last labels
+        self._marker_keys: frozenset[tuple[str, int]] = frozenset()  # keys of the markers of the last labels
         self._labelled_stamps: set[int] = set()
-        self._calibration: Calibration | None = None  # the last one written
+        self._calibration: Calibration | None = None  # last calibration written
         bag.add_topic(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", LATCHED_QOS)
         bag.add_topic(EXTRINSICS, "geometry_msgs/msg/TransformStamped", LATCHED_QOS)
         bag.add_topic(TF_STATIC, "tf2_msgs/msg/TFMessage", LATCHED_QOS)

@@ -24,7 +24,7 @@ class NetworkDetector:
         warning: why scores are not reliable or classes are never detected, or None.
     """
 
-    group: ClassVar[str]  # the detector's own group of params, a NetworkParams
+    group: ClassVar[str]  # name of the detector's own parameter group (a NetworkParams)
 
     def __init__(self, params: Any, warning: str | None = None):
         self.params, self.warning = params, warning
@@ -128,7 +128,7 @@ def make_synthetic_frame(pose: SensorPoseParams) -> PointCloud:
     rng = np.random.default_rng(0)
     ground = rng.uniform(0, 40, (2000, 3)) * [1, 1, 0.001] - [0, 20, SENSOR_HEIGHT]
     target = rng.uniform(-0.5, 0.5, (400, 3)) + [8, 0, -0.8]
-    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 4, -0.8]  # DBSCAN has other code for these
+    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 4, -0.8]  # DBSCAN uses a different code path for dense points
     across = rng.uniform(-0.3, 0.3, (400, 3)) + [15, 0, -0.8]
     xyz = np.concatenate([ground, target, dense, across]).astype(np.float32)
     xyz[:, 2] -= pose.height - SENSOR_HEIGHT

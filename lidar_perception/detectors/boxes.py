@@ -13,10 +13,10 @@ from lidar_perception.classes import CAR
 from lidar_perception.geometry import points_in_boxes, quantile, wrap_angle, wrap_line
 
 MARGIN_M = 0.4  # points up to this distance from a box belong to it
-MIN_HEIGHT_M = 0.2  # lower points of a box are not used
+MIN_HEIGHT_M = 0.2  # lower points in a box are not used
 MIN_FACE_POINTS = 30
 FACE_QUANTILE = 0.03  # quantile of the points of a face that marks its surface
-# Depth of that quantile behind a labelled face, in metres: measured on 60 simulated scans.
+# Depth of that quantile behind a labelled face, in metres, measured on 60 simulated scans.
 FRONT, REAR, SIDE = 0.03, 0.03, -0.01
 MIN_FACE_SLOPE = 0.3  # tangent of the flattest angle at which a face is used
 

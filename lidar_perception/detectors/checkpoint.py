@@ -22,9 +22,9 @@ from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import CLASSES, InputError
 
-KEY = "lidar_perception"  # of the header in the metadata, whose values are strings
+KEY = "lidar_perception"  # key of the header in the metadata, whose values are strings
 FORMAT = 1
-MAX_COEFFICIENT = 100.0  # of slopes and offsets of a calibration
+MAX_COEFFICIENT = 100.0  # maximum absolute value of a slope or offset of a calibration
 MIN_HEIGHT_DIFFERENCE_M = 0.3  # smaller differences in mounting height need no warning
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class Config(Protocol):
 
 
 POINTPILLARS, POINTNET = NetworkConfig.network, PointNetConfig.network
-NETWORKS: dict[str, tuple[str, str, type[Config]]] = {  # title, use, and class of the config
+NETWORKS: dict[str, tuple[str, str, type[Config]]] = {  # kind -> (title, use, config class)
     POINTPILLARS: ("PointPillars", "the node pointpillars_detector and pointpillars.weights", NetworkConfig),
     POINTNET: ("PointNet", "the node pointnet_detector and pointnet.weights", PointNetConfig),
 }
@@ -137,7 +137,7 @@ def _parse_header(text: str | None, source: str) -> dict[str, Any]:
     try:
         content = json.loads(text or "")
         parts = {name: content[name] for name in ("format", *PARTS)}
-        network = content.get("network", POINTPILLARS)  # missing in early files
+        network = content.get("network", POINTPILLARS)  # files of early versions lack this key
         calibration = content.get("calibration", {})
         if not all(isinstance(parts[name], kind) for name, kind in PARTS.items()):
             raise TypeError
@@ -226,7 +226,7 @@ def read_arrays(path: str | Path, kind: type[Config]) -> tuple[Header, dict[str,
     """
     try:
         text, tensors = _read(Path(path), framework="np")
-    except (TypeError, AttributeError) as error:  # of safetensors
+    except (TypeError, AttributeError) as error:  # raised by safetensors
         raise WeightsMismatch(str(error)) from None
     return Header.from_json(text, str(path), kind), tensors
 

@@ -11,7 +11,7 @@ from lidar_perception.types import InputError
 
 C = TypeVar("C")
 
-MAX_LENGTH = 64  # of a tuple or a string
+MAX_LENGTH = 64  # maximum length of a tuple or string
 MAX_NUMBER = 1 << 16  # far above every width, count and distance in metres of a network
 
 

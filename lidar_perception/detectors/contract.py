@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike
 from lidar_perception.intensity import find_scale_problem, guess_scale, to_unit
 from lidar_perception.types import Detections, PointCloud, as_point_cloud, check_columns, usable_returns
 
-Cloud = PointCloud | ArrayLike  # see PointCloud.of
-FUSED = "fused"  # the default detector
+Cloud = PointCloud | ArrayLike  # see PointCloud.of()
+FUSED = "fused"  # name of the default detector
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from lidar_perception.types import CLASSES, Detections, InputError, PointCloud, 
 
 ENTRY_POINTS = "lidar_perception.detectors"  # group of entry points: NAME = "module:Class"
 REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
-ARGUMENTS = "sensor_height", "device", "range"  # passed to a class that takes them
+ARGUMENTS = "sensor_height", "device", "range"  # keyword arguments, passed if the class accepts them
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def load_custom_detector(
 def _find_class(reference: str) -> Callable[..., Any]:
     module_name, _, class_name = reference.partition(":")
     if (here := os.getcwd()) not in sys.path:
-        sys.path.append(here)  # a console script does not have it, unlike `python -m`
+        sys.path.append(here)  # `python -m` has it on the path, but a console script does not
     try:
         found: Any = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
@@ -221,7 +221,7 @@ def _find_arguments(make: Callable[..., Any]) -> set[str]:
     """Return those of ARGUMENTS that a class takes by keyword."""
     try:
         parameters = inspect.signature(make).parameters
-    except ValueError:  # a class that is written in C
+    except ValueError:  # the class is written in C
         return set()
     return {
         name

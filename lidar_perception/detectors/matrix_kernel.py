@@ -30,8 +30,8 @@ def _vector_width() -> int:
 
 LANES = _vector_width()
 BLOCK = 2 * LANES  # columns of a tile: two vectors
-ROWS = 12 if LANES == 16 else 6  # rows of a tile: as many as its sums fit in the registers
-UNROLL = 4  # channels in one turn of the inner loop
+ROWS = 12 if LANES == 16 else 6  # rows of a tile, limited by the registers for its sums
+UNROLL = 4  # channels per iteration of the inner loop
 
 
 @intrinsic
@@ -141,7 +141,7 @@ def multiply(rows, weights, bias, floor):
         starts[:] = bias.ctypes.data + 4 * BLOCK * block
         for first in range(0, len(rows), ROWS):
             for i in range(ROWS):
-                row = min(first + i, len(rows) - 1)  # the last is repeated
+                row = min(first + i, len(rows) - 1)  # the last row is repeated
                 inputs[i] = rows.ctypes.data + 4 * row * rows.shape[1]
                 outputs[i] = sums.ctypes.data + 4 * (row * sums.shape[1] + BLOCK * block)
             multiply_tile(

@@ -49,7 +49,7 @@ def _is_kept(boxes, group, iou, by_x):
     area = boxes[:, 3] * boxes[:, 4]
     x, max_reach = boxes[by_x, 0], 0.0
     for r in reach:
-        if r > max_reach:  # not NaN, as of boxes that overlap nothing
+        if r > max_reach:  # False for NaN, the radius of boxes that overlap nothing
             max_reach = r
     for i in range(len(boxes)):
         if not kept[i] or not reach[i] > 0:

@@ -17,7 +17,7 @@ from lidar_perception.types import SENSOR_HEIGHT, Detections, PointCloud
 MAX_MAST_M = 1.0  # a car farther below the sensor passes under a gantry
 MAX_ROOF_GAP_M = 1.0  # less than half of a car's width and the gap to the next car
 
-Corner = tuple[float, float, float]  # of a range: x, y, z in metres
+Corner = tuple[float, float, float]  # corner of a range: x, y, z in metres
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def write_onnx(
             output_names=list(outputs),
             dynamic_shapes=dict(dynamic),
         )
-    assert program is not None  # as dynamo is True
+    assert program is not None  # always set with dynamo=True
     model = program.model_proto
     onnx.helper.set_model_props(model, {KEY: header.to_json()})
     onnx.checker.check_model(model)
@@ -87,7 +87,7 @@ def open_session(path: str | Path) -> tuple[Any, str | None]:
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         return session, session.get_modelmeta().custom_metadata_map.get(KEY)
-    except Exception as error:  # its errors have no common base
+    except Exception as error:  # onnx exceptions share no base class
         reason = str(error).splitlines()[0]
         raise InputError(f"ONNX Runtime cannot read {path}: {reason}") from None
 
@@ -96,7 +96,7 @@ def run_session(session: Any, source: str, outputs: Sequence[str], inputs: Mappi
     """Return the outputs of a session. InputError that names the file `source` if it fails."""
     try:
         return session.run(list(outputs), dict(inputs))
-    except Exception as error:  # its errors have no common base
+    except Exception as error:  # onnx exceptions share no base class
         raise InputError(f"ONNX Runtime cannot run {source}: {str(error).splitlines()[0]}") from None
 
 

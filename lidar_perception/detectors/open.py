@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 POINTPILLARS, POINTNET = "pointpillars", "pointnet"
 
-# The function load(path, device) of each detector, in this folder. An empty path means the shipped
+# Each detector's function load(path, device) in this folder. An empty path means the shipped
 # weights. A new detector is one line here. If it has an entry in PARAMS, the parameters of its
 # node, its function gets them as a third argument.
 LOAD = {
@@ -41,7 +41,7 @@ PARAMS = {
     FUSED: "fused.params.FusedDetectorParams",
 }
 ONNX = ".onnx"
-DETECTOR_BY_SUFFIX = {ONNX: POINTPILLARS, ".json": FUSED}  # of files that are not checkpoints
+DETECTOR_BY_SUFFIX = {ONNX: POINTPILLARS, ".json": FUSED}  # suffixes of files other than checkpoints
 
 
 class ConfigurableDetector(Detector, Protocol):

@@ -33,7 +33,7 @@ def run_in_parts(compute: Callable[[int, int], None], count: int, max_parts: int
     helpers = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
     work()
     for helper in helpers:
-        if not helper.cancel():  # it has already started
+        if not helper.cancel():  # False if it has already started
             helper.result()
 
 

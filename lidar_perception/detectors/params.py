@@ -11,7 +11,7 @@ import numpy as np
 from lidar_perception.param_fields import Params, param
 from lidar_perception.types import CLASSES, Detections
 
-MIN_SCORE = 0.001  # for average precision, which needs boxes that a robot would not act on
+MIN_SCORE = 0.001  # low threshold for the average precision, which needs weak boxes too
 RANGE_CHOICES = "auto", "ahead", "around"
 
 

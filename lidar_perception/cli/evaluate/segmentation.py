@@ -72,7 +72,7 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
 
     grounds = tuple(name for name in GROUND_METHODS if name in methods)
     clusterings = tuple(name for name in CLUSTERING_METHODS if name in methods)
-    # Open everything first: a typing error in the last path should not cost an hour.
+    # Open everything first, so that a typo in the last path does not cost an hour.
     recordings = [options.open_recording(None, path) for path in options.data]
     labelled = [recording for recording in recordings if POINT_LABELS in recording.has]
     for recording in recordings:

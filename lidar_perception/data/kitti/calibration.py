@@ -24,7 +24,7 @@ IMAGE_SIZES = {
     718.856: (1241, 376),
 }
 RAW_CALIB = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
-MAX_SKEW = 0.01  # of a rounded rotation matrix, from R R^T = I
+MAX_SKEW = 0.01  # tolerance of R R^T = I for a rounded rotation matrix
 
 
 def read_calibration(path: Path, image: Path | None = None) -> Calibration:
@@ -78,7 +78,7 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
         try:
             values[name] = np.array(rest.split(), float)
         except ValueError:
-            continue  # such as calib_time
+            continue  # other entries, such as calib_time
     return values
 
 

@@ -20,10 +20,10 @@ from lidar_perception.types import GroundTruth, InputError, PointCloud
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 START_NS = 1_316_995_200 * 10**9  # 26 September 2011, the first day of KITTI's recordings
-PERIOD_NS = 10**8  # the sensor turns at 10 Hz
-GAP_NS = 10 * 10**9  # between the drives of a recording
-OBJECT_DATA = "object data"  # the layout of unrelated frames
-SCANS = ("velodyne_reduced", "velodyne")  # the full scan is preferred
+PERIOD_NS = 10**8  # the sensor rotates at 10 Hz
+GAP_NS = 10 * 10**9  # time inserted between the drives of a recording
+OBJECT_DATA = "object data"  # name of the layout with unrelated frames
+SCANS = ("velodyne_reduced", "velodyne")  # folder names; the last one, with full scans, is preferred
 
 
 def read_velodyne(path: Path) -> np.ndarray:

@@ -110,7 +110,7 @@ def _read_poses(root: Path, drive: str) -> dict[int, np.ndarray]:
     if path is None:
         return {}
     to_camera = np.linalg.inv(_read_camera_to_lidar(root))
-    if path.name == POSE_FILES[0]:  # of the rectified camera
+    if path.name == POSE_FILES[0]:  # this file has the poses of the rectified camera
         rectify = _read_rectification(root)
         return {
             int(row[0]): check_pose(row[1:].reshape(4, 4), path) @ rectify @ to_camera for row in _read_rows(path, 17)

@@ -15,9 +15,9 @@ from lidar_perception.geometry import wrap_angle
 from lidar_perception.runs.files import check_regular, read_text
 from lidar_perception.types import CLASSES, MAX_NUMBER, GroundTruth, InputError, class_ids
 
-# Columns of a label file after the class, in order; they are kept in GroundTruth.extras.
+# Columns of a label file after the class, in order, stored in GroundTruth.extras.
 COLUMNS = ("truncated", "occluded", "alpha", "bbox", "dimensions", "location", "rotation_y")
-NAME_BY_TRACKING_NAME = {"Person": "Person_sitting"}  # names that the tracking benchmark changed
+NAME_BY_TRACKING_NAME = {"Person": "Person_sitting"}  # name in the tracking benchmark -> name in the object benchmark
 # An unlabelled region: only its 2D box is known.
 DONT_CARE = {
     "track_id": -1,
@@ -172,7 +172,7 @@ def to_camera_box(box: np.ndarray, lidar_to_camera: np.ndarray) -> dict:
     """
     x, y, z, length, w, h, yaw = (float(v) for v in box)
     centre = lidar_to_camera @ [x, y, z, 1.0]
-    # The rotation about the camera's y axis that has this yaw in the LiDAR frame; the vertical axes
+    # Rotation about the camera's y axis that corresponds to this yaw in the LiDAR frame; the vertical axes
     # of camera and LiDAR are not parallel.
     right, ahead = lidar_to_camera[0, :2], lidar_to_camera[2, :2]
     rotation = float(

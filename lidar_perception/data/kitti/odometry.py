@@ -29,7 +29,7 @@ from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
 CALIBRATION, TIMES, POSES_FILE = FILES = ("calib.txt", "times.txt", "poses.txt")
-SINCE_1970 = 10**9  # seconds; larger times count from 1970, others from the start of the sequence
+SINCE_1970 = 10**9  # in seconds; larger times are Unix times, others count from the start of the sequence
 
 
 def is_layout(path: Path) -> bool:

@@ -46,7 +46,7 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     """Open the drives in order of time; only the file lists and time stamps are read."""
     drives = list_drives(path.absolute())
     with_camera = {drive: any((drive.parent / name).exists() for name in RAW_CALIB) for drive in drives}
-    # A drive with a calibration is KITTI's, and has time stamps.
+    # A drive with a calibration comes from KITTI and has time stamps.
     frames, has_times = make_frames(drives, need_stamps=with_camera)
     if not frames:
         raise InputError(f"{path} has no KITTI scans: expected DATE/DRIVE_sync/{DATA}/*.bin")

@@ -19,7 +19,7 @@ from lidar_perception.runs import journal
 from lidar_perception.runs.files import write_text
 from lidar_perception.types import Detections, GroundTruth, InputError
 
-FOLDER = "kitti"  # folder of result files in the folder of a run
+FOLDER = "kitti"  # subfolder for result files in the folder of a run
 DECIMALS = 6  # with fewer, the order of weak scores and overlaps would change
 
 

@@ -18,13 +18,13 @@ from lidar_perception.geometry import box_corners
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import GroundTruth
 
-MIN_DEPTH_M = 0.1  # from the camera, of points in the image
-MIN_PIXELS = 2  # width and height of the smallest 2D box
+MIN_DEPTH_M = 0.1  # minimum distance from the camera of points in the image
+MIN_PIXELS = 2  # minimum width and height of a 2D box
 TRACKING_NAME_BY_NAME = {name: alias for alias, name in NAME_BY_TRACKING_NAME.items()}
 
-# The twelve edges of box_corners: bottom, top, vertical.
+# Twelve edges between the corners of box_corners: bottom, top, vertical.
 EDGES = np.array([(i + up, (i + 1) % 4 + up) for up in (0, 4) for i in range(4)] + [(i, i + 4) for i in range(4)])
-# The IMU of KITTI's car, 0.81 m behind the LiDAR; calibration files must have it.
+# Pose of the IMU of KITTI's car, 0.81 m behind the LiDAR, required in calibration files.
 IMU_TO_LIDAR = np.column_stack([np.eye(3), [-0.81, 0.32, -0.80]])
 
 

@@ -26,7 +26,7 @@ NAMES = (
     "traffic_cone",
     "barrier",
 )
-# Class of the categories of labels; other categories, such as animals, have none.
+# Label category -> class; other categories, such as animals, have no class.
 CATEGORIES = {
     "vehicle.car": "car",
     "vehicle.truck": "truck",

@@ -25,9 +25,9 @@ from lidar_perception.types import GroundTruth, InputError, PointCloud, usable_r
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 CHANNEL = "LIDAR_TOP"
-SWEEP = "x y z intensity ring"  # of a .pcd.bin file, float32
-EGO_RADIUS_M = 1.0  # points nearer than this in both x and y are on the vehicle itself
-FULL_REFLECTION = 255  # intensity
+SWEEP = "x y z intensity ring"  # columns of a .pcd.bin file, float32
+EGO_RADIUS_M = 1.0  # points closer than this in both x and y are on the vehicle itself
+FULL_REFLECTION = 255  # maximum value of the intensity column
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,10 +20,10 @@ from lidar_perception.data.nuscenes.tables import Tables
 from lidar_perception.types import CLASSES, GroundTruth, InputError
 
 TABLE = "sample_annotation"
-BLOCK_SIZE = 4096  # labels that are converted to columns at a time
+BLOCK_SIZE = 4096  # number of labels converted to columns at a time
 BIKE_RACK = "static_object.bicycle_rack"
-MAX_TIME_S = 1.5  # between two labels for a velocity; twice as long with one in between
-# In types.CLASSES. A bicycle with a rider is a Cyclist; other classes are Misc.
+MAX_TIME_S = 1.5  # maximum time between two labels to derive a velocity; doubled with a label in between
+# nuScenes class -> class in types.CLASSES; a bicycle with a rider is a Cyclist, others are Misc.
 CLASS_BY_NAME = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian"}
 
 
@@ -123,7 +123,7 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
         for number, (token, category) in enumerate(tables.rows("instance", "token", "category_token"))
     }
     own_links, links, in_frames, of_objects, of_categories = (array("q") for _ in range(5))
-    tokens: dict[str, int] = {}  # number of each label, in order of first occurrence
+    tokens: dict[str, int] = {}  # token -> number of the label, in order of first occurrence
     fields = ("translation", "size", "rotation")
     block, blocks = [], []
     for token, sample, instance, before, after, lidar, radar, labels, *box in tables.rows(
@@ -190,7 +190,7 @@ def _link_neighbours(tables: Tables, tokens: dict[str, int], own: array, links: 
         links: (2 K,) numbers of the previous and next labels, -1 = none.
     """
     linked = np.array(links).reshape(-1, 2)
-    row_of = np.full(len(tokens) + 1, -1)  # the last element is that of link -1
+    row_of = np.full(len(tokens) + 1, -1)  # the last element serves link -1 (no label)
     row_of[own] = np.arange(len(own))
     neighbours = row_of[linked]
     if (missing := (neighbours < 0) & (linked >= 0)).any():

@@ -14,8 +14,8 @@ from lidar_perception.data.nuscenes.boxes import ATTRIBUTES, NAMES, GlobalBoxes,
 from lidar_perception.runs.files import check_regular, shorten_error, write_text
 from lidar_perception.types import CLASSES, MAX_NUMBER, Detections, InputError
 
-MAX_BOXES = 500  # per frame
-# nuScenes' names of our classes; its bicycles include their riders.
+MAX_BOXES = 500  # maximum number of boxes per frame
+# Our class -> nuScenes name; bicycles of nuScenes include their riders.
 NAME_BY_CLASS = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle"}
 META = {"use_camera": False, "use_lidar": True, "use_radar": False, "use_map": False, "use_external": True}
 

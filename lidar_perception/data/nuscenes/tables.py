@@ -19,7 +19,7 @@ from lidar_perception.types import MAX_NUMBER, InputError
 
 CHUNK_SIZE = 2**22  # characters read at a time; rows are shorter
 SEPARATORS = " \t\r\n,"
-MAX_TIME_US = 2**31 * 10**6  # since 1970; the limit of a header's seconds
+MAX_TIME_US = 2**31 * 10**6  # maximum Unix time, limited by the seconds of a header
 TYPE_BY_FIELD: dict[str, type] = {
     **dict.fromkeys(
         (
@@ -130,7 +130,7 @@ class Tables:
         """
         try:
             column = np.array(values, np.float64).reshape(len(values), -1)
-        except (ValueError, TypeError, OverflowError):  # OverflowError: an int of 400 digits
+        except (ValueError, TypeError, OverflowError):  # OverflowError for an int of 400 digits
             column = np.zeros((len(values), 0))
         if len(values) == 0:
             return np.zeros((0, width))

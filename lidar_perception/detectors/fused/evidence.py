@@ -24,12 +24,12 @@ from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.groups import group_points
 from lidar_perception.types import CLASSES
 
-# Size of clusters that may be a person or a cyclist.
+# Size limits of clusters that may be a person or a cyclist.
 MIN_HEIGHT_M, MAX_HEIGHT_M, MAX_LENGTH_M = 0.8, 2.6, 2.8
-MAX_DISTANCE_M = 0.6  # between the centres of a proposal and of its cluster
+MAX_DISTANCE_M = 0.6  # maximum distance between the centres of a proposal and its cluster
 MIN_PROBABILITY, MAX_PROBABILITY = 0.001, 0.999  # no source is certain
 
-# By source, the log-odds (K,) float64 that each of K proposals has the proposed class; NaN where
+# Source -> log-odds (K,) float64 that each of K proposals has the proposed class; NaN where
 # the source gives no evidence.
 Evidence = dict[str, np.ndarray]
 

@@ -28,7 +28,7 @@ from lidar_perception.runs.files import read_text, shorten_error, write_text
 from lidar_perception.types import InputError
 
 PACKAGE = Path(__file__).with_name("fusion.json")
-NO_INTENSITY = PACKAGE.with_name("fusion_no_intensity.json")  # for clouds without intensity
+NO_INTENSITY = PACKAGE.with_name("fusion_no_intensity.json")  # file for clouds without intensity
 SUFFIX = ".json"  # distinguishes a fusion file from a checkpoint
 MAX_BYTES = 10**6
 MAX_LOG_ODDS = 1000.0
@@ -40,7 +40,7 @@ KNOTS = {  # source -> knots of its piecewise linear curve, in log-odds
     "silhouette": (-4.0, -2.5, -1.0, 0.0, 1.0, 2.5),
 }
 
-# By class, the model of the sources' log-odds, see candidates/confidence.py.
+# Class -> model of the sources' log-odds, see candidates/confidence.py.
 Models = Mapping[str, Any]
 
 

@@ -16,8 +16,8 @@ from lidar_perception.geometry import counting_sort, points_in_boxes
 from lidar_perception.groups import group_by_id
 from lidar_perception.types import SENSOR_HEIGHT, PointCloud
 
-POINT, CONTEXT = 5, 6  # numbers that the network reads of a point, and of a whole cluster
-RADII_M = (3.0, 6.0, 12.0)  # of the search for ground around a cluster, one after the other
+POINT, CONTEXT = 5, 6  # number of input features of a point, and of the cluster as a whole
+RADII_M = (3.0, 6.0, 12.0)  # radii of the search for ground around a cluster, tried in this order
 MIN_GROUND_POINTS = 3
 CELLS = 64  # hash grid of CELLS x CELLS cells of RADII_M[0]; distant places share a cell
 

@@ -21,8 +21,8 @@ from lidar_perception.detectors.pointnet.box_head import Outputs
 from lidar_perception.detectors.pointnet.clusters import CONTEXT, POINT, ClusterInput
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 
-NORM_EPS = 1e-5  # of batch norms
-CHUNK = 32  # clusters per batch, so that their rows stay in the cache
+NORM_EPS = 1e-5  # epsilon of the batch norms
+CHUNK = 32  # clusters per batch, small enough to stay in the cache
 
 ZERO, NO_FLOOR = np.float32(0), np.float32(-np.inf)
 
@@ -126,7 +126,7 @@ class _Local:
     """LocalNet without padding: groups contain only existing points."""
 
     def __init__(self, config: PointNetConfig, weights: LayerWeights):
-        self.shallow = config.point_channels[-1]  # width of the features of a point
+        self.shallow = config.point_channels[-1]  # number of features of a point
         self.in_ball = config.density == "ball"
         radii, counts = zip(*config.groups)
         self.radii, self.counts = np.array(radii, np.float32), np.array(counts)

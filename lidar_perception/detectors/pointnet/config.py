@@ -16,7 +16,7 @@ from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams, E
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.types import CLASSES, InputError
 
-MAX_POINTS = 4096  # of a cluster, to bound computing time
+MAX_POINTS = 4096  # maximum points of a cluster, to bound computing time
 SAMPLINGS, DENSITIES = ("random", "farthest"), ("neighbours", "ball")
 
 
@@ -188,11 +188,11 @@ NETWORKS: dict[str, Switches] = {
     **ABLATIONS,
     "pointnet": PLAIN,
     "pointnet2": Switches(msg=False, mrg=False, skip=False),  # PointNet++, single-scale grouping
-    # The paper's Eq. 15 and 17 to the letter
+    # Eq. 15 and 17 exactly as in the paper
     "farthest": Switches(sampling="farthest"),
     "ball-density": Switches(density="ball"),
     "farthest-ball-density": Switches(sampling="farthest", density="ball"),
-    # Other radii than the paper's (0.1, 0.2, 0.4), Table 4
+    # Radii other than the paper's (0.1, 0.2, 0.4), Table 4
     "radii-halved": Switches(radii=(0.05, 0.1, 0.2)),
     "radii-doubled": Switches(radii=(0.2, 0.4, 0.8)),
     "radii-quadrupled": Switches(radii=(0.4, 0.8, 1.6)),

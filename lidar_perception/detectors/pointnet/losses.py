@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from lidar_perception.detectors.pointnet.box_head import BoxTargets, Outputs
 
-BOX_WEIGHT, YAW_BIN_WEIGHT = 1.0, 0.3  # lambda of Eq. 18, of boxes and of yaw bins
+BOX_WEIGHT, YAW_BIN_WEIGHT = 1.0, 0.3  # weights (lambda of Eq. 18) of the box loss and the yaw bin loss
 SMOOTH = 0.2  # the box loss is linear above this error
 
 

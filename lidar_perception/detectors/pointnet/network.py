@@ -168,7 +168,7 @@ class PointNet(nn.Module):
         self.head = mlp(found + CONTEXT, *config.head_channels)
         self.classes = nn.Linear(config.head_channels[-1], classes + 1)
         self.box = nn.Linear(config.head_channels[-1], 6 + 2 * bins)
-        # What calibration found, see predict.probabilities.
+        # Result of the calibration, see predict.probabilities.
         self.register_buffer("temperature", torch.ones(1))
         self.register_buffer("offsets", torch.zeros(classes + 1))
 

@@ -21,7 +21,7 @@ from lidar_perception.detectors.pointnet.network import PointNet, fuse_norms
 from lidar_perception.types import InputError
 
 INPUTS = ("points", "valid", "context")
-EXAMPLES = 4  # clusters of the example input
+EXAMPLES = 4  # number of clusters in the example input
 
 
 class CalibratedPointNet(nn.Module):
@@ -75,7 +75,7 @@ class OnnxPointNet:
         found = ({i.name for i in self.session.get_inputs()}, {o.name for o in self.session.get_outputs()})
         if found != ({*INPUTS}, {*Outputs._fields}):
             raise InputError(f"{path} has other inputs or outputs than a network of its header; export it again")
-        self.temperature = np.ones(1, np.float32)  # the graph calibrates
+        self.temperature = np.ones(1, np.float32)  # 1 because the graph already calibrates
         self.offsets = np.zeros(len(self.config.classes) + 1, np.float32)
 
     def to(self, device: str) -> None:

@@ -15,7 +15,7 @@ from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
 from lidar_perception.detectors.pointnet.network import PointNet
 from lidar_perception.runs.threads import set_torch_threads
 
-CHUNK = 256  # clusters per batch, to bound memory and stay in the cache
+CHUNK = 256  # clusters per batch, bounds the memory and fits into the cache
 
 
 class TorchPointNet:

@@ -9,7 +9,7 @@ from lidar_perception.detectors.weights_file import require_weights
 from lidar_perception.types import InputError
 
 WEIGHTS = Path(__file__).parent / "weights" / "pointnet.safetensors"
-JUDGE = "judge.safetensors"  # in the same folder
+JUDGE = "judge.safetensors"  # file name of the judge's weights, in the same folder
 
 
 def weights_file(params: PointNetParams) -> Path:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, TypedDict
 from lidar_perception.classes import DETECTED
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError
 
-VERSIONS = {  # paper B, Table 3
+VERSIONS = {  # versions of Table 3 in paper B
     "v0": dict(remove_ground=False, cluster_ids=False, pseudo_map=False, neck="deconv"),
     "v1": dict(remove_ground=True, cluster_ids=False, pseudo_map=False, neck="fpn"),
     "v2": dict(remove_ground=True, cluster_ids=True, pseudo_map=False, neck="fpn"),
@@ -31,7 +31,7 @@ SIZES = {
         deconv_channels=128,
         fpn_channels=64,
     ),
-    # the same grid with an eighth of the operations, for two CPU cores
+    # same grid with an eighth of the operations, for two CPU cores
     "compact": dict(
         pillar_channels=16,
         map_channels=(8, 8),
@@ -50,17 +50,17 @@ class Range(TypedDict):
     high: tuple[float, float, float]
 
 
-AHEAD = Range(low=(0.0, -39.68, -3.0), high=(69.12, 39.68, 1.0))  # where KITTI has labels
+AHEAD = Range(low=(0.0, -39.68, -3.0), high=(69.12, 39.68, 1.0))  # region in which KITTI has labels
 RANGES = {"ahead": AHEAD, "around": Range(low=(-51.2, -51.2, -3.0), high=(51.2, 51.2, 1.0))}
-# Range of each of the two passes that cover `around` with a network trained ahead: one half plus a
+# Range of each of the two passes that cover `around` with a network trained on `ahead`: one half plus a
 # margin, so that no object is cut off.
 HALF = Range(low=(-5.12, -51.2, -3.0), high=(51.2, 51.2, 1.0))
 
-XY_SCALE = 0.02  # of networks trained with this package
+XY_SCALE = 0.02  # scale of x and y in networks trained with this package
 CHOICES = {"neck": ("deconv", "fpn"), "fusion": ("add", "concat"), "anchors_at": ("cells", "ends")}
-NORM_EPS = 1e-3  # of batch norms
-CODE, BINS = 7, 2  # numbers that describe a box, and halves of the circle of headings
-MAX_CELLS = 1 << 22  # of a grid, to bound computing time: about 100 m x 100 m at 5 cm
+NORM_EPS = 1e-3  # epsilon of the batch norms
+CODE, BINS = 7, 2  # numbers per box code, and direction bins (half circles)
+MAX_CELLS = 1 << 22  # maximum cells of a grid, to bound computing time: about 100 m x 100 m at 5 cm
 MAX_LAYERS = 64
 
 

@@ -164,7 +164,7 @@ def _load_sparse(path: Path) -> tuple[Header, SparseNetwork]:
     try:
         header, tensors = read_arrays(path, NetworkConfig)
         return header, SparseNetwork(header.config, tensors)
-    except WeightsMismatch:  # torch reads more number formats, and names what does not fit
+    except WeightsMismatch:  # torch reads more number formats and reports mismatches in detail
         from lidar_perception.detectors.pointpillars.network import load_network
 
         header, network = load_network(path)

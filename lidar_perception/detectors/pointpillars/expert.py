@@ -22,8 +22,8 @@ from lidar_perception.ground.params import GroundParams
 from lidar_perception.groups import renumber_ids
 from lidar_perception.types import PointCloud
 
-MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # one channel each, for all sets of classes
-# Index into MAP_KINDS by class; the last entry, -1, is for clusters without a class.
+MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # channels of the map, the same for every set of classes
+# Class -> index into MAP_KINDS; the last entry, -1, is for clusters without a class.
 CHANNELS = np.array([*(MAP_KINDS.index(row.moves_as) for row in TABLE), -1])
 
 

@@ -27,7 +27,7 @@ from lidar_perception.types import InputError
 
 NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
 MAX_POINTS = 32
-COLUMNS = 10  # x y z i, x_c y_c z_c, x_p y_p z_p
+COLUMNS = 10  # number of inputs: x y z i, x_c y_c z_c, x_p y_p z_p
 
 
 @dataclass(frozen=True)
@@ -35,16 +35,16 @@ class Project:
     """Names and conventions of the PointPillars of one project."""
 
     name: str
-    points: str  # prefix of the linear layer of points and its norm
-    block: str  # prefix of block i, {i}
+    points: str  # prefix of the linear layer for points and its norm
+    block: str  # prefix of block {i}
     first: int  # index of the first convolution in a block
-    neck: str  # prefix of the neck's branch i, {i}
+    neck: str  # prefix of branch {i} of the neck
     head: tuple[str, str, str]
     classes: tuple[str, ...]
-    bottoms: dict[str, float]  # z of the bottom face of the anchors
+    bottoms: dict[str, float]  # class -> z of the bottom face of its anchors
     anchors_at: str
     direction_offset: float
-    centred_xyz: bool  # inputs are x_p y_p z_p instead of x y z
+    centred_xyz: bool  # True if inputs are x_p y_p z_p instead of x y z
 
 
 PROJECTS = (
@@ -103,7 +103,7 @@ def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[Net
     used, converted = {}, network.state_dict()
     for ours, theirs in _map_names(project, config).items():
         if theirs.endswith("num_batches_tracked") and theirs not in state:
-            continue  # missing in files of torch before 0.4.1
+            continue  # not in files of torch before 0.4.1
         used[theirs] = _get_tensor(state, theirs, path)
         converted[ours] = used[theirs]
     linear = f"{project.points}linear.weight"
@@ -211,7 +211,7 @@ def _map_names(project: Project, config: NetworkConfig) -> dict[str, str]:
             names[f"{ours}.1.{part}"] = f"{theirs}{index + 1}.{part}"
 
     for i, layers in enumerate(config.block_layers):
-        for j in range(layers + 1):  # convolution, norm, ReLU
+        for j in range(layers + 1):  # each layer is a convolution, a norm and a ReLU
             layer(f"blocks.{i}.{j}", project.block.format(i=i), project.first + 3 * j)
         layer(f"neck.ups.{i}", project.neck.format(i=i), 0)
     for ours, theirs in zip(("scores", "codes", "directions"), project.head):

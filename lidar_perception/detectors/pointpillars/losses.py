@@ -49,7 +49,7 @@ def detection_loss(outputs: Outputs, targets: Targets, classes_of: Tensor) -> Lo
     number = count.sum().clamp(min=clouds)
     codes, bins = targets.codes[positive], targets.bins[positive]  # (P, 7), (P,)
     found = outputs.codes.float()[positive]
-    # sin(a - b): rotation by half a turn is left to the direction loss
+    # sin(a - b) ignores rotations by 180 degrees, which the direction loss handles
     difference = torch.cat([found[:, :6] - codes[:, :6], torch.sin(found[:, 6:] - codes[:, 6:])], dim=1)
     boxes = functional.smooth_l1_loss(difference, torch.zeros_like(difference), beta=SMOOTH, reduction="sum") / number
     headings = functional.cross_entropy(outputs.directions.float()[positive], bins, reduction="sum") / number

@@ -24,8 +24,8 @@ from lidar_perception.detectors.checkpoint import Header, Net, load_checkpoint
 from lidar_perception.detectors.pointpillars.config import BINS, CODE, NORM_EPS, NetworkConfig
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 
-MOMENTUM = 0.01  # of batch norms
-PRIOR = 0.01  # score of every anchor before training
+MOMENTUM = 0.01  # momentum of the batch norms
+PRIOR = 0.01  # initial score of every anchor
 
 Conv = nn.Conv2d | nn.ConvTranspose2d
 
@@ -79,7 +79,7 @@ class PillarNet(nn.Module):
         image = values.new_zeros(count, values.shape[1])  # (B * H * W, C), empty is 0
         if self.config.zero_row:
             image = self._zero_rows(image, pillars.cells, inputs[:1])
-        # Values are never below 0, so the initial zeros do not affect the maximum.
+        # Values are non-negative, so the initial zeros do not affect the maximum.
         image.scatter_reduce_(0, pillars.cells[:, None].expand_as(values), values, "amax")
         return image.view(pillars.batch, height, width, -1).permute(0, 3, 1, 2)  # (B, C, H, W)
 
@@ -148,7 +148,7 @@ class Head(nn.Module):
 
     def __init__(self, channels: int, per_cell: int, classes: int):
         super().__init__()
-        self.per_cell, self.classes = per_cell, classes  # anchors per cell
+        self.per_cell, self.classes = per_cell, classes  # number of anchors per cell, and of classes
         self.scores = nn.Conv2d(channels, per_cell * classes, 1)
         self.codes = nn.Conv2d(channels, per_cell * CODE, 1)
         self.directions = nn.Conv2d(channels, per_cell * BINS, 1)
@@ -171,7 +171,7 @@ class Head(nn.Module):
     def boxes_at(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
         """Return codes (M, 7) and directions (M, 2) at anchors (M,) of a single cloud."""
         rows = features[0].flatten(1)[:, anchors // self.per_cell].T  # (M, C)
-        numbers = anchors % self.per_cell  # within the cell
+        numbers = anchors % self.per_cell  # index of each anchor within its cell
 
         def apply(conv: nn.Conv2d, width: int) -> Tensor:
             weight = conv.weight.view(self.per_cell, width, -1)[numbers]  # (M, width, C)

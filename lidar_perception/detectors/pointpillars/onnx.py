@@ -23,7 +23,7 @@ from lidar_perception.detectors.pointpillars.pillars import Pillars
 from lidar_perception.detectors.pointpillars.prediction import Prediction
 from lidar_perception.types import InputError
 
-COUNT = 100  # points of the example input
+COUNT = 100  # number of points in the example input
 OUTPUTS = ["logits", "codes", "directions"]
 
 

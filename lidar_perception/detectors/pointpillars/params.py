@@ -39,7 +39,7 @@ class PointPillarsParams(NetworkParams):
     engine: str = make_engine_param()
 
 
-# The experts of paper B are Patchwork++ and DBSCAN, without parameters. These parameters were
+# Paper B uses Patchwork++ and DBSCAN as experts but states no parameters. These parameters were
 # chosen on simulated scans and keep a car in one cluster; those of paper A, for pedestrians, split
 # cars.
 EXPERT_GROUND = GroundParams(method="patchwork")

@@ -40,7 +40,7 @@ def make_pillar_batch(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillar
         ],
         dim=1,
     )
-    # Means of offsets: their sums stay small, so the order of the points hardly matters.
+    # The means are over offsets, whose sums stay small, so the order of the points hardly matters.
     counted = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)
     sums = counted.new_zeros(len(clouds) * height * width, 4).index_add_(0, cells, counted)[cells]
     offsets = torch.cat([middle - sums[:, :3] / sums[:, 3:], middle[:, : config.offset_columns - 3]], dim=1)

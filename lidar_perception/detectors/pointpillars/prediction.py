@@ -28,7 +28,7 @@ class Prediction(NamedTuple):
 class Network(Protocol):
     """A network that a PointPillarsProposer can run."""
 
-    has_fixed_range: bool  # the network cannot be used for another range
+    has_fixed_range: bool  # True if the network cannot be used for another range
 
     def to(self, device: str) -> None:
         """Move to another device if the network can."""

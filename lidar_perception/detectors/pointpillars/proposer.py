@@ -30,7 +30,7 @@ from lidar_perception.detectors.pointpillars.prediction import Network, Predicti
 from lidar_perception.detectors.trained_network import TrainedNetwork
 from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError
 
-SHARED_M = 1.0  # boxes with their centre up to this far behind the sensor come from both passes
+SHARED_M = 1.0  # both passes yield boxes with a centre up to this far behind the sensor
 TIMED_STEPS = ("preprocess", "network", "postprocess")
 
 
@@ -128,7 +128,7 @@ class PointPillarsProposer(TrainedNetwork):
             inputs = {False: make_network_input(view.frame, self.config, ground, cluster_ids)}
         else:
             frame, inputs = view.frame, {}
-            if self.config.remove_ground and ground is not None:  # reads obstacles only
+            if self.config.remove_ground and ground is not None:  # the network reads obstacles only
                 kept = np.flatnonzero(~ground)
                 frame, ground = frame.take(kept), ground[kept]
                 cluster_ids = None if cluster_ids is None else cluster_ids.take(kept)
@@ -175,7 +175,7 @@ class PointPillarsProposer(TrainedNetwork):
         """Return the boxes of one pass that reach their thresholds, rotated back."""
         logits = prediction.logits
         limits = np.array([*map(_logit, min_scores)], np.float32)
-        # Class by class: a reduction over three columns takes three times as long.
+        # Loops over classes, because a reduction over three columns takes three times as long.
         chosen = np.flatnonzero(reduce(np.logical_or, map(np.greater_equal, logits.T, limits)))
         labels = logits[chosen].argmax(axis=1)
         best = logits[chosen, labels]

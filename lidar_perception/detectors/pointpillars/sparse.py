@@ -24,8 +24,8 @@ from lidar_perception.detectors.pointpillars.pillars import Pillars
 from lidar_perception.detectors.pointpillars.prediction import Prediction
 from lidar_perception.detectors.pointpillars.sparse_layers import Grid, Layer, dilate, make_layers, shrink
 
-REACH = 6  # the head is evaluated up to this many of its cells from a point
-MIN_PER_PART = 1_000_000  # multiplications per task of a thread
+REACH = 6  # distance from a point, in cells, up to which the head is evaluated
+MIN_PER_PART = 1_000_000  # minimum number of multiplications per task of a thread
 
 
 class Map(NamedTuple):
@@ -89,7 +89,7 @@ class SparseNetwork:
         scales = np.ones(points + offsets, np.float32)
         scales[:2], scales[4 + offsets :] = config.xy_scale, config.id_scale
         order = [*range(4), *range(4 + offsets, points + offsets), *range(4, 4 + offsets)]
-        scaled = (linear * scales)[:, order]  # points, then offsets
+        scaled = (linear * scales)[:, order]  # point columns first, then offsets
         self.pillar_weights = pack_weights(scaled[:, :, None])
         self.pillar_bias = pad_bias(bias, len(self.pillar_weights) * BLOCK)
         self.pillar_columns = pad_channels(config.pillar_channels)

@@ -11,8 +11,8 @@ from numba import njit
 
 from lidar_perception.detectors.matrix_kernel import BLOCK, ROWS, multiply, multiply_tile
 
-BATCH = 32  # tiles per table of addresses
-POINTS = 192  # points per call of multiply
+BATCH = 32  # number of tiles per address table
+POINTS = 192  # number of points per call of multiply
 
 
 @njit(cache=True, nogil=True)
@@ -42,7 +42,7 @@ def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, firs
         tiles = min(BATCH, (last - begin + ROWS - 1) // ROWS)
         for tile in range(tiles):
             for i in range(ROWS):
-                cell = min(begin + tile * ROWS + i, last - 1)  # the last is repeated
+                cell = min(begin + tile * ROWS + i, last - 1)  # the last cell is repeated
                 row, column = divmod(np.int64(cells[cell]), width)
                 corner = row * stride * across + column * stride
                 if taps == 1:
@@ -138,4 +138,4 @@ def pillar_rows(points, offsets, cells, index, weights, bias, rows):
             row = index[1 + cell // width, 1 + cell % width]
             for k in range(rows.shape[1]):
                 value, known = values[i, k], rows[row, k]
-                rows[row, k] = value if value > known or value != value else known  # NaN stays
+                rows[row, k] = value if value > known or value != value else known  # propagates NaN

@@ -109,7 +109,7 @@ def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
     per layer.
     """
     layers: list[Layer] = []
-    widths = [config.pillar_channels, 3][: 2 if config.pseudo_map else 1]  # of each map
+    widths = [config.pillar_channels, 3][: 2 if config.pseudo_map else 1]  # widths of the maps
 
     def add(
         name: str,
