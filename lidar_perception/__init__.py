@@ -43,7 +43,7 @@ _OTHER_MODULES = {  # (module, name) of everything outside lidar_perception.api
 }
 
 
-if not TYPE_CHECKING:  # else every name would exist for a type checker
+if not TYPE_CHECKING:  # otherwise every name would exist for a type checker
 
     def __getattr__(name: str) -> Any:
         if name not in __all__:

@@ -35,7 +35,7 @@ from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError, PointCloud, as_point_cloud, unknown_name
 
-P = TypeVar("P")  # a dataclass of parameters
+P = TypeVar("P")  # any parameter dataclass
 
 
 def load_detector(

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from lidar_perception.types import InputError
 
-MAX_PIXELS = 1 << 20  # along a side of an image
+MAX_PIXELS = 1 << 20  # maximum width or height of an image
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def _in_view(xyz, projection, width, height):
         depth = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
         u = p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]
         v = p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]
-        seen[i] = 0 <= u < width * depth and 0 <= v < height * depth  # so depth > 0
+        seen[i] = 0 <= u < width * depth and 0 <= v < height * depth  # implies depth > 0
     return seen
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-Size = tuple[float, float, float]  # length, width, height, metres
+Size = tuple[float, float, float]  # (length, width, height) in metres
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,14 @@ TABLE = (
     ObjectClass("Misc"),
     ObjectClass("DontCare"),
 )
-MAX_DIAGONAL = 6.40  # metres, of the largest class (paper B, Table 2)
+MAX_DIAGONAL = 6.40  # maximum diagonal of the largest class in metres (paper B, Table 2)
 
 CLASSES = tuple(row.name for row in TABLE)
 _NAME_BY_SPELLING = {"".join(filter(str.isalnum, name)).casefold(): name for name in CLASSES}
-# Index into CLASSES by every name of a class, in lower case.
+# Lower-case name of a class -> index into CLASSES.
 ID_BY_ALIAS = {name.casefold(): i for i, row in enumerate(TABLE) for name in (row.name, *row.aliases)}
 DETECTED = {row.name: row.numbers for row in TABLE if row.numbers is not None}
-BY_SIZE = sorted(DETECTED, key=lambda name: -DETECTED[name].min_diagonal)  # largest first
+BY_SIZE = sorted(DETECTED, key=lambda name: -DETECTED[name].min_diagonal)  # classes, largest first
 CAR, PEDESTRIAN, CYCLIST, DONT_CARE = map(CLASSES.index, ("Car", "Pedestrian", "Cyclist", "DontCare"))
 
 

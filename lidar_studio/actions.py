@@ -18,9 +18,9 @@ from lidar_studio.interpolation import Motion, apply_correction, reinterpolate_f
 from lidar_studio.state import ACCEPTED, KEY, PROPOSED, REJECTED, Box, Change, Seeds, Stack, State, Track
 
 Action = Mapping[str, Any]
-TrackChanges = dict[int, Track | None]  # None: the track is removed
-MAX_CLASS_LENGTH = 100  # characters
-WITH_TRACKS = "seed", "propose", "import"  # actions with tracks; `tracks` of merge are ids
+TrackChanges = dict[int, Track | None]  # track id -> new track, None if it is removed
+MAX_CLASS_LENGTH = 100  # maximum length of a class name
+WITH_TRACKS = "seed", "propose", "import"  # actions that carry tracks; in `merge`, `tracks` are ids
 
 
 def convert_tracks(action: Action, convert: Callable[[Any], Any]) -> Action:
@@ -33,7 +33,7 @@ def convert_tracks(action: Action, convert: Callable[[Any], Any]) -> Action:
 def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
     """Return the next state and the change. InputError for an invalid action."""
     name, motion = action.get("do"), with_scan_poses(state, motion)
-    if name == "poses":  # not an edit of a person, so not undoable
+    if name == "poses":  # not a manual edit, so it cannot be undone
         poses = tuple(tuple(map(float, row)) for row in action["poses"])
         return replace(state, poses=poses, seq=state.seq + 1), Change(
             {}, (state.seeds, state.seeds), (state.checked, state.checked), (state.kept, state.kept)
@@ -53,7 +53,7 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
     redo_stack: Stack = None
     if action.get("joins") and state.undo_stack is not None:  # completes the previous action
         undo_stack = state.undo_stack[0].combine_with(change), state.undo_stack[1]
-    elif action.get("beside"):  # not done by a person, so it leaves undo and redo alone
+    elif action.get("beside"):  # not done by a person, so it does not affect undo and redo
         undo_stack, redo_stack = state.undo_stack, state.redo_stack
     return replace(state.with_change(change), seq=state.seq + 1, undo_stack=undo_stack, redo_stack=redo_stack), change
 
@@ -239,7 +239,7 @@ def _reject_rest(state: State, action: Action, motion: Motion) -> Outcome:
 
 def _accept(state: State, action: Action, motion: Motion, to: str = ACCEPTED) -> Outcome:
     track, seeds = require_track(state, action.get("track")), state.seeds
-    if action.get("seed") is not None:  # the frame in which the object is nearest
+    if action.get("seed") is not None:  # frame in which the object is nearest
         seeds = add_seed(seeds, require_frame(action, motion, "seed"), track.id)
     return {track.id: replace(track, state=to)}, seeds, state.checked
 
@@ -304,7 +304,7 @@ def _trim(state: State, action: Action, motion: Motion) -> Outcome:
     if not cut or not kept:
         raise InputError(f"track {track.id} has {'no' if kept else 'only'} boxes {side} frame {frame}")
     seeds = tuple(s for s in state.seeds if s[1] != track.id or s[0] not in cut)
-    # Tracking may still reach frames that have no box yet.
+    # Tracking may later reach frames that have no box yet.
     removed = track.removed_frames | (beyond if track.nearby else cut)
     return ({track.id: replace(track, boxes=kept, removed_frames=removed)}, seeds, state.checked)
 

@@ -38,7 +38,7 @@ COLORS = (
     "#999999",
     "#666666",
 )  # colour-blind safe palette of Okabe and Ito, and two greys
-DEFAULT_SIZE_M = (1.0, 1.0, 1.0)  # of a new box whose class has no usual size
+DEFAULT_SIZE_M = (1.0, 1.0, 1.0)  # size of a new box if its class has no usual size
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def select_drive(recording: Recording, sequence: str | None = None) -> Drive:
         InputError: the recording has several drives and `sequence` is None, or has none of this
             name.
     """
-    all_frames = recording.frames[:]  # iterating a bag would keep the clouds in memory
+    all_frames = recording.frames[:]  # a slice, because iterating over a bag keeps the clouds in memory
     names = list(dict.fromkeys(frame.sequence for frame in all_frames))
     listed = f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}"
     if sequence is None and len(names) > 1:

@@ -81,7 +81,7 @@ class Journal:
             raise InputError(
                 f"{self.path} was removed or replaced; nothing was done: export your labels and start again"
             )
-        if status.st_size != self._size:  # on a file system without locks
+        if status.st_size != self._size:  # possible on a file system without locks
             raise InputError(
                 f"another process has written {self.path}; nothing was done: stop one of them and start again"
             )

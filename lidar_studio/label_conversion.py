@@ -17,7 +17,7 @@ from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLab
 from lidar_perception.labels.formats.files import replace_non_finite
 from lidar_studio.state import ACCEPTED, KEY, Box, Kept, State, Track, track_to_json
 
-IMPORTED = "imported"  # source of a track
+IMPORTED = "imported"  # source of an imported track
 ID, SCORE, REST = "track_id", "score", "rest"  # keys of Track.extra
 
 
@@ -36,7 +36,7 @@ def to_tracks(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str
                 **({} if math.isnan(score) else {SCORE: score}),
             }
             key = (number, name) if number != NO_TRACK else (NO_TRACK, f, k)
-            if key in found and f in found[key][1]:  # an id twice in one frame
+            if key in found and f in found[key][1]:  # the id occurs twice in one frame
                 key = NO_TRACK, f, k
             _, boxes, extra = found.setdefault(key, (name, {}, {}))
             boxes[f], extra[f] = Box.of(frame.boxes[k], KEY), fields
@@ -97,7 +97,7 @@ def _choose_ids(state: State) -> dict[int, int]:
     used = set[int]()
     for t in chosen:
         fields = {extra[ID] for extra in t.extra.values() if ID in extra}
-        if len(t.boxes) > 1:  # boxes without an id that a person merged
+        if len(t.boxes) > 1:  # a person has merged boxes without an id
             fields.discard(NO_TRACK)
         if len(fields) == 1 and (number := fields.pop()) not in used:
             found[t.id] = number

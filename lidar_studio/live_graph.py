@@ -35,9 +35,9 @@ from msg_utils.stamps import to_ns
 
 Array = np.ndarray[Any, Any]
 BOXES, TRACKS, LABELS = "detections", "tracks", "labels"  # kinds of box topics
-MAX_BYTES, MAX_FRAMES = 300 * 10**6, 300  # of stored clouds: 30 s at 10 Hz
-MAX_WAIT_S = 0.5  # of a cloud for its boxes; then it is shown without them
-MAX_EARLY_ARRAYS = 50  # per topic
+MAX_BYTES, MAX_FRAMES = 300 * 10**6, 300  # limits of the stored clouds: 30 s at 10 Hz
+MAX_WAIT_S = 0.5  # maximum wait of a cloud for its boxes; afterwards it is shown without them
+MAX_EARLY_ARRAYS = 50  # maximum number of early arrays per topic
 
 
 @dataclass
@@ -74,7 +74,7 @@ class LiveFrame:
     cloud: Any
     received_s: float
     objects: dict[str, MarkedObjects] = field(default_factory=dict)
-    trails: dict[str, dict[int, Array]] = field(default_factory=dict)  # by make_track_id
+    trails: dict[str, dict[int, Array]] = field(default_factory=dict)  # topic -> make_track_id(...) -> trail
     is_shown: bool = False
 
 
@@ -96,13 +96,13 @@ class LiveGraph:
         self.statistics: Mapping[str, Any] = {}
         self.topics: dict[str, BoxTopic] = {}
         self.tree = TransformTree()
-        self.skipped_count = 0  # clouds that arrived while a page was paused
+        self.skipped_count = 0  # number of clouds that arrived while a page was paused
         self._frames: dict[int, LiveFrame] = {}
         self._by_stamp: dict[int, LiveFrame] = {}
         self._next = self._bytes = 0
         self._holding_pages: set[int] = set()
         self._awaiting_tf: list[tuple[LiveFrame, str, MarkedObjects, Any]] = []
-        self._numbers: dict[tuple[str, str], int] = {}  # BoxTopic.number
+        self._numbers: dict[tuple[str, str], int] = {}  # (kind, topic) -> BoxTopic.number
         self._last_status: dict[str, Any] = {}
         self._scale = StreamScale()
         self._lock = threading.RLock()
@@ -164,7 +164,7 @@ class LiveGraph:
             box_topic.received_count += 1
             objects = _keep_valid(objects)
             frame = self._by_stamp.get(objects.stamp_ns)
-            if frame is None or topic in frame.objects:  # it is early, or a bag loops
+            if frame is None or topic in frame.objects:  # the array is early, or a bag is looping
                 box_topic.early_arrays[objects.stamp_ns] = objects, message
                 while len(box_topic.early_arrays) > MAX_EARLY_ARRAYS:
                     box_topic.early_arrays.popitem(last=False)

@@ -14,10 +14,10 @@ from lidar_studio.live_graph import BOXES, LABELS, TRACKS
 from lidar_studio.results import CLUSTERED_TOPICS
 
 ARRAY = "vision_msgs/msg/Detection3DArray"
-# Endings of cloud topics, those with the most columns first.
+# Suffixes of cloud topics, those with the most columns first.
 CLOUD_ENDINGS = tuple(topic.lstrip("/") for topic in (*CLUSTERED_TOPICS, "/ground_segmentation/output/points", POINTS))
 KIND_BY_ENDING = {FOUND: BOXES, TRACKED: TRACKS, TRUTH: LABELS}
-ARRAY_SUFFIX = "_3d"  # of a topic of markers that is also published as Detection3DArray
+ARRAY_SUFFIX = "_3d"  # suffix of the Detection3DArray topic that accompanies a topic of markers
 
 
 def parse_namespace(topic: str) -> str:

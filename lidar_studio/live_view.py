@@ -26,8 +26,8 @@ from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
 from msg_utils.messages import load_message_class
 
-SCAN_PERIOD_S = 1.0  # of the list of topics
-STOP_TIMEOUT_S = 5.0  # to handle the last message
+SCAN_PERIOD_S = 1.0  # period at which the list of topics is updated
+STOP_TIMEOUT_S = 5.0  # time to handle the last message
 RECEPTION = ReceptionParams(queue=5)
 SHOWN_PROBLEMS = "publishers", "silent", "stale", "lost", "dropped"  # kinds of Reception.problems
 
@@ -51,7 +51,7 @@ class LiveView(ExternalNode):
         super().__init__(domain, f"view_{os.getpid()}")
         self.live, self.namespace, self.wanted = live, namespace, (clouds, tuple(boxes))
         self.receptions: dict[str, Reception] = {}
-        self.decode_errors: dict[str, str] = {}  # by topic, of its last message
+        self.decode_errors: dict[str, str] = {}  # topic -> error of its last message
         self.clouds, self.problem, self._last_scan = "", "", -math.inf
         if has_tf():
             for topic, qos in ((TF, TF_QOS), (TF_STATIC, STATIC_QOS)):
@@ -69,7 +69,7 @@ class LiveView(ExternalNode):
         """Spin until `stop` is set. An exception is shown on the page and raised."""
         try:
             self.spin_until(stop.is_set, math.inf, self._step)
-        except Exception as error:  # nobody joins this thread
+        except Exception as error:  # logged here because nobody joins this thread
             self.live.problems = [
                 f"reception has stopped: {type(error).__name__}: {shorten_error(error)}; start view again"
             ]

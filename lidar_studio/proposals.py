@@ -24,18 +24,18 @@ from lidar_studio.state import PROPOSED, Box, Track
 from lidar_studio.survey import FrameSurvey
 
 Array = np.ndarray[Any, Any]
-PlacedBox = tuple[Array, str]  # a box (7,) and its class
-Hit = tuple[int, Array, int, float, bool]  # frame, box, class id, score, and True for a candidate
-SAME_OBJECT_DISTANCE_M = 0.6  # between the centres of a candidate and a detection of one person
-MIN_CONFIDENCE = 0.3  # of a candidate
-UNDETECTED_WEIGHT = 0.5  # of the size similarity of objects without a detection
-MIN_HITS = 2  # of a proposed track, unless there is only one frame
-MIN_SCORE = 0.3  # of a proposed track
-PLACED_SCORE = 0.95  # of a box that a person placed
+PlacedBox = tuple[Array, str]  # box (7,) and its class
+Hit = tuple[int, Array, int, float, bool]  # (frame, box, class id, score, True for a candidate)
+SAME_OBJECT_DISTANCE_M = 0.6  # max centre distance of a candidate and a detection of the same person
+MIN_CONFIDENCE = 0.3  # minimum confidence of a candidate
+UNDETECTED_WEIGHT = 0.5  # weight of the size similarity for objects without a detection
+MIN_HITS = 2  # minimum detections of a proposed track, unless there is only one frame
+MIN_SCORE = 0.3  # minimum score of a proposed track
+PLACED_SCORE = 0.95  # score of a box placed by a person
 CANDIDATES = "candidates"  # source of a track without detections
-MAX_HIT_DISTANCE_M = 1.0  # between a track and the detection that updated it
+MAX_HIT_DISTANCE_M = 1.0  # maximum distance between a track and the detection that updated it
 NO_HIT = -1
-# Standard deviations of a cluster's size, as shares of the seed's length, width or height. Hidden
+# Standard deviations of a cluster's size, as fractions of the seed's length, width or height. Hidden
 # parts make a cluster shorter, so a deficit in length counts less than an excess.
 LENGTH_EXCESS, LENGTH_DEFICIT, WIDTH_EXCESS, HEIGHT_DEVIATION = 0.12, 0.3, 0.2, 0.12
 END_VIEW_PENALTY = 0.5  # deviation added where only the front or rear may be visible

@@ -36,11 +36,11 @@ from lidar_studio.state import KEY, Box, State, Track
 from lidar_studio.survey import FrameSurvey, survey_drive
 
 Array = np.ndarray[Any, Any]
-BOX_MARGIN_M = 0.1  # around a box, when taking its points
-# Two tracks are the same object if enough boxes coincide: this share of the shorter track's boxes,
+BOX_MARGIN_M = 0.1  # margin around a box when selecting its points
+# Two tracks are the same object if enough boxes coincide: this fraction of the shorter track's boxes,
 MIN_COMMON_SHARE = 0.5
 SAME_TRACK_DISTANCE_M = 0.7  # with centres within this distance,
-SAME_TRACK_LENGTH_SHARE = 0.4  # or within this share of the length
+SAME_TRACK_LENGTH_SHARE = 0.4  # or within this fraction of the length
 
 
 class Proposer:

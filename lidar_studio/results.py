@@ -36,9 +36,9 @@ from msg_utils.markers import MarkedObjects
 Array = np.ndarray[Any, Any]
 SIMILAR_CLASS = {row.name: row.looks_like or row.name for row in TABLE}
 CLUSTERED_TOPICS = ("/clustering/output/points", "/perception/output/points")
-MAX_SOURCES = 8  # shown per detection
+MAX_SOURCES = 8  # maximum number of sources shown per detection
 MAX_CACHED_FRAMES = 2000
-TRACKER_ID_STEP = 10**10  # between the ids of two trackers; marker ids have 32 bits
+TRACKER_ID_STEP = 10**10  # offset between the ids of two trackers; larger than any 32-bit marker id
 
 
 @dataclass(frozen=True)
@@ -305,7 +305,7 @@ def tracks_to_json(frames: Mapping[int, MarkedObjects], topic: str, tracker: int
                     "uncertainty": 0.0,
                 },
             )
-            track["class"] = label  # the tracker's last decision
+            track["class"] = label  # the tracker's latest decision
             track["score"] = max(track["score"], float(score))
             track["boxes"].append([i, *map(float, box), "proposed"])
     return list(made.values())

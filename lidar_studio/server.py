@@ -31,10 +31,10 @@ from lidar_studio.state import find_next_uncertain
 LOG = logging.getLogger(__name__)
 HOSTS = ("127.0.0.1", "localhost")
 PAGE = Path(__file__).with_name("page")
-MAX_REQUEST = 10**7  # bytes
+MAX_REQUEST = 10**7  # maximum size of a request in bytes
 MAX_QUEUED_EVENTS = 1000
-PREFETCH_FRAMES = 2  # on either side of the requested frame
-Events = asyncio.Queue[dict[str, Any] | None]  # of one page; None: it is too far behind
+PREFETCH_FRAMES = 2  # number of frames to prefetch on either side of the requested one
+Events = asyncio.Queue[dict[str, Any] | None]  # events of one page; None if the page is too far behind
 HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -149,7 +149,7 @@ class Server:
             response = _error_response(400, str(error))
         except web.HTTPException as error:
             response = _error_response(error.status, error.reason)
-        except Exception as error:  # a bug; the journal still matches the labels
+        except Exception as error:  # a bug, but the journal still matches the labels
             LOG.exception("%s %s", request.method, request.path)
             response = _error_response(500, f"internal error: {type(error).__name__}: {shorten_error(error)}")
         if not response.prepared:
@@ -328,7 +328,7 @@ async def _send_events(socket: web.WebSocketResponse, queue: Events) -> None:
 
 
 def _notify_in_loop(loop: asyncio.AbstractEventLoop, server: Server, event: dict[str, Any]) -> None:
-    with suppress(RuntimeError):  # the loop is closed, as a source may outlive the server
+    with suppress(RuntimeError):  # the loop may be closed, because a source can outlive the server
         loop.call_soon_threadsafe(server.broadcast, event)
 
 

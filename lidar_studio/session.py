@@ -52,7 +52,7 @@ from lidar_studio.state import (
 
 Array = np.ndarray[Any, Any]
 
-NEARBY_FRAMES = 20  # frames on each side of a click through which it is tracked at once
+NEARBY_FRAMES = 20  # number of frames on each side of a click that are tracked immediately
 Listener = Callable[[dict[str, Any]], None]
 
 
@@ -76,7 +76,7 @@ class Session:
         # Cancel events of the running task, and of the next one, which waits for it to end.
         self._cancelled = self._next_cancelled = threading.Event()
         self._worker: threading.Thread | None = None
-        self._task = ""  # the worker's task, "" once it has ended
+        self._task = ""  # name of the worker's task, "" once it has ended
         self._lock, self._exporting = threading.RLock(), threading.Lock()
         for line in journal.lines:
             self.state, _ = apply(self.state, convert_tracks(line, track_from_json), drive.motion)
@@ -142,7 +142,7 @@ class Session:
             self._cancelled = cancelled  # may already be set
             try:
                 work()
-            except Exception as error:  # the page shows it, as nobody joins this thread
+            except Exception as error:  # shown on the page, because nobody joins this thread
                 self.notify(
                     {
                         "error": str(error)
@@ -275,7 +275,7 @@ class Session:
         path = self.journal.path.parent / path
         if path.resolve() == self.journal.path.resolve():
             raise InputError(f"{path} is the journal of these labels; give another name")
-        with self._exporting:  # a button may be pressed twice
+        with self._exporting:  # the user may press the button twice
             written = export_labels(
                 to_labels(self.state, self.drive.frames), format_name, path, self.drive.frames, force
             )

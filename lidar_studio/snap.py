@@ -18,17 +18,17 @@ from lidar_studio.drive import Drive, Scan
 from lidar_studio.state import KEY, State
 
 Array = np.ndarray[Any, Any]
-BOX_MARGIN_M = 0.3  # around a box, when searching its cluster
+BOX_MARGIN_M = 0.3  # margin around a box when searching for its cluster
 # Without ground points below a box, this many of the nearest ones are used, up to this distance.
 MIN_GROUND_POINTS, MAX_GROUND_DISTANCE_M = 20, 15.0
-MIN_PIECE_SHARE = 0.2  # of the largest cluster in a box; smaller ones are other objects
-# A cluster is part of a clicked vehicle if this share of its points is within this share of the
+MIN_PIECE_SHARE = 0.2  # min size relative to the largest cluster in a box; smaller ones are other objects
+# A cluster is part of a clicked vehicle if this fraction of its points is within this fraction of the
 # usual length from the click.
 MIN_INSIDE_SHARE, PIECE_REACH = 0.8, 0.55
-MIN_REACH_M = 0.1  # beyond the point of a cluster nearest to the click
-MAX_LENGTH_RATIO = 1.5  # to the usual length; a longer cluster contains other objects
+MIN_REACH_M = 0.1  # minimum reach beyond the cluster point nearest to the click
+MAX_LENGTH_RATIO = 1.5  # max ratio to the usual length; a longer cluster contains other objects
 LONG_OBJECT_M = 2.5  # usual length of objects whose far side is hidden
-MAX_END_RATIO = 1.3  # to the usual width; a shorter side is the front or the rear
+MAX_END_RATIO = 1.3  # max ratio to the usual width; a shorter side is the front or the rear
 
 
 def fit_clicked_box(scan: Scan, click: Array, class_name: str) -> Array:
@@ -37,7 +37,7 @@ def fit_clicked_box(scan: Scan, click: Array, class_name: str) -> Array:
     label = find_clicked_cluster(click, scan.xyz, scan.cluster_ids, SeedParams().click_radius)
     members = scan.cluster_ids == label
     usual = find_usual_size(class_name)
-    if usual is not None and usual[0] > LONG_OBJECT_M:  # often split into several clusters
+    if usual is not None and usual[0] > LONG_OBJECT_M:  # long objects are often split into several clusters
         near = np.hypot(*(scan.xyz[:, :2] - click[:2]).T) < usual[0] * PIECE_REACH
         inside, total = (
             np.bincount(scan.cluster_ids[mask], minlength=scan.cluster_ids.max() + 1) for mask in (near, slice(None))
@@ -45,7 +45,7 @@ def fit_clicked_box(scan: Scan, click: Array, class_name: str) -> Array:
         is_part = (inside > MIN_INSIDE_SHARE * total) & (np.arange(len(total)) > 0)
         members |= is_part[scan.cluster_ids]
     box = _fit_box(scan, members)
-    if usual is not None and box[3] > MAX_LENGTH_RATIO * usual[0]:  # merged with other objects
+    if usual is not None and box[3] > MAX_LENGTH_RATIO * usual[0]:  # the cluster includes other objects
         distances = np.hypot(*(scan.xyz[:, :2] - click[:2]).T)
         # A click may miss the cluster by more than the first term.
         reach = max(usual[0] * PIECE_REACH, distances[members].min() + MIN_REACH_M)

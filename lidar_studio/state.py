@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 KEY, PROPOSED, INTERPOLATED = "key", "proposed", "interpolated"  # kinds of boxes
-ACCEPTED, REJECTED = "accepted", "rejected"  # of tracks, as is PROPOSED
+ACCEPTED, REJECTED = "accepted", "rejected"  # states of tracks, in addition to PROPOSED
 CLICK = "click"  # source of a clicked track, which is then tracked through the drive
 
 

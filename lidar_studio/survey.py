@@ -29,12 +29,12 @@ from lidar_perception.types import Detections
 from lidar_studio.drive import Drive, make_pipeline_params, select_drive
 
 Array = np.ndarray[Any, Any]
-MIN_DETECTION_SCORE = 0.1  # low, as the tracker filters weak detections
-PERSON_HEIGHTS_M = 0.9, 2.4  # above the ground
-MAX_PERSON_WIDTH_M = 2.0  # diagonal of the cluster in BEV
+MIN_DETECTION_SCORE = 0.1  # low, because the tracker filters weak detections
+PERSON_HEIGHTS_M = 0.9, 2.4  # height limits of a person above the ground
+MAX_PERSON_WIDTH_M = 2.0  # maximum BEV diagonal of the cluster
 MIN_PERSON_POINTS = 5
-OBJECT_HEIGHTS_M = 0.7, 4.5  # above the ground
-MAX_OBJECT_LENGTH_M = 14.0  # diagonal of the cluster in BEV
+OBJECT_HEIGHTS_M = 0.7, 4.5  # height limits above the ground
+MAX_OBJECT_LENGTH_M = 14.0  # maximum BEV diagonal of the cluster
 MIN_OBJECT_POINTS = 10
 
 
@@ -99,7 +99,7 @@ def _fit_objects(found: SegmentedCloud, counts: Array) -> Array:
     numbers[chosen + 1] = np.arange(1, len(chosen) + 1)
     labels = numbers[found.cluster_ids]
     shapes = fit_boxes(found.xyz[labels > 0], labels[labels > 0], "l_shape")
-    shapes[:, [2, 5]] = found.boxes[chosen][:, [2, 5]]  # down to the ground
+    shapes[:, [2, 5]] = found.boxes[chosen][:, [2, 5]]  # extended down to the ground
     return shapes
 
 

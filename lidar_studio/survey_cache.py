@@ -24,7 +24,7 @@ from lidar_studio.survey import FrameSurvey
 Array = np.ndarray[Any, Any]
 FOLDER, LAYOUT = "survey", 2
 FRAMES_PER_FILE = 20
-MAX_BYTES = 300 * 10**6  # all files; 1,000 frames take a tenth of it
+MAX_BYTES = 300 * 10**6  # limit for all files; 1,000 frames need a tenth of it
 PARTS = "detections", "classes", "scores", "boxes", "images", "features", "things"
 
 

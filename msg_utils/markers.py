@@ -21,7 +21,7 @@ from msg_utils.stamps import make_duration, to_ns
 
 CUBE, ADD, DELETE = 1, 0, 2
 
-COLORS = {  # r g b, from a palette for colour-blind readers
+COLORS = {  # r g b, from a colour-blind safe palette
     "Car": (0.00, 0.45, 0.70),
     "Van": (0.34, 0.71, 0.91),
     "Truck": (0.00, 0.62, 0.45),
@@ -254,6 +254,6 @@ def _read_score(content: dict[str, Any]) -> float:
 def _parse_text(text: str) -> dict[str, Any]:
     try:
         content = json.loads(text) if text else {}
-    except (ValueError, RecursionError):  # not JSON, or nested too deeply
+    except (ValueError, RecursionError):  # raised if the text is not JSON or is nested too deeply
         return {"text": text}
     return content if isinstance(content, dict) else {"text": text}

@@ -12,7 +12,7 @@ import numpy as np
 # sensor_msgs/PointField datatypes
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 CODES = {kind: code for code, kind in DATATYPES.items()}
-MAX_STEP = 2**20  # bytes per point; NumPy's limit is 2**31
+MAX_STEP = 2**20  # maximum bytes per point; NumPy's limit is 2**31
 
 
 class CloudError(ValueError):

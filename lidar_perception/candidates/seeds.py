@@ -15,9 +15,9 @@ from lidar_perception.geometry import points_in_box
 from lidar_perception.runs.files import read_text, shorten_error, write_text
 from lidar_perception.types import MAX_RANGE, InputError
 
-MIN_POINTS = 10  # fewer points have no shape to compare with; as DBSCAN's min_samples
-DECIMALS = 4  # of metres in a template file
-MAX_TEMPLATE_BYTES = 10**7  # about 200,000 points
+MIN_POINTS = 10  # fewer points have no meaningful shape; equals DBSCAN's min_samples
+DECIMALS = 4  # decimals of the coordinates (metres) in a template file
+MAX_TEMPLATE_BYTES = 10**7  # maximum size of a template, about 200,000 points
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from numba import njit
 from lidar_perception.candidates.params import CpaParams, PipelineParams, StmParams
 
 ROWS, COLUMNS = 80, 32  # the paper's window, Table 2
-WINDOW_HEIGHT_M, WINDOW_WIDTH_M = 2.4, 1.6  # of the metric window
+WINDOW_HEIGHT_M, WINDOW_WIDTH_M = 2.4, 1.6  # size of the metric window
 FULL_ROW = np.uint64(0xFFFFFFFF)
 ONE, LAST_COLUMN = np.uint64(1), np.uint64(31)
 

@@ -100,7 +100,7 @@ def _make_cloud() -> PointCloud:
     rng = np.random.default_rng(0)
     flat = rng.uniform(-20, 20, (600, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
     person = _make_person()
-    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 2, 0]  # for DBSCAN by cells
-    across = rng.uniform(-0.1, 0.1, (200, 3)) + [15, 0, 0]  # across the limit of two bands
+    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 2, 0]  # triggers DBSCAN by cells
+    across = rng.uniform(-0.1, 0.1, (200, 3)) + [15, 0, 0]  # points on both sides of a band limit
     xyz = np.concatenate([flat, person, person + [12, 0, 0], dense, across])
     return PointCloud(xyz.astype(np.float32))

@@ -11,9 +11,9 @@ from lidar_perception.geometry import horizontal_range
 from lidar_perception.types import usable_returns
 
 CELL_DEG = 2.0  # the gap between the beams of a VLP-16
-MAX_SAMPLED = 30_000  # points of a larger cloud that are sampled
-MAX_WIDENING = 4.0  # largest factor by which neighbourhoods widen
-MIN_CLUSTER_POINTS = 3  # lower limit of min_size; that of min_samples is one less
+MAX_SAMPLED = 30_000  # number of points to sample from a larger cloud
+MAX_WIDENING = 4.0  # maximum factor by which neighbourhoods widen
+MIN_CLUSTER_POINTS = 3  # lower limit of min_size; the one of min_samples is one less
 # A widened radius of the local threshold, and a widened eps at the end of its band, in multiples of
 # the distance between neighbouring points on a surface that faces the sensor.
 SPACINGS_PER_RADIUS, SPACINGS_PER_EPS = 4.0, 2.5

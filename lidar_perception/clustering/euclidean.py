@@ -59,9 +59,9 @@ from lidar_perception.clustering.tree import (
 # The first cells are FIRST_CELL_MEDIANS times as wide as the median distance of SAMPLE_SIZE points
 # to their nearest neighbours.
 SAMPLE_SIZE, FIRST_CELL_MEDIANS = 64, 5
-MAX_BRUTE_FORCE = 20_000_000  # distances; above this number, points are sorted into larger cells
-MAX_WORK = 2**32  # distances per cloud for local thresholds
-MAX_WORK_PER_POINT = 2**15  # distances per point for local thresholds
+MAX_BRUTE_FORCE = 20_000_000  # number of distances above which points are sorted into larger cells
+MAX_WORK = 2**32  # maximum distances per cloud for local thresholds
+MAX_WORK_PER_POINT = 2**15  # maximum distances per point for local thresholds
 
 
 def cluster_euclidean(
@@ -141,7 +141,7 @@ def _mean_nearest_distance(xyz: np.ndarray, max_distances: float) -> tuple[float
             squared[tree.order] = find_nearest_distances(tree)[0]
             return np.sqrt(squared).mean(), first
         waiting = np.flatnonzero(squared > cells.reach**2)
-        squared[waiting] = np.inf  # a nearer point may lie outside the cells searched
+        squared[waiting] = np.inf  # a closer point may lie outside the searched cells
         if len(waiting) * n <= MAX_BRUTE_FORCE:
             squared[waiting] = [_nearest_squared_distance(columns, n, i) for i in waiting]
             return np.sqrt(squared).mean(), first
@@ -163,7 +163,7 @@ def _nearest_squared_distance(points, size, i):
             squared = dx * dx + dy * dy + dz * dz
             least = min(least, np.float64(squared).view(np.int64))
         if least == 0:
-            break  # keeps many coincident points fast
+            break  # bounds the time for many coincident points
     points[0, i] = px
     return np.int64(least).view(np.float64)
 
@@ -198,7 +198,7 @@ def _mean_distances(cells, radii2):
         gather_neighbourhood(cells, a, near)
         for i in range(cells.start[a], cells.start[a + 1]):
             if i > cells.start[a] and x[i] == x[i - 1] and y[i] == y[i - 1] and z[i] == z[i - 1]:
-                means[i] = means[i - 1]  # keeps many coincident points fast
+                means[i] = means[i - 1]  # bounds the time for many coincident points
                 continue
             px, py, pz, total, count = x[i], y[i], z[i], 0.0, 0.0
             radius2 = radii2[i]

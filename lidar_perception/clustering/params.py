@@ -81,7 +81,7 @@ class EuclideanParams(Params):
 
 
 CLUSTERING_METHODS = ("dbscan", "euclidean")
-FULL_DENSITY = 10.0  # points per square degree that our values need; the HDL-64E has 13 to 16
+FULL_DENSITY = 10.0  # points per square degree required by our values; the HDL-64E has 13 to 16
 
 
 @dataclass(frozen=True)

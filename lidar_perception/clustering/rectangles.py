@@ -35,7 +35,7 @@ def sort_by_cluster(
     start = np.concatenate([[0], np.cumsum(sizes)])
     keys = _make_keys(xyz, labels, start)
     for begin, end in pairwise(start.tolist()):
-        keys[begin:end].sort()  # vectorized, and Numba's would take seconds to compile
+        keys[begin:end].sort()  # NumPy's sort is vectorized; Numba's takes seconds to compile
     x, y = _split_keys(keys)
     return x, y, start
 
@@ -106,7 +106,7 @@ def _convex_hull(x, y):
     count, floor = 0, 0
     for step in range(2 * n - 1):
         if step == n:
-            floor = count - 1  # the lower side is complete; now back over the upper side
+            floor = count - 1  # the lower side is complete; continue with the upper side
         i = step if step < n else 2 * n - 2 - step
         while count > floor + 1:
             ax, ay = corners[0, count - 2], corners[1, count - 2]

@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 
 CUBES_PER_REACH = 32
-# Share of the reach: both points of a pair may be a cube's diagonal from the one that is kept.
+# Fraction of the reach: both points of a pair may be a cube's diagonal away from the one kept.
 SLACK = 2 * 3**0.5 / CUBES_PER_REACH
 MAX_DISTANCES_PER_POINT = 2_000
-MIN_DISTANCES = 2**30  # lower limit of a search's budget, about a second
+MIN_DISTANCES = 2**30  # minimum budget of a search in distances, about a second
 
 
 def max_exact_distances(count: int) -> float:

@@ -18,10 +18,10 @@ from lidar_perception.ground.cloth_slopes import UNOBSERVED, find_climbing_cells
 from lidar_perception.ground.cloth_solver import settle_sheet
 from lidar_perception.ground.params import ClothParams
 
-GRID_LEVELS = 6  # grids of the solver, each twice as coarse as the previous one
-TOLERANCE_M = 0.001  # largest movement of a particle in the last step
+GRID_LEVELS = 6  # number of grids of the solver, each twice as coarse as the previous one
+TOLERANCE_M = 0.001  # maximum movement of a particle in the last step
 SUNK_WINDOWS = (2, 6)  # half widths, in cells, of the squares around a cell that may be sunk
-SUNK_DEPTH_M = 0.4  # a lone lowest point this far below its surroundings is a reflection
+SUNK_DEPTH_M = 0.4  # depth below the surroundings from which an isolated lowest point is a reflection
 
 
 class Cloth(NamedTuple):
@@ -131,7 +131,7 @@ def _drop_sunk_cells(lowest, depth):
                         break
                 if level > 2:
                     break
-                if higher >= 4:  # all but the cell itself and one more
+                if higher >= 4:  # all neighbours but one
                     sunk.append((r, c))
                     break
     for r, c in sunk:

@@ -6,8 +6,8 @@ import numpy as np
 from numba import njit
 
 UNOBSERVED = np.float32(np.inf)
-REACH_CELLS, STEP_M = 6, 0.05  # largest gap and step over which the ground continues
-# Squared distance, row and column offset of the cells around one, the nearest first.
+REACH_CELLS, STEP_M = 6, 0.05  # maximum gap and step over which the ground continues
+# Squared distance, row offset and column offset of the cells around a cell, nearest first.
 NEIGHBOURS = np.array(
     sorted(
         (i * i + j * j, i, j)

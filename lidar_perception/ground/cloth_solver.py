@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-SWEEPS = 2  # before and after each correction
-COARSEST_SWEEPS = 40  # on the coarsest grid, which is about ten cells wide
-RELAXATION = 1.5  # over-relaxation on the coarsest grid
+SWEEPS = 2  # sweeps before and after each correction
+COARSEST_SWEEPS = 40  # sweeps on the coarsest grid, which is about ten cells wide
+RELAXATION = 1.5  # over-relaxation factor on the coarsest grid
 MAX_CYCLES = 30  # five to seven are typical
 
 

@@ -175,7 +175,7 @@ class ObstacleParams(Params):
             raise ValueError(f"max_height = {self.max_height} must not be below min_height = {self.min_height}, or 0")
 
 
-P = TypeVar("P")  # a dataclass of parameters with a group `ground`
+P = TypeVar("P")  # any parameter dataclass with a group `ground`
 
 
 def set_sensor_height(params: P, height: float) -> P:

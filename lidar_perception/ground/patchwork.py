@@ -17,7 +17,7 @@ from numba import njit
 from lidar_perception.geometry import counting_sort
 from lidar_perception.ground.params import PatchworkParams
 
-# Constants of the library, with their names there.
+# Constants of the Patchwork++ library; comments give their names there.
 RINGS, SECTORS = (2, 4, 4, 4), (16, 32, 54, 32)  # of each zone: num_rings_each_zone, ...sectors...
 PATCHES = sum(rings * sectors for rings, sectors in zip(RINGS, SECTORS))
 MIN_PATCH_POINTS = 10  # num_min_pts
@@ -27,8 +27,8 @@ NEAR_RINGS = 4  # num_rings_of_interest
 MIN_SEED_HEIGHT = -1.2  # adaptive_seed_selection_margin, in sensor heights
 VERTICAL_SEED_DISTANCE, VERTICAL_DISTANCE = 0.25, 0.1  # th_seeds_v, th_dist_v, metres
 MAX_NOISE_DEG, MAX_NOISE_INTENSITY = -15.0, 0.2  # RNR_ver_angle_thr, RNR_intensity_thr
-MIN_NOISE_DEPTH = 0.8  # of reflections, metres below the ground
-MAX_LINE_RATIO = 8.0  # of the eigenvalues of a patch that may be reverted
+MIN_NOISE_DEPTH = 0.8  # minimum depth of reflections below the ground, metres
+MAX_LINE_RATIO = 8.0  # max eigenvalue ratio of a patch that can be reverted
 MANY_POINTS = 1500  # a flat patch with more points is reverted
 
 OTHER, GROUND, REMOVED = 0, 1, 2  # states of a point in its patch
@@ -190,7 +190,7 @@ def _fit_ground(points, state, size, zone, plane, settings):
 @njit(cache=True, nogil=True)
 def _mark_seeds(points, state, size, min_height, distance):
     """Mark the points less than `distance` above the mean of the lowest ones."""
-    lowest, count = np.empty(LOWEST_POINTS), 0  # ascending
+    lowest, count = np.empty(LOWEST_POINTS), 0  # kept in ascending order
     for i in range(size):
         z = points[2, i]
         if state[i] == REMOVED or z < min_height or (count == LOWEST_POINTS and z >= lowest[-1]):

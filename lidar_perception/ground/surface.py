@@ -8,10 +8,10 @@ import numpy as np
 from numba import njit
 from scipy import ndimage
 
-CELL_M = 2.0  # width of the square cells whose mean heights the surface goes through
-MIN_POINTS = 3  # ground points in a cell that has a height
+CELL_M = 2.0  # width of the square cells whose mean heights define the surface
+MIN_POINTS = 3  # minimum ground points of a cell to have a height
 SMOOTHING_M = 2.4  # standard deviation of the Gaussian that smooths the heights
-MIN_WEIGHT = 1e-3  # of a smoothed height; cells with less get the height of the nearest cell
+MIN_WEIGHT = 1e-3  # minimum weight of a smoothed height; other cells get the height of the nearest cell
 
 
 class GroundSurface(NamedTuple):

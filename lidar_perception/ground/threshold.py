@@ -12,10 +12,10 @@ from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.types import SENSOR_HEIGHT
 
 MIN_POINTS = 3
-SAMPLE_SIZE = 2048  # points on which trial planes are compared; the fit uses all points
+SAMPLE_SIZE = 2048  # number of points used to compare trial planes; the fit uses all points
 CONFIDENCE = 0.9999  # probability of drawing at least one triple without outliers
-MIN_SINE = 1e-3  # of the angle in a trial's triangle; thinner triangles do not fix a plane
-MAX_REFINEMENTS = 50  # a few suffice; this bounds the rare case that the inliers cycle
+MIN_SINE = 1e-3  # min sine of the angle in a trial's triangle; thin triangles do not define a plane
+MAX_REFINEMENTS = 50  # a few suffice; bounds the rare case that the inliers cycle
 
 
 def segment_by_threshold(

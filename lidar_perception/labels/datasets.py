@@ -23,7 +23,7 @@ from lidar_perception.runs.files import write_bytes, write_folder
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import SENSOR_HEIGHT, InputError
 
-# For a recording without a camera: level, at the LiDAR, with KITTI's field of view.
+# Camera for a recording without one: level, at the LiDAR, with KITTI's field of view.
 ASSUMED_CAMERA = replace(
     FORWARD_CAMERA, lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 )

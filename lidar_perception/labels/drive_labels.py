@@ -14,8 +14,8 @@ from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import CLASSES, MAX_RANGE, GroundTruth, InputError, class_ids
 
 NO_TRACK = -1
-OTHER_CLASS = "Misc"  # in CLASSES, for unknown classes
-MAX_DIFFERENCE = 1e-4  # metres and radians, between a box and the one that was read
+OTHER_CLASS = "Misc"  # one of CLASSES, used for unknown classes
+MAX_DIFFERENCE = 1e-4  # tolerance in metres and radians between a box and the one that was read
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ class DriveLabels:
         return sum(len(frame) for frame in self.frames)
 
 
-Row = tuple[Sequence[float], str, int, float, dict[str, Any]]  # box, class, track id, score, extra
+Row = tuple[Sequence[float], str, int, float, dict[str, Any]]  # (box, class, track id, score, extra)
 
 
 def make_frame_labels(

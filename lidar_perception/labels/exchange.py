@@ -33,7 +33,7 @@ from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
 Read = Callable[[Path, Sequence[Frame]], DriveLabels]
-Write = Callable[..., None]  # labels, out, frames, force
+Write = Callable[..., None]  # arguments: labels, out, frames, force
 
 # Reader and writer of each format; with `force`, a writer replaces existing files. A new format is
 # one file and one line here.
@@ -137,7 +137,7 @@ def _recognise_text(file: Path) -> str:
     """Recognise the format by the number of columns before the class in the first line."""
     words = read_text(file, MAX_BYTES).lstrip().partition("\n")[0].split()
     if words and words[0].endswith(":"):
-        return ""  # a calibration
+        return ""  # the file is a calibration
     numbers = 0
     with suppress(ValueError):
         for word in words:

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
 Color = tuple[int, int, int]  # r g b, 0..255
-DASH, GAP = 7.0, 5.0  # pixels of a dashed line
-MAX_RADIUS = 4  # pixels of a point
-OUTLINE_COLOR = (10, 14, 22)  # of texts
+DASH, GAP = 7.0, 5.0  # lengths of dashes and gaps in pixels
+MAX_RADIUS = 4  # maximum radius of a point in pixels
+OUTLINE_COLOR = (10, 14, 22)  # outline of text
 DEPTH_STEPS = np.uint16(65535)  # points are sorted by their rounded depth
 
 
@@ -65,7 +65,7 @@ class Canvas:
             return
         depth = depth[order] - depth[order].min()
         steps = depth * (DEPTH_STEPS / max(depth.max(), 1e-6))
-        order = order[np.argsort(DEPTH_STEPS - steps.astype(np.uint16), kind="stable")]  # radix
+        order = order[np.argsort(DEPTH_STEPS - steps.astype(np.uint16), kind="stable")]  # radix sort for uint16
         cells = np.stack([column[order], row[order]], axis=1).astype(np.int32)
         # One packed number per pixel, in an image with a margin. The last of equal indices wins.
         stride = self.width + 2 * reach
@@ -77,7 +77,7 @@ class Canvas:
         values = packed.view(np.uint32).ravel()
         index = (cells[:, 1] + reach) * stride + cells[:, 0] + reach
         sides = np.clip(np.round(2 * radius[order]), 1, 2 * reach - 1).astype(np.int64)
-        for side in np.unique(sides):  # far to near, as the radius does not grow with the depth
+        for side in np.unique(sides):  # from far to near, because the radius does not grow with the depth
             rows = sides == side
             shift = np.arange(side) - side // 2
             offsets = (shift[:, None] * stride + shift).ravel()
@@ -121,7 +121,7 @@ class Canvas:
             offset = np.linalg.norm(start - segments[kept, 0], axis=1)
             drawn = (offset[owner] + share[:, 0] * length[owner]) % (DASH + GAP) < DASH
             at, owner, cell = at[drawn], owner[drawn], cell[drawn]
-        cosine = (np.abs(direction).max(axis=1) / length)[owner]  # of the angle to the main axis
+        cosine = (np.abs(direction).max(axis=1) / length)[owner]  # cosine of the angle to the main axis
         reach = int(np.ceil(width)) + 1
         across = np.where(steep[owner], at[:, 0], at[:, 1])
         pixels = np.floor(across)[:, None] + np.arange(-reach, reach + 1)
@@ -139,7 +139,7 @@ class Canvas:
         order = np.argsort(opaque, kind="stable")
         index, opaque, owner = index[order], opaque[order], owner[order]
         last = np.full(self.width * self.height, -1, np.int64)
-        last[index] = np.arange(len(index))  # of equal indices the last one wins
+        last[index] = np.arange(len(index))  # the last of equal indices wins
         chosen = last[last >= 0]
         flat = self.pixels.reshape(-1, 3)
         where, share = index[chosen], opaque[chosen, None]

@@ -9,12 +9,12 @@ from lidar_perception.types import CLASSES
 from msg_utils.markers import COLORS, OTHER_COLOR
 
 BACKGROUND = np.array([11, 15, 24], np.uint8)
-LABEL = (235, 240, 245)  # labelled boxes, which are dashed
+LABEL = (235, 240, 245)  # colour of labelled boxes, which are dashed
 TEXT, DIM = (225, 230, 238), (130, 142, 160)
 GRID = (38, 47, 64)
 # Other classes have the brightest possible colour of their markers.
 DETECTED_COLORS = dict(zip(DETECTED, ((64, 186, 255), (255, 104, 80), (255, 212, 66))))
-# Metres above the ground: dull at the ground, light at the height of roofs.
+# Colours by height above the ground in metres: dull at the ground, light at roof height.
 HEIGHTS = (-0.3, 0.15, 0.9, 1.8, 3.5, 7.0)
 HEIGHT_COLORS = np.array(
     [[46, 66, 106], [70, 96, 142], [76, 140, 166], [126, 190, 184], [206, 216, 190], [224, 200, 210]], np.float32

@@ -17,9 +17,9 @@ from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError
 
 VIDEO_SUFFIXES, ANIMATION_SUFFIXES = (".mp4", ".mkv", ".mov"), (".gif", ".webp")
-ANIMATED_WIDTH = 960  # pixels
-MAX_ANIMATED = 300  # pictures of an animation, which is held in memory
-TICKS = 1000  # per second
+ANIMATED_WIDTH = 960  # width of an animation in pixels
+MAX_ANIMATED = 300  # maximum number of frames of an animation, which is held in memory
+TICKS = 1000  # ticks per second
 PNG_KEY, PNG_LEVEL = "lidar_perception", 3
 QUALITY = {"crf": "20", "preset": "veryfast"}
 
@@ -124,7 +124,7 @@ class _Animation:
     def __init__(self, path: Path) -> None:
         self.path, self.ticks = path, 0
         self.pictures: list[Image.Image] = []
-        self.durations: list[int] = []  # milliseconds
+        self.durations: list[int] = []  # frame durations in milliseconds
 
     def add(self, picture: np.ndarray, seconds: float) -> None:
         image = Image.fromarray(picture)
@@ -139,4 +139,4 @@ class _Animation:
         first, *others = self.pictures
         first.save(
             self.path, save_all=True, append_images=others, duration=self.durations, loop=0, quality=80
-        )  # ignored by GIF
+        )  # GIF ignores these options

@@ -28,15 +28,15 @@ EDGES = np.array(
 FRONT, FLOOR = [0, 3, 7, 4], [0, 1, 2, 3]  # corners of the front and the bottom face
 OTHER_FACES = [[1, 2, 6, 5], [0, 1, 5, 4], [2, 3, 7, 6], [4, 5, 6, 7]]
 RING_POINTS = 180
-MIN_RANGE, MAX_RANGE_AHEAD, MAX_RANGE_AROUND = 6.0, 55.0, 45.0  # metres that a picture shows
-POINT_SHARE = 5e-4  # radius of a point, as a share of the range
-FOV = 60.0  # degrees
-FAR_PERCENTILE = 98  # of the ranges of the points; it sets the range of a picture
-BEV_SHARE = 0.375  # of the width, for the bird's-eye view
-CLASS_SHARE = 0.5  # of the class colour in the colour of points in boxes
-ARROW_S = 1.0  # seconds of motion that an arrow shows
-SCALE_WIDTH = 110  # pixels of the colour scale
-MIN_SPEED = 0.5  # m/s; slower boxes have no arrow
+MIN_RANGE, MAX_RANGE_AHEAD, MAX_RANGE_AROUND = 6.0, 55.0, 45.0  # limits of the displayed range in metres
+POINT_SHARE = 5e-4  # radius of a point, as a fraction of the range
+FOV = 60.0  # vertical field of view in degrees
+FAR_PERCENTILE = 98  # percentile of the points' ranges that sets the range of a picture
+BEV_SHARE = 0.375  # fraction of the width used by the bird's-eye view
+CLASS_SHARE = 0.5  # weight of the class colour in the colour of points in boxes
+ARROW_S = 1.0  # motion shown by an arrow, in seconds
+SCALE_WIDTH = 110  # width of the colour scale in pixels
+MIN_SPEED = 0.5  # in m/s; slower boxes have no arrow
 NO_BOXES = np.zeros((0, 7))
 
 

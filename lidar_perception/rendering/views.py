@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-NEAR = 0.3  # metres; nothing nearer to the eye is drawn
+NEAR = 0.3  # near clipping distance in metres
 
 
 class View(Protocol):

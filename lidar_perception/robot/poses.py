@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import InputError
 
-UNIT_TOLERANCE = 1e-2  # largest deviation of a quaternion's length from 1; drivers round
+UNIT_TOLERANCE = 1e-2  # max deviation of a quaternion's norm from 1, because drivers round
 
 
 def make_pose(translation: np.ndarray, quaternion: np.ndarray) -> np.ndarray:

@@ -13,10 +13,10 @@ from lidar_perception.types import InputError
 
 SECOND_NS = 10**9
 KEPT_NS = 10 * SECOND_NS  # history of each transform, as in tf2
-MAX_KEPT = 10_000  # poses of each transform, at any rate
+MAX_KEPT = 10_000  # maximum number of poses of each transform
 MAX_FRAMES = 10_000  # bounds the memory if a publisher makes a new name for every message
-JUMP_NS = SECOND_NS  # a stamp this far before the last one means that a bag started again
-MAX_LAG_S = 10.0  # a longer gap between a stamp and a transform is hardly a lag
+JUMP_NS = SECOND_NS  # a stamp this far before the last one means that a bag has restarted
+MAX_LAG_S = 10.0  # a longer gap between a stamp and a transform means different clocks, not a lag
 CLOCKS = (
     "are they stamped by different clocks? Let the driver stamp clouds with the computer's "
     "time, synchronise the sensor (PTP), or set use_sim_time everywhere"
@@ -40,7 +40,7 @@ class _Link:
     def __init__(self, parent: str, static: bool, keeps_all: bool):
         self.parent, self.static, self.keeps_all = parent, static, keeps_all
         self.times: list[int] = []  # ns, ascending
-        self.values: list[np.ndarray] = []  # (7,) translation and quaternion
+        self.values: list[np.ndarray] = []  # arrays (7,), translation and quaternion
 
     def add(self, stamp_ns: int, value: np.ndarray) -> None:
         if self.static:
@@ -57,7 +57,7 @@ class _Link:
         old = 0
         while self.times[-1] - self.times[old] > KEPT_NS or len(self.times) - old > MAX_KEPT:
             old += 1
-        if old > len(self.times) // 10:  # deleting moves the whole list, so not with every message
+        if old > len(self.times) // 10:  # deleting moves the whole list, so it is not done with every message
             del self.times[:old], self.values[:old]
 
     def interpolate(self, at: np.ndarray, name: str, max_gap: float | None) -> np.ndarray:
@@ -110,7 +110,7 @@ class TransformTree:
     """
 
     def __init__(self, keeps_all: bool = False) -> None:
-        self._links: dict[str, _Link] = {}  # by the frame that is the child
+        self._links: dict[str, _Link] = {}  # child frame -> link to its parent
         self._keeps_all = keeps_all
         self.jumps = 0
 

@@ -28,7 +28,7 @@ WAITING_MESSAGE = "waiting for another process to compile, or to load compiled c
 class _Compilation:
     """Listener to Numba's events; Numba sends none when it loads code from its cache."""
 
-    current: _Compilation | None = None  # that of the outermost block
+    current: _Compilation | None = None  # compilation of the outermost block
 
     def __init__(self, report: Callable[[str], object]):
         self.report, self.finished = report, threading.Event()
@@ -115,7 +115,7 @@ def _is_cached() -> bool:
 
     function: Any = geometry.counting_sort
     source = Path(geometry.__file__)
-    if not hasattr(function, "stats"):  # NUMBA_DISABLE_JIT
+    if not hasattr(function, "stats"):  # true with NUMBA_DISABLE_JIT
         return True
     indices = Path(function.stats.cache_path).glob(f"{source.stem}.{function.__name__}-*.nbi")
     return any(index.stat().st_mtime >= source.stat().st_mtime for index in indices)

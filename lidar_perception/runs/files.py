@@ -30,7 +30,7 @@ def check_regular(path: Path) -> Path:
     return path
 
 
-MAX_TEXT_BYTES = 2**28  # of a file of numbers or labels
+MAX_TEXT_BYTES = 2**28  # maximum size of a file of numbers or labels
 
 
 def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES, what: str = "") -> str:

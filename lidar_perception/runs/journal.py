@@ -19,7 +19,7 @@ from lidar_perception.runs.resuming import find_differences, lock_folder
 from lidar_perception.types import InputError
 
 JOURNAL_NAME = "frames.jsonl"
-SYNC_S = 1.0  # longest time whose records are lost when the machine stops
+SYNC_S = 1.0  # maximum time whose records are lost if the machine crashes
 
 
 class Journal:

@@ -26,8 +26,8 @@ from typing import Any, cast
 from lidar_perception.runs.threads import limit_to_one_thread
 from lidar_perception.types import InputError
 
-EXIT_TIMEOUT_S = 30.0  # for processes that have been asked to end
-RUNS_PER_PROCESS = 16  # of consecutive items, which often share work (scans of one street)
+EXIT_TIMEOUT_S = 30.0  # time for processes to end when asked to
+RUNS_PER_PROCESS = 16  # runs of consecutive items, which often share work (scans of one street)
 
 
 def run_in_processes(
@@ -150,7 +150,7 @@ def _receive_result(receiver: Connection, running: dict[Connection, ForkServerPr
     """
     try:
         result, error = receiver.recv()
-    except (EOFError, OSError):  # OSError in the middle of a result
+    except (EOFError, OSError):  # OSError if the result is cut off
         process = running.pop(receiver)
         process.join()
         if process.exitcode:
@@ -222,7 +222,7 @@ def _send_results(results: SimpleQueue[Any], pipe: Connection) -> None:
 @contextmanager
 def _block_interrupts() -> Iterator[None]:
     """Block SIGINT, so that processes started here ignore ctrl-C; their parent ends them."""
-    resource_tracker.ensure_running()  # if it were started in the block, it would lift it
+    resource_tracker.ensure_running()  # must not start inside the block, because it would unblock the signals
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

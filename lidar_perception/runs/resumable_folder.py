@@ -82,7 +82,7 @@ def _begin(folder: Path, settings: dict, names: Iterable[str], resume: bool, for
         _check_settings(folder, settings)
         return
     refuse_other_files(folder, (*names, INCOMPLETE_NAME, RECORD_NAME, PARTS_NAME))
-    write_text(folder / INCOMPLETE_NAME, "{}")  # a stop while files are removed leaves what only force takes
+    write_text(folder / INCOMPLETE_NAME, "{}")  # if interrupted during removal, only force accepts the folder
     for old in folder.iterdir():
         if old.is_dir() and not old.is_symlink():
             shutil.rmtree(old)

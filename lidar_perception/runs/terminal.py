@@ -60,7 +60,7 @@ def _split_title(table: Table) -> list[list[Any]]:
     return [[part] for part in (table.title, untitled) if part is not None]
 
 
-MAX_WIDTH = 100_000  # characters, wider than any table
+MAX_WIDTH = 100_000  # in characters, wider than any table
 
 console = Terminal()
 errors = Terminal(stderr=True)
@@ -83,7 +83,7 @@ def show_input_warnings() -> Iterator[None]:
         yield
 
 
-LOG_INTERVAL_S = 15.0  # between lines of progress without a terminal
+LOG_INTERVAL_S = 15.0  # time between progress lines without a terminal
 
 
 def make_progress() -> Progress:

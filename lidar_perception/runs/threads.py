@@ -8,11 +8,11 @@ import sys
 from lidar_perception.runs.machine import count_cores
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# Of the OpenMP standard, and of GNU's OpenMP: spin this often first, because the next layer of a
-# network follows within microseconds.
+# Variables of the OpenMP standard and of GNU's OpenMP. Threads spin this often before they sleep,
+# because the next layer of a network follows within microseconds.
 PASSIVE_WAITING = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "1000"}
 
-_thread_count = 0  # 0: not set
+_thread_count = 0  # 0 if not set
 
 
 def set_thread_count(count: int) -> None:

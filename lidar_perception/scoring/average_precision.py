@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-STEPS = 40  # of recall from 0 to 1
+STEPS = 40  # number of recall steps from 0 to 1
 MIN_OBJECTS = STEPS + 1  # objects needed to fill all points
 
 

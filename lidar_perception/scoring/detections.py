@@ -96,7 +96,7 @@ def measure_detector(
         if folder is not None:
             try:
                 write_results(folder / f"{frame.name}.txt", result.detections, choose_calibration(frame)[0])
-            except InputError as error:  # disk error, or values that are not finite
+            except InputError as error:  # disk errors, or values that are not finite
                 raise RunError(str(error)) from None
         return result
 

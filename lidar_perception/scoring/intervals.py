@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 import numpy as np
 
 MIN_DRIVES, BLOCK_FRAMES = 8, 10
-INTERVAL_PERCENT = 90  # of the draws that are inside an interval
+INTERVAL_PERCENT = 90  # percentage of the draws inside an interval
 
 
 def group_frames(names: Sequence[str], follow: bool = False) -> list[np.ndarray]:

@@ -31,7 +31,7 @@ from lidar_perception.types import InputError, RunError
 Start = Callable[[Recording], Callable[[Frame], Any]]
 
 CONNECT_S = 20.0  # timeout for a Dask scheduler and its first worker
-TASKS_PER_THREAD = 2  # on a Dask cluster
+TASKS_PER_THREAD = 2  # number of tasks per thread of a Dask cluster
 
 
 class Report(Protocol):
@@ -184,7 +184,7 @@ _get_worker = functools.lru_cache(maxsize=1)(lambda run, reopen, start: _make_wo
 
 def _measure_on_cluster(run: str, reopen: Callable[[], Recording], start: Start, i: int) -> tuple[int, Any]:
     """Measure a frame in a process that other runs may share."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # for libraries that are loaded later
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by libraries that are loaded later
     with threadpool_limits(1):
         return _get_worker(run, reopen, start)(i)
 

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-MAX_SHOWN = 5  # reasons for skipped frames
+MAX_SHOWN = 5  # maximum number of reasons listed for skipped frames
 
 
 def make_table(title: str, first: str, *others: str, width: int = 0) -> Table:

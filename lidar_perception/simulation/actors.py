@@ -15,10 +15,10 @@ from lidar_perception.simulation.shapes.thing import Thing, make_rigid
 from lidar_perception.simulation.solids import compute_hull
 from lidar_perception.simulation.trajectory import Trajectory
 
-HEAD_ROOM_M = 2.2  # higher parts do not block anyone
-SIGHT_M, FAR_SIGHT_M = 80.0, 120.0  # farther things are left out of a moment; the latter for
-LARGE_M = 5.0  # things of this size
-STEP_S = 0.1  # between the positions of a robot that others keep clear of
+HEAD_ROOM_M = 2.2  # parts above this height do not block anyone
+SIGHT_M, FAR_SIGHT_M = 80.0, 120.0  # maximum distance of objects in a scan; the latter applies to
+LARGE_M = 5.0  # objects of at least this size
+STEP_S = 0.1  # time between the robot positions that others keep clear of
 
 
 def make_prop(made: np.ndarray) -> Thing:
@@ -99,10 +99,10 @@ def footprints_touch(one, other, seconds, gap):
     for i in range(6):
         times[i] = min(max(times[i], 0.0), seconds)
     times.sort()
-    for i in range(5):  # motion is straight between these times
+    for i in range(5):  # motion is linear between these times
         x, y = _compute_offset(one, other, times[i])
         next_x, next_y = _compute_offset(one, other, times[i + 1])
-        enter, leave = 0.0, 1.0  # shares of this interval
+        enter, leave = 0.0, 1.0  # start and end of the overlap, as fractions of this interval
         for side in range(4):
             angle = (one if side < 2 else other)[HEADING] + side % 2 * np.pi / 2
             cos, sin = math.cos(angle), math.sin(angle)

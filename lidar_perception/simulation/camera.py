@@ -11,9 +11,9 @@ from lidar_perception.data.kitti.labels import DONT_CARE
 from lidar_perception.data.kitti.write import keep_visible_objects
 from lidar_perception.types import GroundTruth
 
-# Annotators leave out objects that are hardly visible. The smallest of 20 pedestrians in real
+# Annotators skip objects that are hardly visible. The smallest of 20 pedestrians in real
 # frames has 16 points; few in KITTI have fewer than 5.
-MIN_VISIBLE = 0.15  # share of the object
+MIN_VISIBLE = 0.15  # minimum visible fraction of an object
 MIN_POINTS = 5
 
 

@@ -19,7 +19,7 @@ from lidar_perception.simulation.shapes.vehicles import make_car, make_van
 from lidar_perception.simulation.terrain import PAVEMENT, Ground
 from lidar_perception.simulation.trajectory import DRIVE_SECONDS, ROBOT_RADIUS_M, Trajectory, draw_trajectory
 
-SHOULDER_M = 0.6  # from a path to benches and lamps
+SHOULDER_M = 0.6  # distance from a path to benches and lamps
 
 
 @dataclass(frozen=True)
@@ -30,23 +30,23 @@ class CampusKind:
     court is laid out around the trajectory of the robot.
     """
 
-    share: float  # of the scenes
-    left: tuple[float, float]  # from the trajectory to what lines the court
+    share: float  # fraction of scenes of this kind
+    left: tuple[float, float]  # distance from the trajectory to the left edge of the court
     right: tuple[float, float]
-    fronts: dict[str, float]  # weights of these, see FRONTS and CAMPUS_FRONTS
-    turn: float  # largest heading of the robot to both sides, rad
-    lane: float = 0.0  # chance of a lane for cars to the right
-    path: bool = False  # a path through grass
-    things: float = 0.5  # on 100 square metres
-    edge: float = 18.0  # things along the edges, on 100 m
-    seats: float = 5.0  # benches along the edges, on 100 m
-    racks: float = 1.5  # rows of bicycles along the edges, on 100 m
-    along: float = 0.0  # groups who walk along x, on 100 m
-    across: float = 0.0  # groups who walk anywhere, on 100 square metres
-    standers: float = 8.0  # groups who stand, on 100 m
-    riders: float = 3.0  # cyclists on 100 m
-    ends: tuple[float, float] = (25.0, 60.0)  # of the court behind and ahead of the trajectory
-    stands: float = 0.15  # chance that the robot stands
+    fronts: dict[str, float]  # weights of the kinds of edge, see FRONTS and CAMPUS_FRONTS
+    turn: float  # maximum heading of the robot to either side, rad
+    lane: float = 0.0  # probability of a car lane on the right
+    path: bool = False  # True for a path through grass
+    things: float = 0.5  # objects per 100 square metres
+    edge: float = 18.0  # objects along the edges, per 100 m
+    seats: float = 5.0  # benches along the edges, per 100 m
+    racks: float = 1.5  # bicycle racks along the edges, per 100 m
+    along: float = 0.0  # groups walking along x, per 100 m
+    across: float = 0.0  # groups walking in any direction, per 100 square metres
+    standers: float = 8.0  # standing groups, per 100 m
+    riders: float = 3.0  # cyclists per 100 m
+    ends: tuple[float, float] = (25.0, 60.0)  # length of the court behind and ahead of the trajectory
+    stands: float = 0.15  # probability that the robot stands still
     speed: tuple[float, float] = (0.5, 1.5)
 
 

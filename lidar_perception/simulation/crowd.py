@@ -12,10 +12,10 @@ from lidar_perception.simulation.shapes import furniture
 from lidar_perception.simulation.shapes.people import CARRIED, make_pedestrian, make_sitting_person, make_wheelchair
 from lidar_perception.simulation.shapes.thing import Thing
 
-# Chances of groups of 1, 2, ... people.
+# Probabilities of groups of 1, 2, ... people.
 STANDING_CHANCES, WALKING_CHANCES = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)
-BUSYNESS = 0.3, 1.0, 1.0, 2.5  # factors for the number of people in a place
-WHEELCHAIR_SHARE = 0.06  # wheelchairs per group that walks or stands
+BUSYNESS = 0.3, 1.0, 1.0, 2.5  # possible factors for the number of people in a scene
+WHEELCHAIR_SHARE = 0.06  # wheelchairs per walking or standing group
 
 
 def make_person(rng, speed: float = 0.0) -> Thing:

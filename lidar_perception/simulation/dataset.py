@@ -24,7 +24,7 @@ from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.types import InputError
 
 LAYOUTS = ("kitti", "kitti-tracking", "semantickitti")
-FOLDERS = ("training", "sequences")  # that one of them has in it
+FOLDERS = ("training", "sequences")  # folder names, one of which exists in a data set
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def write_frame(folder: Path, plan: DatasetPlan, number: int) -> int:
     """
     sequence, moment = divmod(number, plan.streets_of)
     scan = simulate_scan(plan.seed + sequence, moment, plan.sensor, plan.scenes)
-    order = np.argsort(scan.ring, kind="stable")  # as in KITTI's files, beam by beam
+    order = np.argsort(scan.ring, kind="stable")  # beam by beam, as in KITTI's files
     cloud = scan.frame.points()[order]
     if plan.layout == "semantickitti":
         shares = _write_semantickitti(folder, plan, sequence, moment, scan, cloud, order)

@@ -79,7 +79,7 @@ def simulate_drive(
 
 def simulate_scan(seed: int, i: int, sensor: Sensor, scenes: Scenes = ALL_STREETS) -> SimulatedScan:
     """Simulate scan i of the drive through the scene of a seed, independently of other scans."""
-    # Wandering beams also differ between scenes, of which there may be only one scan each.
+    # The wander of the beams also differs between scenes, which may have only one scan each.
     scene, sensor = _make_cached_scene(seed, scenes), sensor.at_turn(seed + i)
     moment = scene.at(i / sensor.rate, sensor.height)
     hits = cast_rays(

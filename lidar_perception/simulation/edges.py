@@ -16,7 +16,7 @@ from numba import njit
 
 from lidar_perception.simulation.hashing import hash_uniform
 
-OUTLIER = 1  # SemanticKITTI class of returns that are from no surface
+OUTLIER = 1  # SemanticKITTI class of returns that do not come from a surface
 
 
 class RayHit(NamedTuple):
@@ -68,7 +68,7 @@ def merge_hits(one, other, pulse, key):
     """Merge the hits of the two rays of a beam."""
     if one.solid == other.solid:
         return one
-    share = hash_uniform(5, key)  # of the energy on the other hit
+    share = hash_uniform(5, key)  # fraction of the energy on the other hit
     first, second = one.brightness * (1 - share), other.brightness * share
     if one.range < np.inf and other.range < np.inf and abs(one.range - other.range) < pulse:
         return RayHit(
@@ -79,7 +79,7 @@ def merge_hits(one, other, pulse, key):
             one.semantic if one.semantic == other.semantic else OUTLIER,
             other.solid if share > 0.5 else one.solid,
         )
-    # An empty ray has no power: 0 / inf.
+    # For a ray without a hit the power is 0 / inf = 0.
     if second / other.range**2 > first / one.range**2:
         return RayHit(other.range, second, other.cosine, other.owner, other.semantic, other.solid)
     return RayHit(one.range, first, one.cosine, one.owner, one.semantic, one.solid)

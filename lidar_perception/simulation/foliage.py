@@ -9,7 +9,7 @@ from numba import njit
 
 from lidar_perception.simulation.hashing import hash_uniform, mix_bits
 
-# Width of cells, and the share of them that holds all leaves. With leaves everywhere a crown would
+# Width of cells, and the fraction of them that holds all leaves. With leaves everywhere a crown would
 # be one cluster for DBSCAN; KITTI's crowns fall into many. A beam that hits no leaf within
 # MAX_STEPS passes.
 CELL_M, LEAF_SHARE, MAX_STEPS = 0.5, 0.25, 12

@@ -16,8 +16,8 @@ from lidar_perception.simulation.shapes.people import make_sitting_person
 from lidar_perception.simulation.terrain import PAVEMENT, Ground
 from lidar_perception.simulation.trajectory import DRIVE_SECONDS, ROBOT_RADIUS_M, Trajectory, draw_trajectory
 
-WINDOW_VIEW_M = 4.0  # from windows to the plants outside
-SEAT_WIDTH_M = 0.65  # of a table, per person
+WINDOW_VIEW_M = 4.0  # distance from windows to the plants outside
+SEAT_WIDTH_M = 0.65  # width of a table per person
 
 
 @dataclass(frozen=True)
@@ -28,20 +28,20 @@ class IndoorKind:
     walls are laid out around the trajectory of the robot.
     """
 
-    share: float  # of the scenes
-    wide: tuple[float, float]  # from the trajectory to the side walls
-    ends: tuple[float, float]  # and to the walls behind and ahead
+    share: float  # fraction of scenes of this kind
+    wide: tuple[float, float]  # distance from the trajectory to the side walls
+    ends: tuple[float, float]  # distance to the walls behind and ahead
     height: tuple[float, float]
-    walls: dict[str, float]  # weights of their pieces, see WALLS
-    fill: tuple[str, ...]  # furniture, see FILLS
-    turn: float  # largest heading of the robot to both sides, rad
-    outer: float = 0.0  # chance that a side is all windows
-    at_walls: float = 12.0  # things on 100 m
-    things: float = 0.3  # things on 100 square metres
-    along: float = 0.0  # groups who walk along x, on 100 m
-    across: float = 0.0  # groups who walk anywhere, on 100 square metres
-    standers: float = 5.0  # groups who stand, on 100 m
-    stands: float = 0.15  # chance that the robot stands
+    walls: dict[str, float]  # weights of the kinds of wall segments, see WALLS
+    fill: tuple[str, ...]  # kinds of furniture, see FILLS
+    turn: float  # maximum heading of the robot to either side, rad
+    outer: float = 0.0  # probability that a side consists of windows only
+    at_walls: float = 12.0  # objects along the walls, per 100 m
+    things: float = 0.3  # objects per 100 square metres
+    along: float = 0.0  # groups walking along x, per 100 m
+    across: float = 0.0  # groups walking in any direction, per 100 square metres
+    standers: float = 5.0  # standing groups, per 100 m
+    stands: float = 0.15  # probability that the robot stands still
     speed: tuple[float, float] = (0.5, 1.5)
 
 
@@ -98,7 +98,7 @@ INDOOR_KINDS = {
         things=0.5,
     ),
 }
-WALLS = {  # maker, and smallest and largest length
+WALLS = {  # kind -> (function, minimum length, maximum length)
     "wall": (interiors.make_wall, 1.0, 7.0),
     "door": (interiors.make_door, 1.2, 1.7),
     "glazing": (interiors.make_glazing, 2.0, 6.0),
@@ -130,7 +130,7 @@ def make_interior(
         made = THINGS[rng.integers(len(THINGS))](rng)
         actors.admit(Actor(make_prop(made), x, y, rng.uniform(-np.pi, np.pi)), gap=0.3)
     crowd.fill_court(rng, actors, court, people, kind.along, kind.across, kind.standers)
-    # Last, since it blocks nobody.
+    # Placed last because it does not block people.
     lid = court.inner(-interiors.WALL_THICKNESS_M)
     ceiling = interiors.make_ceiling(rng, lid.x1 - lid.x0, lid.y1 - lid.y0, height)
     actors.add(Actor(make_prop(ceiling), *court.centre))

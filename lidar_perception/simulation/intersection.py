@@ -102,7 +102,7 @@ def intersect_shape(kind, start, way):
             enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
     if kind != BOX:
         (x, y, z), (u, v, w) = start, way
-        if kind == CYLINDER:  # from the axis, not from the centre
+        if kind == CYLINDER:  # distance from the axis, not from the centre
             z, w = 0.0, 0.0
         square = u * u + v * v + w * w
         middle = -(x * u + y * v + z * w) / square

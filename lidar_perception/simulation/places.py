@@ -106,5 +106,5 @@ def space_evenly(rng, length: float, spacing: float) -> np.ndarray:
 
 
 def scatter(rng, length: float, rate: float) -> np.ndarray:
-    """Return independent positions along a length, rate per 100 m in the mean."""
+    """Return independent positions along a length, on average `rate` per 100 m."""
     return rng.uniform(0, length, rng.poisson(max(length, 0.0) * rate / 100))

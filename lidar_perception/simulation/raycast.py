@@ -174,7 +174,7 @@ def _way(turn, column, ring):
 @njit(cache=True, nogil=True)
 def _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, counting):
     columns, rings = only.shape
-    latest = np.zeros((columns, rings), np.int32)  # last owner that a ray hit
+    latest = np.zeros((columns, rings), np.int32)  # last owner hit by each ray
     for s in order:
         owner, near = shapes.owner[s], seen.near[s]
         counts = counting and owner > 0

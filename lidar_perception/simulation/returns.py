@@ -16,7 +16,7 @@ from lidar_perception.simulation.solids import RETROREFLECTOR
 # Lost returns are adjacent: on a SemanticKITTI scan only 0.03 of the road's returns beyond 35 m are
 # missing singly.
 GRAZING_EXPONENT = 1 / 3
-POWER_SCATTER, SCATTER_COLUMNS = 0.5, 16  # standard deviation; columns of a run
+POWER_SCATTER, SCATTER_COLUMNS = 0.5, 16  # standard deviation of the power; columns with the same value
 # Neighbouring points of one beam differ as much on the road, sidewalks (0.03) and facades (0.04) of
 # a SemanticKITTI scan (robust standard deviation).
 INTENSITY_NOISE = 0.035
@@ -61,7 +61,7 @@ def make_returns(
     noisy = hits.range + rng.normal(0.0, sensor.range_noise, shape)
     if sensor.offsets:
         noisy += np.asarray(sensor.offsets)
-    with np.errstate(divide="ignore", invalid="ignore"):  # no range over infinite reach: NaN
+    with np.errstate(divide="ignore", invalid="ignore"):  # NaN for rays without a hit and an infinite reach
         power = (
             np.log(hits.brightness / 0.1)
             + GRAZING_EXPONENT * np.log(hits.cosine)

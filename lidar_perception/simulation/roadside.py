@@ -13,7 +13,7 @@ from lidar_perception.simulation.shapes.buildings import make_building
 from lidar_perception.simulation.solids import compute_extents
 from lidar_perception.simulation.street import CORNER_WALK_M, Street, StreetKind
 
-PLANT_CLASSES = {70, 71}  # of SemanticKITTI
+PLANT_CLASSES = {70, 71}  # SemanticKITTI classes of plants
 BORDERS = (*[vegetation.make_hedge] * 3, *[furniture.make_fence] * 2, furniture.make_wall)
 # Bushes and trees per 100 m, and the depth of their strip in m: a wood, a hedgerow, fields.
 WILD_FRONTS = ((110, 60, 4.0), (130, 12, 1.2), (8, 3, 15.0))
@@ -170,7 +170,7 @@ def _place_furniture(rng, side: Side, kind: StreetKind) -> Iterator[Actor]:
     for along in scatter(rng, side.length, 2.2 * kind.clutter):
         made = make_clutter(rng, rural)
         low, high = compute_extents(made)
-        wide = np.abs([low[:, :2], high[:, :2]]).max()  # at any angle it stays off the road
+        wide = np.abs([low[:, :2], high[:, :2]]).max()  # half width that stays off the road at any rotation
         at_wall = not rural and rng.random() < 0.35
         out = side.walk - wide if at_wall else edge + wide + rng.uniform(0, 0.15)
         turn = rng.choice([0.0, np.pi / 2, np.pi, -np.pi / 2]) + rng.normal(0, 0.1)

@@ -25,8 +25,8 @@ from lidar_perception.simulation.traffic import populate
 from lidar_perception.simulation.trajectory import DRIVE_SECONDS, Trajectory
 from lidar_perception.types import CLASSES, InputError, did_you_mean
 
-MAX_PEOPLE = 100  # times the usual number; making a street then takes 3 s
-EGO_HALF_SIZE_M = (3.0, 1.1)  # half length and half width that the ego vehicle keeps clear
+MAX_PEOPLE = 100  # maximum factor for the number of people; creating a street then takes 3 s
+EGO_HALF_SIZE_M = (3.0, 1.1)  # half length and half width of the area kept clear for the ego vehicle
 
 
 class Scenes(NamedTuple):

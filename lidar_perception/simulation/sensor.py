@@ -14,13 +14,13 @@ import yaml
 from lidar_perception.runs.files import read_text, shorten_error
 from lidar_perception.types import SENSOR_HEIGHT, InputError, did_you_mean
 
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, if available
-MAX_BYTES = 1 << 20  # of a sensor file
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster where available
+MAX_BYTES = 1 << 20  # maximum size of a sensor file
 GOLDEN_RATIO = 0.6180339887498949
-MAX_RATE = 1000.0  # turns a second
-MAX_NOISE = 1.0  # metres
-MAX_BEAMS = 1 << 16  # rings are uint16
-MAX_RAYS = 5_000_000  # in a turn; the densest sensors have 0.5 million. Each takes some 100 bytes
+MAX_RATE = 1000.0  # in revolutions per second
+MAX_NOISE = 1.0  # in metres
+MAX_BEAMS = 1 << 16  # limited by the uint16 ring column
+MAX_RAYS = 5_000_000  # per revolution, about 100 bytes each; the densest sensors have 0.5 million
 
 
 @dataclass(frozen=True)
@@ -33,26 +33,26 @@ class Sensor:
     """
 
     elevations: tuple[float, ...]  # one per beam, descending; ring 0 is the highest
-    azimuth_step: float  # between firings; rounded to a whole number in a turn
-    height: float = SENSOR_HEIGHT  # above the road
+    azimuth_step: float  # angle between firings; rounded to divide a revolution evenly
+    height: float = SENSOR_HEIGHT  # height above the road
     min_range: float = 0.9
     max_range: float = 120.0
-    range_noise: float = 0.02  # standard deviation
-    rate: float = 10.0  # turns per second
-    reach: float = 50.0  # where half of the returns of brightness 0.1 are lost
-    silent: float = 0.0  # share of returns whose intensity is 0
-    floor: float = 0.0  # intensities below this are 0
-    dropout: float = 0.005  # share of the returns lost at random
+    range_noise: float = 0.02  # standard deviation of the range
+    rate: float = 10.0  # revolutions per second
+    reach: float = 50.0  # range at which half of the returns of brightness 0.1 are lost
+    silent: float = 0.0  # fraction of returns with intensity 0
+    floor: float = 0.0  # intensities below this value become 0
+    dropout: float = 0.005  # fraction of returns lost at random
     divergence: float = 2e-3  # full angle of a beam
-    pulse: float = 0.75  # two surfaces closer than this give one return between them
-    lifts: tuple[float, ...] = ()  # where each beam starts on the z axis; empty: all at 0
-    offsets: tuple[float, ...] = ()  # what each beam adds to the range; empty: nothing
-    biases: tuple[float, ...] = ()  # what each beam adds to the intensity; empty: nothing
-    fade: tuple[float, float] = (0.0, 0.0)  # range, and loss of intensity per metre beyond it
-    blocked: tuple[tuple[float, float, float], ...] = ()  # by the vehicle: (first ring, from, to),
-    #                                for it and all lower rings, degrees counter-clockwise; 0 to 360
+    pulse: float = 0.75  # pulse length: two surfaces closer than this give one return between them
+    lifts: tuple[float, ...] = ()  # origin of each beam on the z axis; empty: all 0
+    offsets: tuple[float, ...] = ()  # range offset of each beam; empty: all 0
+    biases: tuple[float, ...] = ()  # intensity offset of each beam; empty: all 0
+    fade: tuple[float, float] = (0.0, 0.0)  # (range, loss of intensity per metre beyond it)
+    blocked: tuple[tuple[float, float, float], ...] = ()  # sectors blocked by the vehicle: (first ring, from, to),
+    #                                for that ring and all lower ones, degrees counter-clockwise; 0 to 360
     #                                is all around
-    wander: float = 0.0  # beams are lower by up to this, differently in every turn
+    wander: float = 0.0  # max downward shift of the beams, different in every revolution
 
     def __post_init__(self) -> None:
         up = np.asarray(self.elevations, np.float64)
@@ -199,7 +199,7 @@ def make_rays(sensor: Sensor, motion: Motion = NO_MOTION) -> Rays:
     since = sensor.times() - motion.stamp / sensor.rate
     moved = since[:, None] * np.asarray(motion.velocity, np.float64)
     direction = sensor.directions()
-    if motion.yaw_rate:  # beams start on the z axis, so only their directions turn
+    if motion.yaw_rate:  # beams start on the z axis, so only their directions rotate
         turned = motion.yaw_rate * since[:, None]
         cos, sin = np.cos(turned), np.sin(turned)
         x, y = direction[..., 0].copy(), direction[..., 1].copy()
@@ -218,7 +218,7 @@ def make_generic_sensor(
     Raises:
         InputError: A value is impossible.
     """
-    if beams > MAX_BEAMS:  # before the list is made
+    if beams > MAX_BEAMS:  # checked before the list is created
         raise InputError(f"impossible sensor: {beams} beams must be {MAX_BEAMS} at most")
     if beams > 1 and not lowest < highest:
         raise InputError(f"impossible sensor: lowest {lowest} must be below highest {highest}")
@@ -267,7 +267,7 @@ FIELD_SHAPES = {
     "biases": (0,),
     "fade": (2,),
     "blocked": (0, 3),
-}  # of fields that are lists; 0: any length
+}  # list field -> length of its items, 0 for any length
 DEGREE_FIELDS = ("elevations", "azimuth_step", "divergence", "wander")
 
 
@@ -309,7 +309,7 @@ def _normalize_name(name: str) -> str:
 
 PRESET_FILES = {
     _normalize_name(path.stem): path for path in sorted((Path(__file__).parent / "sensors").glob("*.yaml"))
-}  # files of the package
+}  # presets in files of the package
 
 
 @cache
@@ -318,7 +318,7 @@ def _load_preset(key: str) -> Sensor:
 
 
 HDL64E = _load_preset("hdl64e")
-SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E}  # and those of PRESET_FILES
+SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E}  # presets; those of PRESET_FILES are loaded on demand
 SENSOR_NAMES = tuple(path.stem for path in PRESET_FILES.values())
 GENERIC_FORMAT = "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE (degrees, turns a second)"
 

@@ -9,16 +9,16 @@ from typing import TypedDict
 import numpy as np
 from numba import njit
 
-BOX, ELLIPSOID, CYLINDER = 0, 1, 2  # a cylinder stands along its z axis
+BOX, ELLIPSOID, CYLINDER = 0, 1, 2  # kinds of solids; a cylinder's axis is z
 
-# One part of a thing, in the thing's frame: x forward, y left, z up from the ground below its
+# One part of an object, in the object's frame: x forward, y left, z up from the ground below its
 # origin; metres, radians.
-# half: half sizes along the part's axes, which are turned by pitch about y (positive: nose down),
+# half: half sizes along the part's axes, which are rotated by pitch about y (positive: nose down),
 # then by yaw about z.
 # semantic: SemanticKITTI class.
 # reflectance: 0..1; a RETROREFLECTOR is equally bright from all directions and does not fade.
-# density: 1/m; inf is solid; a beam passes through foliage for 1 / density metres in the mean.
-# transmission: share of the beams that pass, as through glass.
+# density: 1/m; inf is solid; a beam penetrates foliage by 1 / density metres on average.
+# transmission: fraction of beams that pass, for example through glass.
 RETROREFLECTOR = 1.0
 PART = np.dtype(
     [

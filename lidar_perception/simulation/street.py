@@ -11,9 +11,9 @@ from lidar_perception.simulation.places import Side
 from lidar_perception.simulation.terrain import Ground
 
 BEHIND_M, AHEAD_M = 100.0, 130.0  # street behind the start and beyond the end of a drive
-CORNER_WALK_M = 2.5  # sidewalk along a side street, m
+CORNER_WALK_M = 2.5  # width of the sidewalk along a side street, m
 ARM_LENGTH_M = 60.0  # length of a side street, m
-# Widths of parking strips: cars along the curb, or nose to it.
+# Widths of parking strips for parallel and perpendicular parking.
 PARALLEL_STRIP_M, ACROSS_STRIP_M = 2.2, 5.0
 
 
@@ -25,26 +25,26 @@ class StreetKind:
     shares, chances and weights of fronts are 0 .. 1.
     """
 
-    share: float  # of the streets, a choice
-    fronts: dict[str, float]  # weights of what lines a side, see roadside.py
+    share: float  # fraction of streets of this kind, a free choice
+    fronts: dict[str, float]  # weights of the kinds of roadside, see roadside.py
     lane: tuple[float, float] = (3.0, 3.5)
-    extra_lanes: tuple[int, int] = (0, 1)  # how many more lanes in our direction, high excluded
+    extra_lanes: tuple[int, int] = (0, 1)  # number of additional lanes in our direction, upper bound excluded
     oncoming: tuple[int, int] = (1, 2)
-    rails: float = 0.0  # chance of tram tracks
-    cycle: float = 0.0  # chance of a strip for bicycles
-    parking: float = 0.0  # chance of parking strips
-    across: float = 0.0  # chance that cars park nose to the curb
+    rails: float = 0.0  # probability of tram tracks
+    cycle: float = 0.0  # probability of a bicycle lane
+    parking: float = 0.0  # probability of parking strips
+    across: float = 0.0  # probability of perpendicular parking
     occupied: tuple[float, float] = (0.0, 0.6)
     walk: tuple[float, float] = (1.6, 3.0)
     curb: float = 0.12
-    crossing: tuple[float, float] = (50.0, 120.0)  # from one side street to the next
+    crossing: tuple[float, float] = (50.0, 120.0)  # distance from one side street to the next
     speed: tuple[float, float] = (3.0, 13.0)
-    stands: float = 0.15  # chance that a lane stands
-    headway: float = 5.0  # mean time between vehicles of a lane, s, beyond the least
-    lamp: float = 3.0  # rates for each side
+    stands: float = 0.15  # probability that the traffic of a lane stands still
+    headway: float = 5.0  # mean time between vehicles of a lane beyond the minimum, s
+    lamp: float = 3.0  # objects per 100 m on each side: lamps (tree, clutter: trees, small objects)
     tree: float = 4.0
     clutter: float = 4.0
-    islands: float = 0.3  # chance that a crossing has some between the directions
+    islands: float = 0.3  # probability that a crossing has islands between the directions
     walkers: float = 3.3
     standers: float = 0.12
     seats: float = 0.05
@@ -171,7 +171,7 @@ def draw_street(rng: np.random.Generator, kind: StreetKind, seconds: float) -> S
         parking = ACROSS_STRIP_M if rng.random() < kind.across else PARALLEL_STRIP_M
     lanes, right, left = _draw_lanes(rng, kind, speed, parking)
     walk, crossings = rng.uniform(*kind.walk), _draw_crossings(rng, kind, start, end)
-    # Slopes of 27 scans of KITTI: 0.67 +- 0.2 degrees ahead (the sensor's own pitch), +- 0.45
+    # Slopes in 27 scans of KITTI: 0.67 +- 0.2 degrees ahead (the sensor's own pitch), +- 0.45
     # aside. With these heights of grass and litter, cells of 1 m next to the road scatter about
     # their planes as on KITTI: 5 to 40 m away 3 to 5 cm at the upper quartile, 36 to 52 % of them
     # more than 1 cm (real: 42 to 49). Wave, camber and reflectances are guesses.

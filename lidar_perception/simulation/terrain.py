@@ -17,14 +17,14 @@ from numba import njit
 from lidar_perception.simulation.hashing import hash_uniform
 from lidar_perception.simulation.solids import RETROREFLECTOR
 
-ROAD, PARKING, SIDEWALK, GRASS = 40, 44, 48, 72  # SemanticKITTI
-GRAIN_M = 0.25  # m between the bumps of a rough surface
-PATCH = 10  # bumps from one rough patch to the next
-BARE_SHARE = 0.45  # approximate share of the ground between the patches
-PATCH_STEEPNESS = 3.0  # of the edges of patches
-BARE_HEIGHT_SHARE = 0.1  # height of bumps between the patches, as a share of that in patches
-ROAD_HEIGHT_SHARE = 0.06  # height of bumps on the road, in the same way
-MAX_TUFT_DISTANCE_M, TUFT_STEPS = 6.0, 8  # length of a grazing ray that is searched for tufts
+ROAD, PARKING, SIDEWALK, GRASS = 40, 44, 48, 72  # SemanticKITTI classes
+GRAIN_M = 0.25  # distance between the bumps of a rough surface, m
+PATCH = 10  # distance between rough patches, in bumps
+BARE_SHARE = 0.45  # approximate fraction of the ground between the patches
+PATCH_STEEPNESS = 3.0  # steepness of the edges of patches
+BARE_HEIGHT_SHARE = 0.1  # height of bumps between the patches, as a fraction of that in patches
+ROAD_HEIGHT_SHARE = 0.06  # height of bumps on the road, as a fraction of that in patches
+MAX_TUFT_DISTANCE_M, TUFT_STEPS = 6.0, 8  # length of a grazing ray to search for tufts, and number of steps
 
 
 class Ground(NamedTuple):
@@ -38,21 +38,21 @@ class Ground(NamedTuple):
     slope_y: float = 0.0
     wave: float = 0.0
     wavelength: float = 25.0
-    camber: float = 0.0  # fall per metre from the centre line to both curbs
+    camber: float = 0.0  # slope down from the centre line to both curbs
     curb_left: float = 1e9  # y of the curbs
     curb_right: float = -1e9
     curb_height: float = 0.0
     walk: float = 1e9  # width of the sidewalk beyond each curb; grass beyond
     crossings: tuple[tuple[float, float], ...] = ()  # x intervals of side streets, without a curb
     parking: float = 0.0  # width of the parking strip inside each curb
-    rough: float = 0.0  # greatest height of tufts; ROAD_HEIGHT_SHARE of it on the road
-    litter: float = 0.0  # greatest height of bumps on sidewalks and parking strips
+    rough: float = 0.0  # maximum height of tufts; ROAD_HEIGHT_SHARE of it on the road
+    litter: float = 0.0  # maximum height of bumps on sidewalks and parking strips
     road: float = 0.3  # reflectances
     sidewalk: float = 0.4
     grass: float = 0.35
 
 
-PAVEMENT = Ground(curb_left=-1e6, curb_right=-1e6 - 1)  # level, all of it sidewalk
+PAVEMENT = Ground(curb_left=-1e6, curb_right=-1e6 - 1)  # level ground that is all sidewalk
 
 
 class GroundHit(NamedTuple):
@@ -115,7 +115,7 @@ def cast_ground(ground, start, way, max_range):
         t, edge = _intersect_raised(ground, start, way, t, max_range)
     if not t <= max_range:
         return nothing
-    cosine = edge  # at a curb, if one is hit
+    cosine = edge  # replaced if the ray hits a curb
     if not edge:
         _, slope_x, slope_y = _relief(ground, start[0] + t * way[0], start[1] + t * way[1])
         cosine = min(max(slope_x * way[0] + slope_y * way[1] - way[2], 1e-3), 1.0)
@@ -137,7 +137,7 @@ def min_ground_range(ground, start, way):
     if closing <= 1e-3:
         return np.inf
     height = start[2] - ground.slope_x * start[0] - ground.slope_y * start[1] - abs(ground.wave)
-    height -= ground.curb_height + 0.01  # Newton's method stops nearer to the relief
+    height -= ground.curb_height + 0.01  # margin for the residual error of Newton's method
     tall = max(ground.rough, ground.litter)
     return max((height - tall) / closing, height / closing - MAX_TUFT_DISTANCE_M)
 

@@ -17,10 +17,10 @@ from lidar_perception.simulation.shapes.vehicles import make_car, make_van
 from lidar_perception.simulation.solids import parts
 from lidar_perception.simulation.street import CORNER_WALK_M, PARALLEL_STRIP_M, Lane, Street, parking_width
 
-DRAWBAR_M = 0.8  # between a car and its trailer
-FREE_CORNER_M = 5.0  # without parked vehicles, at a crossing
+DRAWBAR_M = 0.8  # gap between a car and its trailer
+FREE_CORNER_M = 5.0  # distance to a crossing without parked vehicles
 OTHER_VEHICLE = 20  # SemanticKITTI class
-MOTORCYCLIST_SHARE = 0.3  # of the riders at the edges of the road
+MOTORCYCLIST_SHARE = 0.3  # fraction of motorcyclists among the riders at the edges of the road
 
 
 def populate(rng: np.random.Generator, street: Street, actors: ActorSet, people: float) -> None:

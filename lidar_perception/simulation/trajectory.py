@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-DRIVE_SECONDS = 20.0  # during which nothing collides
-ROBOT_RADIUS_M = 0.35  # of a robot off the road
+DRIVE_SECONDS = 20.0  # time during which nothing collides
+ROBOT_RADIUS_M = 0.35  # radius of a robot off the road
 
 
 class TrajectoryPoint(NamedTuple):
@@ -59,7 +59,7 @@ def draw_trajectory(rng: np.random.Generator, speed: tuple[float, float], stands
     if rng.random() < stands:
         return Trajectory()
     pace, long = rng.uniform(*speed), 2 * np.pi / rng.uniform((8.0, 15.0), (15.0, 25.0))
-    # One sway turns atan(reach * rate / speed) at most; two share the angle.
+    # One sinusoid turns by at most atan(reach * rate / speed); two share the angle.
     reach = 0.5 * pace * np.tan(turn * rng.uniform(0.3, 1.0, 2)) / long
     phase = rng.uniform(-np.pi, np.pi, 2)
     return Trajectory(float(pace), tuple(zip(reach.tolist(), long.tolist(), phase.tolist())))

@@ -90,7 +90,7 @@ def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION, mar
 def _fill_windows(found, grid, kind, centre, half, axes, relative):
     corners, facing, reach = np.empty((16, 3)), np.empty((3, 3)), np.empty(3)
     for p in range(len(kind)):
-        # The time of the whole turn gives a window, which gives the time when the sensor faces it.
+        # The time of the full revolution gives a window, which gives the time when the sensor faces it.
         begin, end = (grid.begin, grid.end) if grid.moves else (0.0, 0.0)
         for _ in range(3 if grid.moves else 1):
             ahead = _find_direction(centre[p], relative[p], (begin + end) / 2)

@@ -15,7 +15,7 @@ from msg_utils.markers import from_marker_array
 
 __tracebackhide__ = True  # so that pytest shows the line in the test
 
-MAX_LISTED = 20  # missing and extra objects that are listed, each
+MAX_LISTED = 20  # maximum number of missing and of extra objects to list
 
 
 class Objects(NamedTuple):

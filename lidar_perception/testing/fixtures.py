@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 NEEDS_ROS = "needs ROS 2, or the extra [ros]"
-FRAMES = 8  # of drive_bag
+FRAMES = 8  # number of frames of drive_bag
 
 
 @pytest.fixture(scope="session")

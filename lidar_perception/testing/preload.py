@@ -8,7 +8,7 @@ from lidar_perception.runs.threads import default_to_one_thread
 
 default_to_one_thread()  # as nodes.main does
 for name in NODES:
-    with suppress(ImportError):  # the node reports it when it starts
+    with suppress(ImportError):  # reported by the node when it starts
         load_node_class(name)
 for module in ("nodes.stopping", "detectors.open"):
     with suppress(ImportError):

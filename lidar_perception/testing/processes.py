@@ -12,7 +12,7 @@ from lidar_perception.param_fields import flatten
 from lidar_perception.testing.forking import ForkedNode
 from lidar_perception.wire.topics import POINTS
 
-MAX_LOG_LINES = 60  # of each log in the report of a failed test
+MAX_LOG_LINES = 60  # maximum lines of each log in the report of a failed test
 
 
 class NodesUnderTest(Processes):
@@ -22,7 +22,7 @@ class NodesUnderTest(Processes):
     True: then each is a new interpreter, as in production, and takes seconds to start.
     """
 
-    active: list[NodesUnderTest] = []  # of all tests
+    active: list[NodesUnderTest] = []  # nodes of all tests that are running
     fresh = False
 
     def __enter__(self) -> NodesUnderTest:

@@ -16,14 +16,14 @@ from scipy.spatial.transform import Rotation
 from lidar_perception.data.frame import Frame
 from lidar_perception.types import InputError
 
-MAX_SPEED = 100.0  # m/s; a faster pose change is a jump
-MAX_ROTATION_ERROR = 1e-2  # largest element of R R^T - I in a valid pose
-SOURCES = ("recording", "odometry", "tf", "kiss_icp")  # of poses, best first
+MAX_SPEED = 100.0  # in m/s; a faster pose change is a jump
+MAX_ROTATION_ERROR = 1e-2  # maximum element of R R^T - I in a valid pose
+SOURCES = ("recording", "odometry", "tf", "kiss_icp")  # sources of poses, best first
 NO_SOURCE = "none"
-# Cell sizes of KISS-ICP's downsampling, in map voxels, and the points needed to register coarsely
+# Cell sizes of KISS-ICP's downsampling, in map voxels, and the minimum points for coarse registration
 MAP_CELL, FINE_CELL, COARSE_CELL = 0.5, 1.5, 3.0
 MIN_COARSE_POINTS = 300
-CONVERGENCE = 1e-3  # m and rad; KISS-ICP stops at a smaller step
+CONVERGENCE = 1e-3  # in m and rad; KISS-ICP stops at a smaller step
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class Odometry:
         config.registration.convergence_criterion = CONVERGENCE
 
         def voxelize(scan: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            # points to register, and points for the map
+            # points for registration, and points for the map
             mapped = voxel_down_sample(scan, MAP_CELL * voxel)
             coarse = voxel_down_sample(mapped, COARSE_CELL * voxel)
             if len(coarse) >= MIN_COARSE_POINTS:

@@ -15,7 +15,7 @@ from lidar_perception.geometry import wrap_angle, wrap_line
 X, Y, VX, VY, HEADING, TURN = range(6)
 MEASURED = np.array([X, Y, HEADING])
 MIN_OPPOSING_SCORE = 1.0  # sum of scores of opposite measured headings that flips a heading
-MIN_TURN_RAD = 1e-4  # per step; a smaller turn uses the series of sin(a) / a
+MIN_TURN_RAD = 1e-4  # rotation per step below which the series of sin(a) / a is used
 
 
 def predict(

@@ -159,7 +159,7 @@ class TrackingParams(Params):
         return self.vehicle, self.pedestrian, self.cyclist
 
 
-EGO_SOURCES = ("auto", "odometry", "tf", "kiss_icp", "none")  # choices of a node
+EGO_SOURCES = ("auto", "odometry", "tf", "kiss_icp", "none")  # choices for a node
 RECORDED_EGO = ("auto", "recording", "kiss_icp", "none")  # choices for a recording
 
 

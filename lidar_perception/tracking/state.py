@@ -112,7 +112,7 @@ class Tracks:
         The layout is that of geometry_msgs/PoseWithCovariance; roll and pitch have none.
         """
         result = np.zeros((len(self), 6, 6))
-        rows, source = np.array([0, 1, 5]), np.array([0, 1, 4])  # x, y, yaw
+        rows, source = np.array([0, 1, 5]), np.array([0, 1, 4])  # rows of x, y and yaw
         result[:, rows[:, None], rows] = self.covariances[:, source[:, None], source]
         result[:, 2, 2] = self.height_variances
         return result

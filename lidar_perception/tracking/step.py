@@ -17,14 +17,14 @@ from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams
 from lidar_perception.tracking.state import States
 from lidar_perception.types import CLASSES, PEDESTRIAN
 
-HEIGHT_NOISE = 0.2  # m, standard deviation of a measured z
-HEIGHT_DRIFT = 0.3  # m/s^0.5, noise density of the z of an object
-MAX_SIZE_WEIGHT = 20.0  # sum of scores
+HEIGHT_NOISE = 0.2  # standard deviation of a measured z, m
+HEIGHT_DRIFT = 0.3  # process noise density of an object's z, m/s^0.5
+MAX_SIZE_WEIGHT = 20.0  # maximum sum of scores for the size
 CLASS_LEAD = 0.5  # lead in evidence at which a track changes its class
-HIT_MEMORY = 20.0  # frames, time constant of hits and headings
+HIT_MEMORY = 20.0  # time constant of hits and headings, in frames
 DECAY = 1.0 - 1.0 / HIT_MEMORY
 KIND_IDS = np.array(KIND_OF_CLASS)
-MAX_REVERSE_SPEED = np.array([2.0, 0.3, 1.0])  # m/s by KIND_IDS; a faster object is not reversing
+MAX_REVERSE_SPEED = np.array([2.0, 0.3, 1.0])  # in m/s by KIND_IDS; a faster object is not reversing
 
 
 def predict(states: States, seconds: float, params: TrackingParams) -> States:

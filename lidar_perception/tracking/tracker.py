@@ -128,7 +128,7 @@ class Tracker:
         if seconds == 0:
             self.problem = "a frame has the same stamp as the previous one and is ignored"
             return None
-        restarted = late is not None and stamp > late  # such as a short bag that is looped
+        restarted = late is not None and stamp > late  # for example a short bag in a loop
         if seconds < 0 and -seconds <= self.params.max_gap and not restarted:
             self._stamp, self._late = last, stamp
             self.problem = f"a frame is {-seconds:.2f} s older than the previous one and is ignored"
@@ -197,7 +197,7 @@ def _to_sensor_frame(states: States, ego: Ego, seen: np.ndarray, params: Trackin
     )
     chosen, back = states.take(indices), np.linalg.inv(ego.pose)
     cos, sin = (back[:2, 0] / max(np.hypot(*back[:2, 0]), 1e-9)).tolist()
-    side = -1.0 if back[2, 2] < 0 else 1.0  # upside-down sensor
+    side = -1.0 if back[2, 2] < 0 else 1.0  # -1 for an upside-down sensor
     covariances = motion.rotate_covariances(chosen.covariances, cos, sin, side)
     velocities = chosen.means[:, 2:4] @ np.array([[cos, sin], [-side * sin, side * cos]])
     detections = Detections.of(transform_boxes(chosen.to_boxes(), back), chosen.class_ids, scores[indices])

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidar_perception.tracking.state import Tracks
 
-TRAIL_POINTS = 20  # per track
+TRAIL_POINTS = 20  # number of trail points per track
 
 
 class Trails:
@@ -31,7 +31,7 @@ class Trails:
             seconds: length of a trail.
         """
         length = int(seconds * 1e9)
-        oldest, min_gap = stamp_ns - length, length // (TRAIL_POINTS + 1)  # + 1: uneven frames
+        oldest, min_gap = stamp_ns - length, length // (TRAIL_POINTS + 1)  # + 1 allows for uneven frame times
         centres = tracks.detections.boxes[:, :3].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
         previous, self._trails = self._trails, {}
         for number, centre in zip(tracks.ids.tolist(), centres):
@@ -39,7 +39,7 @@ class Trails:
             while trail and trail[0][0] < oldest:
                 trail.popleft()
             if len(trail) > 1 and trail[-1][0] - trail[-2][0] < min_gap:
-                trail.pop()  # the last position, too soon after the previous one
+                trail.pop()  # drop the last position if it came too soon after the previous one
             trail.append((stamp_ns, centre))
             self._trails[number] = trail
         back = np.linalg.inv(pose)

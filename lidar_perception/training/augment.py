@@ -16,10 +16,10 @@ from lidar_perception.training.params import AugmentParams, IntensityParams, Noi
 from lidar_perception.training.pasting import MIN_RANGE_M, find_points_in_box
 from lidar_perception.types import SENSOR_HEIGHT
 
-BEAM_STEP = np.radians(0.4)  # elevation between two beams
+BEAM_STEP = np.radians(0.4)  # elevation step between two beams
 REFLECTOR_INTENSITY = 0.99
-FADE_RANGE_M = 15.0  # range at which a fading intensity does not change
-BOX_MARGIN_M = 0.01  # points this near to a box belong to it, since labels are rounded
+FADE_RANGE_M = 15.0  # range at which the intensity fade has no effect
+BOX_MARGIN_M = 0.01  # points this close to a box belong to it, because labels are rounded
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def load_or_make(
             with np.load(path) as file:
                 return read(file)
         except (OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile):
-            path.unlink(missing_ok=True)  # it is made below
+            path.unlink(missing_ok=True)  # recreated below
     content = make()
     if path is not None and (max_gb == np.inf or folder_size(path.parent) < max_gb * 1e9):
         try:

@@ -25,12 +25,12 @@ from lidar_perception.training.database import THING, Database
 from lidar_perception.training.pasting import find_points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, PointCloud
 
-# A thing resembles a standing person if
-MAX_WIDTH_M = 1.2  # its sides are at most this long,
-MIN_TOP_M, MAX_TOP_M = 0.6, 4.5  # its top is this high above the ground,
-MAX_GAP_M = 0.8  # its lowest point is this near to the ground,
-MIN_DISTANCE_M = 0.3  # and every labelled box is farther away.
-MAX_THINGS = 20  # from a scene
+# An object resembles a standing person under these conditions:
+MAX_WIDTH_M = 1.2  # maximum length of its sides
+MIN_TOP_M, MAX_TOP_M = 0.6, 4.5  # height of its top above the ground
+MAX_GAP_M = 0.8  # maximum height of its lowest point above the ground
+MIN_DISTANCE_M = 0.3  # minimum distance from every labelled box
+MAX_THINGS = 20  # maximum number of such objects from a scene
 
 
 @dataclass(frozen=True)

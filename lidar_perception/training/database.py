@@ -16,15 +16,15 @@ from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pasting import estimate_floor, paste_object
 from lidar_perception.types import InputError
 
-FLOOR_REACH_M = 3.0  # points this near, along both axes, show the ground under an object
-FLOOR_SHARE = 0.1  # of them are lower than the ground
-MAX_STEP_M = 1.0  # between the ground in both scenes
-BLOCKING_HEIGHTS_M = (0.63, 2.23)  # above the ground: not ground, and hides people
-SECTORS = 720  # of a turn
-MAX_DIRECTIONS = 64  # drawn for each object
-MAX_TRIES = 3  # objects tried for each missing one
-THING = -1  # class of background things, see cut_objects.py
-MAX_HIDDEN_SHARE = 0.3  # scene points in front of an object, as a share of its points
+FLOOR_REACH_M = 3.0  # points within this distance along both axes show the ground under an object
+FLOOR_SHARE = 0.1  # fraction of these points that are below the ground
+MAX_STEP_M = 1.0  # maximum difference in ground height between the two scenes
+BLOCKING_HEIGHTS_M = (0.63, 2.23)  # heights above the ground of points that can hide people
+SECTORS = 720  # sectors of a revolution
+MAX_DIRECTIONS = 64  # number of directions drawn for each object
+MAX_TRIES = 3  # maximum objects tried for each missing one
+THING = -1  # class of background objects, see cut_objects.py
+MAX_HIDDEN_SHARE = 0.3  # scene points in front of an object, as a fraction of its points
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def _paste(box, own, points, boxes, free, low, high, rng: np.random.Generator) -
     if bev_iou(enlarge_boxes(box[None]), enlarge_boxes(boxes)).any():
         return None
     step = estimate_floor(points, box, FLOOR_REACH_M, FLOOR_SHARE) - (box[2] - box[5] / 2)
-    if not abs(step) <= MAX_STEP_M:  # NaN: no ground
+    if not abs(step) <= MAX_STEP_M:  # NaN if there is no ground
         return None
     box[2] += step
     own[:, 2] += np.float32(step)

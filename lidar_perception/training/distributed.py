@@ -10,7 +10,7 @@ from datetime import timedelta
 import torch
 from torch import distributed
 
-TIMEOUT = timedelta(hours=2)  # the other processes wait this long while rank 0 validates
+TIMEOUT = timedelta(hours=2)  # time that the other processes wait while rank 0 validates
 
 
 @contextmanager

@@ -34,10 +34,10 @@ from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.training.sources import FIRST_FITTED_SCENE
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError
 
-MAX_CENTRE_DISTANCE_M = 0.5  # of a hit on a pedestrian or cyclist
-MIN_SAMPLES = 20  # correct proposals of a class, and as many wrong ones, to fit curves to
-MIN_PROBABILITY = 1e-6  # in the log loss
-# Of weights whose header names no sensor and scene.
+MAX_CENTRE_DISTANCE_M = 0.5  # maximum centre distance of a match with a pedestrian or cyclist
+MIN_SAMPLES = 20  # minimum number of correct and of wrong proposals of a class to fit its curves
+MIN_PROBABILITY = 1e-6  # probabilities are clipped at this value in the log loss
+# Defaults for weights whose header does not name the sensor and the scene.
 DEFAULT_SENSOR, DEFAULT_SCENE = "hdl64e", "street"
 
 
@@ -125,7 +125,7 @@ def fit_fusion(
     params = fill_from_header(params, header)
     sensor = find_sensor(params.sensor, params.mount_height or _find_trained_height(header))
     scenes = Scenes(None, params.people, params.scene)
-    scenes.scene_types()  # raises InputError for an unknown one
+    scenes.scene_types()  # raises InputError for an unknown scene type
     around = detector.range == "around"
     errors.print(
         f"{params.scans} {params.scene} scans of {params.sensor} at {sensor.height:g} m, "
@@ -204,7 +204,7 @@ def collect_samples(frame: Frame, proposals: Proposals, scan: int) -> Samples:
         for i, hit, similar_hit in zip(own, hits, _match_boxes(boxes, similar, name)):
             free = np.flatnonzero(hit & ~taken)
             if not len(free) and (hit.any() or similar_hit.any()):
-                continue  # on an object that is found already, or on a similar one
+                continue  # the object is already detected, or its class is only similar
             taken[free[:1]] = True
             kept.append(i)
             right.append(len(free) > 0)

@@ -45,7 +45,7 @@ class Table:
     def close(self) -> None:
         """Close the file."""
         if self.stream is not None:
-            with suppress(OSError):  # of a full disk, which add() has reported
+            with suppress(OSError):  # the disk is full, which add() has reported
                 self.stream.close()
 
 

@@ -30,9 +30,9 @@ from lidar_perception.training.run import Progress, Run, Task
 from lidar_perception.training.run_directory import RunDirectory
 from lidar_perception.types import InputError
 
-WARM_UP_S = 60.0  # until the duration of a step is known
-MEMORY_S = 600.0  # after which the duration of a step counts 1 / e in the mean
-SPARE_STEPS = 2  # whose time is kept free, as durations vary
+WARM_UP_S = 60.0  # time until the duration of a step is known
+MEMORY_S = 600.0  # time constant of the weights in the mean step duration
+SPARE_STEPS = 2  # safety margin of the time budget, in steps
 
 
 def train(
@@ -69,7 +69,7 @@ def train(
     run = Run(task, params, device)
     if path.exists():
         run.load(_read_state(path, run.settings()))
-    wait_for_all()  # until every process has read the file that rank 0 replaces
+    wait_for_all()  # wait until every process has read the file that rank 0 replaces
     log = Log(out, run.progress.step) if get_rank() == 0 else None
     begun = time.monotonic() - run.progress.seconds
     pace, warned = Pace(until, run.validate_steps, validation), False
@@ -85,7 +85,7 @@ def train(
                 run.progress.late = is_true_anywhere(pace.is_over(), device) and not run.done
                 due = run.is_validation_due() and (run.done or not is_true_anywhere(pace.is_over(2), device))
                 if due or (run.progress.late and run.progress.step > run.progress.validated):
-                    _save_state(path, run)  # as validation takes a while
+                    _save_state(path, run)  # saved first, because validation takes a while
                     with pace.time_validation(), pause_progress(bar):
                         _validate(run, log)
                     _save_state(path, run)
@@ -127,7 +127,7 @@ class Pace:
     def __init__(self, until: float, validate_steps: int, validation: float = 0.0):
         self.until, self.validate_steps, self.validation = until, validate_steps, validation
         self.begun = self.last_step = time.monotonic()
-        self.steps = self.seconds = 0.0  # weighted sums, in which earlier steps count less
+        self.steps = self.seconds = 0.0  # weighted sums in which earlier steps have less weight
 
     @property
     def step_duration(self) -> float:

@@ -10,7 +10,7 @@ from lidar_perception.param_fields import Params, flatten, param
 
 # A resumed run may change these.
 CHANGEABLE = ("log_steps", "save_steps", "max_skipped", "data.cache", "data.cache_gb")
-PAPER_SHARE = 751 / 7518  # of the frames, which paper B holds out
+PAPER_SHARE = 751 / 7518  # fraction of the frames that paper B holds out
 
 
 @dataclass(frozen=True)

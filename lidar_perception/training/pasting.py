@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-MIN_RANGE_M = 1e-3  # no point counts as nearer to the sensor
+MIN_RANGE_M = 1e-3  # lower limit of the range of a point
 MIN_FLOOR_POINTS = 5
 
 

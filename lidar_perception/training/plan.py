@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 
 from lidar_perception.types import InputError
 
-RESERVE_SHARE = 0.1  # of the budget, for everything that was not measured
-STARTUP_S = 20.0  # until the processes run
-MAX_PREPARATION_SHARE = 0.25  # of the time, to make scenes
-VALIDATION_SHARE = 0.12  # of the time, to validate
+RESERVE_SHARE = 0.1  # fraction of the budget reserved for everything that was not measured
+STARTUP_S = 20.0  # time until all processes run
+MAX_PREPARATION_SHARE = 0.25  # maximum fraction of the time to create scenes
+VALIDATION_SHARE = 0.12  # fraction of the time to validate
 SCANS_RANGE, VAL_SCANS_RANGE = (24, 3000), (16, 200)
 MAX_VALIDATIONS = 6
-PASSES_RANGE = 4, 80  # over the scenes: fewer show each too rarely, more teach nothing new
-FULL_RANGE_STEPS = 12_000  # from this many steps on, training covers the whole detection range
-MIN_STEPS = 20  # fewer steps teach nothing
+PASSES_RANGE = 4, 80  # passes over the scenes: fewer undertrain, more teach nothing new
+FULL_RANGE_STEPS = 12_000  # number of steps from which training covers the full detection range
+MIN_STEPS = 20  # minimum number of steps for any effect
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from lidar_perception.training.trainer import Trainer
 from lidar_perception.types import InputError
 
 DEFAULT_BUDGET_H = 2.0
-MIN_FREE_GB = 0.5  # on the disk
+MIN_FREE_GB = 0.5  # free disk space to leave
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def _time_scans(sources: Sequence[Any]) -> tuple[Iterable[Item], float, float]:
     for source in sources:
         if isinstance(source, SimulatedScenes):
             count = source.per_scene
-            source.scene(0)  # compiles the simulator
+            source.scene(0)  # triggers compilation of the simulator
             begun = time.perf_counter()
             scenes = [source.scene(i) for i in range(count, count + min(count, MAX_TIMED_SCENES))]
             return (

@@ -85,7 +85,7 @@ class Run:
         self.validate_steps = params.validation_steps(task.epoch)
         self.module = task.module
         self.average = WeightAverage(self.module, params.ema)
-        # Norm statistics begin as means over all steps, so that the initial values do not count.
+        # Norm statistics start as means over all steps, so that the initial values have no effect.
         self.norms = [
             (m, m.momentum)
             for m in self.module.modules()
@@ -114,7 +114,7 @@ class Run:
     def shorten_schedule(self, fit: float) -> None:
         """Leave out steps evenly so that `fit` more steps reach the end of the schedule."""
         left, fit = self.steps - self.position, max(fit, 1.0)
-        if left > fit:  # once fit is 1, one step is left, without rounding errors
+        if left > fit:  # once fit is 1, exactly one step is left, without rounding errors
             self.progress.left_out = self.steps - self.progress.step - (left - left / fit + 1)
 
     def is_validation_due(self) -> bool:

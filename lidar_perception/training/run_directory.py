@@ -18,9 +18,9 @@ from lidar_perception.training.plan import Data, Plan, Speed
 from lidar_perception.types import InputError
 
 RUN = "run.json"  # settings, measured speed and plan of the first start
-STATE = "last.pt"  # what a resumed run needs
+STATE = "last.pt"  # state needed to resume the run
 WEIGHTS = "best.safetensors", "last.safetensors"
-SCANS = "scans"  # the cache, unless another one is given
+SCANS = "scans"  # folder of the cache, unless another one is given
 WRITTEN = (RUN, STATE, *WEIGHTS, "objects.npz", "log.csv", "validation.csv")
 MAX_RUN_BYTES = 10**6
 

@@ -56,7 +56,7 @@ class RecordedScenes:
         return {name: by_name[name] for name in self.names}
 
     def __getstate__(self) -> dict:
-        return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # not sent, see above
+        return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # not pickled, see above
 
     @property
     def sensor_height(self) -> float:

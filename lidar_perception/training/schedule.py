@@ -8,8 +8,8 @@ import math
 import torch
 from torch import nn
 
-START_DIVISOR, END_DIVISOR = 10.0, 1e4  # the first rate is lr / 10, the last lr / 10 / 1e4
-SLOW_MOMENTUM, FAST_MOMENTUM = 0.95, 0.85  # at the lowest and the highest rate
+START_DIVISOR, END_DIVISOR = 10.0, 1e4  # initial rate: lr / 10; final rate: lr / 10 / 1e4
+SLOW_MOMENTUM, FAST_MOMENTUM = 0.95, 0.85  # momentum at the lowest and the highest rate
 
 
 def compute_one_cycle(step: float, steps: int, lr: float, warm_share: float) -> tuple[float, float]:

@@ -13,8 +13,8 @@ from lidar_perception.training.params import DataParams
 from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
 from lidar_perception.types import InputError
 
-SIM = "sim"  # stands for simulated scenes instead of a path
-# First seeds of the scenes to train on, to validate on and to fit curves to. Nothing else uses
+SIM = "sim"  # value that selects simulated scenes instead of a path
+# First seeds of the scenes for training, validation and curve fitting. Nothing else uses
 # seeds near them.
 FIRST_SCENE, FIRST_VALIDATION_SCENE, FIRST_FITTED_SCENE = 10_000_000, 20_000_000, 30_000_000
 
@@ -58,7 +58,7 @@ def open_sources(
     else:
         pairs = [frames.split(params.val_share, seed) for frames in training]
         training, held_out = [first for first, _ in pairs], [second for _, second in pairs]
-    if split is not None and val_split is None:  # the frames of --split stay in the training
+    if split is not None and val_split is None:  # the frames of --split remain in the training set
         held_out = [frames.exclude(training, "validate on") for frames in held_out]
     else:
         training = [frames.exclude(held_out, "train on") for frames in training]

@@ -83,7 +83,7 @@ def start_training(
     settings = _collect_settings(request, params, sensor, init)
     chosen = torch.device(find_device(request.device))
     with join_process_group(chosen) as device, directory.lock():
-        wait_for_all()  # until every process has looked at the files that rank 0 writes
+        wait_for_all()  # wait until every process has read the files that rank 0 writes
         planner = Planner(trainer, request, params, sensor, device, speed)
         if get_rank() == 0:
             make_folder(Path(params.data.cache))

@@ -82,12 +82,12 @@ def measure_step(
         loss: loss(module, batch), as in run.Task.
         prepare: Returns a few samples. Training runs it in other processes.
     """
-    prepare()  # compiles kernels
+    prepare()  # triggers compilation of kernels
     preparation, samples = measure_duration(prepare)
     batch = [samples[i % len(samples)] for i in range(params.batch)]
     amp = choose_dtype(params.amp, device)
 
-    def step() -> None:  # in this process only, even if several train together
+    def step() -> None:  # runs in this process only, even in distributed training
         with torch.autocast(device.type, amp) if amp else nullcontext():
             total, _ = loss(module, batch)
         total.backward()

@@ -18,7 +18,7 @@ from msg_utils.stamps import SECOND_NS
 ENCAPSULATION = b"\0\1\0\0"  # CDR, little-endian; alignment counts from its end
 STAMP, LENGTH, BODY = Struct("<iI"), Struct("<I"), Struct("<10d4fiI?")
 IDS, NUMBER, POSE, SIZE = Struct("<3i"), Struct("<d"), Struct("<7d"), Struct("<3d")
-EMPTY_STRING = LENGTH.pack(1) + bytes(4)  # its zero byte and padding
+EMPTY_STRING = LENGTH.pack(1) + bytes(4)  # length 1, then a zero byte and padding
 # No colors, texture resource, texture (stamp, frame, format, data) and uv coordinates.
 NO_TEXTURE = LENGTH.pack(0) + EMPTY_STRING + STAMP.pack(0, 0) + 2 * EMPTY_STRING + bytes(8)
 # No mesh resource, no mesh file (name, data), mesh_use_embedded_materials is False.

@@ -18,7 +18,7 @@ LIVOX = tuple(f"{package}/msg/CustomMsg" for package in LIVOX_PACKAGES)
 CLOUD_TYPES = (POINT_CLOUD, COMPRESSED, *LIVOX)
 COMPRESSIONS = ("zlib", "zstd")
 
-# Driver that turns the packets of a sensor into clouds, by the package of the packet messages.
+# Package of packet messages -> driver that converts the packets to clouds.
 DRIVER_BY_PACKAGE = {
     "velodyne_msgs": "velodyne_pointcloud (velodyne_transform_node)",
     "ouster_msgs": "ouster_ros (replay.launch.xml)",

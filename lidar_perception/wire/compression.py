@@ -7,7 +7,7 @@ import zlib
 import lz4.frame
 import zstandard
 
-MAX_BYTES = 2**28  # of a decompressed chunk or message; recorders write a few megabytes
+MAX_BYTES = 2**28  # max size of a decompressed chunk or message; recorders write a few megabytes
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 

@@ -18,9 +18,9 @@ from msg_utils.stamps import SECOND_NS, make_header
 
 FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
 PACKED = np.dtype([(name, f"<{kind}") for name, kind in FIELDS.items()])  # layout in ROS 1
-OFFSETS = [0, 4, 8, 12, 16, 17, 18]  # of the fields in a point, in bytes
-POINT_BYTES = 20  # in CDR, where each point starts at a multiple of 4
-FIXED_BYTES = 16  # from timebase to rsvd
+OFFSETS = [0, 4, 8, 12, 16, 17, 18]  # offsets of the fields of a point, in bytes
+POINT_BYTES = 20  # size of a point in CDR, where each point starts at a multiple of 4
+FIXED_BYTES = 16  # size of the fields from timebase to rsvd
 
 
 def decode_livox(data: bytes) -> Any:
@@ -34,7 +34,7 @@ def decode_livox(data: bytes) -> Any:
         points = bytes(data[offset + 4 :])
     except (struct.error, IndexError) as error:
         raise InputError(f"{len(data)} bytes are not a valid Livox CustomMsg ({error})") from None
-    if len(points) < count * POINT_BYTES - 1:  # no padding after the last point
+    if len(points) < count * POINT_BYTES - 1:  # the last point has no padding
         raise InputError(
             f"the Livox CustomMsg is truncated: {count} points need "
             f"{count * POINT_BYTES - 1} bytes, the message has {len(points)}"
@@ -53,7 +53,7 @@ def decode_livox(data: bytes) -> Any:
 
 def livox_ros1_to_cdr(data: bytes) -> bytes:
     """Convert a serialized ROS 1 CustomMsg to CDR. ValueError or struct.error if damaged."""
-    (size,) = struct.unpack_from("<I", data, 12)  # after seq and stamp of the header
+    (size,) = struct.unpack_from("<I", data, 12)  # follows seq and stamp in the header
     start = 16 + size
     (count,) = struct.unpack_from("<I", data, start + FIXED_BYTES)
     packed = np.frombuffer(data, PACKED, count, start + FIXED_BYTES + 4)

@@ -20,7 +20,7 @@ from msg_utils.markers import MarkedObjects, MarkerRow, make_marker_rows, rows_t
 from msg_utils.point_cloud2 import CloudError, from_array, read_columns, read_xyz, to_array
 from msg_utils.stamps import to_ns
 
-# In the column in_view: segmented, and not segmented as no detector reads the point.
+# Values of the column in_view: segmented, or not segmented because no detector reads the point.
 IN_VIEW, OUT_OF_RANGE = 1, 2
 MAX_ID = 2**31  # marker ids are int32
 FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.infer_full_scale
@@ -172,7 +172,7 @@ def read_calibration(info: Any, transform: Any) -> Calibration:
         *poses.check_pose((t.x, t.y, t.z), (q.x, q.y, q.z, q.w), "the LiDAR-to-camera transform")
     )
     parent, child = transform.header.frame_id, transform.child_frame_id
-    if info.header.frame_id != parent:  # it is the camera's pose in the LiDAR frame: invert it
+    if info.header.frame_id != parent:  # the message has the camera's pose in the LiDAR frame, so invert it
         if info.header.frame_id != child:
             raise InputError(
                 f"CameraInfo is in frame '{info.header.frame_id}' but the transform links '{parent}' and '{child}'"

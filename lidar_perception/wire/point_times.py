@@ -15,10 +15,10 @@ from msg_utils.stamps import SECOND_NS, to_ns
 # Names used by Ouster, Velodyne, Hesai and RoboSense, Autoware and Livox; the first match counts.
 NAMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
 UNITS_NS = (10**9, 10**6, 10**3, 1)
-LIVOX_COLUMN, LIVOX_UNIT_NS = ("offset_time", True), 1  # integers: Livox documents the unit
-SWEEP_S = 2e-3, 1.0  # limits of the duration of a turn, from which the unit is inferred
-SINCE_1970_NS = 1e18  # larger values count from 1970
-MAX_OFFSET_S = 1.0  # between a point and the stamp of its cloud
+LIVOX_COLUMN, LIVOX_UNIT_NS = ("offset_time", True), 1  # integers, whose unit Livox documents
+SWEEP_S = 2e-3, 1.0  # limits of the duration of a sweep, from which the unit is inferred
+SINCE_1970_NS = 1e18  # larger values are Unix times
+MAX_OFFSET_S = 1.0  # maximum offset of a point's time from the stamp of its cloud
 
 
 class PointTimes(NamedTuple):
@@ -89,7 +89,7 @@ def _unit_ns(span: float, is_integer: bool, low: float) -> int:
     for unit in UNITS_NS[2:] if is_integer else UNITS_NS:  # s and ms are too coarse as integers
         if SWEEP_S[0] <= span * unit * 1e-9 <= SWEEP_S[1]:
             return unit
-    return 1 if is_integer else 10**9  # a cloud shorter than SWEEP_S
+    return 1 if is_integer else 10**9  # reached for a cloud shorter than SWEEP_S
 
 
 def deskew_points(

@@ -2,17 +2,17 @@
 
 POINTS = "/points"
 TRUTH = "/ground_truth/detections"
-TRUTH_3D = "/ground_truth/detections_3d"  # the same as Detection3DArray, optional
+TRUTH_3D = "/ground_truth/detections_3d"  # the same labels as Detection3DArray, optional
 CAMERA_INFO = "/camera/camera_info"
-EXTRINSICS = "/camera/extrinsics"  # geometry_msgs/TransformStamped, camera in the LiDAR frame
+EXTRINSICS = "/camera/extrinsics"  # geometry_msgs/TransformStamped, pose of the camera in the LiDAR frame
 IMAGE = "/camera/image/compressed"
 TF, TF_STATIC = "/tf", "/tf_static"
 ODOMETRY = "/odom"  # nav_msgs/Odometry, the usual name
-CLICK = "/clicked_point"  # what RViz and Foxglove publish
-FOUND, TRACKS = "/output/detections", "/output/tracks"  # suffixes of the topics of a node
+CLICK = "/clicked_point"  # topic that RViz and Foxglove publish
+FOUND, TRACKS = "/output/detections", "/output/tracks"  # suffixes of a node's topics
 
-ODOMETRY_FRAME = "odom"  # fixed; REP-105
+ODOMETRY_FRAME = "odom"  # fixed frame, REP-105
 LIDAR_FRAME = "velodyne"
-CAMERA_FRAME = "camera_optical"  # z forward; REP-103
+CAMERA_FRAME = "camera_optical"  # optical frame (z forward), REP-103
 
 SEMANTIC, INSTANCE = "semantic", "instance"  # columns of a labelled cloud, as in SemanticKITTI

@@ -14,7 +14,7 @@ from msg_utils.markers import ADD, COLORS, OTHER_COLOR, MarkerRow, list_marker_k
 ARROW, LINE_STRIP, TEXT = 0, 4, 9
 # Namespaces in addition to those named after the classes.
 VELOCITY, TRAIL, NUMBER = EXTRA_NAMESPACES = "velocity", "trail", "number"
-MIN_ARROW_PROBABILITY = 0.5  # of motion; a track with less has no velocity arrow
+MIN_ARROW_PROBABILITY = 0.5  # minimum probability of motion for a velocity arrow
 
 
 def make_track_rows(

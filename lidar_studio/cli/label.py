@@ -84,7 +84,7 @@ def label(
         for format_name, path in sources:
             try:
                 session.do({"do": "import", "format": format_name, "path": path})
-            except AlreadyImportedError as error:  # the same command was run before
+            except AlreadyImportedError as error:  # the same import command has been run before
                 errors.print(str(error), style="yellow")
         if target is not None:
             written = session.export(target[0], os.path.abspath(target[1]), force)

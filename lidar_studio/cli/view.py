@@ -133,7 +133,7 @@ def _open_live_content(namespace: str, points: str, detections: tuple[str, ...])
 
     require_rclpy()
     use_large_shared_memory(points != "" and is_fed_by_driver([points]))
-    from lidar_studio.live_view import run_live_view  # after the profile is set
+    from lidar_studio.live_view import run_live_view  # imported after the profile is set
 
     name = "/".join(filter(None, (f"ROS domain {os.environ.get('ROS_DOMAIN_ID') or 0}", namespace.strip("/"))))
     live = LiveGraph(name)

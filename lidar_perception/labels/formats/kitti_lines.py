@@ -29,9 +29,9 @@ from lidar_perception.labels.drive_labels import (
 )
 from lidar_perception.types import InputError
 
-# Smallest hidden shares of the 2D box of a partly (1) and a largely (2) occluded object.
+# Minimum hidden fractions of the 2D box of a partly (1) and a largely (2) occluded object.
 MIN_PARTLY, MIN_LARGELY = 0.1, 0.5
-LEVELS = (-1, 0, 1, 2)  # of truncation in the tracking layout
+LEVELS = (-1, 0, 1, 2)  # levels of truncation in the tracking layout
 
 
 def require_calibration(frame: Frame) -> Calibration:

@@ -53,7 +53,7 @@ def _read(kind: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
     files = list_frame_files(path, frames, SUFFIX)
     check_label_files(path, files, SUFFIX, ignored=(CLASSES_FILE,))
     classes = path / CLASSES_FILE
-    if classes.exists():  # it states the format
+    if classes.exists():  # this file states the format
         content = read_json(classes)
         stated = content.get("format") if isinstance(content, dict) else None
         kind = stated if stated in KINDS else kind

@@ -47,13 +47,13 @@ from lidar_perception.runs.files import check_unused, write_text
 from lidar_perception.types import InputError
 
 ROOT = "nuscenes"
-NO_SCORE = -1.0  # of labels, as in nuscenes-devkit
+NO_SCORE = -1.0  # score of labels, as in nuscenes-devkit
 OUR_NAMES = {**CLASS_BY_NAME, **{name: our_name for our_name, name in NAME_BY_CLASS.items()}}
 NUSCENES_NAMES = {our_name: name for name, our_name in OUR_NAMES.items()}
-# nuScenes' classes for our classes that it lacks, such as vans; our name is written as a field.
+# Our classes that nuScenes lacks, such as vans -> nuScenes class; our name is written as a field.
 SIMILAR_NAMES = {row.name: NUSCENES_NAMES[row.looks_like] for row in TABLE if row.looks_like in NUSCENES_NAMES}
 WRITTEN_NAMES = {**NUSCENES_NAMES, **SIMILAR_NAMES}
-# nuScenes' classes that are ours only with a rider.
+# nuScenes classes that correspond to ours only with a rider.
 RIDDEN_CLASSES, NOT_RIDDEN = OUR_NAMES.keys() - CLASS_BY_NAME.keys(), "cycle.without_rider"
 OWN = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id", "attribute_name"}
 
@@ -139,7 +139,7 @@ def find_read_rotation(labels: FrameLabels, k: int, pose: np.ndarray) -> list[fl
         return None
     centre, size, _ = to_global_boxes(box[None], pose)
     placement = {"translation": centre[0], "size": size[0][[1, 0, 2]], "rotation": rotation}
-    with suppress(ValueError, TypeError, OverflowError):  # a field of another tool
+    with suppress(ValueError, TypeError, OverflowError):  # the field may come from another tool
         return rotation if is_unchanged(box, _to_local_box(placement, pose)[0]) else None
     return None
 
@@ -175,7 +175,7 @@ def _make_columns(
     if kind in RIDDEN_CLASSES:
         attribute = NOT_RIDDEN
     elif NUSCENES_NAMES.get(kind) in RIDDEN_CLASSES and attribute == NOT_RIDDEN:
-        attribute = ""  # a person changed the class
+        attribute = ""  # no longer valid, because a person changed the class
     extra.pop("tracking_id", None)
     if kind in SIMILAR_NAMES:
         extra["class_name"] = kind

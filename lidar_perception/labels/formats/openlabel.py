@@ -188,7 +188,7 @@ def _make_content(
     )
     objects = {
         uid: dict(o) for uid, o in kept.get("objects", {}).items() if uid in used or not o.get("frame_intervals")
-    }  # used, or not bound to frames
+    }  # objects that are still used, or not bound to frames
     systems = kept if kept.get("coordinate_systems") else parts.make_coordinate_systems([frame for frame, _ in own])
     lidar = parts.find_lidar_system(systems["coordinate_systems"], "the file that was read")
     numbers = [int(uid) for uid in (*used, *objects) if is_track_number(uid)]
@@ -200,7 +200,7 @@ def _make_content(
         """Return the data of an object in a frame."""
         if uid not in frames_by_object:
             known = objects.get(uid, {})
-            same_class = class_name(str(known.get("type", ""))) == kind  # in any spelling
+            same_class = class_name(str(known.get("type", ""))) == kind  # compared in any spelling
             objects[uid] = {"name": f"{kind} {uid}", **known, "type": known["type"] if same_class else kind}
         frames_by_object.setdefault(uid, []).append(index)
         frame_objects = frame_contents[str(index)].setdefault("objects", {})

@@ -49,7 +49,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     contents = []
     for file in files:
         content = read_json(file) if file.exists() else []
-        # Later versions of SUSTechPOINTS have the list inside an object.
+        # Later versions of SUSTechPOINTS wrap the list in an object.
         contents.append(content.get("objs", content) if isinstance(content, dict) else content)
     ids = report_format_errors(
         str(path),

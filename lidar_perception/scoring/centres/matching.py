@@ -27,7 +27,7 @@ def assign_pairs(cost: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.
 
     As many pairs as possible, then the least total cost. Returns rows (P,) and columns (P,).
     """
-    # a forbidden pair costs more than all allowed pairs together
+    # so that a forbidden pair costs more than all allowed pairs together
     forbidden = cost[allowed].max(initial=0.0) * cost.size + 1.0
     rows, columns = linear_sum_assignment(np.where(allowed, cost, forbidden))
     keep = allowed[rows, columns]

@@ -87,7 +87,7 @@ def measure_frame(
     scan, camera = frame.load(), frame.camera()
     try:
         _, found = find_candidates(scan, make_seed_source(truth, templates, params), camera, params)
-    except InputError as error:  # no seed, or no camera: this frame has no candidates
+    except InputError as error:  # without a seed or a camera, the frame has no candidates
         return CandidateResult(truth, collect_boxes(Candidates.none()), {}, f"{frame.name}: {error}")
     return CandidateResult(truth, collect_boxes(found), found.ms, name=frame.name)
 

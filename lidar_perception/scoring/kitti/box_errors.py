@@ -15,7 +15,7 @@ from lidar_perception.scoring.kitti.protocol import METRICS, RELAXED, ComparedFr
 from lidar_perception.scoring.tables import make_table
 from lidar_perception.types import CLASSES
 
-RANGES = (0.0, 15.0, 30.0, 45.0, np.inf)  # metres
+RANGES = (0.0, 15.0, 30.0, 45.0, np.inf)  # limits of the ranges in metres
 ERRORS = ("away", "aside", "bottom", "length", "width", "height", "yaw")
 # name of a correction -> columns of a box that are corrected
 CORRECTIONS = {
@@ -28,9 +28,9 @@ CORRECTIONS = {
     "height": [5],
     "yaw": [6],
 }
-MIN_BEV_AP = 20.0  # percent; below this nothing is diagnosed
-MIN_AP_RATIO = 4  # of BEV to 3D AP; from here on heights are diagnosed as wrong
-MAX_MEDIAN_ERROR = 0.1  # metres; a smaller median height error is not a bias
+MIN_BEV_AP = 20.0  # in percent; below this value nothing is diagnosed
+MIN_AP_RATIO = 4  # ratio of BEV AP to 3D AP from which heights are diagnosed as wrong
+MAX_MEDIAN_ERROR = 0.1  # in metres; a smaller median height error does not count as bias
 
 
 def match_boxes(frames: list[ComparedFrame], name: str, min_score: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:

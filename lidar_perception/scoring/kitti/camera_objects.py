@@ -12,7 +12,7 @@ from lidar_perception.data.kitti.write import project_boxes
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import Detections, GroundTruth, InputError, class_ids
 
-NO_ANGLE = -10.0  # KITTI's value of an unknown alpha
+NO_ANGLE = -10.0  # KITTI's value for an unknown alpha
 # Truncation levels of the tracking layout: 0 inside, 1 at the image border, 2 ends of tracks;
 # of the raw layout: 2 outside, 99 behind. Objects of level 2 or higher are ignored.
 IGNORED_LEVEL = 2
@@ -104,7 +104,7 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
     sides = np.maximum(_read_columns(labels, "dimensions", 3), 0)
     location, turn = _read_columns(labels, "location", 3), _read_columns(labels, "rotation_y")
     alpha = _read_columns(labels, "alpha")
-    whole = sides.all(axis=1)  # not only a 2D box
+    whole = sides.all(axis=1)  # True for labels with a 3D box
     bearing = np.arctan2(location[:, 0], location[:, 2])
     computed = np.where(whole, wrap_angle(turn - bearing), np.nan)
     return CameraObjects(

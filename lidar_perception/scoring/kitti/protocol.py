@@ -26,15 +26,15 @@ from lidar_perception.types import CLASSES
 SCORED = tuple(DETECTED)
 NEIGHBOURS = {row.looks_like: row.name for row in TABLE if row.looks_like}
 METRICS = ("image", "bev", "3d")
-STRICT = {name: of.strict for name, of in DETECTED.items()}  # overlap of a hit
-RELAXED = {name: of.relaxed for name, of in DETECTED.items()}  # in BEV and 3D
+STRICT = {name: of.strict for name, of in DETECTED.items()}  # minimum overlap of a match
+RELAXED = {name: of.relaxed for name, of in DETECTED.items()}  # minimum overlap of a match, in BEV and 3D
 DIFFICULTIES = ("easy", "moderate", "hard")
-MIN_PIXELS = (40, 25, 25)  # height of the 2D box
+MIN_PIXELS = (40, 25, 25)  # minimum height of the 2D box (easy, moderate, hard)
 MAX_OCCLUDED = (0, 1, 2)
 MAX_TRUNCATED = (0.15, 0.3, 0.5)
 
 COUNTED, IGNORED, OTHER = 0, 1, -1
-EPS = np.finfo(float).eps  # smaller areas are 0
+EPS = np.finfo(float).eps  # smaller areas count as 0
 
 
 @dataclass(frozen=True)
@@ -265,11 +265,11 @@ def _count_hits(pairs, thresholds, excused, true_alpha, found_alpha):
     """
     overlaps, min_overlap, labels, detections, scores, first_true, first_found, first_pair = pairs
     hits, wrong, similarity = np.zeros((3, len(thresholds)))
-    taken = np.zeros(len(scores), np.int64)  # at which threshold, from 1
+    taken = np.zeros(len(scores), np.int64)  # number of the threshold, from 1, at which each is matched
     for f in range(len(first_pair) - 1):
         count = first_true[f + 1] - first_true[f]
         for t in range(len(thresholds)):
-            end = first_found[f]  # scores fall
+            end = first_found[f]  # valid because the scores are in descending order
             while end < first_found[f + 1] and scores[end] >= thresholds[t]:
                 end += 1
             for i in range(first_true[f], first_true[f + 1]):

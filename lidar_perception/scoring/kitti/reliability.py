@@ -15,7 +15,7 @@ from lidar_perception.scoring.tables import make_table
 EDGES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)  # lower edges of the bins of scores
 
 LOG_ODDS = np.arange(-7.0, 7.05, 0.1)  # finer bins for the fit
-MIN_BOXES = 10  # of right, and of wrong boxes, for a fit
+MIN_BOXES = 10  # minimum number of correct and of wrong boxes for a fit
 
 
 def fit_calibrations(frames: Comparison) -> dict[str, tuple[float, float]]:

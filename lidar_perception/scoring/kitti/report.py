@@ -26,7 +26,7 @@ from lidar_perception.scoring.kitti.protocol import (
 )
 from lidar_perception.types import PEDESTRIAN, Detections, InputError
 
-# row of the JSON file: metric and overlap
+# Row of the JSON file -> metric and overlap.
 ROWS = {
     "image": ("image", STRICT),
     "bev": ("bev", STRICT),

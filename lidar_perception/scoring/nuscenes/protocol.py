@@ -31,19 +31,19 @@ RANGES = {
     "traffic_cone": 30.0,
     "barrier": 30.0,
 }
-DISTANCES = (0.5, 1.0, 2.0, 4.0)  # of centres of a hit, metres
-ERROR_DISTANCE = 2.0  # of hits that errors are computed for
+DISTANCES = (0.5, 1.0, 2.0, 4.0)  # maximum centre distances of a match, metres
+ERROR_DISTANCE = 2.0  # centre distance of the matches used for the errors
 RECALLS = np.linspace(0.0, 1.0, 101)
-FIRST_RECALL_INDEX = 11  # of the first of RECALLS above 0.1
+FIRST_RECALL_INDEX = 11  # index of the first of RECALLS above 0.1
 MIN_PRECISION = 0.1
-MAP_WEIGHT = 5  # of mAP in NDS; each of ERRORS has weight 1
+MAP_WEIGHT = 5  # weight of mAP in NDS; each of ERRORS has weight 1
 RACK_CLASSES = ("bicycle", "motorcycle")  # ignored inside a bicycle rack
 
 # translation m, scale 1 - IoU of the aligned boxes, orientation rad, velocity m/s, attribute
 # 1 - accuracy
 ERRORS = ("ate", "ase", "aoe", "ave", "aae")
 UNDEFINED = {"traffic_cone": ("aoe", "ave", "aae"), "barrier": ("ave", "aae")}
-SYMMETRIC_CLASSES = ("barrier",)  # front and rear are equal
+SYMMETRIC_CLASSES = ("barrier",)  # classes whose front and rear are equivalent
 
 
 def select_counted(boxes: GlobalBoxes, ego: np.ndarray, racks: GlobalBoxes) -> np.ndarray:
@@ -52,7 +52,7 @@ def select_counted(boxes: GlobalBoxes, ego: np.ndarray, racks: GlobalBoxes) -> n
     They are of a known class, within its range of the vehicle at ego (>=2,), not known to be
     without points, and not a bicycle or motorcycle in a rack.
     """
-    ranges = np.array([RANGES[name] for name in NAMES] + [0.0])[boxes.class_ids]  # -1 is the last
+    ranges = np.array([RANGES[name] for name in NAMES] + [0.0])[boxes.class_ids]  # -1 selects the last entry
     away = np.sqrt(((boxes.centres[:, :2] - ego[:2]) ** 2).sum(axis=1))
     kept = (away < ranges) & (boxes.points != 0)
     cycles = np.isin(boxes.class_ids, [NAMES.index(name) for name in RACK_CLASSES])

@@ -8,8 +8,7 @@ from lidar_perception.scoring.nuscenes.protocol import DISTANCES, ERRORS
 from lidar_perception.scoring.nuscenes.report import DETECTED_NAMES
 from lidar_perception.scoring.tables import format_number, make_table, print_skipped, print_time
 
-# The improved-PointNet paper on nuScenes. It does not name the split or the classes, and gives no
-# AOE, AVE and AAE.
+# The improved-PointNet paper on nuScenes, which states neither split nor classes, AOE, AVE or AAE.
 PAPER = {"map": 92.68, "ate": 0.298, "ase": 0.218, "nds": 83.45}
 
 

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from lidar_perception.scoring.tables import format_number, make_table, print_skipped
 
-# Paper C: segmentation on KITTI, percent
+# Paper C: segmentation on KITTI, in percent.
 PAPER = {"accuracy": 94.96, "precision": 94.3, "recall": 93.5, "f1": 93.9, "iou": 92.12}
 
 

@@ -25,14 +25,14 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, GroundTruth
 
 UNKNOWN = -1  # label of clusters and points that are not scored
-MIN_OBJECT_SHARE = 0.5  # of its points in a box, for a cluster to be that object
-MAX_BACKGROUND_SHARE = 0.15  # of its points in any box, for a cluster to be background
-BOX_MARGIN = 0.05  # metres; labels are rounded, so points this near to a box belong to it
+MIN_OBJECT_SHARE = 0.5  # minimum fraction of a cluster's points in a box to count as that object
+MAX_BACKGROUND_SHARE = 0.15  # maximum fraction of a cluster's points in boxes to count as background
+BOX_MARGIN = 0.05  # in metres; points this close to a box belong to it, because labels are rounded
 # Classes that resemble a scored class, and DontCare
 IGNORED_CLASSES = [row.name for row in TABLE if row.numbers is None and (row.looks_like or row.vehicle)] + [
     CLASSES[DONT_CARE]
 ]
-MIN_POINTS = 10  # clusters with fewer do not count
+MIN_POINTS = 10  # clusters with fewer points are ignored
 
 
 def label_clusters(
@@ -159,7 +159,7 @@ def measure_network(weights: Path, settings: Mapping[str, Any], recording: Recor
         ground = segment_ground(scan, params.ground)
         ids = cluster_obstacles(scan.xyz, ground, params.clustering)
         camera = frame.camera()
-        if camera is None:  # labels cover all directions
+        if camera is None:  # without a camera, labels cover all directions
             indices, hidden = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)
         else:
             indices, hidden = (np.flatnonzero(camera.in_view(scan.xyz)), partial(find_unlabelled, truth, camera))

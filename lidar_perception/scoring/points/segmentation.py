@@ -25,13 +25,13 @@ from lidar_perception.groups import renumber_ids
 from lidar_perception.types import CLASSES, GroundTruth
 
 PROTOCOLS = ("without vegetation", "with vegetation", "vegetation not ground")
-LOW_VEGETATION_Z = -1.3  # metres in the LiDAR frame of KITTI, 1.73 m above the road
+LOW_VEGETATION_Z = -1.3  # in metres, in KITTI's LiDAR frame, which is 1.73 m above the road
 
 HIT_IOU = 0.5
 MIN_POINTS = 10  # objects with fewer points are ignored
-BOTTOM_MARGIN = 0.2  # metres above the bottom of a box; points below it may be road
-BOX_MARGIN = 0.2  # metres; a cluster is scored if most of it is in boxes enlarged by this
-MIN_PIECE_SHARE = 0.1  # of an object's points in a cluster that is a piece of it
+BOTTOM_MARGIN = 0.2  # in metres above the bottom of a box; lower points may be road
+BOX_MARGIN = 0.2  # in metres; a cluster is scored if most of its points are in boxes enlarged by this
+MIN_PIECE_SHARE = 0.1  # minimum fraction of an object's points for a cluster to be a piece of it
 RANGE_NAMES = ("0-15", "15-30", "30-45", "45+")
 RANGE_LIMITS = np.array([15.0, 30.0, 45.0])
 

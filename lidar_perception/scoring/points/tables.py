@@ -16,7 +16,7 @@ from lidar_perception.types import PointCloud
 # recall, F1. The first row is from the paper (IROS 2022, Table I), the second from its repository.
 PUBLISHED = {"without vegetation": (94.92, 98.18, 96.51), "with vegetation": (93.72, 92.33, 92.87)}
 
-MAX_DRAWN_RANGE = 50.0  # metres to each side
+MAX_DRAWN_RANGE = 50.0  # in metres to each side
 
 
 def print_scores(content: dict, ground_method: str, console: Console) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidar_perception.scoring.tracking.pairs import EPS, MIN_SIMILARITY, Pairs, find_best_pairs
 
-CONTINUATION_GAIN = 1000.0  # of pairs of the previous frame; above any similarity
+CONTINUATION_GAIN = 1000.0  # bonus for pairs of the previous frame, larger than any similarity
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def count_hota(frames: list[Pairs]) -> HotaCounts:
     true_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.true_ids for f in frames)]))
     track_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.track_ids for f in frames)]))
     indices = [(np.searchsorted(true_ids, f.true_ids), np.searchsorted(track_ids, f.track_ids)) for f in frames]
-    together = np.zeros((len(true_ids), len(track_ids)))  # summed share of each pair
+    together = np.zeros((len(true_ids), len(track_ids)))  # summed weight of each pair
     true_count, track_count = np.zeros((len(true_ids), 1)), np.zeros((1, len(track_ids)))
     for f, (i, j) in zip(frames, indices):
         s = f.similarity

@@ -16,8 +16,8 @@ from scipy.optimize import linear_sum_assignment
 
 from lidar_perception.scoring.tracking.pairs import Pairs
 
-MIN_OVERLAP = 0.25  # IoU of a match
-STEPS = 40  # recall 1/40, 2/40, .. 1
+MIN_OVERLAP = 0.25  # minimum IoU of a match
+STEPS = 40  # recall thresholds 1/40, 2/40, ..., 1
 FORBIDDEN = 1e6  # cost of a pair below MIN_OVERLAP
 
 

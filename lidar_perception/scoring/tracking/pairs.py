@@ -19,11 +19,11 @@ from lidar_perception.scoring.kitti.camera_objects import CameraObjects, to_came
 from lidar_perception.scoring.kitti.protocol import EPS, NEIGHBOURS, compute_image_iou
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 
-MAX_OCCLUSION, MAX_TRUNCATION = 2, 0  # levels of the tracking layout
-MIN_HEIGHT = 25.0  # pixels
-MAX_REGION_SHARE = 0.5  # of a box inside a DontCare region
-MAX_CENTRE_DISTANCE = 2.0  # metres; farther centres have the similarity 0
-MIN_SIMILARITY = 0.5  # of a match in CLEAR MOT, and with an ignored label
+MAX_OCCLUSION, MAX_TRUNCATION = 2, 0  # maximum levels, as in the tracking layout
+MIN_HEIGHT = 25.0  # minimum height of the 2D box in pixels
+MAX_REGION_SHARE = 0.5  # maximum fraction of a box inside a DontCare region
+MAX_CENTRE_DISTANCE = 2.0  # in metres; more distant centres have similarity 0
+MIN_SIMILARITY = 0.5  # minimum similarity of a match in CLEAR MOT and of a match with an ignored label
 
 SIMILARITIES = ("centres", "3d", "image")
 
@@ -79,7 +79,7 @@ def make_pairs(
         raise InputError("similarity in the image needs a calibration; take 'centres' or '3d'")
     true_ids, track_ids = read_track_ids(truth, "label"), read_track_ids(tracks, "track")
     true, found = (to_camera_objects(objects, calibration) for objects in (truth, tracks))
-    # regions without a box come last and are in .regions
+    # regions without a box come last and are listed in .regions
     true_objects, objects = true.take(np.arange(len(truth))), found.take(np.arange(len(tracks)))
     ignored = np.array(
         [

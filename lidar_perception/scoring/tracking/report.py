@@ -63,7 +63,7 @@ def measure_tracking(
     def measure(frame: Frame) -> Observation | None:
         truth = frame.truth()
         if truth is not None:
-            read_track_ids(truth, "label")  # before the detector's work
+            read_track_ids(truth, "label")  # checked before the detector runs
         frame = frame.with_cached_scan()
         tracks = tracker(frame, detector(frame.load()).detections)
         if truth is None:

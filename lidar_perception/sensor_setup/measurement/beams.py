@@ -11,22 +11,22 @@ from scipy.signal import find_peaks, peak_prominences
 
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-MIN_BEAM_POINTS = 30  # of a beam in a scan that is fitted
+MIN_BEAM_POINTS = 30  # minimum points of a beam in a scan for a fit
 MAX_BEAMS = 300
-BIN = 0.02  # degrees, of the histogram of elevations
+BIN = 0.02  # bin width of the elevation histogram, in degrees
 MIN_RANGE_M = 2.0  # at shorter range, small offsets of a beam change its elevation much
-# Largest scatter of the points of one beam about it in degrees, the median of the beams, if beams
+# Maximum scatter of a beam's points about it in degrees (median over the beams), if beams
 # are identified by the ring column, the order of the points, or the elevation.
 MAX_SPREAD = {"ring": 3.0, "order": 0.12, "elevation": 0.01}
-MIN_PEAK_SHARE = 0.75  # of the points in the inner half of the space between peaks
-MIN_USUAL_SHARE = 0.2  # of the scans with a number of beams that counts
-SECTORS = 72  # of a turn
+MIN_PEAK_SHARE = 0.75  # minimum fraction of points in the inner half of the spacing between peaks
+MIN_USUAL_SHARE = 0.2  # minimum fraction of scans that must agree on a number of beams
+SECTORS = 72  # sectors of a revolution
 MAX_LIFT_ERROR_M = 0.01
-MIN_LIFT_M = 0.03  # beams that start nearer to each other start at one point
-MAX_LIFT_M = 0.5  # more than the height of a sensor
-ANGLE_RESOLUTION = 1e-3  # degrees
-MAX_GAP_STEPS = 3.5  # of a gap whose lost returns are counted
-PIECE_POINTS = 9  # neighbouring returns that a parabola is fitted to
+MIN_LIFT_M = 0.03  # beams whose origins are closer together share one origin
+MAX_LIFT_M = 0.5  # larger than any sensor is high
+ANGLE_RESOLUTION = 1e-3  # rounding of angles, in degrees
+MAX_GAP_STEPS = 3.5  # maximum gap, in azimuth steps, whose lost returns are counted
+PIECE_POINTS = 9  # number of neighbouring returns to fit a parabola to
 
 
 class Beams(NamedTuple):
@@ -87,7 +87,7 @@ def _label_by_order(scans: Sequence[Scan]) -> list[np.ndarray] | None:
             azimuth = (scan.azimuth - seam) % 360.0
             step = np.diff(azimuth)
             forward = step if np.median(step) >= 0 else -step
-            starts = forward < -30.0  # back to the start of a turn
+            starts = forward < -30.0  # a revolution starts
             count = int(starts.sum()) + 1
             if not 4 <= count <= MAX_BEAMS or len(azimuth) / count < MIN_BEAM_POINTS or ((forward < 0).mean() > 0.1):
                 continue
@@ -99,8 +99,8 @@ def _label_by_order(scans: Sequence[Scan]) -> list[np.ndarray] | None:
         if best is None:
             return None
         labels.append(best[1])
-    # A beam without points shifts the numbers of the following ones. So only scans with one number
-    # of beams count: the greatest that is usual.
+    # A beam without points shifts the numbers of the following ones. Therefore only scans with one number
+    # of beams are used: the greatest common one.
     shares = np.bincount([int(label[-1]) for label in labels]) / len(labels)
     usual = int(np.flatnonzero(shares >= min(MIN_USUAL_SHARE, shares.max())).max())
     return [label if label[-1] == usual else np.full(len(label), -1) for label in labels]
@@ -203,7 +203,7 @@ def _fit_lifts(beams: list[_Points]) -> tuple[np.ndarray, np.ndarray]:
     for n, beam in enumerate(beams):
         every = max(1, len(beam.z) // 20_000)
         distance, z = beam.distance[::every], beam.z[::every]
-        weight = 1.0 / np.maximum(distance, 0.5)  # so that residuals are angles
+        weight = 1.0 / np.maximum(distance, 0.5)  # turns the residuals into angles
         kept, off = np.ones(len(z), bool), np.zeros(len(z))
         for _ in range(4):
             if kept.sum() < MIN_BEAM_POINTS:
@@ -214,7 +214,7 @@ def _fit_lifts(beams: list[_Points]) -> tuple[np.ndarray, np.ndarray]:
             kept = off <= max(3 * 1.4826 * float(np.median(off)), 1e-5)
         reach = float(np.subtract(*np.percentile(weight, [90, 10])))
         scatter = 1.4826 * float(np.median(off))
-        # Returns of one sector are similar and count as one.
+        # Returns of one sector are similar, so they count as one sample.
         sure[n] = reach > 0.04 and scatter / reach / np.sqrt(len(np.unique(beam.sector))) < MAX_LIFT_ERROR_M
     if not sure.any() or np.median(np.abs(lift[sure])) < MIN_LIFT_M:
         return np.zeros(len(beams)), sure
@@ -247,7 +247,7 @@ def measure_azimuth_step(scans: Sequence[Scan], beams: Beams) -> tuple[float, fl
             gaps = gaps[gaps >= ANGLE_RESOLUTION]
             if len(gaps) < MIN_BEAM_POINTS // 2:
                 continue
-            # Encoders round azimuths, so gaps differ and their mean counts. A gap of lost returns
+            # Encoders round azimuths, so gaps differ and their mean is used. A gap of lost returns
             # has several steps.
             step = float(np.median(gaps))
             for _ in range(3):

@@ -13,25 +13,25 @@ from lidar_perception.sensor_setup.measurement.beams import Beams
 from lidar_perception.sensor_setup.measurement.mount import Mount
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-SECTORS = 360  # of a turn
-NEAR_BODY_M = 1.0  # constant returns this near are the robot's, even if it stands still
-MAX_BODY_M = 4.0  # constant returns this near are the robot's if it moves
-MAX_ROBOT_SIZE_M = (5.5, 2.6)  # length and width, up to a van
-MAX_BODY_SHARE = 0.3  # of all points; more are walls along the robot's path
-MAX_FOREIGN_SHARE = 0.2  # of the points in the box of the robot's body
-MIN_BODY_SCANS = 0.7  # share of the scans with a return of the body
-MAX_BODY_VARIATION_M = 0.06  # of its range
-MIN_BODY_HEIGHT_M = 0.15  # above the ground
-MIN_CELLS = 20  # of sector and beam; fewer are chance
-MARGIN_M = 0.05  # around the body
-MIN_FAR_M = 4.0  # far returns show whether the robot moves:
-MIN_CHANGE_M = 0.3  # they have changed if their range differs this much between scans,
-QUANTILES = (0.1, 0.9)  # namely between these shares of the scans, since people pass by;
-MAX_STILL_SHARE = 0.3  # if less of them changed, the robot stands still
-MAX_GROUND_RANGE_M = 30.0  # nearer ground gives a return
-MIN_BLIND = 3  # degrees; narrower gaps are chance
-MIN_SEEN_SHARE = 0.35  # of the sectors with a return, for a beam that can show blind sectors
-ROW_STEP = 2.0  # degrees between rows if there are no beams
+SECTORS = 360  # sectors of a revolution
+NEAR_BODY_M = 1.0  # constant returns this close come from the robot, even if it stands still
+MAX_BODY_M = 4.0  # constant returns this close come from the robot if it moves
+MAX_ROBOT_SIZE_M = (5.5, 2.6)  # maximum length and width, those of a van
+MAX_BODY_SHARE = 0.3  # maximum fraction of all points; more points are walls along the robot's path
+MAX_FOREIGN_SHARE = 0.2  # max fraction of points in the body box that do not belong to the robot
+MIN_BODY_SCANS = 0.7  # minimum fraction of scans with a return from the body
+MAX_BODY_VARIATION_M = 0.06  # maximum variation of the body's range
+MIN_BODY_HEIGHT_M = 0.15  # minimum height of the body above the ground
+MIN_CELLS = 20  # minimum number of (sector, beam) cells; fewer may be chance
+MARGIN_M = 0.05  # margin around the body box
+MIN_FAR_M = 4.0  # minimum range of far returns, which show whether the robot moves
+MIN_CHANGE_M = 0.3  # a far return has changed if its range differs by this much between scans
+QUANTILES = (0.1, 0.9)  # quantiles over the scans to compare, so that passers-by do not count
+MAX_STILL_SHARE = 0.3  # if a smaller fraction of far returns changed, the robot stands still
+MAX_GROUND_RANGE_M = 30.0  # maximum range at which the ground reliably returns
+MIN_BLIND = 3  # minimum width of a blind sector in degrees; narrower gaps may be chance
+MIN_SEEN_SHARE = 0.35  # min fraction of sectors with a return for a beam to be informative
+ROW_STEP = 2.0  # elevation step between rows if there are no beams, in degrees
 
 
 class Coverage(NamedTuple):
@@ -117,13 +117,13 @@ def measure_coverage(
     if has_walls:
         body = _drop_small(body & (middle < NEAR_BODY_M))
         own, box = _select_body(scans, labels, body, middle)
-    # Only cells that should see the ground can be blind: a tilted sensor sees the sky in others.
+    # Only cells that point at the ground can be blind; a tilted sensor sees the sky in others.
     sees_ground = (
         np.zeros(seen.shape, bool)
         if mount is None
         else (_cell_directions(rows) @ mount.normal * MAX_GROUND_RANGE_M < -mount.height)
     )
-    sees_ground |= not sees_ground.any()  # unknown, as from high above the ground
+    sees_ground |= not sees_ground.any()  # unknown, for example high above the ground
     open_ = (seen > 0).any(axis=0) | ~sees_ground.any(axis=0)
     inside = [~select_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
     foreign = float(sum((i & ~m).sum() for i, m in zip(inside, own)) / max(1, sum(i.sum() for i in inside)))
@@ -139,7 +139,7 @@ def measure_coverage(
         [],
         _find_view(open_),
     )
-    # Without motion it may be a person next to the robot.
+    # If the robot stands still, it may be a person next to the robot.
     hiding = body & (coverage.can_crop and still is False)
     return coverage._replace(blocked=_find_blocked(((seen == 0) & sees_ground) | hiding, open_, seen, hiding))
 
@@ -160,7 +160,7 @@ def _select_body(
     points = np.concatenate([scan.xyz[m] for scan, m in zip(scans, own)])
     if not len(points):
         return own, np.zeros(0)
-    # A few returns near the body, such as of people there, do not widen the box.
+    # A few returns near the body, for example from people, do not enlarge the box.
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
     return own, np.concatenate([low - MARGIN_M, high + MARGIN_M])
 
@@ -216,7 +216,7 @@ def _find_body(
     middle = np.nanmedian(filled, axis=0)
     varies = np.nanmedian(np.abs(filled - middle), axis=0)
     steady = (share >= MIN_BODY_SCANS) & (varies <= MAX_BODY_VARIATION_M) & (len(ranges) >= 3)
-    if still is False and len(ranges) >= 5 and mount is not None:  # else the floor would count
+    if still is False and len(ranges) >= 5 and mount is not None:  # otherwise the floor would count as body
         body = steady & (middle < MAX_BODY_M)
         body &= middle * (_cell_directions(rows) @ mount.normal) + mount.height > MIN_BODY_HEIGHT_M
     else:
@@ -244,16 +244,16 @@ def _find_blocked(
     informative = (seen[:, open_] > 0).mean(axis=1) >= MIN_SEEN_SHARE if open_.any() else np.zeros(len(seen), bool)
     if not informative.any():
         return []
-    # The lowest informative beam that sees something in each sector, from below.
+    # Lowest informative beam with a return in each sector, counted from below.
     hidden = np.where(informative[:, None], blind, True)
     lowest = len(blind) - np.cumprod(hidden[::-1], axis=0).sum(axis=0)
     candidates = np.append(np.flatnonzero(informative), len(blind))
     first = candidates[np.searchsorted(candidates, lowest)]
-    for row in range(len(blind) - 2, -1, -1):  # the body hides beams, informative or not
+    for row in range(len(blind) - 2, -1, -1):  # the body blocks informative and other beams alike
         first = np.where((first == row + 1) & body[row], row, first)
     first = np.where(open_, first, 0)
     out = []
-    step = max(1, len(blind) // 16)  # rounded, so that neighbours join
+    step = max(1, len(blind) // 16)  # rounded, so that neighbours merge
     level = np.where(first < len(blind), -(-first // step) * step, len(blind))
     level = np.minimum(level, np.where(first < len(blind), len(blind) - 1, len(blind)))
     turn = int(np.argmax(np.diff(level, prepend=level[-1]) != 0))

@@ -34,16 +34,16 @@ from lidar_perception.sensor_setup.measurement.timing import Timing, measure_tim
 from lidar_perception.simulation.sensor import SENSOR_NAMES, find_sensor
 from lidar_perception.types import InputError
 
-MAX_MODEL_ERROR = 0.15  # degrees between the beams of sensors of one model, the median
-# The same for a different number of beams, as a share of the model's beam distance. Beams of any
+MAX_MODEL_ERROR = 0.15  # median difference in degrees between beams of two sensors of one model
+# The same for a different number of beams, as a fraction of the model's beam spacing. Beams of any
 # sensor are a quarter of it from the nearest beam.
 MAX_PARTIAL_ERROR = 1 / 6
 MIN_SCANS = 5  # fewer cannot separate the robot from its surroundings
-MIN_OUTDOOR_RANGE_M = 30.0  # if nothing is farther, the room limits the range and not the sensor
-MAX_OWN_SPREAD = 0.01  # degrees between points of a beam, beyond which they have been moved
-MIN_MOTION_M = 0.1  # a robot that moved less stands still
-MIN_POSE_MOTION_M = 2.0  # by its poses, which drift while it stands
-PEOPLE_ELEVATIONS = (-15.0, 5.0)  # degrees of the beams that hit people
+MIN_OUTDOOR_RANGE_M = 30.0  # if all returns are closer, the room limits the range instead of the sensor
+MAX_OWN_SPREAD = 0.01  # spread of a beam's elevations in degrees above which the points have been transformed
+MIN_MOTION_M = 0.1  # a robot that moved less is considered standing
+MIN_POSE_MOTION_M = 2.0  # minimum motion according to the poses, which drift while the robot stands
+PEOPLE_ELEVATIONS = (-15.0, 5.0)  # elevations of beams that hit people, in degrees
 
 
 class CloudSource(NamedTuple):
@@ -227,7 +227,7 @@ def _find_heading(
     shifts = find_shifts(draw_images(_level_scans(scans, mount), moves=still is False), numbers)
     if recorded.base or not recorded.poses:
         return estimate_heading(shifts, compute_shifts(recorded.poses, shifts))
-    # Odometry of the sensor itself shows where it went, but not the x axis of a base.
+    # Odometry of the sensor itself gives its motion, but not the x axis of a base.
     level = invert_pose(mount.pose)
     poses = {number: sensor @ level for number, sensor in recorded.poses.items()}
     return estimate_heading(compute_shifts(poses, shifts), {})
@@ -246,7 +246,7 @@ def _measure_distance(
     since the robot may be slow.
     """
     distance = recorded.distance
-    # Poses of a part of the clouds may be of a stop.
+    # If only some clouds have poses, the robot may have been standing there.
     if len(recorded.poses) == len(scans) or distance >= MIN_MOTION_M:
         return distance
     if mount is None or heading is None:

@@ -10,19 +10,19 @@ from scipy.fft import irfft2, rfft2
 
 from lidar_perception.geometry import wrap_angle
 
-CELL_M, HALF_SIZE_M = 0.2, 40.0  # of the images from above
-LOW_M, HIGH_M = 0.3, 3.0  # heights above the ground of points that are drawn
-MIN_SHIFT_M = 0.3  # smaller shifts show no direction
-MIN_PEAK_RATIO = 1.2  # of a clear peak to the rest of the correlation
-PEAK_HALF_SIZE = 5  # cells around a peak that do not count as the rest
-# Cells occupied in this share of the scans move with the robot, as lines of a beam on a straight
+CELL_M, HALF_SIZE_M = 0.2, 40.0  # cell size and half width of the BEV images
+LOW_M, HIGH_M = 0.3, 3.0  # heights above the ground of the points in these images
+MIN_SHIFT_M = 0.3  # minimum shift that gives a direction
+MIN_PEAK_RATIO = 1.2  # minimum ratio of a clear peak to the rest of the correlation
+PEAK_HALF_SIZE = 5  # cells around a peak that are excluded from the rest
+# Cells occupied in this fraction of the scans move with the robot, like lines of a beam on a straight
 # wall do. Only with this many scans.
 LOCKED_SHARE, MIN_LOCKED_SCANS = 0.7, 5
-GAPS = (1, 2, 4, 8, 16)  # from a cloud to the one that it is compared with
-MIN_AGREEMENT = 0.8  # length of the mean direction, 0 .. 1
-MAX_STRAIGHT_TURN = 5.0  # degrees between scans; in turns, a sensor off the origin moves sideways
-MIN_ERROR = 7.0  # degrees: surroundings may mislead all pairs of one place, as walls do
-MAX_OFF_AXIS = 10.0  # degrees between x and the heading, beyond twice the error
+GAPS = (1, 2, 4, 8, 16)  # index differences between the clouds that are compared
+MIN_AGREEMENT = 0.8  # minimum length of the mean direction vector, 0 to 1
+MAX_STRAIGHT_TURN = 5.0  # max rotation between scans in degrees; in turns, an off-centre sensor moves sideways
+MIN_ERROR = 7.0  # minimum error in degrees, since walls can mislead all pairs of one place
+MAX_OFF_AXIS = 10.0  # tolerance between x axis and heading in degrees, added to twice the error
 
 
 class Shift(NamedTuple):
@@ -32,7 +32,7 @@ class Shift(NamedTuple):
     y: float
 
 
-Shifts = Mapping[tuple[int, int], Shift | None]  # by the numbers of two scans; None if unclear
+Shifts = Mapping[tuple[int, int], Shift | None]  # (scan, scan) -> shift, None if unclear
 
 
 class Heading(NamedTuple):

@@ -13,19 +13,20 @@ from lidar_perception.ground.threshold import fit_plane, fit_plane_by_ransac, he
 from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-# The largest tilt of a sensor against the ground; beyond, its frame is another one.
+# Maximum tilt of a sensor against the ground; if larger, the frame is a different one.
 STEEP = ThresholdParams(max_slope=45.0, inlier_distance=0.08)
-MIN_DISTANCE_M = 0.3  # of ground, beyond the robot
+MIN_DISTANCE_M = 0.3  # minimum distance of ground points, outside the robot
 REACH_RATIO = 2.5  # ground is fitted up to this many times the distance of its nearest
 MIN_REACH_M, MAX_REACH_M = 5.0, 25.0  # part, within these limits
-MIN_SHARE = 0.12  # of the low points there that are on the plane
+MIN_SHARE = 0.12  # minimum fraction of the low points that are on the plane
 MIN_POINTS = 60
-INLIER_DISTANCE_M = 0.05  # of the points that the final plane is fitted to
-MIN_DEPTH_M, MAX_BEYOND_SHARE = 0.3, 0.25  # points this far below, as a share of those on it
-SECTORS = 6  # of a scan, each of which is left out once to estimate the error
-MIN_HEIGHT_M = 0.1  # a nearer surface is what the sensor stands on
-UPSIDE_DOWN_RATIO = 8.0  # of points overhead to those below: a floor overhead, not a ceiling
-MIN_EXTENT_M = 1.5  # of the plane
+INLIER_DISTANCE_M = 0.05  # inlier distance of the final plane fit
+# Depth of points below the plane, and their maximum fraction relative to those on it.
+MIN_DEPTH_M, MAX_BEYOND_SHARE = 0.3, 0.25
+SECTORS = 6  # sectors of a scan, each left out once to estimate the error
+MIN_HEIGHT_M = 0.1  # a closer surface is what the sensor stands on
+UPSIDE_DOWN_RATIO = 8.0  # ratio of points above to below from which the surface above is the floor
+MIN_EXTENT_M = 1.5  # minimum extent of the plane
 LOWERED_M = 1.0  # clouds are lowered by this to find a floor at their origin
 
 
@@ -109,7 +110,7 @@ def find_ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:
     plane = fit_plane_by_ransac(_thin_by_cells(xyz[candidate]), STEEP)
     if plane is None or (plane[2] > -MIN_HEIGHT_M if below else plane[2] < MIN_HEIGHT_M):
         return None
-    # Near ground shows best how the robot stands, since roads fall towards their curbs.
+    # Near ground best shows how the robot stands, since roads slope towards their curbs.
     near = candidate & (np.abs(height_above_plane(xyz, plane)) <= STEEP.inlier_distance)
     if near.sum() < MIN_POINTS:
         return None
@@ -125,7 +126,7 @@ def find_ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:
             break
     off = height_above_plane(xyz, plane)
     on = around & (np.abs(off) <= INLIER_DISTANCE_M)
-    beyond = around & ((off < -MIN_DEPTH_M) if below else (off > MIN_DEPTH_M))  # below a table
+    beyond = around & ((off < -MIN_DEPTH_M) if below else (off > MIN_DEPTH_M))  # the sensor may be below a table
     share = on.sum() / max(1, (around & ((off if below else -off) < 1.0)).sum())
     if (
         on.sum() < MIN_POINTS
@@ -208,7 +209,7 @@ def measure_mount(scans: Sequence[Scan]) -> Mount | None:
     middle = np.median(rows, axis=0)
     spread = 1.4826 * np.median(np.abs(rows - middle), axis=0)
     own = np.median([p.error for p in found], axis=0)
-    # In one place the error is that of a scan; in many places it is that of their agreement.
+    # For one place, use the error of a scan; for many, use the spread between them.
     error = np.maximum(1.2533 * spread / np.sqrt(len(found)), own / np.sqrt(len(found)))
     roll = (middle[1] + np.pi) % (2 * np.pi) - np.pi
     return Mount(float(middle[0]), float(roll), float(middle[2]), error, spread, list(planes), upside_down)

@@ -75,7 +75,7 @@ def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int], stamps_n
     base = poses.base
     mount = poses.find_mount(base) if base else None
     by_cloud = {}
-    # Odometry without child_frame_id may be of another frame than the base.
+    # Odometry without child_frame_id may describe another frame than the base.
     is_nameless = poses.odometry and not poses.odometry_child
     for number in () if is_nameless else numbers:
         pose = _find_base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))

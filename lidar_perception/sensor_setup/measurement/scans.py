@@ -15,13 +15,13 @@ from lidar_perception.wire.point_times import NAMES as TIMES
 from lidar_perception.wire.point_times import read_point_times
 from msg_utils.point_cloud2 import to_array
 
-# Columns with the number of the beam: of Velodyne and Ouster, Hesai and Nebula, Livox, RoboSense
+# Columns with the beam number, as named by Velodyne and Ouster, Hesai and Nebula, Livox, RoboSense
 # and others.
 RING_FIELDS = ("ring", "channel", "line", "laser_id", "laser_number", "row")
-MAX_MEDIAN_RANGE_M = 250.0  # of a cloud in metres, in the sensor's frame
-MAX_SPREAD_M = 200.0  # median distance to the cloud's centre if it is in metres in another frame
-MIN_ELEVATION_SPAN = 1.0  # degrees; a sensor with less scans a plane
-MIN_POINTS = 100  # usable points of a cloud
+MAX_MEDIAN_RANGE_M = 250.0  # maximum for a cloud in metres in the sensor's frame
+MAX_SPREAD_M = 200.0  # maximum median distance to the cloud's centre for a cloud in metres in another frame
+MIN_ELEVATION_SPAN = 1.0  # in degrees; a sensor with a smaller span scans a plane
+MIN_POINTS = 100  # minimum number of usable points of a cloud
 
 
 class Scan(NamedTuple):
@@ -156,7 +156,7 @@ def measure_intensity(scans: Sequence[Scan]) -> IntensityScale | None:
     if not len(values) or values.min() == values.max():
         return None
     greatest = float(values.max())
-    sample = values[:: max(1, len(values) // 10_000)]  # of all scans: one may begin with zeros
+    sample = values[:: max(1, len(values) // 10_000)]  # sampled over all scans, because one may begin with zeros
     whole = bool((sample == np.round(sample)).all())
     # No known driver sends whole numbers up to 1 as floats, so they count as integers.
     full = infer_full_scale(values, np.int64 if whole else values.dtype)

@@ -11,7 +11,7 @@ from lidar_perception.sensor_setup.measurement.beams import Beams
 from lidar_perception.sensor_setup.measurement.measure import MIN_OUTDOOR_RANGE_M, SensorMeasurement
 from lidar_perception.simulation.sensor import Sensor, find_sensor
 
-DEFAULT_STEP = 0.2  # degrees
+DEFAULT_STEP = 0.2  # default azimuth step in degrees
 
 
 def make_sensor(m: SensorMeasurement) -> Sensor:
@@ -69,13 +69,13 @@ def _make_in_own_frame(m: SensorMeasurement) -> Sensor:
         fields["height"] = round(mounting.mount.height, 3)
     elif mounting.height_hint is not None:
         fields["height"] = mounting.height_hint
-    # The nearest surface may be far away, as the ground is, or nearer than in the data sheet.
+    # The nearest surface may be far away, like the ground, or closer than the data sheet's minimum.
     min_range = fields.get("min_range", Sensor.min_range)
     if m.view.min_range < min_range:
         fields["min_range"] = float(np.floor(100 * m.view.min_range) / 100)
     if pattern.beams is None:
         return _make_grid(m, fields)
-    # Surroundings of a single place hide more than the robot does, so only the ends of the view
+    # In a single place the surroundings hide more than the robot does, so only the ends of the view
     # count there. The same holds if lower beams do not point lower.
     has_moved = (
         coverage.still is False

@@ -9,10 +9,10 @@ import numpy as np
 
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-MIN_GAP = 1.5  # times the usual distance of two stamps, from which on clouds are missing
-MAX_GAP = 1000  # times; longer gaps separate drives
-RATES = (0.5, 100.0)  # turns per second of real sensors
-MIN_STAMPS = 4  # for a rate
+MIN_GAP = 1.5  # stamp gap, as a multiple of the usual one, from which clouds count as missing
+MAX_GAP = 1000  # multiple of the usual gap; longer gaps separate drives
+RATES = (0.5, 100.0)  # plausible rotation rates in revolutions per second
+MIN_STAMPS = 4  # minimum number of stamps to compute a rate
 
 
 class Timing(NamedTuple):

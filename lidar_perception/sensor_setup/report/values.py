@@ -12,7 +12,7 @@ from lidar_perception.sensor_setup.measurement.scans import RING_FIELDS
 from lidar_perception.sensor_setup.report.warnings import MAX_SLOPE_SPREAD, MIN_TURN_S, check_recorded_poses
 from lidar_perception.wire.point_times import NAMES as TIMES
 
-HIGH, FAIR, LOW = "high", "fair", "low"  # confidence
+HIGH, FAIR, LOW = "high", "fair", "low"  # levels of confidence
 
 
 class MeasuredValue(NamedTuple):
@@ -120,7 +120,7 @@ def _describe_mount(m: SensorMeasurement) -> list[MeasuredValue]:
     if mount is None:
         return [MeasuredValue("height", "unknown: no ground in view", LOW)]
     error, spread = np.degrees(mount.error), np.degrees(mount.spread)
-    # In one place the slope of the ground counts as tilt.
+    # In a single place, the slope of the ground is part of the measured tilt.
     confidence = (
         HIGH
         if (

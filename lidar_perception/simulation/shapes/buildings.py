@@ -8,8 +8,8 @@ from lidar_perception.simulation.shapes.thing import GLASS, METAL, block
 from lidar_perception.simulation.solids import parts
 
 BUILDING = 50
-FOOT_M = -1.0  # bottom of a house, in the ground
-ROOM_DEPTH_M = 3.0  # behind the front
+FOOT_M = -1.0  # bottom of a house, sunk into the ground
+ROOM_DEPTH_M = 3.0  # depth of rooms behind the front
 
 
 def make_building(rng: np.random.Generator, length: float, depth: float, storeys: int) -> np.ndarray:
@@ -19,9 +19,9 @@ def make_building(rng: np.random.Generator, length: float, depth: float, storeys
     balconies and the edge of the roof protrude by up to 1.2 m. The depth is at least 4 m. At most
     40 parts for 15 m and four storeys.
     """
-    x, tone = length / 2, rng.uniform(0.25, 0.55)  # half of SemanticKITTI's: 0.34 to 0.52
+    x, tone = length / 2, rng.uniform(0.25, 0.55)  # the middle half in SemanticKITTI is 0.34 to 0.52
     ground, storey = rng.uniform(2.9, 3.8), rng.uniform(2.7, 3.2)
-    floors = [ground + storey * i for i in range(storeys)]  # the upper faces of the ceilings
+    floors = [ground + storey * i for i in range(storeys)]  # heights of the upper faces of the ceilings
     top = floors[-1]
     wall = dict(reflectance=tone)
     count = max(int(length / rng.uniform(2.8, 4.0)), 1)
@@ -53,7 +53,7 @@ def make_building(rng: np.random.Generator, length: float, depth: float, storeys
         block((-x, -0.05, FOOT_M), (x, 0.0, rng.uniform(0.4, 0.8)), reflectance=0.8 * tone),
         block((-x, -rng.uniform(0.2, 0.6), top), (x, depth, top + 0.25), reflectance=0.3),
     ]
-    if rng.random() < 0.6:  # the ridge of the roof
+    if rng.random() < 0.6:  # a roof with a ridge
         rows.append(block((-x, 0.3 * depth, top), (x, 0.7 * depth, top + rng.uniform(1.5, 3.0)), reflectance=0.3))
     rows += [row for below in floors[:-1] for row in _decorate_front(rng, below, sill, x, places, pitch)]
     return parts(rows, BUILDING)

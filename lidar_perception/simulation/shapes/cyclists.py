@@ -25,10 +25,10 @@ from lidar_perception.simulation.shapes.thing import (
 from lidar_perception.simulation.solids import BOX, ELLIPSOID, compute_extents, part, parts
 
 BICYCLE, MOTORCYCLE, BICYCLIST, MOTORCYCLIST = 11, 15, 31, 32
-CRANK_M, GEAR_M = 0.17, 5.0  # length of a crank, distance per turn of the cranks
-SPOKE_TRANSMISSION = 0.5  # share of the beams that pass between the spokes
-FRAME_TRANSMISSION = 0.6  # between stays, chain and pedals, and through the rack
-THIGH, SHANK = 0.26, 0.27  # lengths as shares of the rider's height, down to the pedal
+CRANK_M, GEAR_M = 0.17, 5.0  # length of a crank, distance per crank revolution
+SPOKE_TRANSMISSION = 0.5  # fraction of beams that pass between the spokes
+FRAME_TRANSMISSION = 0.6  # fraction of beams that pass between stays, chain and pedals, and through the rack
+THIGH, SHANK = 0.26, 0.27  # lengths down to the pedal, as fractions of the rider's height
 
 
 class RiderBuild(NamedTuple):

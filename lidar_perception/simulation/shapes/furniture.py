@@ -11,7 +11,7 @@ from lidar_perception.simulation.shapes.thing import GLASS, METAL, PLATE, RUBBER
 from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, part, parts
 
 BUILDING, FENCE, VEGETATION, POLE, SIGN, OTHER = 50, 51, 70, 80, 81, 99
-FOOT_M = -0.3  # bottom of fixed things, in the ground
+FOOT_M = -0.3  # bottom of fixed objects, sunk into the ground
 
 
 def make_pole(rng: np.random.Generator) -> np.ndarray:
@@ -311,7 +311,7 @@ def _cylinder(low: float, high: float, radius: float, reflectance: float) -> tup
     return part(CYLINDER, (0, 0, (low + high) / 2), (radius, radius, (high - low) / 2), reflectance=reflectance)
 
 
-# Things that a detector may confuse with a person.
+# Objects that a detector may confuse with a person.
 PERSON_SIZED = (
     make_sign,
     make_beacon,

@@ -293,5 +293,5 @@ def make_cart(rng: np.random.Generator) -> np.ndarray:
     return parts(rows, OTHER)
 
 
-# Things that a detector may confuse with a person.
+# Objects that a detector may confuse with a person.
 PERSON_SIZED = (make_display, make_machine, make_boxes, make_coat_stand, make_cart, make_chair)

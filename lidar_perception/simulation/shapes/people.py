@@ -14,12 +14,12 @@ from lidar_perception.simulation.solids import BOX, ELLIPSOID, compute_hull, par
 
 PERSON, OTHER = 30, 99
 CARRIED = ("", "backpack", "bag", "umbrella", "trolley", "pram")
-WHEEL_TRANSMISSION = 0.6  # share of the beams that pass between the spokes of a wheelchair
+WHEEL_TRANSMISSION = 0.6  # fraction of beams that pass between the spokes of a wheelchair
 
-STANCE = 0.54  # share of a stride with the foot on the ground; 0.6 for real walkers
-MIN_LENGTH_SHARE = 0.3  # shortest box as a share of the height, in KITTI
-HEEL_OFF = 0.6  # share of the stance after which the heel rises
-# Lengths as shares of the height, after Drillis and Contini (1966); radii with clothes.
+STANCE = 0.54  # fraction of a stride with the foot on the ground; real walkers: 0.6
+MIN_LENGTH_SHARE = 0.3  # minimum length of a box in KITTI, as a fraction of the height
+HEEL_OFF = 0.6  # fraction of the stance after which the heel rises
+# Lengths as fractions of the height, after Drillis and Contini (1966); radii include clothes.
 THIGH, SHANK, ANKLE, FOOT, SHOULDER, UPPER_ARM, FOREARM = (0.245, 0.246, 0.039, 0.152, 0.818, 0.186, 0.2)
 REACH = 0.99 * (THIGH + SHANK)
 HIP = REACH + ANKLE
@@ -159,7 +159,7 @@ def _pose_foot(u: float, stride: float, h: float) -> tuple[tuple, float, tuple]:
         x = stride * (STANCE * (smooth - 0.5))
         lift, rise = 0.03 * stride * sin(pi * v), 1.0 - smooth
     tilt = most * rise
-    ahead = 0.7 * FOOT * h  # from the ankle to the tip
+    ahead = 0.7 * FOOT * h  # distance from the ankle to the tip of the foot
     flat, steep = cos(tilt), sin(tilt)
     toe = (x + ahead, lift)
     ankle = (toe[0] - ahead * flat + ANKLE * h * steep, lift + ahead * steep + ANKLE * h * flat)
@@ -195,7 +195,7 @@ def _arm_parts(side: int, u: float, build: PersonBuild, up: float, left: bool) -
     """
     h, w, coat = build.height, build.width, build.coat
     swing = 0.45 * min(build.step / (0.43 * h), 1.2) * cos(2 * pi * u)
-    bend = 0.3 if build.step else build.phase  # standing people hold their arms in many ways
+    bend = 0.3 if build.step else build.phase  # standing people bend their arms by a random amount
     if build.carried == "pram" or (build.carried == "umbrella" and left):
         swing, bend = 0.2, (1.1 if build.carried == "pram" else 2.2)
     elif build.carried == "trolley" and not left:

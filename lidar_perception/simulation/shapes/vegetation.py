@@ -10,7 +10,7 @@ from lidar_perception.simulation.shapes.thing import interpolate, rod
 from lidar_perception.simulation.solids import BOX, ELLIPSOID, part, parts
 
 VEGETATION, TRUNK = 70, 71
-BARK, LEAVES = 0.31, 0.34  # medians of trunk and vegetation in a scan of SemanticKITTI
+BARK, LEAVES = 0.31, 0.34  # reflectances: medians of trunk and vegetation in a scan of SemanticKITTI
 WOOD = {"reflectance": BARK, "semantic": TRUNK}
 
 

@@ -24,7 +24,7 @@ from lidar_perception.simulation.shapes.thing import (
 from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, Surface, part, parts
 
 CAR = 10
-PILLAR = 0.035  # radius, m
+PILLAR = 0.035  # radius of a roof pillar, m
 LIGHTS = 0.9  # reflectance
 # Only the middle of a bumper reaches the end of the box. On KITTI's cars seen from the front,
 # points of the middle third are 0.06 m behind the end of the box at 0.25 to 0.35 of the height,
@@ -32,17 +32,17 @@ LIGHTS = 0.9  # reflectance
 # 0.3 m further behind (medians of 25 to 38 cars up to 40 m away). Tails are upright: 0.06 m in the
 # middle third up to 0.7 of the height; round at their corners: 0.15 m at 0.86 of the half width,
 # 0.4 m at 0.96. Sides are 0.04 m inside the box, which may be as wide as the mirrors.
-BUMPER = 0.29  # height of the foremost point, as a share of the height
-BONNET = 0.13  # m from the front of the box to the middle of the bonnet's edge,
-CORNER = 0.3  # m and to the sides of the edge
-TAIL = 0.07  # m from the rear of the box to the flat part of the tail
-TAIL_FLAT, TAIL_SIDE = 0.59, 0.95  # ends of the flat and the round part, of the half width
-TAIL_ROUND = 0.45  # m: length of the round part
-TAIL_LOW, TAIL_TOP = 0.22, 0.67  # ends of the closed part of the tail, of the height
-SIDE = 0.035  # m from the side of the box to the body
-DOME = 0.09  # m: rise of the roof in its middle
-MOTTLE = 0.7  # standard deviation of the logarithm of the reflectance of parts of one body
-LEGS = 0.5  # m: smallest distance from a bench to the front seats
+BUMPER = 0.29  # height of the foremost point, as a fraction of the vehicle's height
+BONNET = 0.13  # distance from the front of the box to the middle of the bonnet's edge, m
+CORNER = 0.3  # distance from the front of the box to the sides of that edge, m
+TAIL = 0.07  # distance from the rear of the box to the flat part of the tail, m
+TAIL_FLAT, TAIL_SIDE = 0.59, 0.95  # ends of the flat and the round part, as fractions of the half width
+TAIL_ROUND = 0.45  # length of the round part, m
+TAIL_LOW, TAIL_TOP = 0.22, 0.67  # ends of the closed part of the tail, as fractions of the height
+SIDE = 0.035  # distance from the side of the box to the body, m
+DOME = 0.09  # rise of the roof in the middle, m
+MOTTLE = 0.7  # standard deviation of the log reflectance among parts of one body
+LEGS = 0.5  # minimum distance from a bench to the front seats, m
 
 
 class Style(NamedTuple):

@@ -28,12 +28,12 @@ from lidar_perception.training.augment import TrainingScene, raise_scene
 from lidar_perception.training.cache import cache_path, file_fingerprint, load_or_make
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, PointCloud
 
-SPARSE_SHARES = 0.08, 0.7  # smallest and largest share of the points left in a sparse scene
-MIN_POINTS_LEFT = 3  # of a cluster in a sparse or augmented scene
-OBJECT_MARGIN_M = 0.3  # points this near to an object are cut out with it
-MAX_DECOYS = 24  # random decoys in a scene without a proposer
-MAX_PROPOSALS = 14  # of each class in a scene with a proposer,
-MAX_RANDOM_DECOYS = 8  # and random decoys there
+SPARSE_SHARES = 0.08, 0.7  # minimum and maximum fraction of points left in a sparse scene
+MIN_POINTS_LEFT = 3  # minimum points left of a cluster in a sparse or augmented scene
+OBJECT_MARGIN_M = 0.3  # points this close to an object are cut out with it
+MAX_DECOYS = 24  # number of random decoys in a scene without a proposer
+MAX_PROPOSALS = 14  # maximum proposals of each class in a scene with a proposer
+MAX_RANDOM_DECOYS = 8  # number of random decoys in a scene with a proposer
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from lidar_perception.training.record import summarize_report
 from lidar_perception.training.run import Validation
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
-MIN_SCORED_POINTS = 10  # of a cluster that counts in the accuracy
+MIN_SCORED_POINTS = 10  # minimum points of a cluster that counts in the accuracy
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def augment_clusters(
     boxes[:, :6] *= scale
     points[:, 2] += floor[number].astype(np.float32)
     boxes[:, 2] += floor
-    # The height of the ground is uncertain.
+    # Random vertical shift, because the ground height is uncertain.
     floor = floor + height + rng.uniform(-0.5, 0.5, count) * params.height
     if rng.random() < params.flip:
         points[:, 1] *= -1

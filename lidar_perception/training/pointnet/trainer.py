@@ -37,7 +37,7 @@ from lidar_perception.training.timing import find_readable_frame, measure_durati
 from lidar_perception.training.trainer import Cuts, StepSpeed
 from lidar_perception.types import InputError
 
-TIMED_FRAMES = 8  # validated together, so that the calibration counts little
+TIMED_FRAMES = 8  # frames validated together, so that the calibration adds little time
 
 
 def find_proposer(params: PointNetTraining) -> Path | None:
@@ -90,7 +90,7 @@ class PointNetTrainer:
         def prepare_scene(scene: TrainingScene) -> Any:
             return prepare(cut_scene(scene), make_rng())
 
-        chosen = select_usable_scenes(scenes, prepare_scene)  # compiles, too
+        chosen = select_usable_scenes(scenes, prepare_scene)  # also triggers compilation
         cutting, parts = measure_duration(lambda: [cut_scene(scene) for scene in chosen])
         network = make_pointnet(self.config).to(device)
         step = measure_step(

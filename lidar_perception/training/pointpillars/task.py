@@ -47,14 +47,14 @@ from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pasting import find_points_in_box
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, GroundTruth, InputError, PointCloud
 
-# Boxes of low score hardly change the AP, and validation is quicker without them.
+# Boxes with a low score hardly change the AP, and validation is faster without them.
 VALIDATION_PARAMS = DetectorParams(
     pointpillars=PointPillarsParams(scores=ScoreParams.for_all_classes(0.1), warm_up=False)
 )
-# Similar class: the class, such as Van: Car, Person_sitting: Pedestrian.
+# Similar class -> class, such as Van -> Car and Person_sitting -> Pedestrian.
 CLASS_BY_SIMILAR = {other: name for name, other in NEIGHBOURS.items()}
-MIN_TOUCH_IOU = 1e-6  # of an anchor that touches a box
-DONT_CARE_LABEL = -2  # of a box of the class DontCare
+MIN_TOUCH_IOU = 1e-6  # minimum IoU of an anchor that touches a box
+DONT_CARE_LABEL = -2  # label of a box of the class DontCare
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class ScenePreparation:
 
     def __call__(self, scene: TrainingScene, rng: np.random.Generator) -> Sample:
         """Prepare a scene. Raise InputError if no point is in the detection range."""
-        lift = np.array([0, 0, scene.height - SENSOR_HEIGHT])  # to a sensor at SENSOR_HEIGHT
+        lift = np.array([0, 0, scene.height - SENSOR_HEIGHT])  # shift to a sensor at SENSOR_HEIGHT
         low, high = np.array(self.config.low) - lift, np.array(self.config.high) - lift
         scene = turn_and_crop(scene, self.augment, low, high, rng)
         if self._objects is not None and rng.random() < self.augment.crowded:

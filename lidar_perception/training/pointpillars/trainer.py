@@ -41,7 +41,7 @@ from lidar_perception.training.trainer import Cuts, StepSpeed
 from lidar_perception.types import InputError
 
 OBJECTS = "objects.npz"
-# Range ahead and aside in metres that contains most objects.
+# Range (forward, sideways) in metres that contains most objects.
 REDUCED_RANGES = {"ahead": (46.08, 23.04), "around": (30.72, 30.72)}
 
 
@@ -84,7 +84,7 @@ class PointPillarsTrainer:
         )
         prepare = ScenePreparation(reduced, params.augment, params.data.min_points)
         chosen = select_usable_scenes(scenes, lambda scene: prepare(scene, np.random.default_rng(0)))
-        cut_objects(chosen[0], self.config.classes, params.data.min_points)  # compiles
+        cut_objects(chosen[0], self.config.classes, params.data.min_points)  # triggers compilation
         cutting, parts = measure_duration(cut_all)
         network = make_network(self.config).to(device)
         channels_last(network)
