@@ -215,7 +215,7 @@ def evaluate(
     else:
         loaded = as_detector(detector)
         loaded = loaded if min_score is None else loaded.with_min_score(min_score)
-    report = DetectionReport(follow=recording.is_sequential)
+    report = DetectionReport(sequential=recording.is_sequential)
     start = partial(measure_detector, lambda: loaded, 1.0, None)
     numbers = range(min(len(recording), limit or len(recording)))
     for _, result in measure_frames(recording, start, numbers):

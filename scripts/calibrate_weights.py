@@ -24,7 +24,7 @@ from lidar_perception.scoring.detections import measure_detector
 from lidar_perception.scoring.kitti.protocol import Comparison
 from lidar_perception.scoring.kitti.reliability import fit_calibrations
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.scoring.run import fill
+from lidar_perception.scoring.run import fill_report
 
 MIN_COUNTED_SCORE = 0.02
 
@@ -45,7 +45,7 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
     """Calibrate checkpoints, in place."""
     for path in weights:
         report = DetectionReport()
-        fill(
+        fill_report(
             report,
             open_recording(scans),
             partial(measure_detector, partial(load_uncalibrated, path), 1.0, None),

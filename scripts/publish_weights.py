@@ -39,7 +39,7 @@ from lidar_perception.runs.terminal import console
 from lidar_perception.scoring.detections import measure_detector
 from lidar_perception.scoring.intervals import INTERVAL_PERCENT
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.scoring.run import fill
+from lidar_perception.scoring.run import fill_report
 from lidar_perception.training.record import round_metrics, select_metrics
 
 ROWS = (("bev_relaxed", "BEV"), ("bev", "BEV"), ("3d_relaxed", "3D"), ("3d", "3D"))
@@ -65,8 +65,10 @@ JUDGE_NOTE = (
 def evaluate_weights(weights: Path, folder: Path) -> dict[str, Any]:
     """Return the results of `evaluate detection --intervals`, as in its JSON file."""
     recording = open_recording(folder)
-    report = DetectionReport(follow=recording.is_sequential)
-    fill(report, recording, partial(measure_detector, partial(open_detector, weights, min_score=MIN_SCORE), 1.0, None))
+    report = DetectionReport(sequential=recording.is_sequential)
+    fill_report(
+        report, recording, partial(measure_detector, partial(open_detector, weights, min_score=MIN_SCORE), 1.0, None)
+    )
     return {**report.compute(), "intervals": report.compute_intervals(SAMPLES)}
 
 

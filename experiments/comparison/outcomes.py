@@ -46,7 +46,7 @@ def start_comparison(
 
     It returns the results by name, or None for a frame without labels. The first frame is run
     twice and counts once, because a first run also loads compiled code. With open_ bound, this is a
-    Start of scoring.run.
+    StartMeasurement of scoring.run.
     """
     contenders, state = open_(), {"turn": 0}
 
@@ -90,18 +90,18 @@ class ComparisonReport:
 
     Attributes:
         resamples: Number of resamples of the drives for intervals; 0 for no intervals.
-        follow: See DetectionReport.
+        sequential: See DetectionReport.
         skipped: Reasons of frames that could not be read.
     """
 
     contenders: list[Contender]
     reports: dict[str, DetectionReport] = field(init=False)
     resamples: int = 0
-    follow: bool = False
+    sequential: bool = False
     skipped: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.reports = {contender.name: DetectionReport(follow=self.follow) for contender in self.contenders}
+        self.reports = {contender.name: DetectionReport(sequential=self.sequential) for contender in self.contenders}
 
     @property
     def first(self) -> DetectionReport:
@@ -148,7 +148,7 @@ def summarize(contender: Contender, report: DetectionReport, resamples: int = 0)
                     name: rows if name in contender.classes else None
                     for name, rows in report.compute_intervals(resamples).items()
                 },
-                "f1": centres.compute_f1_interval(contender.operating, resamples, report.follow),
+                "f1": centres.compute_f1_interval(contender.operating, resamples, report.sequential),
             }
         }
         if resamples

@@ -170,10 +170,10 @@ class ScoringOptions:
         return recording
 
     def fill(self, report: Any, recording: Any, start: Any, title: str = "evaluating") -> None:
-        """Score the frames of the recording, see scoring.run.fill."""
-        from lidar_perception.scoring.run import fill
+        """Score the frames of the recording, see scoring.run.fill_report."""
+        from lidar_perception.scoring.run import fill_report
 
-        fill(report, recording, start, limit=self.limit, jobs=self.jobs, dask=self.dask, title=title)
+        fill_report(report, recording, start, limit=self.limit, jobs=self.jobs, dask=self.dask, title=title)
 
     def write(self, content: dict) -> None:
         """Write the scores as JSON if --json was given."""

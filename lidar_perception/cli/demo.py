@@ -248,7 +248,7 @@ def _print_detections(frames: Sequence[RecordedResult], calibration: Any) -> dic
     report = DetectionReport()
     for frame in frames:
         report.update(
-            FrameDetections(str(frame.stamp_ns), to_truth(frame.truth), to_detections(frame.found), calibration)
+            FrameDetections(str(frame.stamp_ns), to_truth(frame.truth), to_detections(frame.published), calibration)
         )
     scores = score_at_threshold(report.frames)
     print_scores_at_threshold(scores, len(frames), console)
@@ -300,7 +300,7 @@ def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str
 def _drawn(frames: Sequence[RecordedResult], detector: str) -> dict[int, tuple[np.ndarray, Any]]:
     """Return {stamp: (boxes of labels, detected objects)} of the classes that are detected."""
     wanted = {CLASSES[PEDESTRIAN]} if detector == CANDIDATES else {*DETECTED}
-    return {f.stamp_ns: (f.truth.boxes[[label in wanted for label in f.truth.labels]], f.found) for f in frames}
+    return {f.stamp_ns: (f.truth.boxes[[label in wanted for label in f.truth.labels]], f.published) for f in frames}
 
 
 def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]], height: float) -> bool:

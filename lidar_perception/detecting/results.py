@@ -55,7 +55,7 @@ class FrameResult:
 def measure_records(open_: Callable[[], Detector], recording: Recording) -> Callable[[Frame], str]:
     """Return a function that runs the detector of open_() and returns its record, a JSON text.
 
-    partial(measure_records, open_) is a Start of scoring.run.
+    partial(measure_records, open_) is a StartMeasurement of scoring.run.
     """
     detector = open_()
 
@@ -135,7 +135,7 @@ def make_results(
     """Return a function that makes the FrameResult of a frame from its record.
 
     Frames must be processed in order of time, in one process. With all arguments but the last,
-    partial() makes this a Start of scoring.run.
+    partial() makes this a StartMeasurement of scoring.run.
 
     Args:
         read_record: returns the record of a frame by its name.

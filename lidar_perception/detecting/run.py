@@ -23,7 +23,7 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import ConfigurableDetector, resolve_weights
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.journal import open_journal
-from lidar_perception.scoring.run import fill, fill_journal
+from lidar_perception.scoring.run import fill_journal, fill_report
 from lidar_perception.tracking.drive_tracker import DriveTracker
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import CLASSES
@@ -168,7 +168,7 @@ def detect(
                 any(each.needs_scans for each in made),
             )
             summary = Summary(made, skipped=run.skipped)
-            fill(summary, recording, start, limit=run.count, title="writing")
+            fill_report(summary, recording, start, limit=run.count, title="writing")
     return summary
 
 

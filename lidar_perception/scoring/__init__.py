@@ -1,1 +1,1 @@
-"""Detections, ground and clusters against labels."""
+"""Scores of detections, tracks, ground and clusters on labelled recordings."""

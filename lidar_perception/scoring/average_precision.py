@@ -19,41 +19,49 @@ MIN_OBJECTS = STEPS + 1  # objects needed to fill all points
 
 
 def choose_thresholds(scores: np.ndarray, objects: int) -> np.ndarray:
-    """Choose the descending score thresholds (T,) at which precision is sampled.
+    """Choose the score thresholds (T,), in descending order, at which precision is sampled.
 
-    They are the scores of true positives (N,) with the recall nearest to 0, 1/40, .. 1, or all
-    scores for fewer than MIN_OBJECTS objects. objects is the number of labelled objects, at least
-    N.
+    These are the scores whose recall is nearest to 0, 1/40, .. 1, or all scores for fewer than
+    MIN_OBJECTS objects.
+
+    Args:
+        scores: (N,) scores of the true positives.
+        objects: Number of labelled objects, at least N.
     """
-    ordered = np.sort(scores)[::-1]
-    if objects < MIN_OBJECTS or len(ordered) == 0:
-        return ordered
-    chosen, wanted = [], 0.0
-    for i in range(len(ordered)):
-        recall, following = (i + 1) / objects, (i + 2) / objects
-        if i + 1 == len(ordered) or following - wanted >= wanted - recall:
-            chosen.append(i)
-            wanted += 1 / STEPS
-    return ordered[chosen[:MIN_OBJECTS]]
+    descending = np.sort(scores)[::-1]
+    if objects < MIN_OBJECTS or len(descending) == 0:
+        return descending
+    indices, target_recall = [], 0.0
+    for i in range(len(descending)):
+        recall, next_recall = (i + 1) / objects, (i + 2) / objects
+        if i + 1 == len(descending) or next_recall - target_recall >= target_recall - recall:
+            indices.append(i)
+            target_recall += 1 / STEPS
+    return descending[indices[:MIN_OBJECTS]]
 
 
 def sample_curve(values: np.ndarray, objects: int, official: bool = False) -> np.ndarray:
-    """Sample the highest of values (T,) at recall 0, 1/40, .. 1 or above, as (41,).
+    """Return for recall 0, 1/40, .. 1 the highest value at this recall or above, as (41,).
 
-    values belong to the thresholds of choose_thresholds. Recall that is not reached gives 0.
+    Args:
+        values: (T,) value at each threshold of choose_thresholds.
+        objects: Number of labelled objects.
+        official: Sample like KITTI's program even if there are few objects.
+
+    Recall levels that are not reached get 0.
     """
-    best = np.maximum.accumulate(values[::-1])[::-1]
+    best_values = np.maximum.accumulate(values[::-1])[::-1]
     curve = np.zeros(MIN_OBJECTS)
     if objects >= MIN_OBJECTS or official:
-        curve[: len(best)] = best
+        curve[: len(best_values)] = best_values
         return curve
     # the first true positive that reaches the recall
-    index = np.maximum((np.arange(MIN_OBJECTS) * objects + STEPS - 1) // STEPS - 1, 0)
-    reached = index < len(best)
-    curve[reached] = best[index[reached]]
+    threshold_indices = np.maximum((np.arange(MIN_OBJECTS) * objects + STEPS - 1) // STEPS - 1, 0)
+    is_reached = threshold_indices < len(best_values)
+    curve[is_reached] = best_values[threshold_indices[is_reached]]
     return curve
 
 
 def average_curve(curve: np.ndarray) -> tuple[float, float]:
-    """Return the average in percent at 11 and at 40 recall points of a curve (41,)."""
+    """Return the averages of a curve (41,) over 11 and over 40 recall points, in percent."""
     return 100 * float(curve[::4].mean()), 100 * float(curve[1:].mean())

@@ -26,12 +26,13 @@ class FrameDetections(Generic[BoxesT]):
     """Detections and labels of one frame.
 
     Attributes:
-        name: name of the frame.
-        truth: labels, or None.
-        detections: of a detector, or labels with a score in extras (result files).
-        calibration: None without a camera.
-        ms: duration of the detector, None for result files.
-        problem: why the detector rejected the frame, whose objects then count as missed, or None.
+        name: Name of the frame.
+        truth: Labels, or None.
+        detections: Output of a detector, or labels with a score in extras (result files).
+        calibration: Camera calibration, None without a camera.
+        ms: Run time of the detector, None for result files.
+        problem: Reason why the detector rejected the frame, or None. All objects of a rejected
+            frame count as misses.
     """
 
     name: str
@@ -42,57 +43,60 @@ class FrameDetections(Generic[BoxesT]):
     problem: str | None = None
 
 
-def thin_scan(frame: PointCloud, share: float, name: str) -> PointCloud:
-    """Return a random share (0..1) of the points of a frame, as of a sparser sensor (paper C).
+def thin_scan(frame: PointCloud, fraction: float, name: str) -> PointCloud:
+    """Return a random fraction (0..1) of a frame's points to emulate a sparser sensor (paper C).
 
-    The choice depends on the name of the frame only. A smaller share is a subset of a larger one.
+    The choice depends on the frame's name only. A smaller fraction is a subset of a larger one.
     """
-    if share >= 1.0:
+    if fraction >= 1.0:
         return frame
-    return frame.take(np.flatnonzero(draw_subset(len(frame), share, name)))
+    return frame.take(np.flatnonzero(draw_subset(len(frame), fraction, name)))
 
 
-def draw_subset(count: int, share: float, name: str) -> np.ndarray:
-    """Return a mask (count,) bool of a random share of the points, seeded by name."""
-    return np.random.default_rng(zlib.crc32(name.encode())).random(count) < share
+def draw_subset(count: int, fraction: float, name: str) -> np.ndarray:
+    """Return a random mask (count,) bool, seeded by `name`, that is True for this fraction."""
+    return np.random.default_rng(zlib.crc32(name.encode())).random(count) < fraction
 
 
 def run_detector(
-    detector: Detector, frame: Frame, truth: GroundTruth | None, calibration: Calibration | None, keep: float = 1.0
+    detector: Detector, frame: Frame, truth: GroundTruth | None, calibration: Calibration | None, fraction: float = 1.0
 ) -> FrameDetections[Detections]:
-    """Run a detector on a share `keep` of the points of a frame.
+    """Run a detector on a random fraction of the points of a frame.
 
-    Raises InputError if the scan cannot be read.
+    Raises:
+        InputError: The scan cannot be read.
     """
-    scan = thin_scan(frame.load(), keep, frame.name)
-    begin = perf_counter()
+    scan = thin_scan(frame.load(), fraction, frame.name)
+    start = perf_counter()
     try:
-        found = detector(scan)
+        result = detector(scan)
     except RunError:
         raise
     except InputError as error:
         return FrameDetections(frame.name, truth, Detections.none(), calibration, problem=str(error))
-    return FrameDetections(frame.name, truth, found.detections, calibration, (perf_counter() - begin) * 1e3)
+    return FrameDetections(frame.name, truth, result.detections, calibration, (perf_counter() - start) * 1e3)
 
 
 def measure_detector(
-    open_: Callable[[], Detector], keep: float, folder: Path | None, recording: Recording
+    open_detector: Callable[[], Detector], fraction: float, folder: Path | None, recording: Recording
 ) -> Callable[[Frame], FrameDetections[Detections] | None]:
-    """Make a function that runs the detector of open_() on each labelled frame.
+    """Make a function that runs a detector on each labelled frame.
 
-    partial(measure_detector, open_, keep, folder) is a Start of scoring.run.
+    partial(measure_detector, open_detector, fraction, folder) is a StartMeasurement of scoring.run.
 
     Args:
-        keep: share of the points that the detector gets, 0..1.
-        folder: also run on frames without labels, and write KITTI result files there.
+        open_detector: Function that loads the detector.
+        fraction: Fraction of the points that the detector gets, 0..1.
+        folder: Folder for KITTI result files, or None. With a folder, frames without labels are
+            processed too.
     """
-    detector = open_()
+    detector = open_detector()
 
     def measure(frame: Frame) -> FrameDetections[Detections] | None:
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None and folder is None:
             return None
-        result = run_detector(detector, frame, truth, calibration, keep)
+        result = run_detector(detector, frame, truth, calibration, fraction)
         if folder is not None:
             try:
                 write_results(folder / f"{frame.name}.txt", result.detections, choose_calibration(frame)[0])
@@ -106,11 +110,11 @@ def measure_detector(
 def measure_result_files(folder: Path, recording: Recording) -> Callable[[Frame], FrameDetections[GroundTruth] | None]:
     """Make a function that reads the KITTI result file folder/NAME.txt of each labelled frame.
 
-    folder may be a run of `detect`; frames that the run skipped are skipped.
-    partial(measure_result_files, folder) is a Start of scoring.run.
+    `folder` may be the output of `detect`; frames that `detect` skipped are skipped here too.
+    partial(measure_result_files, folder) is a StartMeasurement of scoring.run.
     """
-    files = find_result_folder(folder)
-    skipped = journal.read_skipped_frames(files.parent)
+    result_folder = find_result_folder(folder)
+    skipped = journal.read_skipped_frames(result_folder.parent)
 
     def measure(frame: Frame) -> FrameDetections[GroundTruth] | None:
         truth, calibration = frame.truth(), frame.calibration()
@@ -119,9 +123,9 @@ def measure_result_files(folder: Path, recording: Recording) -> Callable[[Frame]
         if frame.name in skipped:
             raise InputError(skipped[frame.name])
         try:
-            found = read_results(files / f"{frame.name}.txt", choose_calibration(frame)[0].lidar_to_camera)
+            detections = read_results(result_folder / f"{frame.name}.txt", choose_calibration(frame)[0].lidar_to_camera)
         except InputError as error:
             raise RunError(str(error)) from None
-        return FrameDetections(frame.name, truth, found, calibration)
+        return FrameDetections(frame.name, truth, detections, calibration)
 
     return measure

@@ -15,20 +15,20 @@ MIN_DRIVES, BLOCK_FRAMES = 8, 10
 INTERVAL_PERCENT = 90  # percentage of the draws inside an interval
 
 
-def group_frames(names: Sequence[str], follow: bool = False) -> list[np.ndarray]:
-    """Group frames, named DRIVE/FRAME, into the drives or blocks to draw from.
+def group_frames(names: Sequence[str], sequential: bool = False) -> list[np.ndarray]:
+    """Group frames into the drives or blocks that the bootstrap draws from.
 
     Args:
-        names: names of the frames.
-        follow: True if frames without a drive are consecutive, as in a bag; they are then one
-            drive. Otherwise each frame counts as one drive, as in KITTI's object layout.
+        names: Names of the frames, DRIVE/FRAME.
+        sequential: True if frames without a drive name are consecutive, as in a bag; they form one
+            drive. Otherwise each of them counts as its own drive, as in KITTI's object layout.
 
     Returns:
-        Indices of the frames of each group.
+        Frame indices of each group.
     """
     drives: dict[str, list[int]] = {}
     for i, name in enumerate(names):
-        drives.setdefault(name.rpartition("/")[0] or ("" if follow else f"/{i}"), []).append(i)
+        drives.setdefault(name.rpartition("/")[0] or ("" if sequential else f"/{i}"), []).append(i)
     if len(drives) >= MIN_DRIVES:
         return [*map(np.array, drives.values())]
     return [
@@ -39,26 +39,35 @@ def group_frames(names: Sequence[str], follow: bool = False) -> list[np.ndarray]
 
 
 def compute_interval(
-    score: Callable[[np.ndarray], float | None], parts: Sequence[np.ndarray], count: int
+    score: Callable[[np.ndarray], float | None], groups: Sequence[np.ndarray], count: int
 ) -> list[float] | None:
-    """Return [low, high] of score(frames) over `count` draws of the groups in parts.
+    """Compute the bootstrap interval [low, high] of a score.
 
-    frames (F,) are indices. Returns None for fewer than two groups, or if no draw has a score.
+    Args:
+        score: Function of frame indices (F,) that returns a score, or None if there is none.
+        groups: Frame indices of each drive or block, see group_frames.
+        count: Number of bootstrap draws.
+
+    Returns:
+        The interval, or None for fewer than two groups or if no draw has a score.
     """
-    return compute_bounds(score(frames) for frames in draw_samples(parts, count))
+    return compute_bounds(score(frames) for frames in draw_samples(groups, count))
 
 
-def draw_samples(parts: Sequence[np.ndarray], count: int) -> Iterator[np.ndarray]:
-    """Yield indices of frames (F,) for `count` draws with a fixed seed; none for one group."""
+def draw_samples(groups: Sequence[np.ndarray], count: int) -> Iterator[np.ndarray]:
+    """Yield the frame indices (F,) of `count` bootstrap draws (fixed seed); none for one group."""
     rng = np.random.default_rng(0)
-    for _ in range(count if len(parts) > 1 else 0):
-        yield np.concatenate([parts[i] for i in rng.integers(len(parts), size=len(parts))])
+    for _ in range(count if len(groups) > 1 else 0):
+        yield np.concatenate([groups[i] for i in rng.integers(len(groups), size=len(groups))])
 
 
 def compute_bounds(scores: Iterable[float | None]) -> list[float] | None:
-    """Return [low, high] of the central INTERVAL_PERCENT of the scores, None without any."""
-    found = [score for score in scores if score is not None]
-    if not found:
+    """Return the bounds [low, high] of the central INTERVAL_PERCENT of the scores.
+
+    Scores of None are ignored. Returns None if no score remains.
+    """
+    values = [score for score in scores if score is not None]
+    if not values:
         return None
     limits = (100 - INTERVAL_PERCENT) / 2, (100 + INTERVAL_PERCENT) / 2
-    return np.percentile(found, limits).round(2).tolist()
+    return np.percentile(values, limits).round(2).tolist()

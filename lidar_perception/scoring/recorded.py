@@ -1,4 +1,4 @@
-"""Results that a running graph recorded to a bag, with the labels of their frames."""
+"""Results that ROS nodes recorded to a bag, with the labels of the same frames."""
 
 from __future__ import annotations
 
@@ -14,41 +14,43 @@ from msg_utils.markers import MarkedObjects, from_marker_array
 
 @dataclass(frozen=True)
 class RecordedResult:
-    """Labels of one frame, and the objects that a node published for it."""
+    """Labels of one frame and the objects that a node published for it."""
 
     stamp_ns: int
     truth: MarkedObjects
-    found: MarkedObjects
+    published: MarkedObjects
 
 
 def read_results(path: Path, *topics: str) -> list[list[RecordedResult]]:
-    """Read the results of labelled frames from each of several topics, in order of time.
+    """Read the results of labelled frames from each topic, in order of time.
 
-    Results are in the frame of the labels. Of messages with equal stamps the last one counts.
+    Results are transformed into the frame of the labels. If several messages have the same stamp,
+    the last one is used.
 
     Raises:
-        InputError: no transform connects the results with the labels.
+        InputError: No transform connects the results with the labels.
     """
-    opened = BagHandle(path)
-    found = read_objects_by_stamp(opened.bag(), (*topics, TRUTH))
-    truth = found[TRUTH]
-    poses = BagPoses(opened, next((each.frame_id for each in truth.values()), ""))
+    handle = BagHandle(path)
+    objects = read_objects_by_stamp(handle.bag(), (*topics, TRUTH))
+    truth = objects[TRUTH]
+    poses = BagPoses(handle, next((labels.frame_id for labels in truth.values()), ""))
     return [
         [
-            RecordedResult(stamp, truth[stamp], poses.to_cloud_frame(found[topic][stamp], topic))
-            for stamp in sorted(found[topic].keys() & truth.keys())
+            RecordedResult(stamp, truth[stamp], poses.to_cloud_frame(objects[topic][stamp], topic))
+            for stamp in sorted(objects[topic].keys() & truth.keys())
         ]
         for topic in topics
     ]
 
 
 def read_objects_by_stamp(bag: Bag, topics: Iterable[str]) -> dict[str, dict[int, MarkedObjects]]:
-    """Read the objects on MarkerArray topics by topic and header.stamp.
+    """Read the objects of MarkerArray topics, by topic and header.stamp.
 
-    Of messages with equal stamps the last one counts. A topic that is not in the bag is empty.
+    If several messages have the same stamp, the last one is used. A topic that is not in the bag
+    has no objects.
     """
-    found: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in topics}
-    for topic, _, message in bag.messages(found.keys() & bag.topics.keys()):
+    by_topic: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in topics}
+    for topic, _, message in bag.messages(by_topic.keys() & bag.topics.keys()):
         objects = from_marker_array(message)
-        found[topic][objects.stamp_ns] = objects
-    return found
+        by_topic[topic][objects.stamp_ns] = objects
+    return by_topic

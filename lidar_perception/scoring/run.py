@@ -1,11 +1,11 @@
 """Measurement of the frames of a recording, in one process, in several, or on a Dask cluster.
 
     for i, result in measure_frames(recording, start, jobs=4): ...
-    fill(report, recording, start)          # update() with each result, skipped frames named
+    fill_report(report, recording, start)   # calls update() with each result, lists skipped frames
 
-start(recording) is called once per process and returns measure(frame), which returns any picklable
-result, or None for a frame without one. InputError from measure, or from reading the frame in it,
-skips the frame. Results are in the order of the frames.
+start(recording) is called once per process and returns a function measure(frame). It returns any
+picklable result, or None for a frame without a result. If it raises InputError, the frame is
+skipped. Results come in the order of the frames.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from lidar_perception.runs.processes import run_in_processes
 from lidar_perception.runs.terminal import show_progress
 from lidar_perception.types import InputError, RunError
 
-Start = Callable[[Recording], Callable[[Frame], Any]]
+StartMeasurement = Callable[[Recording], Callable[[Frame], Any]]
 
 CONNECT_S = 20.0  # timeout for a Dask scheduler and its first worker
 TASKS_PER_THREAD = 2  # number of tasks per thread of a Dask cluster
 
 
 class Report(Protocol):
-    """Collection of the results of frames; skipped has one line per skipped frame."""
+    """Collection of the results of frames; `skipped` has one line per skipped frame."""
 
     skipped: list[str]
 
@@ -50,31 +50,31 @@ class Skipped(str):
     """Reason why a frame was not measured."""
 
 
-def fill(
+def fill_report(
     report: Report,
     recording: Recording,
-    start: Start,
+    start: StartMeasurement,
     *,
     limit: int | None = None,
     jobs: int = 1,
     dask: str | None = None,
     title: str = "evaluating",
 ) -> None:
-    """Update a report with the results of a recording under a progress bar.
+    """Measure a recording, add the results to a report, and show a progress bar.
 
     Skipped frames are added to report.skipped. Without a limit these include labels whose scan is
     missing.
 
     Args:
-        limit: number of frames to measure, None for all.
+        limit: Number of frames to measure, None for all.
 
     Raises:
-        InputError: a process or the cluster failed.
+        InputError: A process or the cluster failed.
     """
     count = min(len(recording), limit or len(recording))
-    found = measure_frames(recording, start, range(count), jobs=jobs, dask=dask)
-    with closing(found):
-        for _, result in show_progress(found, title, count):
+    results = measure_frames(recording, start, range(count), jobs=jobs, dask=dask)
+    with closing(results):
+        for _, result in show_progress(results, title, count):
             if isinstance(result, Skipped):
                 report.skipped.append(str(result))
             elif result is not None:
@@ -86,7 +86,7 @@ def fill(
 def fill_journal(
     journal: Journal,
     recording: Recording,
-    start: Start,
+    start: StartMeasurement,
     names: Sequence[str],
     *,
     jobs: int = 1,
@@ -96,35 +96,39 @@ def fill_journal(
     """Measure frames and add each result to a journal as soon as it is complete.
 
     Frames that are already in the journal are not measured again. measure() returns a JSON object
-    with the frame's name under "frame". A skipped frame is written as {"frame": name, "skipped":
-    reason}.
+    that contains {"frame": name}. A skipped frame is written as {"frame": name, "skipped": reason}.
 
     Args:
-        names: names of the first frames of the recording.
+        names: Names of the frames to measure, the first ones of the recording.
 
     Raises:
-        InputError: a process or the cluster failed.
+        InputError: A process or the cluster failed.
     """
-    missing = [i for i, name in enumerate(names) if name not in journal.lines]
-    found = measure_frames(recording, start, missing, jobs=jobs, dask=dask)
-    with closing(found):
-        for i, line in show_progress(found, title, len(missing)):
+    unfinished = [i for i, name in enumerate(names) if name not in journal.lines]
+    results = measure_frames(recording, start, unfinished, jobs=jobs, dask=dask)
+    with closing(results):
+        for i, line in show_progress(results, title, len(unfinished)):
             journal.add(json.dumps({"frame": names[i], "skipped": str(line)}) if isinstance(line, Skipped) else line)
 
 
 def measure_frames(
-    recording: Recording, start: Start, numbers: Sequence[int] | None = None, *, jobs: int = 1, dask: str | None = None
+    recording: Recording,
+    start: StartMeasurement,
+    numbers: Sequence[int] | None = None,
+    *,
+    jobs: int = 1,
+    dask: str | None = None,
 ) -> Generator[tuple[int, Any]]:
-    """Yield (i, result of frame i, or Skipped) in the order of the frames.
+    """Yield (i, result), or (i, Skipped) for a frame that is skipped, in the order of the frames.
 
     Args:
-        numbers: indices of the frames in ascending order, None for all.
-        jobs: number of processes.
-        dask: address of a Dask scheduler. Its workers need this package and the recording under the
+        numbers: Indices of the frames in ascending order, None for all.
+        jobs: Number of processes.
+        dask: Address of a Dask scheduler. Its workers need this package and the recording under the
             same path.
 
     Raises:
-        InputError: a process or the cluster failed.
+        InputError: A process or the cluster failed.
     """
     numbers = range(len(recording)) if numbers is None else numbers
     if dask is not None:
@@ -136,21 +140,23 @@ def measure_frames(
 
 
 def sort_results(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]) -> Generator[tuple[int, Any]]:
-    """Yield pairs (number, value) in the order of `numbers`, each as early as possible."""
-    waiting: dict[int, Any] = {}
-    wanted = iter(numbers)
-    following = next(wanted, None)
+    """Yield pairs (number, value) in the order of `numbers`, each as soon as it is available."""
+    held_back: dict[int, Any] = {}
+    remaining = iter(numbers)
+    next_number = next(remaining, None)
     for number, value in pairs:
-        waiting[number] = value
-        while following in waiting:
-            yield following, waiting.pop(following)
-            following = next(wanted, None)
+        held_back[number] = value
+        while next_number in held_back:
+            yield next_number, held_back.pop(next_number)
+            next_number = next(remaining, None)
 
 
-def _measure_in_process(recording: Recording, start: Start, numbers: Sequence[int]) -> Generator[tuple[int, Any]]:
-    measure, wanted = start(recording), set(numbers)
-    for i, frame in enumerate(islice(recording, max(wanted, default=-1) + 1)):
-        if i in wanted:
+def _measure_in_process(
+    recording: Recording, start: StartMeasurement, numbers: Sequence[int]
+) -> Generator[tuple[int, Any]]:
+    measure, selected = start(recording), set(numbers)
+    for i, frame in enumerate(islice(recording, max(selected, default=-1) + 1)):
+        if i in selected:
             yield i, _measure_safely(measure, frame)
 
 
@@ -172,8 +178,8 @@ def _require_reopen(recording: Recording) -> Callable[[], Recording]:
     return recording.reopen
 
 
-def _make_worker(reopen: Callable[[], Recording], start: Start) -> Callable[[int], tuple[int, Any]]:
-    """Return a function index -> (index, result), for use in the process that calls this."""
+def _make_worker(reopen: Callable[[], Recording], start: StartMeasurement) -> Callable[[int], tuple[int, Any]]:
+    """Open the recording in this process and return a function index -> (index, result)."""
     recording = reopen()
     measure = start(recording)
     return lambda i: (i, _measure_safely(measure, recording.frames[i]))
@@ -182,7 +188,7 @@ def _make_worker(reopen: Callable[[], Recording], start: Start) -> Callable[[int
 _get_worker = functools.lru_cache(maxsize=1)(lambda run, reopen, start: _make_worker(reopen, start))
 
 
-def _measure_on_cluster(run: str, reopen: Callable[[], Recording], start: Start, i: int) -> tuple[int, Any]:
+def _measure_on_cluster(run: str, reopen: Callable[[], Recording], start: StartMeasurement, i: int) -> tuple[int, Any]:
     """Measure a frame in a process that other runs may share."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by libraries that are loaded later
     with threadpool_limits(1):
@@ -190,9 +196,9 @@ def _measure_on_cluster(run: str, reopen: Callable[[], Recording], start: Start,
 
 
 def _measure_on_dask(
-    address: str, recording: Recording, start: Start, numbers: Sequence[int]
+    address: str, recording: Recording, start: StartMeasurement, numbers: Sequence[int]
 ) -> Iterator[tuple[int, Any]]:
-    """Yield results in the order in which the workers of a Dask cluster finish."""
+    """Yield results in the order in which the workers of a Dask cluster finish them."""
     try:
         import distributed
         from distributed.comm import CommClosedError
@@ -209,14 +215,16 @@ def _measure_on_dask(
             f"cannot reach a Dask scheduler with workers at {address}: {str(error) or repr(error)}"
         ) from None
     with client:
-        ahead = TASKS_PER_THREAD * sum(client.nthreads().values())
-        waiting = iter(numbers)
-        running = distributed.as_completed(client.map(work, [*islice(waiting, ahead)], pure=False), loop=client.loop)
+        max_submitted = TASKS_PER_THREAD * sum(client.nthreads().values())
+        not_submitted = iter(numbers)
+        submitted = distributed.as_completed(
+            client.map(work, [*islice(not_submitted, max_submitted)], pure=False), loop=client.loop
+        )
         try:
-            for future in running:
+            for future in submitted:
                 yield future.result()
-                for number in islice(waiting, 1):
-                    running.add(client.submit(work, number, pure=False))
+                for number in islice(not_submitted, 1):
+                    submitted.add(client.submit(work, number, pure=False))
         except (distributed.KilledWorker, CommClosedError, CancelledError) as error:
             raise InputError(
                 f"the Dask cluster at {address} failed: {error}; finished frames are kept, and the same command resumes"

@@ -13,7 +13,7 @@ MAX_SHOWN = 5  # maximum number of reasons listed for skipped frames
 
 
 def make_table(title: str, first: str, *others: str, width: int = 0) -> Table:
-    """Make a table for 80 columns: a first column of text, the others numbers of min. `width`."""
+    """Make a table with one column of text, then right-aligned columns of at least `width`."""
     table = Table(title=title, box=SIMPLE_HEAD, padding=0, caption_justify="left")
     table.add_column(first, overflow="fold")
     for name in others:
@@ -22,27 +22,27 @@ def make_table(title: str, first: str, *others: str, width: int = 0) -> Table:
 
 
 def format_number(value: float | None, digits: int = 2, width: int = 5) -> str:
-    """Format a number in at most width characters (84.00, 100.0); a dash for None and inf."""
+    """Format a number with at most `width` characters (84.00, 100.0); None and inf as a dash."""
     return "-" if value is None or math.isinf(value) else f"{value:.{digits}f}"[:width].rstrip(".")
 
 
 def format_interval(interval: list[float] | None) -> str:
-    """Format an interval as 44-89; a dash for None."""
+    """Format an interval like 44-89; None as a dash."""
     return "-" if interval is None else "-".join(f"{value:.0f}" for value in interval)
 
 
 def format_percent(row: dict, *keys: str) -> list[str]:
-    """Format shares 0..1 of a row of scores in percent."""
+    """Format the ratios (0..1) at these keys of a row of scores as percentages."""
     return [f"{100 * row[key]:.1f}" for key in keys]
 
 
 def format_counts(row: dict, *keys: str) -> list[str]:
-    """Format integers of a row of scores."""
+    """Format the counts at these keys of a row of scores."""
     return [str(row[key]) for key in keys]
 
 
 def print_time(ms: float | None, console: Console) -> None:
-    """Print the median duration of the detector, if it was run."""
+    """Print the median run time of the detector, unless it is None."""
     if ms is not None:
         console.print(f"detector: {ms:.1f} ms a frame (median)")
 

@@ -33,7 +33,7 @@ from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.open import LOAD
 from lidar_perception.labels.exchange import import_labels
 from lidar_perception.scoring.recorded import read_objects_by_stamp
-from lidar_perception.scoring.run import fill
+from lidar_perception.scoring.run import fill_report
 from lidar_perception.scoring.tracking.report import TrackingReport, measure_tracking, observe
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import Detections
@@ -228,7 +228,7 @@ def test_written_tracks_score_like_the_tracker(drives, tmp_path, monkeypatch):
         detect(monkeypatch, drives, "--out", tmp_path, "--format", "kitti", "--track", "--ego", "none", "--force") == 0
     )
     recording, itself, read = open_recording(drives), TrackingReport(), TrackingReport()
-    fill(
+    fill_report(
         itself,
         recording,
         partial(measure_tracking, lambda: MadeDetector().with_min_score(0.05), TrackingParams(), "none"),

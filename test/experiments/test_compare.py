@@ -25,7 +25,7 @@ from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
 from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
 from lidar_perception.scoring.kitti.protocol import SCORED
-from lidar_perception.scoring.run import fill
+from lidar_perception.scoring.run import fill_report
 from lidar_perception.types import Detections, InputError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -64,7 +64,7 @@ def compute_report(root, *detectors) -> dict:
     """Return the report of detectors; each is a function from a frame to a detector or None."""
     contenders = [Contender(str(i), each) for i, each in enumerate(detectors)]
     report = ComparisonReport(contenders)
-    fill(report, open_recording(root), partial(start_comparison, lambda: contenders))
+    fill_report(report, open_recording(root), partial(start_comparison, lambda: contenders))
     return report.compute()
 
 

@@ -42,7 +42,7 @@ from lidar_perception.scoring.centres.matching import (
 from lidar_perception.scoring.centres.report import CandidateReport, measure_candidates
 from lidar_perception.scoring.centres.report import measure_frame as score_frame
 from lidar_perception.scoring.centres.tables import PAPER_TABLE_6
-from lidar_perception.scoring.run import fill
+from lidar_perception.scoring.run import fill_report
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
 COUNT = 7
@@ -122,7 +122,7 @@ def test_hits_and_misses_add_up_to_labels(kitti, measured):
 
 def test_stages_agree_with_evaluate_candidates(kitti, measured):
     report = CandidateReport()
-    fill(report, open_recording(kitti), partial(measure_candidates, PAPER))
+    fill_report(report, open_recording(kitti), partial(measure_candidates, PAPER))
     assert report.frames == len(measured)
     for stage, score in report.scores.items():
         for key in ("tp", "fp", "fn"):

@@ -29,7 +29,7 @@ from lidar_perception.scoring.centres.report import (
 )
 from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.scoring.run import Skipped, fill, measure_frames
+from lidar_perception.scoring.run import Skipped, fill_report, measure_frames
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError, PointCloud
 
 seeds = st.integers(0, 2**32 - 1)
@@ -206,7 +206,7 @@ def truth_of(*centres, label="Pedestrian"):
 def run(frames, source="ground_truth"):
     report, recording = CandidateReport(), Recording(Path("here"), "memory", frames)
     start = partial(measure_candidates, PipelineParams(seed=SeedParams(source=source)))
-    fill(report, recording, start)
+    fill_report(report, recording, start)
     found = [result for _, result in measure_frames(recording, start)]
     assert len(found) == len(frames)
     return report.compute(), found

@@ -61,7 +61,11 @@ def test_recorded_tracks_are_scored_if_labels_have_ids(recorded):
         scores = score_recorded_tracks(frames, None)["Pedestrian"]
         assert (scores["true_tracks"], scores["switches"]) == (3, 0) and scores["HOTA"] > 0.8
         later = [
-            replace(f, stamp_ns=f.stamp_ns + 600 * TENTH, found=replace(f.found, ids=np.asarray(f.found.ids) + 100))
+            replace(
+                f,
+                stamp_ns=f.stamp_ns + 600 * TENTH,
+                published=replace(f.published, ids=np.asarray(f.published.ids) + 100),
+            )
             for f in frames
         ]
         both = score_recorded_tracks([*frames, *later], None)["Pedestrian"]  # two drives

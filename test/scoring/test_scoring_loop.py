@@ -14,7 +14,7 @@ from samples import object_folder, walker_label, write
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.scoring.detections import measure_result_files
-from lidar_perception.scoring.run import Skipped, fill, measure_frames, sort_results
+from lidar_perception.scoring.run import Skipped, fill_report, measure_frames, sort_results
 from lidar_perception.types import InputError, RunError
 
 COUNT = 5
@@ -79,7 +79,7 @@ def test_processes_measure_the_frames_of_a_split(root, tmp_path):
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_unreadable_frame_is_skipped_by_name(root, jobs):
     recording, report = open_recording(root), Names()
-    fill(report, recording, counting, jobs=jobs)
+    fill_report(report, recording, counting, jobs=jobs)
     (line,) = report.skipped
     assert report.names == ["000000", "000002", "000004"]
     assert "000001.bin" in line and "\n" not in line
@@ -89,7 +89,7 @@ def test_unreadable_frame_is_skipped_by_name(root, jobs):
 def test_run_error_ends_the_run_and_keeps_earlier_results(root, jobs):
     report = Names()
     with pytest.raises(InputError, match=r"^cannot go on after 000002$"):
-        fill(report, open_recording(root), functools.partial(ending, "000002"), jobs=jobs)
+        fill_report(report, open_recording(root), functools.partial(ending, "000002"), jobs=jobs)
     assert report.skipped == [] and "000002" not in report.names
     assert report.names == ["000000", "000001"][: len(report.names)]
 
@@ -134,7 +134,7 @@ def test_limit_reads_no_other_frames(root, limit, expected):
         return lambda frame: touched.append(frame.name) or measure(frame)
 
     report = Names()
-    fill(report, open_recording(root), noting, limit=limit)
+    fill_report(report, open_recording(root), noting, limit=limit)
     assert report.names == expected
     assert touched == [f"00000{i}" for i in range(min(limit or COUNT, COUNT))]
 

@@ -14,7 +14,7 @@ from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.labels import read_tracking_labels
 from lidar_perception.data.kitti.results import write_tracking_results
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.scoring.run import fill
+from lidar_perception.scoring.run import fill_report
 from lidar_perception.scoring.tracking.clear import ClearCounts, count_clear
 from lidar_perception.scoring.tracking.hota import HotaCounts, count_hota
 from lidar_perception.scoring.tracking.over_recall import score_over_recall
@@ -149,7 +149,7 @@ def test_unnamed_drives_of_a_bag_score_like_named_ones():
                     Frame.of(f"{k}/{i}", scan, truth, sequence=str(k) * named, index=i if named else len(frames))
                 )
         recording, report = Recording("a", "", frames), TrackingReport()
-        fill(
+        fill_report(
             report,
             recording,
             partial(measure_tracking, lambda: lambda scan: found[scan.stamp_ns], TrackingParams(), "none"),
@@ -175,7 +175,7 @@ def test_frames_without_pose_are_counted_and_reported(capsys):
     ]
     for ego, unknown in ("recording", 2), ("none", 0):
         report = TrackingReport()
-        fill(
+        fill_report(
             report,
             Recording("a", "", frames),
             partial(measure_tracking, lambda: lambda scan: DetectionResult(Detections.none()), TrackingParams(), ego),

@@ -87,7 +87,7 @@ class DetectionRequest:
         return recording
 
     def make_start(self, recording: Any) -> Any:
-        """Return the function that scores a frame, see scoring.run.Start."""
+        """Return the function that scores a frame, see scoring.run.StartMeasurement."""
         from lidar_perception.scoring.detections import measure_detector, measure_result_files
 
         if self.detector is None:
@@ -198,7 +198,7 @@ def detection(options: ScoringOptions, **choices: Any) -> None:
     request = DetectionRequest(options, **choices)
     request.check()
     recording = request.open_recording()
-    report = DetectionReport(follow=recording.is_sequential)
+    report = DetectionReport(sequential=recording.is_sequential)
     options.fill(report, recording, request.make_start(recording))
     if request.write_results is not None:
         console.print(f"result files: {request.write_results}")

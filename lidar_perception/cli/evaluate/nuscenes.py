@@ -52,7 +52,7 @@ class NuscenesRequest:
         return recording
 
     def make_start(self, recording: Any) -> Any:
-        """Return the function that scores a frame, see scoring.run.Start."""
+        """Return the function that scores a frame, see scoring.run.StartMeasurement."""
         from lidar_perception.scoring.nuscenes.report import measure_key_frames, measure_result_file
 
         if self.detector is None:

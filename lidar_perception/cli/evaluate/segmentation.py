@@ -92,9 +92,9 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
     if not (report.ground or report.clusters):
         raise no_labels_error(recordings[0], report.skipped)
     content = report.compute()
-    if report.whole:
+    if report.without_camera:
         errors.print(
-            f"{', '.join(map(str, options.data))}: {report.whole} frames "
+            f"{', '.join(map(str, options.data))}: {report.without_camera} frames "
             "without a camera calibration were scored as a whole"
         )
     print_scores(content, params.ground.method, console)

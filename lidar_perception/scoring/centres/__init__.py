@@ -1,1 +1,1 @@
-"""Paper A's protocol: pedestrians by centre distance."""
+"""Protocol of paper A: pedestrians matched by centre distance."""

@@ -11,77 +11,82 @@ MAX_CENTRE_DISTANCE = 1.0  # metres, Section 3.8
 
 
 def match_centres(
-    found: np.ndarray, truth: np.ndarray, max_distance: float = MAX_CENTRE_DISTANCE
+    detections: np.ndarray, labels: np.ndarray, max_distance: float = MAX_CENTRE_DISTANCE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match boxes one to one whose 3D centres are at most max_distance apart.
+    """Match detections (K, >=3) and labels (M, >=3) one to one by their 3D centres.
 
-    As many pairs as possible, then the least total distance. Returns the rows (P,) of found (K,
-    >=3) and of truth (M, >=3).
+    Centres of a pair are at most max_distance apart. The number of pairs is as large as possible,
+    then the total distance as small as possible.
+
+    Returns:
+        Indices (P,) of the detections and (P,) of the labels of the pairs.
     """
-    distance = np.linalg.norm(found[:, None, :3].astype(float) - truth[None, :, :3], axis=2)
+    distance = np.linalg.norm(detections[:, None, :3].astype(float) - labels[None, :, :3], axis=2)
     return assign_pairs(distance, distance <= max_distance)  # NaN centres match nothing
 
 
 def assign_pairs(cost: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Assign rows to columns of a non-negative cost (K, M) where allowed (K, M) bool.
+    """Assign rows to columns of a non-negative cost matrix (K, M).
 
-    As many pairs as possible, then the least total cost. Returns rows (P,) and columns (P,).
+    The number of pairs is as large as possible, then the total cost as small as possible. Only
+    pairs with allowed (K, M) bool are assigned. Returns rows (P,) and columns (P,).
     """
     # so that a forbidden pair costs more than all allowed pairs together
     forbidden = cost[allowed].max(initial=0.0) * cost.size + 1.0
     rows, columns = linear_sum_assignment(np.where(allowed, cost, forbidden))
-    keep = allowed[rows, columns]
-    return rows[keep], columns[keep]
+    is_allowed = allowed[rows, columns]
+    return rows[is_allowed], columns[is_allowed]
 
 
 def find_range_bins(boxes: np.ndarray) -> np.ndarray:
-    """Return the index (K,) into RANGE_NAMES of the horizontal range of boxes (K, >=2)."""
+    """Return the index (K,) into RANGE_NAMES for each of the boxes (K, >=2)."""
     return np.searchsorted(RANGE_LIMITS, np.hypot(boxes[:, 0], boxes[:, 1]), side="right")
 
 
 def count_by_range(
-    found: np.ndarray, truth: np.ndarray, pairs: tuple[np.ndarray, np.ndarray]
+    detections: np.ndarray, labels: np.ndarray, pairs: tuple[np.ndarray, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Count the detections of one frame by RANGE_NAMES.
+    """Count true positives, false positives and misses of one frame by range.
 
-    A true positive and a miss belong to the range of the label, a false positive to its own.
+    True positives and misses are counted at the range of the label, false positives at the range of
+    the detection.
 
     Args:
-        found: (K, 7) detected boxes.
-        truth: (M, 7) labelled boxes.
-        pairs: result of match_centres.
+        detections: (K, 7) detected boxes.
+        labels: (M, 7) labelled boxes.
+        pairs: Result of match_centres.
 
     Returns:
-        True positives, false positives, misses, each (5,) int, and summed centre errors (5,),
-        metres.
+        True positives, false positives, misses, each (5,) int by RANGE_NAMES, and the sums (5,) of
+        the centre errors, metres.
     """
     i, j = pairs
-    true_bin, found_bin = find_range_bins(truth), find_range_bins(found)
+    label_bins, detection_bins = find_range_bins(labels), find_range_bins(detections)
     bins = len(RANGE_NAMES)
-    hits = np.bincount(true_bin[j], minlength=bins)
-    misses = np.bincount(true_bin, minlength=bins) - hits
-    false = np.bincount(np.delete(found_bin, i), minlength=bins)
-    error = np.linalg.norm(found[i, :3].astype(float) - truth[j, :3], axis=1)
-    return hits, false, misses, np.bincount(true_bin[j], weights=error, minlength=bins)
+    hits = np.bincount(label_bins[j], minlength=bins)
+    misses = np.bincount(label_bins, minlength=bins) - hits
+    false_positives = np.bincount(np.delete(detection_bins, i), minlength=bins)
+    distances = np.linalg.norm(detections[i, :3].astype(float) - labels[j, :3], axis=1)
+    return hits, false_positives, misses, np.bincount(label_bins[j], weights=distances, minlength=bins)
 
 
 class Score:
-    """Counts of one stage by range: true and false positives, misses, centre errors."""
+    """True positives, false positives, misses and sums of centre errors of one stage, by range."""
 
     def __init__(self) -> None:
         self.tp, self.fp, self.fn = (np.zeros(len(RANGE_NAMES), int) for _ in range(3))
         self.error = np.zeros(len(RANGE_NAMES))
 
-    def update(self, found: np.ndarray, truth: np.ndarray) -> None:
+    def update(self, detections: np.ndarray, labels: np.ndarray) -> None:
         """Add one frame with detected boxes (K, 7) and labelled boxes (M, 7)."""
-        counts = count_by_range(found, truth, match_centres(found, truth))
+        counts = count_by_range(detections, labels, match_centres(detections, labels))
         for total, count in zip((self.tp, self.fp, self.fn, self.error), counts):
             total += count
 
     def make_rows(self) -> dict[str, dict]:
-        """Return tp, fp, fn, precision, recall, f1 and centre_error_m by range name and for "all".
+        """Return tp, fp, fn, precision, recall, f1 and centre_error_m for each range and for "all".
 
-        A ratio without cases is 0; centre_error_m is None without hits.
+        A ratio with denominator 0 is 0; centre_error_m is None without true positives.
         """
         rows = {name: self._row(i) for i, name in enumerate(RANGE_NAMES)}
         return {**rows, "all": self._row(slice(None))}

@@ -1,4 +1,4 @@
-"""Paper A's protocol: candidates of each stage against Pedestrian labels, by range."""
+"""Protocol of paper A: scores of the candidates of each stage on pedestrian labels, by range."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ MAX_TIMES = 10_000  # durations kept per step
 
 
 def select_pedestrians(truth: GroundTruth | None) -> np.ndarray:
-    """Return the Pedestrian boxes (M, 7) of labels, or of None."""
+    """Return the pedestrian boxes (M, 7) of labels; none if truth is None."""
     return np.zeros((0, 7)) if truth is None else truth.of_class(PEDESTRIAN)
 
 
 def load_pedestrians(frame: Frame, view: bool = True) -> np.ndarray:
-    """Load the Pedestrian boxes (M, 7) of a frame.
+    """Load the pedestrian boxes (M, 7) of a frame.
 
-    With view, where only points in the camera's view are used, boxes outside the image are left
-    out.
+    With `view`, only boxes in the camera's image are returned, as for a pipeline that uses only
+    points in the camera's view.
     """
     truth = frame.truth()
     if view and truth is not None and len(select_pedestrians(truth)):
@@ -50,11 +50,11 @@ class CandidateResult:
     """Candidates and labels of one frame.
 
     Attributes:
-        truth: (M, 7) Pedestrian boxes.
-        boxes: (K, 7) by stage.
-        ms: duration of each step.
-        problem: why there are no candidates, or None.
-        name: name of the frame.
+        truth: (M, 7) boxes of labelled pedestrians.
+        boxes: (K, 7) candidate boxes by stage.
+        ms: Duration of each step.
+        problem: Reason why there are no candidates, or None.
+        name: Name of the frame.
     """
 
     truth: np.ndarray
@@ -65,9 +65,9 @@ class CandidateResult:
 
 
 def measure_candidates(params: PipelineParams, recording: Recording) -> Callable[[Frame], CandidateResult | None]:
-    """Run the candidate pipeline on every frame with a pedestrian, as in paper A.
+    """Make a function that runs the candidate pipeline on frames with a pedestrian (paper A).
 
-    partial(measure_candidates, params) is a Start of scoring.run.
+    partial(measure_candidates, params) is a StartMeasurement of scoring.run.
     """
     warm_up()
     templates = None if params.seed.source == "ground_truth" else load_seeds(params.seed.file)
@@ -86,10 +86,10 @@ def measure_frame(
         return None
     scan, camera = frame.load(), frame.camera()
     try:
-        _, found = find_candidates(scan, make_seed_source(truth, templates, params), camera, params)
+        _, candidates = find_candidates(scan, make_seed_source(truth, templates, params), camera, params)
     except InputError as error:  # without a seed or a camera, the frame has no candidates
         return CandidateResult(truth, collect_boxes(Candidates.none()), {}, f"{frame.name}: {error}")
-    return CandidateResult(truth, collect_boxes(found), found.ms, name=frame.name)
+    return CandidateResult(truth, collect_boxes(candidates), candidates.ms, name=frame.name)
 
 
 def collect_boxes(candidates: Candidates) -> dict[str, np.ndarray]:
@@ -100,8 +100,8 @@ def collect_boxes(candidates: Candidates) -> dict[str, np.ndarray]:
 def make_seed_source(truth: np.ndarray, templates: Sequence[Seed] | None, params: PipelineParams) -> SeedSource:
     """Make the source of a frame's seeds.
 
-    Without templates the seed is a true pedestrian, truth (M, 7), as in the paper; otherwise
-    params decide.
+    Without templates the seed is a labelled pedestrian of truth (M, 7), as in the paper. Otherwise
+    params.seed.source selects the source.
     """
     if templates is None:
         return make_truth_source(truth)
@@ -112,10 +112,10 @@ def make_seed_source(truth: np.ndarray, templates: Sequence[Seed] | None, params
 
 @dataclass
 class CandidateReport:
-    """Scores of the stages over frames with a pedestrian, and durations of the steps.
+    """Scores of each stage on frames with a pedestrian, and durations of the steps.
 
-    It keeps sums, reasons of skipped frames and the last MAX_TIMES durations of each step, so it
-    does not grow in a node that runs for days.
+    Only sums, reasons for skipped frames and the last MAX_TIMES durations of each step are kept,
+    so that memory use stays small in a node that runs for days.
     """
 
     frames: int = 0
@@ -139,7 +139,7 @@ class CandidateReport:
             self.update_times({**result.ms, "total": sum(result.ms.values())})
 
     def update_times(self, ms: dict[str, float]) -> None:
-        """Add durations of steps that are measured separately, as by nodes."""
+        """Add durations of steps in ms; nodes measure them separately from the candidates."""
         for step, value in ms.items():
             self.times.setdefault(step, deque(maxlen=MAX_TIMES)).append(value)
 

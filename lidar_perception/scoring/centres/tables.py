@@ -1,4 +1,4 @@
-"""Tables of the scores of pedestrian candidates, by range and stage."""
+"""Tables of pedestrian candidate scores by range and stage."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PAPER_TABLE_6 = {
 
 
 def print_candidate_report(content: dict, console: Console) -> None:
-    """Print scores by range and stage next to the paper's, and the times of the steps."""
+    """Print the scores by range and stage, the paper's scores, and the durations of the steps."""
     table = make_table(
         f"{content['ground_truth']} pedestrians in {content['frames']} frames, hit = 3D centre within 1.0 m",
         "stage",

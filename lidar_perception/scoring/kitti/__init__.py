@@ -1,1 +1,1 @@
-"""The protocol of KITTI's object benchmark."""
+"""Scores as in KITTI's object benchmark."""

@@ -1,5 +1,4 @@
-"""Differences between detected and labelled boxes, the effect of correcting each of them, and the
-diagnosis of wrong heights."""
+"""Errors of detected boxes, the effect of correcting each of them, and a diagnosis of height errors."""
 
 from __future__ import annotations
 
@@ -34,47 +33,62 @@ MAX_MEDIAN_ERROR = 0.1  # in metres; a smaller median height error does not coun
 
 
 def match_boxes(frames: list[ComparedFrame], name: str, min_score: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
-    """Return the detected boxes (P, 7) and labelled boxes (P, 7) of a class that match.
+    """Match the detections and labels of a class.
 
-    Each label takes the detection of min_score or more that overlaps it most in BEV, if above the
-    relaxed overlap.
+    Each label matches the detection with the highest BEV IoU, if it is above the relaxed overlap.
+    Detections below min_score are ignored.
+
+    Returns:
+        Detected boxes (P, 7) and labelled boxes (P, 7) of the matches.
     """
     class_id, pairs = CLASSES.index(name), [(np.zeros((0, 7)), np.zeros((0, 7)))]
     for frame in frames:
-        found = np.flatnonzero((frame.found.class_ids == class_id) & (frame.found.scores >= min_score))
-        true = np.flatnonzero(frame.true.class_ids == class_id)
-        overlaps = frame.overlaps[METRICS.index("bev")][np.ix_(found, true)]
-        matched = np.flatnonzero(overlaps.max(axis=0, initial=0.0) > RELAXED[name])
-        best = overlaps[:, matched].argmax(axis=0) if len(matched) else matched
-        pairs.append((frame.found.boxes[found[best]], frame.true.boxes[true[matched]]))
-    found_boxes, true_boxes = map(np.concatenate, zip(*pairs))
-    return found_boxes, true_boxes
+        detections = np.flatnonzero((frame.found.class_ids == class_id) & (frame.found.scores >= min_score))
+        labels = np.flatnonzero(frame.true.class_ids == class_id)
+        overlaps = frame.overlaps[METRICS.index("bev")][np.ix_(detections, labels)]
+        matched_labels = np.flatnonzero(overlaps.max(axis=0, initial=0.0) > RELAXED[name])
+        best_detections = overlaps[:, matched_labels].argmax(axis=0) if len(matched_labels) else matched_labels
+        pairs.append((frame.found.boxes[detections[best_detections]], frame.true.boxes[labels[matched_labels]]))
+    detected_boxes, true_boxes = map(np.concatenate, zip(*pairs))
+    return detected_boxes, true_boxes
 
 
 def measure_heights(frames: list[ComparedFrame], name: str) -> dict[str, Any]:
-    """Measure the height errors of the boxes of a class that match_boxes() matches.
+    """Measure the height errors of the matched boxes of a class; see match_boxes.
 
     Returns:
-        The number of `pairs`, and medians in metres, None without pairs: `z_error_m`, detected
-        minus true centre; `abs_z_error_m`, its absolute value; `height_error_m`, detected minus
-        true height; `height_m`, true height.
+        pairs: Number of matches.
+        z_error_m: Median of detected minus labelled z of the centre, metres.
+        abs_z_error_m: Median of its absolute value.
+        height_error_m: Median of detected minus labelled height.
+        height_m: Median of the labelled height.
+
+        The medians are None without matches.
     """
-    found, true = match_boxes(frames, name)
-    z, height = found[:, 2] - true[:, 2], true[:, 5]
-    rows = {"z_error_m": z, "abs_z_error_m": np.abs(z), "height_error_m": found[:, 5] - height, "height_m": height}
-    return {"pairs": len(z), **{key: _compute_median(values) for key, values in rows.items()}}
+    detected, labelled = match_boxes(frames, name)
+    z_error, height = detected[:, 2] - labelled[:, 2], labelled[:, 5]
+    rows = {
+        "z_error_m": z_error,
+        "abs_z_error_m": np.abs(z_error),
+        "height_error_m": detected[:, 5] - height,
+        "height_m": height,
+    }
+    return {"pairs": len(z_error), **{key: _compute_median(values) for key, values in rows.items()}}
 
 
 def diagnose_heights(name: str, rows: dict, matched: dict) -> str:
-    """Return one line if class `name` is detected in BEV but not in 3D, else "".
+    """Return a one-line diagnosis if a class is detected in BEV but not in 3D, otherwise "".
 
-    rows is its average precision in DetectionReport, matched the result of measure_heights().
+    Args:
+        name: Name of the class.
+        rows: Average precision of the class, as in DetectionReport.
+        matched: Result of measure_heights.
     """
     for suffix in ("_relaxed", ""):
-        bev, full = (rows[metric + suffix]["moderate"] for metric in ("bev", "3d"))
-        if matched["pairs"] and bev and bev["r40"] >= MIN_BEV_AP and full["r40"] * MIN_AP_RATIO <= bev["r40"]:
+        bev, three_d = (rows[metric + suffix]["moderate"] for metric in ("bev", "3d"))
+        if matched["pairs"] and bev and bev["r40"] >= MIN_BEV_AP and three_d["r40"] * MIN_AP_RATIO <= bev["r40"]:
             return (
-                f"{name}: AP is {bev['r40']:.1f} in BEV but {full['r40']:.1f} in 3D "
+                f"{name}: AP is {bev['r40']:.1f} in BEV but {three_d['r40']:.1f} in 3D "
                 f"(moderate, overlap {rows['bev' + suffix]['overlap']}): heights are wrong. "
                 + _describe_heights(matched)
             )
@@ -82,57 +96,61 @@ def diagnose_heights(name: str, rows: dict, matched: dict) -> str:
 
 
 def _describe_heights(matched: dict) -> str:
-    z, taller, height = (matched[key] for key in ("z_error_m", "height_error_m", "height_m"))
+    z_error, height_error, height = (matched[key] for key in ("z_error_m", "height_error_m", "height_m"))
     boxes = f"the {matched['pairs']} matched boxes are"
-    if abs(z) < MAX_MEDIAN_ERROR:
+    if abs(z_error) < MAX_MEDIAN_ERROR:
         return (
             f"In the median {boxes} {matched['abs_z_error_m']:.2f} m too high or too low, and "
-            f"{abs(taller):.2f} m too {'tall' if taller > 0 else 'flat'}."
+            f"{abs(height_error):.2f} m too {'tall' if height_error > 0 else 'flat'}."
         )
     reason = "check the sensor height and the frame of the boxes."
-    if abs(abs(z) - height / 2) < MAX_MEDIAN_ERROR:
+    if abs(abs(z_error) - height / 2) < MAX_MEDIAN_ERROR:
         reason = "that is half their height: z is probably the bottom of a box, not its centre."
-    return f"In the median {boxes} {abs(z):.2f} m too {'high' if z > 0 else 'low'}; {reason}"
+    return f"In the median {boxes} {abs(z_error):.2f} m too {'high' if z_error > 0 else 'low'}; {reason}"
 
 
 def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict[str, Any]:
-    """Compare the boxes of a class that match_boxes() matches.
+    """Measure the errors of the matched boxes of a class; see match_boxes.
 
     Returns:
-        by_range: for each of RANGES and for all: number of `pairs`, and of each error the `median`
-            and the `median_size` (of absolute values), m and rad. Errors are detected minus true:
-            centre along the ray from the sensor (away) and to its left (aside), bottom, sizes, and
-            yaw modulo half a turn.
-        strict: for each of CORRECTIONS the percentage of pairs beyond the strict overlap in 3D
-            (`space`) and BEV (`above`), None without pairs.
+        by_range: For each range and for "all": number of `pairs`, and for each of ERRORS its
+            `median` and `median_size` (median of absolute values), in metres and radians. Errors
+            are detected minus labelled: centre along the ray from the sensor (away) and to the left
+            of the ray (aside), bottom, length, width, height, and yaw modulo pi.
+        strict: For each of CORRECTIONS the percentage of pairs above the strict overlap in 3D
+            (`space`) and in BEV (`above`), None without pairs.
     """
-    found, true = match_boxes(frames, name, min_score)
-    differences, away = _compute_differences(found, true), horizontal_range(true)
-    bands = {
-        f"{low:g}-{high:g} m".replace("-inf m", " m -"): (away >= low) & (away < high) for low, high in pairwise(RANGES)
-    } | {"all": np.ones(len(true), bool)}
+    detected, labelled = match_boxes(frames, name, min_score)
+    differences, ranges = _compute_differences(detected, labelled), horizontal_range(labelled)
+    masks = {
+        f"{low:g}-{high:g} m".replace("-inf m", " m -"): (ranges >= low) & (ranges < high)
+        for low, high in pairwise(RANGES)
+    } | {"all": np.ones(len(labelled), bool)}
     return {
         "min_score": min_score,
         "by_range": {
             title: {
-                "pairs": int(own.sum()),
+                "pairs": int(mask.sum()),
                 **{
-                    error: {"median": _compute_median(values[own]), "median_size": _compute_median(np.abs(values[own]))}
+                    error: {
+                        "median": _compute_median(values[mask]),
+                        "median_size": _compute_median(np.abs(values[mask])),
+                    }
                     for error, values in differences.items()
                 },
             }
-            for title, own in bands.items()
+            for title, mask in masks.items()
         },
         "strict": {
-            title: _measure_overlaps(found, true, columns, DETECTED[name].strict)
+            title: _measure_overlaps(detected, labelled, columns, DETECTED[name].strict)
             for title, columns in CORRECTIONS.items()
         },
     }
 
 
-def _compute_differences(found: np.ndarray, true: np.ndarray) -> dict[str, np.ndarray]:
-    azimuth = np.arctan2(true[:, 1], true[:, 0])
-    x, y, z, *sizes, yaw = (found - true).T
+def _compute_differences(detected: np.ndarray, labelled: np.ndarray) -> dict[str, np.ndarray]:
+    azimuth = np.arctan2(labelled[:, 1], labelled[:, 0])
+    x, y, z, *sizes, yaw = (detected - labelled).T
     return dict(
         zip(
             ERRORS,
@@ -148,14 +166,16 @@ def _compute_differences(found: np.ndarray, true: np.ndarray) -> dict[str, np.nd
 
 
 def _measure_overlaps(
-    found: np.ndarray, true: np.ndarray, columns: list[int], min_overlap: float
+    detected: np.ndarray, labelled: np.ndarray, columns: list[int], min_overlap: float
 ) -> dict[str, float | None]:
-    """Return the percentage of pairs above min_overlap with these columns of `found` corrected."""
-    if len(found) == 0:
+    """Return the percentage of pairs above min_overlap after correcting columns of `detected`."""
+    if len(detected) == 0:
         return {"space": None, "above": None}
-    boxes = found.copy()
-    boxes[:, columns] = true[:, columns]
-    bev, full = np.array([[iou[0, 0] for iou in bev_and_3d_iou(a[None], b[None])] for a, b in zip(boxes, true)]).T
+    corrected = detected.copy()
+    corrected[:, columns] = labelled[:, columns]
+    bev, full = np.array(
+        [[iou[0, 0] for iou in bev_and_3d_iou(a[None], b[None])] for a, b in zip(corrected, labelled)]
+    ).T
     return {"space": 100 * float((full > min_overlap).mean()), "above": 100 * float((bev > min_overlap).mean())}
 
 
@@ -164,7 +184,7 @@ def _compute_median(values: np.ndarray) -> float | None:
 
 
 def print_box_errors(errors: dict[str, dict[str, Any]], console: Console) -> None:
-    """Print two tables for each class with pairs."""
+    """Print two tables for each class with matched boxes."""
     for name, content in errors.items():
         if content["by_range"]["all"]["pairs"] == 0:
             continue

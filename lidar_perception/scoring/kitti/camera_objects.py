@@ -1,4 +1,4 @@
-"""Labels and detections in the form that KITTI's benchmark compares."""
+"""Labels and detections in the form that KITTI's benchmark uses."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ class CameraObjects:
     """K objects of one frame, upright in the camera's frame.
 
     Attributes:
-        class_ids: (K,) int32 into CLASSES.
-        boxes: (K, 7) float64 [x y z l w h yaw], metres, in the camera's frame with x forward, y
-            left, z up (without a calibration the LiDAR's). Sizes are 0 where only a 2D box is
-            known.
-        image_boxes: (K, 4) float64 [left top right bottom] pixels; 0 for an object outside the
-            image, infinite without a calibration.
-        alpha: (K,) radians, NaN if unknown.
-        truncated: (K,) 0..1.
-        occluded: (K,) int 0..3.
+        class_ids: (K,) int32, indices into CLASSES.
+        boxes: (K, 7) float64 [x y z l w h yaw], metres and radians, in the camera's frame rotated
+            to x forward, y left, z up, or in the LiDAR frame without a calibration. Sizes are 0 for
+            objects with a 2D box only.
+        image_boxes: (K, 4) float64 [left top right bottom] pixels; 0 for objects outside the image,
+            infinite without a calibration.
+        alpha: (K,) observation angle, radians, NaN if unknown.
+        truncated: (K,) truncated fraction 0..1.
+        occluded: (K,) int, KITTI's occlusion level 0..3.
         scores: (K,) float64, 1 for labels.
         regions: (R, 4) 2D boxes of DontCare regions.
     """
@@ -76,53 +76,60 @@ def to_scored_labels(detections: Detections) -> GroundTruth:
 
 
 def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> CameraObjects:
-    """Convert labels, or detections with their score in extras; notes (2D only) come last.
+    """Convert labels, or detections with a score in extras, to CameraObjects.
 
-    Values of the label file are kept; a missing 2D box or alpha is computed from the box. So is
-    truncation where the file has a level instead of a share (tracking and raw layouts): it is the
-    share of the projected box outside the image.
+    Values of the label file are kept. A missing 2D box or alpha is computed from the 3D box. If the
+    file has a truncation level instead of a fraction (tracking and raw layouts), truncation is the
+    fraction of the projected box outside the image. Labels with a 2D box only (notes) come last.
 
     Raises:
-        InputError: a box or score is not finite.
+        InputError: A box or score is not finite.
     """
     scores = np.array([extra.get("score", 1.0) for extra in _list_extras(objects)])
-    bad = ~np.isfinite(scores)
-    bad[: len(objects)] |= ~np.isfinite(objects.boxes).all(axis=1)
-    if bad.any():
+    not_finite = ~np.isfinite(scores)
+    not_finite[: len(objects)] |= ~np.isfinite(objects.boxes).all(axis=1)
+    if not_finite.any():
         raise InputError(
-            f"box {np.argmax(bad) + 1} of {len(bad)} or its score is not finite; a detector must not return such boxes"
+            f"box {np.argmax(not_finite) + 1} of {len(not_finite)} or its score is not finite; "
+            "a detector must not return such boxes"
         )
     if calibration is None:
         return _make_without_camera(objects, scores[: len(objects)])
     labels = to_labels(objects, calibration.lidar_to_camera)
-    projected, outside = np.zeros((len(labels), 4)), np.zeros(len(labels))
-    pixels, outside[: len(objects)] = project_boxes(objects.boxes, calibration)
+    projected, outside_fractions = np.zeros((len(labels), 4)), np.zeros(len(labels))
+    pixels, outside_fractions[: len(objects)] = project_boxes(objects.boxes, calibration)
     projected[: len(objects)] = np.nan_to_num(pixels)
 
-    given = _read_columns(labels, "bbox", 4)
-    has_pixels = (given[:, 2:] > given[:, :2]).all(axis=1, keepdims=True)
-    sides = np.maximum(_read_columns(labels, "dimensions", 3), 0)
-    location, turn = _read_columns(labels, "location", 3), _read_columns(labels, "rotation_y")
+    label_boxes = _read_columns(labels, "bbox", 4)
+    has_pixels = (label_boxes[:, 2:] > label_boxes[:, :2]).all(axis=1, keepdims=True)
+    sizes = np.maximum(_read_columns(labels, "dimensions", 3), 0)
+    location, rotation_y = _read_columns(labels, "location", 3), _read_columns(labels, "rotation_y")
     alpha = _read_columns(labels, "alpha")
-    whole = sides.all(axis=1)  # True for labels with a 3D box
+    is_3d = sizes.all(axis=1)  # True for labels with a 3D box
     bearing = np.arctan2(location[:, 0], location[:, 2])
-    computed = np.where(whole, wrap_angle(turn - bearing), np.nan)
+    computed_alpha = np.where(is_3d, wrap_angle(rotation_y - bearing), np.nan)
     return CameraObjects(
         class_ids=np.array(class_ids(label["class"] for label in labels), np.int32),
         boxes=np.column_stack(
-            [location[:, 2], -location[:, 0], sides[:, 0] / 2 - location[:, 1], sides[:, [2, 1, 0]], -turn - np.pi / 2]
+            [
+                location[:, 2],
+                -location[:, 0],
+                sizes[:, 0] / 2 - location[:, 1],
+                sizes[:, [2, 1, 0]],
+                -rotation_y - np.pi / 2,
+            ]
         ),
-        image_boxes=np.where(has_pixels, given, projected),
-        alpha=np.where(alpha > NO_ANGLE, alpha, computed),
-        truncated=np.array([_compute_truncation(e, o) for e, o in zip(_list_extras(objects), outside)]),
+        image_boxes=np.where(has_pixels, label_boxes, projected),
+        alpha=np.where(alpha > NO_ANGLE, alpha, computed_alpha),
+        truncated=np.array([_compute_truncation(e, o) for e, o in zip(_list_extras(objects), outside_fractions)]),
         occluded=_read_columns(labels, "occluded").astype(int),
         scores=scores,
-        regions=given[np.array([label["class"] == "DontCare" for label in labels], bool)],
+        regions=label_boxes[np.array([label["class"] == "DontCare" for label in labels], bool)],
     )
 
 
 def select_in_image(truth: GroundTruth, calibration: Calibration | None) -> GroundTruth:
-    """Return the labels that are partly in the image, or all without a calibration."""
+    """Return the labels that are at least partly in the image; all of them without a calibration."""
     rows = np.flatnonzero(to_camera_objects(truth, calibration).pixels_high[: len(truth)] > 0)
     return GroundTruth.of(truth.boxes[rows], truth.class_ids[rows], [truth.extras[i] for i in rows], truth.notes)
 
@@ -145,10 +152,10 @@ def _list_extras(objects: GroundTruth) -> list[dict]:
     return [*objects.extras, *(extra for _, extra in objects.notes)]
 
 
-def _compute_truncation(extra: dict, projected: float) -> float:
+def _compute_truncation(extra: dict, outside_fraction: float) -> float:
     if "track_id" not in extra and "truncated" in extra:
         return extra["truncated"]
-    return 1.0 if extra.get("truncated", 0) >= IGNORED_LEVEL else projected
+    return 1.0 if extra.get("truncated", 0) >= IGNORED_LEVEL else outside_fraction
 
 
 def _read_columns(labels: list[dict], name: str, count: int = 0) -> np.ndarray:

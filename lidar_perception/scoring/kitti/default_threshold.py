@@ -20,10 +20,11 @@ LEVEL = "moderate"
 
 
 def score_at_threshold(frames: list[ComparedFrame]) -> dict[str, dict[str, float]]:
-    """Score by class the detections that the detector reports at its thresholds.
+    """Score all detections by class (BEV, relaxed overlap, moderate difficulty).
 
-    BEV, relaxed overlap, moderate difficulty. Returns labels, hits, wrong, missed, precision,
-    recall and f1, ratios 0 without cases; empty without frames.
+    Returns:
+        labels, hits, wrong, missed, precision, recall and f1 of each class, or {} without frames. A
+        ratio with denominator 0 is 0.
     """
     if not frames:
         return {}
@@ -32,21 +33,23 @@ def score_at_threshold(frames: list[ComparedFrame]) -> dict[str, dict[str, float
 
 
 def _score_class(comparison: Comparison, name: str) -> dict[str, float]:
-    hits, wrong = (int(n[0]) for n in count_hits(comparison, name, "bev", RELAXED[name], LEVEL, np.array([-np.inf])))
+    hits, false_positives = (
+        int(n[0]) for n in count_hits(comparison, name, "bev", RELAXED[name], LEVEL, np.array([-np.inf]))
+    )
     labels = int((classify_labels(comparison.true, name, LEVEL) == COUNTED).sum())
     return {
         "labels": labels,
         "hits": hits,
-        "wrong": wrong,
+        "wrong": false_positives,
         "missed": labels - hits,
-        "precision": hits / max(hits + wrong, 1),
+        "precision": hits / max(hits + false_positives, 1),
         "recall": hits / max(labels, 1),
-        "f1": 2 * hits / max(hits + wrong + labels, 1),
+        "f1": 2 * hits / max(hits + false_positives + labels, 1),
     }
 
 
 def print_scores_at_threshold(content: dict[str, dict[str, float]], frames: int, console: Console) -> None:
-    """Print the table of score_at_threshold(), without classes that have no objects."""
+    """Print the result of score_at_threshold for classes with labels or false positives."""
     table = make_table(
         f"Detections at the default threshold, {frames} frames",
         "",

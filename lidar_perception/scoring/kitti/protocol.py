@@ -39,12 +39,13 @@ EPS = np.finfo(float).eps  # smaller areas count as 0
 
 @dataclass(frozen=True)
 class ComparedFrame:
-    """M labels and K detections of one frame, detections by descending score.
+    """M labels and K detections of one frame.
 
     Attributes:
-        true, found: labels and detections.
-        overlaps: (3, K, M) float64 by METRICS.
-        excused: (K,) largest share of a 2D box inside a DontCare region.
+        true: Labels.
+        found: Detections in descending order of score.
+        overlaps: (3, K, M) float64 IoU for each of METRICS.
+        excused: (K,) largest fraction of a detection's 2D box inside one DontCare region.
     """
 
     true: CameraObjects
@@ -54,40 +55,42 @@ class ComparedFrame:
 
 
 def compare_objects(true: CameraObjects, found: CameraObjects) -> ComparedFrame:
-    """Compute the overlaps of a frame. The order of the detections does not matter."""
+    """Compute the overlaps of the labels and detections of a frame; detections in any order."""
     found = found.take(np.lexsort([*found.boxes.T, *found.image_boxes.T, -found.scores]))
     overlaps = np.stack(
         [compute_image_iou(found.image_boxes, true.image_boxes), *bev_and_3d_iou(found.boxes, true.boxes)]
     )
-    excused = compute_image_iou(found.image_boxes, true.regions, of_first=True)
+    excused = compute_image_iou(found.image_boxes, true.regions, over_first=True)
     return ComparedFrame(true, found, overlaps, excused.max(axis=1, initial=0.0))
 
 
-def compute_image_iou(boxes: np.ndarray, others: np.ndarray, of_first: bool = False) -> np.ndarray:
+def compute_image_iou(boxes: np.ndarray, others: np.ndarray, over_first: bool = False) -> np.ndarray:
     """Compute the IoU (K, M) of 2D boxes (K, 4) and (M, 4) [left top right bottom].
 
-    With of_first, compute the share of each of boxes that is inside others. Both are 0 for a box
-    without area or of infinite size.
+    With over_first, divide the intersection by the area of the first box instead of the union. The
+    result is 0 for boxes with zero or infinite area.
     """
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     areas, other_areas = (np.prod(b[:, 2:] - b[:, :2], axis=1) for b in (boxes, others))
     shared = np.prod(np.maximum(high - low, 0.0), axis=2)
     with np.errstate(invalid="ignore"):
-        whole = areas[:, None] + (0.0 if of_first else other_areas - shared)
-        return np.divide(shared, whole, out=np.zeros_like(shared), where=whole > EPS)
+        denominator = areas[:, None] + (0.0 if over_first else other_areas - shared)
+        return np.divide(shared, denominator, out=np.zeros_like(shared), where=denominator > EPS)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All frames concatenated.
+    """Labels, detections and overlaps of all F frames, concatenated.
 
     Attributes:
-        true, found: labels (M) and detections (K) of all frames.
-        overlaps: (3, P) of the pairs of each frame, detections by labels.
+        true: M labels.
+        found: K detections.
+        overlaps: (3, P) overlaps of the pairs of each frame, with the label as the fastest index.
         excused: (K,) as in ComparedFrame.
-        first_true, first_found, first_pair: (F + 1,) int64 index of the first element of each
-            frame.
+        first_true: (F + 1,) int64 index of the first label of each frame.
+        first_found: (F + 1,) int64 index of the first detection of each frame.
+        first_pair: (F + 1,) int64 index of the first pair of each frame.
     """
 
     true: CameraObjects
@@ -100,7 +103,7 @@ class Comparison:
 
     @staticmethod
     def of(frames: list[ComparedFrame]) -> Comparison:
-        """Concatenate at least one frame."""
+        """Concatenate one or more frames."""
         true, found = [f.true for f in frames], [f.found for f in frames]
         return Comparison(
             CameraObjects.concatenate(true),
@@ -118,23 +121,25 @@ def _find_starts(sizes) -> np.ndarray:
 
 
 def classify_labels(objects: CameraObjects, name: str, difficulty: str) -> np.ndarray:
-    """Classify labels as COUNTED, IGNORED or OTHER, (K,) int8, for a class and difficulty."""
+    """Return COUNTED, IGNORED or OTHER for each label, (K,) int8, given a class and difficulty."""
     level = DIFFICULTIES.index(difficulty)
-    own = objects.class_ids == CLASSES.index(name)
-    like = objects.class_ids == CLASSES.index(NEIGHBOURS.get(name, name))
-    fit = (
+    is_class = objects.class_ids == CLASSES.index(name)
+    is_neighbour = objects.class_ids == CLASSES.index(NEIGHBOURS.get(name, name))
+    is_visible_enough = (
         (objects.occluded <= MAX_OCCLUDED[level])
         & (objects.truncated <= MAX_TRUNCATED[level])
         & (objects.pixels_high >= MIN_PIXELS[level])
     )
-    return np.where(own & fit, COUNTED, np.where(own | like, IGNORED, OTHER)).astype(np.int8)
+    return np.where(is_class & is_visible_enough, COUNTED, np.where(is_class | is_neighbour, IGNORED, OTHER)).astype(
+        np.int8
+    )
 
 
 def classify_detections(objects: CameraObjects, name: str, difficulty: str) -> np.ndarray:
-    """Classify detections as COUNTED, IGNORED or OTHER, (K,) int8."""
-    low = objects.pixels_high < MIN_PIXELS[DIFFICULTIES.index(difficulty)]
-    own = objects.class_ids == CLASSES.index(name)
-    return np.where(low, IGNORED, np.where(own, COUNTED, OTHER)).astype(np.int8)
+    """Return COUNTED, IGNORED or OTHER for each detection, (K,) int8."""
+    is_small = objects.pixels_high < MIN_PIXELS[DIFFICULTIES.index(difficulty)]
+    is_class = objects.class_ids == CLASSES.index(name)
+    return np.where(is_small, IGNORED, np.where(is_class, COUNTED, OTHER)).astype(np.int8)
 
 
 @dataclass(frozen=True)
@@ -142,10 +147,11 @@ class Precision:
     """Average precision in percent for one class, metric, overlap and difficulty.
 
     Attributes:
-        objects: number of counted labels.
-        r11, r40: at 11 and 40 recall points.
-        aos_r11, aos_r40: the same for orientation (AOS).
-        official_r11, official_r40: as KITTI's program computes them for few objects.
+        objects: Number of counted labels.
+        r11, r40: Average precision over 11 and 40 recall points.
+        aos_r11, aos_r40: Average orientation similarity (AOS) over 11 and 40 recall points.
+        official_r11, official_r40: r11 and r40 as computed by KITTI's own program, which differ if
+            there are few objects.
     """
 
     objects: int
@@ -158,32 +164,32 @@ class Precision:
 
 
 def compute_precision(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str) -> Precision | None:
-    """Compute the average precision of a class at an overlap above the given one.
+    """Compute the average precision of a class; hits have more than the given overlap.
 
-    Returns None without counted labels. Orientation is NaN if a hit has no angle.
+    Returns None without counted labels. AOS is NaN if a hit has no observation angle.
     """
     pairs = _collect_pairs(frames, name, metric, overlap, difficulty)
     objects = int((pairs.labels == COUNTED).sum())
     if objects == 0:
         return None
     thresholds = choose_thresholds(_find_hit_scores(pairs), objects)
-    hits, wrong, similarity = _count(frames, pairs, metric, thresholds)
-    right = hits / np.maximum(hits + wrong, 1)
-    oriented = similarity / np.maximum(hits + wrong, 1)
+    hits, false_positives, similarity = _count(frames, pairs, metric, thresholds)
+    precision = hits / np.maximum(hits + false_positives, 1)
+    orientation_similarity = similarity / np.maximum(hits + false_positives, 1)
     return Precision(
         objects,
-        *average_curve(sample_curve(right, objects)),
-        *average_curve(sample_curve(oriented, objects)),
-        *average_curve(sample_curve(right, objects, official=True)),
+        *average_curve(sample_curve(precision, objects)),
+        *average_curve(sample_curve(orientation_similarity, objects)),
+        *average_curve(sample_curve(precision, objects, official=True)),
     )
 
 
 def count_hits(
     frames: Comparison, name: str, metric: str, overlap: float, difficulty: str, thresholds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Count hits and wrong detections, each (T,) float64, with at least each score of thresholds.
+    """Count hits and false positives at each score threshold, each (T,) float64.
 
-    The rules are those of compute_precision(); ignored detections do not count.
+    The rules are those of compute_precision; ignored detections are not counted.
     """
     pairs = _collect_pairs(frames, name, metric, overlap, difficulty)
     return _count(frames, pairs, metric, np.asarray(thresholds, np.float64))[:2]
@@ -192,8 +198,8 @@ def count_hits(
 class _Pairs(NamedTuple):
     """Pairs of all frames for one class, metric and difficulty; see Comparison.
 
-    A hit overlaps by more than min_overlap. labels (M,) and detections (K,) int8 are COUNTED,
-    IGNORED or OTHER.
+    The overlap of a hit is greater than min_overlap. The values of labels (M,) and detections (K,)
+    int8 are COUNTED, IGNORED or OTHER.
     """
 
     overlaps: np.ndarray
@@ -226,13 +232,13 @@ def _count(frames: Comparison, pairs: _Pairs, metric: str, thresholds: np.ndarra
 
 @njit(cache=True, nogil=True)
 def _find_hit_scores(pairs):
-    """Return the scores of detections that hit a counted label.
+    """Return the scores of the detections that hit a counted label.
 
-    Each label takes the unmatched detection with the highest score.
+    Each label is matched with the free detection with the highest score.
     """
     overlaps, min_overlap, labels, detections, scores, first_true, first_found, first_pair = pairs
-    hits, number = np.empty(len(scores)), 0
-    taken = np.zeros(len(scores), np.bool_)
+    hits, hit_count = np.empty(len(scores)), 0
+    is_taken = np.zeros(len(scores), np.bool_)
     for f in range(len(first_pair) - 1):
         count = first_true[f + 1] - first_true[f]
         for i in range(first_true[f], first_true[f + 1]):
@@ -243,29 +249,29 @@ def _find_hit_scores(pairs):
                 pair = first_pair[f] + (j - first_found[f]) * count + i - first_true[f]
                 if (
                     detections[j] != OTHER
-                    and not taken[j]
+                    and not is_taken[j]
                     and overlaps[pair] > min_overlap
                     and (best < 0 or scores[j] > scores[best])
                 ):
                     best = j
             if best >= 0:
-                taken[best] = True
+                is_taken[best] = True
                 if labels[i] == COUNTED and detections[best] == COUNTED:
-                    hits[number] = scores[best]
-                    number += 1
-    return hits[:number]
+                    hits[hit_count] = scores[best]
+                    hit_count += 1
+    return hits[:hit_count]
 
 
 @njit(cache=True, nogil=True)
 def _count_hits(pairs, thresholds, excused, true_alpha, found_alpha):
-    """Count hits, wrong detections and summed angle similarity of hits at each threshold, (T,).
+    """Return hits, false positives and the sum of the hits' angle similarities, each (T,).
 
-    Each label takes the unmatched detection with the highest overlap, an ignored one only if there
-    is no other.
+    At each threshold a label is matched with the free detection with the highest overlap, or with
+    an ignored detection if there is no other.
     """
     overlaps, min_overlap, labels, detections, scores, first_true, first_found, first_pair = pairs
-    hits, wrong, similarity = np.zeros((3, len(thresholds)))
-    taken = np.zeros(len(scores), np.int64)  # number of the threshold, from 1, at which each is matched
+    hits, false_positives, similarity = np.zeros((3, len(thresholds)))
+    taken_at = np.zeros(len(scores), np.int64)  # number of the threshold, from 1, at which each is matched
     for f in range(len(first_pair) - 1):
         count = first_true[f + 1] - first_true[f]
         for t in range(len(thresholds)):
@@ -275,21 +281,21 @@ def _count_hits(pairs, thresholds, excused, true_alpha, found_alpha):
             for i in range(first_true[f], first_true[f + 1]):
                 if labels[i] == OTHER:
                     continue
-                best, most = -1, 0.0
+                best, best_overlap = -1, 0.0
                 for j in range(first_found[f], end):
                     overlap = overlaps[first_pair[f] + (j - first_found[f]) * count + i - first_true[f]]
-                    if detections[j] == OTHER or taken[j] == t + 1 or not overlap > min_overlap:
+                    if detections[j] == OTHER or taken_at[j] == t + 1 or not overlap > min_overlap:
                         continue
-                    if detections[j] == COUNTED and overlap > most:
-                        best, most = j, overlap
+                    if detections[j] == COUNTED and overlap > best_overlap:
+                        best, best_overlap = j, overlap
                     elif detections[j] == IGNORED and best < 0:
                         best = j
                 if best >= 0:
-                    taken[best] = t + 1
+                    taken_at[best] = t + 1
                     if labels[i] == COUNTED and detections[best] == COUNTED:
                         hits[t] += 1
                         similarity[t] += (1 + np.cos(true_alpha[i] - found_alpha[best])) / 2
             for j in range(first_found[f], end):
-                if detections[j] == COUNTED and taken[j] != t + 1 and not excused[j]:
-                    wrong[t] += 1
-    return hits, wrong, similarity
+                if detections[j] == COUNTED and taken_at[j] != t + 1 and not excused[j]:
+                    false_positives[t] += 1
+    return hits, false_positives, similarity

@@ -19,57 +19,63 @@ MIN_BOXES = 10  # minimum number of correct and of wrong boxes for a fit
 
 
 def fit_calibrations(frames: Comparison) -> dict[str, tuple[float, float]]:
-    """Fit the calibration of detectors/calibration.py by class.
+    """Fit the score calibration of each class; see detectors/calibration.py.
 
-    It is a logistic regression of right and wrong boxes on the log odds of their scores. Classes
-    with fewer than MIN_BOXES of either, or whose scores are not informative, are left out.
+    The fit is a logistic regression on the log odds of the scores: true against false positives.
+    Classes with fewer than MIN_BOXES of either, or with uninformative scores, are left out.
     """
     from sklearn.linear_model import LogisticRegression
 
-    found, middles = {}, (LOG_ODDS + 0.05)[:, None]
+    calibrations, bin_centres = {}, (LOG_ODDS + 0.05)[:, None]
     for name in SCORED:
-        hits, wrong = _count_right_and_wrong(frames, name, expit(LOG_ODDS))
-        if min(hits.sum(), wrong.sum()) < MIN_BOXES:
+        hits, false_positives = _count_by_score(frames, name, expit(LOG_ODDS))
+        if min(hits.sum(), false_positives.sum()) < MIN_BOXES:
             continue
         model = LogisticRegression().fit(
-            np.concatenate([middles, middles]), np.repeat([1, 0], len(LOG_ODDS)), np.concatenate([hits, wrong])
+            np.concatenate([bin_centres, bin_centres]),
+            np.repeat([1, 0], len(LOG_ODDS)),
+            np.concatenate([hits, false_positives]),
         )
         if model.coef_[0, 0] > 0:
-            found[name] = round(float(model.coef_[0, 0]), 4), round(float(model.intercept_[0]), 4)
-    return found
+            calibrations[name] = round(float(model.coef_[0, 0]), 4), round(float(model.intercept_[0]), 4)
+    return calibrations
 
 
-def _count_right_and_wrong(frames: Comparison, name: str, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Count right and wrong boxes (B,) with scores between edges (B,); BEV, relaxed, hard."""
-    hits, wrong = count_hits(frames, name, "bev", DETECTED[name].relaxed, "hard", edges)
-    return (np.maximum(-np.diff(np.append(hits, 0.0)), 0.0), np.maximum(-np.diff(np.append(wrong, 0.0)), 0.0))
+def _count_by_score(frames: Comparison, name: str, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Count true and false positives (B,) in each bin of scores with lower edges (B,).
+
+    Matches are in BEV at the relaxed overlap, with hard difficulty.
+    """
+    hits, false_positives = count_hits(frames, name, "bev", DETECTED[name].relaxed, "hard", edges)
+    return (np.maximum(-np.diff(np.append(hits, 0.0)), 0.0), np.maximum(-np.diff(np.append(false_positives, 0.0)), 0.0))
 
 
 def measure_reliability(frames: Comparison, name: str) -> dict[str, Any]:
     """Measure the reliability of the scores of a class (hard difficulty, BEV, relaxed overlap).
 
-    Boxes that KITTI's protocol ignores do not count; a second box of one object is wrong.
+    Boxes that KITTI's protocol ignores are not counted; a duplicate box is a false positive.
 
     Returns:
-        bins: by bin of EDGES the number of `boxes` and the percentage `right`, None without boxes.
-        error: mean gap between the middle of a bin and its share of right boxes, weighted by boxes,
-            in percent.
+        bins: For each bin of EDGES the number of `boxes` and the percentage of true positives
+            (`right`, None without boxes).
+        error: Expected calibration error in percent: the mean gap between the centre of a bin and
+            its fraction of true positives, weighted by the number of boxes.
     """
-    hits, wrong = _count_right_and_wrong(frames, name, np.array(EDGES))
-    boxes = hits + wrong
-    right = hits / np.maximum(boxes, 1)
-    middles = (np.array(EDGES) + np.append(EDGES[1:], 1.0)) / 2
+    hits, false_positives = _count_by_score(frames, name, np.array(EDGES))
+    boxes = hits + false_positives
+    precision = hits / np.maximum(boxes, 1)
+    bin_centres = (np.array(EDGES) + np.append(EDGES[1:], 1.0)) / 2
     return {
         "bins": [
-            {"from": edge, "boxes": int(count), "right": 100 * float(share) if count else None}
-            for edge, count, share in zip(EDGES, boxes, right)
+            {"from": edge, "boxes": int(count), "right": 100 * float(fraction) if count else None}
+            for edge, count, fraction in zip(EDGES, boxes, precision)
         ],
-        "error": 100 * float((boxes * np.abs(right - middles)).sum() / boxes.sum()) if boxes.any() else None,
+        "error": 100 * float((boxes * np.abs(precision - bin_centres)).sum() / boxes.sum()) if boxes.any() else None,
     }
 
 
 def print_reliability(scores: dict[str, dict[str, Any]], console: Console) -> None:
-    """Print one table of all classes."""
+    """Print one table with the reliability of all classes."""
     table = make_table("Right boxes by score, %", "score from", *(f"{edge:g}" for edge in EDGES), "error", width=5)
     for name, content in scores.items():
         table.add_row(

@@ -1,4 +1,4 @@
-"""Scores of detections against labels: KITTI's average precision, and pedestrians by centre."""
+"""Detection scores: KITTI's average precision, and pedestrian scores by centre distance."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ INTERVALS = "bev_relaxed", "bev", "3d"
 
 @dataclass
 class DetectionReport:
-    """Frames to score, reasons for skipped frames, and durations of the detector.
+    """Collection of the frames to score, reasons for skipped frames, and detector run times.
 
-    follow: see intervals.group_frames.
+    `sequential` is described in intervals.group_frames.
     """
 
     frames: list[ComparedFrame] = field(default_factory=list)
@@ -51,40 +51,44 @@ class DetectionReport:
     ms: list[float] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
     with_camera: bool = True
-    follow: bool = False
+    sequential: bool = False
 
     def update(self, result: FrameDetections) -> None:
         """Add one frame.
 
-        With a calibration, detections and labels outside the image are ignored, as KITTI labels
-        nothing there. Without one there are no image scores, and difficulty depends on occlusion
-        only.
+        With a calibration, detections and labels outside the image are ignored, because KITTI has
+        no labels there. Without a calibration there are no image scores, and the difficulty depends
+        on occlusion only.
 
-        Raises InputError with the name of the frame for a number that is not finite.
+        Raises:
+            InputError: A box or score is not finite; the message names the frame.
         """
         if result.problem is not None:
             self.skipped.append(f"{result.name}: {result.problem}")
         if result.ms is not None:
             self.ms.append(result.ms)
-        truth, found, calibration = result.truth, result.detections, result.calibration
+        truth, detections, calibration = result.truth, result.detections, result.calibration
         if truth is None:
             return
-        found = to_scored_labels(found) if isinstance(found, Detections) else found
+        detections = to_scored_labels(detections) if isinstance(detections, Detections) else detections
         try:
-            true_objects, objects = (to_camera_objects(x, calibration) for x in (truth, found))
+            camera_labels, camera_detections = (to_camera_objects(boxes, calibration) for boxes in (truth, detections))
         except InputError as error:
             raise InputError(f"{result.name}: {error}") from None
-        self.frames.append(compare_objects(true_objects, objects))
+        self.frames.append(compare_objects(camera_labels, camera_detections))
         self.names.append(result.name)
         self.with_camera &= calibration is not None
-        chosen = (found.class_ids == PEDESTRIAN) & (objects.pixels_high[: len(found)] > 0)
-        people = (truth.class_ids == PEDESTRIAN) & (true_objects.pixels_high[: len(truth)] > 0)
+        is_pedestrian = (detections.class_ids == PEDESTRIAN) & (camera_detections.pixels_high[: len(detections)] > 0)
+        is_labelled_pedestrian = (truth.class_ids == PEDESTRIAN) & (camera_labels.pixels_high[: len(truth)] > 0)
         self.pedestrians.update(
-            truth.boxes[people], found.boxes[chosen], objects.scores[: len(found)][chosen], result.name
+            truth.boxes[is_labelled_pedestrian],
+            detections.boxes[is_pedestrian],
+            camera_detections.scores[: len(detections)][is_pedestrian],
+            result.name,
         )
 
     def compute(self) -> dict:
-        """Return the content of the JSON file; ap in percent."""
+        """Return the content of the JSON file; ap is in percent."""
         result: dict[str, Any] = {
             "frames": len(self.frames),
             "ap": {},
@@ -106,18 +110,22 @@ class DetectionReport:
         return result
 
     def compute_intervals(self, count: int) -> dict[str, dict[str, list[float] | None]]:
-        """Return intervals [low, high] of AP (R40, moderate) by class and row of INTERVALS.
+        """Compute bootstrap intervals [low, high] of AP (R40, moderate), see intervals.py.
 
-        They come from `count` draws of the drives, see intervals.py. None without labels.
+        Args:
+            count: Number of bootstrap draws.
+
+        Returns:
+            Intervals by class and row of INTERVALS, None without labels.
         """
-        found: dict[tuple[str, str], list[float | None]] = {(name, row): [] for name in SCORED for row in INTERVALS}
-        for frames in draw_samples(group_frames(self.names, self.follow), count):
+        draws: dict[tuple[str, str], list[float | None]] = {(name, row): [] for name in SCORED for row in INTERVALS}
+        for frames in draw_samples(group_frames(self.names, self.sequential), count):
             comparison = Comparison.of([self.frames[i] for i in frames])
-            for (name, row), scores in found.items():
+            for (name, row), scores in draws.items():
                 metric, overlaps = ROWS[row]
                 value = compute_precision(comparison, name, metric, overlaps[name], "moderate")
                 scores.append(None if value is None else value.r40)
-        return {name: {row: compute_bounds(found[name, row]) for row in INTERVALS} for name in SCORED}
+        return {name: {row: compute_bounds(draws[name, row]) for row in INTERVALS} for name in SCORED}
 
     def _class_content(self, comparison: Comparison, name: str) -> dict:
         rows = {
@@ -157,9 +165,10 @@ def _to_angle_content(value: Precision | None) -> dict | None:
 
 
 def average_3d(ap: dict) -> dict | None:
-    """Average 3D AP over classes and difficulties with labels, as in the EG-PointPillars paper.
+    """Average the 3D AP over classes and difficulties, as in the EG-PointPillars paper.
 
-    Returns r11 and r40, or None without labels.
+    Classes and difficulties without labels are left out. Returns r11 and r40, or None if no labels
+    remain.
     """
     rows = [row for name in SCORED for level in DIFFICULTIES if (row := ap[name]["3d"][level])]
     return {key: float(np.mean([row[key] for row in rows])) for key in ("r11", "r40")} if rows else None

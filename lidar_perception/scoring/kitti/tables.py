@@ -1,4 +1,4 @@
-"""Tables of detections against labels, with the papers' results."""
+"""Tables of detection scores, with the papers' results."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ TITLES = {"image": "2D box", "aos": "orientation", "bev": "BEV", "3d": "3D", "be
 
 
 def print_detection_report(content: dict, console: Console) -> None:
-    """Print average precision by class and difficulty, the papers' results, and diagnoses."""
+    """Print average precision by class and difficulty, the papers' results, and the diagnosis."""
     _print_precision(content, console)
     _print_paper(content, console)
     _print_centres(content["pedestrian_centres"], console)
@@ -75,8 +75,8 @@ def _print_paper(content: dict, console: Console) -> None:
     table = make_table("3D AP and Table 5 of the EG-PointPillars paper", "", *titles, "mAP", width=5)
     for key in ("r40", "r11"):
         cells = [_format_cell(level, key) for name in COLUMNS for level in _list_levels(content["ap"][name]["3d"])]
-        mean = content["map_3d"]
-        table.add_row(f"here, {key.upper()}", *cells, format_number(mean[key] if mean else None), style="bold")
+        mean_ap = content["map_3d"]
+        table.add_row(f"here, {key.upper()}", *cells, format_number(mean_ap[key] if mean_ap else None), style="bold")
     for name, classes in PAPER.items():
         table.add_row(name, *(f"{v:.2f}" for levels in classes for v in levels), f"{PAPER_MAP[name]:.2f}", style="dim")
     table.caption = (
@@ -87,7 +87,7 @@ def _print_paper(content: dict, console: Console) -> None:
 
 
 def print_intervals(content: dict[str, dict], console: Console) -> None:
-    """Print the intervals of AP that DetectionReport.compute_intervals returns."""
+    """Print the AP intervals of DetectionReport.compute_intervals."""
     table = make_table(
         f"{INTERVAL_PERCENT} % intervals of AP (R40, moderate), drawn by drive",
         "",

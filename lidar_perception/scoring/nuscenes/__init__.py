@@ -1,1 +1,1 @@
-"""The protocol of nuScenes' detection task."""
+"""Scores as in nuScenes' detection task."""

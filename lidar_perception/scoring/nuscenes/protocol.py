@@ -47,30 +47,32 @@ SYMMETRIC_CLASSES = ("barrier",)  # classes whose front and rear are equivalent
 
 
 def select_counted(boxes: GlobalBoxes, ego: np.ndarray, racks: GlobalBoxes) -> np.ndarray:
-    """Return a mask (K,) of the labels or detections of one frame that count.
+    """Return a mask (K,) of the labels or detections of one frame that are scored.
 
-    They are of a known class, within its range of the vehicle at ego (>=2,), not known to be
-    without points, and not a bicycle or motorcycle in a rack.
+    A box is scored if its class is known, its distance from the vehicle at ego (>=2,) is below the
+    range of the class, it is not a label without points, and it is not a bicycle or motorcycle in a
+    rack.
     """
     ranges = np.array([RANGES[name] for name in NAMES] + [0.0])[boxes.class_ids]  # -1 selects the last entry
-    away = np.sqrt(((boxes.centres[:, :2] - ego[:2]) ** 2).sum(axis=1))
-    kept = (away < ranges) & (boxes.points != 0)
+    distance = np.sqrt(((boxes.centres[:, :2] - ego[:2]) ** 2).sum(axis=1))
+    is_counted = (distance < ranges) & (boxes.points != 0)
     cycles = np.isin(boxes.class_ids, [NAMES.index(name) for name in RACK_CLASSES])
     for rack in np.column_stack([racks.centres, racks.sizes, racks.yaws]):
-        kept &= ~(cycles & points_in_box(boxes.centres, rack))
-    return kept
+        is_counted &= ~(cycles & points_in_box(boxes.centres, rack))
+    return is_counted
 
 
 @dataclass(frozen=True)
 class ClassScores:
     """Scores of one class.
 
-    Attributes:
-        objects, detections: counts.
-        ap: average precision 0..1 at each of DISTANCES.
-        errors: by ERRORS, NaN for errors that the class does not have.
+    Without labels or hits, AP is 0 and the errors are 1.
 
-    Without a hit, or without an object, AP is 0 and the errors are 1.
+    Attributes:
+        objects: Number of labels.
+        detections: Number of detections.
+        ap: Average precision 0..1 at each of DISTANCES.
+        errors: Value of each of ERRORS, NaN if it is not defined for the class.
     """
 
     objects: int
@@ -84,29 +86,32 @@ class ClassScores:
 
 
 def score_class(
-    name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: GlobalBoxes, found_frames: np.ndarray
+    name: str, truth: GlobalBoxes, true_frames: np.ndarray, detections: GlobalBoxes, detection_frames: np.ndarray
 ) -> ClassScores:
-    """Score a class over the counted boxes of all frames.
+    """Score a class over all frames, given the boxes that select_counted keeps.
 
     Args:
-        truth, found: M labels and K detections.
-        true_frames, found_frames: indices of their frames, (M,) ascending and (K,) int.
+        name: Name of the class.
+        truth: M labels.
+        true_frames: (M,) int, ascending, frame of each label.
+        detections: K detections.
+        detection_frames: (K,) int, frame of each detection.
     """
-    own, own_found = (boxes.class_ids == NAMES.index(name) for boxes in (truth, found))
-    truth, true_frames = truth[own], true_frames[own]
-    found, found_frames = found[own_found], found_frames[own_found]
-    order = np.argsort(found.scores, kind="stable")[::-1]
-    found, found_frames = found[order], found_frames[order]
-    frames = max(true_frames.max(initial=-1), found_frames.max(initial=-1)) + 1
+    is_class, is_class_detection = (boxes.class_ids == NAMES.index(name) for boxes in (truth, detections))
+    truth, true_frames = truth[is_class], true_frames[is_class]
+    detections, detection_frames = detections[is_class_detection], detection_frames[is_class_detection]
+    order = np.argsort(detections.scores, kind="stable")[::-1]
+    detections, detection_frames = detections[order], detection_frames[order]
+    frames = max(true_frames.max(initial=-1), detection_frames.max(initial=-1)) + 1
     first = np.searchsorted(true_frames, np.arange(frames + 1))
     ap, errors = {}, {}
     for distance in DISTANCES:
-        indices = _match(found.centres, found_frames, truth.centres, first, distance)
-        precision, confidence = _interpolate_curves(indices >= 0, found.scores, len(truth))
+        indices = _match(detections.centres, detection_frames, truth.centres, first, distance)
+        precision, confidence = _interpolate_curves(indices >= 0, detections.scores, len(truth))
         above = np.maximum(precision[FIRST_RECALL_INDEX:] - MIN_PRECISION, 0)
         ap[distance] = float(above.mean()) / (1 - MIN_PRECISION)
         if distance == ERROR_DISTANCE:
-            hits = found[indices >= 0]
+            hits = detections[indices >= 0]
             errors = {
                 error: _average_error(values, hits.scores, confidence)
                 for error, values in compute_errors(
@@ -114,81 +119,82 @@ def score_class(
                 ).items()
             }
     errors |= dict.fromkeys(UNDEFINED.get(name, ()), math.nan)
-    return ClassScores(len(truth), len(found), ap, errors)
+    return ClassScores(len(truth), len(detections), ap, errors)
 
 
 @njit(cache=True, nogil=True)
 def _match(centres, frames, true_centres, first, max_distance):
-    """Return the index (K,) int64 of the object that each detection hits, -1 without one.
+    """Return the index (K,) int64 of the object that each detection hits, -1 for none.
 
-    Detections are sorted by descending score; objects of frame f are first[f] .. first[f + 1].
+    Detections are in descending order of score; the objects of frame f are those from first[f] to
+    first[f + 1] - 1.
     """
-    indices, taken = np.full(len(centres), -1), np.zeros(len(true_centres), np.bool_)
+    indices, is_taken = np.full(len(centres), -1), np.zeros(len(true_centres), np.bool_)
     for i in range(len(centres)):
         best, nearest = -1, np.inf
         for j in range(first[frames[i]], first[frames[i] + 1]):
-            away = np.sqrt((centres[i, 0] - true_centres[j, 0]) ** 2 + (centres[i, 1] - true_centres[j, 1]) ** 2)
-            if not taken[j] and away < nearest:
-                best, nearest = j, away
+            distance = np.sqrt((centres[i, 0] - true_centres[j, 0]) ** 2 + (centres[i, 1] - true_centres[j, 1]) ** 2)
+            if not is_taken[j] and distance < nearest:
+                best, nearest = j, distance
         if nearest < max_distance:
-            indices[i], taken[best] = best, True
+            indices[i], is_taken[best] = best, True
     return indices
 
 
-def _interpolate_curves(hit: np.ndarray, scores: np.ndarray, objects: int) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate precision and score at RECALLS, (101,) each, 0 at recall that is not reached.
+def _interpolate_curves(is_hit: np.ndarray, scores: np.ndarray, objects: int) -> tuple[np.ndarray, np.ndarray]:
+    """Interpolate precision and score at RECALLS, each (101,); 0 at recalls that are not reached.
 
-    Detections (K,) are sorted by descending score.
+    The detections (K,) are in descending order of score.
     """
-    if not hit.any():
+    if not is_hit.any():
         return np.zeros(len(RECALLS)), np.zeros(len(RECALLS))
-    hits = np.cumsum(hit)
+    hits = np.cumsum(is_hit)
     recall = hits / objects
-    precision = hits / np.arange(1, len(hit) + 1)
+    precision = hits / np.arange(1, len(is_hit) + 1)
     return (np.interp(RECALLS, recall, precision, right=0), np.interp(RECALLS, recall, scores, right=0))
 
 
 def _average_error(values: np.ndarray, scores: np.ndarray, confidence: np.ndarray) -> float:
-    """Average an error over the recalls that are reached, from FIRST_RECALL_INDEX on.
+    """Average an error over the recalls that are reached, starting at FIRST_RECALL_INDEX.
 
-    The error at a recall is the mean over all hits (H,) up to it. NaN are ignored; 1 if all are
-    NaN.
+    The error at a recall is the mean over the hits (H,) with at least the score of that recall.
+    NaN values are ignored; the result is 1 if all values are NaN.
     """
-    reached = np.flatnonzero(confidence)
-    last = reached[-1] if len(reached) else 0
+    reached_indices = np.flatnonzero(confidence)
+    last = reached_indices[-1] if len(reached_indices) else 0
     if last < FIRST_RECALL_INDEX or np.isnan(values).all():
         return 1.0
-    known = np.cumsum(~np.isnan(values))
-    so_far = np.nancumsum(values) / np.maximum(known, 1)
-    curve = np.interp(confidence[::-1], scores[::-1], so_far[::-1])[::-1]
+    known_counts = np.cumsum(~np.isnan(values))
+    running_means = np.nancumsum(values) / np.maximum(known_counts, 1)
+    curve = np.interp(confidence[::-1], scores[::-1], running_means[::-1])[::-1]
     return float(curve[FIRST_RECALL_INDEX : last + 1].mean())
 
 
-def compute_errors(truth: GlobalBoxes, found: GlobalBoxes, half_turns: bool) -> dict[str, np.ndarray]:
-    """Compute the ERRORS (H,) float64 of pairs of boxes.
+def compute_errors(truth: GlobalBoxes, detections: GlobalBoxes, symmetric: bool) -> dict[str, np.ndarray]:
+    """Compute each of ERRORS, (H,) float64, for H pairs of boxes.
 
-    An error is NaN where the true velocity or attribute, or the detected velocity, is unknown. With
-    half_turns a box rotated by pi is the same.
+    An error is NaN where a velocity or the labelled attribute is unknown. With `symmetric`, yaw
+    errors are modulo pi.
     """
-    shared = np.minimum(truth.sizes, found.sizes).prod(axis=1)
-    union = truth.sizes.prod(axis=1) + found.sizes.prod(axis=1) - shared
-    period = np.pi if half_turns else 2 * np.pi
-    rotation = (truth.yaws - found.yaws + period / 2) % period - period / 2
-    differs = (truth.attributes != found.attributes).astype(float)
+    shared = np.minimum(truth.sizes, detections.sizes).prod(axis=1)
+    union = truth.sizes.prod(axis=1) + detections.sizes.prod(axis=1) - shared
+    period = np.pi if symmetric else 2 * np.pi
+    rotation = (truth.yaws - detections.yaws + period / 2) % period - period / 2
+    attribute_errors = (truth.attributes != detections.attributes).astype(float)
     return {
-        "ate": np.hypot(*(truth.centres - found.centres)[:, :2].T),
+        "ate": np.hypot(*(truth.centres - detections.centres)[:, :2].T),
         "ase": 1 - shared / union,
         "aoe": np.abs(rotation),
-        "ave": np.hypot(*(truth.velocities - found.velocities).T),
-        "aae": np.where(truth.attributes < 0, np.nan, differs),
+        "ave": np.hypot(*(truth.velocities - detections.velocities).T),
+        "aae": np.where(truth.attributes < 0, np.nan, attribute_errors),
     }
 
 
 def summarize(scores: dict[str, ClassScores]) -> dict[str, float]:
-    """Return map, the mean of each of ERRORS over its classes, and nds, all in 0..1.
+    """Return "map", the mean of each of ERRORS over the classes, and "nds", all 0..1.
 
-    nds is nuScenes' detection score, the mean of mAP with weight MAP_WEIGHT and 1 - error (at least
-    0) of each error.
+    nds is the nuScenes detection score: the weighted mean of mAP (weight MAP_WEIGHT) and of
+    max(0, 1 - error) for each error (weight 1).
     """
     result = {
         "map": float(np.mean([s.mean_ap for s in scores.values()])),

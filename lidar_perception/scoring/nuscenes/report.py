@@ -22,12 +22,15 @@ DETECTED_NAMES = tuple(NAME_BY_CLASS.values())
 
 @dataclass(frozen=True)
 class KeyFrameResult:
-    """One key frame.
+    """Boxes of one key frame.
 
     Attributes:
-        boxes: all boxes, as in a result file.
-        truth, counted: labels and boxes that count, None without labels.
-        ms, problem: see FrameDetections.
+        token: Sample token.
+        boxes: All detected boxes, as in a result file.
+        truth: Labels that are scored, None if the frame has no labels.
+        counted: Detected boxes that are scored, None if the frame has no labels.
+        ms: Run time of the detector, None for result files.
+        problem: Reason why the detector rejected the frame, or None.
     """
 
     token: str
@@ -41,7 +44,7 @@ class KeyFrameResult:
 def select_boxes(
     frame: Frame, boxes: GlobalBoxes, ms: float | None = None, problem: str | None = None
 ) -> KeyFrameResult:
-    """Select the boxes and labels of a nuScenes frame that count."""
+    """Select the detected boxes and labels of a nuScenes frame that are scored."""
     key = frame.native
     labels = key.labels()
     if labels is None:
@@ -58,16 +61,21 @@ def select_boxes(
 
 
 def measure_key_frames(
-    open_: Callable[[], Detector], unlabelled: bool, recording: Recording
+    open_detector: Callable[[], Detector], include_unlabelled: bool, recording: Recording
 ) -> Callable[[Frame], KeyFrameResult | None]:
-    """Run the detector of open_() on every key frame with labels, or with unlabelled on all.
+    """Make a function that runs a detector on every key frame with labels.
 
-    partial(measure_key_frames, open_, unlabelled) is a Start of scoring.run.
+    partial(measure_key_frames, open_detector, include_unlabelled) is a StartMeasurement of
+    scoring.run.
+
+    Args:
+        open_detector: Function that loads the detector.
+        include_unlabelled: Also run on key frames without labels.
     """
-    detector = open_()
+    detector = open_detector()
 
     def measure(frame: Frame) -> KeyFrameResult | None:
-        if frame.native.labels() is None and not unlabelled:
+        if frame.native.labels() is None and not include_unlabelled:
             return None
         result = run_detector(detector, frame, None, None)
         boxes, problem = GlobalBoxes.none(), result.problem
@@ -81,9 +89,9 @@ def measure_key_frames(
 
 
 def measure_result_file(path: Path, recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
-    """Read a result file of nuScenes' detection task.
+    """Make a function that reads the boxes of each labelled key frame from a nuScenes result file.
 
-    partial(measure_result_file, path) is a Start of scoring.run.
+    partial(measure_result_file, path) is a StartMeasurement of scoring.run.
     """
     boxes = read_results(path, list(recording))
     return lambda frame: None if frame.native.labels() is None else select_boxes(frame, boxes[frame.name])
@@ -91,13 +99,14 @@ def measure_result_file(path: Path, recording: Recording) -> Callable[[Frame], K
 
 @dataclass
 class NuscenesReport:
-    """Labels and detections that count.
+    """Labels and detections of all key frames.
 
     Attributes:
-        truth, detections: by frame.
-        ms: durations of the detector, if it was run.
-        skipped: reasons of skipped frames.
-        boxes: by sample token, for a result file.
+        truth: Scored labels of each frame.
+        detections: Scored detections of each frame.
+        ms: Run times of the detector; empty for result files.
+        skipped: Reasons for skipped frames.
+        boxes: All detected boxes by sample token, for a result file.
     """
 
     truth: list[GlobalBoxes] = field(default_factory=list)
@@ -122,10 +131,10 @@ class NuscenesReport:
             self.detections.append(result.counted)
 
     def compute(self) -> dict:
-        """Return the content of the JSON file, with ap, map and nds in percent.
+        """Return the content of the JSON file; ap, map and nds are in percent.
 
-        all is the mean over the ten classes, as in nuScenes' ranking; ours is the mean over the
-        three classes that the package's detectors know.
+        "all" is the mean over the ten classes, as in nuScenes' ranking. "ours" is the mean over the
+        three classes of the package's detectors.
         """
         result = {
             "frames": self.frames,
@@ -136,12 +145,12 @@ class NuscenesReport:
             "skipped": self.skipped,
         }
         if self.frames:
-            truth, found = (GlobalBoxes.concatenate(parts) for parts in (self.truth, self.detections))
-            numbers = [
+            truth, detections = (GlobalBoxes.concatenate(parts) for parts in (self.truth, self.detections))
+            frame_indices = [
                 np.repeat(np.arange(self.frames), [len(part) for part in parts])
                 for parts in (self.truth, self.detections)
             ]
-            scores = {name: score_class(name, truth, numbers[0], found, numbers[1]) for name in NAMES}
+            scores = {name: score_class(name, truth, frame_indices[0], detections, frame_indices[1]) for name in NAMES}
             result["classes"] = {name: _to_class_content(s) for name, s in scores.items()}
             result["all"] = _to_percent(summarize(scores))
             result["ours"] = _to_percent(summarize({name: scores[name] for name in DETECTED_NAMES}))
@@ -158,5 +167,5 @@ def _to_class_content(scores: ClassScores) -> dict:
     }
 
 
-def _to_percent(figures: dict[str, float]) -> dict[str, float]:
-    return {name: 100 * value if name in ("map", "nds") else value for name, value in figures.items()}
+def _to_percent(scores: dict[str, float]) -> dict[str, float]:
+    return {name: 100 * value if name in ("map", "nds") else value for name, value in scores.items()}

@@ -1,4 +1,4 @@
-"""Table of detections against the labels of nuScenes, with a paper's results."""
+"""Table of nuScenes detection scores, with the results of a paper."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PAPER = {"map": 92.68, "ate": 0.298, "ase": 0.218, "nds": 83.45}
 
 
 def print_nuscenes_report(content: dict, console: Console) -> None:
-    """Print AP at each distance and the errors, by class and overall."""
+    """Print the AP at each distance and the errors, for each class and overall."""
     table = make_table(
         f"nuScenes detection, {content['frames']} frames",
         "",
@@ -30,7 +30,7 @@ def print_nuscenes_report(content: dict, console: Console) -> None:
             str(row["objects"]),
             *(f"{ap:.3g}" for ap in row["ap"].values()),
             format_number(row["mean_ap"]),
-            *_errors(row),
+            *_format_errors(row),
             style="" if name in DETECTED_NAMES else "dim",
         )
     table.add_section()
@@ -38,8 +38,8 @@ def print_nuscenes_report(content: dict, console: Console) -> None:
         objects = sum(
             row["objects"] for name, row in content["classes"].items() if key == "all" or name in DETECTED_NAMES
         )
-        table.add_row(title, str(objects), *[""] * len(DISTANCES), *_means(content[key]), style="bold")
-    table.add_row("the paper", "", *[""] * len(DISTANCES), *_means(PAPER), style="dim")
+        table.add_row(title, str(objects), *[""] * len(DISTANCES), *_format_summary(content[key]), style="bold")
+    table.add_row("the paper", "", *[""] * len(DISTANCES), *_format_summary(PAPER), style="dim")
     table.caption = (
         "AP in percent by centre distance; ATE m, ASE 1 - IoU, AOE rad, AVE m/s, AAE 1 - accuracy. "
         "A class that is not detected has AP 0 and errors 1. Our three: car, pedestrian, bicycle "
@@ -51,9 +51,9 @@ def print_nuscenes_report(content: dict, console: Console) -> None:
     print_skipped(content["skipped"], console)
 
 
-def _means(row: dict) -> list[str]:
-    return [format_number(row["map"]), *_errors(row), format_number(row["nds"])]
+def _format_summary(row: dict) -> list[str]:
+    return [format_number(row["map"]), *_format_errors(row), format_number(row["nds"])]
 
 
-def _errors(row: dict) -> list[str]:
+def _format_errors(row: dict) -> list[str]:
     return [format_number(row.get(name), width=4) for name in ERRORS]

@@ -1,1 +1,1 @@
-"""Ground, clusters and points against labels."""
+"""Scores of ground, clusters and point classes."""

@@ -1,4 +1,4 @@
-"""Tables of the classes of a cluster network against labels."""
+"""Tables of the scores of a cluster network."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PAPER = {"accuracy": 94.96, "precision": 94.3, "recall": 93.5, "f1": 93.9, "iou"
 
 
 def print_cluster_scores(content: dict[str, Any], out: Console) -> None:
-    """Print the confusion of clusters, and the paper's scores."""
+    """Print the confusion matrix of clusters, the scores of points, and the paper's scores."""
     names = content["classes"]
     rows = content["clusters"]
     table = make_table(

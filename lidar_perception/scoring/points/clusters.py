@@ -1,4 +1,4 @@
-"""Class labels of clusters and of their points, and the confusion with a network (paper C)."""
+"""True classes of clusters and points, and the confusion matrix of a cluster network (paper C)."""
 
 from __future__ import annotations
 
@@ -38,36 +38,39 @@ MIN_POINTS = 10  # clusters with fewer points are ignored
 def label_clusters(
     clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray, classes: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Label K clusters by the box with the largest share of their points.
+    """Label K clusters by the box that contains most of their points.
 
     Args:
-        boxes, class_ids: (M, 7) labelled boxes, and (M,) indices into CLASSES.
-        classes: names of the labels.
+        clusters: K clusters.
+        boxes: (M, 7) labelled boxes.
+        class_ids: (M,) indices into CLASSES.
+        classes: Names of the labels.
 
     Returns:
-        Labels (K,) int64 into classes, len(classes) for background, UNKNOWN for neither; and the
-        index of the box (K,) int64 of each cluster, -1 for none.
+        Labels (K,) int64: index into classes, len(classes) for background, UNKNOWN for neither; and
+        the index (K,) int64 of each cluster's box, -1 for none.
     """
     count, background = len(clusters), len(classes)
-    number = np.repeat(np.arange(count), clusters.sizes)
-    share, owners = np.zeros(count), np.full(count, -1)
+    cluster_index = np.repeat(np.arange(count), clusters.sizes)
+    best_fraction, owners = np.zeros(count), np.full(count, -1)
     sizes = np.maximum(clusters.sizes, 1)
     for i, box in enumerate(boxes):
         inside = points_in_box(clusters.points[:, :3], box, BOX_MARGIN)
-        part = np.bincount(number[inside], minlength=count) / sizes
-        more = part > share
-        share[more], owners[more] = part[more], i
-    of_boxes = np.append(map_labels(class_ids, classes), background)
-    labels = np.where(share >= MIN_OBJECT_SHARE, of_boxes[owners], UNKNOWN)
-    labels[share < MAX_BACKGROUND_SHARE] = background
+        fraction = np.bincount(cluster_index[inside], minlength=count) / sizes
+        is_better = fraction > best_fraction
+        best_fraction[is_better], owners[is_better] = fraction[is_better], i
+    label_of_box = np.append(map_labels(class_ids, classes), background)
+    labels = np.where(best_fraction >= MIN_OBJECT_SHARE, label_of_box[owners], UNKNOWN)
+    labels[best_fraction < MAX_BACKGROUND_SHARE] = background
     owners[(labels == UNKNOWN) | (labels == background)] = -1
     return labels, owners
 
 
 def label_points(xyz: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
-    """Label points (N, 3) by the class of their box, as (N,) int64.
+    """Label points (N, 3) by the class of the box that contains them, as (N,) int64.
 
-    len(classes) is background, UNKNOWN a box of an ignored class.
+    Points outside all boxes get len(classes) (background), points in a box of an ignored class get
+    UNKNOWN.
     """
     labels = np.full(len(xyz), len(classes))
     for label, box in zip(map_labels(class_ids, classes), boxes):
@@ -82,19 +85,20 @@ def find_unlabelled(truth: GroundTruth, camera: Camera, xyz: np.ndarray) -> np.n
 
 
 def mask_unlabelled(labels: np.ndarray, clusters: Clusters, unlabelled: np.ndarray, background: int) -> np.ndarray:
-    """Set the labels (K,) of background clusters to UNKNOWN if half of their points are unlabelled.
+    """Return the labels (K,), with UNKNOWN for background clusters in unlabelled regions.
 
-    unlabelled (P,) bool is a mask of the points of all clusters.
+    These are clusters with at least half of their points in such a region: unlabelled (P,) bool
+    masks the points of all clusters.
     """
-    number = np.repeat(np.arange(len(clusters)), clusters.sizes)
-    share = np.bincount(number, unlabelled, minlength=len(clusters)) / np.maximum(clusters.sizes, 1)
-    return np.where((labels == background) & (share >= 0.5), UNKNOWN, labels)
+    cluster_index = np.repeat(np.arange(len(clusters)), clusters.sizes)
+    fraction = np.bincount(cluster_index, unlabelled, minlength=len(clusters)) / np.maximum(clusters.sizes, 1)
+    return np.where((labels == background) & (fraction >= 0.5), UNKNOWN, labels)
 
 
 def map_labels(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
-    """Map class_ids (M,) to labels (M,) int64 into classes.
+    """Map class_ids (M,) to labels (M,) int64, indices into classes.
 
-    len(classes) is background; classes of IGNORED_CLASSES are UNKNOWN.
+    IGNORED_CLASSES become UNKNOWN, other classes become len(classes) (background).
     """
     return np.array(
         [
@@ -116,34 +120,38 @@ def count_confusions(
     """Count the clusters and points of one frame by true and predicted class.
 
     Args:
+        clusters: Clusters of the frame.
         labels: (K,) true labels of the clusters.
-        point_truth, cluster_ids: (N,) true label of each point, and its cluster, 0 for none.
-        classes: names of the labels.
+        predictions: Predicted classes of the clusters.
+        point_truth: (N,) true label of each point.
+        cluster_ids: (N,) cluster of each point, 0 for none.
+        classes: Names of the C labels.
 
     Returns:
-        Counts of clusters and of points, (K + 1, K + 1) each, with background last.
+        Counts of clusters and of points, each (C + 1, C + 1) with background last.
     """
     shape = len(classes) + 1, len(classes) + 1
-    of_clusters, of_points = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+    cluster_counts, point_counts = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
     predicted = predictions.probabilities.argmax(axis=1)
-    counted = (labels >= 0) & (clusters.sizes >= MIN_POINTS)
-    np.add.at(of_clusters, (labels[counted], predicted[counted]), 1)
+    is_scored = (labels >= 0) & (clusters.sizes >= MIN_POINTS)
+    np.add.at(cluster_counts, (labels[is_scored], predicted[is_scored]), 1)
     largest = max(int(cluster_ids.max(initial=0)), int(clusters.ids.max(initial=0)))
-    of_number = np.full(largest + 1, len(classes))
-    of_number[clusters.ids] = predicted
-    known = point_truth >= 0
-    np.add.at(of_points, (point_truth[known], of_number[cluster_ids[known]]), 1)
-    return of_clusters, of_points
+    class_of_id = np.full(largest + 1, len(classes))
+    class_of_id[clusters.ids] = predicted
+    is_labelled = point_truth >= 0
+    np.add.at(point_counts, (point_truth[is_labelled], class_of_id[cluster_ids[is_labelled]]), 1)
+    return cluster_counts, point_counts
 
 
 def measure_network(weights: Path, settings: Mapping[str, Any], recording: Recording) -> Callable[[Frame], Any]:
-    """Run a cluster network on the points in the image of every frame with labelled boxes.
+    """Make a function that runs a cluster network on every frame with labelled boxes.
 
-    partial(measure_network, weights, settings) is a Start of scoring.run.
+    Only points in the camera's image are used if the frame has a calibration.
+    partial(measure_network, weights, settings) is a StartMeasurement of scoring.run.
 
     Args:
-        settings: ground and clustering parameters by dotted name that differ from those of
-            training.
+        weights: Checkpoint of the network.
+        settings: Ground and clustering parameters, by dotted name, that differ from training.
     """
     classifier = load_pointnet_detector(
         weights, "cpu", PointNetDetectorParams(pointnet=PointNetParams(warm_up=False))
@@ -160,25 +168,25 @@ def measure_network(weights: Path, settings: Mapping[str, Any], recording: Recor
         ids = cluster_obstacles(scan.xyz, ground, params.clustering)
         camera = frame.camera()
         if camera is None:  # without a camera, labels cover all directions
-            indices, hidden = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)
+            indices, find_hidden = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)
         else:
-            indices, hidden = (np.flatnonzero(camera.in_view(scan.xyz)), partial(find_unlabelled, truth, camera))
-        seen, ids = scan.take(indices), ids[indices]
-        made = make_clusters(seen, ids, ground=ground[indices])
-        labels, _ = label_clusters(made, truth.boxes, truth.class_ids, config.classes)
-        labels = mask_unlabelled(labels, made, hidden(made.points[:, :3]), background)
-        points = label_points(seen.xyz, truth.boxes, truth.class_ids, config.classes)
-        points[(points == background) & hidden(seen.xyz)] = UNKNOWN
-        return count_confusions(made, labels, classifier.predict(made), points, ids, config.classes)
+            indices, find_hidden = (np.flatnonzero(camera.in_view(scan.xyz)), partial(find_unlabelled, truth, camera))
+        visible, ids = scan.take(indices), ids[indices]
+        clusters = make_clusters(visible, ids, ground=ground[indices])
+        labels, _ = label_clusters(clusters, truth.boxes, truth.class_ids, config.classes)
+        labels = mask_unlabelled(labels, clusters, find_hidden(clusters.points[:, :3]), background)
+        point_labels = label_points(visible.xyz, truth.boxes, truth.class_ids, config.classes)
+        point_labels[(point_labels == background) & find_hidden(visible.xyz)] = UNKNOWN
+        return count_confusions(clusters, labels, classifier.predict(clusters), point_labels, ids, config.classes)
 
     return measure
 
 
 @dataclass
 class ClusterScores:
-    """Confusion of clusters and of points, (K + 1, K + 1) each, by true and predicted class.
+    """Confusion matrices of clusters and of points, each (K + 1, K + 1).
 
-    The last row and column is background.
+    Rows are true classes, columns are predicted classes; the last ones are background.
     """
 
     classes: tuple[str, ...]
@@ -198,7 +206,7 @@ class ClusterScores:
         self.frames += 1
 
     def compute(self) -> dict[str, Any]:
-        """Return the scores as JSON; shares in percent, None without objects."""
+        """Return the content of the JSON file; ratios in percent, None if the denominator is 0."""
         return {
             "frames": self.frames,
             "classes": [*self.classes, "background"],
@@ -210,28 +218,28 @@ class ClusterScores:
 
 
 def _compute_scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, Any]:
-    """Compute accuracy, and precision, recall, F1 and IoU by class and as their mean."""
-    right = np.diag(confusion)
+    """Compute the accuracy, and precision, recall, F1 and IoU by class and averaged over classes."""
+    correct = np.diag(confusion)
     true, predicted = confusion.sum(axis=1), confusion.sum(axis=0)
     rows = {}
     for i, name in enumerate(classes):
         rows[name] = {
             "objects": int(true[i]),
-            "precision": _to_percent(right[i], predicted[i]),
-            "recall": _to_percent(right[i], true[i]),
-            "f1": _to_percent(2 * right[i], true[i] + predicted[i]),
-            "iou": _to_percent(right[i], true[i] + predicted[i] - right[i]),
+            "precision": _to_percent(correct[i], predicted[i]),
+            "recall": _to_percent(correct[i], true[i]),
+            "f1": _to_percent(2 * correct[i], true[i] + predicted[i]),
+            "iou": _to_percent(correct[i], true[i] + predicted[i] - correct[i]),
         }
-    found = [row for row in rows.values() if row["objects"]]
+    present_rows = [row for row in rows.values() if row["objects"]]
     mean = {
-        key: float(np.mean([row[key] or 0.0 for row in found])) if found else None
+        key: float(np.mean([row[key] or 0.0 for row in present_rows])) if present_rows else None
         for key in ("precision", "recall", "f1", "iou")
     }
     count = len(classes)
     return {
         "confusion": confusion.tolist(),
-        "accuracy": _to_percent(right.sum(), confusion.sum()),
-        "object_accuracy": _to_percent(right[:count].sum(), true[:count].sum()),
+        "accuracy": _to_percent(correct.sum(), confusion.sum()),
+        "object_accuracy": _to_percent(correct[:count].sum(), true[:count].sum()),
         "by_class": rows,
         "mean": mean,
     }

@@ -1,4 +1,4 @@
-"""Ground segmentation and clustering against labelled points or boxes, frame by frame."""
+"""Scores of ground segmentation and clustering on labelled points or boxes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ from lidar_perception.wire.params import ViewParams
 
 @dataclass(frozen=True)
 class SegmentationParams:
-    """Parameters; the camera's view is on because KITTI labels nothing outside it."""
+    """Parameters of ground segmentation and clustering.
+
+    The crop to the camera's view is on by default because KITTI has no labels outside it.
+    """
 
     view: ViewParams = ViewParams(enabled=True)
     ground: GroundParams = GroundParams()
@@ -39,40 +42,47 @@ class SegmentationParams:
 
 @dataclass(frozen=True)
 class SegmentationResult:
-    """Arguments of GroundReport.update and ClusterReport.update by method, for one frame.
+    """Results of all methods for one frame.
 
-    whole is True if there was no camera to crop to.
+    Attributes:
+        ground: Arguments of GroundReport.update by method.
+        clusters: Arguments of ClusterReport.update by method.
+        without_camera: True if the frame has no camera calibration and was scored all around.
     """
 
     ground: dict[str, tuple] = field(default_factory=dict)
     clusters: dict[str, tuple] = field(default_factory=dict)
-    whole: bool = False
+    without_camera: bool = False
 
 
 def measure_methods(
-    params: SegmentationParams, grounds: tuple[str, ...], clusterings: tuple[str, ...], recording: Recording
+    params: SegmentationParams,
+    ground_methods: tuple[str, ...],
+    clustering_methods: tuple[str, ...],
+    recording: Recording,
 ) -> Callable[[Frame], SegmentationResult | None]:
-    """Run ground and clustering methods on every labelled frame.
+    """Make a function that runs ground and clustering methods on every labelled frame.
 
-    Ground is scored on labelled points. Clusters are scored on labelled instances or boxes; with
-    boxes on the ground of params, in the camera's view if there is a camera.
-    partial(measure_methods, params, grounds, clusterings) is a Start of scoring.run.
+    Ground is scored on labelled points, clusters on labelled instances or boxes. Frames with boxes
+    are cropped to the camera's view if they have a calibration.
+    partial(measure_methods, params, ground_methods, clustering_methods) is a StartMeasurement of
+    scoring.run.
     """
     timer = Timer()
 
     def measure_points(frame: Frame, labels: Any) -> SegmentationResult:
-        scan, found, ground = frame.load(), {}, {}
+        scan, ground_by_method, ground = frame.load(), {}, {}
         z = scan.xyz[:, 2] + np.float32(frame.sensor_height - SENSOR_HEIGHT)
-        for name in grounds:
-            found[name], ms = timer(segment_ground, scan, replace(params.ground, method=name))
-            ground[name] = count_by_protocol(found[name], labels.classes, z), ms
-        if not clusterings:
+        for name in ground_methods:
+            ground_by_method[name], ms = timer(segment_ground, scan, replace(params.ground, method=name))
+            ground[name] = count_by_protocol(ground_by_method[name], labels.classes, z), ms
+        if not clustering_methods:
             return SegmentationResult(ground)
-        chosen = found.get(params.ground.method)
-        if chosen is None:
-            chosen = segment_ground(scan, params.ground)
+        obstacle_ground = ground_by_method.get(params.ground.method)
+        if obstacle_ground is None:
+            obstacle_ground = segment_ground(scan, params.ground)
         objects = find_instances(scan.xyz, labels.classes, labels.instances)
-        return SegmentationResult(ground, score_methods(scan, chosen, objects))
+        return SegmentationResult(ground, score_methods(scan, obstacle_ground, objects))
 
     def measure_boxes(frame: Frame, truth: Any) -> SegmentationResult:
         scan, camera = frame.load(), frame.camera()
@@ -81,12 +91,12 @@ def measure_methods(
         return SegmentationResult(
             {},
             score_methods(scan, segment_ground(scan, params.ground), find_objects_in_boxes(scan.xyz, truth)),
-            whole=camera is None and params.view.enabled,
+            without_camera=camera is None and params.view.enabled,
         )
 
     def score_methods(scan: PointCloud, ground: np.ndarray, objects: Objects) -> dict:
         scores = {}
-        for name in clusterings:
+        for name in clustering_methods:
             ids, ms = timer(cluster_obstacles, scan.xyz, ground, replace(params.clustering, method=name))
             scores[name] = objects.classes, objects.ranges, score_clusters(ids, objects), ms
         return scores
@@ -96,7 +106,7 @@ def measure_methods(
         if labels is not None:
             return measure_points(frame, labels)
         truth = frame.truth()
-        return None if truth is None or not clusterings else measure_boxes(frame, truth)
+        return None if truth is None or not clustering_methods else measure_boxes(frame, truth)
 
     return measure
 
@@ -104,7 +114,7 @@ def measure_methods(
 class Timer:
     """Stopwatch: timer(function, *arguments) -> (result, milliseconds).
 
-    The first call of a method is preceded by a run that loads compiled code.
+    Each method runs once before its first measurement, to load compiled code.
     """
 
     def __init__(self) -> None:
@@ -122,16 +132,21 @@ class Timer:
 
 @dataclass
 class SegmentationReport:
-    """Scores of ground by method, and of clusters by source and method.
+    """Ground scores by method, and cluster scores by recording format and method.
 
-    source is the format of the next recording; whole counts frames without a camera to crop to.
+    Attributes:
+        source: Format of the recording that is being measured.
+        ground: Ground scores by method.
+        clusters: Cluster scores by format and method.
+        skipped: Reasons for skipped frames.
+        without_camera: Number of frames without a camera calibration.
     """
 
     source: str = ""
     ground: dict[str, GroundReport] = field(default_factory=dict)
     clusters: dict[str, dict[str, ClusterReport]] = field(default_factory=dict)
     skipped: list[str] = field(default_factory=list)
-    whole: int = 0
+    without_camera: int = 0
 
     def update(self, result: SegmentationResult) -> None:
         """Add one frame."""
@@ -139,7 +154,7 @@ class SegmentationReport:
             self.ground.setdefault(name, GroundReport()).update(*counts)
         for name, scores in result.clusters.items():
             self.clusters.setdefault(self.source, {}).setdefault(name, ClusterReport()).update(*scores)
-        self.whole += result.whole
+        self.without_camera += result.without_camera
 
     def compute(self) -> dict[str, Any]:
         """Return the content of the JSON file."""
@@ -154,12 +169,12 @@ class SegmentationReport:
 
 
 def segment_by_methods(
-    frame: Frame, params: SegmentationParams, grounds: tuple[str, ...]
+    frame: Frame, params: SegmentationParams, ground_methods: tuple[str, ...]
 ) -> tuple[PointCloud, PointTruth | None, dict[str, np.ndarray]]:
-    """Return a frame, its labels, and the ground (N,) bool by each method, for a picture."""
+    """Return a frame's cloud, its point labels, and its ground (N,) bool by method, to draw them."""
     scan = frame.load()
     return (
         scan,
         frame.point_truth(),
-        {name: segment_ground(scan, replace(params.ground, method=name)) for name in grounds},
+        {name: segment_ground(scan, replace(params.ground, method=name)) for name in ground_methods},
     )

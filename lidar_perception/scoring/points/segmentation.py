@@ -1,4 +1,4 @@
-"""Ground and clusters against labels of points (SemanticKITTI) or boxes (KITTI, bags).
+"""Scores of ground and clusters on labelled points (SemanticKITTI) or boxes (KITTI, bags).
 
 Ground is road, parking, sidewalk, other-ground, lane-marking and terrain; unlabelled points and
 outliers are ignored. There are three protocols, since vegetation changes F1 by several points:
@@ -37,35 +37,35 @@ RANGE_LIMITS = np.array([15.0, 30.0, 45.0])
 
 
 def select_true_ground(semantic: np.ndarray, z: np.ndarray, protocol: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the masks ground (N,) and counted (N,) of points.
+    """Return two masks (N,): points of the true ground, and points that are counted.
 
     Args:
-        semantic: (N,) classes.
-        z: (N,) height as seen from KITTI's sensor, metres.
-        protocol: one of PROTOCOLS.
+        semantic: (N,) SemanticKITTI classes.
+        z: (N,) height relative to a sensor at KITTI's mounting height, metres.
+        protocol: One of PROTOCOLS.
     """
-    ground, counted = np.isin(semantic, GROUND), ~np.isin(semantic, UNLABELLED)
+    ground, is_counted = np.isin(semantic, GROUND), ~np.isin(semantic, UNLABELLED)
     vegetation = semantic == VEGETATION
     if protocol == "without vegetation":
-        counted &= ~vegetation
+        is_counted &= ~vegetation
     elif protocol == "with vegetation":
         ground |= vegetation & (z < LOW_VEGETATION_Z)
-    return ground, counted
+    return ground, is_counted
 
 
-def count_ground(found: np.ndarray, ground: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """Count the predicted ground, found (N,) bool, as (4,) int64 [tp fp fn tn]."""
-    case = np.where(ground, np.where(found, 0, 2), np.where(found, 1, 3))
-    return np.bincount(case.compress(counted), minlength=4)
+def count_ground(predicted: np.ndarray, ground: np.ndarray, is_counted: np.ndarray) -> np.ndarray:
+    """Count the points of predicted ground (N,) bool, as (4,) int64 [tp fp fn tn]."""
+    case = np.where(ground, np.where(predicted, 0, 2), np.where(predicted, 1, 3))
+    return np.bincount(case.compress(is_counted), minlength=4)
 
 
-def count_by_protocol(found: np.ndarray, semantic: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:
-    """Count the predicted ground, found (N,) bool, by protocol; see select_true_ground."""
-    return {name: count_ground(found, *select_true_ground(semantic, z, name)) for name in PROTOCOLS}
+def count_by_protocol(predicted: np.ndarray, semantic: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:
+    """Count the points of predicted ground (N,) bool by protocol; see count_ground."""
+    return {name: count_ground(predicted, *select_true_ground(semantic, z, name)) for name in PROTOCOLS}
 
 
 def to_ground_row(counts: np.ndarray) -> dict:
-    """Return counts (4,) and their ratios for the JSON file. A ratio without cases is 0."""
+    """Return counts (4,) and their ratios for the JSON file; a ratio with denominator 0 is 0."""
     tp, fp, fn, tn = counts.tolist()
     return dict(
         tp=tp,
@@ -87,7 +87,7 @@ class GroundReport:
     ms: list[float] = field(default_factory=list)
 
     def update(self, counts: dict[str, np.ndarray], ms: float) -> None:
-        """Add one scan: counts of count_by_protocol and the duration of the method."""
+        """Add one scan: the result of count_by_protocol and the duration of the method."""
         for name, total in self.counts.items():
             total += counts[name]
         self.ms.append(ms)
@@ -107,10 +107,10 @@ class Objects:
 
     Attributes:
         owner: (N,) int32 object 1..K of each point, or 0.
-        region: (N,) int32 owner, and also points that are neutral for clusters of that object.
-        near: (N,) bool points whose clusters are scored.
-        counted: (N,) bool points with a known class; the others are ignored.
-        classes: K names.
+        region: (N,) int32 like owner, plus the points that are neutral for clusters of an object.
+        near: (N,) bool points near an object; clusters elsewhere are not scored.
+        counted: (N,) bool points with a known class; other points are ignored.
+        classes: Class names of the K objects.
         ranges: (K,) horizontal range, metres.
     """
 
@@ -123,10 +123,10 @@ class Objects:
 
 
 def find_objects_in_boxes(xyz: np.ndarray, truth: GroundTruth) -> Objects:
-    """Return the objects of labelled boxes, except DontCare, with at least MIN_POINTS points.
+    """Find the objects in labelled boxes, except DontCare, with at least MIN_POINTS points.
 
-    A box contains some of the road, so an object's points are more than BOTTOM_MARGIN above the
-    bottom of the box; lower ones are neutral. A point in two boxes belongs to the smaller one.
+    A box contains some of the road, so only points more than BOTTOM_MARGIN above its bottom belong
+    to the object; lower ones are neutral. A point in two boxes belongs to the smaller one.
     """
     owner, region = np.zeros((2, len(xyz)), np.int32)
     for k in np.argsort(-np.prod(truth.boxes[:, 3:6], axis=1), kind="stable"):
@@ -135,44 +135,46 @@ def find_objects_in_boxes(xyz: np.ndarray, truth: GroundTruth) -> Objects:
             inside = points_in_box(xyz, box)
             region[inside] = k + 1
             owner[inside] = np.where(xyz[inside, 2] > box[2] - box[5] / 2 + BOTTOM_MARGIN, k + 1, 0)
-    chosen = np.flatnonzero(np.bincount(owner, minlength=len(truth) + 1)[1:] >= MIN_POINTS)
-    near = np.zeros(len(xyz), bool)
-    for box in truth.boxes[chosen]:
-        near |= points_in_box(xyz, box, BOX_MARGIN)
+    kept_indices = np.flatnonzero(np.bincount(owner, minlength=len(truth) + 1)[1:] >= MIN_POINTS)
+    near_object = np.zeros(len(xyz), bool)
+    for box in truth.boxes[kept_indices]:
+        near_object |= points_in_box(xyz, box, BOX_MARGIN)
     return Objects(
-        _renumber(owner, chosen + 1),
-        _renumber(region, chosen + 1),
-        near,
+        _renumber(owner, kept_indices + 1),
+        _renumber(region, kept_indices + 1),
+        near_object,
         np.ones(len(xyz), bool),
-        tuple(truth.labels[k] for k in chosen),
-        np.hypot(*truth.boxes[chosen, :2].T),
+        tuple(truth.labels[k] for k in kept_indices),
+        np.hypot(*truth.boxes[kept_indices, :2].T),
     )
 
 
 def find_instances(xyz: np.ndarray, semantic: np.ndarray, instance: np.ndarray) -> Objects:
-    """Return the objects of SemanticKITTI with at least MIN_POINTS points.
+    """Find the objects of a SemanticKITTI scan with at least MIN_POINTS points.
 
-    An object is the points of one class and instance, moving or not. Unlabelled points, outliers,
-    things without an instance and smaller objects are ignored.
+    An object consists of the points of one class and instance, moving or not. Unlabelled points,
+    outliers, object classes without an instance id, and smaller objects are ignored.
     """
     table = np.zeros(1 << 16, np.int32)
     table[list(THINGS)] = list(THINGS)
     table[list(MOVING)] = list(MOVING.values())
-    thing = table[semantic]
-    keys, which, counts = np.unique(
-        np.where((thing > 0) & (instance > 0), thing << 16 | instance, 0), return_inverse=True, return_counts=True
+    thing_class = table[semantic]
+    keys, key_index, counts = np.unique(
+        np.where((thing_class > 0) & (instance > 0), thing_class << 16 | instance, 0),
+        return_inverse=True,
+        return_counts=True,
     )
-    chosen = np.flatnonzero((keys > 0) & (counts >= MIN_POINTS))
-    owner = _renumber(which.reshape(-1), chosen)
-    sums = [np.bincount(owner, axis, minlength=len(chosen) + 1)[1:] for axis in xyz[:, :2].T]
-    centres = np.stack(sums, axis=1) / counts[chosen, None]
-    counted = (owner > 0) | ((thing == 0) & ~np.isin(semantic, UNLABELLED))
+    kept_indices = np.flatnonzero((keys > 0) & (counts >= MIN_POINTS))
+    owner = _renumber(key_index.reshape(-1), kept_indices)
+    sums = [np.bincount(owner, axis, minlength=len(kept_indices) + 1)[1:] for axis in xyz[:, :2].T]
+    centres = np.stack(sums, axis=1) / counts[kept_indices, None]
+    is_counted = (owner > 0) | ((thing_class == 0) & ~np.isin(semantic, UNLABELLED))
     return Objects(
         owner,
         owner,
         owner > 0,
-        counted,
-        tuple(THINGS[key >> 16] for key in keys[chosen].tolist()),
+        is_counted,
+        tuple(THINGS[key >> 16] for key in keys[kept_indices].tolist()),
         horizontal_range(centres),
     )
 
@@ -182,11 +184,11 @@ class ClusterScore:
     """Clusters of one frame against K objects.
 
     Attributes:
-        iou: (K,) IoU with the best cluster, 0 without one.
+        iou: (K,) IoU with the best cluster, 0 if no cluster overlaps.
         pieces: (K,) number of clusters with at least MIN_PIECE_SHARE of the object's points.
-        shared: (K,) bool, True if the best cluster is also a piece of another object.
-        clusters: number of clusters.
-        judged: number of clusters with most of their points near objects.
+        shared: (K,) bool, True if the best cluster also contains a piece of another object.
+        clusters: Number of clusters.
+        judged: Number of clusters with most of their points near objects.
     """
 
     iou: np.ndarray
@@ -197,31 +199,42 @@ class ClusterScore:
 
 
 def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
-    """Score the clusters cluster_ids (N,) int, 0 = none, of a frame.
+    """Score the clusters of a frame; cluster_ids (N,) int are 0 for points without a cluster.
 
-    The result does not depend on the numbers of the clusters. Memory grows with the pairs of
-    objects and clusters that share points only.
+    The result does not depend on the values of the ids. Memory grows only with the number of pairs
+    of objects and clusters that share points.
     """
     labels, numbers = renumber_ids(cluster_ids)
-    ids, owner, region, near = (
+    ids, owner, region, is_near = (
         a.compress(objects.counted).astype(np.int64) for a in (labels, objects.owner, objects.region, objects.near)
     )
     size, rows = np.bincount(ids, minlength=len(numbers) + 1), len(objects.classes) + 1
     points = np.bincount(owner, minlength=rows)
-    both = (owner > 0) & (ids > 0)
-    pairs, common = np.unique(owner[both] * len(size) + ids[both], return_counts=True)
-    touched, inside = np.unique(region * len(size) + ids, return_counts=True)
-    thing, cluster = np.divmod(pairs, len(size))
+    in_both = (owner > 0) & (ids > 0)
+    pairs, shared_points = np.unique(owner[in_both] * len(size) + ids[in_both], return_counts=True)
+    region_pairs, region_points = np.unique(region * len(size) + ids, return_counts=True)
+    object_index, cluster_index = np.divmod(pairs, len(size))
     # the points of an object are in its region, so each pair is also a pair of the regions
-    iou = common / (size[cluster] + points[thing] - inside[np.searchsorted(touched, pairs)])
-    piece = common >= MIN_PIECE_SHARE * points[thing]
-    best = np.zeros(rows)
-    np.maximum.at(best, thing, iou)
-    several = np.bincount(cluster[piece], minlength=len(size)) > 1
-    shared = np.bincount(thing[(iou == best[thing]) & piece & several[cluster]], minlength=rows) > 0
-    judged = 2 * np.bincount(ids, near, minlength=len(size))[1:] > size[1:]
+    iou = shared_points / (
+        size[cluster_index] + points[object_index] - region_points[np.searchsorted(region_pairs, pairs)]
+    )
+    is_piece = shared_points >= MIN_PIECE_SHARE * points[object_index]
+    best_iou = np.zeros(rows)
+    np.maximum.at(best_iou, object_index, iou)
+    has_several_pieces = np.bincount(cluster_index[is_piece], minlength=len(size)) > 1
+    shared = (
+        np.bincount(
+            object_index[(iou == best_iou[object_index]) & is_piece & has_several_pieces[cluster_index]], minlength=rows
+        )
+        > 0
+    )
+    is_judged = 2 * np.bincount(ids, is_near, minlength=len(size))[1:] > size[1:]
     return ClusterScore(
-        best[1:], np.bincount(thing[piece], minlength=rows)[1:], shared[1:], len(numbers), int(judged.sum())
+        best_iou[1:],
+        np.bincount(object_index[is_piece], minlength=rows)[1:],
+        shared[1:],
+        len(numbers),
+        int(is_judged.sum()),
     )
 
 
@@ -233,30 +246,30 @@ class ClusterReport:
     ms: list[float] = field(default_factory=list)
 
     def update(self, classes: tuple[str, ...], ranges: np.ndarray, score: ClusterScore, ms: float) -> None:
-        """Add one frame: classes and ranges (K,) of its Objects, its score, and the duration."""
+        """Add one frame: classes and ranges (K,) of its Objects, its score, and the duration in ms."""
         self.frames.append((classes, ranges, score))
         self.ms.append(ms)
 
     def compute(self) -> dict:
-        """Return the content of the JSON file. precision is hits / judged clusters."""
+        """Return the content of the JSON file; precision is the fraction of judged clusters that hit."""
         classes = np.array([c for names, _, _ in self.frames for c in names], str)
         ranges = _concatenate(each for _, each, _ in self.frames)
         bins = np.searchsorted(RANGE_LIMITS, ranges, "right")
         columns = [
             _concatenate(getattr(score, name) for _, _, score in self.frames) for name in ("iou", "pieces", "shared")
         ]
-        everything = _to_object_row(*columns)
+        overall = _to_object_row(*columns)
         clusters, judged = (sum(getattr(score, name) for _, _, score in self.frames) for name in ("clusters", "judged"))
-        hits = everything["hits"]
+        hits = overall["hits"]
         return {
             "frames": len(self.frames),
             "ms": _compute_median(self.ms),
             "clusters": clusters,
             "clusters_per_frame": _divide(clusters, len(self.frames)),
             "judged_clusters": judged,
-            **everything,
+            **overall,
             "precision": _divide(hits, judged),
-            "f1": _divide(2 * hits, judged + everything["objects"]),
+            "f1": _divide(2 * hits, judged + overall["objects"]),
             "by_class": {
                 str(name): _to_object_row(*(c[classes == name] for c in columns)) for name in np.unique(classes)
             },
@@ -265,27 +278,27 @@ class ClusterReport:
 
 
 def _to_object_row(iou: np.ndarray, pieces: np.ndarray, shared: np.ndarray) -> dict:
-    """mean_pieces is the mean over objects with a piece; 1 is no over-segmentation."""
+    """Return counts and ratios of K objects; mean_pieces is the mean over objects with a piece."""
     count, hits = len(iou), int(np.sum(iou > HIT_IOU))
-    over, under = int(np.sum(pieces > 1)), int(np.sum(shared))
+    over_segmented, under_segmented = int(np.sum(pieces > 1)), int(np.sum(shared))
     return dict(
         objects=count,
         hits=hits,
         recall=_divide(hits, count),
         mean_iou=_divide(float(np.sum(iou)), count),
-        over_segmented=over,
-        over_segmentation=_divide(over, count),
+        over_segmented=over_segmented,
+        over_segmentation=_divide(over_segmented, count),
         mean_pieces=float(np.mean(pieces[pieces > 0])) if (pieces > 0).any() else None,
-        under_segmented=under,
-        under_segmentation=_divide(under, count),
+        under_segmented=under_segmented,
+        under_segmentation=_divide(under_segmented, count),
     )
 
 
-def _renumber(ids: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Map ids (N,) to their position 1.. in chosen, else 0, as (N,) int32."""
-    table = np.zeros(max(ids.max(initial=0), chosen.max(initial=0)) + 1, np.int32)
-    table[chosen] = np.arange(1, len(chosen) + 1)
-    return table[ids]
+def _renumber(ids: np.ndarray, kept_ids: np.ndarray) -> np.ndarray:
+    """Map ids (N,) to their position 1.. in kept_ids, other ids to 0, as (N,) int32."""
+    new_ids = np.zeros(max(ids.max(initial=0), kept_ids.max(initial=0)) + 1, np.int32)
+    new_ids[kept_ids] = np.arange(1, len(kept_ids) + 1)
+    return new_ids[ids]
 
 
 def _concatenate(parts) -> np.ndarray:

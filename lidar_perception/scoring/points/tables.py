@@ -1,4 +1,4 @@
-"""Tables and a picture of ground and clusters against labels."""
+"""Tables of ground and cluster scores, and a picture of the ground."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_DRAWN_RANGE = 50.0  # in metres to each side
 
 
 def print_scores(content: dict, ground_method: str, console: Console) -> None:
-    """Print tables of ground, and of clusters for each source."""
+    """Print a table of ground scores, and a table of cluster scores for each recording format."""
     if content["ground"]:
         _print_ground(content["ground"], console)
     for source, reports in content["clusters"].items():
@@ -96,7 +96,7 @@ def _print_clusters(reports: dict, title: str, console: Console) -> None:
 
 
 def _format_object(row: dict) -> list[str]:
-    """Precision and F1 exist only for all objects together."""
+    """Format one row of objects; precision and F1 exist only for all objects together."""
     judged = format_percent(row, "precision", "f1") if "precision" in row else ("", "")
     return [
         *format_counts(row, "objects", "hits"),
@@ -114,27 +114,29 @@ def _format_count(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def draw_ground(path: Path, name: str, frame: PointCloud, semantic: np.ndarray, found: dict[str, np.ndarray]) -> None:
-    """Draw the ground (N,) of each method in a BEV picture, and write it as PNG.
+def draw_ground(
+    path: Path, name: str, frame: PointCloud, semantic: np.ndarray, ground_by_method: dict[str, np.ndarray]
+) -> None:
+    """Draw the ground (N,) bool of each method in BEV, forward up, and write a PNG file.
 
-    x (forward) points up, y (left) to the left, metres. Vegetation is not counted.
+    Vegetation is not counted.
     """
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    true, counted = select_true_ground(semantic, frame.xyz[:, 2], "without vegetation")
+    is_ground, is_counted = select_true_ground(semantic, frame.xyz[:, 2], "without vegetation")
     figure, rows = plt.subplots(
-        1, len(found), figsize=(7 * len(found), 7.6), dpi=110, squeeze=False, layout="constrained"
+        1, len(ground_by_method), figsize=(7 * len(ground_by_method), 7.6), dpi=110, squeeze=False, layout="constrained"
     )
-    for axes, (method, ground) in zip(rows[0], found.items()):
+    for axes, (method, ground) in zip(rows[0], ground_by_method.items()):
         for mask, color, label, size in (
-            (~counted, "#dddddd", "not counted", 0.2),
-            (counted & ~true & ~ground, "#b0b0b0", "not ground", 0.3),
-            (counted & true & ground, "#009e73", "ground, found", 0.3),
-            (counted & true & ~ground, "#0072b2", "ground, missed", 1.2),
-            (counted & ~true & ground, "#d55e00", "found, but not ground", 1.2),
+            (~is_counted, "#dddddd", "not counted", 0.2),
+            (is_counted & ~is_ground & ~ground, "#b0b0b0", "not ground", 0.3),
+            (is_counted & is_ground & ground, "#009e73", "ground, found", 0.3),
+            (is_counted & is_ground & ~ground, "#0072b2", "ground, missed", 1.2),
+            (is_counted & ~is_ground & ground, "#d55e00", "found, but not ground", 1.2),
         ):
             axes.scatter(
                 -frame.xyz[mask, 1],

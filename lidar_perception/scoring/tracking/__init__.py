@@ -1,1 +1,1 @@
-"""Tracks against labels: HOTA, CLEAR MOT and AB3DMOT's averages over recall."""
+"""Tracking scores: HOTA, CLEAR MOT and AB3DMOT's averages over recall."""

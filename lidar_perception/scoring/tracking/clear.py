@@ -16,12 +16,15 @@ class ClearCounts:
     """Counts of one or more sequences.
 
     Attributes:
-        tp, fn, fp: boxes.
-        switches: labels matched to another id than the last time.
-        fragments: labels matched again after a gap.
-        mostly_tracked, partly_tracked, mostly_lost: labelled tracks matched in more than 80 %, in
-            20 % or more, in less than 20 % of their frames.
-        located: sum of similarities.
+        tp: Boxes that match a label.
+        fn: Labels without a match.
+        fp: Boxes without a match.
+        switches: Labels that match another track id than the last time.
+        fragments: Labels that match again after a gap.
+        mostly_tracked: Labelled tracks that match in more than 80 % of their frames.
+        partly_tracked: Labelled tracks that match in 20 % to 80 % of their frames.
+        mostly_lost: Labelled tracks that match in less than 20 % of their frames.
+        located: Sum of the similarities of all matches.
     """
 
     tp: int = 0
@@ -38,7 +41,10 @@ class ClearCounts:
         return ClearCounts(*(a + b for a, b in zip(astuple(self), astuple(other))))
 
     def compute_scores(self) -> dict[str, float]:
-        """Return MOTA (at most 1, may be negative), MOTP, recall and precision; 0 without cases."""
+        """Return MOTA (at most 1, can be negative), MOTP, recall and precision.
+
+        A ratio with denominator 0 is 0.
+        """
         objects = max(1, self.tp + self.fn)
         return {
             "MOTA": (self.tp - self.fp - self.switches) / objects,
@@ -48,45 +54,48 @@ class ClearCounts:
         }
 
 
-def count_clear(frames: list[Pairs], alike: float = MIN_SIMILARITY) -> ClearCounts:
-    """Count one sequence; its frames in order, as returned by drop_ignored.
+def count_clear(frames: list[Pairs], min_similarity: float = MIN_SIMILARITY) -> ClearCounts:
+    """Count one sequence.
 
-    Boxes of a similarity of at least `alike` can match. A pair of the previous frame is kept if
-    possible.
+    A label keeps its track of the previous frame if possible.
+
+    Args:
+        frames: Frames of the sequence in order, as returned by drop_ignored.
+        min_similarity: Minimum similarity of a match.
     """
     true_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.true_ids for f in frames)]))
-    last, before = (np.full(len(true_ids), -1, np.int64) for _ in range(2))
-    seen, found, runs = (np.zeros(len(true_ids), int) for _ in range(3))
+    last_track, previous_track = (np.full(len(true_ids), -1, np.int64) for _ in range(2))
+    frame_counts, match_counts, run_counts = (np.zeros(len(true_ids), int) for _ in range(3))
     tp = fp = switches = 0
     located = 0.0
     for f in frames:
         i = np.searchsorted(true_ids, f.true_ids)
-        seen[i] += 1
+        frame_counts[i] += 1
         fp += len(f.track_ids)
         if len(i) == 0 or len(f.track_ids) == 0:
             continue  # earlier matches can continue after such a frame, as in TrackEval
-        gain = CONTINUATION_GAIN * (f.track_ids == before[i][:, None]) + f.similarity
-        rows, columns = find_best_pairs(np.where(f.similarity < alike - EPS, 0.0, gain))
-        who, ids = i[rows], f.track_ids[columns]
-        switches += int(((last[who] >= 0) & (last[who] != ids)).sum())
-        runs[who] += before[who] < 0
-        last[who] = ids
-        before[:] = -1
-        before[who] = ids
-        found[who] += 1
-        tp += len(who)
-        fp -= len(who)
+        gain = CONTINUATION_GAIN * (f.track_ids == previous_track[i][:, None]) + f.similarity
+        rows, columns = find_best_pairs(np.where(f.similarity < min_similarity - EPS, 0.0, gain))
+        matched, ids = i[rows], f.track_ids[columns]
+        switches += int(((last_track[matched] >= 0) & (last_track[matched] != ids)).sum())
+        run_counts[matched] += previous_track[matched] < 0
+        last_track[matched] = ids
+        previous_track[:] = -1
+        previous_track[matched] = ids
+        match_counts[matched] += 1
+        tp += len(matched)
+        fp -= len(matched)
         located += float(f.similarity[rows, columns].sum())
-    share = found / np.maximum(seen, 1)
-    most, some = int((share > 0.8).sum()), int((share >= 0.2).sum())
+    matched_fraction = match_counts / np.maximum(frame_counts, 1)
+    mostly_tracked, at_least_partly = int((matched_fraction > 0.8).sum()), int((matched_fraction >= 0.2).sum())
     return ClearCounts(
         tp,
-        int(seen.sum()) - tp,
+        int(frame_counts.sum()) - tp,
         fp,
         switches,
-        int(np.maximum(runs - 1, 0).sum()),
-        most,
-        some - most,
-        len(true_ids) - some,
+        int(np.maximum(run_counts - 1, 0).sum()),
+        mostly_tracked,
+        at_least_partly - mostly_tracked,
+        len(true_ids) - at_least_partly,
         located,
     )

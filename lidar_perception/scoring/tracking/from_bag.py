@@ -19,7 +19,7 @@ def count_recorded_tracks(frames: Sequence[RecordedResult]) -> dict[str, int]:
     """Count the recorded tracks by class."""
     ids: dict[str, set[int]] = {}
     for frame in frames:
-        for i, label in zip(frame.found.ids.tolist(), frame.found.labels):
+        for i, label in zip(frame.published.ids.tolist(), frame.published.labels):
             ids.setdefault(label, set()).add(i)
     return {name: len(ids[name]) for name in sorted(ids)}
 
@@ -27,21 +27,21 @@ def count_recorded_tracks(frames: Sequence[RecordedResult]) -> dict[str, int]:
 def score_recorded_tracks(
     frames: Sequence[RecordedResult], calibration: Calibration | None
 ) -> dict[str, dict[str, Any] | None]:
-    """Score the recorded tracks by class as in TrackingReport.
+    """Score the recorded tracks; return the "classes" of TrackingReport.compute.
 
     Raises:
-        InputError: the labels have no track ids.
+        InputError: The labels have no track ids.
     """
-    report, drive, before = TrackingReport(), 0, 0
+    report, drive, last_stamp_ns = TrackingReport(), 0, 0
     for i, frame in enumerate(frames):
-        drive += not is_same_drive(before, frame.stamp_ns)
-        before = frame.stamp_ns
+        drive += not is_same_drive(last_stamp_ns, frame.stamp_ns)
+        last_stamp_ns = frame.stamp_ns
         report.update(
             observe(
                 f"drive {drive}",
                 i,
                 to_truth(frame.truth),
-                to_tracked_labels(np.asarray(frame.found.ids), to_detections(frame.found)),
+                to_tracked_labels(np.asarray(frame.published.ids), to_detections(frame.published)),
                 calibration,
             )
         )

@@ -1,6 +1,6 @@
-"""HOTA (Luiten et al., IJCV 2021), the balance of detection and association of tracks.
+"""HOTA (Luiten et al., IJCV 2021), a tracking score that balances detection and association.
 
-Counts are added over sequences; scores are computed from the sums.
+Counts are summed over sequences; scores are computed from the sums.
 """
 
 from __future__ import annotations
@@ -20,12 +20,14 @@ def _zeros() -> np.ndarray:
 
 @dataclass(frozen=True)
 class HotaCounts:
-    """Counts at each of ALPHAS, (19,) float64.
+    """Counts at each similarity threshold of ALPHAS, (19,) float64.
 
     Attributes:
-        tp, fn, fp: counts of boxes.
-        associated: sum over true positives of the share of frames in which their tracks match.
-        located: sum over true positives of their similarity.
+        tp: True positives.
+        fn: Misses.
+        fp: False positives.
+        associated: Sum of the association accuracies of the true positives.
+        located: Sum of the similarities of the true positives.
     """
 
     tp: np.ndarray = field(default_factory=_zeros)
@@ -40,7 +42,7 @@ class HotaCounts:
     def compute_scores(self) -> dict[str, float]:
         """Return HOTA, DetA, AssA, DetRe, DetPr and LocA, 0..1, averaged over ALPHAS.
 
-        They are 0 without cases.
+        A ratio with denominator 0 is 0.
         """
         det_a = self.tp / np.maximum(1.0, self.tp + self.fn + self.fp)
         ass_a = self.associated / np.maximum(1.0, self.tp)
@@ -56,30 +58,30 @@ class HotaCounts:
 
 
 def count_hota(frames: list[Pairs]) -> HotaCounts:
-    """Count one sequence; its frames in order, as returned by drop_ignored."""
+    """Count one sequence, given its frames in order as returned by drop_ignored."""
     true_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.true_ids for f in frames)]))
     track_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.track_ids for f in frames)]))
     indices = [(np.searchsorted(true_ids, f.true_ids), np.searchsorted(track_ids, f.track_ids)) for f in frames]
-    together = np.zeros((len(true_ids), len(track_ids)))  # summed weight of each pair
-    true_count, track_count = np.zeros((len(true_ids), 1)), np.zeros((1, len(track_ids)))
+    shared_frames = np.zeros((len(true_ids), len(track_ids)))  # summed weight of each pair
+    true_frames, track_frames = np.zeros((len(true_ids), 1)), np.zeros((1, len(track_ids)))
     for f, (i, j) in zip(frames, indices):
-        s = f.similarity
-        either = s.sum(axis=0) + s.sum(axis=1)[:, None] - s
-        together[np.ix_(i, j)] += np.divide(s, either, out=np.zeros_like(s), where=either > EPS)
-        true_count[i] += 1
-        track_count[0, j] += 1
-    alignment = together / np.maximum(true_count + track_count - together, EPS)
+        similarity = f.similarity
+        union = similarity.sum(axis=0) + similarity.sum(axis=1)[:, None] - similarity
+        shared_frames[np.ix_(i, j)] += np.divide(similarity, union, out=np.zeros_like(similarity), where=union > EPS)
+        true_frames[i] += 1
+        track_frames[0, j] += 1
+    alignment = shared_frames / np.maximum(true_frames + track_frames - shared_frames, EPS)
     matches = np.zeros((len(ALPHAS), len(true_ids), len(track_ids)))
     located = _zeros()
     for f, (i, j) in zip(frames, indices):
         # pairs of similarity 0 can be assigned too; they are below every alpha
         rows, columns = find_best_pairs(alignment[np.ix_(i, j)] * f.similarity)
-        alike = f.similarity[rows, columns]
-        is_match = alike >= ALPHAS[:, None] - EPS
+        similarities = f.similarity[rows, columns]
+        is_match = similarities >= ALPHAS[:, None] - EPS
         matches[:, i[rows], j[columns]] += is_match
-        located += (is_match * alike).sum(axis=1)
+        located += (is_match * similarities).sum(axis=1)
     tp = matches.sum(axis=(1, 2))
-    either = np.maximum(1.0, true_count + track_count - matches)
+    union = np.maximum(1.0, true_frames + track_frames - matches)
     return HotaCounts(
-        tp, true_count.sum() - tp, track_count.sum() - tp, (matches * matches / either).sum(axis=(1, 2)), located
+        tp, true_frames.sum() - tp, track_frames.sum() - tp, (matches * matches / union).sum(axis=(1, 2)), located
     )

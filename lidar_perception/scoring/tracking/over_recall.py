@@ -23,9 +23,10 @@ FORBIDDEN = 1e6  # cost of a pair below MIN_OVERLAP
 
 @dataclass(frozen=True)
 class RecallPoint:
-    """Counts over tracks with a mean score of at least threshold.
+    """Counts over tracks with a mean score of at least `threshold`.
 
-    tp includes ignored labels; objects and fn do not. overlap is the sum over tp.
+    tp includes matches of ignored labels; objects and fn exclude ignored labels. overlap is the sum
+    of the IoU of all matches.
     """
 
     threshold: float
@@ -39,31 +40,33 @@ class RecallPoint:
 
     @property
     def mota(self) -> float:
-        """At most 1; -inf without objects."""
+        """MOTA, at most 1; -inf without objects."""
         return 1 - (self.fn + self.fp + self.switches) / self.objects if self.objects else -np.inf
 
     @property
     def smota(self) -> float:
-        """MOTA scaled to 0..1 by the best value possible at this recall."""
+        """MOTA divided by the best value that is possible at this recall, clipped to 0..1."""
         if not self.objects:
             return 0.0
-        wrong = self.fn + self.fp + self.switches - (1 - self.recall) * self.objects
-        return min(1.0, max(0.0, 1 - wrong / (self.recall * self.objects)))
+        errors = self.fn + self.fp + self.switches - (1 - self.recall) * self.objects
+        return min(1.0, max(0.0, 1 - errors / (self.recall * self.objects)))
 
 
 def score_over_recall(sequences: list[list[Pairs]]) -> dict[str, float | None]:
-    """Return sAMOTA, AMOTA, AMOTP, best_MOTA, and best_score, the threshold of best_MOTA.
+    """Compute sAMOTA, AMOTA, AMOTP, best_MOTA, and best_score (the threshold of best_MOTA).
 
-    sequences are lists of frames in order, as returned by make_pairs. Scores are 0 without a
-    matching track, best_score is then None.
+    If no track matches, the scores are 0 and best_score is None.
+
+    Args:
+        sequences: Frames of each sequence in order, as returned by make_pairs.
     """
     means = [_average_scores(frames) for frames in sequences]
     matched = [[np.zeros(len(f.track_ids), bool) for f in frames] for frames in sequences]
     hits: list[float] = []
-    first = _count_at_threshold(sequences, means, matched, -np.inf, 1.0, hits)
+    all_tracks = _count_at_threshold(sequences, means, matched, -np.inf, 1.0, hits)
     points = [
         _count_at_threshold(sequences, means, matched, threshold, recall, [])
-        for threshold, recall in _choose_thresholds(np.array(hits), first.tp + first.fn)
+        for threshold, recall in _choose_thresholds(np.array(hits), all_tracks.tp + all_tracks.fn)
     ]
     best = max(points, key=lambda p: p.mota, default=None)
     if best is None or best.mota <= 0:
@@ -86,15 +89,15 @@ def _average_scores(frames: list[Pairs]) -> dict[int, float]:
 
 
 def _choose_thresholds(scores: np.ndarray, objects: int) -> list[tuple[float, float]]:
-    """Return (score, recall) of the hits nearest to recall 1/40, 2/40, .."""
-    ordered, chosen, wanted = np.sort(scores)[::-1], [], 0.0
-    for i, score in enumerate(ordered.tolist()):
+    """Return the score thresholds with the recall nearest to 1/40, 2/40, .., as (score, recall)."""
+    descending, chosen, target_recall = np.sort(scores)[::-1], [], 0.0
+    for i, score in enumerate(descending.tolist()):
         recall = (i + 1) / objects
-        following = (i + 2) / objects if i + 1 < len(ordered) else recall
-        if following - wanted < wanted - recall and i + 1 < len(ordered):
+        next_recall = (i + 2) / objects if i + 1 < len(descending) else recall
+        if next_recall - target_recall < target_recall - recall and i + 1 < len(descending):
             continue
-        chosen.append((score, wanted))
-        wanted += 1 / STEPS
+        chosen.append((score, target_recall))
+        target_recall += 1 / STEPS
     return chosen[1:]
 
 
@@ -108,27 +111,27 @@ def _count_at_threshold(
 ) -> RecallPoint:
     """Count at one threshold.
 
-    The score of each hit is appended to hits. matched is updated in place: a track that matched
-    once is never excused again, as in the script.
+    Appends the score of each match to `hits`. Updates `matched` in place: a track that has matched
+    once is never excused again, as in the paper's script.
     """
     tp = fn = fp = switches = objects = 0
     overlap = 0.0
-    for frames, score, was in zip(sequences, means, matched):
+    for frames, score, matched_frames in zip(sequences, means, matched):
         histories: dict[int, list[tuple[int, bool]]] = {}
-        for f, matched_once in zip(frames, was):
-            average = np.array([score[i] for i in f.track_ids.tolist()])
-            kept = np.flatnonzero(average >= threshold) if len(average) else np.zeros(0, int)
-            rows, columns = _match(f.overlap[:, kept])
-            columns = kept[columns]
+        for f, matched_once in zip(frames, matched_frames):
+            mean_scores = np.array([score[i] for i in f.track_ids.tolist()])
+            selected = np.flatnonzero(mean_scores >= threshold) if len(mean_scores) else np.zeros(0, int)
+            rows, columns = _match(f.overlap[:, selected])
+            columns = selected[columns]
             matched_once[columns] = True
-            hits += average[columns].tolist()
-            excused = f.excused[kept] & ~matched_once[kept]
+            hits += mean_scores[columns].tolist()
+            is_excused = f.excused[selected] & ~matched_once[selected]
             ignored_hits = int(f.ignored[rows].sum())
-            need = int((~f.ignored).sum())
-            objects += need
+            label_count = int((~f.ignored).sum())
+            objects += label_count
             tp += len(rows)
-            fn += need - (len(rows) - ignored_hits)
-            fp += len(kept) - len(rows) - int(excused.sum())
+            fn += label_count - (len(rows) - ignored_hits)
+            fp += len(selected) - len(rows) - int(is_excused.sum())
             overlap += float(f.overlap[rows, columns].sum())
             ids = np.full(len(f.true_ids), -1, np.int64)
             ids[rows] = f.track_ids[columns]
@@ -141,19 +144,23 @@ def _count_at_threshold(
 def _match(overlap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     cost = np.where(overlap >= MIN_OVERLAP, 1.0 - overlap, FORBIDDEN)
     rows, columns = linear_sum_assignment(cost)
-    good = cost[rows, columns] < FORBIDDEN
-    return rows[good], columns[good]
+    is_allowed = cost[rows, columns] < FORBIDDEN
+    return rows[is_allowed], columns[is_allowed]
 
 
 def _count_switches(history: list[tuple[int, bool]]) -> int:
-    """Count the switches of one label, given (track or -1, is ignored) for each of its frames."""
-    count, last = 0, history[0][0]
+    """Count the id switches of one label.
+
+    Args:
+        history: Track id (-1 for none) and ignored flag for each frame of the label.
+    """
+    count, last_track = 0, history[0][0]
     if all(ignored for _, ignored in history):
         return 0
-    for (before, _), (track, ignored) in itertools.pairwise(history):
+    for (previous_track, _), (track, ignored) in itertools.pairwise(history):
         if ignored:
-            last = -1
+            last_track = -1
             continue
-        count += last != track and last != -1 and track != -1 and before != -1
-        last = track if track != -1 else last
+        count += last_track != track and last_track != -1 and track != -1 and previous_track != -1
+        last_track = track if track != -1 else last_track
     return count

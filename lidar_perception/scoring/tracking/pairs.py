@@ -30,13 +30,14 @@ SIMILARITIES = ("centres", "3d", "image")
 
 @dataclass(frozen=True)
 class Pairs:
-    """M labels of a class and its neighbours, and K tracks of the class, in one frame.
+    """M labels of a class and its neighbour class, and K tracks of the class, in one frame.
 
     Attributes:
-        true_ids, track_ids: (M,) and (K,) int64, unique.
-        ignored: (M,) bool labels that need not be detected.
-        scores: (K,) float64.
-        excused: (K,) bool tracks that are not false positives if they match nothing.
+        true_ids: (M,) int64, unique track ids of the labels.
+        ignored: (M,) bool, True for labels that need not be detected.
+        track_ids: (K,) int64, unique ids of the tracks.
+        scores: (K,) float64 scores of the tracks.
+        excused: (K,) bool, True for tracks that are not false positives if they match no label.
         similarity: (M, K) float64 0..1, for HOTA and CLEAR MOT.
         overlap: (M, K) float64 3D IoU, for AB3DMOT's scores.
     """
@@ -62,94 +63,107 @@ def to_tracked_labels(ids: np.ndarray, detections: Detections) -> GroundTruth:
 def make_pairs(
     truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None, similarity: str = "centres"
 ) -> dict[str, Pairs]:
-    """Make the pairs of one frame by detected class.
+    """Make the pairs of one frame by class.
 
     Args:
-        truth: labels with a track_id in each extra.
-        tracks: labels with a track_id and score in each extra.
-        calibration: None if no box is too small and there are no DontCare regions.
-        similarity: "centres" 1 - distance / 2 m, "3d" 3D IoU, "image" IoU of the 2D boxes.
+        truth: Labels with a track_id in extras.
+        tracks: Tracks as labels with a track_id and score in extras.
+        calibration: Camera calibration. With None, no box is too small and DontCare regions are not
+            applied.
+        similarity: "centres": 1 - distance / 2 m, "3d": 3D IoU, "image": IoU of the 2D boxes.
 
     Raises:
-        InputError: a track id is missing or duplicate, or a number is not finite.
+        InputError: A track id is missing or duplicate, or a number is not finite.
     """
     if similarity not in SIMILARITIES:
         raise InputError(f"similarity = {similarity!r} must be one of {', '.join(SIMILARITIES)}")
     if similarity == "image" and calibration is None:
         raise InputError("similarity in the image needs a calibration; take 'centres' or '3d'")
     true_ids, track_ids = read_track_ids(truth, "label"), read_track_ids(tracks, "track")
-    true, found = (to_camera_objects(objects, calibration) for objects in (truth, tracks))
+    camera_labels, camera_tracks = (to_camera_objects(objects, calibration) for objects in (truth, tracks))
     # regions without a box come last and are listed in .regions
-    true_objects, objects = true.take(np.arange(len(truth))), found.take(np.arange(len(tracks)))
-    ignored = np.array(
+    labels_in_scene, tracks_in_scene = (
+        camera_labels.take(np.arange(len(truth))),
+        camera_tracks.take(np.arange(len(tracks))),
+    )
+    is_ignored = np.array(
         [
             extra.get("occluded", 0) > MAX_OCCLUSION or round(extra.get("truncated", 0)) > MAX_TRUNCATION
             for extra in truth.extras
         ],
         bool,
     )
-    ignored |= true_objects.pixels_high == 0
-    in_region = compute_image_iou(objects.image_boxes, true.regions, of_first=True)
-    excused = (objects.pixels_high <= MIN_HEIGHT + EPS) | (in_region > MAX_REGION_SHARE + EPS).any(axis=1)
+    is_ignored |= labels_in_scene.pixels_high == 0
+    region_fraction = compute_image_iou(tracks_in_scene.image_boxes, camera_labels.regions, over_first=True)
+    is_excused = (tracks_in_scene.pixels_high <= MIN_HEIGHT + EPS) | (region_fraction > MAX_REGION_SHARE + EPS).any(
+        axis=1
+    )
     return {
-        name: _make_class_pairs(name, true_objects, objects, true_ids, track_ids, ignored, excused, similarity)
+        name: _make_class_pairs(
+            name, labels_in_scene, tracks_in_scene, true_ids, track_ids, is_ignored, is_excused, similarity
+        )
         for name in DETECTED
     }
 
 
-def read_track_ids(objects: GroundTruth, what: str) -> np.ndarray:
+def read_track_ids(objects: GroundTruth, noun: str) -> np.ndarray:
     """Read the track ids (N,) int64.
 
-    Raises InputError if one is missing (-1 in KITTI) or duplicate; `what` names the objects.
+    Args:
+        objects: N labels or tracks.
+        noun: Name of the objects in error messages.
+
+    Raises:
+        InputError: An id is missing (-1 in KITTI) or duplicate.
     """
     ids = np.array([extra.get("track_id", -1) for extra in objects.extras], np.int64)
     if (ids < 0).any():
-        raise InputError(f"a {what} has no track id; tracking scores need one in each")
+        raise InputError(f"a {noun} has no track id; tracking scores need one in each")
     if len(np.unique(ids)) < len(ids):
-        raise InputError(f"a frame has the {what} id {np.sort(ids)[:-1][np.diff(np.sort(ids)) == 0][0]} twice")
+        raise InputError(f"a frame has the {noun} id {np.sort(ids)[:-1][np.diff(np.sort(ids)) == 0][0]} twice")
     return ids
 
 
 def _make_class_pairs(
     name: str,
-    true: CameraObjects,
-    found: CameraObjects,
+    camera_labels: CameraObjects,
+    camera_tracks: CameraObjects,
     true_ids: np.ndarray,
     track_ids: np.ndarray,
     ignored: np.ndarray,
     excused: np.ndarray,
     similarity: str,
 ) -> Pairs:
-    own, other = CLASSES.index(name), CLASSES.index(NEIGHBOURS.get(name, name))
-    rows = np.flatnonzero(np.isin(true.class_ids, [own, other]))
-    columns = np.flatnonzero(found.class_ids == own)
-    labels, tracks = true.take(rows), found.take(columns)
+    class_id, neighbour_id = CLASSES.index(name), CLASSES.index(NEIGHBOURS.get(name, name))
+    rows = np.flatnonzero(np.isin(camera_labels.class_ids, [class_id, neighbour_id]))
+    columns = np.flatnonzero(camera_tracks.class_ids == class_id)
+    labels, tracks = camera_labels.take(rows), camera_tracks.take(columns)
     overlap = iou_3d(labels.boxes, tracks.boxes)
     if similarity == "centres":
-        apart = np.linalg.norm(labels.boxes[:, None, :3] - tracks.boxes[None, :, :3], axis=2)
-        alike = np.maximum(1.0 - apart / MAX_CENTRE_DISTANCE, 0.0)
+        distance = np.linalg.norm(labels.boxes[:, None, :3] - tracks.boxes[None, :, :3], axis=2)
+        class_similarity = np.maximum(1.0 - distance / MAX_CENTRE_DISTANCE, 0.0)
     else:
-        alike = overlap if similarity == "3d" else compute_image_iou(labels.image_boxes, tracks.image_boxes)
+        class_similarity = overlap if similarity == "3d" else compute_image_iou(labels.image_boxes, tracks.image_boxes)
     return Pairs(
         true_ids[rows],
-        ignored[rows] | (labels.class_ids != own),
+        ignored[rows] | (labels.class_ids != class_id),
         track_ids[columns],
         tracks.scores,
         excused[columns],
-        alike,
+        class_similarity,
         overlap,
     )
 
 
 def drop_ignored(pairs: Pairs) -> Pairs:
-    """Return the pairs that HOTA and CLEAR MOT count.
+    """Return the pairs for HOTA and CLEAR MOT.
 
-    Ignored labels, tracks matched to them, and excused tracks that match nothing are dropped.
+    Drops ignored labels, tracks that match one, and excused tracks without a match.
     """
     rows, columns = find_best_pairs(np.where(pairs.similarity < MIN_SIMILARITY - EPS, 0.0, pairs.similarity))
-    dropped = pairs.excused.copy()
-    dropped[columns] = pairs.ignored[rows]
-    labels, tracks = np.flatnonzero(~pairs.ignored), np.flatnonzero(~dropped)
+    is_dropped = pairs.excused.copy()
+    is_dropped[columns] = pairs.ignored[rows]
+    labels, tracks = np.flatnonzero(~pairs.ignored), np.flatnonzero(~is_dropped)
     both = np.ix_(labels, tracks)
     return replace(
         pairs,
@@ -164,10 +178,10 @@ def drop_ignored(pairs: Pairs) -> Pairs:
 
 
 def find_best_pairs(gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows (P,) and columns (P,) of the assignment of maximum total gain (M, K).
+    """Assign rows to columns so that the total gain is maximal; gain is (M, K).
 
-    Pairs without gain are dropped.
+    Returns the rows (P,) and columns (P,) of the pairs with a positive gain.
     """
     rows, columns = linear_sum_assignment(gain, maximize=True)
-    kept = gain[rows, columns] > EPS
-    return rows[kept], columns[kept]
+    has_gain = gain[rows, columns] > EPS
+    return rows[has_gain], columns[has_gain]

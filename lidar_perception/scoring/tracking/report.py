@@ -1,4 +1,4 @@
-"""Tracking scores by class; frames may be added in any order."""
+"""Tracking scores by class, from frames in any order."""
 
 from __future__ import annotations
 
@@ -20,9 +20,13 @@ from lidar_perception.types import GroundTruth, InputError
 
 @dataclass(frozen=True)
 class Observation:
-    """Labels and tracks of frame `index` of a sequence, by class.
+    """Labels and tracks of one frame, by class.
 
-    has_pose is False if the source of poses had none for the frame.
+    Attributes:
+        sequence: Name of the sequence.
+        index: Index of the frame in the sequence.
+        pairs: Labels and tracks by class.
+        has_pose: False if the frame has no pose.
     """
 
     sequence: str
@@ -39,9 +43,10 @@ def observe(
     calibration: Calibration | None = None,
     similarity: str = "centres",
 ) -> Observation:
-    """Make the Observation of a frame; see make_pairs.
+    """Make the Observation of a frame; for the arguments see make_pairs.
 
-    Raises InputError that names the sequence and frame if it cannot be scored.
+    Raises:
+        InputError: The frame cannot be scored; the message names the sequence and frame.
     """
     try:
         return Observation(sequence, index, make_pairs(truth, tracks, calibration, similarity))
@@ -50,15 +55,15 @@ def observe(
 
 
 def measure_tracking(
-    open_: Callable[[], Detector], params: TrackingParams, ego: str, recording: Recording
+    open_detector: Callable[[], Detector], params: TrackingParams, ego: str, recording: Recording
 ) -> Callable[[Frame], Observation | None]:
-    """Make a function that tracks the detections of open_(), see DriveTracker.
+    """Make a function that runs a detector and a DriveTracker on each frame.
 
-    Frames must be measured in order of time, in one process. partial(measure_tracking, open_,
-    params, ego) is a Start of scoring.run.
+    Frames must be measured in order of time, in one process.
+    partial(measure_tracking, open_detector, params, ego) is a StartMeasurement of scoring.run.
     """
     tracker = DriveTracker(recording, params, ego)
-    detector = open_()
+    detector = open_detector()
 
     def measure(frame: Frame) -> Observation | None:
         truth = frame.truth()
@@ -68,9 +73,9 @@ def measure_tracking(
         tracks = tracker(frame, detector(frame.load()).detections)
         if truth is None:
             return None
-        found = to_tracked_labels(tracks.ids, tracks.detections)
+        tracked_labels = to_tracked_labels(tracks.ids, tracks.detections)
         return replace(
-            observe(tracker.drive, frame.index, truth, found, frame.calibration()), has_pose=tracker.has_pose
+            observe(tracker.drive, frame.index, truth, tracked_labels, frame.calibration()), has_pose=tracker.has_pose
         )
 
     return measure
@@ -78,7 +83,7 @@ def measure_tracking(
 
 @dataclass
 class TrackingReport:
-    """Frames of sequences. A frame that is added twice counts once, the last time."""
+    """Collection of the frames of all sequences; a repeated frame replaces the earlier one."""
 
     frames: dict[tuple[str, int], dict[str, Pairs]] = field(default_factory=dict)
     without_pose: set[tuple[str, int]] = field(default_factory=set)
@@ -91,9 +96,9 @@ class TrackingReport:
         (self.without_pose.discard if observation.has_pose else self.without_pose.add)(key)
 
     def compute(self) -> dict:
-        """Return the content of the JSON file: counts of frames, and scores by class.
+        """Return the content of the JSON file: counts of frames, and scores (0..1) by class.
 
-        Scores are 0..1. A class without labels and tracks is None.
+        The scores are None for a class without labels and tracks.
         """
         names = sorted({sequence for sequence, _ in self.frames})
         ordered = {name: [self.frames[key] for key in sorted(self.frames) if key[0] == name] for name in names}
@@ -110,9 +115,9 @@ class TrackingReport:
 
 
 def _score_class(sequences: list[list[Pairs]]) -> dict | None:
-    counted = [[drop_ignored(f) for f in frames] for frames in sequences]
+    scored_sequences = [[drop_ignored(f) for f in frames] for frames in sequences]
     hota, clear = HotaCounts(), ClearCounts()
-    for frames in counted:
+    for frames in scored_sequences:
         hota, clear = hota + count_hota(frames), clear + count_clear(frames)
     if clear.tp + clear.fn + clear.fp == 0:
         return None
@@ -122,8 +127,8 @@ def _score_class(sequences: list[list[Pairs]]) -> dict | None:
         **score_over_recall(sequences),
         "labels": clear.tp + clear.fn,
         "boxes": clear.tp + clear.fp,
-        "true_tracks": _count_tracks(counted, "true_ids"),
-        "tracks": _count_tracks(counted, "track_ids"),
+        "true_tracks": _count_tracks(scored_sequences, "true_ids"),
+        "tracks": _count_tracks(scored_sequences, "track_ids"),
         "hits": clear.tp,
         "misses": clear.fn,
         "false": clear.fp,

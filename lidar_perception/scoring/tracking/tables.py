@@ -1,4 +1,4 @@
-"""Tables of tracks against labels."""
+"""Tables of tracking scores."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ COUNTS = {"labels": "labels", "IDSW": "switches", "false": "false"}
 
 
 def print_tracking_report(content: dict, console: Console) -> None:
-    """Print scores by class in percent, and counts."""
+    """Print the scores (in percent) and counts of each class."""
     table = make_table(
         f"Tracking, {content['frames']} frames of {content['sequences']} sequences, {EGO_TITLES[content['ego']]}",
         "",
