@@ -66,41 +66,42 @@ def compute_shape_features(
     """
     stm = replace(params.stm, window="metric", spread=True, dilations=0, axis="yaw")
     floors = boxes[:, 2].astype(float) - boxes[:, 5] / 2
-    drawn = (
+    silhouette_areas = (
         count_pixels(draw_silhouettes(xyz, start, np.ones((len(boxes), 1)), floors, replace(params, stm=stm)))
         * PIXEL_AREA_M2
     )
     count = np.diff(start)
-    ranges, low, high, spread, length, width, middle = _compute_moments(
+    ranges, low, high, spread, length, width, median_offset = _compute_moments(
         np.ascontiguousarray(xyz, np.float32), np.asarray(start, np.int64)
     ).T
-    beam = ranges * np.radians(params.resolution.elevation_step)
+    beam_steps = ranges * np.radians(params.resolution.elevation_step)
     height = np.maximum(high - floors, 0.1)
     return {
         "range_m": ranges,
-        "height_m": height + beam / 2,
+        "height_m": height + beam_steps / 2,
         "length_m": length,
         "width_m": width,
-        "area_m2": count * beam * ranges * np.radians(params.resolution.azimuth_step),
-        "hidden_below_m": low - floors - beam,
+        "area_m2": count * beam_steps * ranges * np.radians(params.resolution.azimuth_step),
+        "hidden_below_m": low - floors - beam_steps,
         "upright": spread / height,
-        "fill": drawn / (np.maximum(length, 0.1) * height),
-        "lopsided": middle / np.maximum(length, 0.1),
+        "fill": silhouette_areas / (np.maximum(length, 0.1) * height),
+        "lopsided": median_offset / np.maximum(length, 0.1),
     }
 
 
 def compute_confidence(
     shape: dict[str, np.ndarray], similarity: np.ndarray | None = None, height_difference: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the probability (K,) float64, 0..1, that each cluster is a pedestrian.
+    """Compute the probability (K,) float64, 0..1, that each cluster is a pedestrian.
 
-    The probability holds for simulated scans whose pedestrians are distributed over range as in
-    KITTI's labels (paper A, Table 1).
+    The probability is calibrated on simulated scans with the same distribution of pedestrians over
+    range as KITTI's labels (paper A, Table 1).
 
     Args:
-        shape: features by compute_shape_features.
-        similarity, height_difference: (K,) similarity to a seed, and difference to its height in
-            metres; both or neither.
+        shape: Result of compute_shape_features.
+        similarity: (K,) similarity to a seed, or None.
+        height_difference: (K,) difference to the height of the seed, metres, or None. Give both or
+            neither.
     """
     features = dict(shape)
     if similarity is not None and height_difference is not None:
@@ -114,15 +115,15 @@ def compute_log_odds(model: Mapping[str, Any], features: Mapping[str, np.ndarray
 
     Args:
         model: `bias`, and `curves` with the `knots` and `values` of each feature. A curve is
-            constant beyond its first and last knot. A NaN feature adds the curve's `unknown`, by
-            default 0.
-        features: arrays (K,) by name.
+            constant beyond its first and last knot. A feature that is NaN adds the `unknown` value
+            of its curve, 0 by default.
+        features: Arrays (K,) by name.
     """
-    odds = np.full(len(next(iter(features.values()))), float(model["bias"]))
+    log_odds = np.full(len(next(iter(features.values()))), float(model["bias"]))
     for name, curve in model["curves"].items():
         values = np.interp(features[name], curve["knots"], curve["values"])
-        odds += np.where(np.isnan(features[name]), curve.get("unknown", 0.0), values)
-    return odds
+        log_odds += np.where(np.isnan(features[name]), curve.get("unknown", 0.0), values)
+    return log_odds
 
 
 @functools.cache
@@ -132,9 +133,13 @@ def _load_models() -> dict[str, Any]:
 
 @njit(cache=True)
 def _compute_moments(xyz, start):
-    """Return (K, 7): horizontal range of the centroid, lowest and highest z, standard deviation of
-    z, extent along and across the widest direction, distance of the median from the middle."""
-    out = np.zeros((len(start) - 1, 7))
+    """Return seven features of each cluster, (K, 7).
+
+    They are the horizontal range of the centroid, the lowest and highest z, the standard deviation
+    of z, the extents along and across the widest direction, and the distance of the median from the
+    middle of the extent along it.
+    """
+    moments = np.zeros((len(start) - 1, 7))
     for k in range(len(start) - 1):
         points = xyz[start[k] : start[k + 1]].astype(np.float64)
         n = len(points)
@@ -150,7 +155,7 @@ def _compute_moments(xyz, start):
         along = points[:, 0] * ax + points[:, 1] * ay
         across = points[:, 1] * ax - points[:, 0] * ay
         middle = (along.max() + along.min()) / 2
-        out[k] = (
+        moments[k] = (
             np.hypot(x, y),
             points[:, 2].min(),
             points[:, 2].max(),
@@ -159,4 +164,4 @@ def _compute_moments(xyz, start):
             across.max() - across.min(),
             abs(quantile(along.copy(), 0.5) - middle),
         )
-    return out
+    return moments

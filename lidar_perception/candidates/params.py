@@ -22,7 +22,7 @@ class HeightParams(Params):
 
 @dataclass(frozen=True)
 class ResolutionParams(Params):
-    """Angular resolution of the sensor; the defaults are those of KITTI's HDL-64E."""
+    """Angular resolution of the sensor; defaults for the HDL-64E of KITTI."""
 
     elevation_step: float = param(0.43, "Angle between neighbouring beams.", unit="deg", low=0.01, high=20.0)
     azimuth_step: float = param(0.17, "Angle between neighbouring points of a beam.", unit="deg", low=0.01, high=20.0)

@@ -1,4 +1,4 @@
-"""The candidate pipeline: one cloud in, pedestrian candidates out.
+"""Candidate pipeline: finds pedestrian candidates in a cloud.
 
     crop, view -> ground -> clusters -> boxes snapped to the ground -> height -> STM -> CPA
 
@@ -36,33 +36,35 @@ def segment_cloud(
     """Run the stages up to the boxes.
 
     Args:
-        cloud: a PointCloud, or an array (N, 3) or (N, 4) as PointCloud.of takes it.
-        ground, cluster_ids: (N,) bool and (N,) ids from any clustering; computed if None.
+        cloud: A PointCloud, or an array (N, 3) or (N, 4) as for PointCloud.of.
+        camera: Camera of the view, None if params.view is off.
+        params: Parameters of the pipeline.
+        ground: (N,) bool mask of the ground points; computed if None.
+        cluster_ids: (N,) ids from any clustering; computed if None.
 
     Raises:
-        InputError: for an enabled view without a camera, for other arrays, and for columns of
-            another length.
+        InputError: params.view is on without a camera, or an array has the wrong shape or length.
     """
     t0 = perf_counter()
     frame = as_point_cloud(cloud)
     check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
-    kept, frame = crop_with_sensor_pose(frame, params.crop, params.ground.sensor_pose)
-    indices, seen = crop_to_view(frame, camera, params.view)
-    indices = kept.take(indices)
+    cropped_indices, frame = crop_with_sensor_pose(frame, params.crop, params.ground.sensor_pose)
+    indices, visible = crop_to_view(frame, camera, params.view)
+    indices = cropped_indices.take(indices)
     t1 = perf_counter()
-    ground = segment_ground(seen, params.ground) if ground is None else np.asarray(ground, bool)[indices]
+    ground = segment_ground(visible, params.ground) if ground is None else np.asarray(ground, bool)[indices]
     t2 = perf_counter()
     numbers = None
     if cluster_ids is None:
-        cluster_ids = cluster_obstacles(seen.xyz, ground, params.clustering)
+        cluster_ids = cluster_obstacles(visible.xyz, ground, params.clustering)
     else:
         cluster_ids, numbers = renumber_ids(np.asarray(cluster_ids)[indices])
     t3 = perf_counter()
-    boxes = fit_grounded_boxes(seen.xyz, ground, cluster_ids, params.boxes)
+    boxes = fit_grounded_boxes(visible.xyz, ground, cluster_ids, params.boxes)
     t4 = perf_counter()
     ms = dict(view=t1 - t0, ground=t2 - t1, clustering=t3 - t2, boxes=t4 - t3)
     return SegmentedCloud(
-        indices, seen.xyz, ground, cluster_ids, boxes, numbers, ms={k: v * 1e3 for k, v in ms.items()}
+        indices, visible.xyz, ground, cluster_ids, boxes, numbers, ms={k: v * 1e3 for k, v in ms.items()}
     )
 
 
@@ -73,13 +75,20 @@ def find_candidates(
     params: PipelineParams = PipelineParams(),
     **columns: np.ndarray | None,
 ) -> tuple[SegmentedCloud, Candidates]:
-    """Run the whole pipeline on one cloud.
+    """Run all stages of the pipeline on one cloud.
 
-    cloud and columns are those of segment_cloud(). `ms` of the candidates covers every step of
-    params.STEPS.
+    Args:
+        cloud: See segment_cloud.
+        seed: Source of the seed pedestrians.
+        camera: See segment_cloud.
+        params: Parameters of the pipeline.
+        columns: `ground` and `cluster_ids` of segment_cloud.
+
+    Returns:
+        The segmented cloud and the candidates, whose `ms` has the durations of all STEPS.
 
     Raises:
-        InputError: if the seed source has no seed for this cloud.
+        InputError: The seed source has no seed for this cloud.
     """
     segmented = segment_cloud(cloud, camera, params, **columns)
     return segmented, refine_segmented(segmented, seed, params)
@@ -88,13 +97,13 @@ def find_candidates(
 def refine_segmented(
     segmented: SegmentedCloud, seed: SeedSource, params: PipelineParams = PipelineParams()
 ) -> Candidates:
-    """Find the candidates among the clusters of a cloud, and name clusters by the cloud's ids.
+    """Find the candidates among the clusters of a cloud; clusters keep the ids of the cloud.
 
     Raises:
-        InputError: if there is no seed.
+        InputError: There is no seed.
     """
-    found = refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed(segmented), params)
-    clusters = found.clusters
+    candidates = refine_clusters(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed(segmented), params)
+    clusters = candidates.clusters
     if segmented.numbers is not None:
         clusters = segmented.numbers[clusters - 1]
-    return replace(found, clusters=clusters, ms={**segmented.ms, **found.ms})
+    return replace(candidates, clusters=clusters, ms={**segmented.ms, **candidates.ms})

@@ -1,4 +1,4 @@
-"""Clusters to pedestrian candidates: height filter, STM and CPA (paper A)."""
+"""Selection of pedestrian candidates among clusters: height filter, STM and CPA (paper A)."""
 
 from __future__ import annotations
 
@@ -22,9 +22,15 @@ STAGES = ("stage1", "stage2", "final")
 class Candidates:
     """Detections after the height filter (stage1), STM (stage2) and STM with CPA (final).
 
-    Scores are the similarity to the seed (stage1: without CPA) or, if enabled, the confidence.
-    clusters (K,) int64 are the ids of the clusters of `final`, ascending; ms is the duration of
-    each step.
+    Scores are the similarity to the seed (without CPA for stage1 and stage2) or, if enabled, the
+    confidence.
+
+    Attributes:
+        stage1: Detections after the height filter.
+        stage2: Detections after STM.
+        final: Detections after STM with CPA.
+        clusters: (K,) int64 cluster ids of the detections in `final`, ascending.
+        ms: Duration of each step.
     """
 
     stage1: Detections
@@ -39,7 +45,7 @@ class Candidates:
 
 
 def select_by_height(boxes: np.ndarray, seed_height: float, params: HeightParams) -> np.ndarray:
-    """Return (K,) bool: |h - h_seed| <= tolerance (Section 3.5)."""
+    """Return a mask (K,) bool of the boxes with |h - h_seed| <= tolerance (Section 3.5)."""
     return np.abs(boxes[:, 5] - seed_height) <= params.tolerance
 
 
@@ -50,53 +56,63 @@ def refine_clusters(
     seeds: Sequence[Seed],
     params: PipelineParams = PipelineParams(),
 ) -> Candidates:
-    """Find the candidates among clusters 1..K of points (N, 3).
+    """Find the candidates among clusters 1..K.
 
-    labels (N,) are the points' cluster ids, boxes (K, 7) are snapped to the ground. Of several
-    seeds the one that gives a cluster its highest score counts.
+    The score of a cluster is the highest one over all seeds.
+
+    Args:
+        xyz: (N, 3) points.
+        labels: (N,) cluster of each point, 0 for none.
+        boxes: (K, 7) boxes of the clusters, snapped to the ground.
+        seeds: Seed pedestrians.
+        params: Parameters of the pipeline.
     """
     t0 = perf_counter()
-    fits = np.array([select_by_height(boxes, seed.height, params.height) for seed in seeds])
-    kept = np.flatnonzero(fits.any(axis=0))
-    fits = fits[:, kept]
-    boxes = boxes[kept]
+    has_seed_height = np.array([select_by_height(boxes, seed.height, params.height) for seed in seeds])
+    kept_indices = np.flatnonzero(has_seed_height.any(axis=0))
+    has_seed_height = has_seed_height[:, kept_indices]
+    boxes = boxes[kept_indices]
     floors = boxes[:, 2] - boxes[:, 5] / 2
     t1 = perf_counter()
     templates = [seed.silhouette(params) for seed in seeds]
-    points, start = group_points(xyz, labels, kept + 1)
-    images = draw_silhouettes(points, start, np.ones((len(kept), 1)), floors, params)
-    plain = np.array([compute_similarity(images, template, params.stm) for template in templates])
+    points, start = group_points(xyz, labels, kept_indices + 1)
+    images = draw_silhouettes(points, start, np.ones((len(kept_indices), 1)), floors, params)
+    stm_scores = np.array([compute_similarity(images, template, params.stm) for template in templates])
     t2 = perf_counter()
     ranges = np.hypot(boxes[:, 0], boxes[:, 1])
     scales = compute_cpa_scales(ranges, params.cpa)
-    chosen = np.flatnonzero((scales < 1.0).any(axis=1))
-    final = plain.copy()
-    if len(chosen):
-        images = draw_silhouettes(*group_points(xyz, labels, kept[chosen] + 1), scales[chosen], floors[chosen], params)
-        for scores, template in zip(final, templates):
-            scores[chosen] = compute_similarity(images, template, params.stm)
+    augmented = np.flatnonzero((scales < 1.0).any(axis=1))
+    cpa_scores = stm_scores.copy()
+    if len(augmented):
+        images = draw_silhouettes(
+            *group_points(xyz, labels, kept_indices[augmented] + 1), scales[augmented], floors[augmented], params
+        )
+        for scores, template in zip(cpa_scores, templates):
+            scores[augmented] = compute_similarity(images, template, params.stm)
     t3 = perf_counter()
     threshold = params.stm.threshold
     if params.confidence.enabled:
         threshold = params.confidence.threshold
         shape = compute_shape_features(points, start, boxes, params)
-        for seed, *similarities in zip(seeds, plain, final):
+        for seed, *similarities in zip(seeds, stm_scores, cpa_scores):
             # The similarity of the seed's own cluster carries no information: it is always 1.
             is_seed = find_seed_cluster(seed, points, start)
             seed_confidence = 1.0 if seed.certain else compute_confidence(shape)
             height_difference = shape["height_m"] - seed.height
             for scores in similarities:
                 scores[:] = np.where(is_seed, seed_confidence, compute_confidence(shape, scores, height_difference))
-    plain, final = (np.where(fits, scores, -np.inf).max(axis=0) for scores in (plain, final))
+    stm_scores, cpa_scores = (
+        np.where(has_seed_height, scores, -np.inf).max(axis=0) for scores in (stm_scores, cpa_scores)
+    )
     t4 = perf_counter()
 
-    def detections(scores: np.ndarray, accepted: np.ndarray) -> Detections:
+    def make_detections(scores: np.ndarray, accepted: np.ndarray) -> Detections:
         return Detections.of(boxes[accepted], PEDESTRIAN, scores[accepted])
 
     return Candidates(
-        detections(plain, np.ones(len(kept), bool)),
-        detections(plain, plain >= threshold),
-        detections(final, final >= threshold),
-        kept[final >= threshold] + 1,
+        make_detections(stm_scores, np.ones(len(kept_indices), bool)),
+        make_detections(stm_scores, stm_scores >= threshold),
+        make_detections(cpa_scores, cpa_scores >= threshold),
+        kept_indices[cpa_scores >= threshold] + 1,
         dict(height=(t1 - t0) * 1e3, stm=(t2 - t1) * 1e3, cpa=(t3 - t2) * 1e3, confidence=(t4 - t3) * 1e3),
     )

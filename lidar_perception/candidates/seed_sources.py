@@ -17,32 +17,39 @@ SeedSource = Callable[[SegmentedCloud], tuple[Seed, ...]]
 
 
 def make_truth_source(pedestrians: np.ndarray) -> SeedSource:
-    """Return a source that takes the nearest pedestrian of boxes (M, 7), the paper's protocol."""
-    return lambda s: (seed_from_truth(s.xyz, s.ground, pedestrians),)
+    """Make a source whose seed is the nearest pedestrian of boxes (M, 7), as in the paper."""
+    return lambda segmented: (seed_from_truth(segmented.xyz, segmented.ground, pedestrians),)
 
 
 def make_click_source(click: np.ndarray, params: SeedParams = SeedParams()) -> SeedSource:
-    """Return a source that takes the cluster at a point (3,) in the LiDAR frame."""
-    return lambda s: (seed_from_click(click, s.xyz, s.cluster_ids, s.boxes, params.click_radius),)
+    """Make a source whose seed is the cluster at a clicked point (3,) in the LiDAR frame."""
+    return lambda segmented: (
+        seed_from_click(click, segmented.xyz, segmented.cluster_ids, segmented.boxes, params.click_radius),
+    )
 
 
 def make_automatic_source(templates: Sequence[Seed], params: PipelineParams) -> SeedSource:
-    """Return a source that takes the cluster most likely to be a pedestrian, or the templates."""
+    """Make a source whose seed is the cluster that is most likely a pedestrian.
 
-    def source(s: SegmentedCloud) -> tuple[Seed, ...]:
-        clusters = np.arange(1, len(s.boxes) + 1)
-        likely = compute_confidence(
-            compute_shape_features(*group_points(s.xyz, s.cluster_ids, clusters), s.boxes, params)
+    If its confidence is below params.seed.min_confidence, the templates are the seeds.
+    """
+
+    def source(segmented: SegmentedCloud) -> tuple[Seed, ...]:
+        clusters = np.arange(1, len(segmented.boxes) + 1)
+        confidence = compute_confidence(
+            compute_shape_features(
+                *group_points(segmented.xyz, segmented.cluster_ids, clusters), segmented.boxes, params
+            )
         )
-        likely[np.bincount(s.cluster_ids, minlength=len(s.boxes) + 1)[1:] < MIN_POINTS] = -1.0
-        if likely.max(initial=-1.0) < params.seed.min_confidence:  # min_confidence may be 0
+        confidence[np.bincount(segmented.cluster_ids, minlength=len(segmented.boxes) + 1)[1:] < MIN_POINTS] = -1.0
+        if confidence.max(initial=-1.0) < params.seed.min_confidence:  # min_confidence may be 0
             return tuple(templates)
-        best = int(likely.argmax())
-        return (seed_from_points(s.xyz[s.cluster_ids == best + 1], s.boxes[best]),)
+        best = int(confidence.argmax())
+        return (seed_from_points(segmented.xyz[segmented.cluster_ids == best + 1], segmented.boxes[best]),)
 
     return source
 
 
 def make_fixed_source(*seeds: Seed) -> SeedSource:
-    """Return a source that takes the same seeds for every cloud."""
-    return lambda s: seeds
+    """Make a source that returns the same seeds for every cloud."""
+    return lambda segmented: seeds

@@ -1,4 +1,4 @@
-"""The seed pedestrian and its template file (paper A, Section 3.5)."""
+"""Seed pedestrians and their template files (paper A, Section 3.5)."""
 
 from __future__ import annotations
 
@@ -24,9 +24,11 @@ MAX_TEMPLATE_BYTES = 10**7  # maximum size of a template, about 200,000 points
 class Seed:
     """A seed pedestrian.
 
-    xyz (M, 3) float32 are its points in the LiDAR frame, M >= 10; floor is z of the ground under
-    it, and height its own height above that, in metres. certain: a person or a label confirms that
-    it is a pedestrian.
+    Attributes:
+        xyz: (M, 3) float32 points in the LiDAR frame, M >= 10.
+        floor: z of the ground below the pedestrian, metres.
+        height: Height of the pedestrian above the ground, metres.
+        certain: True if a person or a label confirms that it is a pedestrian.
     """
 
     xyz: np.ndarray
@@ -35,41 +37,45 @@ class Seed:
     certain: bool = False
 
     def silhouette(self, params: PipelineParams = PipelineParams()) -> np.ndarray:
-        """Draw the seed's silhouette, (80,) uint32 (see silhouette.py)."""
+        """Draw the silhouette of the seed, (80,) uint32 (see silhouette.py)."""
         return draw_silhouettes(
             self.xyz, np.array([0, len(self.xyz)]), np.ones((1, 1)), np.array([self.floor]), params
         )[0]
 
 
 def seed_from_points(xyz: np.ndarray, box: np.ndarray, certain: bool = False) -> Seed:
-    """Make a seed of a pedestrian's points (M, 3), M >= 10, and its box (7,) on the ground."""
+    """Make a seed from a pedestrian's points (M, 3) and its box (7,) on the ground.
+
+    Raises:
+        InputError: There are fewer than MIN_POINTS points.
+    """
     if len(xyz) < MIN_POINTS:
         raise InputError(f"the seed pedestrian has {len(xyz)} points; pick a nearer one (at least {MIN_POINTS})")
     return Seed(np.ascontiguousarray(xyz, np.float32), float(box[2] - box[5] / 2), float(box[5]), certain)
 
 
 def find_seed_cluster(seed: Seed, xyz: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return (K,) bool: True for a cluster that holds at least half of the seed's own points.
+    """Return a mask (K,) bool of the clusters that contain at least half of the seed's points.
 
-    Cluster k has the rows start[k]:start[k + 1] of xyz (N, 3) float32. All are False in a frame
-    other than the seed's.
+    Cluster k has the rows start[k]:start[k + 1] of xyz (N, 3) float32. In other frames than the
+    seed's, the mask is False everywhere.
     """
-    row = np.dtype((np.void, 12))
-    same = np.isin(
-        np.ascontiguousarray(xyz, np.float32).view(row).ravel(),
-        np.ascontiguousarray(seed.xyz, np.float32).view(row).ravel(),
+    row_type = np.dtype((np.void, 12))
+    is_seed_point = np.isin(
+        np.ascontiguousarray(xyz, np.float32).view(row_type).ravel(),
+        np.ascontiguousarray(seed.xyz, np.float32).view(row_type).ravel(),
     )
-    shared = np.diff(np.concatenate([[0], np.cumsum(same)])[start])
+    shared = np.diff(np.concatenate([[0], np.cumsum(is_seed_point)])[start])
     return 2 * shared >= len(seed.xyz)
 
 
 def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray) -> Seed:
-    """Make a seed of the nearest pedestrian of boxes (M, 7), the paper's protocol.
+    """Make a seed from the nearest pedestrian of boxes (M, 7), as in the paper.
 
-    It has the box's height and the points in the box that are not ground.
+    The seed has the height of the box and the points in the box that are not ground.
 
     Raises:
-        InputError: without a pedestrian, or with too few points on it.
+        InputError: There is no pedestrian, or it has too few points.
     """
     if len(pedestrians) == 0:
         raise InputError("no Pedestrian in the ground truth of this frame, so no seed")
@@ -78,40 +84,51 @@ def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray
 
 
 def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, radius: float) -> Seed:
-    """Make a seed of the cluster nearest to click (3,).
+    """Make a seed from the cluster that is nearest to click (3,).
 
-    Clusters have labels 1..K and ground-snapped boxes (K, 7). Raises InputError as
-    find_clicked_cluster does.
+    Args:
+        click: (3,) point in the frame of the cloud.
+        xyz: (N, 3) points.
+        labels: (N,) cluster 1..K of each point, 0 for none.
+        boxes: (K, 7) boxes of the clusters, snapped to the ground.
+        radius: Maximum distance, metres.
+
+    Raises:
+        InputError: See find_clicked_cluster, or the cluster has too few points.
     """
     label = find_clicked_cluster(click, xyz, labels, radius)
     return seed_from_points(xyz[labels == label], boxes[label - 1], certain=True)
 
 
 def find_clicked_cluster(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, radius: float) -> int:
-    """Return the label of the cluster with the point nearest to click (3,).
+    """Find the cluster with the point that is nearest to click (3,) and return its label.
 
-    labels (N,) are those of points (N, 3), 0 for no cluster.
+    Args:
+        click: (3,) point in the frame of the cloud.
+        xyz: (N, 3) points.
+        labels: (N,) cluster of each point, 0 for none.
+        radius: Maximum distance, metres.
 
     Raises:
-        InputError: if no cluster is within radius, or the click is not finite.
+        InputError: No cluster is within the radius, or the click is not finite.
     """
     click = np.asarray(click, np.float64)
     if not np.isfinite(click).all():
         raise InputError("the clicked point has a coordinate that is not finite; click again")
-    clustered = np.flatnonzero(labels)
-    if len(clustered) == 0:
+    clustered_indices = np.flatnonzero(labels)
+    if len(clustered_indices) == 0:
         raise InputError("a point was clicked but the cloud has no clusters")
     with np.errstate(over="ignore"):
-        distance = np.linalg.norm(xyz[clustered] - click.astype(np.float32), axis=1)
+        distance = np.linalg.norm(xyz[clustered_indices] - click.astype(np.float32), axis=1)
     if not distance.min() <= radius:
         raise InputError(
             f"nearest cluster is {distance.min():.1f} m from the clicked point; click within {radius:g} m of one"
         )
-    return int(labels[clustered[distance.argmin()]])
+    return int(labels[clustered_indices[distance.argmin()]])
 
 
 def save_seed(seed: Seed, path: str | Path) -> None:
-    """Write a template as JSON: the points, and the silhouette as text for readers."""
+    """Write a template as JSON; it contains the points, and the silhouette as text for humans."""
     rows = ["".join(".#"[bit] for bit in row) for row in to_pixels(seed.silhouette()).astype(int)]
     points = [[round(float(v), DECIMALS) for v in p] for p in seed.xyz]
     write_text(
@@ -129,15 +146,15 @@ def save_seed(seed: Seed, path: str | Path) -> None:
 
 
 def load_seeds(paths: str = "") -> tuple[Seed, ...]:
-    """Read one or more templates, with commas between their paths, as load_seed() does."""
+    """Read one or more templates, given their paths separated by commas; see load_seed."""
     return tuple(load_seed(path.strip()) for path in paths.split(","))
 
 
 def load_seed(path: str | Path = "") -> Seed:
-    """Read a template; an empty path reads the package's own, a simulated pedestrian.
+    """Read a template; an empty path stands for the shipped template, a simulated pedestrian.
 
     Raises:
-        InputError: naming the file and the error in it.
+        InputError: The file is not a valid template; the message names the file and the error.
     """
     packaged = files("lidar_perception.candidates") / "pedestrian.json"
     source = path or packaged

@@ -1,4 +1,4 @@
-"""A cloud segmented into ground and clusters, in which the seed and the candidates are found."""
+"""Cloud segmented into ground and clusters, the input for seeds and candidates."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ from lidar_perception.wire.params import ViewParams
 class SegmentedCloud:
     """Ground, clusters and boxes of the M points of a cloud that are in view.
 
-    indices (M,) int64: rows of the points in the cloud.
-    xyz (M, 3) float32, ground (M,) bool, cluster_ids (M,) int32, 0 for no cluster, 1..K.
-    boxes (K, 7) float32: boxes of the clusters, down to the ground plane.
-    numbers (K,) int64: the cloud's own ids of these clusters; None for 1..K.
-    ms: duration of each step.
+    Attributes:
+        indices: (M,) int64 rows of the points in the cloud.
+        xyz: (M, 3) float32 points.
+        ground: (M,) bool mask of the ground points.
+        cluster_ids: (M,) int32 cluster 1..K of each point, 0 for none.
+        boxes: (K, 7) float32 boxes of the clusters, extended down to the ground plane.
+        numbers: (K,) int64 ids of these clusters in the cloud; None for 1..K.
+        ms: Duration of each step.
     """
 
     indices: np.ndarray
@@ -38,39 +41,41 @@ class SegmentedCloud:
 def fit_grounded_boxes(
     xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray, params: BoxParams = BoxParams()
 ) -> np.ndarray:
-    """Fit boxes (K, 7) to clusters 1..K, down to the plane through the ground points."""
+    """Fit boxes (K, 7) to clusters 1..K and extend them down to the ground plane."""
     plane = fit_ground_plane(xyz.compress(ground, axis=0), params)
     return snap_to_ground(fit_boxes(xyz, cluster_ids, params.shape), plane)
 
 
 def snap_to_ground(boxes: np.ndarray, plane: np.ndarray | None) -> np.ndarray:
-    """Return boxes (K, 7) whose bottom is lowered to the plane under their centre (Section 3.4).
+    """Return boxes (K, 7) extended down to the plane below their centre (Section 3.4).
 
-    A box that already reaches below the plane is not changed. Without a plane no box is.
+    Boxes that already reach below the plane are not changed, nor is any box without a plane.
     """
     snapped = boxes.copy()
     if plane is None:
         return snapped
-    ground = boxes[:, :2].astype(np.float64) @ plane[:2] + plane[2]
+    plane_z = boxes[:, :2].astype(np.float64) @ plane[:2] + plane[2]
     top = boxes[:, 2] + boxes[:, 5] / 2
-    bottom = np.minimum(boxes[:, 2] - boxes[:, 5] / 2, ground)
+    bottom = np.minimum(boxes[:, 2] - boxes[:, 5] / 2, plane_z)
     snapped[:, 2] = (top + bottom) / 2
     snapped[:, 5] = top - bottom
     return snapped
 
 
 def fit_ground_plane(ground: np.ndarray, params: BoxParams) -> np.ndarray | None:
-    """Fit the plane (3,) under the boxes to ground points (M, 3), None if there is none."""
+    """Fit a plane (3,) to ground points (M, 3); return None if no plane is found."""
     if params.plane == "ransac":
         return fit_plane_by_ransac(ground, ThresholdParams())
     return fit_plane(ground)
 
 
 def diagnose_empty(usable: int, ground: np.ndarray, cluster_ids: np.ndarray | None = None) -> str | None:
-    """Explain why a cloud has no candidates, with the remedy; None if there is no reason so far.
+    """Return the reason, with a remedy, why a cloud has no candidates; None if none is known.
 
-    usable is the number of finite points; ground (M,) and cluster_ids (M,) are those of the points
-    in view.
+    Args:
+        usable: Number of finite points in the cloud.
+        ground: (M,) mask of the ground points among the points in view.
+        cluster_ids: (M,) cluster of each point in view, 0 for none.
     """
     if usable == 0:
         return "the cloud is empty or has no finite point, or crop.* leaves none"
@@ -84,14 +89,13 @@ def diagnose_empty(usable: int, ground: np.ndarray, cluster_ids: np.ndarray | No
 
 
 def crop_to_view(frame: PointCloud, camera: Camera | None, params: ViewParams) -> tuple[np.ndarray, PointCloud]:
-    """Keep the points of a frame that are in the camera's view.
+    """Crop a frame to the points in the camera's view, if params.enabled is True.
 
     Returns:
-        indices (M,) int64 of the points kept, and the frame of these points. All points are kept
-        if params.enabled is False.
+        Indices (M,) int64 of the points that are kept, and the frame with these points.
 
     Raises:
-        InputError: if it is True and there is no camera.
+        InputError: params.enabled is True but there is no camera.
     """
     if not params.enabled:
         return np.arange(len(frame)), frame

@@ -26,24 +26,28 @@ def draw_silhouettes(
 ) -> np.ndarray:
     """Draw the silhouettes of K clusters.
 
-    The steps are those of the paper, except where params.stm changes them: rotate about z so that
-    the cluster's widest direction in x-y becomes y (PCA, seen from the sensor, so that z stays up
-    and the result does not depend on the heading); add the copies contracted towards the centroid
-    in y-z; stretch the y-z extent to the window; close with 3 x 3; dilate with 3 x 3.
+    The steps are those of the paper, unless params.stm changes them:
+
+    1. Rotate the cluster about z so that its widest direction in x-y becomes y. The direction is
+       found by PCA and oriented as seen from the sensor.
+    2. Add the CPA copies, contracted towards the centroid in y-z.
+    3. Stretch the y-z extent to the window.
+    4. Close with 3 x 3, then dilate with 3 x 3.
 
     Args:
-        xyz: (N, 3) float32, cluster after cluster.
+        xyz: (N, 3) float32 points, sorted by cluster.
         start: (K + 1,); cluster k has the rows start[k]:start[k + 1], at least one.
-        scales: (K, S) float64 contractions a_k of the CPA copies, 1 for the points themselves (see
+        scales: (K, S) float64 scales a_k of the CPA copies; 1 for the original points (see
             compute_cpa_scales).
-        floors: (K,) z of the ground under each cluster, for the metric window only.
+        floors: (K,) z of the ground below each cluster, for the metric window only.
+        params: Parameters of the pipeline.
 
     Returns:
         (K, 80) uint32.
     """
-    stm, cell = params.stm, params.resolution
+    stm, resolution = params.stm, params.resolution
     floors = np.zeros(len(start) - 1) if floors is None else floors
-    half = np.radians([cell.azimuth_step, cell.elevation_step]) / 2 * stm.spread
+    half_angles = np.radians([resolution.azimuth_step, resolution.elevation_step]) / 2 * stm.spread
     return _draw_silhouettes(
         np.ascontiguousarray(xyz, np.float32),
         np.asarray(start, np.int64),
@@ -51,7 +55,7 @@ def draw_silhouettes(
         np.asarray(floors, np.float64),
         stm.window == "metric",
         stm.axis == "pca",
-        half,
+        half_angles,
         stm.dilations,
     )
 
@@ -59,39 +63,42 @@ def draw_silhouettes(
 def compute_cpa_scales(ranges: np.ndarray, params: CpaParams) -> np.ndarray:
     """Compute the scales (K, 1 + steps) float64 of the CPA copies.
 
-    The first is 1, for the cluster itself. The others are a_k = max(min_scale, 1 - k decrement) if
-    the horizontal range (K,) is in [min_range, max_range), else 1, which adds no points.
+    The first scale is 1, for the original points. The others are a_k = max(min_scale, 1 - k
+    decrement) if the horizontal range (K,) is in [min_range, max_range), otherwise 1, which adds no
+    points.
     """
     steps = np.arange(1 + params.steps)
     contracted = np.maximum(params.min_scale, 1.0 - steps * params.decrement)
     contracted[0] = 1.0
-    inside = (ranges >= params.min_range) & (ranges < params.max_range)
-    return np.where(inside[:, None], contracted, 1.0)
+    in_range = (ranges >= params.min_range) & (ranges < params.max_range)
+    return np.where(in_range[:, None], contracted, 1.0)
 
 
 def compute_similarity(images: np.ndarray, template: np.ndarray, params: StmParams = StmParams()) -> np.ndarray:
-    """Return (K,) float64 cosine of binary images (K, 80) and a template (80,); 0 if one is blank.
+    """Compute the cosine similarity (K,) of images (K, 80) and a template (80,); 0 if one is blank.
 
-    params.shifts: the best cosine of the images shifted sideways by up to this many columns.
-    params.seen_only: only rows down to the last one that is set in both are compared.
+    The images are shifted sideways by up to params.shifts columns, and the best value is returned.
+    With params.seen_only, only the rows above the lowest set row of both are compared.
     """
     if params.seen_only and params.window == "metric":
         rows = np.arange(ROWS)
-        last = np.minimum(ROWS - 1 - (images[:, ::-1] != 0).argmax(axis=1), ROWS - 1 - (template[::-1] != 0).argmax())
-        seen = np.where(rows <= last[:, None], np.uint32(FULL_ROW), np.uint32(0))
-        images, templates = images & seen, template & seen
+        last_rows = np.minimum(
+            ROWS - 1 - (images[:, ::-1] != 0).argmax(axis=1), ROWS - 1 - (template[::-1] != 0).argmax()
+        )
+        row_mask = np.where(rows <= last_rows[:, None], np.uint32(FULL_ROW), np.uint32(0))
+        images, templates = images & row_mask, template & row_mask
     else:
         templates = template[None]
     norm = np.sqrt(count_pixels(images) * count_pixels(templates).astype(float))
     shared = count_pixels(images & templates)
     for columns in range(1, params.shifts + 1):
-        for moved in (images << np.uint32(columns), images >> np.uint32(columns)):
-            shared = np.maximum(shared, count_pixels(moved & templates))
+        for shifted in (images << np.uint32(columns), images >> np.uint32(columns)):
+            shared = np.maximum(shared, count_pixels(shifted & templates))
     return np.divide(shared, norm, out=np.zeros(len(images)), where=norm > 0)
 
 
 def to_pixels(image: np.ndarray) -> np.ndarray:
-    """Convert a silhouette (80,) uint32 to (80, 32) bool; row 0 is on top, column 0 is bit 0."""
+    """Convert a silhouette (80,) uint32 to (80, 32) bool; row 0 is the top, column 0 is bit 0."""
     return (image[:, None] >> np.arange(COLUMNS, dtype=np.uint32) & 1).astype(bool)
 
 
@@ -102,25 +109,25 @@ def from_pixels(pixels: np.ndarray) -> np.ndarray:
 
 
 def count_pixels(images: np.ndarray) -> np.ndarray:
-    """Return (K,) the number of bits set in each image (K, 80) uint32."""
+    """Return the number of set bits (K,) of each image (K, 80) uint32."""
     return np.unpackbits(images.view(np.uint8), axis=1).sum(axis=1, dtype=np.int64)
 
 
 @njit(cache=True)
-def _draw_silhouettes(xyz, start, scales, floors, metric, upright, half, dilations):
+def _draw_silhouettes(xyz, start, scales, floors, metric, with_pca, half_angles, dilations):
     images = np.zeros((len(start) - 1, ROWS), np.uint32)
     rows = np.empty(ROWS, np.uint64)
     for k in range(len(start) - 1):
         points = xyz[start[k] : start[k + 1]]
         centre = _find_centroid(points)
-        lateral, vertical = _find_principal_axes(points, centre) if upright else _find_yaw_axes(points, centre)
+        lateral, vertical = _find_principal_axes(points, centre) if with_pca else _find_yaw_axes(points, centre)
         y, z = np.empty(len(points)), np.empty(len(points))
         for i in range(len(points)):
             y[i] = z[i] = 0.0
             for j in range(3):
                 y[i] += (points[i, j] - centre[j]) * lateral[j]
                 z[i] += (points[i, j] - centre[j]) * vertical[j]
-        reach = half * np.hypot(centre[0], centre[1])
+        half_sizes = half_angles * np.hypot(centre[0], centre[1])
         # The window: its left edge, its top, pixels per metre. The centroid is the origin of y and
         # z, so a copy is a scaled cluster; because scales are at most 1, it extends no farther.
         if metric:
@@ -128,11 +135,11 @@ def _draw_silhouettes(xyz, start, scales, floors, metric, upright, half, dilatio
             top = floors[k] + WINDOW_HEIGHT_M - centre[2]
             per_y, per_z = COLUMNS / WINDOW_WIDTH_M, ROWS / WINDOW_HEIGHT_M
         else:
-            left, top = y.min() - reach[0], z.max() + reach[1]
-            per_y = COLUMNS / max(y.max() + reach[0] - left, 1e-6)
-            per_z = ROWS / max(top - z.min() + reach[1], 1e-6)
+            left, top = y.min() - half_sizes[0], z.max() + half_sizes[1]
+            per_y = COLUMNS / max(y.max() + half_sizes[0] - left, 1e-6)
+            per_z = ROWS / max(top - z.min() + half_sizes[1], 1e-6)
         rows[:] = 0
-        _draw(y, z, scales[k], metric, reach, left, top, per_y, per_z, rows)
+        _draw(y, z, scales[k], metric, half_sizes, left, top, per_y, per_z, rows)
         image = _erode(_dilate(rows))
         for _ in range(dilations):
             image = _dilate(image)
@@ -141,22 +148,22 @@ def _draw_silhouettes(xyz, start, scales, floors, metric, upright, half, dilatio
 
 
 @njit(cache=True)
-def _draw(y, z, scales, metric, reach, left, top, per_y, per_z, rows):
+def _draw(y, z, scales, metric, half_sizes, left, top, per_y, per_z, rows):
     for s in range(len(scales)):
         if s > 0 and scales[s] == 1.0:
             continue
         for i in range(len(y)):
-            first = int(np.floor((scales[s] * y[i] - reach[0] - left) * per_y))
-            last = int(np.floor((scales[s] * y[i] + reach[0] - left) * per_y))
-            high = int(np.floor((top - scales[s] * z[i] - reach[1]) * per_z))
-            low = int(np.floor((top - scales[s] * z[i] + reach[1]) * per_z))
-            if metric and (last < 0 or first >= COLUMNS or low < 0 or high >= ROWS):
+            first_column = int(np.floor((scales[s] * y[i] - half_sizes[0] - left) * per_y))
+            last_column = int(np.floor((scales[s] * y[i] + half_sizes[0] - left) * per_y))
+            top_row = int(np.floor((top - scales[s] * z[i] - half_sizes[1]) * per_z))
+            bottom_row = int(np.floor((top - scales[s] * z[i] + half_sizes[1]) * per_z))
+            if metric and (last_column < 0 or first_column >= COLUMNS or bottom_row < 0 or top_row >= ROWS):
                 continue
             # No point is outside a stretched window; its far edges belong to the last pixels.
-            first, last = min(max(first, 0), COLUMNS - 1), min(last, COLUMNS - 1)
-            high = min(high, ROWS - 1)
-            bits = (FULL_ROW >> np.uint64(31 - last + first)) << np.uint64(first)
-            for row in range(max(high, 0), min(low, ROWS - 1) + 1):
+            first_column, last_column = min(max(first_column, 0), COLUMNS - 1), min(last_column, COLUMNS - 1)
+            top_row = min(top_row, ROWS - 1)
+            bits = (FULL_ROW >> np.uint64(31 - last_column + first_column)) << np.uint64(first_column)
+            for row in range(max(top_row, 0), min(bottom_row, ROWS - 1) + 1):
                 rows[row] |= bits
 
 
@@ -171,7 +178,7 @@ def _find_centroid(points):
 
 @njit(cache=True)
 def _find_yaw_axes(points, centre):
-    """Return unit vectors: the widest direction in x-y, to the left seen from the sensor; up."""
+    """Return two unit vectors: the widest direction in x-y (to the sensor's left), and up."""
     xx, xy, yy = 0.0, 0.0, 0.0
     for p in points:
         dx, dy = p[0] - centre[0], p[1] - centre[1]
@@ -187,7 +194,7 @@ def _find_yaw_axes(points, centre):
 
 @njit(cache=True)
 def _find_principal_axes(points, centre):
-    """Return unit vectors of the second largest and the largest spread, to the left and up."""
+    """Return the principal axes with the second largest and the largest spread (left and up)."""
     spread = np.zeros((3, 3))
     for p in points:
         for i in range(3):
@@ -204,19 +211,19 @@ def _find_principal_axes(points, centre):
 
 @njit(cache=True)
 def _dilate(rows):
-    """Dilate with 3 x 3; pixels outside the window count as not set."""
-    wide = (rows | (rows << ONE) | (rows >> ONE)) & FULL_ROW
-    out = wide.copy()
-    out[1:] |= wide[:-1]
-    out[:-1] |= wide[1:]
-    return out
+    """Dilate with 3 x 3; pixels outside the window are treated as not set."""
+    widened = (rows | (rows << ONE) | (rows >> ONE)) & FULL_ROW
+    dilated = widened.copy()
+    dilated[1:] |= widened[:-1]
+    dilated[:-1] |= widened[1:]
+    return dilated
 
 
 @njit(cache=True)
 def _erode(rows):
-    """Erode with 3 x 3; pixels outside the window count as set, so its border does not erode."""
-    narrow = rows & ((rows << ONE) | ONE) & ((rows >> ONE) | (ONE << LAST_COLUMN))
-    out = narrow.copy()
-    out[1:] &= narrow[:-1]
-    out[:-1] &= narrow[1:]
-    return out
+    """Erode with 3 x 3; pixels outside the window are treated as set, so the border is kept."""
+    narrowed = rows & ((rows << ONE) | ONE) & ((rows >> ONE) | (ONE << LAST_COLUMN))
+    eroded = narrowed.copy()
+    eroded[1:] &= narrowed[:-1]
+    eroded[:-1] &= narrowed[1:]
+    return eroded

@@ -1,6 +1,6 @@
-"""Warm-up of the candidate pipeline: compiles or loads its code before the first cloud.
+"""Warm-up of the candidate pipeline: compiles its code, or loads it, before the first cloud.
 
-A node warms up what its parameters make it run; code of another method is compiled when the
+A node warms up only the methods that its parameters select. Another method is compiled when the
 parameter changes.
 """
 
@@ -31,7 +31,7 @@ CAMERA = Camera(np.array([[50, -100, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]], flo
 @report_compilation(whole_detector=True)
 def warm_up() -> None:
     """Run every stage and method once on synthetic points to trigger JIT compilation."""
-    for ground, clustering, boxes, sure in (
+    for ground, clustering, boxes, with_confidence in (
         ("threshold", "dbscan", "axis_aligned", False),
         ("cloth", "euclidean", "l_shape", True),
     ):
@@ -43,7 +43,7 @@ def warm_up() -> None:
                     "clustering.method": clustering,
                     "boxes.shape": boxes,
                     "clustering.dbscan.join_bands": True,
-                    "confidence.enabled": sure,
+                    "confidence.enabled": with_confidence,
                 },
             )
         )
@@ -52,7 +52,7 @@ def warm_up() -> None:
 
 
 def warm_up_ground(params: GroundParams, view: ViewParams = ViewParams()) -> None:
-    """Compile the ground segmentation and the plane of its diagnostics."""
+    """Compile the ground segmentation and the plane fit of its diagnostics."""
     cloud = _make_cloud()
     _, cloud = crop_to_view(cloud, CAMERA, view)
     segment_ground(cloud, params)
@@ -62,7 +62,7 @@ def warm_up_ground(params: GroundParams, view: ViewParams = ViewParams()) -> Non
 
 
 def warm_up_clustering(params: ClusteringParams, boxes: BoxParams) -> None:
-    """Compile the clustering, also of dense clouds, and the boxes of clusters."""
+    """Compile the clustering, including that of dense clouds, and the box fit."""
     cloud = _make_cloud()
     ground = np.zeros(len(cloud), bool)
     ids = cluster_obstacles(cloud.xyz, ground, params)
@@ -71,7 +71,7 @@ def warm_up_clustering(params: ClusteringParams, boxes: BoxParams) -> None:
 
 
 def warm_up_candidates(params: PipelineParams, segmented: bool = False) -> None:
-    """Compile the pipeline; if `segmented`, only the stages behind the clustering."""
+    """Compile the pipeline; if `segmented`, only the stages after the clustering."""
     person = _make_person()
     seed = seed_from_points(person, np.array([8, 0, -0.85, 1, 1, 1.7, 0]))
     params = with_values(params, {"seed.min_confidence": 0.0})
@@ -84,23 +84,23 @@ def warm_up_candidates(params: PipelineParams, segmented: bool = False) -> None:
 
 
 def _warm_up_tree(params: ClusteringParams) -> None:
-    """Compile the tree of Euclidean clustering, which only dense clouds need."""
+    """Compile the tree of Euclidean clustering, which is used for dense clouds only."""
     if params.method == "euclidean":
         cluster_euclidean(_make_person(), params.euclidean, -1, 0)
 
 
 def _make_person() -> np.ndarray:
-    """Return (400, 3) float32 points in the volume of a person."""
+    """Return 400 random points (400, 3) float32 in the volume of a person."""
     rng = np.random.default_rng(0)
     return (rng.uniform(-0.5, 0.5, (400, 3)) * [0.5, 0.5, 1.7] + [8, 0, -0.8]).astype(np.float32)
 
 
 def _make_cloud() -> PointCloud:
-    """Return 600 points of flat ground and 3,000 of objects."""
+    """Return a cloud with 600 points on flat ground and 3,000 on objects."""
     rng = np.random.default_rng(0)
-    flat = rng.uniform(-20, 20, (600, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
+    ground = rng.uniform(-20, 20, (600, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
     person = _make_person()
     dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 2, 0]  # triggers DBSCAN by cells
-    across = rng.uniform(-0.1, 0.1, (200, 3)) + [15, 0, 0]  # points on both sides of a band limit
-    xyz = np.concatenate([flat, person, person + [12, 0, 0], dense, across])
+    at_band_limit = rng.uniform(-0.1, 0.1, (200, 3)) + [15, 0, 0]  # points on both sides of a band limit
+    xyz = np.concatenate([ground, person, person + [12, 0, 0], dense, at_band_limit])
     return PointCloud(xyz.astype(np.float32))

@@ -1,1 +1,1 @@
-"""Multi-object tracking: ids, velocities and steadier detections, also on a moving robot."""
+"""Multi-object tracking: track ids, velocities and smoothed boxes, also on a moving robot."""

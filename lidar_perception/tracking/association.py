@@ -1,6 +1,6 @@
-"""Assignment of detections to tracks: least total cost within gates.
+"""Assignment of detections to tracks with minimum total cost within gates.
 
-The work grows with the number of pairs within their gates, not with tracks times detections.
+Run time grows with the number of pairs within their gates, not with tracks times detections.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ MAX_COST = 1.0
 
 
 class Pairs(NamedTuple):
-    """Allowed pairs of tracks and detections, ordered by track and detection.
+    """Allowed pairs of tracks and detections, sorted by track, then by detection.
 
     Attributes:
-        tracks, boxes: (P,) indices.
+        tracks: (P,) indices of the tracks.
+        boxes: (P,) indices of the detections.
         costs: (P,) float64, at most MAX_COST.
     """
 
@@ -30,9 +31,9 @@ class Pairs(NamedTuple):
     boxes: np.ndarray
     costs: np.ndarray
 
-    def select(self, wanted: np.ndarray) -> Pairs:
-        """Return the pairs at wanted (P,) bool or indices."""
-        return Pairs(*(column[wanted] for column in self))
+    def select(self, selection: np.ndarray) -> Pairs:
+        """Return the selected pairs, given a mask (P,) bool or indices."""
+        return Pairs(*(column[selection] for column in self))
 
 
 def find_pairs(
@@ -50,14 +51,15 @@ def find_pairs(
     Args:
         tracks: (N, 7) predicted boxes.
         spread: (N,) standard deviation of a measured centre around the predicted one, metres.
-        kinds: (N,) indices in KINDS.
-        reach: (N,) smallest gate, metres.
-        boxes: (M, 7) detected boxes in the frame of tracks.
-        box_kinds: (M,) indices in KINDS.
-        seconds: time since the previous frame.
+        kinds: (N,) indices into KINDS.
+        reach: (N,) minimum gate, metres.
+        boxes: (M, 7) detected boxes in the same frame as the tracks.
+        box_kinds: (M,) indices into KINDS.
+        params: Parameters of the assignment.
+        seconds: Time since the previous frame.
     """
-    widest = params.max_gate * max(1.0, seconds / NOMINAL_PERIOD_S)
-    gate = np.minimum(np.maximum(params.sigmas * spread, reach), widest)
+    max_gate = params.max_gate * max(1.0, seconds / NOMINAL_PERIOD_S)
+    gate = np.minimum(np.maximum(params.sigmas * spread, reach), max_gate)
     order = np.argsort(boxes[:, 0], kind="stable")
     i, j, distance, iou = _find_pairs_in_gates(
         np.ascontiguousarray(tracks), gate, np.ascontiguousarray(boxes), order, params.overlap > 0
@@ -65,17 +67,19 @@ def find_pairs(
     cost = (1.0 - params.overlap) * distance / gate[i]
     if params.overlap > 0:
         cost += params.overlap * (1.0 - iou)
-    differ = kinds[i] != box_kinds[j]
-    on_foot_or_cycle = (kinds[i] > 0) & (box_kinds[j] > 0)
-    cost += params.other_kind * differ * np.where(on_foot_or_cycle, 0.5, 1.0)
+    is_other_kind = kinds[i] != box_kinds[j]
+    are_both_persons = (kinds[i] > 0) & (box_kinds[j] > 0)
+    cost += params.other_kind * is_other_kind * np.where(are_both_persons, 0.5, 1.0)
     allowed = np.flatnonzero(cost <= MAX_COST)
     return Pairs(i, j, cost).select(allowed[np.lexsort((j[allowed], i[allowed]))])
 
 
 @njit(cache=True, nogil=True)
 def _find_pairs_in_gates(tracks, gate, boxes, order, with_iou):
-    """Return tracks, boxes, distances and BEV IoU (P,) of the pairs whose distance is within the
-    gate; order (M,) are the indices of the boxes by x."""
+    """Return tracks, boxes, distances and BEV IoU (P,) of the pairs within the gate.
+
+    order (M,) are the indices that sort the boxes by x.
+    """
     x = boxes[order, 0]
     reach, box_reach = footprint_radii(tracks), footprint_radii(boxes)
     work = np.empty((4, MAX_CORNERS))
@@ -84,52 +88,54 @@ def _find_pairs_in_gates(tracks, gate, boxes, order, with_iou):
         a = tracks[track]
         # Slightly wider, so that rounding loses no pair at the gate.
         margin = gate[track] + 1e-9 * (abs(a[0]) + gate[track])
-        for place in range(lower_bound(x, a[0] - margin), len(x)):
-            if x[place] > a[0] + margin:
+        for position in range(lower_bound(x, a[0] - margin), len(x)):
+            if x[position] > a[0] + margin:
                 break
-            b = boxes[order[place]]
+            b = boxes[order[position]]
             dx, dy = a[0] - b[0], a[1] - b[1]
             distance = np.sqrt(dx * dx + dy * dy)
             if distance <= gate[track]:
                 shared = 0.0
                 if with_iou:
-                    shared = overlap_area(a, b, reach[track] + box_reach[order[place]], work)
+                    shared = overlap_area(a, b, reach[track] + box_reach[order[position]], work)
                 i.append(track)
-                j.append(order[place])
+                j.append(order[position])
                 distances.append(distance)
                 ious.append(shared / (a[3] * a[4] + b[3] * b[4] - shared) if shared > 0 else 0.0)
     return np.array(i)[1:], np.array(j)[1:], np.array(distances)[1:], np.array(ious)[1:]
 
 
 def assign(pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
-    """Assign detections to tracks: as many as possible, then at least total cost.
+    """Assign as many detections as possible to tracks, at the minimum total cost.
 
-    Returns the tracks (P,), ascending, and their detections (P,).
+    Returns the indices of the tracks (P,), ascending, and of their detections (P,).
     """
-    part = _label_parts(pairs.tracks, pairs.boxes)
-    single = np.bincount(part)[part] == 1
-    chosen = [np.flatnonzero(single)]
-    rest = np.flatnonzero(~single)
-    rest = rest[np.argsort(part[rest], kind="stable")]
-    for group in np.split(rest, np.flatnonzero(np.diff(part[rest])) + 1):
+    component = _label_components(pairs.tracks, pairs.boxes)
+    is_single = np.bincount(component)[component] == 1
+    selected_parts = [np.flatnonzero(is_single)]
+    remaining = np.flatnonzero(~is_single)
+    remaining = remaining[np.argsort(component[remaining], kind="stable")]
+    for group in np.split(remaining, np.flatnonzero(np.diff(component[remaining])) + 1):
         if len(group):
-            chosen.append(group[_assign_part(pairs.select(group))])
-    found = np.sort(np.concatenate(chosen))
-    return pairs.tracks[found], pairs.boxes[found]
+            selected_parts.append(group[_assign_component(pairs.select(group))])
+    selected = np.sort(np.concatenate(selected_parts))
+    return pairs.tracks[selected], pairs.boxes[selected]
 
 
 @njit(cache=True, nogil=True)
-def _label_parts(tracks, boxes):
-    """Label pairs (P,) that are connected by common tracks or boxes: the smallest index of such a
-    pair, (P,) int64."""
+def _label_components(tracks, boxes):
+    """Return the connected component (P,) int64 of each pair: the smallest index of its pairs.
+
+    Pairs with a common track or box are connected.
+    """
     parent = np.arange(len(tracks))
     for nodes in (tracks, boxes):
         first = np.full(nodes.max() + 1 if len(nodes) else 0, -1)  # the first pair of each node
         for pair in range(len(nodes)):
             if first[nodes[pair]] < 0:
                 first[nodes[pair]] = pair
-            one, other = _root(parent, first[nodes[pair]]), _root(parent, pair)
-            parent[max(one, other)] = min(one, other)
+            root, other = _root(parent, first[nodes[pair]]), _root(parent, pair)
+            parent[max(root, other)] = min(root, other)
     for pair in range(len(tracks)):
         parent[pair] = _root(parent, pair)
     return parent
@@ -143,12 +149,12 @@ def _root(parent, node):
     return node
 
 
-def _assign_part(pairs: Pairs) -> np.ndarray:
-    """Return the indices of the chosen pairs among connected ones."""
+def _assign_component(pairs: Pairs) -> np.ndarray:
+    """Return the indices of the assigned pairs within one connected component."""
     tracks, i = np.unique(pairs.tracks, return_inverse=True)
     boxes, j = np.unique(pairs.boxes, return_inverse=True)
     cost = np.full((len(tracks), len(boxes)), FORBIDDEN)
     index = np.full(cost.shape, -1)
     cost[i, j], index[i, j] = pairs.costs, np.arange(len(i))
-    found = index[linear_sum_assignment(cost)]
-    return found[found >= 0]
+    assigned = index[linear_sum_assignment(cost)]
+    return assigned[assigned >= 0]

@@ -1,4 +1,4 @@
-"""Tracker for a whole recording, drive by drive, with the poses of the recording."""
+"""Tracker for a recording: restarts at each drive and reads the sensor's poses."""
 
 from __future__ import annotations
 
@@ -23,16 +23,18 @@ MAX_POSE_CHECKS = 50  # frames at the start of a recording that are searched for
 class DriveTracker:
     """Tracker for the detections of a recording: tracker(frame, detections) -> Tracks.
 
-    Call it for each frame in order of time. All tracks end where a new drive begins: at a new
-    sequence, or, in a recording without sequences such as a bag, where the stamps jump (see
+    Call it for each frame in order of time. All tracks end when a new drive begins: at a new
+    sequence, or, in a recording without sequences such as a bag, at a jump of the stamps (see
     data.frame). Ids are unique in the whole recording.
 
     Args:
-        ego: source of the poses, one of RECORDED_EGO; see choose_ego_source. kiss_icp loads every
+        recording: Recording with the frames.
+        params: Parameters of the tracker.
+        ego: Source of the poses, one of RECORDED_EGO; see choose_ego_source. kiss_icp loads every
             frame.
 
     Attributes:
-        drive: name of the drive of the last frame.
+        drive: Name of the last frame's drive.
         has_pose: True if the last frame had a pose, or if ego is "none".
     """
 
@@ -44,9 +46,10 @@ class DriveTracker:
         self._number = 0  # of the drive
 
     def __call__(self, frame: Frame, detections: Detections) -> Tracks:
-        """Return the tracks after a frame, in its LiDAR frame.
+        """Update the tracks with a frame and return them in its LiDAR frame.
 
-        Raises InputError if the pose of the frame cannot be read.
+        Raises:
+            InputError: The pose of the frame cannot be read.
         """
         sequence, stamp_ns = self._last
         if frame.sequence != sequence or not (frame.sequence or is_same_drive(stamp_ns, frame.stamp_ns)):
@@ -60,14 +63,18 @@ class DriveTracker:
         return self.tracker(detections, frame.stamp_ns, pose)
 
 
-def choose_ego_source(recording: Recording, wanted: str = "auto") -> str:
-    """Resolve "auto" to the source of the sensor's motion; return any other source as given.
+def choose_ego_source(recording: Recording, source: str = "auto") -> str:
+    """Resolve "auto" to a source of the sensor's motion; return any other source unchanged.
 
-    "auto" is the first of: the recording's poses if one of its first MAX_POSE_CHECKS frames has
-    one, KISS-ICP if it is installed, the recording's poses if it has any, none.
+    "auto" selects the first one that applies:
+
+    1. the poses of the recording, if one of its first MAX_POSE_CHECKS frames has a pose
+    2. KISS-ICP, if it is installed
+    3. the poses of the recording, if it has any
+    4. none
     """
-    if wanted != "auto":
-        return wanted
+    if source != "auto":
+        return source
     return choose_recorded_source(
         POSES in recording.has
         and (not has_odometry() or any(map(has_valid_pose, islice(recording.frames, MAX_POSE_CHECKS))))
@@ -77,7 +84,7 @@ def choose_ego_source(recording: Recording, wanted: str = "auto") -> str:
 def has_valid_pose(frame: Frame) -> bool:
     """Return True if a frame has a valid pose.
 
-    A recording whose odometry and clouds have different clocks has none.
+    If the clocks of odometry and clouds differ, no frame has one.
     """
     try:
         return is_valid_pose(frame.pose())

@@ -1,7 +1,7 @@
-"""Motion of the sensor: sources of poses, validity, and extrapolation where poses are missing.
+"""Motion of the sensor: sources of poses, checks, and extrapolation over missing poses.
 
-A pose is a (4, 4) float64 matrix from the sensor's frame to a fixed frame. Without poses the fixed
-frame is the sensor's own, and velocities are relative to the sensor.
+A pose is a (4, 4) float64 matrix that transforms from the sensor's frame to a fixed frame. Without
+poses the fixed frame is the sensor's own, and velocities are relative to the sensor.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class Ego:
     """Motion state of the sensor.
 
     Attributes:
-        pose: (4, 4) current pose, extrapolated where poses are missing.
-        velocity: (3,) m/s in the sensor's frame, from the last two given poses.
-        rotation: (3,) rotation vector, rad/s, from the last two given poses.
-        missing_s: seconds since the last given pose.
-        has_pose: True once a pose was given.
+        pose: (4, 4) current pose, extrapolated if the measured pose is missing.
+        velocity: (3,) m/s in the sensor's frame, from the last two measured poses.
+        rotation: (3,) angular velocity as a rotation vector, rad/s, from the same poses.
+        missing_s: Time since the last measured pose.
+        has_pose: True after the first measured pose.
     """
 
     pose: np.ndarray
@@ -59,19 +59,19 @@ def is_valid_pose(pose: np.ndarray | None) -> bool:
 
 
 def advance_ego(ego: Ego, pose: np.ndarray | None, seconds: float, max_gap: float) -> Ego:
-    """Return the motion state `seconds` later.
+    """Return the motion state `seconds` later, with the pose measured then.
 
-    Where the pose is missing (None), the sensor keeps its velocity for max_gap seconds and then
-    stands still.
+    If the pose is missing (None), the sensor is assumed to keep its velocity for max_gap seconds
+    and then to stand still.
     """
     if pose is not None:
         pose = np.asarray(pose, np.float64)
-        since = seconds + ego.missing_s
-        if not ego.has_pose or since <= 0:
+        elapsed_s = seconds + ego.missing_s
+        if not ego.has_pose or elapsed_s <= 0:
             return Ego(pose, ego.velocity, ego.rotation, 0.0, True)
         start = ego.pose @ np.linalg.inv(_compute_step(ego, min(ego.missing_s, max_gap)))
         step = np.linalg.inv(start) @ pose
-        return Ego(pose, step[:3, 3] / since, Rotation.from_matrix(step[:3, :3]).as_rotvec() / since, 0.0, True)
+        return Ego(pose, step[:3, 3] / elapsed_s, Rotation.from_matrix(step[:3, :3]).as_rotvec() / elapsed_s, 0.0, True)
     moving_s = max(min(seconds, max_gap - ego.missing_s), 0.0)
     return Ego(
         ego.pose @ _compute_step(ego, moving_s), ego.velocity, ego.rotation, ego.missing_s + seconds, ego.has_pose
@@ -86,31 +86,39 @@ def _compute_step(ego: Ego, seconds: float) -> np.ndarray:
 
 
 def is_jump(ego: Ego, pose: np.ndarray, seconds: float) -> bool:
-    """Return True if no sensor can reach a pose from the last one in this time."""
+    """Return True if the distance to the last pose is too large for the elapsed time."""
     distance = np.linalg.norm(np.asarray(pose, float)[:3, 3] - ego.pose[:3, 3])
     return ego.has_pose and bool(distance > MAX_SPEED * (seconds + ego.missing_s) + 1.0)
 
 
-def choose_source(wanted: str, available: Collection[str]) -> str:
-    """Choose a source of poses: the wanted one, or with "auto" the best of those available.
+def choose_source(requested: str, available: Collection[str]) -> str:
+    """Choose the requested source of poses, or with "auto" the best available one.
 
-    Returns NO_SOURCE if the wanted source is not available.
+    Returns NO_SOURCE if the requested source is not available.
     """
-    return next((name for name in SOURCES if name in available and wanted in ("auto", name)), NO_SOURCE)
+    return next((name for name in SOURCES if name in available and requested in ("auto", name)), NO_SOURCE)
 
 
-def choose_recorded_source(has_poses: bool, wanted: str = "auto") -> str:
-    """Choose the source of poses for recorded frames, which may come with poses.
+def choose_recorded_source(has_poses: bool, requested: str = "auto") -> str:
+    """Choose the source of poses for recorded frames.
 
-    A source other than "auto" is assumed to be available; it reports itself if it is not.
+    A source other than "auto" is returned unchanged; it raises an error on use if it is not
+    available.
+
+    Args:
+        has_poses: True if the recording has poses.
+        requested: Name of a source, or "auto".
     """
-    return choose_source(wanted, {wanted, *["recording"] * has_poses, *["kiss_icp"] * has_odometry()})
+    return choose_source(requested, {requested, *["recording"] * has_poses, *["kiss_icp"] * has_odometry()})
 
 
 def make_pose_reader(source: str) -> Callable[[Frame], np.ndarray | None]:
-    """Make a function frame -> pose (4, 4) or None, for the frames of one drive in order.
+    """Make a function frame -> pose (4, 4) or None, to be called for a drive's frames in order.
 
-    KISS-ICP loads each frame. Raises InputError if source is kiss_icp and it is not installed.
+    KISS-ICP loads each frame.
+
+    Raises:
+        InputError: The source is kiss_icp, which is not installed.
     """
     if source == "kiss_icp":
         odometry = Odometry()
@@ -119,17 +127,18 @@ def make_pose_reader(source: str) -> Callable[[Frame], np.ndarray | None]:
 
 
 def has_odometry() -> bool:
-    """Return True if the extra [odometry], which Odometry needs, is installed."""
+    """Return True if KISS-ICP (the extra [odometry]) is installed."""
     return importlib.util.find_spec("kiss_icp") is not None
 
 
 class Odometry:
     """KISS-ICP odometry (Vizzo et al., RA-L 2023): odometry(xyz) -> pose.
 
-    It runs in one thread, so that equal scans give equal poses. Scans are registered at the coarse
-    resolution if that leaves MIN_COARSE_POINTS, else at the fine one.
+    It runs in one thread, so that the same scans always give the same poses. Scans are registered
+    at the coarse resolution if that leaves MIN_COARSE_POINTS points, otherwise at the fine one.
 
-    Raises InputError if kiss-icp is not installed.
+    Raises:
+        InputError: kiss-icp is not installed.
     """
 
     def __init__(self, voxel: float = 1.0) -> None:

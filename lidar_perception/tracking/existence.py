@@ -24,17 +24,17 @@ def to_log_odds(probability: np.ndarray | float) -> np.ndarray:
 
 
 def to_probability(log_odds: np.ndarray) -> np.ndarray:
-    """Convert log odds to probabilities, without the limits of to_log_odds."""
+    """Convert log odds to probabilities; unlike in to_log_odds the result is not clipped."""
     return 1.0 / (1.0 + np.exp(-np.clip(log_odds, -50.0, 50.0)))
 
 
 def compute_evidence(scores: np.ndarray, params: ExistenceParams) -> np.ndarray:
-    """Compute the evidence (N,) of scores (N,): positive for an object, negative against it."""
+    """Compute the evidence (N,) of scores (N,): positive values support an object."""
     return params.gain * (to_log_odds(scores) - to_log_odds(params.neutral))
 
 
 def discount_observations(count: np.ndarray, correlation: float) -> np.ndarray:
-    """Convert counts (N,) of correlated observations to equivalent independent ones (N,)."""
+    """Return how many independent observations (N,) are equivalent to count (N,) correlated ones."""
     return count / (1.0 + np.maximum(count - 1.0, 0.0) * correlation)
 
 
@@ -44,7 +44,8 @@ def compute_validity(total: np.ndarray, count: np.ndarray, moving: np.ndarray, p
     Args:
         total: (N,) sum of the evidence.
         count: (N,) number of observations.
-        moving: (N,) probability of motion; above 0.5 it counts as evidence for an object.
+        moving: (N,) probability of motion; values above 0.5 are evidence for an object.
+        params: Parameters of the existence model.
     """
     mean = total / np.maximum(count, 1e-9)
     return (
@@ -55,11 +56,17 @@ def compute_validity(total: np.ndarray, count: np.ndarray, moving: np.ndarray, p
 
 
 def compute_miss_penalty(hits: np.ndarray, tries: np.ndarray, seconds: float, params: ExistenceParams) -> np.ndarray:
-    """Compute how much a miss lowers the log odds of presence, (N,).
+    """Compute the penalty (N,) of a miss in the log odds of presence.
 
-    The penalty is large for tracks with a high hit rate, hits (N,) of tries (N,), but at most
-    max_absence per NOMINAL_PERIOD_S of the `seconds` since the previous frame: misses are
-    correlated, because an occlusion lasts for a while at any frame rate.
+    The penalty rises with the hit rate of a track up to params.max_absence per NOMINAL_PERIOD_S.
+    The limit is per time, not per frame, because misses are correlated: an occlusion lasts for a
+    while at any frame rate.
+
+    Args:
+        hits: (N,) number of hits.
+        tries: (N,) number of frames.
+        seconds: Time since the previous frame.
+        params: Parameters of the existence model.
     """
     rate = np.minimum((hits + PRIOR_HITS) / (tries + PRIOR_TRIES), MAX_HIT_RATE)
     return np.minimum(-np.log(1.0 - rate), params.max_absence * (seconds / NOMINAL_PERIOD_S))

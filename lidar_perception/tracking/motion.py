@@ -28,24 +28,24 @@ def predict(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Predict means and covariances `seconds` (0 or more) ahead.
 
-    acceleration, turning and wandering (N,) are the noise densities of MotionParams.
+    acceleration, turning and wandering (N,) are noise densities, see MotionParams.
     """
     t, count = seconds, len(means)
     _, _, vx, vy, _, turn = means.T
     angle = turn * t
-    straight = np.abs(angle) < MIN_TURN_RAD
-    safe = np.where(straight, 1.0, turn)
+    is_straight = np.abs(angle) < MIN_TURN_RAD
+    divisor = np.where(is_straight, 1.0, turn)
     sin, cos = np.sin(angle), np.cos(angle)
-    along = np.where(straight, t, sin / safe)
-    across = np.where(straight, angle * t / 2, (1.0 - cos) / safe)
-    later = means.copy()
-    later[:, X] += along * vx - across * vy
-    later[:, Y] += across * vx + along * vy
-    later[:, VX], later[:, VY] = cos * vx - sin * vy, sin * vx + cos * vy
-    later[:, HEADING] = wrap_angle(means[:, HEADING] + angle)
+    along = np.where(is_straight, t, sin / divisor)
+    across = np.where(is_straight, angle * t / 2, (1.0 - cos) / divisor)
+    predicted_means = means.copy()
+    predicted_means[:, X] += along * vx - across * vy
+    predicted_means[:, Y] += across * vx + along * vy
+    predicted_means[:, VX], predicted_means[:, VY] = cos * vx - sin * vy, sin * vx + cos * vy
+    predicted_means[:, HEADING] = wrap_angle(means[:, HEADING] + angle)
 
-    along_by_turn = np.where(straight, -angle * t * t / 3, (t * cos - along) / safe)
-    across_by_turn = np.where(straight, t * t / 2, (t * sin - across) / safe)
+    along_by_turn = np.where(is_straight, -angle * t * t / 3, (t * cos - along) / divisor)
+    across_by_turn = np.where(is_straight, t * t / 2, (t * sin - across) / divisor)
     f = np.tile(np.eye(6), (count, 1, 1))
     f[:, X, VX] = f[:, Y, VY] = along
     f[:, X, VY], f[:, Y, VX] = -across, across
@@ -53,50 +53,54 @@ def predict(
     f[:, VX, VY], f[:, VY, VX] = -sin, sin
     f[:, X, TURN] = along_by_turn * vx - across_by_turn * vy
     f[:, Y, TURN] = across_by_turn * vx + along_by_turn * vy
-    f[:, VX, TURN], f[:, VY, TURN] = -t * later[:, VY], t * later[:, VX]
+    f[:, VX, TURN], f[:, VY, TURN] = -t * predicted_means[:, VY], t * predicted_means[:, VX]
     f[:, HEADING, TURN] = t
-    predicted = f @ covariances @ f.transpose(0, 2, 1)
-    for place, speed, density in ((X, VX, acceleration), (Y, VY, acceleration), (HEADING, TURN, turning)):
+    predicted_covariances = f @ covariances @ f.transpose(0, 2, 1)
+    for value, rate, density in ((X, VX, acceleration), (Y, VY, acceleration), (HEADING, TURN, turning)):
         square = density * density
-        predicted[:, place, place] += square * t**3 / 3
-        predicted[:, place, speed] += square * t * t / 2
-        predicted[:, speed, place] += square * t * t / 2
-        predicted[:, speed, speed] += square * t
-    predicted[:, HEADING, HEADING] += wandering * wandering * t
-    return later, predicted
+        predicted_covariances[:, value, value] += square * t**3 / 3
+        predicted_covariances[:, value, rate] += square * t * t / 2
+        predicted_covariances[:, rate, value] += square * t * t / 2
+        predicted_covariances[:, rate, rate] += square * t
+    predicted_covariances[:, HEADING, HEADING] += wandering * wandering * t
+    return predicted_means, predicted_covariances
 
 
 def update(
     means: np.ndarray, covariances: np.ndarray, measured: np.ndarray, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Update with measured (N, 3) [x y heading] of standard deviations noise (N, 3).
+    """Update with measurements (N, 3) [x y heading] with standard deviations noise (N, 3).
 
-    The measured heading or its opposite is used, whichever is nearer to the state's: detectors
-    confuse front and rear, which flip_reversed_headings() decides.
+    Either the measured heading or its opposite is used, whichever is nearer to the state's heading,
+    because detectors confuse front and rear. flip_reversed_headings() decides which is the front.
     """
     innovation = measured - means[:, MEASURED]
     innovation[:, 2] = wrap_line(innovation[:, 2])
-    against = covariances[:, :, MEASURED]
-    spread = against[:, MEASURED]
-    spread[:, range(3), range(3)] += noise * noise
-    gain = np.linalg.solve(spread, against.transpose(0, 2, 1)).transpose(0, 2, 1)
-    return _normalize(means + (gain @ innovation[:, :, None])[:, :, 0], covariances - gain @ against.transpose(0, 2, 1))
+    cross_covariances = covariances[:, :, MEASURED]
+    innovation_covariances = cross_covariances[:, MEASURED]
+    innovation_covariances[:, range(3), range(3)] += noise * noise
+    gain = np.linalg.solve(innovation_covariances, cross_covariances.transpose(0, 2, 1)).transpose(0, 2, 1)
+    return _normalize(
+        means + (gain @ innovation[:, :, None])[:, :, 0], covariances - gain @ cross_covariances.transpose(0, 2, 1)
+    )
 
 
 def constrain_to_heading(means: np.ndarray, covariances: np.ndarray, slip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Update with a lateral speed of 0, of standard deviations slip (N,).
+    """Update with a measured lateral speed of 0 with standard deviations slip (N,), m/s.
 
-    Wheels and feet go forward, so this couples the heading and the direction of motion.
+    Wheels and feet move forward, so this couples the heading with the direction of motion.
     """
     sin, cos = np.sin(means[:, HEADING]), np.cos(means[:, HEADING])
     vx, vy = means[:, VX], means[:, VY]
-    slope = np.zeros((len(means), 6))
-    slope[:, VX], slope[:, VY], slope[:, HEADING] = -sin, cos, -(cos * vx + sin * vy)
-    against = (covariances @ slope[:, :, None])[:, :, 0]
-    spread = (slope * against).sum(axis=1) + slip * slip
-    gain = against / spread[:, None]
-    across = cos * vy - sin * vx
-    return _normalize(means - gain * across[:, None], covariances - gain[:, :, None] * against[:, None, :])
+    jacobian = np.zeros((len(means), 6))
+    jacobian[:, VX], jacobian[:, VY], jacobian[:, HEADING] = -sin, cos, -(cos * vx + sin * vy)
+    cross_covariances = (covariances @ jacobian[:, :, None])[:, :, 0]
+    variances = (jacobian * cross_covariances).sum(axis=1) + slip * slip
+    gain = cross_covariances / variances[:, None]
+    lateral_speed = cos * vy - sin * vx
+    return _normalize(
+        means - gain * lateral_speed[:, None], covariances - gain[:, :, None] * cross_covariances[:, None, :]
+    )
 
 
 def flip_reversed_headings(
@@ -104,17 +108,23 @@ def flip_reversed_headings(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reverse the headings that point backwards.
 
-    A heading is reversed if the object moves backwards faster than backwards (N,) m/s, or if it
-    does not move forward faster than that and the measured headings oppose it: agreement (N,) is
-    the sum of the scores of agreeing headings less that of opposite ones.
+    A heading is reversed if the object moves backwards faster than `backwards`, or if the measured
+    headings oppose it and the object does not move forward faster than `backwards`.
 
-    Returns the new means and agreements.
+    Args:
+        means: (N, 6) states.
+        agreement: (N,) sum of the scores of measured headings that agree with the state, minus the
+            sum of those that oppose it.
+        backwards: (N,) speed limit, m/s.
+
+    Returns:
+        The new means and agreements.
     """
     forward = np.cos(means[:, HEADING]) * means[:, VX] + np.sin(means[:, HEADING]) * means[:, VY]
-    wrong = (forward < -backwards) | (agreement < -MIN_OPPOSING_SCORE) & (forward <= backwards)
+    is_reversed = (forward < -backwards) | (agreement < -MIN_OPPOSING_SCORE) & (forward <= backwards)
     flipped = means.copy()
-    flipped[:, HEADING] = wrap_angle(means[:, HEADING] + np.pi * wrong)
-    return flipped, np.where(wrong, -agreement, agreement)
+    flipped[:, HEADING] = wrap_angle(means[:, HEADING] + np.pi * is_reversed)
+    return flipped, np.where(is_reversed, -agreement, agreement)
 
 
 def _normalize(means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -124,12 +134,12 @@ def _normalize(means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, 
 
 
 def rotate_covariances(covariances: np.ndarray, cos: float, sin: float, side: float = 1.0) -> np.ndarray:
-    """Express covariances in axes in which the old x axis is [cos sin].
+    """Transform covariances to a frame in which the old x axis is [cos sin].
 
-    The old y axis points to the left of the old x axis, or with side -1, for an upside-down frame,
-    to its right.
+    `side` is 1, or -1 if one of the frames is upside down, so that the old y axis points to the
+    right of the old x axis.
     """
-    r = np.diag([cos, side * cos, cos, side * cos, side, side])
+    rotation = np.diag([cos, side * cos, cos, side * cos, side, side])
     for a, b in ((X, Y), (VX, VY)):
-        r[a, b], r[b, a] = -side * sin, sin
-    return r @ covariances @ r.T
+        rotation[a, b], rotation[b, a] = -side * sin, sin
+    return rotation @ covariances @ rotation.T

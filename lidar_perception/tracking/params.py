@@ -15,7 +15,7 @@ NOMINAL_PERIOD_S = 0.1  # time between frames that max_gate and max_absence refe
 
 @dataclass(frozen=True)
 class MotionParams(Params):
-    """Motion and measurement noise of one kind of object."""
+    """Noise of the motion and of the measurements for one kind of object."""
 
     acceleration: float = param(2.0, "Noise density of random acceleration.", unit="m/s^1.5", low=0.01, high=100.0)
     turning: float = param(

@@ -1,4 +1,4 @@
-"""State of N tracks as one array per quantity, oldest track first, and the published tracks."""
+"""State of the tracks as one array per quantity, oldest track first, and the published tracks."""
 
 from __future__ import annotations
 
@@ -14,19 +14,25 @@ class States:
     """State of N tracks in the fixed frame.
 
     Attributes:
-        ids: (N,) int64.
-        means, covariances: (N, 6) and (N, 6, 6), see motion.py.
-        heights, height_variances: (N,) z of the centre.
-        sizes, size_weights: (N, 3) weighted mean of l w h, and (N,) its weight.
-        class_evidence, class_ids: (N, CLASSES) sum of scores per class, and (N,) int32.
-        total, observations: (N,) evidence and number of observations, see existence.py.
+        ids: (N,) int64 track ids.
+        means: (N, 6) filter state, see motion.py.
+        covariances: (N, 6, 6) covariance of the filter state.
+        heights: (N,) z of the centre, metres.
+        height_variances: (N,) variance of z, m^2.
+        sizes: (N, 3) weighted mean of length, width and height, metres.
+        size_weights: (N,) weight of that mean.
+        class_evidence: (N, len(CLASSES)) sum of the scores by class.
+        class_ids: (N,) int32 indices into CLASSES.
+        total: (N,) sum of the evidence, see existence.py.
+        observations: (N,) number of observations, see existence.py.
         present: (N,) log odds of presence.
-        hits, tries: (N,) decayed counts.
+        hits: (N,) number of hits, with exponential decay.
+        tries: (N,) number of frames, with exponential decay.
         moving: (N,) probability of motion.
         ages: (N,) seconds since the first detection.
         unseen: (N,) seconds since the last hit.
-        heading_agreement: (N,) decayed sum of the scores of measured headings that agree with the
-            state's, less those of opposite ones.
+        heading_agreement: (N,) sum of the scores of measured headings that agree with the state,
+            minus the sum of those that oppose it, with exponential decay.
     """
 
     ids: np.ndarray
@@ -65,7 +71,7 @@ class States:
 
     @staticmethod
     def none() -> States:
-        """Return the state without tracks."""
+        """Return states of zero tracks."""
         shapes = {"means": (6,), "covariances": (6, 6), "sizes": (3,), "class_evidence": (len(CLASSES),)}
         kinds = {"ids": np.int64, "class_ids": np.int32}
         return States(*(np.zeros((0, *shapes.get(f.name, ())), kinds.get(f.name, np.float64)) for f in fields(States)))
@@ -80,8 +86,8 @@ class Tracks:
     """K tracks of one frame in the sensor's frame; K may be 0.
 
     Attributes:
-        ids: (K,) int64 from 1, never reused.
-        detections: boxes and classes; the score is the probability that the object is real, of its
+        ids: (K,) int64, starting at 1 and never reused.
+        detections: Boxes and classes; a score is the probability that the object is real, of its
             class, and present.
         velocities: (K, 2) m/s over ground along the sensor's x and y axes, or relative to the
             sensor if there are no poses.
@@ -107,12 +113,12 @@ class Tracks:
         return len(self.ids)
 
     def to_pose_covariances(self) -> np.ndarray:
-        """Return the covariances (K, 6, 6) float64 of x y z and the rotations about these axes.
+        """Return the pose covariances (K, 6, 6) float64 as in geometry_msgs/PoseWithCovariance.
 
-        The layout is that of geometry_msgs/PoseWithCovariance; roll and pitch have none.
+        The order is x, y, z, roll, pitch, yaw; the entries of roll and pitch are 0.
         """
         result = np.zeros((len(self), 6, 6))
-        rows, source = np.array([0, 1, 5]), np.array([0, 1, 4])  # rows of x, y and yaw
-        result[:, rows[:, None], rows] = self.covariances[:, source[:, None], source]
+        rows, columns = np.array([0, 1, 5]), np.array([0, 1, 4])  # rows of x, y and yaw
+        result[:, rows[:, None], rows] = self.covariances[:, columns[:, None], columns]
         result[:, 2, 2] = self.height_variances
         return result

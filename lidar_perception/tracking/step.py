@@ -1,4 +1,4 @@
-"""The steps of the tracker for one frame: predict, match, update, start and prune tracks.
+"""Steps of the tracker for one frame: predict, match, update, start and prune tracks.
 
 Tracks and detections are in the same fixed frame.
 """
@@ -53,9 +53,9 @@ def predict(states: States, seconds: float, params: TrackingParams) -> States:
 def match(
     states: States, boxes: np.ndarray, class_ids: np.ndarray, scores: np.ndarray, params: TrackingParams, seconds: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match tracks and detections `seconds` after the previous frame.
+    """Match tracks and detections of a frame, `seconds` after the previous one.
 
-    Strong detections are matched first, weak ones with the remaining tracks (Zhang et al.,
+    Strong detections are matched first, then weak ones with the remaining tracks (Zhang et al.,
     ByteTrack, ECCV 2022). Returns the indices of the tracks (P,) and of their detections (P,).
     """
     kinds = KIND_IDS[states.class_ids]
@@ -71,10 +71,10 @@ def match(
         params.association,
         seconds,
     )
-    strong = (scores >= params.association.strong)[pairs.boxes]
-    i, j = assign(pairs.select(strong))
-    rest, weak = assign(pairs.select(~strong & ~np.isin(pairs.tracks, i)))
-    return np.concatenate([i, rest]), np.concatenate([j, weak])
+    is_strong = (scores >= params.association.strong)[pairs.boxes]
+    i, j = assign(pairs.select(is_strong))
+    weak_tracks, weak_detections = assign(pairs.select(~is_strong & ~np.isin(pairs.tracks, i)))
+    return np.concatenate([i, weak_tracks]), np.concatenate([j, weak_detections])
 
 
 def update(
@@ -87,12 +87,20 @@ def update(
     fixed: bool,
     seconds: float,
 ) -> States:
-    """Update the tracks with a frame `seconds` after the previous one.
+    """Update the tracks with the detections of a frame.
 
-    Tracks i (P,) are matched with boxes (P, 7), the others are missed. fixed is True if the frame
-    is fixed to the ground: only then do objects move along their heading.
+    Args:
+        states: State of N tracks, predicted to this frame.
+        i: (P,) indices of the tracks with a detection; the others are missed.
+        boxes: (P, 7) detected boxes.
+        class_ids: (P,) classes of the detections.
+        scores: (P,) scores of the detections.
+        params: Parameters of the tracker.
+        fixed: True if the frame is fixed to the ground. Only then are objects assumed to move along
+            their heading.
+        seconds: Time since the previous frame.
     """
-    new = states.copy()
+    updated = states.copy()
     kinds = KIND_IDS[states.class_ids[i]]
     noise = np.column_stack(
         [*[_collect_by_kind(params, "position")[kinds]] * 2, _collect_by_kind(params, "heading")[kinds]]
@@ -101,50 +109,50 @@ def update(
     if fixed:
         means, covariances = motion.constrain_to_heading(means, covariances, _collect_by_kind(params, "slip")[kinds])
     agreement = states.heading_agreement[i] * DECAY + scores * np.sign(np.cos(boxes[:, 6] - means[:, motion.HEADING]))
-    new.means[i], new.heading_agreement[i] = motion.flip_reversed_headings(
+    updated.means[i], updated.heading_agreement[i] = motion.flip_reversed_headings(
         means, agreement, MAX_REVERSE_SPEED[kinds] if fixed else np.full(len(i), np.inf)
     )
-    new.covariances[i] = covariances
+    updated.covariances[i] = covariances
     gain = states.height_variances[i] / (states.height_variances[i] + HEIGHT_NOISE**2)
-    new.heights[i] += gain * (boxes[:, 2] - states.heights[i])
-    new.height_variances[i] *= 1.0 - gain
+    updated.heights[i] += gain * (boxes[:, 2] - states.heights[i])
+    updated.height_variances[i] *= 1.0 - gain
     weight = scores / (states.size_weights[i] + scores)
-    new.sizes[i] += weight[:, None] * (boxes[:, 3:6] - states.sizes[i])
-    new.size_weights[i] = np.minimum(states.size_weights[i] + scores, MAX_SIZE_WEIGHT)
-    new.moving[:] = compute_moving_probability(new.means, new.covariances, params.moving_speed)
-    _add_evidence(new, i, class_ids, scores, params, seconds)
-    return new
+    updated.sizes[i] += weight[:, None] * (boxes[:, 3:6] - states.sizes[i])
+    updated.size_weights[i] = np.minimum(states.size_weights[i] + scores, MAX_SIZE_WEIGHT)
+    updated.moving[:] = compute_moving_probability(updated.means, updated.covariances, params.moving_speed)
+    _add_evidence(updated, i, class_ids, scores, params, seconds)
+    return updated
 
 
 def _add_evidence(
-    new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.ndarray, params: TrackingParams, seconds: float
+    states: States, i: np.ndarray, class_ids: np.ndarray, scores: np.ndarray, params: TrackingParams, seconds: float
 ) -> None:
-    """Add the evidence of one frame to the arrays of new, in place."""
-    own = params.existence
-    missed = np.ones(len(new), bool)
-    missed[i] = False
-    new.total[missed] += own.missed
-    new.observations[:] += 1.0
-    new.total[i] += existence.compute_evidence(scores, own)
-    new.class_evidence[i, class_ids] += scores
-    best = new.class_evidence.argmax(axis=1)
-    rows = np.arange(len(new))
-    ahead = new.class_evidence[rows, best] > (new.class_evidence[rows, new.class_ids] + CLASS_LEAD)
-    new.class_ids[ahead] = best[ahead]
-    lost = existence.compute_miss_penalty(new.hits, new.tries, seconds, own)
-    new.present[missed] -= lost[missed]
-    new.present[i] = np.minimum(new.present[i] + own.seen, own.max_present)
-    new.hits[:] *= DECAY
-    new.tries[:] *= DECAY
-    new.hits[i] += 1.0
-    new.tries[:] += 1.0
-    new.unseen[i] = 0.0
+    """Add the evidence of one frame to the states, in place."""
+    existence_params = params.existence
+    is_missed = np.ones(len(states), bool)
+    is_missed[i] = False
+    states.total[is_missed] += existence_params.missed
+    states.observations[:] += 1.0
+    states.total[i] += existence.compute_evidence(scores, existence_params)
+    states.class_evidence[i, class_ids] += scores
+    best_classes = states.class_evidence.argmax(axis=1)
+    rows = np.arange(len(states))
+    is_better = states.class_evidence[rows, best_classes] > (states.class_evidence[rows, states.class_ids] + CLASS_LEAD)
+    states.class_ids[is_better] = best_classes[is_better]
+    penalty = existence.compute_miss_penalty(states.hits, states.tries, seconds, existence_params)
+    states.present[is_missed] -= penalty[is_missed]
+    states.present[i] = np.minimum(states.present[i] + existence_params.seen, existence_params.max_present)
+    states.hits[:] *= DECAY
+    states.tries[:] *= DECAY
+    states.hits[i] += 1.0
+    states.tries[:] += 1.0
+    states.unseen[i] = 0.0
 
 
 def start_tracks(
     first_id: int, boxes: np.ndarray, class_ids: np.ndarray, scores: np.ndarray, params: TrackingParams
 ) -> States:
-    """Start a track for each detection (K, 7), with zero velocity."""
+    """Start one track with zero velocity for each of K detections."""
     count, kinds = len(boxes), KIND_IDS[class_ids]
     noise, heading, speed, turning = (
         _collect_by_kind(params, name)[kinds] for name in ("position", "heading", "first_speed", "turning")
@@ -153,7 +161,7 @@ def start_tracks(
     means[:, motion.MEASURED] = boxes[:, [0, 1, 6]]
     variances = np.column_stack([noise, noise, speed, speed, heading, np.where(turning > 0, 0.3, 0.0)]) ** 2
     covariances = np.einsum("ni,ij->nij", variances, np.eye(6))
-    own, zeros, ones = params.existence, np.zeros(count), np.ones(count)
+    existence_params, zeros, ones = params.existence, np.zeros(count), np.ones(count)
     votes = np.zeros((count, len(CLASSES)))
     votes[np.arange(count), class_ids] = scores
     return States(
@@ -166,9 +174,9 @@ def start_tracks(
         scores.copy(),
         votes,
         class_ids.astype(np.int32),
-        existence.compute_evidence(scores, own),
+        existence.compute_evidence(scores, existence_params),
         ones,
-        np.full(count, own.seen / 2),
+        np.full(count, existence_params.seen / 2),
         ones.copy(),
         ones.copy(),
         compute_moving_probability(means, covariances, params.moving_speed),
@@ -181,27 +189,29 @@ def start_tracks(
 def prune(states: States, params: TrackingParams, fixed: bool) -> States:
     """Remove tracks that are probably gone, and the less probable of overlapping tracks."""
     states = states.take(np.flatnonzero(existence.to_probability(states.present) >= params.existence.end))
-    rank = compute_probabilities(states, params, fixed)
-    kept = rotated_nms(states.to_boxes(), rank, states.class_ids, params.overlap, across_classes=True)
-    return states.take(np.sort(kept[: params.max_tracks]))
+    probabilities = compute_probabilities(states, params, fixed)
+    kept_indices = rotated_nms(states.to_boxes(), probabilities, states.class_ids, params.overlap, across_classes=True)
+    return states.take(np.sort(kept_indices[: params.max_tracks]))
 
 
 def compute_probabilities(states: States, params: TrackingParams, fixed: bool) -> np.ndarray:
     """Compute the probability (N,) that each track is real, of its class, and present.
 
-    fixed is True if the frame is fixed to the ground; only then is motion evidence.
+    Motion is evidence for an object only if the frame is fixed to the ground (`fixed`).
     """
-    own, still = params.existence, np.zeros(len(states))
-    validity = existence.compute_validity(states.total, states.observations, states.moving if fixed else still, own)
+    existence_params, no_motion = params.existence, np.zeros(len(states))
+    validity = existence.compute_validity(
+        states.total, states.observations, states.moving if fixed else no_motion, existence_params
+    )
     if fixed:
-        riding = compute_moving_probability(states.means, states.covariances, own.walking)
-        riding *= KIND_IDS[states.class_ids] == KIND_OF_CLASS[PEDESTRIAN]
-        validity -= own.faster * np.maximum(2.0 * riding - 1.0, 0.0)
+        fast_probability = compute_moving_probability(states.means, states.covariances, existence_params.walking)
+        fast_probability *= KIND_IDS[states.class_ids] == KIND_OF_CLASS[PEDESTRIAN]
+        validity -= existence_params.faster * np.maximum(2.0 * fast_probability - 1.0, 0.0)
     return existence.to_probability(validity) * existence.to_probability(states.present)
 
 
 def compute_moving_probability(means: np.ndarray, covariances: np.ndarray, speed: float) -> np.ndarray:
-    """Compute the probability (N,) that objects move faster than speed, m/s."""
+    """Compute the probability (N,) that objects move faster than `speed`, in m/s."""
     vx, vy = means[:, motion.VX], means[:, motion.VY]
     speeds = np.hypot(vx, vy)
     ux, uy = (np.divide(v, speeds, out=np.full_like(v, np.sqrt(0.5)), where=speeds > 1e-6) for v in (vx, vy))

@@ -1,6 +1,6 @@
-"""The tracker: Kalman filters in a fixed frame, two rounds of assignment, evidence of existence.
+"""Multi-object tracker: Kalman filters in a fixed frame, two-stage assignment, track existence.
 
-It is deterministic: equal frames give equal tracks.
+It is deterministic: the same frames always give the same tracks.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ class Tracker:
     """Multi-object tracker: tracker(detections, stamp_ns, pose) -> Tracks.
 
     Attributes:
-        params: may be replaced between calls.
-        problem: problem of the last frame, or None.
+        params: Parameters; they may be replaced between calls.
+        problem: Description of a problem with the last frame, or None.
         frame_used: False if the last frame was ignored.
-        started, ended: number of tracks so far.
+        started: Number of tracks started so far.
+        ended: Number of tracks ended so far.
     """
 
     def __init__(self, params: TrackingParams = TrackingParams()) -> None:
@@ -56,20 +57,21 @@ class Tracker:
     def __call__(self, detections: Detections, stamp_ns: int = 0, pose: np.ndarray | None = None) -> Tracks:
         """Update the tracks with one frame and return them.
 
-        Boxes that are not finite or have no size are ignored. A frame with the stamp of the
-        previous one, or a slightly older one, is ignored. A jump of time or of the sensor's pose
-        ends all tracks; so does a frame that continues from a slightly older stamp.
+        Boxes that are not finite or have no size are ignored. A frame with the same stamp as the
+        previous one, or with a slightly older stamp, is ignored. If a second frame follows such an
+        older frame, time is assumed to have restarted. A restart, or a jump of time or of the
+        sensor's pose, ends all tracks.
 
         Args:
-            detections: boxes in the sensor's frame.
-            stamp_ns: time of the frame, or 0 if it has none.
-            pose: (4, 4) sensor in a fixed frame, or None if unknown.
+            detections: Boxes in the sensor's frame.
+            stamp_ns: Time of the frame, or 0 if it has none.
+            pose: (4, 4) pose of the sensor in a fixed frame, or None if unknown.
 
         Returns:
             The tracks in the sensor's frame.
 
         Raises:
-            InputError: detections is not a Detections object.
+            InputError: `detections` is not a Detections object.
         """
         if not isinstance(detections, Detections):
             raise InputError(
@@ -88,25 +90,29 @@ class Tracker:
         states = predict(self._states, seconds, self.params)
         i, j = match(states, boxes, class_ids, scores, self.params, seconds)
         states = update(states, i, boxes[j], class_ids[j], scores[j], self.params, self._ego.has_pose, seconds)
-        free = np.ones(len(boxes), bool)
-        free[j] = False
-        new = np.flatnonzero(free & (scores >= self.params.association.strong))
-        before = len(states)
-        states = states.append(start_tracks(self._next_id, boxes[new], class_ids[new], scores[new], self.params))
-        self._next_id += len(new)
-        seen = np.zeros(len(states), bool)
-        seen[i], seen[before:] = True, True
-        hit = set(states.ids[seen].tolist())
-        kept = prune(states, self.params, self._ego.has_pose)
-        self.started += len(new)
-        self.ended += len(states) - len(kept)
-        self._states = kept
-        return self._report(np.array([i in hit for i in kept.ids.tolist()], bool))
+        is_unmatched = np.ones(len(boxes), bool)
+        is_unmatched[j] = False
+        new_detections = np.flatnonzero(is_unmatched & (scores >= self.params.association.strong))
+        old_count = len(states)
+        states = states.append(
+            start_tracks(
+                self._next_id, boxes[new_detections], class_ids[new_detections], scores[new_detections], self.params
+            )
+        )
+        self._next_id += len(new_detections)
+        is_seen = np.zeros(len(states), bool)
+        is_seen[i], is_seen[old_count:] = True, True
+        seen_ids = set(states.ids[is_seen].tolist())
+        remaining = prune(states, self.params, self._ego.has_pose)
+        self.started += len(new_detections)
+        self.ended += len(states) - len(remaining)
+        self._states = remaining
+        return self._report(np.array([i in seen_ids for i in remaining.ids.tolist()], bool))
 
     def predict(self, stamp_ns: int) -> Tracks:
-        """Return the tracks predicted to stamp_ns without changing them, for a lost or late frame.
+        """Predict the tracks to stamp_ns, for a lost or late frame, without changing the tracker.
 
-        They are in the frame of the sensor, which is assumed to have kept its velocity.
+        The sensor is assumed to have kept its velocity. Returns the tracks in its frame.
         """
         self.problem = None
         seconds = 0.0 if self._stamp is None else (int(stamp_ns) - self._stamp) / 1e9
@@ -120,17 +126,17 @@ class Tracker:
         if stamp == 0:
             self.problem = f"the frames have no stamps: assuming {self.params.period:g} s per frame"
             return self.params.period
-        last, self._stamp = self._stamp, stamp
-        late, self._late = self._late, None
-        if last is None:
+        last_stamp, self._stamp = self._stamp, stamp
+        late_stamp, self._late = self._late, None
+        if last_stamp is None:
             return self.params.period
-        seconds = (stamp - last) / 1e9
+        seconds = (stamp - last_stamp) / 1e9
         if seconds == 0:
             self.problem = "a frame has the same stamp as the previous one and is ignored"
             return None
-        restarted = late is not None and stamp > late  # for example a short bag in a loop
-        if seconds < 0 and -seconds <= self.params.max_gap and not restarted:
-            self._stamp, self._late = last, stamp
+        has_restarted = late_stamp is not None and stamp > late_stamp  # for example a short bag in a loop
+        if seconds < 0 and -seconds <= self.params.max_gap and not has_restarted:
+            self._stamp, self._late = last_stamp, stamp
             self.problem = f"a frame is {-seconds:.2f} s older than the previous one and is ignored"
             return None
         if seconds < 0 or seconds > self.params.max_gap:
@@ -141,8 +147,12 @@ class Tracker:
         return seconds
 
     def _move_ego(self, pose: np.ndarray | None, seconds: float) -> None:
-        valid = pose if is_valid_pose(pose) else None
-        if valid is not None and len(self._states) and (not self._ego.has_pose or is_jump(self._ego, valid, seconds)):
+        valid_pose = pose if is_valid_pose(pose) else None
+        if (
+            valid_pose is not None
+            and len(self._states)
+            and (not self._ego.has_pose or is_jump(self._ego, valid_pose, seconds))
+        ):
             stamp, had_pose = self._stamp, self._ego.has_pose
             self.reset()
             self._stamp = stamp
@@ -151,19 +161,22 @@ class Tracker:
                 if had_pose
                 else "the first pose arrived: all tracks ended and start again in the fixed frame"
             )
-        if valid is None and (pose is not None or self._ego.has_pose):
+        if valid_pose is None and (pose is not None or self._ego.has_pose):
             self.problem = (
                 "the pose is missing or not rigid: the sensor is assumed to keep its "
                 f"velocity for {self.params.max_ego_gap:g} s and then to stand; check "
                 "that odometry or TF is published, and often enough"
             )
-        self._ego = advance_ego(self._ego, valid, seconds, self.params.max_ego_gap)
+        self._ego = advance_ego(self._ego, valid_pose, seconds, self.params.max_ego_gap)
 
     def _select_valid(self, detections: Detections) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return boxes (K, 7), class ids (K,) and scores (K,), at most max_detections of them."""
+        """Return the boxes (K, 7), class ids (K,) and scores (K,) of the valid detections.
+
+        At most max_detections are returned: those with the best scores.
+        """
         boxes, scores = detections.boxes.astype(np.float64), detections.scores.astype(np.float64)
         with np.errstate(invalid="ignore"):
-            valid = (
+            is_valid = (
                 np.isfinite(boxes).all(axis=1)
                 & np.isfinite(scores)
                 & (boxes[:, 3:6] > 0).all(axis=1)
@@ -171,13 +184,13 @@ class Tracker:
                 & (detections.class_ids >= 0)
                 & (detections.class_ids < len(CLASSES))
             )
-        if not valid.all():
+        if not is_valid.all():
             self.problem = (
-                f"{(~valid).sum()} of {len(valid)} detections are ignored: not finite, "
+                f"{(~is_valid).sum()} of {len(is_valid)} detections are ignored: not finite, "
                 f"without a size, or more than {MAX_RANGE / 1e3:g} km from the origin "
                 "of their frame; publish them in a frame nearby"
             )
-        indices = np.flatnonzero(valid & (scores >= self.params.min_score))
+        indices = np.flatnonzero(is_valid & (scores >= self.params.min_score))
         if len(indices) > self.params.max_detections:
             self.problem = (
                 f"{len(indices)} detections are too many; only the best {self.params.max_detections} are used"
@@ -190,27 +203,27 @@ class Tracker:
 
 
 def _to_sensor_frame(states: States, ego: Ego, seen: np.ndarray, params: TrackingParams) -> Tracks:
-    """Return the tracks to publish, in the sensor's frame."""
+    """Return the tracks that are probable enough to publish, in the sensor's frame."""
     scores = compute_probabilities(states, params, ego.has_pose)
     indices = np.flatnonzero(
         (scores >= params.report) & (seen | (to_probability(states.present) >= params.report_unseen))
     )
-    chosen, back = states.take(indices), np.linalg.inv(ego.pose)
-    cos, sin = (back[:2, 0] / max(np.hypot(*back[:2, 0]), 1e-9)).tolist()
-    side = -1.0 if back[2, 2] < 0 else 1.0  # -1 for an upside-down sensor
-    covariances = motion.rotate_covariances(chosen.covariances, cos, sin, side)
-    velocities = chosen.means[:, 2:4] @ np.array([[cos, sin], [-side * sin, side * cos]])
-    detections = Detections.of(transform_boxes(chosen.to_boxes(), back), chosen.class_ids, scores[indices])
+    published, to_sensor = states.take(indices), np.linalg.inv(ego.pose)
+    cos, sin = (to_sensor[:2, 0] / max(np.hypot(*to_sensor[:2, 0]), 1e-9)).tolist()
+    side = -1.0 if to_sensor[2, 2] < 0 else 1.0  # -1 for an upside-down sensor
+    covariances = motion.rotate_covariances(published.covariances, cos, sin, side)
+    velocities = published.means[:, 2:4] @ np.array([[cos, sin], [-side * sin, side * cos]])
+    detections = Detections.of(transform_boxes(published.to_boxes(), to_sensor), published.class_ids, scores[indices])
     return Tracks(
-        chosen.ids,
+        published.ids,
         detections,
         velocities,
-        chosen.moving,
+        published.moving,
         covariances,
-        side * chosen.means[:, 5],
-        chosen.height_variances,
+        side * published.means[:, 5],
+        published.height_variances,
         seen[indices],
-        chosen.ages,
+        published.ages,
     )
 
 

@@ -20,15 +20,15 @@ class Trails:
     def __call__(self, tracks: Tracks, pose: np.ndarray, stamp_ns: int, seconds: float) -> list[np.ndarray]:
         """Return the trail of each of K tracks over the last `seconds`.
 
-        A trail is an array (N, 3) float64 with N from 1 to TRAIL_POINTS, oldest position first and
-        the current one last, thinned so that it covers the whole time. A track that is missing
-        from one call starts a new trail.
+        A trail is an array (N, 3) float64 of positions, oldest first and current last. It is
+        thinned to at most TRAIL_POINTS positions that cover the full time. A track that is missing
+        in one call starts a new trail.
 
         Args:
             tracks: K tracks.
-            pose: (4, 4) frame of the tracks, and of the trails, in a fixed frame.
-            stamp_ns: time of the tracks.
-            seconds: length of a trail.
+            pose: (4, 4) pose, in a fixed frame, of the frame of the tracks and trails.
+            stamp_ns: Time of the tracks.
+            seconds: Duration of a trail.
         """
         length = int(seconds * 1e9)
         oldest, min_gap = stamp_ns - length, length // (TRAIL_POINTS + 1)  # + 1 allows for uneven frame times
@@ -42,8 +42,8 @@ class Trails:
                 trail.pop()  # drop the last position if it came too soon after the previous one
             trail.append((stamp_ns, centre))
             self._trails[number] = trail
-        back = np.linalg.inv(pose)
+        from_fixed_frame = np.linalg.inv(pose)
         return [
-            np.array([position for _, position in trail]) @ back[:3, :3].T + back[:3, 3]
+            np.array([position for _, position in trail]) @ from_fixed_frame[:3, :3].T + from_fixed_frame[:3, 3]
             for trail in self._trails.values()
         ]
