@@ -24,15 +24,20 @@ def to_detection_array(
     """Build a Detection3DArray of boxes (K, 7) [x y z l w h yaw], with one hypothesis each.
 
     Args:
-        ids: K ids, as for markers; default: 0..K-1.
-        covariances: (K, 6, 6) of x, y, z and the rotations about them, in metres and radians;
-            default: zeros, which mean "unknown", as in sensor_msgs/Imu.
+        boxes: (K, 7) boxes.
+        labels: K class names.
+        scores: K scores.
+        header: Header of the array and of each detection.
+        make: Function that creates messages, see msg_utils.
+        ids: K ids as for markers, by default 0..K-1.
+        covariances: (K, 6, 6) pose covariances of x, y, z, roll, pitch, yaw in metres and radians.
+            By default zeros, which mean "unknown", as in sensor_msgs/Imu.
     """
     detections = []
     boxes = np.asarray(boxes, float).reshape(-1, 7)
     ids = range(len(boxes)) if ids is None else ids
-    spread = np.zeros((len(boxes), 36)) if covariances is None else covariances.reshape(-1, 36)
-    for i, box, label, score, square in zip(ids, boxes, labels, scores, spread, strict=True):
+    covariance_rows = np.zeros((len(boxes), 36)) if covariances is None else covariances.reshape(-1, 36)
+    for i, box, label, score, covariance in zip(ids, boxes, labels, scores, covariance_rows, strict=True):
         pose, (length, width, height) = make_box_pose(box, make), map(float, box[3:6])
         hypothesis = make("vision_msgs/msg/ObjectHypothesis", class_id=label, score=float(score))
         detections.append(
@@ -44,7 +49,7 @@ def to_detection_array(
                     make(
                         "vision_msgs/msg/ObjectHypothesisWithPose",
                         hypothesis=hypothesis,
-                        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=square),
+                        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
                     )
                 ],
                 bbox=make(
@@ -58,28 +63,28 @@ def to_detection_array(
 
 
 def from_detection_array(msg: Any) -> MarkedObjects:
-    """Return the objects of a Detection3DArray, each with its most likely class.
+    """Convert a Detection3DArray to objects, each with its most likely class.
 
-    If the ids in the message are not unique numbers, ids are 0..K-1, and the original ids, which
-    may be any text, are "id" in extras.
+    If the ids in the message are not unique numbers, the objects get the ids 0..K-1, and extras
+    contain the original ids (any text) as "id".
     """
     boxes, labels, scores = [], [], []
-    for d in msg.detections:
-        p, s = d.bbox.center.position, d.bbox.size
-        boxes.append([p.x, p.y, p.z, s.x, s.y, s.z, compute_yaw(d.bbox.center)])
-        best = max(d.results, key=lambda r: r.hypothesis.score, default=None)
-        labels.append(best.hypothesis.class_id if best else "")
-        scores.append(best.hypothesis.score if best else 1.0)
-    names = [d.id for d in msg.detections]
-    numbered = all(n.isascii() and n.isdigit() and len(n) < 19 for n in names) and len(set(map(int, names))) == len(
-        names
-    )
-    extras = [{"id": n} if n and not numbered else {} for n in names]
+    for detection in msg.detections:
+        position, size = detection.bbox.center.position, detection.bbox.size
+        boxes.append([position.x, position.y, position.z, size.x, size.y, size.z, compute_yaw(detection.bbox.center)])
+        best_result = max(detection.results, key=lambda r: r.hypothesis.score, default=None)
+        labels.append(best_result.hypothesis.class_id if best_result else "")
+        scores.append(best_result.hypothesis.score if best_result else 1.0)
+    names = [detection.id for detection in msg.detections]
+    has_numeric_ids = all(name.isascii() and name.isdigit() and len(name) < 19 for name in names) and len(
+        set(map(int, names))
+    ) == len(names)
+    extras = [{"id": name} if name and not has_numeric_ids else {} for name in names]
     return MarkedObjects(
         np.array(boxes, float).reshape(-1, 7),
         labels,
         np.array(scores, float),
-        np.array(names if numbered else range(len(names)), np.int64),
+        np.array(names if has_numeric_ids else range(len(names)), np.int64),
         extras,
         [],
         to_ns(msg.header.stamp),

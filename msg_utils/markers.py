@@ -1,10 +1,10 @@
-"""Conversion between labelled boxes and visualization_msgs/MarkerArray, exact in both directions.
+"""Lossless conversion between labelled boxes and visualization_msgs/MarkerArray.
 
 Each box is a CUBE marker: pose and scale are the box, ns is the label, text is a JSON object with
-the score and other fields. An object without a 3D box (KITTI's DontCare) is the text of a DELETE
-marker, which is not drawn. Each array deletes the markers of the previous array that it does not
-contain, so that none becomes stale or flickers. An array without objects has one DELETE marker, so
-that it has a header.
+the score and other fields. An object without a 3D box (KITTI's DontCare) is stored as the text of a
+DELETE marker, which is not drawn. Each array deletes the markers of the previous array that it does
+not contain, so that no marker becomes stale or flickers. An array without objects has one DELETE
+marker, which carries the header.
 """
 
 from __future__ import annotations
@@ -37,9 +37,15 @@ OTHER_COLOR = (0.6, 0.6, 0.6)
 class MarkedObjects:
     """Objects of a message.
 
-    boxes (K, 7) float64 [x y z l w h yaw]; labels: K strings; scores (K,) float64; ids (K,) int.
-    extras: K JSON objects, including the score if there is one.
-    notes: (label, JSON object) of objects without a 3D box.
+    Attributes:
+        boxes: (K, 7) float64 [x y z l w h yaw].
+        labels: K class names.
+        scores: (K,) float64.
+        ids: (K,) int.
+        extras: K JSON objects, including the score if there is one.
+        notes: (label, JSON object) of each object without a 3D box.
+        stamp_ns: Stamp of the message.
+        frame_id: Frame of the message.
     """
 
     boxes: np.ndarray
@@ -56,9 +62,10 @@ class MarkedObjects:
 
 
 class MarkerRow(NamedTuple):
-    """The fields of a marker that differ between the markers of an array.
+    """Fields of a marker that differ between the markers of an array.
 
-    quaternion: (z, w) of the rotation about z. scale: x, y, z. points: (N, 3) metres.
+    `quaternion` is (z, w) of a rotation about z, `scale` is x, y, z in metres, and `points` is (N,
+    3) in metres.
     """
 
     ns: str
@@ -74,7 +81,7 @@ class MarkerRow(NamedTuple):
 
 
 class MarkerRows(NamedTuple):
-    """A MarkerArray as rows with a common header; functions of this module read it as a message."""
+    """MarkerArray as rows with a common header; functions of this module accept it as a message."""
 
     rows: Sequence[MarkerRow]
     header: Any
@@ -96,31 +103,31 @@ def make_marker_rows(
     previous: Iterable[tuple[str, int]] = (),
     color: tuple[float, float, float] | None = None,
 ) -> list[MarkerRow]:
-    """Return the markers of K boxes; for the arguments see to_marker_array."""
-    rows, shown = [], set()
-    numbers = np.asarray(boxes, np.float64).reshape(-1, 7).tolist()
-    ids = range(len(numbers)) if ids is None else ids
-    for i, (box, label, number) in enumerate(zip(numbers, labels, map(int, ids), strict=True)):
+    """Make the markers of K boxes; for the arguments see to_marker_array."""
+    rows, added_keys = [], set()
+    box_rows = np.asarray(boxes, np.float64).reshape(-1, 7).tolist()
+    ids = range(len(box_rows)) if ids is None else ids
+    for i, (box, label, marker_id) in enumerate(zip(box_rows, labels, map(int, ids), strict=True)):
         content = dict(extras[i]) if extras is not None else {}
         if scores is not None:
             content["score"] = float(scores[i])
-        half = box[6] / 2
+        half_yaw = box[6] / 2
         rows.append(
             MarkerRow(
                 label,
-                number,
+                marker_id,
                 ADD,
                 CUBE,
                 json.dumps(content) if content else "",
                 box[:3],
-                (math.sin(half), math.cos(half)),
+                (math.sin(half_yaw), math.cos(half_yaw)),
                 box[3:6],
                 (*(color or COLORS.get(label, OTHER_COLOR)), 0.4),
             )
         )
-        shown.add((label, number))
+        added_keys.add((label, marker_id))
     rows += [MarkerRow(label, -1 - i, DELETE, text=json.dumps(content)) for i, (label, content) in enumerate(notes)]
-    rows += [MarkerRow(label, number, DELETE) for label, number in sorted(set(previous) - shown)]
+    rows += [MarkerRow(label, marker_id, DELETE) for label, marker_id in sorted(set(previous) - added_keys)]
     return rows or [MarkerRow("", 0, DELETE)]
 
 
@@ -137,28 +144,33 @@ def to_marker_array(
     """Build a MarkerArray of K boxes.
 
     Args:
+        boxes: (K, 7) [x y z l w h yaw].
+        labels: K class names, used as namespaces.
+        scores: K scores, or None.
+        header: Header of all markers.
+        make: Function that creates messages, see msg_utils.
+        lifetime_ns: Lifetime of the markers, 0 for no limit.
         ids: K ids, by default 0..K-1.
         extras: K dicts for the texts.
-        notes: (label, content) of objects without a 3D box.
-        previous: list_marker_keys() of the previous array.
-        color: (r, g, b) in place of the labels' colours.
-        lifetime_ns: 0 for no limit.
+        notes: (label, content) of each object without a 3D box.
+        previous: Result of list_marker_keys() for the previous array.
+        color: (r, g, b) that replaces the colours of the labels.
     """
     return rows_to_message(make_marker_rows(boxes, labels, scores, **more), header, make, lifetime_ns)
 
 
 def rows_to_message(rows: Iterable[MarkerRow], header: Any, make: Any, lifetime_ns: int = 0) -> Any:
-    """Build a MarkerArray of rows."""
+    """Build a MarkerArray from rows."""
 
-    def vector(kind: str, numbers: Sequence[float]) -> Any:
+    def make_vector(kind: str, numbers: Sequence[float]) -> Any:
         x, y, z = map(float, numbers)
         return make(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
     lifetime, markers = make_duration(lifetime_ns, make), []
     for row in rows:
         (z, w), (r, g, b, a) = row.quaternion, row.color
-        turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
-        points = [] if row.points is None else [vector("Point", point) for point in row.points]
+        orientation = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
+        points = [] if row.points is None else [make_vector("Point", point) for point in row.points]
         markers.append(
             make(
                 "visualization_msgs/msg/Marker",
@@ -170,8 +182,10 @@ def rows_to_message(rows: Iterable[MarkerRow], header: Any, make: Any, lifetime_
                 lifetime=lifetime,
                 text=row.text,
                 points=points,
-                pose=make("geometry_msgs/msg/Pose", position=vector("Point", row.position), orientation=turn),
-                scale=vector("Vector3", row.scale),
+                pose=make(
+                    "geometry_msgs/msg/Pose", position=make_vector("Point", row.position), orientation=orientation
+                ),
+                scale=make_vector("Vector3", row.scale),
                 color=make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=a),
             )
         )
@@ -179,7 +193,7 @@ def rows_to_message(rows: Iterable[MarkerRow], header: Any, make: Any, lifetime_
 
 
 def from_marker_array(msg: Any) -> MarkedObjects:
-    """Return the objects of a MarkerArray (message or MarkerRows) of any node that sends CUBEs."""
+    """Convert the CUBE markers of a MarkerArray (message or MarkerRows) of any node to objects."""
     cubes = [m for m in msg.markers if m.action == ADD and m.type == CUBE]
     extras = [_parse_text(m.text) for m in cubes]
     scores = [_read_score(content) for content in extras]
@@ -199,37 +213,38 @@ def from_marker_array(msg: Any) -> MarkedObjects:
 
 
 def find_header(msg: Any) -> Any | None:
-    """Return the header of the first CUBE of a MarkerArray, else of the first marker, else None.
+    """Return the header of a MarkerArray, None if it is empty.
 
-    A DELETEALL marker may have no header.
+    It is taken from the first CUBE marker if there is one, otherwise from the first marker, because
+    a DELETEALL marker may have no header.
     """
     if isinstance(msg, MarkerRows):
         return msg.header
     cubes = (m for m in msg.markers if m.action == ADD and m.type == CUBE)
-    found = next(cubes, next(iter(msg.markers), None))
-    return None if found is None else found.header
+    first_marker = next(cubes, next(iter(msg.markers), None))
+    return None if first_marker is None else first_marker.header
 
 
 def list_marker_keys(array: Any) -> frozenset[tuple[str, int]]:
-    """Return (ns, id) of the markers that a MarkerArray, or its rows, adds.
+    """Return (ns, id) of each marker that an array, or its rows, adds.
 
-    This is `previous` of the next array.
+    Pass the result as `previous` when you build the next array.
     """
     return frozenset((m.ns, int(m.id)) for m in getattr(array, "markers", array) if m.action == ADD)
 
 
 def make_box_pose(box: np.ndarray, make: Any) -> Any:
-    """Build the geometry_msgs/Pose of the centre and yaw of a box (7,)."""
-    half = float(box[6]) / 2
+    """Build the geometry_msgs/Pose of a box (7,) from its centre and yaw."""
+    half_yaw = float(box[6]) / 2
     return make(
         "geometry_msgs/msg/Pose",
         position=make("geometry_msgs/msg/Point", x=float(box[0]), y=float(box[1]), z=float(box[2])),
-        orientation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half)),
+        orientation=make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half_yaw), w=math.cos(half_yaw)),
     )
 
 
 def compute_yaw(pose: Any) -> float:
-    """Return the rotation about z of a geometry_msgs/Pose, in radians."""
+    """Compute the yaw angle of a geometry_msgs/Pose, in radians."""
     q = pose.orientation
     return math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
 
@@ -243,7 +258,7 @@ def _read_box(m: Any) -> list[float]:
 
 
 def _read_score(content: dict[str, Any]) -> float:
-    """Return the score; 1 if it is missing or not a number that float64 can hold."""
+    """Return the score; 1 if it is missing or not a number in the range of float64."""
     score = content.get("score")
     try:
         return float(score) if isinstance(score, int | float) else 1.0

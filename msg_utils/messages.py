@@ -1,4 +1,4 @@
-"""Message classes of the ROS 2 installation, by name."""
+"""Access to the message classes of the ROS 2 installation by name."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ import numpy as np
 def load_message_class(type_name: str) -> type[Any]:
     """Load a message class by name, such as 'sensor_msgs/msg/PointCloud2'.
 
-    Raises ModuleNotFoundError if the package is not installed.
+    Raises:
+        ModuleNotFoundError: The message package is not installed.
     """
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
 
 def make_ros_message(type_name: str, /, **fields: Any) -> Any:
-    """Make a message of rclpy's class.
+    """Make a message of an rclpy class.
 
-    NumPy arrays are converted to array.array, whose values the setters do not check one by one.
+    NumPy arrays are converted to array.array, because the setters do not check each of its values.
     """
     for name, value in fields.items():
         if isinstance(value, np.ndarray):

@@ -1,6 +1,6 @@
 """Conversion between sensor_msgs/PointCloud2 and NumPy structured arrays.
 
-Field order, padding, datatypes, counts, byte order and row padding may be arbitrary.
+Clouds may have any field order, padding, datatypes, counts, byte order and row padding.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ class CloudError(ValueError):
 
 
 def compute_dtype(msg: Any) -> np.dtype:
-    """Return the structured dtype of a cloud's points, with point_step as itemsize.
+    """Return the structured dtype of a cloud's points; its itemsize is point_step.
 
-    Fields without a name are padding.
+    Fields without a name are treated as padding.
 
     Raises:
-        CloudError: unknown datatype, field that extends beyond point_step, duplicate name, or
-            point_step above MAX_STEP.
+        CloudError: A datatype is unknown, a field extends beyond point_step, a name is duplicate,
+            or point_step is above MAX_STEP.
     """
     if msg.point_step > MAX_STEP:
         raise CloudError(f"point_step = {msg.point_step} is more than {MAX_STEP} bytes a point; the message is broken")
@@ -57,7 +57,7 @@ def to_array(msg: Any) -> np.ndarray:
     The result is a read-only view of the message's buffer, or a copy if rows are padded.
 
     Raises:
-        CloudError: the buffer is too short for height, width and the steps.
+        CloudError: The buffer is too short for height, width, point_step and row_step.
     """
     count = msg.height * msg.width
     if count == 0:
@@ -65,49 +65,49 @@ def to_array(msg: Any) -> np.ndarray:
     if msg.point_step == 0:
         raise CloudError(f"point_step is 0 for {count} points; the message is broken")
     dtype = compute_dtype(msg)
-    data, row = np.frombuffer(msg.data, np.uint8), msg.width * msg.point_step
-    step = compute_row_step(msg)
-    if step < row:
-        raise CloudError(f"row_step = {step} is less than width x point_step = {row}")
-    needed = (msg.height - 1) * step + row
-    if len(data) < needed:
+    data, row_bytes = np.frombuffer(msg.data, np.uint8), msg.width * msg.point_step
+    row_step = compute_row_step(msg)
+    if row_step < row_bytes:
+        raise CloudError(f"row_step = {row_step} is less than width x point_step = {row_bytes}")
+    required_bytes = (msg.height - 1) * row_step + row_bytes
+    if len(data) < required_bytes:
         raise CloudError(
             f"data has {len(data)} bytes where height {msg.height} x width "
-            f"{msg.width} x point_step {msg.point_step} needs {needed}; "
+            f"{msg.width} x point_step {msg.point_step} needs {required_bytes}; "
             "the message was cut"
         )
-    rows = np.ndarray((msg.height, msg.width), dtype, data, strides=(step, msg.point_step))
+    rows = np.ndarray((msg.height, msg.width), dtype, data, strides=(row_step, msg.point_step))
     rows.flags.writeable = False
     return rows.reshape(count)
 
 
 def compute_row_step(msg: Any) -> int:
-    """Return the number of bytes from one row of a cloud to the next.
+    """Return the distance in bytes between two rows of a cloud.
 
-    Some drivers send a row_step of 0, or of the whole cloud, for rows without padding.
+    Some drivers set row_step to 0 or to the size of the cloud; their rows have no padding.
     """
-    row, step = msg.width * msg.point_step, msg.row_step
-    whole = msg.height * row
-    is_whole_cloud = step == whole <= len(msg.data) < (msg.height - 1) * whole + row
-    return int(row if msg.height <= 1 or step == 0 or is_whole_cloud else step)
+    row_bytes, row_step = msg.width * msg.point_step, msg.row_step
+    cloud_bytes = msg.height * row_bytes
+    is_cloud_size = row_step == cloud_bytes <= len(msg.data) < (msg.height - 1) * cloud_bytes + row_bytes
+    return int(row_bytes if msg.height <= 1 or row_step == 0 or is_cloud_size else row_step)
 
 
 def read_columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     """Return the named fields as (N, len(names)) float32.
 
     Raises:
-        CloudError: a field is missing, or has several numbers per point.
+        CloudError: A field is missing or has several numbers per point.
     """
     for name in names:
         if name not in (points.dtype.names or ()):
             raise CloudError(f"the cloud has no field '{name}'; it has {', '.join(points.dtype.names or ()) or 'none'}")
         if points.dtype[name].shape:
             raise CloudError(f"field '{name}' has count > 1; a single number is needed")
-    out = np.empty((len(points), len(names)), np.float32)
+    columns = np.empty((len(points), len(names)), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes inf
         for i, name in enumerate(names):
-            out[:, i] = points[name]
-    return out
+            columns[:, i] = points[name]
+    return columns
 
 
 def read_xyz(points: np.ndarray) -> np.ndarray:
@@ -116,21 +116,21 @@ def read_xyz(points: np.ndarray) -> np.ndarray:
     Raises:
         CloudError: x, y or z is missing or not a floating-point field.
     """
-    out = read_columns(points, ("x", "y", "z"))
+    xyz = read_columns(points, ("x", "y", "z"))
     for name in "xyz":
         if points.dtype[name].kind != "f":
             raise CloudError(f"field '{name}' is of type {points.dtype[name]}; metres as float32 or float64 are needed")
-    return out
+    return xyz
 
 
 def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1, is_dense: bool = True) -> Any:
-    """Build a PointCloud2 from a structured array (N,) of any layout; N is a multiple of height."""
+    """Build a PointCloud2 from a structured array (N,); N must be a multiple of height."""
     width = len(points) // height
     if width * height != len(points):
         raise ValueError(f"{len(points)} points cannot be split into {height} rows")
     data = np.ascontiguousarray(points).view(np.uint8).reshape(-1)
-    orders = {points.dtype[n].base.byteorder for n in points.dtype.names or ()} - {"|"}
-    if len(orders) > 1:
+    byte_orders = {points.dtype[n].base.byteorder for n in points.dtype.names or ()} - {"|"}
+    if len(byte_orders) > 1:
         raise ValueError("fields of both byte orders cannot be in one cloud")
     return _make_cloud(
         header,
@@ -140,7 +140,7 @@ def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1, i
         height=height,
         width=width,
         point_step=points.dtype.itemsize,
-        is_bigendian=">" in orders,
+        is_bigendian=">" in byte_orders,
         is_dense=is_dense,
     )
 
@@ -165,38 +165,46 @@ def make_point_fields(dtype: np.dtype, make: Any) -> list[Any]:
 
 
 def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
-    """Return the cloud with additional fields, each (height * width,) of a PointField datatype.
+    """Return the cloud with additional fields.
 
-    A field of the same name and datatype is overwritten. The bytes of other fields, the shape,
-    density and byte order do not change. Offsets of new fields are multiples of their size.
+    A field with the same name and datatype is overwritten. The bytes of other fields, height,
+    width, is_dense and the byte order do not change. The offset of a new field is a multiple of its
+    size.
+
+    Args:
+        msg: The PointCloud2.
+        make: Function that creates messages, see msg_utils.
+        new: Values (height * width,) of each field, of a PointField datatype.
     """
-    old = to_array(msg)
-    order: Literal[">", "<"] = ">" if msg.is_bigendian else "<"
+    points = to_array(msg)
+    byte_order: Literal[">", "<"] = ">" if msg.is_bigendian else "<"
     fields, offset = list(msg.fields), msg.point_step
     names = {f.name: f for f in fields}
-    places = {}
+    layout = {}
     for name, values in new.items():
-        kind = np.dtype(values.dtype).newbyteorder(order)
+        kind = np.dtype(values.dtype).newbyteorder(byte_order)
         code = CODES[f"{kind.kind}{kind.itemsize}"]
-        known = names.get(name)
-        if known is not None and known.datatype == code and known.count <= 1:
-            places[name] = (known.offset, kind)
+        existing = names.get(name)
+        if existing is not None and existing.datatype == code and existing.count <= 1:
+            layout[name] = (existing.offset, kind)
             continue
         fields = [f for f in fields if f.name != name]
         offset = -(-offset // kind.itemsize) * kind.itemsize  # aligned as in C structs
         fields.append(make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code, count=1))
-        places[name] = (offset, kind)
+        layout[name] = (offset, kind)
         offset += kind.itemsize
     # A step that is a multiple of 4 bytes keeps float fields aligned in every point.
-    step = offset if offset == msg.point_step else -(-offset // 4) * 4
-    data = np.zeros((len(old), step), np.uint8)
-    if len(old):
-        raw = np.frombuffer(msg.data, np.uint8)
-        if (step_in := compute_row_step(msg)) != msg.width * msg.point_step:
-            raw = np.ndarray((msg.height, msg.width * msg.point_step), np.uint8, raw, strides=(step_in, 1)).reshape(-1)
-        data[:, : msg.point_step] = raw[: len(old) * msg.point_step].reshape(-1, msg.point_step)
-        for name, (at, kind) in places.items():
-            np.ndarray(len(old), kind, data, offset=at, strides=(step,))[:] = new[name]
+    point_step = offset if offset == msg.point_step else -(-offset // 4) * 4
+    data = np.zeros((len(points), point_step), np.uint8)
+    if len(points):
+        source_bytes = np.frombuffer(msg.data, np.uint8)
+        if (source_row_step := compute_row_step(msg)) != msg.width * msg.point_step:
+            source_bytes = np.ndarray(
+                (msg.height, msg.width * msg.point_step), np.uint8, source_bytes, strides=(source_row_step, 1)
+            ).reshape(-1)
+        data[:, : msg.point_step] = source_bytes[: len(points) * msg.point_step].reshape(-1, msg.point_step)
+        for name, (field_offset, kind) in layout.items():
+            np.ndarray(len(points), kind, data, offset=field_offset, strides=(point_step,))[:] = new[name]
     return _make_cloud(
         msg.header,
         make,
@@ -204,7 +212,7 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
         data.reshape(-1),
         height=msg.height,
         width=msg.width,
-        point_step=step,
+        point_step=point_step,
         is_bigendian=msg.is_bigendian,
         is_dense=msg.is_dense,
     )

@@ -13,7 +13,7 @@ from lidar_perception.data.bag_metadata import LATCHED_QOS
 from lidar_perception.data.storage import Stream, Topic
 from lidar_perception.wire.clouds import LIVOX
 from lidar_perception.wire.codec import load_typestore
-from lidar_perception.wire.livox import livox_ros1_to_cdr
+from lidar_perception.wire.livox import convert_livox_ros1_to_cdr
 
 MAGIC = b"#ROSBAG V"
 SUFFIX = ".bag"
@@ -54,7 +54,7 @@ class Ros1File:
         }
         for topic in self.topics:
             if topic.type in LIVOX:  # slow in rosbags, which converts point by point
-                self.converters[topic.id] = livox_ros1_to_cdr
+                self.converters[topic.id] = convert_livox_ros1_to_cdr
         self.times = (self.reader.start_time, self.reader.end_time - 1) if self.reader.message_count else None
 
     def close(self) -> None:

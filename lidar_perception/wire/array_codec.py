@@ -1,6 +1,6 @@
-"""CDR of arrays of boxes and markers, encoded without message objects, ten times as fast.
+"""Encoding of box and marker arrays to CDR without message objects, which is ten times as fast.
 
-The bytes are equal to rclpy's for the same messages, but padding, which it leaves undefined, is 0.
+The bytes are the same as from rclpy, except that padding, which rclpy leaves undefined, is 0.
 """
 
 from __future__ import annotations
@@ -26,34 +26,35 @@ NO_MESH = 2 * EMPTY_STRING + LENGTH.pack(0) + b"\0"
 
 
 def encode_markers(rows: Sequence[MarkerRow], header: Any, lifetime_ns: int = 0) -> bytes:
-    """Return the CDR of the visualization_msgs/MarkerArray of rows.
+    """Encode rows as a visualization_msgs/MarkerArray in CDR.
 
     Args:
-        header: message with `stamp` and `frame_id`.
-        lifetime_ns: 0 for no limit.
+        rows: Markers of the array.
+        header: std_msgs/Header of all markers.
+        lifetime_ns: Lifetime of the markers, 0 for no limit.
     """
-    out, head = bytearray(LENGTH.pack(len(rows))), _header(header)
+    buffer, header_bytes = bytearray(LENGTH.pack(len(rows))), _encode_header(header)
     lifetime = divmod(lifetime_ns, SECOND_NS)
     for row in rows:
-        _align(out, 4)
-        out += head
-        _add_string(out, row.ns)
-        _align(out, 4)
-        out += IDS.pack(row.id, row.type, row.action)
-        _align(out, 8)
-        out += BODY.pack(*row.position, 0.0, 0.0, *row.quaternion, *row.scale, *row.color, *lifetime, False)
-        _align(out, 4)
+        _align(buffer, 4)
+        buffer += header_bytes
+        _add_string(buffer, row.ns)
+        _align(buffer, 4)
+        buffer += IDS.pack(row.id, row.type, row.action)
+        _align(buffer, 8)
+        buffer += BODY.pack(*row.position, 0.0, 0.0, *row.quaternion, *row.scale, *row.color, *lifetime, False)
+        _align(buffer, 4)
         if row.points is None or not len(row.points):
-            out += LENGTH.pack(0)
+            buffer += LENGTH.pack(0)
         else:
-            out += LENGTH.pack(len(row.points))
-            _align(out, 8)
-            out += np.asarray(row.points, "<f8").tobytes()
-        out += NO_TEXTURE
-        _add_string(out, row.text)
-        _align(out, 4)
-        out += NO_MESH
-    return ENCAPSULATION + bytes(out)
+            buffer += LENGTH.pack(len(row.points))
+            _align(buffer, 8)
+            buffer += np.asarray(row.points, "<f8").tobytes()
+        buffer += NO_TEXTURE
+        _add_string(buffer, row.text)
+        _align(buffer, 4)
+        buffer += NO_MESH
+    return ENCAPSULATION + bytes(buffer)
 
 
 def encode_detection_array(
@@ -65,42 +66,46 @@ def encode_detection_array(
     ids: Iterable[int] | None = None,
     covariances: np.ndarray | None = None,
 ) -> bytes:
-    """Return the CDR of the vision_msgs/Detection3DArray of boxes; the arguments are those of
-    msg_utils.detections.to_detection_array."""
-    head = _header(header)
-    numbers = np.asarray(boxes, float).reshape(-1, 7).tolist()
-    out = bytearray(head)
-    _align(out, 4)
-    out += LENGTH.pack(len(numbers))
-    spread = np.zeros((len(numbers), 36)) if covariances is None else np.asarray(covariances, "<f8").reshape(-1, 36)
-    for i, box, label, score, square in zip(
-        range(len(numbers)) if ids is None else ids, numbers, labels, scores, spread, strict=True
+    """Encode boxes as a vision_msgs/Detection3DArray in CDR.
+
+    The arguments are those of msg_utils.detections.to_detection_array.
+    """
+    header_bytes = _encode_header(header)
+    box_rows = np.asarray(boxes, float).reshape(-1, 7).tolist()
+    buffer = bytearray(header_bytes)
+    _align(buffer, 4)
+    buffer += LENGTH.pack(len(box_rows))
+    covariance_rows = (
+        np.zeros((len(box_rows), 36)) if covariances is None else np.asarray(covariances, "<f8").reshape(-1, 36)
+    )
+    for i, box, label, score, covariance in zip(
+        range(len(box_rows)) if ids is None else ids, box_rows, labels, scores, covariance_rows, strict=True
     ):
-        half = box[6] / 2
-        pose = POSE.pack(*box[:3], 0.0, 0.0, math.sin(half), math.cos(half))
-        _align(out, 4)
-        out += head
-        _align(out, 4)
-        out += LENGTH.pack(1)
-        _add_string(out, label)
-        _align(out, 8)
-        out += NUMBER.pack(score) + pose + square.tobytes()
-        out += pose + SIZE.pack(*box[3:6])
-        _add_string(out, str(int(i)))
-    return ENCAPSULATION + bytes(out)
+        half_yaw = box[6] / 2
+        pose = POSE.pack(*box[:3], 0.0, 0.0, math.sin(half_yaw), math.cos(half_yaw))
+        _align(buffer, 4)
+        buffer += header_bytes
+        _align(buffer, 4)
+        buffer += LENGTH.pack(1)
+        _add_string(buffer, label)
+        _align(buffer, 8)
+        buffer += NUMBER.pack(score) + pose + covariance.tobytes()
+        buffer += pose + SIZE.pack(*box[3:6])
+        _add_string(buffer, str(int(i)))
+    return ENCAPSULATION + bytes(buffer)
 
 
-def _header(header: Any) -> bytes:
-    out = bytearray(STAMP.pack(header.stamp.sec, header.stamp.nanosec))
-    _add_string(out, header.frame_id)
-    return bytes(out)
+def _encode_header(header: Any) -> bytes:
+    buffer = bytearray(STAMP.pack(header.stamp.sec, header.stamp.nanosec))
+    _add_string(buffer, header.frame_id)
+    return bytes(buffer)
 
 
-def _add_string(out: bytearray, text: str) -> None:
-    _align(out, 4)
+def _add_string(buffer: bytearray, text: str) -> None:
+    _align(buffer, 4)
     data = text.encode()
-    out += LENGTH.pack(len(data) + 1) + data + b"\0"
+    buffer += LENGTH.pack(len(data) + 1) + data + b"\0"
 
 
-def _align(out: bytearray, size: int) -> None:
-    out += bytes(-len(out) % size)
+def _align(buffer: bytearray, size: int) -> None:
+    buffer += bytes(-len(buffer) % size)

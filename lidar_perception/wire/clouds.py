@@ -1,4 +1,4 @@
-"""Messages with a point cloud: PointCloud2, CompressedPointCloud2 and Livox CustomMsg."""
+"""Reading of point cloud messages: PointCloud2, CompressedPointCloud2 and Livox CustomMsg."""
 
 from __future__ import annotations
 
@@ -37,9 +37,10 @@ DRIVER_BY_PACKAGE = {
 
 
 def decode_cloud(data: bytes, kind: str) -> Any:
-    """Decode a cloud message of one of CLOUD_TYPES in CDR; return a PointCloud2 of rosbags' class.
+    """Decode a cloud message in CDR, of one of CLOUD_TYPES, to a PointCloud2 (class of rosbags).
 
-    Raises InputError if the message is damaged or its compression is not supported.
+    Raises:
+        InputError: The message is damaged, or its compression is not supported.
     """
     if kind in LIVOX:
         return decode_livox(data)
@@ -48,9 +49,12 @@ def decode_cloud(data: bytes, kind: str) -> Any:
 
 
 def check_readable(data: bytes, kind: str) -> None:
-    """Raise InputError if the compression of a cloud message is not supported.
+    """Check that the compression of a cloud message is supported.
 
-    Damaged messages are reported by decode_cloud.
+    Damaged messages are accepted here; decode_cloud reports them.
+
+    Raises:
+        InputError: The compression is not supported.
     """
     if kind == COMPRESSED:
         try:
@@ -63,16 +67,20 @@ def check_readable(data: bytes, kind: str) -> None:
 def find_cloud_topics(topics: Mapping[str, str]) -> list[str]:
     """Return the sorted names of the cloud topics, without compressed copies such as /points/zlib.
 
-    topics: types by name.
+    Args:
+        topics: Message type of each topic.
     """
     clouds = {topic for topic, kind in topics.items() if kind in CLOUD_TYPES}
     return sorted(topic for topic in clouds if topics[topic] != COMPRESSED or topic.rpartition("/")[0] not in clouds)
 
 
 def diagnose_packets(topics: Mapping[str, str]) -> str | None:
-    """Explain, with the remedy, that a topic has sensor packets or an unsupported scan type.
+    """Return an error message for a topic with raw sensor packets or an unsupported scan type.
 
-    topics: types by name. None if there is no such topic.
+    The message includes the remedy. Returns None if there is no such topic.
+
+    Args:
+        topics: Message type of each topic.
     """
     for topic, kind in sorted(topics.items()):
         package, _, name = kind.replace("/msg/", "/").partition("/")

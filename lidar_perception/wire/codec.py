@@ -37,7 +37,7 @@ MORE_TYPES = {
 
 @functools.cache
 def load_typestore() -> Typestore:
-    """Return the typestore of ROS 2 Jazzy, extended by MORE_TYPES."""
+    """Return the rosbags typestore of ROS 2 Jazzy with MORE_TYPES added."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in MORE_TYPES.items():
         store.register(get_types_from_msg(text, name))
@@ -45,24 +45,27 @@ def load_typestore() -> Typestore:
 
 
 def bag_message(type_name: str, /, **fields: Any) -> Any:
-    """Make a message of rosbags' class; other fields are zero, empty or False."""
+    """Make a message of a rosbags class; fields that are not given are zero, empty or False."""
     names = {}
     for name, kind in load_typestore().fielddefs[type_name][1]:
-        names[name] = fields.pop(name) if name in fields else _zero(kind)
+        names[name] = fields.pop(name) if name in fields else _make_zero(kind)
     if fields:
         raise TypeError(f"{type_name} has no field {next(iter(fields))!r}")
     return load_typestore().types[type_name](**names)
 
 
 def encode(message: Any) -> bytes:
-    """Serialize a message of rosbags' class to CDR."""
+    """Serialize a message of a rosbags class to CDR."""
     return bytes(load_typestore().serialize_cdr(message, message.__msgtype__))
 
 
 def decode(data: bytes, type_name: str) -> Any:
-    """Deserialize CDR to a message of rosbags' class.
+    """Deserialize CDR to a message of a rosbags class.
 
-    Arrays in the message are views of `data`. Raises InputError if the data are damaged.
+    Arrays in the message are views of `data`.
+
+    Raises:
+        InputError: The data are damaged.
     """
     try:
         return load_typestore().deserialize_cdr(data, type_name)
@@ -70,7 +73,7 @@ def decode(data: bytes, type_name: str) -> Any:
         raise InputError(f"{len(data)} bytes are not a valid {type_name} ({error})") from None
 
 
-def _zero(kind: tuple[Any, Any]) -> Any:
+def _make_zero(kind: tuple[Any, Any]) -> Any:
     node, detail = kind
     if node == Nodetype.BASE:
         name = detail[0]
@@ -81,4 +84,4 @@ def _zero(kind: tuple[Any, Any]) -> Any:
     count = count if node == Nodetype.ARRAY else 0
     if element[0] == Nodetype.BASE and element[1][0] != "string":
         return np.zeros(count, element[1][0].replace("octet", "uint8"))
-    return [_zero(element) for _ in range(count)]
+    return [_make_zero(element) for _ in range(count)]

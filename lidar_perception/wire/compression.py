@@ -1,4 +1,4 @@
-"""Decompression with a limited size of the result, as a few bytes can expand to gigabytes."""
+"""Decompression with a size limit, because a few bytes can expand to gigabytes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ def decompress(data: bytes, compression: str, size: int | None) -> bytes:
     """Decompress data.
 
     Args:
+        data: Compressed bytes.
         compression: "" (none), "zstd", "lz4" (frames) or "zlib" (with a zlib or gzip header).
-        size: of the result, in bytes; None if unknown.
+        size: Size of the decompressed data in bytes, None if unknown.
 
     Raises:
-        ValueError: the result has another size or more than MAX_BYTES, the data are damaged, or the
-            compression is unknown.
+        ValueError: The result has a different size or more than MAX_BYTES, the data are damaged, or
+            the compression is unknown.
     """
     limit = MAX_BYTES if size is None else size
     if limit > MAX_BYTES:

@@ -24,12 +24,16 @@ FIXED_BYTES = 16  # size of the fields from timebase to rsvd
 
 
 def decode_livox(data: bytes) -> Any:
-    """Convert a CustomMsg in CDR to a PointCloud2 with all columns. InputError if damaged."""
+    """Convert a CustomMsg in CDR to a PointCloud2 with all fields.
+
+    Raises:
+        InputError: The message is damaged.
+    """
     try:
         order = "<" if data[1] & 1 else ">"
         seconds, nanoseconds, size = struct.unpack_from(f"{order}iII", data, 4)
         frame_id = bytes(data[16 : 16 + size]).rstrip(b"\0").decode(errors="replace")
-        offset = 4 + _aligned(12 + size) + FIXED_BYTES
+        offset = 4 + _align(12 + size) + FIXED_BYTES
         (count,) = struct.unpack_from(f"{order}I", data, offset)
         points = bytes(data[offset + 4 :])
     except (struct.error, IndexError) as error:
@@ -51,8 +55,12 @@ def decode_livox(data: bytes) -> Any:
     return from_array(np.frombuffer(points + b"\0", kind, count), header, bag_message)
 
 
-def livox_ros1_to_cdr(data: bytes) -> bytes:
-    """Convert a serialized ROS 1 CustomMsg to CDR. ValueError or struct.error if damaged."""
+def convert_livox_ros1_to_cdr(data: bytes) -> bytes:
+    """Convert a serialized ROS 1 CustomMsg to CDR.
+
+    Raises:
+        ValueError, struct.error: The message is damaged.
+    """
     (size,) = struct.unpack_from("<I", data, 12)  # follows seq and stamp in the header
     start = 16 + size
     (count,) = struct.unpack_from("<I", data, start + FIXED_BYTES)
@@ -61,10 +69,10 @@ def livox_ros1_to_cdr(data: bytes) -> bytes:
     padded[:, : PACKED.itemsize] = packed.view(np.uint8).reshape(count, PACKED.itemsize)
     head = data[4:12] + struct.pack("<I", size + 1) + data[16:start] + b"\0"
     return b"".join(
-        (b"\0\1\0\0", head.ljust(_aligned(len(head)), b"\0"), data[start : start + FIXED_BYTES + 4], padded.tobytes())
+        (b"\0\1\0\0", head.ljust(_align(len(head)), b"\0"), data[start : start + FIXED_BYTES + 4], padded.tobytes())
     )
 
 
-def _aligned(size: int) -> int:
+def _align(size: int) -> int:
     """Round up to a multiple of 8."""
     return -(-size // 8) * 8

@@ -34,34 +34,35 @@ def to_point_cloud(
     If the cloud has a column `in_view`, points where it is 0 are left out.
 
     Args:
-        intensity_max: value of a full reflection; 0: inferred by `scale`; None: do not read the
+        msg: The PointCloud2.
+        intensity_max: Intensity of a full reflection; 0: inferred by `scale`; None: do not read the
             intensity.
-        scale: infers the value of a full reflection from this cloud (infer_full_scale) or from a
-            stream of clouds (StreamScale).
+        scale: Function that infers the intensity of a full reflection, from this cloud
+            (infer_full_scale) or from a stream of clouds (StreamScale).
 
     Returns:
         The PointCloud, and the indices (N,) of its points in the message.
 
     Raises:
-        InputError: the cloud is malformed.
+        InputError: The cloud is malformed.
     """
     try:
         points = to_array(msg)
         indices = None
         if "in_view" in (points.dtype.names or ()):
-            indices = np.flatnonzero(_single(points, "in_view"))
+            indices = np.flatnonzero(_read_scalar_field(points, "in_view"))
             points = points.take(indices)
         coordinates = read_xyz(points)
         raw = None if intensity_max is None else _read_raw_intensity(points)
     except CloudError as error:
         raise InputError(str(error)) from None
     intensity = None if raw is None else to_unit(raw[0], intensity_max or scale(*raw))
-    usable = usable_returns(coordinates)
-    if not usable.all():
-        kept = np.flatnonzero(usable)
-        indices = kept if indices is None else indices.take(kept)
-        coordinates = coordinates.take(kept, axis=0)
-        intensity = None if intensity is None else intensity.take(kept)
+    is_usable = usable_returns(coordinates)
+    if not is_usable.all():
+        usable_indices = np.flatnonzero(is_usable)
+        indices = usable_indices if indices is None else indices.take(usable_indices)
+        coordinates = coordinates.take(usable_indices, axis=0)
+        intensity = None if intensity is None else intensity.take(usable_indices)
     cloud = PointCloud(coordinates, intensity, to_ns(msg.header.stamp), msg.header.frame_id)
     return cloud, np.arange(len(points)) if indices is None else indices
 
@@ -72,13 +73,13 @@ def _read_raw_intensity(points: np.ndarray) -> tuple[np.ndarray, np.dtype] | Non
 
 
 def read_raw_intensity(msg: Any) -> tuple[np.ndarray, np.dtype] | None:
-    """Read the intensities of all points of a PointCloud2 as the driver wrote them.
+    """Read the unscaled intensities of all points of a PointCloud2.
 
     Returns:
-        The values (N,) float32 and their dtype in the message; None without such a field.
+        The values (N,) float32 and their dtype in the message; None without an intensity field.
 
     Raises:
-        InputError: the cloud is malformed.
+        InputError: The cloud is malformed.
     """
     try:
         return _read_raw_intensity(to_array(msg))
@@ -87,11 +88,13 @@ def read_raw_intensity(msg: Any) -> tuple[np.ndarray, np.dtype] | None:
 
 
 def diagnose_recorded_intensity(source: Any, clouds: Sequence[PointCloud]) -> str | None:
-    """Describe an implausible intensity scale of a recording, with the remedy, or return None.
+    """Return a message with the remedy if the intensity scale of a recording is implausible.
+
+    Returns None if it is plausible.
 
     Args:
-        source: name of the recording.
-        clouds: a sample of its clouds.
+        source: Name of the recording.
+        clouds: Sample of its clouds.
     """
     intensities = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
     problem = find_scale_problem(np.concatenate(intensities)) if intensities else None
@@ -99,34 +102,35 @@ def diagnose_recorded_intensity(source: Any, clouds: Sequence[PointCloud]) -> st
 
 
 def scatter_values(values: np.ndarray | int, indices: np.ndarray, msg: Any, dtype: str) -> np.ndarray:
-    """Return a column for all points of a cloud, with values (N,) at indices (N,), 0 elsewhere."""
+    """Return a column for all points of a cloud with `values` (N,) at `indices` (N,), otherwise 0."""
     column = np.zeros(msg.height * msg.width, dtype)
     column[indices] = values
     return column
 
 
 def read_column(msg: Any, name: str, indices: np.ndarray) -> np.ndarray | None:
-    """Return the values (N,) of a field at indices (N,); None if the cloud has no such field.
+    """Read the values (N,) of a field at indices (N,); None if the cloud has no such field.
 
-    Raises InputError if the field has several numbers per point.
+    Raises:
+        InputError: The field has several numbers per point.
     """
     points = to_array(msg)
-    return _single(points, name).take(indices) if name in (points.dtype.names or ()) else None
+    return _read_scalar_field(points, name).take(indices) if name in (points.dtype.names or ()) else None
 
 
 def make_xyz_cloud(msg: Any, xyz: np.ndarray, indices: np.ndarray, make: Any) -> Any:
-    """Make a PointCloud2 with float32 fields x, y, z, and intensity if `msg` has one.
+    """Make a PointCloud2 with float32 fields x, y, z, and intensity if `msg` has it.
 
     Args:
-        msg: cloud that gives the header and the intensity.
+        msg: Cloud from which the header and the intensity are copied.
         xyz: (M, 3) coordinates of the new points.
-        indices: (M,) indices of these points in `msg`, where their intensity is read.
-        make: creates messages, see msg_utils.messages.
+        indices: (M,) indices of these points in `msg`, to read their intensity.
+        make: Function that creates messages, see msg_utils.
     """
     names = to_array(msg).dtype.names or ()
     fields = {axis: xyz[:, i] for i, axis in enumerate("xyz")}
     for name in [n for n in INTENSITY_FIELDS if n in names][:1]:
-        fields["intensity"] = _single(to_array(msg), name).take(indices)
+        fields["intensity"] = _read_scalar_field(to_array(msg), name).take(indices)
     points = np.empty(len(xyz), [(name, "<f4") for name in fields])
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf
         for name, values in fields.items():
@@ -135,29 +139,33 @@ def make_xyz_cloud(msg: Any, xyz: np.ndarray, indices: np.ndarray, make: Any) ->
 
 
 def read_cluster_ids(msg: Any, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Read the column `cluster_id` of a cloud, written by any clustering.
+    """Read the column `cluster_id` of a cloud; any clustering node may have written it.
 
     Returns:
-        Labels (N,) int32 of the points at indices (N,), 0 for noise and 1..K, and the ids (K,)
-            int64 of these clusters in the message (see groups.renumber_ids). None if the message
-            has no such column.
+        Labels (N,) int32 of the points at indices (N,): 0 for noise, 1..K for clusters; and the ids
+        (K,) int64 of these clusters in the message (see groups.renumber_ids). None if the message
+        has no such column.
 
     Raises:
-        InputError: the column does not hold ids.
+        InputError: The column does not contain ids.
     """
     ids = read_column(msg, "cluster_id", indices)
     return None if ids is None else renumber_ids(ids)
 
 
-def _single(points: np.ndarray, name: str) -> np.ndarray:
-    """Return the values (N,) of a field; raise InputError if it has several numbers per point."""
+def _read_scalar_field(points: np.ndarray, name: str) -> np.ndarray:
+    """Return the values (N,) of a field.
+
+    Raises:
+        InputError: The field has several numbers per point.
+    """
     if points.dtype[name].shape:
         raise InputError(f"field '{name}' has count > 1; it must have one number per point")
     return points[name]
 
 
 def read_calibration(info: Any, transform: Any) -> Calibration:
-    """Return the calibration of a camera from its CameraInfo and its extrinsics.
+    """Read the calibration of a camera from its CameraInfo and its extrinsics.
 
     Args:
         info: sensor_msgs/CameraInfo.
@@ -182,9 +190,10 @@ def read_calibration(info: Any, transform: Any) -> Calibration:
 
 
 def make_calibration(info: Any, lidar_to_camera: np.ndarray) -> Calibration:
-    """Return the calibration from CameraInfo and the pose (4, 4) of the LiDAR in the camera frame.
+    """Make the calibration from CameraInfo and the pose (4, 4) of the LiDAR in the camera frame.
 
-    Raises InputError if P is empty.
+    Raises:
+        InputError: P is empty.
     """
     intrinsics = np.asarray(info.p, float).reshape(3, 4)
     if intrinsics[0, 0] <= 0 or info.width == 0 or info.height == 0:
@@ -211,7 +220,7 @@ def make_camera_info(calibration: Calibration, header: Any, make: Any) -> Any:
 
 
 def make_extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
-    """Make a TransformStamped: the pose of the camera frame in the LiDAR frame of `header`."""
+    """Make a TransformStamped with the pose of the camera in the LiDAR frame named in `header`."""
     rotation, translation = calibration.pose
     x, y, z = map(float, translation)
     qx, qy, qz, qw = map(float, rotation)
@@ -228,19 +237,22 @@ def make_extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
 
 
 def make_truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()) -> Any:
-    """Make the MarkerArray of labels; `previous` is as in to_marker_array.
+    """Make the MarkerArray of labels; for `previous` see to_marker_array.
 
-    Marker ids are track ids if these are unique. Unknown classes keep their names (see to_truth).
+    Marker ids are the track ids if these are unique. Unknown classes keep their names (see
+    to_truth).
     """
     labels = [str(extra.get("class_name", label)) for label, extra in zip(truth.labels, truth.extras)]
-    tracks: list[Any] = [extra.get("track_id") for extra in truth.extras]
-    unique = all(t is not None and 0 <= t < MAX_ID for t in tracks) and len(set(zip(labels, tracks))) == len(tracks)
+    track_ids: list[Any] = [extra.get("track_id") for extra in truth.extras]
+    has_unique_ids = all(t is not None and 0 <= t < MAX_ID for t in track_ids) and len(
+        set(zip(labels, track_ids))
+    ) == len(track_ids)
     return to_marker_array(
         truth.boxes,
         labels,
         header=header,
         make=make,
-        ids=tracks if unique else None,
+        ids=track_ids if has_unique_ids else None,
         extras=truth.extras,
         notes=truth.notes,
         previous=previous,
@@ -274,14 +286,15 @@ def to_detections(objects: MarkedObjects) -> Detections:
 def make_detection_rows(
     detections: Detections, previous: Any = (), clusters: np.ndarray | None = None
 ) -> list[MarkerRow]:
-    """Return the markers of K detections.
+    """Make the markers of K detections.
 
-    The text of each marker is JSON with the id, the probabilities by source, and `cluster_id`, as
-    marker ids have only 32 bits.
+    The text of each marker is JSON with the id, the probabilities by source, and `cluster_id`,
+    which does not fit into the 32 bits of a marker id.
 
     Args:
-        previous: as in to_marker_array.
-        clusters: (K,) ids in the column `cluster_id` of the cloud, if each detection is a cluster.
+        detections: The detections.
+        previous: See to_marker_array.
+        clusters: (K,) ids in the column `cluster_id` of the cloud if the detections are clusters.
     """
     labels = [CLASSES[i] for i in detections.class_ids]
     texts: list[dict[str, Any]] = [{"id": i} for i in range(len(detections))]
@@ -310,7 +323,7 @@ def make_detection_markers(
 
 
 def make_odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -> Any:
-    """Make a nav_msgs/Odometry: the pose (4, 4) of `moving_frame` in the frame of `header`."""
+    """Make a nav_msgs/Odometry with the pose (4, 4) of `moving_frame` in the frame of `header`."""
     x, y, z = map(float, pose[:3, 3])
     qx, qy, qz, qw = map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
     position = make("geometry_msgs/msg/Point", x=x, y=y, z=z)

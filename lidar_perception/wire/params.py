@@ -9,7 +9,7 @@ from lidar_perception.param_fields import Params, param
 
 @dataclass(frozen=True)
 class InputParams(Params):
-    """Reading of the fields of a cloud."""
+    """Interpretation of the fields of a cloud."""
 
     intensity_max: float = param(
         0.0,

@@ -1,4 +1,4 @@
-"""Measurement times of the points of a cloud, from the time column of its driver."""
+"""Measurement times of a cloud's points, read from the time column of the sensor driver."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class PointTimes(NamedTuple):
     """Measurement times of N points.
 
     Attributes:
-        name: name of the column.
-        seconds: (N,) float64, relative to the stamp of the cloud; NaN where the driver wrote NaN.
-        at_stamp: value of the column for a point measured at the stamp.
+        name: Name of the column.
+        seconds: (N,) float64 time relative to the stamp of the cloud; NaN if the driver wrote NaN.
+        at_stamp: Value of the column for a point that is measured at the stamp.
     """
 
     name: str
@@ -36,14 +36,15 @@ class PointTimes(NamedTuple):
 
 
 def read_point_times(msg: Any, indices: np.ndarray) -> PointTimes:
-    """Read the measurement times of the points (N,) of a PointCloud2 at indices (N,).
+    """Read the measurement times of the points of a PointCloud2 at indices (N,).
 
-    The unit (s, ms, us or ns) is inferred from the time span of the cloud, which is one turn of the
-    sensor. Times since 1970 are converted to times relative to the stamp. Zeros at other points
-    are ignored, as drivers write them for beams without return.
+    The unit (s, ms, us or ns) is inferred from the time span of the cloud, which is one sweep of
+    the sensor. Unix times are converted to times relative to the stamp. Zeros at other points are
+    ignored, because drivers write them for beams without a return.
 
     Raises:
-        InputError: there is no such column, no point has a time, or the times do not fit the stamp.
+        InputError: There is no time column, no point has a time, or the times are too far from the
+            stamp.
     """
     try:
         points = to_array(msg)
@@ -63,14 +64,14 @@ def read_point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     finite_values = values[finite.take(indices)]
     if not len(finite_values):
         raise InputError(f"all times in the column '{name}' are NaN or infinite")
-    counts = column != 0
-    counts[indices] = True
-    turn_values = column[counts & finite]
-    low, span = finite_values.min(), turn_values.max() - turn_values.min()
-    unit = LIVOX_UNIT_NS if (name, is_integer) == LIVOX_COLUMN else _unit_ns(float(span), is_integer, float(low))
+    is_measured = column != 0
+    is_measured[indices] = True
+    sweep_values = column[is_measured & finite]
+    low, span = finite_values.min(), sweep_values.max() - sweep_values.min()
+    unit = LIVOX_UNIT_NS if (name, is_integer) == LIVOX_COLUMN else _infer_unit_ns(float(span), is_integer, float(low))
     stamp = to_ns(msg.header.stamp)
-    since_stamp = abs(float(low)) * unit <= abs(float(low) * unit - stamp)
-    at_stamp = 0 if since_stamp else stamp // unit if is_integer else stamp / unit
+    is_relative = abs(float(low)) * unit <= abs(float(low) * unit - stamp)
+    at_stamp = 0 if is_relative else stamp // unit if is_integer else stamp / unit
     seconds = (values - at_stamp) * (unit * 1e-9)
     largest = max(float(np.nanmin(seconds)), float(np.nanmax(seconds)), key=abs)
     if abs(largest) > MAX_OFFSET_S:
@@ -81,11 +82,11 @@ def read_point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     return PointTimes(name, seconds, at_stamp)
 
 
-def _unit_ns(span: float, is_integer: bool, low: float) -> int:
-    """Infer the time unit in ns from the time span of one turn and the lowest time."""
-    since_1970 = next((unit for unit in reversed(UNITS_NS) if low * unit > SINCE_1970_NS), None)
-    if since_1970 is not None:
-        return since_1970
+def _infer_unit_ns(span: float, is_integer: bool, low: float) -> int:
+    """Infer the time unit in ns from the time span of one sweep and the lowest time."""
+    unix_unit = next((unit for unit in reversed(UNITS_NS) if low * unit > SINCE_1970_NS), None)
+    if unix_unit is not None:
+        return unix_unit
     for unit in UNITS_NS[2:] if is_integer else UNITS_NS:  # s and ms are too coarse as integers
         if SWEEP_S[0] <= span * unit * 1e-9 <= SWEEP_S[1]:
             return unit
@@ -95,45 +96,49 @@ def _unit_ns(span: float, is_integer: bool, low: float) -> int:
 def deskew_points(
     msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLookup
 ) -> tuple[np.ndarray, np.ndarray, PointTimes] | None:
-    """Correct the motion of the sensor: transform points to its pose at the stamp.
+    """Correct the motion of the sensor by transforming points to its pose at the stamp.
 
     Args:
         msg: PointCloud2 with a time column.
-        frame: N of its points.
+        frame: N points of this cloud.
         indices: (N,) indices of these points in `msg`.
-        poses: returns the poses (K, 4, 4) of the sensor in a fixed frame at times (K,) ns.
+        poses: Function that returns the poses (K, 4, 4) of the sensor in a fixed frame at times
+            (K,) in ns.
 
     Returns:
-        Indices (M,) into `frame` of the points with a time, their new coordinates (M, 3), and their
-        times. None if the frame is empty or all points were measured at the stamp.
+        Indices (M,) into `frame` of the points with a time, their corrected coordinates (M, 3), and
+        their times. None if the frame is empty or all points were measured at the stamp.
     """
     if not len(indices):
         return None
     times = read_point_times(msg, indices)
     if not times.seconds.any():
         return None
-    timed, xyz = np.flatnonzero(np.isfinite(times.seconds)), frame.xyz
-    if len(timed) < len(frame):
-        times = times._replace(seconds=times.seconds.take(timed))
-        xyz = xyz.take(timed, axis=0)
-    moved = deskew(
+    timed_indices, xyz = np.flatnonzero(np.isfinite(times.seconds)), frame.xyz
+    if len(timed_indices) < len(frame):
+        times = times._replace(seconds=times.seconds.take(timed_indices))
+        xyz = xyz.take(timed_indices, axis=0)
+    deskewed = deskew(
         xyz, times.seconds, lambda seconds: poses(frame.stamp_ns + np.rint(seconds * SECOND_NS).astype(np.int64))
     )
-    return timed, moved, times
+    return timed_indices, deskewed, times
 
 
 def deskew_frame(msg: Any, frame: PointCloud, indices: np.ndarray, poses: PoseLookup) -> PointCloud:
-    """Return the frame after motion correction, see deskew_points. Points without a time stay."""
+    """Return the frame after motion correction, see deskew_points.
+
+    Points without a time are not changed.
+    """
     if (deskewed_points := deskew_points(msg, frame, indices, poses)) is None:
         return frame
-    timed, moved, _ = deskewed_points
+    timed_indices, deskewed, _ = deskewed_points
     xyz = frame.xyz.copy()
-    xyz[timed] = moved
+    xyz[timed_indices] = deskewed
     return replace(frame, xyz=xyz)
 
 
-def replace_points(msg: Any, make: Any, indices: np.ndarray, moved: np.ndarray, times: PointTimes) -> Any:
-    """Return the message with new coordinates `moved` (N, 3) of the points at indices (N,).
+def replace_points(msg: Any, make: Any, indices: np.ndarray, coordinates: np.ndarray, times: PointTimes) -> Any:
+    """Return the message with new coordinates (N, 3) for the points at indices (N,).
 
     All times are set to the stamp, so that a second motion correction has no effect.
     """
@@ -141,7 +146,7 @@ def replace_points(msg: Any, make: Any, indices: np.ndarray, moved: np.ndarray, 
     columns = {}
     for axis, name in enumerate("xyz"):
         columns[name] = points[name].astype(points[name].dtype.newbyteorder("="))
-        columns[name][indices] = moved[:, axis]
-    kind = points[times.name].dtype.newbyteorder("=")
-    columns[times.name] = np.full(len(points), times.at_stamp, kind)
+        columns[name][indices] = coordinates[:, axis]
+    time_type = points[times.name].dtype.newbyteorder("=")
+    columns[times.name] = np.full(len(points), times.at_stamp, time_type)
     return add_columns(msg, make, **columns)

@@ -1,4 +1,4 @@
-"""Tracks as markers: boxes with stable ids, velocity arrows, labels and trails."""
+"""Markers of tracks: boxes with stable ids, velocity arrows, labels and trails."""
 
 from __future__ import annotations
 
@@ -27,19 +27,20 @@ def make_track_rows(
     extras: Sequence[dict[str, Any]] | None = None,
     previous: Iterable[tuple[str, int]] = (),
 ) -> list[MarkerRow]:
-    """Return the markers of K tracks.
+    """Make the markers of K tracks.
 
-    Boxes are as in make_detection_rows, with velocity, probability of motion and extras in their
-    texts. EXTRA_NAMESPACES have, with the same ids, an arrow to the position in one second, a label
-    with number and speed, and the trail.
+    The boxes are those of make_detection_rows; their texts also contain the velocity, the
+    probability of motion and the extras. Under the same ids, the namespaces EXTRA_NAMESPACES
+    contain an arrow to the position in one second, the trail, and a label with number and speed.
 
     Args:
         ids: (K,) track ids.
+        detections: Boxes, classes and scores of the tracks.
         velocities: (K, 2) m/s.
         moving: (K,) probabilities of motion.
-        trails: K arrays (N, 3) of past positions; those with one point are not drawn.
+        trails: K arrays (N, 3) of past positions; a trail with one point is not drawn.
         extras: K dicts to add to the texts.
-        previous: as in to_marker_array.
+        previous: See to_marker_array.
     """
     numbers: list[int] = (np.asarray(ids) % MAX_ID).tolist()
     labels, boxes = [CLASSES[i] for i in detections.class_ids], detections.boxes.astype(float)
@@ -53,7 +54,7 @@ def make_track_rows(
         for k, (i, velocity, p) in enumerate(zip(numbers, velocities, moving))
     ]
     tops = boxes[:, :3] + boxes[:, 5:6] / 2 * [[0.0, 0.0, 1.0]]
-    ahead = tops + np.pad(np.reshape(velocities, (-1, 2)), ((0, 0), (0, 1)))
+    arrow_tips = tops + np.pad(np.reshape(velocities, (-1, 2)), ((0, 0), (0, 1)))
     captions = (tops + [0.0, 0.0, 0.5]).tolist()
     extra_rows = []
     for k, (i, label, p, trail) in enumerate(zip(numbers, labels, moving, trails, strict=True)):
@@ -67,14 +68,21 @@ def make_track_rows(
         if has_arrow:
             extra_rows.append(
                 MarkerRow(
-                    VELOCITY, i, type=ARROW, scale=(0.1, 0.25, 0.3), color=color, points=np.stack([tops[k], ahead[k]])
+                    VELOCITY,
+                    i,
+                    type=ARROW,
+                    scale=(0.1, 0.25, 0.3),
+                    color=color,
+                    points=np.stack([tops[k], arrow_tips[k]]),
                 )
             )
         if len(trail) > 1:
             extra_rows.append(MarkerRow(TRAIL, i, type=LINE_STRIP, scale=(0.08, 0.0, 0.0), color=color, points=trail))
-    shown = list_marker_keys(extra_rows)
+    extra_keys = list_marker_keys(extra_rows)
     return (
-        make_marker_rows(boxes, labels, detections.scores, ids=numbers, extras=texts, previous=set(previous) - shown)
+        make_marker_rows(
+            boxes, labels, detections.scores, ids=numbers, extras=texts, previous=set(previous) - extra_keys
+        )
         + extra_rows
     )
 
@@ -98,7 +106,7 @@ def make_track_markers(
 
 
 def read_trails(msg: Any) -> dict[int, np.ndarray]:
-    """Return the trails (N, 3) float64 in a MarkerArray, by track id."""
+    """Read the trails (N, 3) float64 from a MarkerArray, by track id."""
     return {
         int(m.id): np.array([[p.x, p.y, p.z] for p in m.points], np.float64)
         for m in msg.markers

@@ -1,4 +1,4 @@
-"""Addition of TF and odometry messages to a transform tree."""
+"""Functions that add TF and odometry messages to a transform tree."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ MOVING, FIXED = "child_frame_id", "header.frame_id"
 
 
 def add_transforms(tree: TransformTree, msg: Any, static: bool) -> None:
-    """Add the valid transforms of a tf2_msgs/TFMessage, then raise InputError if one is invalid."""
+    """Add the valid transforms of a tf2_msgs/TFMessage.
+
+    Raises:
+        InputError: A transform is invalid; the valid ones are added nevertheless.
+    """
     problem = None
     for stamped in msg.transforms:
         t, q = stamped.transform.translation, stamped.transform.rotation
@@ -35,9 +39,10 @@ def add_transforms(tree: TransformTree, msg: Any, static: bool) -> None:
 
 
 def add_odometry(tree: TransformTree, msg: Any) -> None:
-    """Add a nav_msgs/Odometry to a separate tree: the pose of MOVING in FIXED at its stamp.
+    """Add a nav_msgs/Odometry to a separate tree, as the pose of MOVING in FIXED.
 
-    Raises InputError if the pose is invalid.
+    Raises:
+        InputError: The pose is invalid.
     """
     p, q = msg.pose.pose.position, msg.pose.pose.orientation
     tree.set(FIXED, MOVING, to_ns(msg.header.stamp), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))

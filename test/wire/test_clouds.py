@@ -22,7 +22,7 @@ from lidar_perception.wire.clouds import (
     find_cloud_topics,
 )
 from lidar_perception.wire.codec import MORE_TYPES, encode, load_typestore
-from lidar_perception.wire.livox import livox_ros1_to_cdr
+from lidar_perception.wire.livox import convert_livox_ros1_to_cdr
 from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.point_times import read_point_times
 from msg_utils.point_cloud2 import to_array
@@ -74,7 +74,7 @@ def test_livox_message_of_ros1_equals_that_of_ros2(frame_id, count):
     vars(message)["header"] = head
     data = bytes(store.serialize_ros1(message, LIVOX[1]))
     vars(message)["header"] = livox_message(points, frame_id=frame_id).header
-    cdr = livox_ros1_to_cdr(data)
+    cdr = convert_livox_ros1_to_cdr(data)
     assert cdr.rstrip(b"\0") == encode(message).rstrip(b"\0")
     assert same_points(decode_cloud(cdr, LIVOX[1]), points)
 
