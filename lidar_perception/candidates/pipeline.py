@@ -49,22 +49,22 @@ def segment_cloud(
     frame = as_point_cloud(cloud)
     check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
     cropped_indices, frame = crop_with_sensor_pose(frame, params.crop, params.ground.sensor_pose)
-    indices, visible = crop_to_view(frame, camera, params.view)
+    indices, view_cloud = crop_to_view(frame, camera, params.view)
     indices = cropped_indices.take(indices)
     t1 = perf_counter()
-    ground = segment_ground(visible, params.ground) if ground is None else np.asarray(ground, bool)[indices]
+    ground = segment_ground(view_cloud, params.ground) if ground is None else np.asarray(ground, bool)[indices]
     t2 = perf_counter()
     numbers = None
     if cluster_ids is None:
-        cluster_ids = cluster_obstacles(visible.xyz, ground, params.clustering)
+        cluster_ids = cluster_obstacles(view_cloud.xyz, ground, params.clustering)
     else:
         cluster_ids, numbers = renumber_ids(np.asarray(cluster_ids)[indices])
     t3 = perf_counter()
-    boxes = fit_grounded_boxes(visible.xyz, ground, cluster_ids, params.boxes)
+    boxes = fit_grounded_boxes(view_cloud.xyz, ground, cluster_ids, params.boxes)
     t4 = perf_counter()
     ms = dict(view=t1 - t0, ground=t2 - t1, clustering=t3 - t2, boxes=t4 - t3)
     return SegmentedCloud(
-        indices, visible.xyz, ground, cluster_ids, boxes, numbers, ms={k: v * 1e3 for k, v in ms.items()}
+        indices, view_cloud.xyz, ground, cluster_ids, boxes, numbers, ms={k: v * 1e3 for k, v in ms.items()}
     )
 
 

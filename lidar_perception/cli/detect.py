@@ -90,7 +90,7 @@ class Formats(click.ParamType):
     help="With --format mcap: write the clouds into the bag too.",
 )
 @click.option("--png", is_flag=True, help="Draw a picture of every frame, png/FRAME.png.")
-@out_file("--video", "Draw a film: .mp4 (the extra [video]), .gif or .webp.")
+@out_file("--video", "Draw a video: .mp4 (the extra [video]), .gif or .webp.")
 @click.option(
     "--color",
     type=Choice(["height", "intensity"]),
@@ -153,7 +153,7 @@ def detect(
     from lidar_perception.detecting.run import detect as run_detector
     from lidar_perception.detecting.run import make_header
     from lidar_perception.detectors.open import check_weights
-    from lidar_perception.rendering.files import check_film
+    from lidar_perception.rendering.files import check_video
     from lidar_perception.tracking.drive_tracker import choose_ego_source
 
     if dask and jobs > 1:
@@ -171,7 +171,7 @@ def detect(
         chosen = ["json"]
     count = min(len(recording), limit or len(recording))
     if video is not None:
-        check_film(video, count)
+        check_video(video, count)
     height = recording.frames[0].sensor_height
     for doubt in check_weights(Path(detector.weights), height):
         errors.print(doubt)

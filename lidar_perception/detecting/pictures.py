@@ -11,7 +11,7 @@ import numpy as np
 
 from lidar_perception.detecting.formats import Run
 from lidar_perception.detecting.results import FrameResult
-from lidar_perception.rendering.files import Film, open_film, read_png_note, write_png
+from lidar_perception.rendering.files import VideoFile, open_video, read_png_note, write_png
 from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
 
 LAST_PICTURE_S = 0.1  # duration of the last picture of a video
@@ -126,23 +126,25 @@ class VideoWriter:
 
     def __init__(self, run: Run, drawer: FrameDrawer, path: Path) -> None:
         self.drawer, self.path = drawer, path
-        self._writing: AbstractContextManager[Film] = open_film(path, drawer.size)
+        self._writing: AbstractContextManager[VideoFile] = open_video(path, drawer.size)
         self._last: tuple[int, np.ndarray] | None = None  # stamp and picture
 
     def __enter__(self) -> Self:
-        self.film = self._writing.__enter__()
+        self.video_file = self._writing.__enter__()
         return self
 
     def add(self, result: FrameResult) -> None:
         """Draw a frame and write the previous one, whose duration is now known."""
         picture, stamp_ns = self.drawer(result), result.frame.stamp_ns
         if self._last is not None:
-            self.film.add(self._last[1], float(np.clip((stamp_ns - self._last[0]) / 1e9, MIN_PICTURE_S, MAX_PICTURE_S)))
+            self.video_file.add(
+                self._last[1], float(np.clip((stamp_ns - self._last[0]) / 1e9, MIN_PICTURE_S, MAX_PICTURE_S))
+            )
         self._last = stamp_ns, picture
 
     def __exit__(self, *error: Any) -> None:
         try:
             if error[0] is None and self._last is not None:
-                self.film.add(self._last[1], LAST_PICTURE_S)
+                self.video_file.add(self._last[1], LAST_PICTURE_S)
         finally:
             self._writing.__exit__(*error)

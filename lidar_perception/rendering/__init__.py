@@ -1,1 +1,1 @@
-"""Pictures of clouds and boxes without a GPU or a browser: a small rasterizer in NumPy."""
+"""Rendering of clouds and boxes without a GPU or a browser, by a small rasterizer in NumPy."""

@@ -50,16 +50,22 @@ def color_by_intensity(intensity: np.ndarray) -> np.ndarray:
 
 
 def color_by_cluster(ground: np.ndarray, cluster_ids: np.ndarray) -> np.ndarray:
-    """Return colours (N, 3) uint8 by ground (N,) bool and cluster_ids (N,) int, 0 = none.
-    Consecutive ids have different colours."""
+    """Return colours (N, 3) uint8 for points of the ground and of clusters.
+
+    Consecutive cluster ids have different colours.
+
+    Args:
+        ground: (N,) bool mask of the ground points.
+        cluster_ids: (N,) int cluster of each point, 0 for none.
+    """
     colors = np.where(ground[:, None], GROUND_COLOR, UNCLUSTERED_COLOR)
-    clustered = (cluster_ids > 0) & ~ground
-    colors[clustered] = CLUSTER_COLORS[cluster_ids[clustered] * 7 % len(CLUSTER_COLORS)]
+    in_cluster = (cluster_ids > 0) & ~ground
+    colors[in_cluster] = CLUSTER_COLORS[cluster_ids[in_cluster] * 7 % len(CLUSTER_COLORS)]
     return colors
 
 
 def _interpolate(values: np.ndarray, stops: tuple[float, ...], colors: np.ndarray) -> np.ndarray:
-    """Interpolate between the colours at the stops, with a table of 256 values."""
+    """Interpolate between the colours (S, 3) at S stops, with a table of 256 values."""
     steps = np.linspace(stops[0], stops[-1], 256)
     table = np.stack([np.interp(steps, stops, colors[:, c]) for c in range(3)], axis=1)
     position = (np.asarray(values, np.float32) - stops[0]) / (stops[-1] - stops[0])

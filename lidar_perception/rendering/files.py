@@ -1,4 +1,4 @@
-"""Writing of pictures and films: PNG, GIF and WebP with Pillow, MP4 with PyAV (extra [video])."""
+"""Writing of pictures and videos: PNG, GIF and WebP with Pillow, MP4 with PyAV (extra [video])."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def write_png(path: Path, picture: np.ndarray, note: str = "") -> None:
 
 
 def read_png_note(path: Path) -> str | None:
-    """Return the note in a picture of write_png; None without one."""
+    """Return the note in a picture that write_png wrote; None if it has no note."""
     try:
         with Image.open(path) as image:
             return image.info.get(PNG_KEY)
@@ -45,18 +45,18 @@ def read_png_note(path: Path) -> str | None:
         return None
 
 
-class Film(Protocol):
-    """A film that is being written."""
+class VideoFile(Protocol):
+    """Video that is being written."""
 
     def add(self, picture: np.ndarray, seconds: float) -> None:
         """Add a picture (height, width, 3) uint8 that is shown for `seconds`."""
 
 
-def check_film(path: Path, count: int) -> None:
-    """Raise InputError if a film of `count` pictures cannot be written to a path."""
+def check_video(path: Path, count: int) -> None:
+    """Raise InputError if a video of `count` pictures cannot be written to a path."""
     if path.suffix not in (*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES):
         raise InputError(
-            f"{path} is not a film: its name must end in one of {', '.join((*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES))}"
+            f"{path} is not a video: its name must end in one of {', '.join((*VIDEO_SUFFIXES, *ANIMATION_SUFFIXES))}"
         )
     if path.suffix in VIDEO_SUFFIXES and importlib.util.find_spec("av") is None:
         raise InputError(
@@ -70,17 +70,18 @@ def check_film(path: Path, count: int) -> None:
 
 
 @contextmanager
-def open_film(path: Path, size: tuple[int, int]) -> Iterator[Film]:
-    """Open a film of pictures of a size (width, height) for writing. The file appears when it is
-    complete; without a picture there is none.
+def open_video(path: Path, size: tuple[int, int]) -> Iterator[VideoFile]:
+    """Open a video with pictures of a size (width, height) for writing.
+
+    The file appears when it is complete. No file is written if no picture is added.
 
     Raises:
-        InputError: the film cannot be written.
+        InputError: The video cannot be written.
     """
     partial = path.with_name(f".{path.stem}.incomplete{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        writer: Any = _Video(partial, size) if path.suffix in VIDEO_SUFFIXES else _Animation(partial)
+        writer: Any = _H264File(partial, size) if path.suffix in VIDEO_SUFFIXES else _AnimationFile(partial)
         yield writer
         if writer.ticks:
             writer.close()
@@ -91,8 +92,8 @@ def open_film(path: Path, size: tuple[int, int]) -> Iterator[Film]:
         partial.unlink(missing_ok=True)
 
 
-class _Video:
-    """H.264; width and height of its pictures are cut to even numbers."""
+class _H264File:
+    """H.264 video; pictures are cropped to an even width and height."""
 
     def __init__(self, path: Path, size: tuple[int, int]) -> None:
         import av
@@ -118,8 +119,8 @@ class _Video:
         self.container.close()
 
 
-class _Animation:
-    """GIF or WebP, which Pillow writes in one call."""
+class _AnimationFile:
+    """Animated GIF or WebP, which Pillow writes in one call."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.ticks = path, 0

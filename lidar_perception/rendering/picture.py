@@ -1,4 +1,4 @@
-"""The picture of a frame: perspective view on the left, bird's-eye view on the right."""
+"""Picture of a frame: perspective view on the left, bird's-eye view on the right."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ class Boxes:
 
     Attributes:
         boxes: (K, 7) [x y z l w h yaw].
-        class_ids: (K,).
+        class_ids: (K,) indices into CLASSES.
         texts: K short strings to write above the boxes, or empty.
-        trails: recent positions (N, 3) of each box, oldest first, or empty.
-        velocities: (K, 2) m/s, or (0, 2).
+        trails: Recent positions (N, 3) of each box, oldest first, or empty.
+        velocities: (K, 2) m/s; (0, 2) without arrows.
     """
 
     boxes: np.ndarray = field(default_factory=lambda: NO_BOXES)
@@ -61,14 +61,14 @@ class Boxes:
 
 @dataclass(frozen=True)
 class Stage:
-    """The settings shared by all pictures of a film.
+    """Settings shared by all pictures of a video.
 
     Attributes:
-        reach: range that is shown, metres from the sensor.
-        ahead: True to show the area ahead only, False for all around.
+        reach: Displayed range around the sensor, metres.
+        ahead: True to show only the area ahead of the sensor, False to show all around.
         ground: z of the ground at the sensor.
-        color: colour of the points, "height" or "intensity".
-        width, height: pixels.
+        color: Colour of the points, "height" or "intensity".
+        width, height: Size of a picture in pixels.
     """
 
     reach: float
@@ -82,30 +82,35 @@ class Stage:
     def of(
         scan: PointCloud, sensor_height: float, ahead: bool, color: str = "height", size: tuple[int, int] = (1280, 720)
     ) -> Stage:
-        """Return the stage for a film whose first scan is given."""
-        far = np.percentile(horizontal_range(scan.xyz), FAR_PERCENTILE) if len(scan) else MIN_RANGE
-        reach = float(np.clip(far, MIN_RANGE, MAX_RANGE_AHEAD if ahead else MAX_RANGE_AROUND))
+        """Choose the settings for a video, given its first scan."""
+        typical_range = np.percentile(horizontal_range(scan.xyz), FAR_PERCENTILE) if len(scan) else MIN_RANGE
+        reach = float(np.clip(typical_range, MIN_RANGE, MAX_RANGE_AHEAD if ahead else MAX_RANGE_AROUND))
         return Stage(reach, ahead, -sensor_height, color, *size)
 
     @property
     def views(self) -> tuple[Perspective, BirdsEye]:
-        """The left view, from behind the sensor, and the bird's-eye view."""
-        r, right = self.reach, round(self.width * BEV_SHARE)
-        left = self.width - right
+        """Perspective view from behind the sensor, and bird's-eye view."""
+        reach, right_width = self.reach, round(self.width * BEV_SHARE)
+        left_width = self.width - right_width
         if self.ahead:
-            behind = Perspective(
-                (-0.2 * r, -0.045 * r, 0.12 * r),
-                (0.24 * r, 0.01 * r, self.ground),
+            perspective = Perspective(
+                (-0.2 * reach, -0.045 * reach, 0.12 * reach),
+                (0.24 * reach, 0.01 * reach, self.ground),
                 FOV,
-                left,
+                left_width,
                 self.height,
-                POINT_SHARE * r,
+                POINT_SHARE * reach,
             )
-            return behind, BirdsEye((0.44 * r, 0.0), self.height / (1.14 * r), right, self.height)
-        behind = Perspective(
-            (-0.5 * r, -0.1 * r, 0.4 * r), (0.02 * r, 0.0, self.ground), FOV, left, self.height, POINT_SHARE * r
+            return perspective, BirdsEye((0.44 * reach, 0.0), self.height / (1.14 * reach), right_width, self.height)
+        perspective = Perspective(
+            (-0.5 * reach, -0.1 * reach, 0.4 * reach),
+            (0.02 * reach, 0.0, self.ground),
+            FOV,
+            left_width,
+            self.height,
+            POINT_SHARE * reach,
         )
-        return behind, BirdsEye((0.0, 0.0), self.height / (2.1 * r), right, self.height)
+        return perspective, BirdsEye((0.0, 0.0), self.height / (2.1 * reach), right_width, self.height)
 
     @property
     def rings(self) -> np.ndarray:
@@ -123,7 +128,7 @@ class Stage:
 def draw_frame(
     stage: Stage,
     scan: PointCloud,
-    found: Boxes,
+    boxes: Boxes,
     labels: np.ndarray = NO_BOXES,
     title: str = "",
     time: str = "",
@@ -132,33 +137,35 @@ def draw_frame(
     """Draw a frame as an image (height, width, 3) uint8 [r g b].
 
     Args:
-        found: boxes to draw.
+        stage: Settings of the picture.
+        scan: Cloud of N points.
+        boxes: Boxes to draw.
         labels: (L, 7) labelled boxes, drawn dashed.
-        title, time: texts at the top.
-        colors: (N, 3) uint8 colours of the points; None: those of the stage.
+        title, time: Texts at the top left and right.
+        colors: (N, 3) uint8 colours of the points; None to use those of the stage.
     """
-    scale = colors is None
-    colors = highlight_points(stage.colors(scan) if colors is None else colors, scan.xyz, found)
-    whole = Canvas(stage.width, stage.height, BACKGROUND)
-    column, texts = 0, _make_heading(stage, title, time)
+    with_scale = colors is None
+    colors = highlight_points(stage.colors(scan) if colors is None else colors, scan.xyz, boxes)
+    picture = Canvas(stage.width, stage.height, BACKGROUND)
+    left_column, texts = 0, _make_heading(stage, title, time)
     for view in stage.views:
         canvas = Canvas(view.width, view.height, BACKGROUND)
-        written = draw_view(canvas, view, stage, scan.xyz, colors, found, labels)
-        whole.paste(canvas, column, 0)
-        texts += [text.shift(column) for text in written]
-        column += view.width
-    left = stage.views[0].width
-    whole.draw_lines([[[left, 0], [left, stage.height]]], GRID, 1.5)
-    whole.draw_texts([*texts, *_draw_legend(whole, stage, found, labels, scale)])
-    return whole.pixels
+        view_texts = draw_view(canvas, view, stage, scan.xyz, colors, boxes, labels)
+        picture.paste(canvas, left_column, 0)
+        texts += [text.shift(left_column) for text in view_texts]
+        left_column += view.width
+    left_width = stage.views[0].width
+    picture.draw_lines([[[left_width, 0], [left_width, stage.height]]], GRID, 1.5)
+    picture.draw_texts([*texts, *_draw_legend(picture, stage, boxes, labels, with_scale)])
+    return picture.pixels
 
 
-def highlight_points(colors: np.ndarray, xyz: np.ndarray, found: Boxes) -> np.ndarray:
-    """Return the colours (N, 3) of points (N, 3), with light class colours for points in boxes."""
+def highlight_points(colors: np.ndarray, xyz: np.ndarray, boxes: Boxes) -> np.ndarray:
+    """Return colours (N, 3) in which points inside a box have a light version of its class colour."""
     colors = colors.copy()
-    rows, first = points_in_boxes(xyz, found.boxes, 0.1)
-    for k, class_id in enumerate(found.class_ids):
-        inside = rows[first[k] : first[k + 1]]
+    rows, first_rows = points_in_boxes(xyz, boxes.boxes, 0.1)
+    for k, class_id in enumerate(boxes.class_ids):
+        inside = rows[first_rows[k] : first_rows[k + 1]]
         colors[inside] = CLASS_SHARE * np.array(get_class_color(class_id)) + (1 - CLASS_SHARE) * 240
     return colors
 
@@ -169,70 +176,75 @@ def draw_view(
     stage: Stage,
     xyz: np.ndarray,
     colors: np.ndarray,
-    found: Boxes,
+    detections: Boxes,
     labels: np.ndarray = NO_BOXES,
 ) -> list[Text]:
-    """Draw points (N, 3) in colors (N, 3), boxes and labels in one view; return its texts."""
+    """Draw points (N, 3) with colors (N, 3), boxes and labels in one view.
+
+    Returns the texts to draw on top.
+    """
     texts = _draw_rings(canvas, view, stage)
     pixels, depth = view.project(xyz)
-    ahead = np.flatnonzero(depth > NEAR)
-    canvas.draw_points(pixels[ahead], depth[ahead], colors[ahead], view.radius(depth[ahead]))
+    in_front = np.flatnonzero(depth > NEAR)
+    canvas.draw_points(pixels[in_front], depth[in_front], colors[in_front], view.radius(depth[in_front]))
     _draw_sensor(canvas, view, stage)
-    tints = np.array([get_class_color(c) for c in found.class_ids], float).reshape(-1, 3)
-    boxes = found.boxes.astype(float)
-    _draw_trails(canvas, view, found, tints)
+    box_colors = np.array([get_class_color(c) for c in detections.class_ids], float).reshape(-1, 3)
+    boxes = detections.boxes.astype(float)
+    _draw_trails(canvas, view, detections, box_colors)
     _draw_edges(canvas, view, labels.astype(float), np.tile(LABEL, (len(labels), 1)), 1.2, dashed=True)
     faces = [(FLOOR, 0.25)] if isinstance(view, BirdsEye) else [*((face, 0.05) for face in OTHER_FACES), (FRONT, 0.3)]
-    ends, far = view.project(box_corners(boxes))
-    for k in np.flatnonzero((far > NEAR).all(axis=1)):
+    corner_pixels, corner_depths = view.project(box_corners(boxes))
+    for k in np.flatnonzero((corner_depths > NEAR).all(axis=1)):
         for face, alpha in faces:
-            canvas.fill_polygon(ends[k, face], tints[k], alpha)
-    _draw_edges(canvas, view, boxes, tints, 1.7)
-    _draw_arrows(canvas, view, found, tints)
-    return texts + _make_box_texts(view, found)
+            canvas.fill_polygon(corner_pixels[k, face], box_colors[k], alpha)
+    _draw_edges(canvas, view, boxes, box_colors, 1.7)
+    _draw_arrows(canvas, view, detections, box_colors)
+    return texts + _make_box_texts(view, detections)
 
 
 def _draw_rings(canvas: Canvas, view: View, stage: Stage) -> list[Text]:
-    """Draw range rings on the ground; return their texts."""
+    """Draw range rings on the ground; return their captions."""
     angles = np.linspace(0, 2 * np.pi, RING_POINTS)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(RING_POINTS)], axis=1)
     arcs = np.stack([circle[:-1], circle[1:]], axis=1)
     circles = stage.rings[:, None, None, None] * arcs + [0, 0, stage.ground]
     canvas.draw_lines(project_lines(view, circles.reshape(-1, 2, 3)), GRID, 1.2)
-    places = np.stack([stage.rings * 0.8, stage.rings * -0.6, np.full(len(stage.rings), stage.ground)], axis=1)
+    text_positions = np.stack([stage.rings * 0.8, stage.rings * -0.6, np.full(len(stage.rings), stage.ground)], axis=1)
     return [
-        Text(at, f"{radius:g} m", DIM, 11)
-        for at, far, radius in zip(*view.project(places), stage.rings)
-        if far > NEAR and _has_room(view, at)
+        Text(pixel, f"{radius:g} m", DIM, 11)
+        for pixel, depth, radius in zip(*view.project(text_positions), stage.rings)
+        if depth > NEAR and _has_room(view, pixel)
     ]
 
 
 def _draw_sensor(canvas: Canvas, view: View, stage: Stage) -> None:
-    """Draw an arrowhead at the sensor that points ahead."""
+    """Draw an arrowhead at the position of the sensor that points ahead."""
     size = 0.013 * stage.reach
     corners = np.array([[1.6, 0, 0], [-1, 1, 0], [-0.4, 0, 0], [-1, -1, 0]]) * size
-    ends, depth = view.project(corners + [0, 0, stage.ground])
-    if (depth > NEAR).all() and all(_has_room(view, end) for end in ends):
-        canvas.fill_polygon(ends[[0, 1, 2]], TEXT, 0.9)
-        canvas.fill_polygon(ends[[0, 2, 3]], TEXT, 0.7)
+    pixels, depth = view.project(corners + [0, 0, stage.ground])
+    if (depth > NEAR).all() and all(_has_room(view, end) for end in pixels):
+        canvas.fill_polygon(pixels[[0, 1, 2]], TEXT, 0.9)
+        canvas.fill_polygon(pixels[[0, 2, 3]], TEXT, 0.7)
 
 
-def _draw_trails(canvas: Canvas, view: View, found: Boxes, tints: np.ndarray) -> None:
-    """Draw the trails of tracks on the ground, older parts fainter."""
+def _draw_trails(canvas: Canvas, view: View, boxes: Boxes, box_colors: np.ndarray) -> None:
+    """Draw the trails of tracks on the ground; older parts are fainter."""
     lines, colors, alphas = [np.zeros((0, 2, 3))], [np.zeros((0, 3))], [np.zeros(0)]
-    for box, tint, trail in zip(found.boxes, tints, found.trails):
-        low = np.asarray(trail, float) - [0, 0, box[5] / 2]
-        lines.append(np.stack([low[:-1], low[1:]], axis=1))
-        colors.append(np.tile(tint, (len(low) - 1, 1)))
-        alphas.append(np.linspace(0.1, 0.9, len(low) - 1))
+    for box, box_color, trail in zip(boxes.boxes, box_colors, boxes.trails):
+        on_ground = np.asarray(trail, float) - [0, 0, box[5] / 2]
+        lines.append(np.stack([on_ground[:-1], on_ground[1:]], axis=1))
+        colors.append(np.tile(box_color, (len(on_ground) - 1, 1)))
+        alphas.append(np.linspace(0.1, 0.9, len(on_ground) - 1))
     canvas.draw_lines(project_lines(view, np.concatenate(lines)), np.concatenate(colors), 2.5, np.concatenate(alphas))
 
 
 def _draw_edges(
     canvas: Canvas, view: View, boxes: np.ndarray, colors: np.ndarray, width: float, dashed: bool = False
 ) -> None:
-    """Draw the edges of boxes (K, 7) in colors (K, 3). In the bird's-eye view: the bottom edges,
-    and a line from the centre to the front."""
+    """Draw the edges of boxes (K, 7) in colors (K, 3).
+
+    In the bird's-eye view, draw the bottom edges and a line from the centre to the front.
+    """
     corners = box_corners(boxes)
     if isinstance(view, BirdsEye):
         front = corners[:, [0, 3]].mean(axis=1)
@@ -244,50 +256,52 @@ def _draw_edges(
     canvas.draw_lines(project_lines(view, lines.reshape(-1, 2, 3)), colors, width, dashed=dashed)
 
 
-def _draw_arrows(canvas: Canvas, view: View, found: Boxes, tints: np.ndarray) -> None:
+def _draw_arrows(canvas: Canvas, view: View, boxes: Boxes, box_colors: np.ndarray) -> None:
     """Draw arrows from moving boxes to their positions after ARROW_S."""
-    speeds = np.hypot(*np.reshape(found.velocities, (-1, 2)).T)
-    moving = np.flatnonzero(speeds >= MIN_SPEED)
-    start, speed = found.boxes[moving, :3].astype(float), speeds[moving, None]
-    ahead = np.pad(found.velocities[moving] / speed, ((0, 0), (0, 1)))
-    sideways = ahead[:, [1, 0, 2]] * [-1, 1, 0]
-    end, size = start + ahead * speed * ARROW_S, np.minimum(0.8, 0.4 * speed)
+    speeds = np.hypot(*np.reshape(boxes.velocities, (-1, 2)).T)
+    moving_indices = np.flatnonzero(speeds >= MIN_SPEED)
+    start, speed = boxes.boxes[moving_indices, :3].astype(float), speeds[moving_indices, None]
+    direction = np.pad(boxes.velocities[moving_indices] / speed, ((0, 0), (0, 1)))
+    sideways = direction[:, [1, 0, 2]] * [-1, 1, 0]
+    end, head_length = start + direction * speed * ARROW_S, np.minimum(0.8, 0.4 * speed)
     lines = np.stack(
         [
             np.stack([start, end], axis=1),
-            *(np.stack([end, end - size * (ahead + 0.5 * side * sideways)], axis=1) for side in (-1, 1)),
+            *(np.stack([end, end - head_length * (direction + 0.5 * side * sideways)], axis=1) for side in (-1, 1)),
         ]
     )
-    canvas.draw_lines(project_lines(view, lines.reshape(-1, 2, 3)), np.tile(tints[moving], (3, 1)), 1.7)
+    canvas.draw_lines(project_lines(view, lines.reshape(-1, 2, 3)), np.tile(box_colors[moving_indices], (3, 1)), 1.7)
 
 
-def _make_box_texts(view: View, found: Boxes) -> list[Text]:
+def _make_box_texts(view: View, boxes: Boxes) -> list[Text]:
     """Return the texts of the boxes, placed above them in the picture."""
-    pixels, depth = view.project(box_corners(found.boxes.astype(float)))
+    pixels, depth = view.project(box_corners(boxes.boxes.astype(float)))
     return [
-        Text((ends[:, 0].mean(), ends[:, 1].min() - 2), text, get_class_color(class_id), 12, "mb")
-        for ends, far, text, class_id in zip(pixels, depth, found.texts, found.class_ids)
-        if text and (far > NEAR).all() and _has_room(view, ends.mean(axis=0))
+        Text((corners[:, 0].mean(), corners[:, 1].min() - 2), text, get_class_color(class_id), 12, "mb")
+        for corners, corner_depths, text, class_id in zip(pixels, depth, boxes.texts, boxes.class_ids)
+        if text and (corner_depths > NEAR).all() and _has_room(view, corners.mean(axis=0))
     ]
 
 
-def _has_room(view: View, at: np.ndarray) -> bool:
+def _has_room(view: View, pixel: np.ndarray) -> bool:
     """Return True if a text fits into the view at this pixel."""
-    return bool(12 <= at[0] < view.width - 12 and 0 <= at[1] < view.height)
+    return bool(12 <= pixel[0] < view.width - 12 and 0 <= pixel[1] < view.height)
 
 
 def _make_heading(stage: Stage, title: str, time: str) -> list[Text]:
-    left = stage.views[0].width
-    return [Text((16, 14), title, TEXT, 15, "lt"), Text((left - 16, 14), time, DIM, 15, "rt")]
+    left_width = stage.views[0].width
+    return [Text((16, 14), title, TEXT, 15, "lt"), Text((left_width - 16, 14), time, DIM, 15, "rt")]
 
 
-def _draw_legend(canvas: Canvas, stage: Stage, found: Boxes, labels: np.ndarray, scale: bool) -> list[Text]:
-    """Draw the colours of classes with their numbers of boxes, the line of labels, and the colour
-    scale of the points; return the texts."""
+def _draw_legend(canvas: Canvas, stage: Stage, boxes: Boxes, labels: np.ndarray, with_scale: bool) -> list[Text]:
+    """Draw the legend: classes with box counts, the dashed line of labels, and the colour scale.
+
+    Returns the texts to draw on top.
+    """
     items, x, y = [], 18.0, stage.height - 20.0
     entries = [
-        (f"{CLASSES[c]} {np.count_nonzero(found.class_ids == c)}", get_class_color(c), False)
-        for c in np.unique(found.class_ids).tolist()
+        (f"{CLASSES[c]} {np.count_nonzero(boxes.class_ids == c)}", get_class_color(c), False)
+        for c in np.unique(boxes.class_ids).tolist()
     ]
     if len(labels):
         entries.append((f"label {len(labels)}", LABEL, True))
@@ -295,15 +309,15 @@ def _draw_legend(canvas: Canvas, stage: Stage, found: Boxes, labels: np.ndarray,
         canvas.draw_lines([[[x, y], [x + 20, y]]], color, 3.0, dashed=dashed)
         items.append(Text((x + 27, y), text, TEXT, 14, "lm"))
         x += 50 + 8.2 * len(text)
-    if not scale:
+    if not with_scale:
         return items
-    right, top = stage.views[0].width - 80, int(y) - 4
+    scale_right, scale_top = stage.views[0].width - 80, int(y) - 4
     low, high, unit = (0, 1, "") if stage.color == "intensity" else (0, 4, " m")
     values = np.linspace(low, high, SCALE_WIDTH)
     bar = color_by_intensity(values) if stage.color == "intensity" else color_by_height(values)
-    canvas.pixels[top : top + 8, right - SCALE_WIDTH : right] = bar
+    canvas.pixels[scale_top : scale_top + 8, scale_right - SCALE_WIDTH : scale_right] = bar
     return [
         *items,
-        Text((right - SCALE_WIDTH - 6, y), f"{stage.color} {low}", DIM, 12, "rm"),
-        Text((right + 6, y), f"{high}{unit}", DIM, 12, "lm"),
+        Text((scale_right - SCALE_WIDTH - 6, y), f"{stage.color} {low}", DIM, 12, "rm"),
+        Text((scale_right + 6, y), f"{high}{unit}", DIM, 12, "lm"),
     ]

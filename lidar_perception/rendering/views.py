@@ -12,7 +12,7 @@ NEAR = 0.3  # near clipping distance in metres
 
 
 class View(Protocol):
-    """A projection onto an image of width x height pixels."""
+    """Projection onto an image of width x height pixels."""
 
     @property
     def width(self) -> int: ...
@@ -21,22 +21,25 @@ class View(Protocol):
     def height(self) -> int: ...
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return pixels (..., 2), column and row, and depths (...) of points (..., 3). Points with
-        a depth below NEAR cannot be drawn."""
+        """Project points (..., 3); return their pixels (..., 2) [column row] and depths (...).
+
+        Points with a depth below NEAR cannot be drawn.
+        """
 
     def radius(self, depth: np.ndarray) -> np.ndarray:
-        """Return the radius in pixels of points at these depths."""
+        """Return the radius in pixels of points at these depths (N,)."""
 
 
 @dataclass(frozen=True)
 class Perspective:
-    """A pinhole camera.
+    """Pinhole camera.
 
     Attributes:
-        eye, target: position and viewed point in the LiDAR frame, metres.
-        fov: horizontal field of view in degrees.
-        width, height: pixels.
-        point: radius of a point in metres.
+        eye: Position of the camera in the LiDAR frame, metres.
+        target: Point at the centre of the image, in the LiDAR frame, metres.
+        fov: Horizontal field of view in degrees.
+        width, height: Size of the image in pixels.
+        point: Radius of a point in metres.
     """
 
     eye: tuple[float, float, float]
@@ -53,7 +56,7 @@ class Perspective:
 
     @cached_property
     def axes(self) -> np.ndarray:
-        """(3, 3) columns right and down, scaled by the focal length, and ahead."""
+        """Camera axes (3, 3) as columns: right and down, scaled by the focal length, and forward."""
         ahead = np.subtract(self.target, self.eye)
         ahead /= np.linalg.norm(ahead)
         right = np.cross(ahead, [0.0, 0.0, 1.0])
@@ -62,9 +65,9 @@ class Perspective:
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         axes = self.axes
-        camera = xyz @ axes.astype(xyz.dtype) - (self.eye @ axes).astype(xyz.dtype)
-        depth = camera[..., 2]
-        pixels = camera[..., :2] / np.maximum(depth, NEAR)[..., None]
+        projected = xyz @ axes.astype(xyz.dtype) - (self.eye @ axes).astype(xyz.dtype)
+        depth = projected[..., 2]
+        pixels = projected[..., :2] / np.maximum(depth, NEAR)[..., None]
         pixels += np.array([self.width / 2, self.height / 2], xyz.dtype)
         return pixels, depth
 
@@ -74,12 +77,13 @@ class Perspective:
 
 @dataclass(frozen=True)
 class BirdsEye:
-    """Bird's-eye view, x up and y to the left.
+    """Bird's-eye view with x up and y to the left.
 
     Attributes:
-        centre: x and y in the middle of the image, metres.
-        scale: pixels per metre.
-        above: height of the eye in metres.
+        centre: x and y at the centre of the image, metres.
+        scale: Pixels per metre.
+        width, height: Size of the image in pixels.
+        above: Height of the eye in metres.
     """
 
     centre: tuple[float, float]
@@ -89,8 +93,8 @@ class BirdsEye:
     above: float = 1000.0
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        middle = [self.width / 2 + self.centre[1] * self.scale, self.height / 2 + self.centre[0] * self.scale]
-        pixels = np.array(middle, xyz.dtype) - xyz[..., 1::-1] * xyz.dtype.type(self.scale)
+        origin_pixel = [self.width / 2 + self.centre[1] * self.scale, self.height / 2 + self.centre[0] * self.scale]
+        pixels = np.array(origin_pixel, xyz.dtype) - xyz[..., 1::-1] * xyz.dtype.type(self.scale)
         return pixels, self.above - xyz[..., 2]
 
     def radius(self, depth: np.ndarray) -> np.ndarray:
@@ -98,13 +102,15 @@ class BirdsEye:
 
 
 def project_lines(view: View, lines: np.ndarray) -> np.ndarray:
-    """Project lines (S, 2, 3) to segments (S, 2, 2) in pixels, cut where they pass behind the eye;
-    NaN for lines behind it."""
+    """Project lines (S, 2, 3) to segments (S, 2, 2) in pixels.
+
+    Lines that pass behind the eye are cut; lines that are completely behind it are NaN.
+    """
     pixels, depth = view.project(lines)
-    behind = depth < NEAR
-    if behind.any():
-        share = (NEAR - depth[:, 0]) / np.where(behind.any(axis=1), depth[:, 1] - depth[:, 0], 1.0)
-        cut = lines[:, 0] + share[:, None] * (lines[:, 1] - lines[:, 0])
-        pixels = view.project(np.where(behind[..., None], cut[:, None], lines))[0]
-        pixels[behind.all(axis=1)] = np.nan
+    is_behind = depth < NEAR
+    if is_behind.any():
+        fraction = (NEAR - depth[:, 0]) / np.where(is_behind.any(axis=1), depth[:, 1] - depth[:, 0], 1.0)
+        near_points = lines[:, 0] + fraction[:, None] * (lines[:, 1] - lines[:, 0])
+        pixels = view.project(np.where(is_behind[..., None], near_points[:, None], lines))[0]
+        pixels[is_behind.all(axis=1)] = np.nan
     return pixels

@@ -1,1 +1,1 @@
-"""The sensor on its robot: crop, mounting, coordinate frames and motion correction."""
+"""Sensor on a robot: crop, mounting, coordinate frames and motion correction."""

@@ -1,4 +1,4 @@
-"""Motion correction: points of one sweep, measured one after the other, moved to one time."""
+"""Motion correction (deskewing): transforms the points of a sweep to a common time."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ PoseLookup = Callable[[np.ndarray], np.ndarray]
 
 
 def deskew(xyz: np.ndarray, seconds: np.ndarray, poses: PoseLookup) -> np.ndarray:
-    """Move points to the sensor's frame at the stamp. The work is linear in N.
+    """Transform points to the sensor's frame at the stamp. Run time is linear in N.
 
     Args:
         xyz: (N, 3) points, each in the sensor's frame at its own time; N may be 0.
-        seconds: (N,) time of each point after the stamp.
-        poses: motion of the sensor, looked up once for at most MAX_POSES times and the stamp.
+        seconds: (N,) time of each point, relative to the stamp.
+        poses: Motion of the sensor, called once with at most MAX_POSES times and the stamp.
 
     Returns:
         (N, 3) float32.
@@ -32,50 +32,53 @@ def deskew(xyz: np.ndarray, seconds: np.ndarray, poses: PoseLookup) -> np.ndarra
         return xyz
     low, high = float(seconds.min()), float(seconds.max())
     count = MAX_POSES if high > low else 1
-    found = poses(np.append(np.linspace(low, high, count), 0.0))
-    to_stamp = (invert_pose(found[-1]) @ found[:-1]).astype(np.float32)
-    which = np.zeros(len(xyz), np.intp)
+    sensor_poses = poses(np.append(np.linspace(low, high, count), 0.0))
+    to_stamp = (invert_pose(sensor_poses[-1]) @ sensor_poses[:-1]).astype(np.float32)
+    pose_index = np.zeros(len(xyz), np.intp)
     if count > 1:
-        which = np.rint((seconds - low) * ((count - 1) / (high - low))).astype(np.intp)
-    return np.einsum("nij,nj->ni", to_stamp[:, :3, :3].take(which, axis=0), xyz) + to_stamp[:, :3, 3].take(
-        which, axis=0
+        pose_index = np.rint((seconds - low) * ((count - 1) / (high - low))).astype(np.intp)
+    return np.einsum("nij,nj->ni", to_stamp[:, :3, :3].take(pose_index, axis=0), xyz) + to_stamp[:, :3, 3].take(
+        pose_index, axis=0
     )
 
 
 def skew(xyz: np.ndarray, seconds: np.ndarray, poses: PoseLookup) -> np.ndarray:
-    """Invert deskew: return (N, 3) float32, the points as a moving sensor reports them.
+    """Invert deskew: return the points (N, 3) float32 as a moving sensor measures them.
 
-    xyz (N, 3) are in the sensor's frame at the stamp; point i is measured at seconds[i].
+    Args:
+        xyz: (N, 3) points in the sensor's frame at the stamp.
+        seconds: (N,) time of each point, relative to the stamp.
+        poses: Motion of the sensor.
     """
 
     def invert_poses(at: np.ndarray) -> np.ndarray:
-        found = poses(at)
-        return invert_pose(invert_pose(found[-1]) @ found)
+        sensor_poses = poses(at)
+        return invert_pose(invert_pose(sensor_poses[-1]) @ sensor_poses)
 
     return deskew(xyz, seconds, invert_poses)
 
 
 def make_constant_motion(velocity: np.ndarray, rotation: np.ndarray) -> PoseLookup:
-    """Return the poses of a sensor that moves on an arc at constant speed.
+    """Make the motion of a sensor with a constant twist.
 
     velocity (3,) in m/s and rotation (3,) in rad/s are in the sensor's own frame, as in the twist
     of a nav_msgs/Odometry.
     """
     velocity, rotation = np.asarray(velocity, np.float64), np.asarray(rotation, np.float64)
 
-    def poses(at: np.ndarray) -> np.ndarray:
-        found = np.tile(np.eye(4), (len(at), 1, 1))
-        found[:, :3, :3] = Rotation.from_rotvec(at[:, None] * rotation).as_matrix()
-        found[:, :3, 3] = np.einsum("mij,j->mi", _mean_rotation(at, rotation), velocity) * at[:, None]
-        return found
+    def compute_poses(at: np.ndarray) -> np.ndarray:
+        matrices = np.tile(np.eye(4), (len(at), 1, 1))
+        matrices[:, :3, :3] = Rotation.from_rotvec(at[:, None] * rotation).as_matrix()
+        matrices[:, :3, 3] = np.einsum("mij,j->mi", _compute_mean_rotation(at, rotation), velocity) * at[:, None]
+        return matrices
 
-    return poses
+    return compute_poses
 
 
-def _mean_rotation(at: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Return (M, 3, 3) the mean rotation from 0 to each time of at (M,): SO(3)'s left Jacobian.
+def _compute_mean_rotation(at: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return the mean rotation (M, 3, 3) from 0 to each time of at (M,): the left Jacobian of SO(3).
 
-    It maps the velocity to the distance travelled divided by the time.
+    It maps the velocity to the mean velocity in the frame at time 0.
     """
     speed = float(np.linalg.norm(rotation))
     if speed == 0.0:
@@ -83,7 +86,7 @@ def _mean_rotation(at: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     x, y, z = rotation / speed
     axis = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     angle = np.where(np.abs(at * speed) < 1e-4, 1.0, at * speed)
-    small = np.abs(at * speed) < 1e-4
-    first = np.where(small, at * speed / 2, (1 - np.cos(angle)) / angle)
-    second = np.where(small, (at * speed) ** 2 / 6, 1 - np.sin(angle) / angle)
-    return np.eye(3) + first[:, None, None] * axis + second[:, None, None] * (axis @ axis)
+    is_small = np.abs(at * speed) < 1e-4
+    sine_factor = np.where(is_small, at * speed / 2, (1 - np.cos(angle)) / angle)
+    cross_factor = np.where(is_small, (at * speed) ** 2 / 6, 1 - np.sin(angle) / angle)
+    return np.eye(3) + sine_factor[:, None, None] * axis + cross_factor[:, None, None] * (axis @ axis)

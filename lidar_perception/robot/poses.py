@@ -17,7 +17,7 @@ UNIT_TOLERANCE = 1e-2  # max deviation of a quaternion's norm from 1, because dr
 
 
 def make_pose(translation: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """Make poses (..., 4, 4) of translations (..., 3) and quaternions (..., 4) [x y z w]."""
+    """Make poses (..., 4, 4) from translations (..., 3) and quaternions (..., 4) [x y z w]."""
     translation = np.asarray(translation, np.float64)
     pose = np.zeros((*translation.shape[:-1], 4, 4))
     pose[..., :3, :3] = (
@@ -27,17 +27,18 @@ def make_pose(translation: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     return pose
 
 
-def check_pose(translation: ArrayLike, quaternion: ArrayLike, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return translation (3,) and quaternion (4,) [x y z w] as float64, normalised.
+def check_pose(translation: ArrayLike, quaternion: ArrayLike, noun: str) -> tuple[np.ndarray, np.ndarray]:
+    """Check a pose; return translation (3,) and normalised quaternion (4,) [x y z w] as float64.
 
     Raises:
-        InputError: beginning with `what`, if they are not a pose.
+        InputError: A number is not finite, or the quaternion is not of unit length. The message
+            starts with `noun`, which describes the pose.
     """
-    offset, rotation = np.asarray(translation, np.float64), np.asarray(quaternion, np.float64)
-    length = np.linalg.norm(rotation)
-    if not np.isfinite(offset).all() or not abs(length - 1.0) < UNIT_TOLERANCE:
-        raise InputError(f"{what} has no unit quaternion, or is not finite; its publisher is wrong")
-    return offset, rotation / length
+    vector, rotation = np.asarray(translation, np.float64), np.asarray(quaternion, np.float64)
+    norm = np.linalg.norm(rotation)
+    if not np.isfinite(vector).all() or not abs(norm - 1.0) < UNIT_TOLERANCE:
+        raise InputError(f"{noun} has no unit quaternion, or is not finite; its publisher is wrong")
+    return vector, rotation / norm
 
 
 def invert_pose(pose: np.ndarray) -> np.ndarray:
@@ -53,31 +54,33 @@ def invert_pose(pose: np.ndarray) -> np.ndarray:
 def interpolate_poses(
     times: np.ndarray, translations: np.ndarray, quaternions: np.ndarray, at: np.ndarray
 ) -> np.ndarray:
-    """Interpolate poses (M, 4, 4) at times at (M,) int.
+    """Interpolate poses; return (M, 4, 4).
 
     Translations are interpolated linearly, quaternions on the shorter arc (slerp, Shoemake 1985).
-    Before the first and after the last pose, the nearest two are extrapolated; a single pose
+    Before the first and after the last pose, the nearest two poses are extrapolated. A single pose
     applies to all times.
 
     Args:
-        times: (K,) int, ascending, K > 0.
-        translations, quaternions: (K, 3) and (K, 4) [x y z w].
+        times: (K,) int times of the given poses, ascending, K > 0.
+        translations: (K, 3) translations.
+        quaternions: (K, 4) quaternions [x y z w].
+        at: (M,) int times to interpolate at.
     """
     if len(times) == 1:
         return np.broadcast_to(make_pose(translations[0], quaternions[0]), (len(at), 4, 4)).copy()
-    first = np.clip(np.searchsorted(times, at, "right") - 1, 0, len(times) - 2)
+    first_index = np.clip(np.searchsorted(times, at, "right") - 1, 0, len(times) - 2)
     # Subtract before dividing: nanoseconds since 1970 do not fit into a float64.
-    share = ((at - times[first]) / (times[first + 1] - times[first]))[:, None]
+    fraction = ((at - times[first_index]) / (times[first_index + 1] - times[first_index]))[:, None]
     offsets, rotations = np.asarray(translations), Rotation.from_quat(quaternions)
     steps = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
     return make_pose(
-        offsets[first] + share * (offsets[first + 1] - offsets[first]),
-        (rotations[first] * Rotation.from_rotvec(share * steps[first])).as_quat(),
+        offsets[first_index] + fraction * (offsets[first_index + 1] - offsets[first_index]),
+        (rotations[first_index] * Rotation.from_rotvec(fraction * steps[first_index])).as_quat(),
     )
 
 
 def transform_points(xyz: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Transform points (N, 3) by a pose, from its child frame to its parent frame.
+    """Transform points (N, 3) from the child frame of a pose to its parent frame.
 
     The result has the dtype of xyz.
     """
@@ -85,12 +88,12 @@ def transform_points(xyz: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def transform_boxes(boxes: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Transform boxes by a pose: (K, 7) float64, from its child frame to its parent frame.
+    """Transform boxes (K, 7) from the child frame of a pose to its parent frame, as float64.
 
-    Boxes stay upright: only the yaw is rotated.
+    Boxes stay upright; only their yaw is rotated.
     """
     transformed = np.array(boxes, np.float64).reshape(-1, 7)
-    flat = pose[:2, :2] @ np.array([np.cos(transformed[:, 6]), np.sin(transformed[:, 6])])
+    heading = pose[:2, :2] @ np.array([np.cos(transformed[:, 6]), np.sin(transformed[:, 6])])
     transformed[:, :3] = transformed[:, :3] @ pose[:3, :3].T + pose[:3, 3]
-    transformed[:, 6] = wrap_angle(np.arctan2(flat[1], flat[0]))
+    transformed[:, 6] = wrap_angle(np.arctan2(heading[1], heading[0]))
     return transformed

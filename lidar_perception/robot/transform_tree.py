@@ -1,4 +1,4 @@
-"""The tree of coordinate frames over time, filled from /tf, /tf_static and odometry."""
+"""Tree of coordinate frames over time, filled from /tf, /tf_static and odometry."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ CLOCKS = (
 
 
 class MissingTransform(InputError):
-    """Two frames are not connected at a time.
+    """Error: two frames are not connected at a time.
 
-    late: the transform may still arrive, because only the newest one is missing.
+    `late` is True if the transform may still arrive because only the newest one is missing.
     """
 
     def __init__(self, message: str, late: bool = False):
@@ -35,7 +35,7 @@ class MissingTransform(InputError):
 
 
 class _Link:
-    """Pose of a frame in its parent: one static pose, the recent ones, or all of them."""
+    """Poses of a frame in its parent: one static pose, the recent poses, or all of them."""
 
     def __init__(self, parent: str, static: bool, keeps_all: bool):
         self.parent, self.static, self.keeps_all = parent, static, keeps_all
@@ -46,67 +46,67 @@ class _Link:
         if self.static:
             self.times, self.values = [stamp_ns], [value]
             return
-        place = bisect_right(self.times, stamp_ns)  # a recording may go back in time
-        if place and self.times[place - 1] == stamp_ns:
-            self.values[place - 1] = value
+        position = bisect_right(self.times, stamp_ns)  # a recording may go back in time
+        if position and self.times[position - 1] == stamp_ns:
+            self.values[position - 1] = value
             return
-        self.times.insert(place, stamp_ns)
-        self.values.insert(place, value)
+        self.times.insert(position, stamp_ns)
+        self.values.insert(position, value)
         if self.keeps_all:
             return
-        old = 0
-        while self.times[-1] - self.times[old] > KEPT_NS or len(self.times) - old > MAX_KEPT:
-            old += 1
-        if old > len(self.times) // 10:  # deleting moves the whole list, so it is not done with every message
-            del self.times[:old], self.values[:old]
+        expired_count = 0
+        while self.times[-1] - self.times[expired_count] > KEPT_NS or len(self.times) - expired_count > MAX_KEPT:
+            expired_count += 1
+        if expired_count > len(self.times) // 10:  # deleting moves the whole list, so it is not done with every message
+            del self.times[:expired_count], self.values[:expired_count]
 
     def interpolate(self, at: np.ndarray, name: str, max_gap: float | None) -> np.ndarray:
-        """Return poses (M, 4, 4) at times (M,) ns, as TransformTree.lookup_many describes."""
-        chosen = slice(0, 1) if self.static else self._select(int(at.min()), int(at.max()), name, max_gap)
-        values = np.array(self.values[chosen])
-        return interpolate_poses(np.array(self.times[chosen]), values[:, :3], values[:, 3:], at)
+        """Return the poses (M, 4, 4) at times (M,) in ns; see TransformTree.lookup_many."""
+        selection = slice(0, 1) if self.static else self._select(int(at.min()), int(at.max()), name, max_gap)
+        values = np.array(self.values[selection])
+        return interpolate_poses(np.array(self.times[selection]), values[:, :3], values[:, 3:], at)
 
     def _select(self, begin: int, end: int, name: str, max_gap: float | None) -> slice:
-        """Select the poses needed from one time to another, in ns.
+        """Select the poses that are needed for the times from `begin` to `end`, in ns.
 
         Raises:
-            MissingTransform: if they do not cover that time.
+            MissingTransform: The poses do not cover these times.
         """
-        times, ago = self.times, (end - self.times[-1]) / SECOND_NS
-        if ago > 0 and (max_gap is None or ago > max_gap or len(times) == 1):
-            why = (
+        times, late_s = self.times, (end - self.times[-1]) / SECOND_NS
+        if late_s > 0 and (max_gap is None or late_s > max_gap or len(times) == 1):
+            hint = (
                 f"has its publisher stopped? If not, {CLOCKS}"
-                if ago > MAX_LAG_S
+                if late_s > MAX_LAG_S
                 else "is its publisher late, or has it stopped?"
             )
             raise MissingTransform(
-                f"the newest transform of {name} is {ago:.3f} s older than needed; {why}", late=ago < 1.0
+                f"the newest transform of {name} is {late_s:.3f} s older than needed; {hint}", late=late_s < 1.0
             )
-        early = (times[0] - begin) / SECOND_NS
-        if early > 0 and (max_gap is None or early > max_gap or len(times) == 1):
+        early_s = (times[0] - begin) / SECOND_NS
+        if early_s > 0 and (max_gap is None or early_s > max_gap or len(times) == 1):
             raise MissingTransform(
-                f"the oldest transform of {name} is {early:.3f} s newer than "
-                "needed" + (f"; {CLOCKS}" if early > MAX_LAG_S else "")
+                f"the oldest transform of {name} is {early_s:.3f} s newer than "
+                "needed" + (f"; {CLOCKS}" if early_s > MAX_LAG_S else "")
             )
         first, last = bisect_right(times, begin) - 1, bisect_left(times, end)
-        if early > 0:
+        if early_s > 0:
             first, last = 0, max(last, 1)
-        if ago > 0:
+        if late_s > 0:
             first = min(first, len(times) - 2)
-        chosen = slice(first, last + 1)
-        gap = max((b - a for a, b in pairwise(times[chosen])), default=0) / SECOND_NS
+        selection = slice(first, last + 1)
+        gap = max((b - a for a, b in pairwise(times[selection])), default=0) / SECOND_NS
         if max_gap is not None and gap > max_gap:
             raise MissingTransform(f"two transforms of {name} are {gap:.3f} s apart at the time needed")
-        return chosen
+        return selection
 
 
 class TransformTree:
-    """Frames with their poses in their parents.
+    """Frames and their poses in their parent frames.
 
     Poses are interpolated between stamps, and extrapolated only with max_gap. Transforms are kept
-    for KEPT_NS. A stamp at least JUMP_NS before the last one of its frame means that a bag started
-    again: all moving transforms are forgotten, static ones stay. With keeps_all, for recordings,
-    nothing is forgotten.
+    for KEPT_NS. If a stamp is at least JUMP_NS older than the last one of its frame, a bag has
+    restarted: moving transforms are discarded, static ones are kept. With keeps_all, for
+    recordings, nothing is discarded.
     """
 
     def __init__(self, keeps_all: bool = False) -> None:
@@ -123,15 +123,20 @@ class TransformTree:
         quaternion: Sequence[float] | np.ndarray,
         static: bool = False,
     ) -> None:
-        """Set the pose of child in parent at a time, or at all times if it is static.
+        """Set the pose of a child frame in its parent at a time, or at all times if it is static.
 
-        A child that gets another parent leaves the first.
+        A new parent of the child replaces the previous one.
 
         Args:
-            translation, quaternion: (3,) in metres and (4,) [x y z w].
+            parent, child: Names of the frames.
+            stamp_ns: Time of the pose.
+            translation: (3,) metres.
+            quaternion: (4,) [x y z w].
+            static: True if the pose holds at all times.
 
         Raises:
-            InputError: for values that are not a pose, for a frame in itself, and above MAX_FRAMES.
+            InputError: The values are not a pose, a name is empty, both names are the same, or the
+                tree has MAX_FRAMES frames.
         """
         parent, child = parent.lstrip("/"), child.lstrip("/")
         name = f"'{parent}' -> '{child}'"
@@ -143,54 +148,60 @@ class TransformTree:
             raise InputError(f"more than {MAX_FRAMES} frames in the tree; '{child}' is left out")
         if link is None or (link.parent, link.static) != (parent, static):
             link = self._links[child] = _Link(parent, static, self._keeps_all)
-        back = bool(link.times) and stamp_ns <= link.times[-1] - JUMP_NS
-        if back and not static and not self._keeps_all:
+        went_back = bool(link.times) and stamp_ns <= link.times[-1] - JUMP_NS
+        if went_back and not static and not self._keeps_all:
             self.forget()
             link = self._links[child] = _Link(parent, static, self._keeps_all)
         link.add(stamp_ns, value)
 
     def forget(self) -> None:
-        """Forget all moving transforms, because time went back."""
+        """Discard all moving transforms, because time jumped back."""
         self._links = {child: link for child, link in self._links.items() if link.static}
         self.jumps += 1
 
     def lookup(self, target: str, source: str, stamp_ns: int, max_gap: float | None = None) -> np.ndarray:
-        """Return the pose (4, 4) of source in target at a time: it transforms source to target.
+        """Return the pose (4, 4) of source in target at a time; it transforms source to target.
 
         Raises:
-            MissingTransform: if they are not connected at that time.
+            MissingTransform: The frames are not connected at that time.
         """
         return self.lookup_many(target, source, np.array([stamp_ns]), max_gap)[0]
 
     def lookup_many(self, target: str, source: str, at: np.ndarray, max_gap: float | None = None) -> np.ndarray:
-        """Return the poses (M, 4, 4) of source in target at times (M,) int ns, M > 0.
+        """Return the poses (M, 4, 4) of source in target.
 
-        max_gap: seconds by which moving transforms are extrapolated before their first and after
-            their last pose. Between two poses farther apart than this, a transform is unknown.
+        Args:
+            target, source: Names of the frames.
+            at: (M,) int times in ns, M > 0.
+            max_gap: Maximum time in seconds by which moving transforms are extrapolated before
+                their first and after their last pose, and maximum gap between two poses that is
+                interpolated. None: no extrapolation, and any gap is interpolated.
 
         Raises:
-            MissingTransform: if they are not connected at one of these times.
+            MissingTransform: The frames are not connected at one of these times.
         """
         target, source = target.lstrip("/"), source.lstrip("/")
-        up, down = self.find_chain(source), self.find_chain(target)
-        common = next((frame for frame in up if frame in set(down)), None)
+        source_chain, target_chain = self.find_chain(source), self.find_chain(target)
+        common = next((frame for frame in source_chain if frame in set(target_chain)), None)
         if common is None:
             raise MissingTransform(
                 f"TF does not connect '{source}' with '{target}': "
-                f"{self._describe(source, up)}, {self._describe(target, down)}"
+                f"{self._describe(source, source_chain)}, {self._describe(target, target_chain)}"
             )
-        return invert_pose(self._compose(down, common, at, max_gap)) @ self._compose(up, common, at, max_gap)
+        return invert_pose(self._compose(target_chain, common, at, max_gap)) @ self._compose(
+            source_chain, common, at, max_gap
+        )
 
     def is_fixed(self, frame: str) -> bool:
-        """Return True if a frame does not move in its parent, or has none."""
+        """Return True if a frame does not move in its parent, or has no parent."""
         link = self._links.get(frame.lstrip("/"))
         return link is None or link.static
 
     def find_chain(self, frame: str) -> list[str]:
-        """Return the frame, its parent, and so on to the root.
+        """Return the names of a frame and its ancestors, up to the root.
 
         Raises:
-            MissingTransform: for a circle.
+            MissingTransform: The frames form a loop.
         """
         chain = [frame.lstrip("/")]
         while (link := self._links.get(chain[-1])) is not None:

@@ -391,7 +391,7 @@ def test_pictures_and_a_film_of_every_frame(drives, tmp_path, monkeypatch, made)
 def test_impossible_video_is_refused_before_any_work(drives, tmp_path, monkeypatch, capsys, made):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "av" else find(name, *more))
-    for name, words in ("a.mp4", "lidar_perception[video]"), ("a.avi", "is not a film"):
+    for name, words in ("a.mp4", "lidar_perception[video]"), ("a.avi", "is not a video"):
         line = refused(monkeypatch, capsys, drives, "--out", tmp_path / "out", "--video", tmp_path / name)
         assert words in line
     assert made == [] and not (tmp_path / "out").exists()

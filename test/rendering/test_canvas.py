@@ -1,4 +1,4 @@
-"""The canvas compared with slow reference implementations, and films."""
+"""The canvas compared with slow reference implementations, and videos."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lidar_perception.rendering.canvas import Canvas, Text
-from lidar_perception.rendering.files import MAX_ANIMATED, check_film, open_film
+from lidar_perception.rendering.files import MAX_ANIMATED, check_video, open_video
 from lidar_perception.rendering.views import NEAR, BirdsEye, Perspective, project_lines
 from lidar_perception.types import InputError
 
@@ -133,22 +133,22 @@ def pictures(count):
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv", "a.gif", "a.webp"])
-def test_film_has_every_picture_with_its_duration(name, tmp_path):
+def test_video_has_every_picture_with_its_duration(name, tmp_path):
     path = tmp_path / "deep" / name
     if path.suffix in (".mp4", ".mkv"):
         pytest.importorskip("av", reason="needs PyAV, the extra [video]")
-    check_film(path, 4)
-    with open_film(path, (160, 90)) as made:
+    check_video(path, 4)
+    with open_video(path, (160, 90)) as made:
         for k, picture in enumerate(pictures(4)):
             made.add(picture, 0.1 if k else 0.3)
         assert not path.exists()
     assert [p.name for p in path.parent.iterdir()] == [name]
-    seen, times = read_film(path)
+    seen, times = read_video(path)
     assert [np.abs(image - 40 * k).max() <= 8 for k, image in enumerate(seen)] == [True] * 4
     assert times == pytest.approx([0, 0.3, 0.4, 0.5], abs=0.011)
 
 
-def read_film(path):
+def read_video(path):
     """Return the pictures and the start of each in seconds."""
     if path.suffix in (".gif", ".webp"):
         image, seen, times, now = Image.open(path), [], [], 0.0
@@ -165,21 +165,21 @@ def read_film(path):
     return [list(column) for column in zip(*frames)]
 
 
-def test_failed_or_empty_film_leaves_no_file(tmp_path):
+def test_failed_or_empty_video_leaves_no_file(tmp_path):
     for suffix in (".gif", *[".mp4"] * (importlib.util.find_spec("av") is not None)):
-        with open_film(tmp_path / f"a{suffix}", (160, 90)):
+        with open_video(tmp_path / f"a{suffix}", (160, 90)):
             pass
-    with pytest.raises(ZeroDivisionError), open_film(tmp_path / "a.gif", (160, 90)) as made:
+    with pytest.raises(ZeroDivisionError), open_video(tmp_path / "a.gif", (160, 90)) as made:
         made.add(pictures(1)[0], 1 / 0)
     assert not [*tmp_path.iterdir()]
 
 
-def test_unsupported_films_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match=r"a.avi is not a film: .*\.mp4"):
-        check_film(tmp_path / "a.avi", 1)
+def test_unsupported_videos_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(InputError, match=r"a.avi is not a video: .*\.mp4"):
+        check_video(tmp_path / "a.avi", 1)
     with pytest.raises(InputError, match=f"would have {MAX_ANIMATED + 1} pictures.*--limit"):
-        check_film(tmp_path / "a.gif", MAX_ANIMATED + 1)
+        check_video(tmp_path / "a.gif", MAX_ANIMATED + 1)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"a.mp4 needs PyAV: pip install 'lidar_perception\[video"):
-        check_film(tmp_path / "a.mp4", 1)
-    check_film(tmp_path / "a.webp", 1)
+        check_video(tmp_path / "a.mp4", 1)
+    check_video(tmp_path / "a.webp", 1)

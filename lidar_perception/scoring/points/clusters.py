@@ -171,12 +171,12 @@ def measure_network(weights: Path, settings: Mapping[str, Any], recording: Recor
             indices, find_hidden = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)
         else:
             indices, find_hidden = (np.flatnonzero(camera.in_view(scan.xyz)), partial(find_unlabelled, truth, camera))
-        visible, ids = scan.take(indices), ids[indices]
-        clusters = make_clusters(visible, ids, ground=ground[indices])
+        view_cloud, ids = scan.take(indices), ids[indices]
+        clusters = make_clusters(view_cloud, ids, ground=ground[indices])
         labels, _ = label_clusters(clusters, truth.boxes, truth.class_ids, config.classes)
         labels = mask_unlabelled(labels, clusters, find_hidden(clusters.points[:, :3]), background)
-        point_labels = label_points(visible.xyz, truth.boxes, truth.class_ids, config.classes)
-        point_labels[(point_labels == background) & find_hidden(visible.xyz)] = UNKNOWN
+        point_labels = label_points(view_cloud.xyz, truth.boxes, truth.class_ids, config.classes)
+        point_labels[(point_labels == background) & find_hidden(view_cloud.xyz)] = UNKNOWN
         return count_confusions(clusters, labels, classifier.predict(clusters), point_labels, ids, config.classes)
 
     return measure
