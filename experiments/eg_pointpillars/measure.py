@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.normalized_view import NormalizedView, segment_view_ground
 from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointpillars.config import AHEAD
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.geometry import is_within, points_in_boxes
@@ -24,7 +25,6 @@ from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.scoring.kitti.camera_objects import to_camera_objects, to_scored_labels
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, PointCloud
 
-MIN_SCORE = 0.05  # minimum score; weaker boxes hardly change the average precision
 MIN_SHARE = 0.5  # minimum fraction of a cluster's points in a box for the cluster to get the box's class
 NO_CLASS = -1
 
@@ -34,7 +34,7 @@ def measure_frame(frames: Sequence[Frame], number: int, models: Mapping[str, Tra
 
     - true: the labels, see precision.to_record()
     - found: network -> its detections, in the same form
-    - ms: network -> time in all, and of each step
+    - ms: network -> time in all, CPU time in all, and time of each step
     - boxes: [class, diagonal] of each label
     - clusters: [class, diagonal] of each cluster, NO_CLASS for the background
     """
@@ -48,11 +48,11 @@ def measure_frame(frames: Sequence[Frame], number: int, models: Mapping[str, Tra
     turn = number % max(len(names), 1)  # rotates the order so that warm caches favour no network
     for name in (*names[turn:], *names[:turn]):
         detector = open_network(str(models[name].weights), frame.sensor_height)
-        begun = perf_counter()
+        begun, cpu = perf_counter(), process_time()
         result = detector(scan)
-        duration = 1e3 * (perf_counter() - begun)
+        taken = {"total": 1e3 * (perf_counter() - begun), "cpu": 1e3 * (process_time() - cpu)}
         found[name] = to_record(to_camera_objects(to_scored_labels(result.detections), calibration))
-        ms[name] = {"total": round(duration, 2), **{step: round(value, 2) for step, value in result.timings.items()}}
+        ms[name] = {step: round(value, 2) for step, value in (taken | result.timings).items()}
     return {
         "frame": frame.name,
         "true": to_record(to_camera_objects(truth, calibration)),

@@ -1,4 +1,4 @@
-"""The networks of the experiment: five versions, and two of them with fewer labelled scenes."""
+"""The networks of the experiment: five versions, and V0 and V4 trained with fewer labelled scenes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from experiments.eg_pointpillars import paper
-from experiments.framework.trained_models import Model, TrainedModel
+from experiments.framework.trained_models import Model, TrainedModel, count_parameters
+from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.pointpillars.config import VERSIONS
+from lidar_perception.detectors.pointpillars.params import PointPillarsParams
+from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.param_fields import with_values
 from lidar_perception.training.params import PointPillarsTraining
 
@@ -22,8 +25,8 @@ PROTOCOL = {
     "aside": 1000.0,
 }
 STUDIED = "v0", "v4"  # versions in the study of label counts
-SHARES = (0.5, 0.25, 0.1)  # fractions of the labelled scenes, in addition to all of them
-ALL_SHARES = (*reversed(SHARES), 1.0)
+SHARES = (0.1, 0.25, 0.5)  # fractions of the labelled scenes, in addition to all of them, in order of importance
+ALL_SHARES = (*SHARES, 1.0)
 
 
 def choose_models(params: PointPillarsTraining, seed: int) -> list[Model]:
@@ -41,6 +44,22 @@ def choose_models(params: PointPillarsTraining, seed: int) -> list[Model]:
         *(make(version, 1.0) for version in VERSIONS),
         *(make(version, share) for share in SHARES for version in STUDIED),
     ]
+
+
+def read_shipped_models() -> dict[str, TrainedModel]:
+    """Return the compact networks that ship with the package, by version.
+
+    Their steps, seconds and scenes are those of their last training.
+    """
+    shipped = {}
+    for version in VERSIONS:
+        file = weights_file(PointPillarsParams(version=version, size="compact"))
+        last = read_header(file).training
+        model = Model(version.upper(), with_values(TRAINING, {"version": version}))
+        shipped[model.name] = TrainedModel(
+            model, file, last["steps"], last["seconds"], last["steps"], last["scenes"], count_parameters(file)
+        )
+    return shipped
 
 
 def name_model(version: str, share: float, seed: int) -> str:

@@ -1,4 +1,4 @@
-"""V0 and V4 side by side on the same frames (Figure 20 of the paper)."""
+"""Pictures of V0 and V4 on the same frames (Figure 20 of the paper)."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ def make_picture_sections(
     indices = [i for i, frame in enumerate(frames) if frame.name in by_name]
     gain = np.array([errors[first][by_name[frames[i].name]] - errors[last][by_name[frames[i].name]] for i in indices])
     order = np.argsort(-gain, kind="stable")
-    chosen = list(dict.fromkeys([*order[:BETTER], *order[::-1][:WORSE]]))
+    better, worse = order[gain[order] > 0], order[gain[order] < 0]
+    chosen = [*better[:BETTER], *worse[::-1][:WORSE]] or [*order[:1]]
     pictures: list[Picture] = []
     for k in chosen:
         frame = frames[indices[k]]
@@ -62,10 +63,10 @@ def make_picture_sections(
             )
         )
     text = (
-        f"Boxes with a score of at least {SHOWN_SCORE:g}; labels are dashed. The frames are "
-        f"the {BETTER} in which V4 has fewest errors compared with V0, and the {WORSE} in "
-        "which it has most; the paper shows three of the first kind. An error is a missed "
-        "object or a wrong box, in BEV at the overlaps 0.5 (Car) and 0.25."
+        f"Boxes with a score of at least {SHOWN_SCORE:g}; labels are dashed. V4 has fewer errors than V0 in "
+        f"{len(better)} frames and more in {len(worse)}. Up to {BETTER} frames of the first kind and {WORSE} of "
+        "the second are shown, those with the largest difference; the paper shows three of the first kind. An "
+        "error is a missed object or a wrong box, in BEV at the overlaps 0.5 (Car) and 0.25."
     )
     return [Section("Side by side (Figure 20)", text, figures=tuple(pictures))]
 

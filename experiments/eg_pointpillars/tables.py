@@ -11,33 +11,73 @@ from experiments.eg_pointpillars import paper
 from experiments.eg_pointpillars.diagonals import make_diagonal_section
 from experiments.eg_pointpillars.models import ALL_SHARES, STUDIED, group_seeds
 from experiments.framework.experiment import Cell, Figure, Panel, Row, Section, Table
-from experiments.framework.precision import CELLS, compare_records, draw_cells
+from experiments.framework.precision import CELLS, compare_records, draw_cells, from_record
 from experiments.framework.statistics import compute_sampled_p, estimate, make_cells, make_line, nan_to_none
 from experiments.framework.trained_models import TrainedModel
 from lidar_perception.detectors.pointpillars.config import VERSIONS
+from lidar_perception.scoring.kitti.protocol import COUNTED, SCORED, classify_labels
 
 MEAN = len(CELLS)  # index of the mean column, see precision.compute_cells()
 STRICT, RELAXED = 0, 1  # indices into precision.PROTOCOLS
 MIN_AP = 1.0  # in percent; for a lower AP the report says that the training was too short
-TITLES = {"v0": "PointPillars", **{v: f"EG-PointPillars {v.upper()}" for v in VERSIONS if v != "v0"}}
+MIN_LABELS = 50  # labels of a class; the report says that fewer are too few to compare versions
+TITLES = {v: "V0, PointPillars" if v == "v0" else v.upper() for v in VERSIONS}
+MS_PARTS = ("total", "cpu", "experts", "network")  # times in the record of a frame
+GAIN = ("V0", "V4", "V4 above V0")
 Draws = dict[tuple[str, float], np.ndarray]  # (version, fraction of the labels) -> array (1 + R, 2, 10)
 
 
 def make_sections(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> list[Section]:
-    """Return the report of the records of measure_frame()."""
-    records = [record for record in records if "skipped" not in record]
-    names = [record["frame"] for record in records]
-    true = [record["true"] for record in records]
-    by_model = draw_cells(names, {name: compare_records(true, [r["found"][name] for r in records]) for name in models})
-    draws = {key: np.mean([by_model[name] for name in group], axis=0) for key, group in group_seeds(models).items()}
+    """Return the report of the records of measure_frame(), with networks that were trained for it."""
+    records = _drop_skipped(records)
+    by_model = draw_models(records, models)
+    draws = average_seeds(by_model, models)
     return [
         make_training_section(models),
-        make_table_5(draws, len(records)),
-        make_table_6(draws, records, models),
-        make_diagonal_section(records),
+        *make_version_sections(draws, records, models),
         make_label_section(draws),
         *make_seed_sections(by_model, models),
     ]
+
+
+def make_shipped_sections(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> list[Section]:
+    """Return the report of the records of measure_frame(), with the shipped weights."""
+    records = _drop_skipped(records)
+    text = (
+        "These are the weights that ship with the package, of the size compact. They were trained on "
+        "simulated streets, each version for another number of steps and from other initial weights (the "
+        "research log lists them). So a difference between two versions is not the effect of the experts "
+        "alone. No network was trained on a real scan."
+    )
+    draws = average_seeds(draw_models(records, models), models)
+    return [Section("What is measured", text), *make_version_sections(draws, records, models)]
+
+
+def make_version_sections(
+    draws: Draws, records: list[dict[str, Any]], models: Mapping[str, TrainedModel]
+) -> list[Section]:
+    """Return the sections about the versions: Tables 5, 6 and 2, and Figure 13."""
+    return [
+        make_table_5(draws, [record["true"] for record in records]),
+        make_table_6(draws, records, models),
+        make_diagonal_section(records),
+    ]
+
+
+def draw_models(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> dict[str, np.ndarray]:
+    """Return the average precision of each network for samples of the frames, see draw_cells()."""
+    true = [record["true"] for record in records]
+    compared = {name: compare_records(true, [record["found"][name] for record in records]) for name in models}
+    return draw_cells([record["frame"] for record in records], compared)
+
+
+def average_seeds(by_model: Mapping[str, np.ndarray], models: Mapping[str, TrainedModel]) -> Draws:
+    """Return the mean over seeds of draw_models()."""
+    return {key: np.mean([by_model[name] for name in group], axis=0) for key, group in group_seeds(models).items()}
+
+
+def _drop_skipped(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [record for record in records if "skipped" not in record]
 
 
 def make_training_section(models: Mapping[str, TrainedModel]) -> Section:
@@ -54,26 +94,9 @@ def make_training_section(models: Mapping[str, TrainedModel]) -> Section:
         )
         for name, m in models.items()
     ]
-    params: Any = next((m.model.params for m in models.values()), None)
-    text = (
-        ""
-        if params is None
-        else (
-            f"All networks have the size `{params.size}`, batches of {params.batch}, the same scenes "
-            "and the same number of steps. The weights with the best validation score are measured. "
-            + (
-                f"They were trained up to {params.ahead:g} m ahead and {params.aside:g} m to each side, "
-                "and are measured in the whole range. "
-                if 0 < params.ahead < 100
-                else ""
-            )
-            + f"The paper trains {paper.EPOCHS} epochs with a validation every "
-            f"{paper.VALIDATION_EPOCHS}, on KITTI."
-        )
-    )
     return Section(
         "What was trained",
-        text,
+        _describe_training(next((m.model.params for m in models.values()), None)),
         (
             Table(
                 "models",
@@ -85,8 +108,37 @@ def make_training_section(models: Mapping[str, TrainedModel]) -> Section:
     )
 
 
-def make_table_5(draws: Draws, frames: int) -> Section:
-    """Return Table 5 at the paper's overlaps, and in BEV at lower ones."""
+def _describe_training(params: Any) -> str:
+    """Return sentences about the parameters that all networks have in common; "" without networks."""
+    if params is None:
+        return ""
+    sentences = [
+        f"All networks have the size {params.size}, batches of {params.batch} scenes, the same scenes and the same "
+        "number of steps, and begin with random weights. The weights with the best validation score are measured."
+    ]
+    if params.data.scans:
+        sentences.append(
+            f"The scenes are simulated: {params.scene} scans of the sensor {params.sensor}, with "
+            f"{params.data.people:g} times as many people as in KITTI. Validation uses "
+            f"{params.data.val_scans} other scenes."
+        )
+    if 0 < params.ahead < 100:
+        sentences.append(
+            f"They were trained up to {params.ahead:g} m ahead and {params.aside:g} m to each side, and are measured "
+            "in the whole range."
+        )
+    sentences.append(
+        f"The paper trains {paper.EPOCHS} epochs with a validation every {paper.VALIDATION_EPOCHS}, on KITTI."
+    )
+    return " ".join(sentences)
+
+
+def make_table_5(draws: Draws, true: list[dict[str, Any]]) -> Section:
+    """Return Table 5 at the paper's overlaps, and in BEV at lower ones.
+
+    Args:
+        true: Records of the labels of all frames.
+    """
     header = ("version", *(f"{name} {level}" for name, level in CELLS), "mean", "above V0", "p")
     tables = []
     for index, name, title in (
@@ -99,11 +151,16 @@ def make_table_5(draws: Draws, frames: int) -> Section:
             if (version, 1.0) in draws
         ]
         tables.append(Table(name, title, header, tuple(rows)))
+    counts = count_labels(true)
     text = (
-        f"{frames} frames that no network was trained on. R40, mean over seeds. Intervals and "
+        f"{len(true)} frames that no network was trained on, with "
+        + ", ".join(f"{name} {count}" for name, count in counts.items())
+        + " labels (moderate). R40, mean over seeds. Intervals and "
         "p values: samples of the frames, the same for all versions, so that the differences "
         "are paired. The paper does not say which recall points it uses."
     )
+    if few := [name for name, count in counts.items() if count < MIN_LABELS]:
+        text += f" There are too few labels to compare versions by their AP of {' and '.join(few)}, and by the mean."
     best = max((values[0, RELAXED, MEAN] for values in draws.values()), default=np.nan)
     if not best >= MIN_AP:  # also true for NaN
         text = (
@@ -111,6 +168,12 @@ def make_table_5(draws: Draws, frames: int) -> Section:
             f"AP {best:.1f}), so neither the versions nor the study of labels can be compared. " + text
         )
     return Section("Versions (Table 5)", text, tuple(tables))
+
+
+def count_labels(true: list[dict[str, Any]]) -> dict[str, int]:
+    """Count the moderate labels of each class."""
+    objects = [from_record(record) for record in true]
+    return {name: sum(int((classify_labels(o, name, "moderate") == COUNTED).sum()) for o in objects) for name in SCORED}
 
 
 def _make_version_cells(draws: Draws, version: str, index: int) -> tuple[Cell, ...]:
@@ -130,27 +193,13 @@ def _make_version_cells(draws: Draws, version: str, index: int) -> tuple[Cell, .
 
 def make_table_6(draws: Draws, records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> Section:
     """Return Table 6: gain, time per frame, overhead and parameters."""
-    groups = group_seeds(models)
-    ms = {
-        version: np.array(
-            [
-                [
-                    np.mean([r["ms"][name][step] for name in groups[version, 1.0]])
-                    for step in ("total", "experts", "network")
-                ]
-                for r in records
-            ]
-        ).reshape(-1, 3)
-        for version in VERSIONS
-        if (version, 1.0) in groups
-    }
+    groups = {version: names for (version, share), names in group_seeds(models).items() if share == 1.0}
+    ms = {version: _compute_medians(records, names) for version, names in groups.items()}
     rows: list[Row] = []
-    for version, times in ms.items():
-        total, experts, network = np.median(times, axis=0) if len(times) else [np.nan] * 3
-        base = np.median(ms["v0"][:, 0]) if len(times) and "v0" in ms else np.nan
+    for version, (total, cpu, experts, network) in ms.items():
         gain = draws[version, 1.0][0, STRICT, MEAN] - draws["v0", 1.0][0, STRICT, MEAN]
-        count = models[groups[version, 1.0][0]].parameters / 1e3
-        values = nan_to_none([gain, total, total - base, experts, network])
+        base = ms["v0"][0]
+        values = nan_to_none([gain, total, total - base, cpu, experts, network])
         first = version == "v0"
         rows.append(
             (
@@ -158,16 +207,16 @@ def make_table_6(draws: Draws, records: list[dict[str, Any]], models: Mapping[st
                 Cell(None if first else values[0], paper=paper.IMPROVEMENT.get(version), digits=2),
                 Cell(values[1], paper=paper.MS[version]),
                 Cell(None if first else values[2], paper=paper.OVERHEAD_MS.get(version)),
-                Cell(values[3]),
-                Cell(values[4]),
-                Cell(count),
+                *(Cell(value) for value in values[3:]),
+                Cell(models[groups[version][0]].parameters / 1e3),
             )
         )
     return Section(
         "Gain and time (Table 6)",
-        "Median time per frame on the machine named above, in one "
-        "process with one thread unless several processes measured; the paper's times are of a "
-        "GPU. The paper's overhead of V4 contradicts its Table 5, which gives 33.3 ms.",
+        "Median time per frame on the machine named above; the paper's times are of a GPU. On a busy machine "
+        "look at the CPU time, which is that of all threads. On a CPU the versions without ground (V1, V2, V4) "
+        "skip empty cells, so they can be faster than V0. The paper's overhead of V4 contradicts its "
+        "Table 5, which gives 33.3 ms.",
         (
             Table(
                 "table_6",
@@ -177,6 +226,7 @@ def make_table_6(draws: Draws, records: list[dict[str, Any]], models: Mapping[st
                     "mean 3D AP above V0 [points]",
                     "time [ms]",
                     "overhead [ms]",
+                    "CPU time [ms]",
                     "ground and clusters [ms]",
                     "network [ms]",
                     "parameters [thousands]",
@@ -187,12 +237,21 @@ def make_table_6(draws: Draws, records: list[dict[str, Any]], models: Mapping[st
     )
 
 
+def _compute_medians(records: list[dict[str, Any]], names: Sequence[str]) -> np.ndarray:
+    """Return the median over frames of MS_PARTS, the means over networks; NaN without frames."""
+    if not records:
+        return np.full(len(MS_PARTS), np.nan)
+    values = np.array([[[r["ms"][name][part] for name in names] for part in MS_PARTS] for r in records])
+    return np.median(values.mean(axis=2), axis=0)
+
+
 def make_label_section(draws: Draws) -> Section:
     """Return the study of labels: V0 and V4 with a part of the labelled scenes."""
+    title, shares = "Dependency on labels", [s for s in ALL_SHARES if all((v, s) in draws for v in STUDIED)]
+    if len(shares) < 2:
+        return Section(title, "Not measured: the budget was too short for networks with fewer labels.")
     rows: list[Row] = []
-    for share in ALL_SHARES:
-        if any((version, share) not in draws for version in STUDIED):
-            continue
+    for share in shares:
         row: list[str | Cell] = [f"{100 * share:g} %"]
         for index in (STRICT, RELAXED):
             first, last = (draws[version, share][:, index, MEAN] for version in STUDIED)
@@ -203,15 +262,20 @@ def make_label_section(draws: Draws) -> Section:
         rows.append(tuple(row))
     header = (
         "labelled scenes",
-        *(f"{what}, {kind} [%]" for kind in ("3D", "BEV") for what in ("V0", "V4", "V4 above V0", "p")),
+        *(name for kind in ("3D", "BEV") for name in (*(f"{what}, {kind} [%]" for what in GAIN), f"p, {kind}")),
     )
-    header = tuple(name.replace("p, 3D [%]", "p, 3D").replace("p, BEV [%]", "p, BEV") for name in header)
-    return Section(
-        "Dependency on labels",
+    left_out = [f"{100 * share:g} %" for share in ALL_SHARES if share not in shares]
+    text = (
         "The paper claims that the experts reduce the dependency on "
         "labels (Sections 1 and 5) and has no experiment for it. Here both networks get the same "
         "part of the labelled scenes and the same number of steps. Mean AP over classes and "
-        "difficulties, overlaps as in the tables above.",
+        "difficulties, overlaps as in the tables above."
+    )
+    if left_out:
+        text += f" Left out, as the budget was too short: {', '.join(left_out)}."
+    return Section(
+        title,
+        text,
         (Table("labels", "V0 and V4 by share of the labelled scenes", header, tuple(rows)),),
         _draw_label_figure(draws),
     )

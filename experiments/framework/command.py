@@ -30,6 +30,7 @@ EXPERIMENTS = {  # name -> "module:attribute" of an Experiment; the first is the
     "stm-cpa": "experiments.stm_cpa.experiment:STM_CPA",
     "stm-cpa-configurations": "experiments.stm_cpa.configurations:CONFIGURATIONS",
     "eg-pointpillars": "experiments.eg_pointpillars.experiment:EG_POINTPILLARS",
+    "eg-pointpillars-shipped": "experiments.eg_pointpillars.experiment:SHIPPED",
     "clusters": "experiments.clusters.experiment:CLUSTERS",
     "clusters-segmentation": "experiments.clusters.experiment:SEGMENTATION",
 }
@@ -92,7 +93,8 @@ def reproduce(
 
     EXPERIMENT is stm-cpa (default: every table of the STM-CPA paper), stm-cpa-configurations
     (the configurations `paper` and `best`, with and without a labelled seed), eg-pointpillars
-    (the versions of EG-PointPillars, trained first), clusters (adaptive clustering and improved
+    (the versions of EG-PointPillars, trained first), eg-pointpillars-shipped (the versions with the
+    shipped weights, without training), clusters (adaptive clustering and improved
     PointNet: every table) or clusters-segmentation (its tables without a network).
 
     FOLDER gets report.html, report.md, report.json, the tables as CSV and the figures as PNG, and

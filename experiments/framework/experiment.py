@@ -121,6 +121,7 @@ class Experiment:
             importance.
         illustrate: illustrate(records, frames) returns sections with pictures of frames. It gets
             models= too.
+        has_models: The functions have their models already, see with_models().
 
     The functions belong to a module, so that worker processes can import them.
     """
@@ -135,6 +136,7 @@ class Experiment:
     protocol: Mapping[str, Any] = field(default_factory=dict)
     models: Callable[[Any, int], Sequence[Model]] | None = None
     illustrate: Callable[..., list[Section]] | None = None
+    has_models: bool = False
 
     def with_models(self, models: Mapping[str, TrainedModel]) -> Experiment:
         """Return the experiment whose functions get these models."""
@@ -143,4 +145,5 @@ class Experiment:
             measure=partial(self.measure, models=models),
             make_sections=partial(self.make_sections, models=models),
             illustrate=self.illustrate and partial(self.illustrate, models=models),
+            has_models=True,
         )

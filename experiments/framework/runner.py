@@ -122,7 +122,7 @@ def _measure(
 
 def _make_measure(experiment: Experiment, recording: Recording) -> Callable[[Frame], str]:
     """Return a function that measures a frame and returns its record as JSON."""
-    if experiment.training is None:  # trained detectors warm up when opened
+    if not experiment.has_models:  # trained detectors warm up when opened
         warm_up()
     number = {frame.name: i for i, frame in enumerate(recording)}
 

@@ -110,19 +110,6 @@ class ExperimentScenes:
             return open_simulated(params, cache, count)
         return open_selected(Path(self.data), self.test, self.height)
 
-    def describe(self, params: Any) -> str:
-        """Return one sentence about the scenes to train on, to validate on and to measure on."""
-        if self.is_simulated:
-            return (
-                f"{params.data.scans} simulated {params.scene} scans of {params.sensor} to "
-                f"train on, {params.data.val_scans} of other scenes to validate on, and others "
-                "again to measure on"
-            )
-        return (
-            f"{len(self.train)} frames to train on, {len(self.val)} to validate on and "
-            f"{len(self.test)} to measure on, all of {self.data}"
-        )
-
 
 def _list_names(frames: LabelledFrames) -> tuple[str, ...]:
     return tuple(frame.name for frame in frames.frames)

@@ -26,11 +26,13 @@ from lidar_perception.runs.terminal import errors, format_duration
 from lidar_perception.training.params import PointNetTraining, PointPillarsTraining
 from lidar_perception.training.plan import Plan, Speed, fit_plan, training_durations
 from lidar_perception.training.request import TrainingRequest
+from lidar_perception.types import InputError
 
 Training = PointPillarsTraining | PointNetTraining
 DEFAULT_BUDGET_H = 2.0  # default training budget with simulated scans
 MAX_SEEDS = 3
 STEPS_PER_SEED = 4000  # steps per model above which another seed is worth more
+MIN_MODEL_STEPS = 1000  # steps per model below which models that are not required are left out
 NORM_STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
 
 
@@ -42,7 +44,7 @@ class Model:
         name: Unique name in the experiment, such as "v4, seed 1".
         params: Its training. The numbers of scenes and steps come from the common plan.
         label_share: Share of the labelled scenes that it is trained on, above 0 to 1.
-        required: Train it even where the budget is spent.
+        required: Train it even if the budget is short.
     """
 
     name: str
@@ -134,8 +136,8 @@ class SharedPlan:
     Attributes:
         values: Training parameters by dotted name.
         seeds: Number of seeds.
-        durations: Expected seconds of the training of each model, by name.
-        speeds: Measured durations of each model, by name.
+        durations: Expected seconds of the training of each model, by name. Other models are left out.
+        speeds: Measured durations of these models, by name.
     """
 
     values: dict[str, Any]
@@ -202,10 +204,10 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
     assert data is not None, "an experiment needs a model with all labels"
     speeds = {model.name: known[replace(model.params, seed=0)] for model in models}
     given = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps, bool(reduced))
-    measuring = request.test_frames * sum(s.frame for s in speeds.values()) / request.jobs
 
     def fit(seeds: int) -> Plan:
         hours = request.budget or DEFAULT_BUDGET_H
+        measuring = request.test_frames * sum(s.frame for s in speeds.values()) / request.jobs
         return fit_plan(
             max(0.1 * hours, hours - seeds * measuring / 3600),
             request.jobs,
@@ -215,7 +217,19 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
             params.epochs,
         )
 
-    plan = fit(request.seeds or 1)
+    optional = [] if params.steps or params.epochs else [model for model in models if not model.required]
+    while True:
+        try:
+            plan = fit(request.seeds or 1)
+            if plan.steps >= MIN_MODEL_STEPS or not optional:
+                break
+        except InputError:
+            if not optional:
+                raise
+        last = optional.pop()
+        del speeds[last.name]
+        while optional and optional[-1].label_share == last.label_share < 1.0:  # compared with each other
+            del speeds[optional.pop().name]
     seeds = request.seeds or min(max(plan.steps // STEPS_PER_SEED, 1), MAX_SEEDS)
     if seeds > (request.seeds or 1):
         plan = fit(seeds)
@@ -231,7 +245,7 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
     }
     durations = {name: sum(training_durations(plan, speed, data)) for name, speed in speeds.items()}
     errors.print(
-        f"{seeds} x {len(models)} networks of {plan.steps} steps: about "
+        f"{seeds} x {len(speeds)} networks of {plan.steps} steps: about "
         + format_duration(seeds * sum(durations.values()))
     )
     return SharedPlan(values, seeds, durations, speeds)
@@ -260,6 +274,9 @@ def train_models(request: ModelRequest, plan: SharedPlan) -> dict[str, TrainedMo
     trained: dict[str, TrainedModel] = {}
     for seed in range(plan.seeds):
         for first, model in zip(request.models(request.params, 0), request.models(request.params, seed)):
+            if first.name not in plan.durations:
+                errors.print(f"{model.name} is left out, as the budget is too short for it")
+                continue
             planned = plan.apply(model)
             folder = request.folder / _name_folder(planned, request.scenes)
             if not (folder / "last.safetensors").exists():
@@ -288,21 +305,31 @@ def _train(model: Model, request: ModelRequest, folder: Path, speed: Speed) -> N
 
 def read_trained(model: Model, folder: Path) -> TrainedModel:
     """Read a finished training."""
-    from safetensors import safe_open
-
     from lidar_perception.detectors.checkpoint import read_header
 
     best, last = folder / "best.safetensors", folder / "last.safetensors"
     record = read_header(last).training
-    with safe_open(best, "np") as tensors:
-        count = sum(
+    return TrainedModel(
+        model,
+        best,
+        record["steps"],
+        record["seconds"],
+        read_header(best).training["steps"],
+        record["scenes"],
+        count_parameters(best),
+    )
+
+
+def count_parameters(weights: Path) -> int:
+    """Count the parameters in a checkpoint that were learnt."""
+    from safetensors import safe_open
+
+    with safe_open(weights, "np") as tensors:
+        return sum(
             math.prod(tensors.get_slice(name).get_shape())
             for name in tensors.keys()
             if not name.endswith(NORM_STATISTICS)
         )
-    return TrainedModel(
-        model, best, record["steps"], record["seconds"], read_header(best).training["steps"], record["scenes"], count
-    )
 
 
 def _name_folder(model: Model, scenes: ExperimentScenes) -> str:

@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from experiments.__main__ import cli
 from experiments.eg_pointpillars import paper, tables
 from experiments.eg_pointpillars.diagonals import count_classes, make_diagonal_section
+from experiments.eg_pointpillars.experiment import SHIPPED
 from experiments.eg_pointpillars.measure import NO_CLASS, measure_diagonals
 from experiments.eg_pointpillars.models import choose_models
 from experiments.eg_pointpillars.pictures import count_errors
@@ -91,7 +92,7 @@ def test_report_has_values_of_the_paper_and_each_share():
         "true": make_record(BOXES),
         "boxes": [[CAR, 4.2]],
         "clusters": [[CAR, 3.9], [-1, 1]],
-        "ms": {name: {"total": 10.0 + ("V4" in name), "experts": 1.0, "network": 8.0} for name in models},
+        "ms": {name: {"total": 10.0 + ("V4" in name), "cpu": 9.0, "experts": 1.0, "network": 8.0} for name in models},
         "found": {name: make_record(b, np.linspace(0.9, 0.8, len(b))) for name, b in boxes.items()},
     }
     records = [{"frame": f"{i}", **record} for i in range(3)] + [{"frame": "x", "skipped": "bad"}]
@@ -113,6 +114,25 @@ def test_report_has_values_of_the_paper_and_each_share():
     assert by_name["table_6"].rows[-1][3].value == 1.0  # overhead
     assert by_name["seeds"].rows[0][-1].value == 0.0
     assert all(len(row) == len(table.header) for table in by_name.values() for row in table.rows)
+
+
+def test_shipped_weights_are_compared_without_labels_study():
+    models = SHIPPED.measure.keywords["models"]
+    assert [*models] == ["V0", "V1", "V2", "V3", "V4"] and all(m.weights.is_file() for m in models.values())
+    assert len({m.parameters for m in models.values()}) == 4  # V2 and V3 have the same inputs
+    record = {
+        "frame": "0",
+        "true": make_record(BOXES),
+        "boxes": [[CAR, 4.2]],
+        "clusters": [],
+        "ms": {name: {"total": 10.0, "cpu": 9.0, "experts": 1.0, "network": 8.0} for name in models},
+        "found": {name: make_record(BOXES, np.array([0.9, 0.8])) for name in models},
+    }
+    sections = SHIPPED.make_sections([record])
+    names = [table.name for section in sections for table in section.tables]
+    assert names == ["table_5", "table_5_bev", "table_6", "table_2_boxes", "table_2_clusters"]
+    assert "Car 2, Pedestrian 0, Cyclist 0 labels" in sections[1].text
+    assert "too few labels to compare versions by their AP of Car and Pedestrian and Cyclist" in sections[1].text
 
 
 def test_clusters_get_the_class_of_their_label():

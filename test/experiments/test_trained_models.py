@@ -92,6 +92,13 @@ def test_optional_models_are_left_out_when_the_budget_is_spent(tmp_path, capsys)
     assert "v0 half seed 0 is left out" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("least, planned", [(1, ["v0 seed 0", "v0 half seed 0"]), (10**9, ["v0 seed 0"])])
+def test_plan_leaves_out_optional_models_for_more_steps(tmp_path, monkeypatch, least, planned):
+    monkeypatch.setattr(trained_models, "MIN_MODEL_STEPS", least)
+    plan = plan_training(make_request(tmp_path, budget=0.05, seeds=1, params={"steps": 0}))
+    assert [*plan.durations] == [*plan.speeds] == planned
+
+
 def test_budget_that_is_too_short_names_a_longer_one(tmp_path):
     with pytest.raises(InputError, match=r"too short for 20 steps.*--budget"):
         plan_training(make_request(tmp_path, budget=1e-4, params={"steps": 0}))
