@@ -30,7 +30,7 @@ from lidar_perception.detectors.pointpillars.proposer import PointPillarsPropose
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.runs.machine import read_cpu_name
 from lidar_perception.runs.terminal import console, show_progress
-from lidar_perception.runs.threads import set_thread_count, thread_count
+from lidar_perception.runs.threads import get_thread_count, set_thread_count
 from lidar_perception.types import PointCloud
 
 PAPER_TO_V0 = {"v0": 1.0, "v1": 1.06, "v2": 1.86, "v3": 2.48, "v4": 3.54}  # time relative to V0 in paper B, RTX 4090
@@ -47,7 +47,7 @@ def measure_detection(scans: list[PointCloud], repeat: int, sizes: Sequence[str]
     """
     device = find_device()
     name = torch.cuda.get_device_name(device) if device != CPU else read_cpu_name()
-    content: dict[str, Any] = {"device": name, "threads": thread_count(), "sizes": {}}
+    content: dict[str, Any] = {"device": name, "threads": get_thread_count(), "sizes": {}}
     for size in sizes:
         chosen = choose_evenly(scans, FEW) if (size, device) == ("full", CPU) else scans
         detectors = {version: _make_detector(version, size, device, chosen[0]) for version in VERSIONS}
@@ -148,7 +148,7 @@ def measure_engines(scans: list[PointCloud], repeat: int, detectors: Sequence[st
 
     Median CPU time of one thread, in turn. `same` counts scans with equal detections.
     """
-    threads = thread_count()
+    threads = get_thread_count()
     set_thread_count(1)
     rows = []
     for weights in detectors:

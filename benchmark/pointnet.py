@@ -23,7 +23,7 @@ from lidar_perception.detectors.pointnet.predict import predict
 from lidar_perception.detectors.pointnet.torch_network import TorchPointNet
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.runs.terminal import console
-from lidar_perception.runs.threads import thread_count
+from lidar_perception.runs.threads import get_thread_count
 from lidar_perception.types import PointCloud
 
 COUNT = 100  # number of clusters
@@ -66,7 +66,7 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
         "clusters": float(middle[0]),
         "all_clusters": float(middle[1]),
         "points": float(middle[2]),
-        "threads": thread_count(),
+        "threads": get_thread_count(),
         "scans": len(rows),
         "ms": {name: float(np.median([row[name] for row in rows])) for name in rows[0]},
         "steps": dict(zip(STEPS, np.median(steps, axis=0).tolist())),

@@ -130,7 +130,7 @@ def survey_drive(
         return
     sequence = drive.frames[0].sequence
     start = partial(_make_process_surveyor, reopen, choice, sequence, first)
-    yield from run_in_processes(start, frames, 1, "surveyed frames", apart=True)
+    yield from run_in_processes(start, frames, 1, "surveyed frames", separate=True)
 
 
 def _needs_odometry(drive: Drive) -> bool:

@@ -92,16 +92,16 @@ def test_block_waits_for_another_process_that_compiles(tmp_path, monkeypatch):
     log, lines, done = tmp_path / "compile.log", [], tmp_path / "done"
     code = f"import pathlib, time; time.sleep(0.3); print('said'); pathlib.Path({str(done)!r}).touch()"
     monkeypatch.setattr(compiling, "_is_cached", lambda: True)
-    with compiling.compile_meanwhile(code, log, lines.append):
+    with compiling.compile_in_background(code, log, lines.append):
         pass
     assert not log.exists() and not lines  # nothing to compile
     monkeypatch.setattr(compiling, "_is_cached", lambda: False)
-    with compiling.compile_meanwhile(code, log, lines.append):
+    with compiling.compile_in_background(code, log, lines.append):
         assert not done.exists()
     assert done.exists() and log.read_text() == "said\n"
     assert len(lines) == 1 and str(log) in lines[0]
     with (
         pytest.raises(ZeroDivisionError),
-        compiling.compile_meanwhile("import time; time.sleep(60)", log, lines.append),
+        compiling.compile_in_background("import time; time.sleep(60)", log, lines.append),
     ):
         raise ZeroDivisionError  # which does not wait

@@ -61,7 +61,7 @@ def test_processes_that_share_cores_use_one_thread_each():
         "from test_processes import count_threads\n"
         "print(*run_in_processes(count_threads, [0, 1], 2, 'worked'),\n"
         "      *run_in_order(count_threads, [0], 1, 1, 'worked'),\n"
-        "      *run_in_processes(count_threads, [0], 1, 'worked', apart=True))\n"
+        "      *run_in_processes(count_threads, [0], 1, 'worked', separate=True))\n"
     )
     assert run_script(script, OPENBLAS_NUM_THREADS="2").stdout.split() == ["1", "1", "1", "2"]
 

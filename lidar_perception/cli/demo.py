@@ -40,7 +40,7 @@ from lidar_perception.detectors.open import DetectorChoice, open_detector
 from lidar_perception.groups import renumber_ids
 from lidar_perception.nodes import require_rclpy
 from lidar_perception.nodes.graph import FINAL, SINGLE_PROCESS_NODES, cloud_topic, list_result_topics
-from lidar_perception.runs.compiling import compile_meanwhile
+from lidar_perception.runs.compiling import compile_in_background
 from lidar_perception.runs.files import make_folder, write_text
 from lidar_perception.runs.terminal import console, errors, show_progress
 from lidar_perception.scoring.centres.matching import match_centres
@@ -142,7 +142,7 @@ def demo(
         recording.require(BOXES, "demo")
     _make_room(out, data, detector)
     make_folder(out / "logs")
-    with compile_meanwhile(_code_that_compiles(chosen), out / "logs" / "compile.log", errors.print):
+    with compile_in_background(_code_that_compiles(chosen), out / "logs" / "compile.log", errors.print):
         drive = _bag(out / "drive", recording, frames, drive_seed)
     played = _as_replayed(drive, recording)
     clouds = len(played)

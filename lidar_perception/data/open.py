@@ -148,7 +148,7 @@ def split_topic(path: str | Path) -> tuple[Path, str]:
 
 def _select_split(recording: Recording, split: Path) -> Recording:
     """Return the frames that a split file names by frame or sequence, without duplicates."""
-    names = read_text(split, what="the split").split()
+    names = read_text(split, noun="the split").split()
     sequences: dict[str, list[str]] = {}
     frames: dict[str, None] = {}
     for frame in recording:

@@ -74,7 +74,7 @@ def read_labels(path: Path) -> GroundTruth | None:
     if not path.exists():
         return None
     boxes, names = [], []
-    for i, line in enumerate(read_text(path, what="the labels").splitlines(), 1):
+    for i, line in enumerate(read_text(path, noun="the labels").splitlines(), 1):
         words = line.split()
         if not words:
             continue

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from lidar_perception.detectors.checkpoint import KEY, POINTPILLARS, Header
 from lidar_perception.runs.files import write_bytes
-from lidar_perception.runs.threads import thread_count
+from lidar_perception.runs.threads import get_thread_count
 from lidar_perception.types import InputError
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def open_session(path: str | Path) -> tuple[Any, str | None]:
     if not Path(path).is_file():
         raise InputError(f"there is no exported network {path}")
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = thread_count()
+    options.intra_op_num_threads = get_thread_count()
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         return session, session.get_modelmeta().custom_metadata_map.get(KEY)

@@ -7,19 +7,19 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
 
-from lidar_perception.runs.threads import thread_count
+from lidar_perception.runs.threads import get_thread_count
 
 PARTS_PER_THREAD = 4  # if one thread is delayed, the others take over its parts
 
 
 def run_in_parts(compute: Callable[[int, int], None], count: int, max_parts: int) -> None:
     """Call compute(begin, end) for parts that together are 0 .. count, on as many threads as
-    thread_count() says. Only functions that release the GIL become faster.
+    get_thread_count() says. Only functions that release the GIL become faster.
 
     Args:
         max_parts: maximum number of ranges; small amounts of work need few.
     """
-    threads = thread_count()
+    threads = get_thread_count()
     parts = min(max_parts, threads * PARTS_PER_THREAD, count)
     if threads == 1 or parts < 2:
         compute(0, count)

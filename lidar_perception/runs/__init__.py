@@ -1,1 +1,1 @@
-"""Long-running commands: files, processes, resuming, the terminal, compilation."""
+"""Support for long-running commands: files, processes, resuming, terminal output, compilation."""

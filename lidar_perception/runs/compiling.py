@@ -1,6 +1,6 @@
-"""First compilation on a machine: reported while it runs, in one process at a time.
+"""Progress reports and locking for the first compilation on a machine.
 
-Numba caches compiled code, so a later start loads it in a few seconds.
+Numba caches compiled code, so later starts load it in a few seconds.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ WAITING_MESSAGE = "waiting for another process to compile, or to load compiled c
 
 
 class _Compilation:
-    """Listener to Numba's events; Numba sends none when it loads code from its cache."""
+    """Listener for Numba's compile events; Numba sends none when it loads code from its cache."""
 
     current: _Compilation | None = None  # compilation of the outermost block
 
@@ -37,7 +37,7 @@ class _Compilation:
         self.announced = False
 
     def notify(self, event: Any) -> None:
-        """Numba calls this, under its compiler lock, when it begins and ends a function."""
+        """Handle the start or end of a function; Numba calls this while it holds its compiler lock."""
         if event.is_start:
             self.start = self.start if self.depth else perf_counter()
             self.depth += 1
@@ -71,13 +71,13 @@ class _Compilation:
 
 @contextmanager
 def report_compilation(report: Callable[[str], object] | None = None, whole_detector: bool = False) -> Iterator[None]:
-    """Report when Numba compiles for more than REPORT_AFTER_S within the block.
+    """Report the progress if Numba compiles for more than REPORT_AFTER_S within the block.
 
     Args:
-        report: called with each line, by default prints to standard error. Nested blocks use that
-            of the outermost block.
-        whole_detector: the block runs a whole detector, so it compiles if nothing is cached yet;
-            this is reported at once, before torch is loaded.
+        report: Function that is called with each line, by default prints to standard error. Nested
+            blocks use the function of the outermost block.
+        whole_detector: True if the block runs a complete detector. If nothing is cached yet, the
+            compilation is then reported at the start of the block, before torch is loaded.
     """
     outer = _Compilation.current
     if outer is not None:
@@ -110,7 +110,7 @@ def report_compilation(report: Callable[[str], object] | None = None, whole_dete
 
 
 def _is_cached() -> bool:
-    """Return True if Numba's cache of a function that all detectors use is up to date."""
+    """Return True if Numba's cache is up to date for a function that all detectors use."""
     from lidar_perception import geometry
 
     function: Any = geometry.counting_sort
@@ -122,16 +122,16 @@ def _is_cached() -> bool:
 
 
 @contextmanager
-def compile_meanwhile(code: str, log: Path, report: Callable[[str], object]) -> Iterator[None]:
-    """Run Python code in a second process during the block if nothing is compiled yet.
+def compile_in_background(code: str, log: Path, report: Callable[[str], object]) -> Iterator[None]:
+    """Run code that compiles in a second process during the block, if nothing is compiled yet.
 
-    The end of the block waits for the process. Its errors are not raised: this process, which runs
-    the same code later, raises them.
+    The block ends after the process has ended. Errors of the process are not raised, because this
+    process runs the same code later and raises them then.
 
     Args:
-        code: what compiles, for example by opening a detector.
-        log: file for its output.
-        report: called with a line if the process outlasts the block.
+        code: Python code that triggers the compilation, for example by opening a detector.
+        log: File for the output of the process.
+        report: Function that is called with a line if the block has to wait for the process.
     """
     if _is_cached():
         yield
@@ -150,22 +150,23 @@ def compile_meanwhile(code: str, log: Path, report: Callable[[str], object]) -> 
 
 @contextmanager
 def lock_compilation(report: Callable[[str], object]) -> Iterator[None]:
-    """Wait until no other process of this user is in such a block.
+    """Let only one process of this user at a time execute the block.
 
     The first node compiles, and the others load the cached code. If all nodes compiled the same
     functions at the same time on few cores, each would take many times longer.
 
     Args:
-        report: called with a line when the wait is long, and with its duration at the end.
+        report: Function that is called with a line if the wait is long, and with its duration at
+            the end.
     """
     with open(Path(tempfile.gettempdir()) / f"lidar_perception-{os.getuid()}.lock", "w") as lock:
-        start, reported = perf_counter(), False
+        start, has_reported = perf_counter(), False
         while not _try_lock(lock):
             sleep(POLL_INTERVAL_S)
-            if not reported and perf_counter() - start > REPORT_AFTER_S:
+            if not has_reported and perf_counter() - start > REPORT_AFTER_S:
                 report(WAITING_MESSAGE)
-                reported = True
-        if reported:
+                has_reported = True
+        if has_reported:
             report(f"waited {perf_counter() - start:.1f} s for another process to compile")
         yield
 

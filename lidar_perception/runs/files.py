@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, and careful reading of small files."""
+"""Atomic writing of files and folders, and reading of small files with checks."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ _calls = itertools.count()
 
 
 def check_regular(path: Path) -> Path:
-    """Return the path if it is a regular file, a folder, or does not exist.
+    """Return the path if it is a regular file or a folder, or does not exist.
 
     Raises:
-        InputError: for a pipe or a device, which a read may block on, and for an invalid name.
+        InputError: The path is a pipe or a device, on which a read could block, or its name is
+            invalid.
     """
     if "\0" in str(path):
         raise InputError(f"{str(path)!r} is not a valid file name; correct it")
@@ -33,13 +34,18 @@ def check_regular(path: Path) -> Path:
 MAX_TEXT_BYTES = 2**28  # maximum size of a file of numbers or labels
 
 
-def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES, what: str = "") -> str:
-    """Read the UTF-8 text of a file of at most max_bytes, without a byte order mark.
+def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES, noun: str = "") -> str:
+    """Read a UTF-8 text file of at most max_bytes and drop its byte order mark.
+
+    Args:
+        path: The file.
+        max_bytes: Maximum size of the file.
+        noun: Description of the file in error messages.
 
     Raises:
-        InputError: if it cannot be read, or is a pipe or a device; `what` describes the file.
+        InputError: The file cannot be read, is too large, or is a pipe or a device.
     """
-    named = f"{what} {path}" if what else str(path)
+    title = f"{noun} {path}" if noun else str(path)
     path = Path(path)
     try:
         with open(check_regular(path), "rb") as stream:
@@ -50,14 +56,14 @@ def read_text(path: str | Path, max_bytes: int = MAX_TEXT_BYTES, what: str = "")
             )
         return content.decode("utf-8-sig")  # editors on Windows write a byte order mark
     except OSError as error:
-        raise InputError(f"cannot read {named}: {error.strerror or error}") from None
+        raise InputError(f"cannot read {title}: {error.strerror or error}") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"cannot read {named}: it is not UTF-8 text ({error.reason} at byte {error.start})") from None
+        raise InputError(f"cannot read {title}: it is not UTF-8 text ({error.reason} at byte {error.start})") from None
 
 
 @contextmanager
 def convert_os_errors() -> Iterator[None]:
-    """Convert errors about a file (no permission, name too long) to InputError."""
+    """Convert an OSError about a file (no permission, name too long) to InputError."""
     try:
         yield
     except OSError as error:
@@ -67,21 +73,21 @@ def convert_os_errors() -> Iterator[None]:
 
 
 def shorten_error(error: BaseException, length: int = 200) -> str:
-    """Return the first line of an error's message, at most `length` characters, or its type."""
+    """Return the first line of an error message, cut to `length` characters, or the error type."""
     line = (str(error).strip().splitlines() or [type(error).__name__])[0]
     return line if len(line) <= length else f"{line[: length - 3]}..."
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write UTF-8 text as write_bytes does, with a line feed at the end."""
+    """Write UTF-8 text atomically, with a line feed at the end; see write_bytes."""
     write_bytes(path, (text if text.endswith("\n") else text + "\n").encode())
 
 
 def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
-    """Write a file atomically: path holds the old content or the new one, never a part.
+    """Write a file atomically: it has either the old content or all of the new content.
 
     Raises:
-        InputError: if it cannot be written.
+        InputError: The file cannot be written.
     """
     path = Path(path)
     temporary = _make_temporary_path(path)
@@ -99,75 +105,75 @@ def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
 
 
 def _make_temporary_path(path: Path) -> Path:
-    """Return a hidden path in the same folder that no other process and no other call uses."""
+    """Return a hidden path in the same folder that is unique to this process and call."""
     require_name(path)
     return path.with_name(f".{path.name}.{os.getpid()}-{next(_calls)}.tmp")
 
 
 def require_name(path: Path) -> None:
-    """Raise InputError for a path without a name, such as `.`, which a temporary file needs."""
+    """Raise InputError for a path without a name, such as `.`; temporary files need a name."""
     if not path.name:
         raise InputError(f"{path} has no name for a new file; give one, such as {path / 'out'}")
 
 
 def check_unused(path: Path, force: bool) -> None:
-    """Raise InputError if the path exists, unless force."""
+    """Raise InputError if the path exists, unless `force` is True."""
     if path.exists() and not force:
         raise InputError(f"{path} exists already; give another name or --force")
 
 
-def refuse_other_files(folder: Path, ours: Iterable[str]) -> None:
-    """Raise InputError if a folder has files that do not match the patterns `ours`.
+def refuse_other_files(folder: Path, own_patterns: Iterable[str]) -> None:
+    """Raise InputError if a folder has files that do not match any of the patterns.
 
-    They would be removed together with the others.
+    The caller would remove them together with its own files.
     """
-    ours = [*ours, "*.tmp"]
-    if others := sorted(
-        path.name for path in folder.iterdir() if not any(fnmatch(path.name, pattern) for pattern in ours)
+    own_patterns = [*own_patterns, "*.tmp"]
+    if other_names := sorted(
+        path.name for path in folder.iterdir() if not any(fnmatch(path.name, pattern) for pattern in own_patterns)
     ):
         raise InputError(
-            f"{folder} has other files too ({len(others)}, such as {others[0]}), "
+            f"{folder} has other files too ({len(other_names)}, such as {other_names[0]}), "
             "which would be removed; move them away, or give another name"
         )
 
 
 @contextmanager
 def write_folder(path: Path, force: bool = False) -> Iterator[Path]:
-    """Yield a temporary folder whose files move to `path` when the block ends without an error.
+    """Yield a temporary folder; its files are moved to `path` if the block ends without an error.
 
-    With force, they replace files of the same names.
+    With force, they replace files with the same names.
 
     Raises:
-        InputError: if they cannot be written, if `path` exists and force is False, or if `path` has
-            a file that would not be replaced.
+        InputError: The files cannot be written, `path` exists and force is False, or `path` has a
+            file that would not be replaced.
     """
     check_unused(path, force)
-    hidden = _make_temporary_path(path)
+    temporary = _make_temporary_path(path)
     try:
-        make_folder(hidden)
-        yield hidden
-        new = {file.relative_to(hidden) for file in hidden.rglob("*") if not file.is_dir()}
-        old = {file.relative_to(path) for file in path.rglob("*") if not file.is_dir()}
-        if left := sorted(old - new):
+        make_folder(temporary)
+        yield temporary
+        new_files = {file.relative_to(temporary) for file in temporary.rglob("*") if not file.is_dir()}
+        old_files = {file.relative_to(path) for file in path.rglob("*") if not file.is_dir()}
+        if not_replaced := sorted(old_files - new_files):
             raise InputError(
-                f"{path} has files that would not be replaced ({len(left)}, such as "
-                f"{left[0]}); remove the folder yourself, or give another name"
+                f"{path} has files that would not be replaced ({len(not_replaced)}, such as "
+                f"{not_replaced[0]}); remove the folder yourself, or give another name"
             )
         if not path.exists():
-            hidden.rename(path)
-        for file in sorted(new if hidden.exists() else ()):
+            temporary.rename(path)
+        for file in sorted(new_files if temporary.exists() else ()):
             (path / file).parent.mkdir(parents=True, exist_ok=True)
-            (hidden / file).replace(path / file)
+            (temporary / file).replace(path / file)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or error}") from None
     except InputError as error:
-        raise InputError(str(error).replace(str(hidden), str(path))) from None
+        raise InputError(str(error).replace(str(temporary), str(path))) from None
     finally:
-        shutil.rmtree(hidden, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def check_writable_folder(path: Path) -> None:
-    """Raise InputError if a folder cannot be created or written into. Nothing is created."""
+    """Raise InputError if a folder cannot be created or written into; creates nothing."""
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     if not existing.is_dir():
         raise InputError(f"cannot write into the folder {path}: {existing} is a file")
@@ -179,7 +185,7 @@ def make_folder(path: Path) -> None:
     """Create a folder and its parents if needed.
 
     Raises:
-        InputError: if it cannot be created or written into.
+        InputError: The folder cannot be created or written into.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -194,9 +200,13 @@ def make_folder(path: Path) -> None:
 def remove_temporaries(folder: Path, *names: str) -> None:
     """Remove the temporary files of a killed process from a folder, but not from its subfolders.
 
-    names are patterns of the files that were being written. No other process may write there.
+    No other process may write into the folder meanwhile.
+
+    Args:
+        folder: The folder.
+        names: Patterns of the names of the final files.
     """
     for path in folder.glob(".*.tmp"):
-        written = re.fullmatch(r"\.(.+)\.\d+-\d+\.tmp", path.name)  # see _make_temporary_path
-        if written and any(fnmatch(written[1], name) for name in names) and path.is_file():
+        match = re.fullmatch(r"\.(.+)\.\d+-\d+\.tmp", path.name)  # see _make_temporary_path
+        if match and any(fnmatch(match[1], name) for name in names) and path.is_file():
             path.unlink(missing_ok=True)

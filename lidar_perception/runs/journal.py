@@ -1,6 +1,6 @@
-"""Journal of a run over frames, from which a stopped run resumes.
+"""Journal of a run over frames, from which an interrupted run resumes.
 
-frames.jsonl has the settings in the first line, then one record per frame and line.
+The first line of frames.jsonl has the settings; each further line has the record of one frame.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SYNC_S = 1.0  # maximum time whose records are lost if the machine crashes
 
 
 class Journal:
-    """Open journal. lines: name of a finished frame -> its record as JSON."""
+    """Journal that is open for writing; `lines` has the JSON record of each finished frame by name."""
 
     def __init__(self, path: Path, plan: dict[str, Any], lines: dict[str, str], stream: BufferedWriter) -> None:
         self.path, self.plan, self.lines = path, plan, lines
@@ -49,10 +49,10 @@ class Journal:
         self._synced = monotonic()
 
     def sort(self, names: list[str]) -> None:
-        """Rewrite the file with the records in the order of names, those of other frames last."""
+        """Rewrite the file with the records in the order of names; other frames come last."""
         ordered = [self.lines[name] for name in names if name in self.lines]
-        first = set(names)
-        others = [line for name, line in self.lines.items() if name not in first]
+        known_names = set(names)
+        others = [line for name, line in self.lines.items() if name not in known_names]
         write_text(self.path, "\n".join([_format_head(self.plan), *ordered, *others]))
 
 
@@ -64,40 +64,41 @@ def open_journal(
     force: bool = False,
     list_files: Callable[[Path], Iterable[Path]] = lambda folder: (),
 ) -> Iterator[Journal]:
-    """Open the journal of a run in a folder, which is created if needed.
+    """Open the journal of a run in a folder; the folder is created if needed.
 
-    It does not contain frames that were skipped before, so that they are tried again.
+    Frames that an earlier run skipped are not in the journal, so that they are processed again.
 
     Args:
-        plan: the settings of the run.
-        force: start over.
-        list_files: lists the other files of an earlier run in a folder, which force removes.
+        folder: The folder.
+        plan: Settings of the run.
+        force: Start over.
+        list_files: Function that lists the other files of an earlier run, which force removes.
 
     Raises:
-        InputError: if the folder holds a run with another plan, or other files, unless force; or if
-            another process writes there.
+        InputError: The folder has a run with different settings or other files, and force is False;
+            or another process writes into it.
     """
     with lock_folder(folder):
         path = folder / JOURNAL_NAME
         lines = {} if force else _read_records(folder, plan)
         if force and path.exists():  # without a journal, the files may not be ours
-            for old in (*list_files(folder), path):
-                old.unlink(missing_ok=True)
-        for old in folder.glob(f".{JOURNAL_NAME}.*.tmp"):  # left by a process that was killed
-            old.unlink()
+            for old_file in (*list_files(folder), path):
+                old_file.unlink(missing_ok=True)
+        for old_file in folder.glob(f".{JOURNAL_NAME}.*.tmp"):  # left by a process that was killed
+            old_file.unlink()
         write_text(path, "\n".join([_format_head(plan), *lines.values()]))
         stream = open(path, "ab")
-        opened = Journal(path, plan, lines, stream)
+        journal = Journal(path, plan, lines, stream)
         try:
-            yield opened
+            yield journal
         finally:
-            for last in (opened.sync, stream.close):
+            for close_step in (journal.sync, stream.close):
                 with suppress(OSError):  # the disk is full, which add() has reported
-                    last()
+                    close_step()
 
 
 def read_skipped_frames(folder: Path) -> dict[str, str]:
-    """Return why the run in a folder skipped frames, by frame name; {} without a run."""
+    """Return the reasons for skipped frames by frame name; {} if the folder has no run."""
     with suppress(OSError, ValueError, TypeError):
         lines = (folder / JOURNAL_NAME).read_text(errors="replace").splitlines()[1:]
         records = [json.loads(line) for line in lines if '"skipped"' in line]
@@ -110,7 +111,7 @@ def _format_head(plan: dict[str, Any]) -> str:
 
 
 def _read_records(folder: Path, plan: dict[str, Any]) -> dict[str, str]:
-    """Read the records of an earlier run with the same plan; {} without one."""
+    """Read the records of an earlier run with the same plan; {} if there is no such run."""
     path = folder / JOURNAL_NAME
     if not path.exists():
         if any(not old.name.startswith(f".{JOURNAL_NAME}.") for old in folder.iterdir()):
@@ -120,19 +121,19 @@ def _read_records(folder: Path, plan: dict[str, Any]) -> dict[str, str]:
             )
         return {}
     try:
-        head, *rest = path.read_text(errors="replace").split("\n")
-        before = json.loads(head)["plan"]
+        head, *record_lines = path.read_text(errors="replace").split("\n")
+        recorded_plan = json.loads(head)["plan"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"cannot read {path}: {error!r}; --force starts again") from None
-    if different := find_differences(before, json.loads(json.dumps(plan))):
+    if differences := find_differences(recorded_plan, json.loads(json.dumps(plan))):
         raise InputError(
-            f"{folder} was begun with {'; '.join(different)}; give another name, or start again with --force"
+            f"{folder} was begun with {'; '.join(differences)}; give another name, or start again with --force"
         )
-    return {record["frame"]: line for line in rest if (record := _parse_record(line))}
+    return {record["frame"]: line for line in record_lines if (record := _parse_record(line))}
 
 
 def _parse_record(line: str) -> dict | None:
-    """Return the record in a line; None if the line is cut off, or the frame was skipped."""
+    """Return the record in a line; None if the line is incomplete or the frame was skipped."""
     with suppress(ValueError):
         record = json.loads(line)
         if isinstance(record, dict) and "frame" in record and "skipped" not in record:

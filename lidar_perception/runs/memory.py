@@ -1,4 +1,4 @@
-"""Freed memory that the process keeps for the next cloud."""
+"""Setting of glibc to keep freed memory in the process for the next cloud."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ USER_VARIABLES = ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUN
 def keep_freed_memory() -> None:
     """Make glibc keep freed memory instead of returning it to the system.
 
-    The system would hand it out again page by page, each filled with zeros. PointPillars takes 77
-    instead of 91 ms; peak memory is the same, but the process stays at it. The user's settings in
-    the environment take precedence; other C libraries are not affected.
+    This avoids that the system zeroes each page again: PointPillars takes 77 instead of 91 ms. Peak
+    memory is the same, but the process does not shrink afterwards. Settings of the user in the
+    environment take precedence. Other C libraries are not affected.
     """
     if any(name in os.environ for name in USER_VARIABLES):
         return

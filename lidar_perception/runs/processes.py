@@ -1,6 +1,6 @@
-"""Work on many items in several processes, which end with the process that started them.
+"""Processing of many items in several processes that end with their parent process.
 
-This also holds after ctrl-C, after the parent was killed, and when memory runs out.
+They also end after ctrl-C, if the parent is killed, and if memory runs out.
 """
 
 from __future__ import annotations
@@ -31,23 +31,27 @@ RUNS_PER_PROCESS = 16  # runs of consecutive items, which often share work (scan
 
 
 def run_in_processes(
-    start: Callable[[], Callable[[Any], Any]], items: Sequence, jobs: int, what: str, *, apart: bool = False
+    start: Callable[[], Callable[[Any], Any]], items: Sequence, jobs: int, work_done: str, *, separate: bool = False
 ) -> Generator:
-    """Yield start()(item) of all items, in the order in which they are finished.
+    """Yield start()(item) for all items, in the order in which they are finished.
 
-    Processes are forked from a process that has only imported the modules of `start`. Several
-    processes share the cores, so each uses one thread. All of them end with the iterator.
+    Processes are forked from a process that has only imported the modules of `start`. If there are
+    several, each uses one thread. All of them end with the iterator.
 
     Args:
-        start: picklable; called once in each new process.
-        jobs: number of processes. With one job or one item there is no new process, unless apart.
-        what: names the work for errors, such as "wrote frames".
+        start: Picklable function that is called once in each new process and returns the function
+            for the items.
+        items: Items to process.
+        jobs: Number of processes. With one job or one item no new process is started, unless
+            `separate` is True.
+        work_done: What the processes did, for error messages, such as "wrote frames".
+        separate: Always start new processes.
 
     Raises:
-        InputError: raised by a worker, or if a worker died. All processes are ended.
+        InputError: A worker raised InputError, or died. All processes are ended.
     """
     jobs = min(jobs, len(items))
-    if jobs <= 1 and not apart:
+    if jobs <= 1 and not separate:
         if items:
             yield from map(start(), items)
         return
@@ -59,42 +63,49 @@ def run_in_processes(
             running[receiver] = _start_process(context, _run_items, start, deal_items(items, jobs, j), jobs > 1, sender)
         while running:
             for receiver in cast(list[Connection], wait(list(running))):
-                yield from _receive_result(receiver, running, what)
+                yield from _receive_result(receiver, running, work_done)
     finally:
         _end_processes(running)
 
 
 def deal_items(items: Sequence, jobs: int, job: int) -> list:
-    """Return the items of one of several jobs: runs of consecutive items, dealt in turn.
+    """Return the items of one job: runs of consecutive items, dealt to the jobs in turn.
 
-    The shares differ by one run at most, which is at most 1 / RUNS_PER_PROCESS of a share.
+    The jobs differ by at most one run, which is at most 1 / RUNS_PER_PROCESS of the items of a job.
     """
-    run = max(1, len(items) // (jobs * RUNS_PER_PROCESS))
-    return [item for first in range(job * run, len(items), jobs * run) for item in items[first : first + run]]
+    run_length = max(1, len(items) // (jobs * RUNS_PER_PROCESS))
+    return [
+        item
+        for start in range(job * run_length, len(items), jobs * run_length)
+        for item in items[start : start + run_length]
+    ]
 
 
 def run_in_order(
-    start: Callable[[], Callable[[Any], Any]], items: Iterable, jobs: int, ahead: int, what: str
+    start: Callable[[], Callable[[Any], Any]], items: Iterable, jobs: int, max_ahead: int, work_done: str
 ) -> Generator:
-    """Yield start()(item) of all items, which may be endless, in their order.
+    """Yield start()(item) for all items in their order; the items may be endless.
 
-    As run_in_processes, but a single job also gets a new process of one thread. Each process works
-    up to `ahead` items ahead of the caller.
+    The arguments are those of run_in_processes, but a single job also gets a new process with one
+    thread.
+
+    Args:
+        max_ahead: Maximum number of items that each process works ahead of the caller.
     """
-    waiting = iter(items)
-    first = list(islice(waiting, jobs * ahead))
+    remaining = iter(items)
+    first_items = list(islice(remaining, jobs * max_ahead))
     context = _make_context(start)
     running: dict[Connection, ForkServerProcess] = {}
     try:
-        for _ in first[:jobs]:
-            own_end, worker_end = context.Pipe()
-            running[own_end] = _start_process(context, _serve, start, worker_end)
+        for _ in first_items[:jobs]:
+            parent_end, worker_end = context.Pipe()
+            running[parent_end] = _start_process(context, _serve_items, start, worker_end)
         pipes = list(running)
-        pending = deque(_send_item(pipes[k % len(pipes)], item) for k, item in enumerate(first))
+        pending = deque(_send_item(pipes[k % len(pipes)], item) for k, item in enumerate(first_items))
         while pending:
             pipe = pending.popleft()
-            for result in _receive_result(pipe, running, what):
-                pending += [_send_item(pipe, item) for item in islice(waiting, 1)]
+            for result in _receive_result(pipe, running, work_done):
+                pending += [_send_item(pipe, item) for item in islice(remaining, 1)]
                 yield result
     finally:
         _end_processes(running)
@@ -107,10 +118,10 @@ def _make_context(start: Callable) -> ForkServerContext:
 
 
 def _start_process(context: ForkServerContext, work: Callable, *args: Any) -> ForkServerProcess:
-    """Start a process that runs work(*args). The last argument is its end of a pipe.
+    """Start a process that runs work(*args). The last argument is the end of its pipe.
 
-    No other process keeps that end, so the pipe closes with the process, even if it is killed while
-    it sends a result.
+    No other process keeps this end open, so the pipe closes when the process ends, even if the
+    process is killed while it sends a result.
     """
     process = context.Process(target=work, args=args, daemon=True)
     with _block_interrupts():
@@ -124,29 +135,29 @@ def _end_processes(running: dict[Connection, ForkServerProcess]) -> None:
         process.terminate()
     for pipe in running:
         pipe.close()
-    end = monotonic() + EXIT_TIMEOUT_S
+    deadline = monotonic() + EXIT_TIMEOUT_S
     for process in running.values():
-        process.join(max(0.0, end - monotonic()))
+        process.join(max(0.0, deadline - monotonic()))
         process.kill()  # if it has not ended, for example because it was interrupted holding a lock
         process.join()
 
 
 def _find_modules(work: Any) -> set[str]:
-    """Return the modules of the functions and objects that a process is given.
+    """Return the modules of the functions and objects that are passed to a process.
 
-    An object may name in `later_imports` the modules that its methods will import.
+    The attribute `later_imports` of an object can name modules that its methods will import.
     """
     if isinstance(work, partial):
         return set[str]().union(*map(_find_modules, (work.func, *work.args, *work.keywords.values())))
-    later = getattr(getattr(work, "__self__", work), "later_imports", ())
-    return {getattr(work, "__module__", "builtins"), *later}
+    later_imports = getattr(getattr(work, "__self__", work), "later_imports", ())
+    return {getattr(work, "__module__", "builtins"), *later_imports}
 
 
-def _receive_result(receiver: Connection, running: dict[Connection, ForkServerProcess], what: str) -> Iterator:
+def _receive_result(receiver: Connection, running: dict[Connection, ForkServerProcess], work_done: str) -> Iterator:
     """Yield the next result, or nothing if the process has ended normally.
 
     Raises:
-        InputError: if it failed or died.
+        InputError: The process failed or died.
     """
     try:
         result, error = receiver.recv()
@@ -155,7 +166,7 @@ def _receive_result(receiver: Connection, running: dict[Connection, ForkServerPr
         process.join()
         if process.exitcode:
             raise InputError(
-                f"a process that {what} ended with exit code {process.exitcode}"
+                f"a process that {work_done} ended with exit code {process.exitcode}"
                 + (", perhaps out of memory: try fewer --jobs" if process.exitcode == -signal.SIGKILL else "")
             ) from None
         return
@@ -186,7 +197,7 @@ def _send_item(pipe: Connection, item: Any) -> Connection:
     return pipe
 
 
-def _serve(start: Callable, pipe: Connection) -> None:
+def _serve_items(start: Callable, pipe: Connection) -> None:
     limit_to_one_thread()
     signal.signal(signal.SIGTERM, _exit_once)
     results: SimpleQueue[Any] = SimpleQueue()
@@ -204,13 +215,13 @@ def _serve(start: Callable, pipe: Connection) -> None:
 
 
 def _exit_once(*_: Any) -> None:
-    """Exit on the first SIGTERM, ignoring further ones, so that system resources are released."""
+    """Exit on the first SIGTERM and ignore further ones, so that system resources are released."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.exit()
 
 
 def _send_results(results: SimpleQueue[Any], pipe: Connection) -> None:
-    """Send results in a thread, because the reader may be busy for long."""
+    """Send results; this runs in a thread because the reader may be busy for a long time."""
     while True:
         try:
             pipe.send_bytes(results.get())
@@ -221,10 +232,10 @@ def _send_results(results: SimpleQueue[Any], pipe: Connection) -> None:
 
 @contextmanager
 def _block_interrupts() -> Iterator[None]:
-    """Block SIGINT, so that processes started here ignore ctrl-C; their parent ends them."""
+    """Block SIGINT, so that processes started in the block ignore ctrl-C; their parent ends them."""
     resource_tracker.ensure_running()  # must not start inside the block, because it would unblock the signals
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous_mask)

@@ -1,9 +1,9 @@
-"""A folder that is written frame by frame, marked until it is complete, and resumed after a stop.
+"""Data set folder that is written frame by frame and can be resumed after an interruption.
 
-Until it is complete, it has INCOMPLETE, a JSON file of its settings, and .parts with one file per
-finished frame: that frame's share of the files that belong to many frames, such as the label file
-of a sequence. At the end the shares are joined, INCOMPLETE is renamed to dataset.json, which
-records the settings, and .parts is removed.
+While it is incomplete, the folder has a JSON file INCOMPLETE with the settings, and a folder .parts
+with one file per finished frame. This file has the frame's part of each file that belongs to many
+frames, such as the label file of a sequence. At the end the parts are joined, INCOMPLETE is renamed
+to dataset.json, and .parts is removed.
 """
 
 from __future__ import annotations
@@ -31,91 +31,98 @@ def is_finished(folder: Path) -> bool:
 def make_resumable_folder(
     folder: Path, settings: dict, names: Iterable[str], *, resume: bool = False, force: bool = False
 ) -> Iterator[list[int]]:
-    """Yield the numbers of the frames that are still to be written.
+    """Yield the numbers of the frames that remain to be written.
 
-    The caller ends each frame with finish_frame(). After the block, the folder is complete; after
-    an exception in it, the folder can be resumed.
+    The caller calls finish_frame() after each frame. After the block the folder is complete; after
+    an exception in the block it can be resumed.
 
     Args:
-        settings: the settings of the data set; settings["frames"] is the number of frames.
-        names: the names of files and folders in such a folder, which force replaces.
+        folder: The folder.
+        settings: Settings of the data set; settings["frames"] is the number of frames.
+        names: Names of the files and folders of the data set; force replaces them.
+        resume: Continue an interrupted run.
+        force: Replace an existing data set.
 
     Raises:
-        InputError: if the folder exists and neither resume nor force is given; with resume, if it
-            was begun with other settings; with force, if it is not a data set of this package, or
-            has other files.
+        InputError: The folder exists without resume or force; or, with resume, it was written with
+            different settings; or, with force, it is not a data set of this package or has other
+            files.
     """
     with lock_folder(folder):
-        _begin(folder, settings, names, resume, force)
+        _prepare_folder(folder, settings, names, resume, force)
         if not is_finished(folder):
             for path, _, _ in os.walk(folder):
                 remove_temporaries(Path(path), "*")
             yield [i for i in range(settings["frames"]) if not _part_path(folder, i).exists()]
-            _join(folder, settings["frames"])
+            _join_parts(folder, settings["frames"])
             (folder / INCOMPLETE_NAME).replace(folder / RECORD_NAME)
         else:
             yield []
         shutil.rmtree(folder / PARTS_NAME, ignore_errors=True)
 
 
-def finish_frame(folder: Path, number: int, shares: dict[str, str]) -> None:
-    """Mark a frame as finished, after all its files are written.
+def finish_frame(folder: Path, number: int, parts: dict[str, str]) -> None:
+    """Mark a frame as finished; call this after all its files are written.
 
-    shares: path in the folder -> text that this frame adds to that file, in the order of frames.
+    Args:
+        folder: The folder.
+        number: Number of the frame.
+        parts: Text that the frame adds to files of many frames, by path in the folder. The parts
+            are joined in the order of the frames.
     """
-    write_text(_part_path(folder, number), json.dumps(shares))
+    write_text(_part_path(folder, number), json.dumps(parts))
 
 
 def _part_path(folder: Path, number: int) -> Path:
     return folder / PARTS_NAME / f"{number:06}.json"
 
 
-def _begin(folder: Path, settings: dict, names: Iterable[str], resume: bool, force: bool) -> None:
+def _prepare_folder(folder: Path, settings: dict, names: Iterable[str], resume: bool, force: bool) -> None:
     """Check the folder, and clear it unless it is resumed."""
     exists = any(folder.iterdir())
-    ours = (folder / INCOMPLETE_NAME).is_file() or (folder / RECORD_NAME).is_file()
+    is_own = (folder / INCOMPLETE_NAME).is_file() or (folder / RECORD_NAME).is_file()
     if exists and not (resume or force):
-        raise InputError(f"{folder} exists already; give another name" + (", --resume or --force" if ours else ""))
-    if exists and not ours:
+        raise InputError(f"{folder} exists already; give another name" + (", --resume or --force" if is_own else ""))
+    if exists and not is_own:
         raise InputError(f"{folder} is not a simulated data set, so it is left as it is; give another name")
     if exists and resume:
         _check_settings(folder, settings)
         return
     refuse_other_files(folder, (*names, INCOMPLETE_NAME, RECORD_NAME, PARTS_NAME))
     write_text(folder / INCOMPLETE_NAME, "{}")  # if interrupted during removal, only force accepts the folder
-    for old in folder.iterdir():
-        if old.is_dir() and not old.is_symlink():
-            shutil.rmtree(old)
-        elif old.name != INCOMPLETE_NAME:
-            old.unlink()
+    for path in folder.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path.name != INCOMPLETE_NAME:
+            path.unlink()
     write_text(folder / INCOMPLETE_NAME, json.dumps(settings, indent=1))
 
 
 def _check_settings(folder: Path, settings: dict) -> None:
     path = folder / (RECORD_NAME if is_finished(folder) else INCOMPLETE_NAME)
     try:
-        before = json.loads(path.read_text())
-        different = find_differences(before, {k: v for k, v in settings.items() if k != "command"})
+        recorded = json.loads(path.read_text())
+        differences = find_differences(recorded, {k: v for k, v in settings.items() if k != "command"})
     except (OSError, ValueError, AttributeError) as error:
         raise InputError(f"cannot read {path}: {error}; --force starts again") from None
-    if not before:
+    if not recorded:
         raise InputError(f"{folder} was stopped while --force removed what was there; start again with --force")
-    if different:
+    if differences:
         raise InputError(
-            f"{folder} was begun with {'; '.join(different)}; resume it with the same "
+            f"{folder} was begun with {'; '.join(differences)}; resume it with the same "
             "arguments, or start again with --force"
         )
 
 
-def _join(folder: Path, frames: int) -> None:
-    """Write the files that belong to many frames from the shares."""
-    whole: dict[str, list[str]] = {}
+def _join_parts(folder: Path, frames: int) -> None:
+    """Write the files that belong to many frames by joining the parts."""
+    texts_by_name: dict[str, list[str]] = {}
     for i in range(frames):
         try:
-            shares = json.loads(_part_path(folder, i).read_text())
+            parts = json.loads(_part_path(folder, i).read_text())
         except (OSError, ValueError) as error:
             raise InputError(f"cannot read {_part_path(folder, i)}: {error}; remove it and --resume") from None
-        for name, text in shares.items():
-            whole.setdefault(name, []).append(text)
-    for name, texts in whole.items():
+        for name, text in parts.items():
+            texts_by_name.setdefault(name, []).append(text)
+    for name, texts in texts_by_name.items():
         write_bytes(folder / name, "".join(texts).encode())

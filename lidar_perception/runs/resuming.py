@@ -1,4 +1,4 @@
-"""Locks and comparison of settings, for folders that are written in many steps."""
+"""Locks and comparison of settings, for output folders of resumable commands."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from lidar_perception.types import InputError
 
 
 def lock_file(descriptor: int, path: Path) -> str:
-    """Lock an open file or folder; return "", or the reason if the file system has no locks.
+    """Lock an open file or folder.
+
+    Returns "" on success, or an error message if the file system does not support locks.
 
     Raises:
-        InputError: while another process holds the lock.
+        InputError: Another process holds the lock.
     """
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -30,9 +32,12 @@ def lock_file(descriptor: int, path: Path) -> str:
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Create the folder if needed, and keep other processes from writing into it.
+    """Create a folder if needed, and lock it against other processes within the block.
 
     After an error, folders that were created here and are still empty are removed.
+
+    Raises:
+        InputError: The folder cannot be created, or another process has locked it.
     """
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
@@ -54,21 +59,25 @@ def lock_folder(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def find_differences(before: dict[str, Any], asked: dict[str, Any]) -> list[str]:
-    """Describe the settings that differ from before, as in "frames 5, not 6".
+def find_differences(recorded: dict[str, Any], requested: dict[str, Any]) -> list[str]:
+    """Describe the settings that differ, such as "frames 5, not 6".
 
-    Nested dicts have dotted names; keys that only `before` has are ignored.
+    Settings in nested dicts have dotted names. Keys that are only in `recorded` are ignored.
+
+    Args:
+        recorded: Settings of the earlier run.
+        requested: Settings of this run.
     """
-    found = []
-    for key, value in asked.items():
-        old = before.get(key)
-        if isinstance(value, dict) and isinstance(old, dict):
-            found += [f"{key}.{line}" for line in find_differences(old, value)]
-        elif old != value:
-            found.append(f"{key} {old!r}, not {value!r}")
-    return found
+    differences = []
+    for key, value in requested.items():
+        recorded_value = recorded.get(key)
+        if isinstance(value, dict) and isinstance(recorded_value, dict):
+            differences += [f"{key}.{line}" for line in find_differences(recorded_value, value)]
+        elif recorded_value != value:
+            differences.append(f"{key} {recorded_value!r}, not {value!r}")
+    return differences
 
 
 def hash_names(names: Iterable[str]) -> str:
-    """Return a short hash of names, such as those of frames, in their order."""
+    """Return a short hash of names, such as frame names; it depends on their order."""
     return hashlib.sha256("\n".join(names).encode()).hexdigest()[:12]

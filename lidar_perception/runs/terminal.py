@@ -28,9 +28,9 @@ from lidar_perception.types import InputWarning
 
 
 class Terminal(Console):
-    """Console without markup, because text may contain names of files.
+    """Console without markup, because text can contain file names.
 
-    Lines are wrapped, and tables fitted to the width, on a terminal only; output to a file or a
+    Lines are wrapped and tables are fitted to the width only on a terminal. Output to a file or a
     pipe is never wrapped or cut.
     """
 
@@ -54,10 +54,10 @@ class Terminal(Console):
 
 
 def _split_title(table: Table) -> list[list[Any]]:
-    """Split a table from its title, which rich would wrap at the width of the table."""
-    untitled = copy.copy(table)
-    untitled.title = None
-    return [[part] for part in (table.title, untitled) if part is not None]
+    """Separate a table from its title, because rich wraps the title at the width of the table."""
+    table_without_title = copy.copy(table)
+    table_without_title.title = None
+    return [[part] for part in (table.title, table_without_title) if part is not None]
 
 
 MAX_WIDTH = 100_000  # in characters, wider than any table
@@ -68,16 +68,16 @@ errors = Terminal(stderr=True)
 
 @contextmanager
 def show_input_warnings() -> Iterator[None]:
-    """Print each InputWarning once, as one line on standard error."""
+    """Print each InputWarning once, as a single line on standard error."""
     with warnings.catch_warnings():
         warnings.filterwarnings("once", category=InputWarning)
-        show = warnings.showwarning
+        default_show = warnings.showwarning
 
         def print_line(message: Warning | str, category: type[Warning], *args: Any, **kwargs: Any) -> None:
             if issubclass(category, InputWarning):
                 errors.print(Text("warning", "yellow") + f": {message}")
             else:
-                show(message, category, *args, **kwargs)
+                default_show(message, category, *args, **kwargs)
 
         warnings.showwarning = print_line
         yield
@@ -89,8 +89,8 @@ LOG_INTERVAL_S = 15.0  # time between progress lines without a terminal
 def make_progress() -> Progress:
     """Make a progress display on standard error.
 
-    It is a bar with text, count, elapsed and remaining time on a terminal, else a line with the
-    same information every LOG_INTERVAL_S seconds.
+    On a terminal it is a bar with description, count, elapsed and remaining time. Otherwise a line
+    with description, count and remaining time is printed every LOG_INTERVAL_S seconds.
     """
     return (Progress if errors.is_terminal else _LineProgress)(
         TextColumn("{task.description}", markup=False),
@@ -106,7 +106,7 @@ def make_progress() -> Progress:
 
 
 class _LineProgress(Progress):
-    """Progress written line by line; rich displays nothing, but computes the speed."""
+    """Progress printed as lines; rich is used only to compute the speed."""
 
     last_line = 0.0
 
@@ -131,21 +131,21 @@ class _LineProgress(Progress):
         if not task.visible:
             return
         total = "" if task.total is None else f" of {task.total:.0f}"
-        left = task.time_remaining
+        remaining_s = task.time_remaining
         errors.print(
             f"{task.description}: {task.completed:.0f}{total}"
-            + ("" if left is None else f", {format_duration(left)} left")
+            + ("" if remaining_s is None else f", {format_duration(remaining_s)} left")
         )
 
 
 def show_scanning(path: Path) -> Status:
-    """Show a status line while the times of all frames are read, which may take minutes for a bag."""
+    """Show a status line while the times of all frames are read; this can take minutes for a bag."""
     return errors.status(Text(f"looking through {path}"))
 
 
 @contextmanager
 def pause_progress(bar: Progress) -> Iterator[None]:
-    """Hide a progress bar, so that another one can be shown."""
+    """Hide a progress bar within the block, so that another one can be shown."""
     if bar.disable:
         yield
         return
@@ -157,13 +157,13 @@ def pause_progress(bar: Progress) -> Iterator[None]:
 
 
 def show_progress(items: Iterable, description: str, total: int) -> Iterator:
-    """Iterate over items and show the progress out of `total`."""
+    """Iterate over `total` items and show the progress."""
     with make_progress() as bar:
         yield from bar.track(items, total=total, description=description)
 
 
 def format_duration(seconds: float) -> str:
-    """Format a duration for reading: 40 s, 12 min, 1.5 h."""
+    """Format a duration for display, such as 40 s, 12 min or 1.5 h."""
     return (
         f"{seconds:.0f} s"
         if seconds < 90

@@ -1,4 +1,4 @@
-"""Settings of the threads of numerical libraries, for machines whose cores are shared."""
+"""Thread settings of numerical libraries, for machines whose cores are shared."""
 
 from __future__ import annotations
 
@@ -16,33 +16,40 @@ _thread_count = 0  # 0 if not set
 
 
 def set_thread_count(count: int) -> None:
-    """Set the number of threads of networks, in compiled kernels and in torch."""
+    """Set the number of threads that networks use in compiled kernels and in torch."""
     global _thread_count
     _thread_count = count
     set_torch_threads()
 
 
 def set_torch_threads() -> None:
-    """Apply set_thread_count() to torch if torch is loaded."""
+    """Apply the count of set_thread_count() to torch, if torch is loaded."""
     torch = sys.modules.get("torch")
     if _thread_count and torch is not None:
         torch.set_num_threads(_thread_count)
 
 
-def thread_count() -> int:
-    """Return the number of threads of networks: as set, or as OMP_NUM_THREADS says, or one per
-    core."""
-    by_environment = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
-    return _thread_count or (int(by_environment) if by_environment.isdigit() else 0) or (count_cores())
+def get_thread_count() -> int:
+    """Return the number of threads that networks use.
+
+    It is the count of set_thread_count(), or else OMP_NUM_THREADS, or else the number of cores.
+    """
+    omp_threads = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    return _thread_count or (int(omp_threads) if omp_threads.isdigit() else 0) or (count_cores())
 
 
 def use_passive_waiting() -> None:
-    """Make idle OpenMP threads sleep instead of spinning. Call this before torch is loaded.
+    """Make idle OpenMP threads sleep after a short spin. Call this before torch is loaded.
 
-    The user's own settings in the environment are kept. `fused` takes 102 ms on two free cores,
-    120 ms if threads sleep at once and 96 ms if they spin; with two busy processes 230, 245 and
-    339 ms. NumPy's OpenBLAS has no such setting and gains nothing for matrices of three columns,
-    so it gets one thread.
+    Settings of the user in the environment are kept. NumPy's OpenBLAS has no such setting and is
+    not faster with threads for matrices of three columns, so it gets one thread.
+
+    Duration of the detector `fused` on two cores:
+
+        idle threads                 two free cores    two busy processes
+        spin shortly, then sleep         102 ms              230 ms
+        sleep at once                    120 ms              245 ms
+        spin                              96 ms              339 ms
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not PASSIVE_WAITING.keys() & os.environ.keys():
@@ -50,11 +57,11 @@ def use_passive_waiting() -> None:
 
 
 def default_to_one_thread() -> None:
-    """Set one thread per library as default, for processes that share few cores.
+    """Set the default of each library to one thread, for processes that share few cores.
 
-    Threads of linear algebra libraries spin while they wait. torch may use more threads if asked
-    to; they sleep while idle. Call this before the libraries are loaded. The user's own settings in
-    the environment are kept.
+    Threads of linear algebra libraries spin while they wait. set_thread_count() can give torch more
+    threads, which sleep while idle. Call this before the libraries are loaded. Settings of the user
+    in the environment are kept.
     """
     for variable in THREAD_VARIABLES:
         os.environ.setdefault(variable, "1")
@@ -62,10 +69,10 @@ def default_to_one_thread() -> None:
 
 
 def limit_to_one_thread() -> None:
-    """Limit each library in this process to one thread, loaded or not, against the user's settings.
+    """Limit each library in this process to one thread, even if the user has set another number.
 
-    Two processes that prepare scenes on two free cores make 35 scenes per second, but 8 with two
-    threads for matrices in each.
+    The limit also applies to libraries that are not loaded yet. Two processes on two free cores
+    prepare 35 scenes per second; with two threads for matrices in each process it is 8.
     """
     from threadpoolctl import threadpool_limits  # imported here to keep commands fast
 

@@ -72,7 +72,7 @@ def read_raw_calibration(day: Path) -> Calibration:
 def read_matrices(path: Path) -> dict[str, np.ndarray]:
     """Read the numbers in lines "NAME: ..." of a file. InputError if it cannot be read."""
     values = {}
-    for line in read_text(path, what="the calibration").splitlines():
+    for line in read_text(path, noun="the calibration").splitlines():
         # Some names in the tracking benchmark have no colon.
         name, _, rest = line.replace(":", " ", 1).strip().partition(" ")
         try:

@@ -98,7 +98,7 @@ def _find_missing_tracking_scans(folder: Path, frames: list[Frame]) -> list[tupl
     for label in sorted(folder.glob("label_02/*.txt")):
         numbers = {
             int(number)
-            for line in read_text(label, what="the labels").splitlines()
+            for line in read_text(label, noun="the labels").splitlines()
             if (number := line.partition(" ")[0]).isdecimal()
         }
         missing += [

@@ -130,7 +130,7 @@ def _get_pose(poses: Callable[[], dict[int, np.ndarray]], number: int) -> np.nda
 
 def _read_rows(path: Path, columns: int) -> np.ndarray:
     """Read rows of numbers, (N, columns). Raises InputError if the file has other contents."""
-    rows = [line.split() for line in read_text(path, what="the matrices").splitlines()]
+    rows = [line.split() for line in read_text(path, noun="the matrices").splitlines()]
     try:
         found = np.array([row for row in rows if row], float).reshape(-1, columns)
     except ValueError:

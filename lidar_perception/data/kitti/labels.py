@@ -273,5 +273,5 @@ def _find_text(element: ElementTree.Element, name: str) -> str:
 
 
 def _read_lines(path: Path) -> list[tuple[int, str]]:
-    lines = read_text(path, what="the labels").splitlines()
+    lines = read_text(path, noun="the labels").splitlines()
     return [(i, line) for i, line in enumerate(lines, 1) if line.strip()]

@@ -130,7 +130,7 @@ def _read_times(path: Path) -> list[int]:
     if not path.is_file():
         return []
     try:
-        return [int(Decimal(word) * 10**9) for word in read_text(path, what="the times").split()]
+        return [int(Decimal(word) * 10**9) for word in read_text(path, noun="the times").split()]
     except (InvalidOperation, ValueError, OverflowError):
         raise InputError(f"{path} has a line that is not a number of seconds; download it again") from None
 
@@ -152,7 +152,7 @@ def _read_poses(sequence: Path) -> tuple[np.ndarray, Path, list[str]] | None:
         return None
     calibration = sequence / CALIBRATION
     to_camera = to_homogeneous(get_matrix(read_matrices(calibration), calibration, "Tr", (3, 4)))
-    lines = read_text(poses, what="the poses").splitlines()
+    lines = read_text(poses, noun="the poses").splitlines()
     return check_pose(to_camera, calibration), poses, lines
 
 

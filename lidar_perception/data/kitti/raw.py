@@ -150,7 +150,7 @@ def read_frame_list(path: Path) -> dict[str, int]:
     """
     rows = [
         line.split(maxsplit=1)
-        for line in read_text(path, what="the list").splitlines()
+        for line in read_text(path, noun="the list").splitlines()
         if line.strip() and not line.startswith("#")
     ]
     try:
@@ -174,7 +174,7 @@ def _read_stamps(drive: Path, numbers: Sequence[int], required: bool) -> list[in
     path = drive / "velodyne_points/timestamps.txt"
     if not (required or path.exists()):
         return []
-    lines = [line.strip() for line in read_text(path, what="the time stamps").splitlines()]
+    lines = [line.strip() for line in read_text(path, noun="the time stamps").splitlines()]
     stamp_lines = [line for line in lines if line]
     if all(0 <= number < len(lines) and lines[number] for number in numbers):
         stamp_lines = [lines[number] for number in numbers]
