@@ -200,7 +200,7 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
             sources = planner.open_few_scenes()
             known[key] = planner.measure_speed(*sources)
             if model.label_share == 1.0 and data is None:
-                data, reduced = planner.describe_scenes(*sources), trainer.reduced_range(params)
+                data, reduced = planner.count_scenes(*sources), trainer.reduced_range(params)
     assert data is not None, "an experiment needs a model with all labels"
     speeds = {model.name: known[replace(model.params, seed=0)] for model in models}
     given = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps, bool(reduced))

@@ -70,7 +70,7 @@ def realism(
     chosen = select_frames(recording)
     warm_up()
     measured = measure_scans(show_progress(chosen, "measuring real scans", len(chosen)), PAPER)
-    made = simulate_frames(seed, frames, model, streets_of=1, scenes=Scenes(None, people, "street"))
+    made = simulate_frames(seed, frames, model, frames_per_drive=1, scenes=Scenes(None, people, "street"))
     simulated = measure_scans(show_progress(made, "measuring simulated scans", frames), PAPER)
     content = {"data": str(data), "seed": seed, **compare_scans(measured, simulated)}
     print_realism(content, console)

@@ -139,7 +139,7 @@ def simulate(
 
 
 def _bag(out: Path, plan: DatasetPlan, force: bool) -> None:
-    scans = simulate_frames(plan.seed, plan.frames, plan.sensor, plan.streets_of, plan.scenes)
+    scans = simulate_frames(plan.seed, plan.frames, plan.sensor, plan.frames_per_drive, plan.scenes)
     count = write_bag(out, show_progress(scans, "simulating", plan.frames), force=force)
     console.print(f"{out}: {count} scans")
 
@@ -158,7 +158,7 @@ def _data_set(
         "scene": scenes.scene,
         "street": scenes.kind,
         "people": scenes.people,
-        "streets_of": plan.streets_of,
+        "streets_of": plan.frames_per_drive,
         "version": __version__,
     }
     options = {
@@ -169,7 +169,7 @@ def _data_set(
         "frames": plan.frames,
         "scene": scenes.scene,
         "people": scenes.people,
-        "streets-of": plan.streets_of,
+        "streets-of": plan.frames_per_drive,
         "street": scenes.kind,
     }
     asked["command"] = shlex.join(

@@ -218,9 +218,9 @@ def print_fused(fits: Any) -> None:
         for k, (which, score) in enumerate(rows):
             table.add_row(
                 f"{name}, {which}",
-                *((str(own.proposals), str(own.right)) if k == 0 else ("", "")),
-                str(score.right + score.wrong),
-                str(score.right),
+                *((str(own.proposals), str(own.correct)) if k == 0 else ("", "")),
+                str(score.correct + score.wrong),
+                str(score.correct),
                 f"{score.loss:.3f}",
             )
     console.print(table)

@@ -1,4 +1,4 @@
-"""Parameters of the crop, which depends on the robot that carries the sensor."""
+"""Parameters of the crop."""
 
 from __future__ import annotations
 
@@ -10,14 +10,12 @@ from lidar_perception.param_fields import Params, param
 
 @dataclass(frozen=True)
 class CropParams(Params):
-    """Crop before all other processing; by default it removes nothing."""
+    """Crop of the clouds before all other processing; by default nothing is removed."""
 
     body: tuple[float, ...] = param(
         float,
-        "Box of the robot's own body, [min x, min y, min z, "
-        "max x, max y, max z], in which points are dropped. In the "
-        "sensor's frame, or in `base_frame` if it is set. Empty: "
-        "none.",
+        "Box of the robot's own body, [min x, min y, min z, max x, max y, max z], in which points are dropped. "
+        "In the sensor's frame, or in `base_frame` if it is set. Empty: none.",
         unit="m",
     )
     min_range: float = param(0.0, "Points closer to the sensor are dropped.", unit="m", low=0.0, high=1e5)
@@ -26,16 +24,14 @@ class CropParams(Params):
     )
     sectors: tuple[float, ...] = param(
         float,
-        "Azimuth ranges to drop, seen from the sensor: "
-        "from, to, from, to ...; 0 is straight ahead (see "
-        "`input.ahead`), 90 is left, however the sensor is "
-        "mounted. 150, 210 is the area behind the sensor.",
+        "Azimuth ranges to drop, seen from the sensor: from, to, from, to ...; 0 is straight ahead (see "
+        "`input.ahead`), 90 is left, however the sensor is mounted. 150, 210 is the area behind the sensor.",
         unit="deg",
     )
 
     @property
     def enabled(self) -> bool:
-        """True if the crop removes anything."""
+        """True if any limit is set."""
         return self != CropParams()
 
     def check(self) -> None:
@@ -43,10 +39,10 @@ class CropParams(Params):
             raise ValueError("body and sectors must be finite")
         if len(self.body) not in (0, 6) or any(low >= high for low, high in zip(self.body[:3], self.body[3:])):
             raise ValueError(
-                f"body = {list(self.body)} must be empty or six numbers, [min x, min "
-                "y, min z, max x, max y, max z], each min below its max"
+                f"body = {list(self.body)} must be empty or [min x, min y, min z, max x, max y, max z], "
+                "each min below its max"
             )
         if len(self.sectors) % 2:
             raise ValueError(f"sectors = {list(self.sectors)} must be pairs: from, to, from, to")
         if 0.0 < self.max_range < self.min_range:
-            raise ValueError(f"max_range = {self.max_range} must not be below min_range = {self.min_range}, but for 0")
+            raise ValueError(f"max_range = {self.max_range} must be 0, or at least min_range = {self.min_range}")

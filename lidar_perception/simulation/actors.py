@@ -11,7 +11,7 @@ from math import cos, sin
 import numpy as np
 from numba import njit
 
-from lidar_perception.simulation.shapes.thing import Thing, make_rigid
+from lidar_perception.simulation.shapes.scene_object import SceneObject, make_rigid
 from lidar_perception.simulation.solids import compute_hull
 from lidar_perception.simulation.trajectory import Trajectory
 
@@ -21,7 +21,7 @@ LARGE_M = 5.0  # objects of at least this size
 STEP_S = 0.1  # time between the robot positions that others keep clear of
 
 
-def make_prop(made: np.ndarray) -> Thing:
+def make_prop(made: np.ndarray) -> SceneObject:
     """Return a thing without a label, of parts (P,) PART."""
     return make_rigid(made, (0.0, 0.0, 0.0), "")
 
@@ -34,7 +34,7 @@ class Actor:
     Things without a label have size (0, 0, 0).
     """
 
-    thing: Thing
+    thing: SceneObject
     x: float
     y: float
     heading: float = 0.0
@@ -173,7 +173,7 @@ class ActorSet:
             radius: Radius of the robot, m.
         """
         self.seconds = seconds
-        self._path = np.empty((0, 3)) if trajectory is None else trajectory.sampled(seconds, STEP_S)
+        self._path = np.empty((0, 3)) if trajectory is None else trajectory.sample(seconds, STEP_S)
         self._radius = radius
         self.actors: list[Actor] = []
         self._taken, self._reach, self._used = np.empty((64, 8)), np.empty(64), 0

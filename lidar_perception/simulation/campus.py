@@ -95,7 +95,7 @@ def make_campus(
     """Make a court with its surroundings, things and people, and a robot's trajectory."""
     trajectory = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
     court = Court.around(
-        trajectory.sampled(DRIVE_SECONDS, 1.0)[:, 1:],
+        trajectory.sample(DRIVE_SECONDS, 1.0)[:, 1:],
         rng.uniform(*kind.ends, 2),
         np.array([rng.uniform(*kind.right), rng.uniform(*kind.left)]),
     )

@@ -10,24 +10,24 @@ from lidar_perception.simulation.actors import Actor, ActorSet
 from lidar_perception.simulation.places import Court, Side, scatter
 from lidar_perception.simulation.shapes import furniture
 from lidar_perception.simulation.shapes.people import CARRIED, make_pedestrian, make_sitting_person, make_wheelchair
-from lidar_perception.simulation.shapes.thing import Thing
+from lidar_perception.simulation.shapes.scene_object import SceneObject
 
 # Probabilities of groups of 1, 2, ... people.
-STANDING_CHANCES, WALKING_CHANCES = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)
-BUSYNESS = 0.3, 1.0, 1.0, 2.5  # possible factors for the number of people in a scene
-WHEELCHAIR_SHARE = 0.06  # wheelchairs per walking or standing group
+STANDING_PROBABILITIES, WALKING_PROBABILITIES = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)
+CROWD_FACTORS = 0.3, 1.0, 1.0, 2.5  # factors for the number of people in a court
+WHEELCHAIR_SHARE = 0.06  # wheelchairs per group that walks or stands
 
 
-def make_person(rng, speed: float = 0.0) -> Thing:
-    """Make a person who walks at a speed in m/s or stands; some are children or carry things."""
+def make_person(rng, speed: float = 0.0) -> SceneObject:
+    """Make a person who walks at a speed in m/s, or stands; some are children or carry an object."""
     carried = rng.choice(CARRIED, p=(0.6, 0.14, 0.14, 0.04, 0.04, 0.04))
     return make_pedestrian(rng, speed, child=rng.random() < 0.08, carried=str(carried))
 
 
 def place_standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
-    """Yield people who wait, and groups who face each other."""
+    """Yield standing people, and groups of people who face each other."""
     for along in scatter(rng, side.length, rate):
-        out, many = rng.uniform(0.4, max(side.walk - 0.4, 1.0)), rng.choice([1, 2, 3, 4], p=STANDING_CHANCES)
+        out, many = rng.uniform(0.4, max(side.walk - 0.4, 1.0)), rng.choice([1, 2, 3, 4], p=STANDING_PROBABILITIES)
         first, wide = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 0.7) * (many > 1)
         angles = first + 2 * np.pi / many * np.arange(many)
         yield [
@@ -41,7 +41,11 @@ def place_standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
 def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Actor]]:
     """Yield people who walk along a sidewalk, alone or in groups; some start or stop on the way.
 
-    roam: They also walk on the road and in any direction.
+    Args:
+        rng: Random generator.
+        side: The sidewalk.
+        rate: Groups per 100 m.
+        roam: People also walk on the road, and in any direction.
     """
     for along in scatter(rng, side.length, rate):
         speed = _draw_speed(rng)
@@ -51,7 +55,7 @@ def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Act
             low, turn = -3.0, turn + rng.normal(0, 0.6) * (rng.random() < 0.5)
         out = rng.uniform(low, max(side.walk - 0.5, low + 0.5))
         moves = _draw_moves(rng, speed, 0.2)
-        many = rng.choice([1, 2, 3], p=WALKING_CHANCES)
+        many = rng.choice([1, 2, 3], p=WALKING_PROBABILITIES)
         yield [
             side.put(make_person(rng, speed), along + rng.uniform(-0.2, 0.2), out + 0.85 * i, turn, **moves)
             for i in range(many)
@@ -59,14 +63,17 @@ def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Act
 
 
 def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
-    """Yield groups who walk across a court in any direction, rate per 100 square metres.
+    """Yield groups who walk across a court in any direction; half of them start or stop on the way.
 
-    Half of them start or stop on the way.
+    Args:
+        rng: Random generator.
+        court: The court.
+        rate: Groups per 100 square metres.
     """
     for x, y in court.spots(rng, rate):
         speed, turn = _draw_speed(rng), rng.uniform(-np.pi, np.pi)
         moves = _draw_moves(rng, speed, 0.5)
-        many = rng.choice([1, 2, 3], p=WALKING_CHANCES)
+        many = rng.choice([1, 2, 3], p=WALKING_PROBABILITIES)
         yield [
             Actor(make_person(rng, speed), x - 0.85 * i * np.sin(turn), y + 0.85 * i * np.cos(turn), turn, **moves)
             for i in range(many)
@@ -74,7 +81,7 @@ def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
 
 
 def _draw_moves(rng, speed: float, chance: float) -> dict[str, float]:
-    """Draw arguments of Actor for a walk that starts or stops on the way with this chance."""
+    """Draw the speed, start and stop of an Actor, which starts or stops on the way with this chance."""
     moves = {"speed": speed}
     pick = rng.random()
     if pick < chance:
@@ -90,12 +97,18 @@ def _draw_speed(rng) -> float:
 def fill_court(
     rng, actors: ActorSet, court: Court, people: float, along: float, across: float, standers: float
 ) -> None:
-    """Add people on foot to a court.
+    """Add pedestrians and people in wheelchairs to a court.
 
-    along, standers: groups who walk along x, and who stand, per 100 m; across: groups who walk
-    anywhere, per 100 square metres. All are multiplied by people and by how busy the place is.
+    Args:
+        rng: Random generator.
+        actors: Actors of the scene, to which people are added.
+        court: The court.
+        people: Factor for all numbers, which are also multiplied by a random one of CROWD_FACTORS.
+        along: Groups who walk along x, per 100 m.
+        across: Groups who walk in any direction, per 100 square metres.
+        standers: Groups who stand, per 100 m.
     """
-    people *= rng.choice(BUSYNESS)
+    people *= rng.choice(CROWD_FACTORS)
     for groups in (
         place_standing(rng, court.floor, standers * people),
         place_walking(rng, court.floor, along * people, roam=False),
@@ -107,7 +120,7 @@ def fill_court(
 
 
 def place_wheelchairs(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
-    """Yield people in wheelchairs along a side."""
+    """Yield people in wheelchairs along a side, rate per 100 m."""
     for along in scatter(rng, side.length, rate):
         yield [
             side.put(
@@ -121,7 +134,7 @@ def place_wheelchairs(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
 
 
 def place_bench(rng, side: Side, along: float, out: float, people: float, share: float = 0.25) -> list[Actor]:
-    """Return a bench with its back to the outside of a side, and people on a share of its seats."""
+    """Return a bench with its back to the outside of a side, and people on a random share of its seats."""
     sitters = [
         side.put(make_sitting_person(rng, chair=False), along + aside, out, -np.pi / 2)
         for aside in (-0.45, 0.45)

@@ -1,7 +1,6 @@
-"""Simulated scans as data sets of other layouts, written by several processes.
+"""Simulated data sets in the layouts of KITTI and SemanticKITTI, written by several processes.
 
-Every frame depends only on its number, so neither the number of processes nor an interruption
-changes a byte.
+A frame depends only on its number, so the files do not depend on processes and interruptions.
 """
 
 from __future__ import annotations
@@ -24,38 +23,46 @@ from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.types import InputError
 
 LAYOUTS = ("kitti", "kitti-tracking", "semantickitti")
-FOLDERS = ("training", "sequences")  # folder names, one of which exists in a data set
+FOLDERS = ("training", "sequences")  # top folders of these layouts
 
 
 @dataclass(frozen=True)
 class DatasetPlan:
-    """A data set of `frames` scans, streets_of of each of the scenes seed, seed + 1, ...
+    """Content of a simulated data set.
+
+    Attributes:
+        layout: One of LAYOUTS.
+        sensor: The sensor.
+        seed: Seed of the first scene; the next scene has seed + 1.
+        frames: Number of scans.
+        frames_per_drive: Number of scans of each scene.
+        scenes: Types of the scenes.
 
     Raises:
-        InputError: streets_of or the scenes are not possible.
+        InputError: frames_per_drive or scenes is invalid.
     """
 
     layout: str
     sensor: Sensor
     seed: int
     frames: int
-    streets_of: int
+    frames_per_drive: int
     scenes: Scenes = ALL_STREETS
 
     def __post_init__(self) -> None:
         self.scenes.scene_types()
-        most = longest_drive(self.sensor)
-        if not 1 <= self.streets_of <= most:
-            raise InputError(f"streets-of = {self.streets_of} must be 1 .. {most}, the scans of one drive")
+        limit = longest_drive(self.sensor)
+        if not 1 <= self.frames_per_drive <= limit:
+            raise InputError(f"streets-of = {self.frames_per_drive} must be 1 .. {limit}, the scans of one drive")
 
 
 def write_frame(folder: Path, plan: DatasetPlan, number: int) -> int:
-    """Simulate a frame, write all of its files, and return its number.
+    """Simulate a frame, write its files, and return its number.
 
     Raises:
         InputError: A file cannot be written.
     """
-    sequence, moment = divmod(number, plan.streets_of)
+    sequence, moment = divmod(number, plan.frames_per_drive)
     scan = simulate_scan(plan.seed + sequence, moment, plan.sensor, plan.scenes)
     order = np.argsort(scan.ring, kind="stable")  # beam by beam, as in KITTI's files
     cloud = scan.frame.points()[order]
@@ -88,7 +95,7 @@ def _write_semantickitti(
     cloud: np.ndarray,
     order: np.ndarray,
 ) -> dict[str, str]:
-    digits = max(2, len(str((plan.frames - 1) // plan.streets_of)))
+    digits = max(2, len(str((plan.frames - 1) // plan.frames_per_drive)))
     name = f"sequences/{sequence:0{digits}}"
     semantickitti.write_scan(folder / name, moment, cloud, scan.semantic[order], scan.instance[order])
     shares = {
@@ -101,9 +108,9 @@ def _write_semantickitti(
 
 
 def write_frames(folder: Path, plan: DatasetPlan, numbers: list[int], jobs: int) -> Generator[int]:
-    """Write frames in several processes, and yield the number of each when it is written.
+    """Write frames in several processes, and yield the number of each written frame.
 
-    The processes end with the iterator.
+    The processes end when the iterator is closed.
 
     Raises:
         InputError: A process failed.

@@ -1,9 +1,8 @@
 """Returns of beams that hit the edge of an object.
 
-If a ray's neighbours on the grid hit other solids, a second ray is cast to a random place in the
-beam's footprint, so the chance of hitting another solid is the share of the footprint beyond the
-edge. A random share of the energy falls on the second hit. If both surfaces are within the length
-of the pulse, they give one return between them, otherwise the stronger one.
+If neighbouring rays hit different solids, a second ray is cast to a random point in the footprint of
+the beam. A random share of the energy falls on the second hit. If the hits are closer than the
+length of the pulse, they give one return between them, otherwise the stronger one.
 """
 
 from __future__ import annotations
@@ -16,16 +15,17 @@ from numba import njit
 
 from lidar_perception.simulation.hashing import hash_uniform
 
-OUTLIER = 1  # SemanticKITTI class of returns that do not come from a surface
+OUTLIER = 1  # SemanticKITTI class of returns between two surfaces
 
 
 class RayHit(NamedTuple):
-    """The first hit of a ray.
+    """First hit of a ray.
 
     Attributes:
         range: Metres, inf without a hit.
-        brightness, cosine: Brightness and cosine of the incidence.
-        owner: Object, 0 for none.
+        brightness: Brightness, 0 .. 1.
+        cosine: Cosine of the angle of incidence.
+        owner: Track id of the object, 0 for none.
         semantic: SemanticKITTI class, 0 without a hit.
         solid: Index of the solid, -1 for none.
     """
@@ -39,33 +39,32 @@ class RayHit(NamedTuple):
 
 
 def find_edges(solid: np.ndarray) -> np.ndarray:
-    """Return (columns, rings) bool: a neighbouring ray hits another solid."""
-    edge = np.zeros(solid.shape, bool)
-    other = solid != np.roll(solid, 1, axis=0)
-    edge |= other | np.roll(other, -1, axis=0)
-    other = solid[:, 1:] != solid[:, :-1]
-    edge[:, 1:] |= other
-    edge[:, :-1] |= other
+    """Return (columns, rings) bool, True for rays with a neighbour that hits another solid."""
+    differs = solid != np.roll(solid, 1, axis=0)
+    edge = differs | np.roll(differs, -1, axis=0)
+    differs = solid[:, 1:] != solid[:, :-1]
+    edge[:, 1:] |= differs
+    edge[:, :-1] |= differs
     return edge
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def draw_in_footprint(way, divergence, key):
-    """Draw a direction uniformly in the disc of a beam along way (x, y, z)."""
-    x, y, z = way
+def draw_in_footprint(direction, divergence, key):
+    """Draw a unit vector uniformly in the footprint of a beam with this direction (x, y, z)."""
+    x, y, z = direction
     radius = divergence / 2 * math.sqrt(hash_uniform(3, key))
     turn = 2 * np.pi * hash_uniform(4, key)
     aside, up, level = radius * math.cos(turn), radius * math.sin(turn), math.hypot(x, y)
     a = x - aside * y / level - up * z * x / level
     b = y + aside * x / level - up * z * y / level
     c = z + up * level
-    long = math.sqrt(a * a + b * b + c * c)
-    return a / long, b / long, c / long
+    length = math.sqrt(a * a + b * b + c * c)
+    return a / length, b / length, c / length
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def merge_hits(one, other, pulse, key):
-    """Merge the hits of the two rays of a beam."""
+    """Merge the hits of the two rays of a beam into one RayHit."""
     if one.solid == other.solid:
         return one
     share = hash_uniform(5, key)  # fraction of the energy on the other hit
@@ -79,7 +78,7 @@ def merge_hits(one, other, pulse, key):
             one.semantic if one.semantic == other.semantic else OUTLIER,
             other.solid if share > 0.5 else one.solid,
         )
-    # For a ray without a hit the power is 0 / inf = 0.
+    # A ray without a hit has no power: 0 / inf.
     if second / other.range**2 > first / one.range**2:
         return RayHit(other.range, second, other.cosine, other.owner, other.semantic, other.solid)
     return RayHit(one.range, first, one.cosine, one.owner, one.semantic, one.solid)

@@ -1,4 +1,4 @@
-"""Beams through leaves, which grow in clumps with gaps between them."""
+"""Rays through foliage: clumps of leaves with gaps between them."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ from numba import njit
 
 from lidar_perception.simulation.hashing import hash_uniform, mix_bits
 
-# Width of cells, and the fraction of them that holds all leaves. With leaves everywhere a crown would
-# be one cluster for DBSCAN; KITTI's crowns fall into many. A beam that hits no leaf within
-# MAX_STEPS passes.
-CELL_M, LEAF_SHARE, MAX_STEPS = 0.5, 0.25, 12
+# Size of the cells, and share of the cells that contain leaves. The gaps split a crown into several
+# DBSCAN clusters, as in KITTI.
+CELL_M, LEAF_SHARE = 0.5, 0.25
+MAX_STEPS = 12  # of a ray, which then passes
 
 
 @njit(cache=True, nogil=True)
-def trace_foliage(start, way, half, enter, leave, density, plant, key, filled):
+def trace_foliage(origin, direction, half, enter, leave, density, plant, key, leaf_share):
     """Return the range in metres at which leaves stop a ray, inf if it passes.
 
-    Delta tracking (Woodcock et al., 1965) through a grid of full and empty cells.
+    Delta tracking (Woodcock et al. 1965) through a grid of full and empty cells.
 
     Args:
-        start, way: Ray in the frame of a unit shape, three numbers each.
+        origin, direction: Ray in the frame of a unit shape, (x, y, z) each.
         half: Half sizes of the shape, m.
         enter, leave: Ranges at which the ray enters and leaves the shape, m.
         density: Mean density, 1/m.
-        plant: uint64, equal for all rays to a plant in a drive.
-        key: uint64, for the random numbers of this ray and plant.
-        filled: Share of the cells that hold leaves.
+        plant: uint64, equal for all rays to one plant in a drive.
+        key: uint64 key of the random numbers of this ray and plant.
+        leaf_share: Share of the cells that contain leaves.
     """
     t = max(enter, 0.0)
     for step in range(MAX_STEPS):
-        t -= math.log(hash_uniform(10 + step, key)) * filled / density
+        t -= math.log(hash_uniform(10 + step, key)) * leaf_share / density
         if not t < leave:
             return np.inf
         cell = plant
         for i in range(3):
-            place = math.floor((start[i] + t * way[i]) * (half[i] / CELL_M))
-            cell = mix_bits(cell + np.uint64(np.int64(place)))
-        if hash_uniform(1, cell) < filled:
+            index = math.floor((origin[i] + t * direction[i]) * (half[i] / CELL_M))
+            cell = mix_bits(cell + np.uint64(np.int64(index)))
+        if hash_uniform(1, cell) < leaf_share:
             return t
     return np.inf

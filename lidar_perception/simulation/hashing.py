@@ -1,4 +1,4 @@
-"""Random numbers that depend only on a key, in any order: a compiled counter-based hash."""
+"""Compiled counter-based random numbers, which depend only on a key."""
 
 from __future__ import annotations
 
@@ -10,17 +10,14 @@ GOLDEN, FIRST, SECOND = (np.uint64(n) for n in (0x9E3779B97F4A7C15, 0xBF58476D1C
 
 @njit(cache=True, nogil=True)
 def hash_uniform(seed, key):
-    """Return a float64 in the open interval 0 .. 1 for a uint64 key and a small seed.
-
-    The finalizer is that of splitmix64 (Steele, Lea and Flood, OOPSLA 2014).
-    """
+    """Return a uniform float64 in the open interval 0 .. 1 for a uint64 key and a small seed."""
     bits = mix_bits(mix_bits(key) + np.uint64(seed) * GOLDEN) >> np.uint64(12)
     return (np.float64(bits) + 0.5) * 2.0**-52
 
 
 @njit(cache=True, nogil=True)
 def mix_bits(x):
-    """Map uint64 to uint64, one to one."""
+    """Scramble a uint64 by the finalizer of splitmix64 (Steele, Lea and Flood, OOPSLA 2014)."""
     x = (x ^ (x >> np.uint64(30))) * FIRST
     x = (x ^ (x >> np.uint64(27))) * SECOND
     return x ^ (x >> np.uint64(31))

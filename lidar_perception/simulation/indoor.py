@@ -115,7 +115,7 @@ def make_interior(
     trajectory = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
     actors = ActorSet(DRIVE_SECONDS, trajectory=trajectory, radius=ROBOT_RADIUS_M)
     court = Court.around(
-        trajectory.sampled(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2), rng.uniform(*kind.wide, 2)
+        trajectory.sample(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2), rng.uniform(*kind.wide, 2)
     )
     height = rng.uniform(*kind.height)
     for side in court.sides():

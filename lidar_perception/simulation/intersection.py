@@ -116,10 +116,10 @@ def intersect_shape(kind, start, way):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_stop_range(shapes, s, start, way, enter, leave, number, filled):
+def find_stop_range(shapes, s, start, way, enter, leave, number, leaf_share):
     """Return the range at which solid s stops a ray that passes through its shape, else inf.
 
-    A ray that starts within an opaque solid is not stopped. number: number of the ray; filled: see
+    A ray that starts within an opaque solid is not stopped. number: number of the ray; leaf_share: see
     foliage.py.
     """
     t = enter if enter > 0 else np.inf
@@ -131,7 +131,7 @@ def find_stop_range(shapes, s, start, way, enter, leave, number, filled):
             1 / math.sqrt(m[1, 0] ** 2 + m[1, 1] ** 2 + m[1, 2] ** 2),
             1 / math.sqrt(m[2, 0] ** 2 + m[2, 1] ** 2 + m[2, 2] ** 2),
         )
-        t = trace_foliage(start, way, half, enter, leave, shapes.density[s], shapes.plant[s], key, filled)
+        t = trace_foliage(start, way, half, enter, leave, shapes.density[s], shapes.plant[s], key, leaf_share)
     if shapes.transmission[s] > 0 and hash_uniform(2, key) < shapes.transmission[s]:
         return np.inf
     return t

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidar_perception.simulation.actors import Actor, make_prop
-from lidar_perception.simulation.shapes.thing import Thing
+from lidar_perception.simulation.shapes.scene_object import SceneObject
 from lidar_perception.simulation.solids import compute_extents
 
 
@@ -31,7 +31,7 @@ class Side(NamedTuple):
     front: str
     parking: float = 0.0
 
-    def put(self, thing: Thing | np.ndarray, along: float, out: float, turn: float = 0.0, **moves) -> Actor:
+    def put(self, thing: SceneObject | np.ndarray, along: float, out: float, turn: float = 0.0, **moves) -> Actor:
         """Return an actor `along` the curb and `out` from it (m), turned against the line (rad).
 
         Parts (P,) PART become a thing without a label.

@@ -92,11 +92,11 @@ def cast_rays(
     salt = np.uint64(mix_bits(np.uint64(seed % (1 << 64))))
     made = make_rays(sensor, motion)
     turn = Turn(made.direction, made.since, sensor.origins()[:, 2].copy())
-    seen = find_windows(solids, sensor, motion, sensor.divergence / 2)
+    windows = find_windows(solids, sensor, motion, sensor.divergence / 2)
     scene = (
         compile_solids(solids, motion, salt),
-        seen,
-        np.lexsort((seen.near, solids.owner, solids.owner == 0)),
+        windows,
+        np.lexsort((windows.min_range, solids.owner, solids.owner == 0)),
         to_compiled(ground),
         np.array(position, np.float64),
         np.array(motion.velocity, np.float64),
@@ -124,14 +124,16 @@ def cast_rays(
 
 
 @njit(cache=True, nogil=True)
-def _cast_first(hits, turn, only, shapes, seen, order, ground, position, velocity, facing, max_range, filled, counting):
+def _cast_first(
+    hits, turn, only, shapes, windows, order, ground, position, velocity, facing, max_range, leaf_share, counting
+):
     """Fill the hits of the rays in only, (columns, rings) bool, and reached if counting.
 
     order: solids owner by owner, then those without an owner from near to far.
     """
     hits.range[:] = np.inf
     hits.solid[:] = -1
-    _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, counting)
+    _draw_solids(hits, turn, only, shapes, windows, order, max_range, leaf_share, counting)
     columns, rings = only.shape
     for column in range(columns):
         since = turn.since[column]
@@ -143,10 +145,10 @@ def _cast_first(hits, turn, only, shapes, seen, order, ground, position, velocit
                 start, down = (x, y, z + turn.lift[ring]), _to_world(way, facing)
                 far, s = hits.range[column, ring], hits.solid[column, ring]
                 if not far < min_ground_range(ground, start, down):
-                    met = cast_ground(ground, start, down, max_range)
-                    if s < 0 or np.float32(met.range) < np.float32(far):
+                    hit = cast_ground(ground, start, down, max_range)
+                    if s < 0 or np.float32(hit.range) < np.float32(far):
                         _write_hit(
-                            hits, column, ring, RayHit(met.range, met.brightness, met.cosine, 0, met.semantic, -1)
+                            hits, column, ring, RayHit(hit.range, hit.brightness, hit.cosine, 0, hit.semantic, -1)
                         )
                         continue
                 if s >= 0:
@@ -172,21 +174,21 @@ def _way(turn, column, ring):
 
 
 @njit(cache=True, nogil=True)
-def _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, counting):
+def _draw_solids(hits, turn, only, shapes, windows, order, max_range, leaf_share, counting):
     columns, rings = only.shape
     latest = np.zeros((columns, rings), np.int32)  # last owner hit by each ray
     for s in order:
-        owner, near = shapes.owner[s], seen.near[s]
+        owner, near = shapes.owner[s], windows.min_range[s]
         counts = counting and owner > 0
         highest, lowest = 0, rings
-        while lowest > 0 and not seen.beams[s, lowest - 1]:
+        while lowest > 0 and not windows.beams[s, lowest - 1]:
             lowest -= 1
-        while highest < lowest and not seen.beams[s, highest]:
+        while highest < lowest and not windows.beams[s, highest]:
             highest += 1
-        for step in range(seen.count[s] if highest < lowest else 0):
-            column = (seen.first[s] + step) % columns
+        for step in range(windows.count[s] if highest < lowest else 0):
+            column = (windows.first[s] + step) % columns
             for ring in range(highest, lowest):
-                if not seen.beams[s, ring] or not only[column, ring]:
+                if not windows.beams[s, ring] or not only[column, ring]:
                     continue
                 far = hits.range[column, ring]
                 if near > far and not counts:
@@ -195,7 +197,7 @@ def _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, count
                 enter, leave = intersect_shape(shapes.kind[s], start, way)
                 if not (enter <= leave and leave > 0) or (np.float32(enter) > np.float32(far) and not counts):
                     continue
-                t = find_stop_range(shapes, s, start, way, enter, leave, ring * columns + column, filled)
+                t = find_stop_range(shapes, s, start, way, enter, leave, ring * columns + column, leaf_share)
                 if not t < leave or t > max_range:
                     continue
                 if counts and latest[column, ring] != owner:
@@ -253,10 +255,10 @@ def _read_hit(hits, column, ring):
 
 
 @njit(cache=True, nogil=True)
-def _write_hit(hits, column, ring, met):
-    hits.range[column, ring] = met.range
-    hits.brightness[column, ring] = met.brightness
-    hits.cosine[column, ring] = met.cosine
-    hits.owner[column, ring] = met.owner
-    hits.semantic[column, ring] = met.semantic
-    hits.solid[column, ring] = met.solid
+def _write_hit(hits, column, ring, hit):
+    hits.range[column, ring] = hit.range
+    hits.brightness[column, ring] = hit.brightness
+    hits.cosine[column, ring] = hit.cosine
+    hits.owner[column, ring] = hit.owner
+    hits.semantic[column, ring] = hit.semantic
+    hits.solid[column, ring] = hit.solid

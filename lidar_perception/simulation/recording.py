@@ -1,4 +1,4 @@
-"""Simulated drives as labelled frames: of a car with a camera like KITTI's, of robots without."""
+"""Simulated drives as labelled frames: of a car with a camera like KITTI's, or of robots without a camera."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from lidar_perception.simulation.drive import longest_drive, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 
-DRIVE_GAP_NS = 10 * 10**9  # gap between the drives through two scenes, as in KITTI's recordings
+DRIVE_GAP_NS = 10 * 10**9  # between the drives through two scenes
 
 
 class SimulatedFrames(ComputedFrames):
-    """Frames of simulated drives; each is computed when it is read.
+    """Frames of simulated drives, computed when they are read.
 
-    With a forward camera they have, as in KITTI, labels of the objects whose centre it sees. Where
-    not all scenes have a camera, they have labels all around.
+    If all scenes have a camera, only objects whose centre is in the image are labelled, as in
+    KITTI. Otherwise objects in all directions are labelled.
     """
 
     def __init__(
@@ -30,8 +30,15 @@ class SimulatedFrames(ComputedFrames):
         frames_per_drive: int | None = None,
         scenes: Scenes = ALL_STREETS,
     ) -> None:
-        """Each of the scenes seed, seed + 1, ... has frames_per_drive frames, by default as many
-        as fit into a drive."""
+        """Define the frames; none is computed yet.
+
+        Args:
+            seed: Seed of the first scene; the next scene has seed + 1.
+            frames: Number of frames.
+            sensor: The sensor.
+            frames_per_drive: Number of frames of each scene; None uses the full drive.
+            scenes: Types of the scenes.
+        """
         self._seed, self._frames, self._sensor, self._scenes = seed, frames, sensor, scenes
         self._per_drive = frames_per_drive or longest_drive(sensor)
         self._has_camera = scenes.camera
@@ -58,19 +65,19 @@ class SimulatedFrames(ComputedFrames):
 
 
 def simulate_frames(
-    seed: int, frames: int, sensor: Sensor = HDL64E, streets_of: int | None = None, scenes: Scenes = ALL_STREETS
+    seed: int, frames: int, sensor: Sensor = HDL64E, frames_per_drive: int | None = None, scenes: Scenes = ALL_STREETS
 ) -> Iterator[Frame]:
-    """Yield the frames of SimulatedFrames, with streets_of frames of each scene."""
-    yield from SimulatedFrames(seed, frames, sensor, streets_of, scenes)
+    """Yield simulated frames, see SimulatedFrames."""
+    yield from SimulatedFrames(seed, frames, sensor, frames_per_drive, scenes)
 
 
 def simulate_recording(seed: int, frames: int, sensor: Sensor = HDL64E, scenes: Scenes = ALL_STREETS) -> Recording:
-    """Return simulated drives as a recording that no file holds."""
-    has = {BOXES, POSES} | ({CAMERA} if scenes.camera else set())
+    """Return simulated drives as a recording without files."""
+    content = {BOXES, POSES} | ({CAMERA} if scenes.camera else set())
     return Recording(
         Path("simulation"),
         f"simulated {scenes.scene}",
         SimulatedFrames(seed, frames, sensor, None, scenes),
-        frozenset(has),
+        frozenset(content),
         has_times=True,
     )

@@ -1,4 +1,4 @@
-"""Returns that a sensor reports for the hits of its rays: noise, losses and intensity."""
+"""Returns of a sensor for the hits of its rays: noise, losses and intensity."""
 
 from __future__ import annotations
 
@@ -10,22 +10,18 @@ from lidar_perception.simulation.raycast import Hits
 from lidar_perception.simulation.sensor import NO_MOTION, Motion, Sensor, make_rays
 from lidar_perception.simulation.solids import RETROREFLECTOR
 
-# Grazing incidence weakens a return by a power of the cosine of the incidence, and the logarithm of
-# the power scatters. With these values the road is lost as ahead of KITTI's car, where in 27 scans
-# (median) 0.7 of the rays return from 38 m, 0.5 from 43 m, 0.35 from 50 m and none from 60 m.
-# Lost returns are adjacent: on a SemanticKITTI scan only 0.03 of the road's returns beyond 35 m are
-# missing singly.
+# The power of a return is proportional to a power of the cosine of the incidence, and its logarithm
+# scatters. With these values, returns of the road are lost at the same ranges as ahead of KITTI's
+# car: 0.7 of the rays return at 38 m, 0.5 at 43 m, 0.35 at 50 m, and none at 60 m (median of 27
+# scans). Neighbouring returns are lost together: in SemanticKITTI, only 0.03 of the returns of the
+# road beyond 35 m are lost alone.
 GRAZING_EXPONENT = 1 / 3
-POWER_SCATTER, SCATTER_COLUMNS = 0.5, 16  # standard deviation of the power; columns with the same value
-# Neighbouring points of one beam differ as much on the road, sidewalks (0.03) and facades (0.04) of
-# a SemanticKITTI scan (robust standard deviation).
-INTENSITY_NOISE = 0.035
+POWER_SCATTER, SCATTER_COLUMNS = 0.5, 16  # standard deviation, and number of columns that share a value
+INTENSITY_NOISE = 0.035  # as on roads, sidewalks (0.03) and facades (0.04) of SemanticKITTI
 
 
 class Returns(NamedTuple):
-    """The N points of one turn, beam by beam, each counter-clockwise from straight ahead.
-
-    This is the order of KITTI's files.
+    """N points of one turn, beam by beam, counter-clockwise from straight ahead, as in KITTI's files.
 
     Attributes:
         xyz: (N, 3) float32, m in the sensor's frame.
@@ -47,21 +43,25 @@ class Returns(NamedTuple):
 def make_returns(
     hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator, compensated: bool = True
 ) -> Returns:
-    """Return the points that the sensor reports.
+    """Make the returns of the hits.
 
-    A return is lost if its power, which is proportional to brightness over range squared, is below
-    that of a surface of brightness 0.1 that faces the sensor at sensor.reach.
+    The power of a return is proportional to brightness / range squared. It is lost if the power is
+    below that of a surface of brightness 0.1 that faces the sensor at sensor.reach.
 
     Args:
-        compensated: Points are in the frame at the stamp, as KITTI publishes them; otherwise as if
-            the sensor had not moved.
+        hits: First hits of all rays.
+        sensor: The sensor.
+        motion: Motion of the sensor.
+        rng: Random generator.
+        compensated: Apply motion correction, so that points are in the frame at the stamp, as in
+            KITTI; otherwise each point is in the frame at its own time.
     """
     shape = hits.range.shape
-    turn = make_rays(sensor, motion if compensated else NO_MOTION)
+    rays = make_rays(sensor, motion if compensated else NO_MOTION)
     noisy = hits.range + rng.normal(0.0, sensor.range_noise, shape)
     if sensor.offsets:
         noisy += np.asarray(sensor.offsets)
-    with np.errstate(divide="ignore", invalid="ignore"):  # NaN for rays without a hit and an infinite reach
+    with np.errstate(divide="ignore", invalid="ignore"):  # inf / inf for rays without a hit
         power = (
             np.log(hits.brightness / 0.1)
             + GRAZING_EXPONENT * np.log(hits.cosine)
@@ -70,22 +70,22 @@ def make_returns(
     scatter = rng.normal(0.0, POWER_SCATTER, (-(-shape[0] // SCATTER_COLUMNS), shape[1]))
     keep = power > np.repeat(scatter, SCATTER_COLUMNS, axis=0)[: shape[0]]
     keep &= (rng.random(shape) >= sensor.dropout) & sensor.open_rays()
-    # Slightly within the limits, so that rounding to float32 does not exceed them.
+    # A margin, so that ranges are within the limits after rounding to float32.
     keep &= (noisy > sensor.min_range + 1e-4) & (noisy < sensor.max_range - 1e-4)
     ring, column = divmod(np.flatnonzero(keep.T), shape[0])
     ray = column * shape[1] + ring
-    reached, brightness = hits.range.ravel()[ray], hits.brightness.ravel()[ray]
-    xyz = turn.direction.reshape(-1, 3)[ray]
+    ranges, brightness = hits.range.ravel()[ray], hits.brightness.ravel()[ray]
+    xyz = rays.direction.reshape(-1, 3)[ray]
     xyz *= noisy.ravel()[ray, None]
-    xyz += turn.origin.reshape(-1, 3)[ray]
+    xyz += rays.origin.reshape(-1, 3)[ray]
     intensity = brightness + rng.normal(0.0, INTENSITY_NOISE, len(ring))
     if sensor.fade[1]:
-        faded = sensor.fade[1] * np.maximum(reached - sensor.fade[0], 0.0)
-        intensity -= np.where(brightness < RETROREFLECTOR, faded, 0.0)
-    weak = (intensity < sensor.floor) | (rng.random(len(intensity)) < sensor.silent)
+        loss = sensor.fade[1] * np.maximum(ranges - sensor.fade[0], 0.0)
+        intensity -= np.where(brightness < RETROREFLECTOR, loss, 0.0)
+    is_zero = (intensity < sensor.floor) | (rng.random(len(intensity)) < sensor.silent)
     if sensor.biases:
         intensity += np.asarray(sensor.biases)[ring]
-    intensity = np.where(weak, 0.0, np.round(np.clip(intensity, 0.0, 1.0), 2))
+    intensity = np.where(is_zero, 0.0, np.round(np.clip(intensity, 0.0, 1.0), 2))
     return Returns(
         xyz.astype(np.float32),
         intensity.astype(np.float32),

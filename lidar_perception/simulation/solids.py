@@ -1,10 +1,9 @@
-"""Solids: unit shapes under a linear map, with their surface and owner."""
+"""Solids: boxes, ellipsoids and cylinders with their surface and owner."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import TypedDict
 
 import numpy as np
 from numba import njit
@@ -17,8 +16,8 @@ BOX, ELLIPSOID, CYLINDER = 0, 1, 2  # kinds of solids; a cylinder's axis is z
 # then by yaw about z.
 # semantic: SemanticKITTI class.
 # reflectance: 0..1; a RETROREFLECTOR is equally bright from all directions and does not fade.
-# density: 1/m; inf is solid; a beam penetrates foliage by 1 / density metres on average.
-# transmission: fraction of beams that pass, for example through glass.
+# density: 1/m, inf for opaque parts; the mean free path of a beam in foliage is 1 / density.
+# transmission: share of the beams that pass, as through glass.
 RETROREFLECTOR = 1.0
 PART = np.dtype(
     [
@@ -35,49 +34,42 @@ PART = np.dtype(
 )
 
 
-class Surface(TypedDict, total=False):
-    """Surface that several parts share: arguments of part(), see PART."""
-
-    reflectance: float
-    transmission: float
-
-
 def part(
     kind: int,
     centre: tuple,
     half: tuple,
+    reflectance: float,
     *,
     pitch: float = 0.0,
     yaw: float = 0.0,
-    reflectance: float = 0.3,
     semantic: int = 0,
     density: float = np.inf,
     transmission: float = 0.0,
 ) -> tuple:
-    """Return a row of PART; semantic 0 takes the class of its thing."""
+    """Return a row of PART. Semantic 0 means the class of the object, see make_parts."""
     return kind, centre, half, pitch, yaw, reflectance, semantic, density, transmission
 
 
-def parts(rows: list[tuple], semantic: int) -> np.ndarray:
-    """Return the rows of a thing as (P,) PART; rows without a class get this one."""
-    made = np.array(rows, PART)
-    made["semantic"] = np.where(made["semantic"] == 0, semantic, made["semantic"])
-    return made
+def make_parts(rows: list[tuple], semantic: int) -> np.ndarray:
+    """Convert rows to (P,) PART; rows without a class get the class `semantic`."""
+    parts = np.array(rows, PART)
+    parts["semantic"] = np.where(parts["semantic"] == 0, semantic, parts["semantic"])
+    return parts
 
 
 @dataclass(frozen=True)
 class Solids:
-    """P solids in the sensor's frame at the stamp; those of an object are consecutive.
+    """P solids in the sensor's frame at the stamp. The solids of an object are consecutive.
 
     Attributes:
         kind: (P,) int8.
         centre, half: (P, 3) m.
-        axes: (P, 3, 3), the solid's axes as columns.
+        axes: (P, 3, 3), axes of the solid as columns.
         reflectance, transmission: (P,), see PART.
         semantic: (P,) uint16.
         density: (P,) 1/m.
-        owner: (P,) int32 object, 0 for none.
-        velocity: (P, 3) m/s over the ground, in the axes of the sensor's frame.
+        owner: (P,) int32 track id of the object, 0 for none.
+        velocity: (P, 3) m/s over the ground, along the axes of the sensor's frame.
     """
 
     kind: np.ndarray
@@ -100,18 +92,19 @@ class Solids:
 
 
 def place_parts(
-    made: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: np.ndarray, velocity: np.ndarray
+    parts: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: np.ndarray, velocity: np.ndarray
 ) -> Solids:
-    """Place parts in the frame of the sensor.
+    """Transform parts from the frames of their objects to the sensor's frame.
 
     Args:
-        made: (P,) PART, parts of one or more things.
-        base, heading: (P, 3) positions in m and (P,) headings in rad of the things.
+        parts: (P,) PART, parts of one or more objects.
+        base: (P, 3) positions of the objects in m.
+        heading: (P,) headings of the objects in rad.
         owner, velocity: (P,) and (P, 3), see Solids.
     """
-    cos, sin = np.cos(made["yaw"] + heading), np.sin(made["yaw"] + heading)
-    down, nose = np.cos(made["pitch"]), np.sin(made["pitch"])
-    zero = np.zeros(len(made))
+    cos, sin = np.cos(parts["yaw"] + heading), np.sin(parts["yaw"] + heading)
+    down, nose = np.cos(parts["pitch"]), np.sin(parts["pitch"])
+    zero = np.zeros(len(parts))
     axes = np.stack(
         [
             np.stack([cos * down, sin * down, -nose], axis=1),
@@ -120,72 +113,69 @@ def place_parts(
         ],
         axis=2,
     )
-    x, y, z = made["centre"].T
+    x, y, z = parts["centre"].T
     ahead, aside = np.cos(heading), np.sin(heading)
     centre = base + np.stack([ahead * x - aside * y, aside * x + ahead * y, z], axis=1)
     return Solids(
-        made["kind"],
+        parts["kind"],
         centre,
-        made["half"].copy(),
+        parts["half"].copy(),
         axes,
-        made["reflectance"].copy(),
-        made["semantic"].copy(),
-        made["density"].copy(),
-        made["transmission"].copy(),
+        parts["reflectance"].copy(),
+        parts["semantic"].copy(),
+        parts["density"].copy(),
+        parts["transmission"].copy(),
         np.asarray(owner, np.int32),
         np.asarray(velocity, np.float64),
     )
 
 
-def compute_extents(made: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return exact lower and upper bounds of each part, (P, 3) each, in the thing's frame."""
-    low, high = np.empty((len(made), 3)), np.empty((len(made), 3))
-    _extents(made, low, high)
+def compute_extents(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the exact lower and upper bounds of each part, (P, 3) each, in the object's frame."""
+    low, high = np.empty((len(parts), 3)), np.empty((len(parts), 3))
+    _extents(parts, low, high)
     return low, high
 
 
-def compute_hull(made: np.ndarray, below: float = np.inf) -> tuple[float, ...]:
-    """Return the bounds of all parts that reach below a height, in the thing's frame.
-
-    They are least x, y, z and greatest x, y, z; inf and -inf without such parts.
-    """
-    return _hull(made, below)
+def compute_hull(parts: np.ndarray, below: float = np.inf) -> tuple[float, ...]:
+    """Return min x, y, z and max x, y, z of all parts that begin below a height; inf and -inf without any."""
+    return _hull(parts, below)
 
 
 @njit(cache=True, nogil=True)
-def _extents(made, low, high):
-    for p in range(len(made)):
-        reach = _reach(made[p])
+def _extents(parts, low, high):
+    for p in range(len(parts)):
+        half = _half_extents(parts[p])
         for i in range(3):
-            low[p, i], high[p, i] = made[p].centre[i] - reach[i], made[p].centre[i] + reach[i]
+            low[p, i], high[p, i] = parts[p].centre[i] - half[i], parts[p].centre[i] + half[i]
 
 
 @njit(cache=True, nogil=True)
-def _hull(made, below):
+def _hull(parts, below):
     low, high = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)
-    for p in range(len(made)):
-        c, reach = made[p].centre, _reach(made[p])
-        if c[2] - reach[2] < below:
-            low = (min(low[0], c[0] - reach[0]), min(low[1], c[1] - reach[1]), min(low[2], c[2] - reach[2]))
-            high = (max(high[0], c[0] + reach[0]), max(high[1], c[1] + reach[1]), max(high[2], c[2] + reach[2]))
+    for p in range(len(parts)):
+        c, half = parts[p].centre, _half_extents(parts[p])
+        if c[2] - half[2] < below:
+            low = (min(low[0], c[0] - half[0]), min(low[1], c[1] - half[1]), min(low[2], c[2] - half[2]))
+            high = (max(high[0], c[0] + half[0]), max(high[1], c[1] + half[1]), max(high[2], c[2] + half[2]))
     return (*low, *high)
 
 
 @njit(cache=True, nogil=True)
-def _reach(one):
-    """Return how far a part reaches along x, y and z from its centre."""
-    cos, sin, down, nose = (math.cos(one.yaw), math.sin(one.yaw), math.cos(one.pitch), math.sin(one.pitch))
-    a, b, c = one.half[0], one.half[1], one.half[2]
+def _half_extents(part):
+    """Return half the extents of a part along x, y and z."""
+    cos, sin, down, nose = (math.cos(part.yaw), math.sin(part.yaw), math.cos(part.pitch), math.sin(part.pitch))
+    a, b, c = part.half[0], part.half[1], part.half[2]
     return (
-        _along(one.kind, a * cos * down, b * sin, c * cos * nose),
-        _along(one.kind, a * sin * down, b * cos, c * sin * nose),
-        _along(one.kind, a * nose, 0.0, c * down),
+        _half_extent(part.kind, a * cos * down, b * sin, c * cos * nose),
+        _half_extent(part.kind, a * sin * down, b * cos, c * sin * nose),
+        _half_extent(part.kind, a * nose, 0.0, c * down),
     )
 
 
 @njit(cache=True, nogil=True)
-def _along(kind, a, b, c):
-    """Return half the extent of a part in a direction, given the extents of its half axes."""
+def _half_extent(kind, a, b, c):
+    """Return half the extent of a part in a direction, given the components of its half axes."""
     if kind == ELLIPSOID:
         return math.sqrt(a * a + b * b + c * c)
     if kind == CYLINDER:

@@ -12,9 +12,10 @@ from lidar_perception.simulation.places import Side, scatter
 from lidar_perception.simulation.shapes.cyclists import make_bicycle, make_cyclist, make_motorcycle, make_motorcyclist
 from lidar_perception.simulation.shapes.heavy_vehicles import make_bus, make_tram, make_truck
 from lidar_perception.simulation.shapes.people import make_sitting_person
-from lidar_perception.simulation.shapes.thing import Thing, block, disc, make_rigid
+from lidar_perception.simulation.shapes.primitives import block, disc
+from lidar_perception.simulation.shapes.scene_object import SceneObject, make_rigid
 from lidar_perception.simulation.shapes.vehicles import make_car, make_van
-from lidar_perception.simulation.solids import parts
+from lidar_perception.simulation.solids import make_parts
 from lidar_perception.simulation.street import CORNER_WALK_M, PARALLEL_STRIP_M, Lane, Street, parking_width
 
 DRAWBAR_M = 0.8  # gap between a car and its trailer
@@ -46,7 +47,7 @@ def populate(rng: np.random.Generator, street: Street, actors: ActorSet, people:
             actors.admit(*group)
 
 
-def _draw_vehicles(rng, use: str) -> list[Thing]:
+def _draw_vehicles(rng, use: str) -> list[SceneObject]:
     """Draw a vehicle of a lane, with its trailer if any.
 
     The shares are tuned so that the labels of many scenes are close to KITTI's.
@@ -59,15 +60,15 @@ def _draw_vehicles(rng, use: str) -> list[Thing]:
     return [make_bus(rng)] if pick < 0.985 else [make_car(rng), make_trailer(rng)]
 
 
-def make_trailer(rng) -> Thing:
+def make_trailer(rng) -> SceneObject:
     """Make a closed single-axle trailer."""
     length, width, height = size = tuple(rng.uniform((1.8, 1.3, 0.9), (3.8, 1.9, 2.3)).tolist())
     x, y = length / 2, width / 2
     rows = [
-        block((-x, -y, 0.35), (x, y, height), reflectance=rng.uniform(0.1, 0.5)),
-        *(disc((0, s * (y - 0.1), 0.3), 0.3, 0.1, reflectance=0.06) for s in (-1, 1)),
+        block((-x, -y, 0.35), (x, y, height), rng.uniform(0.1, 0.5)),
+        *(disc((0, s * (y - 0.1), 0.3), 0.3, 0.1, 0.06) for s in (-1, 1)),
     ]
-    return make_rigid(parts(rows, OTHER_VEHICLE), size, "Misc")
+    return make_rigid(make_parts(rows, OTHER_VEHICLE), size, "Misc")
 
 
 def _queue_vehicles(rng, lane: Lane, street: Street, seconds: float) -> Iterator[list[Actor]]:

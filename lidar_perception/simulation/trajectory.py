@@ -1,4 +1,4 @@
-"""Trajectory of the sensor: ahead along x at constant speed, swaying to both sides."""
+"""Trajectory of the sensor: along x at constant speed, with sinusoidal motion along y."""
 
 from __future__ import annotations
 
@@ -7,13 +7,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-DRIVE_SECONDS = 20.0  # time during which nothing collides
-ROBOT_RADIUS_M = 0.35  # radius of a robot off the road
+DRIVE_SECONDS = 20.0  # duration of a drive without collisions
+ROBOT_RADIUS_M = 0.35
 
 
 class TrajectoryPoint(NamedTuple):
-    """A trajectory at one time: x, y in the world (m), heading (rad), velocity (2,) in the world
-    (m/s) and yaw_rate (rad/s, counter-clockwise)."""
+    """Trajectory at one time.
+
+    Attributes:
+        x, y: Position in the world, m.
+        heading: rad.
+        velocity: (2,) in the world, m/s.
+        yaw_rate: rad/s, counter-clockwise.
+    """
 
     x: float
     y: float
@@ -23,43 +29,50 @@ class TrajectoryPoint(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """x = speed * t and y = sum of reach * sin(rate * t + phase) over the sways (m, rad/s, rad).
+    """Trajectory with x = speed * t and y = sum of amplitude * sin(rate * t + phase).
 
-    Heading, velocity and yaw rate are exact derivatives. Without sways it is straight.
+    Attributes:
+        speed: m/s.
+        sways: (amplitude in m, rate in rad/s, phase in rad) of each sinusoid along y; empty for a
+            straight trajectory.
     """
 
     speed: float = 0.0
     sways: tuple[tuple[float, float, float], ...] = ()
 
     def at(self, t: float) -> TrajectoryPoint:
-        """Return the point after t seconds."""
-        y = aside = turning = 0.0
-        for reach, rate, phase in self.sways:
+        """Return position, heading and their derivatives after t seconds."""
+        y = velocity_y = acceleration_y = 0.0
+        for amplitude, rate, phase in self.sways:
             sin, cos = math.sin(rate * t + phase), math.cos(rate * t + phase)
-            y, aside = y + reach * sin, aside + reach * rate * cos
-            turning -= reach * rate * rate * sin
-        square = self.speed**2 + aside**2
-        yaw_rate = self.speed * turning / square if square else 0.0
-        return TrajectoryPoint(self.speed * t, y, math.atan2(aside, self.speed), (self.speed, aside), yaw_rate)
+            y, velocity_y = y + amplitude * sin, velocity_y + amplitude * rate * cos
+            acceleration_y -= amplitude * rate * rate * sin
+        square = self.speed**2 + velocity_y**2
+        yaw_rate = self.speed * acceleration_y / square if square else 0.0
+        heading = math.atan2(velocity_y, self.speed)
+        return TrajectoryPoint(self.speed * t, y, heading, (self.speed, velocity_y), yaw_rate)
 
-    def sampled(self, seconds: float, step: float) -> np.ndarray:
-        """Return (T, 3) float64 rows [t x y] from 0 to seconds, every step seconds."""
+    def sample(self, seconds: float, step: float) -> np.ndarray:
+        """Sample the trajectory from 0 to `seconds` every `step` seconds: (T, 3) float64 rows [t x y]."""
         times = np.linspace(0.0, seconds, round(seconds / step) + 1)
         return np.array([(t, *self.at(t)[:2]) for t in times])
 
 
-def draw_trajectory(rng: np.random.Generator, speed: tuple[float, float], stands: float, turn: float) -> Trajectory:
-    """Draw a trajectory that stands still or sways in 8 to 25 s.
+def draw_trajectory(
+    rng: np.random.Generator, speed_range: tuple[float, float], stop_chance: float, max_heading: float
+) -> Trajectory:
+    """Draw a trajectory that stands still, or sways with periods of 8 to 25 s.
 
     Args:
-        speed: Range of the speed, m/s.
-        stands: Probability of standing still.
-        turn: Largest heading to both sides, rad.
+        rng: Random generator.
+        speed_range: Lowest and highest speed, m/s.
+        stop_chance: Probability that it stands still.
+        max_heading: Largest heading to both sides, rad.
     """
-    if rng.random() < stands:
+    if rng.random() < stop_chance:
         return Trajectory()
-    pace, long = rng.uniform(*speed), 2 * np.pi / rng.uniform((8.0, 15.0), (15.0, 25.0))
-    # One sinusoid turns by at most atan(reach * rate / speed); two share the angle.
-    reach = 0.5 * pace * np.tan(turn * rng.uniform(0.3, 1.0, 2)) / long
+    speed, rate = rng.uniform(*speed_range), 2 * np.pi / rng.uniform((8.0, 15.0), (15.0, 25.0))
+    # The heading of one sway is at most atan(amplitude * rate / speed); two sways share max_heading.
+    amplitude = 0.5 * speed * np.tan(max_heading * rng.uniform(0.3, 1.0, 2)) / rate
     phase = rng.uniform(-np.pi, np.pi, 2)
-    return Trajectory(float(pace), tuple(zip(reach.tolist(), long.tolist(), phase.tolist())))
+    return Trajectory(float(speed), tuple(zip(amplitude.tolist(), rate.tolist(), phase.tolist())))

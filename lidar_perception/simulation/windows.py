@@ -1,4 +1,4 @@
-"""Windows of the grid of firings and beams that contain all rays that can hit a solid."""
+"""Windows of solids in the grid of firings and beams, like bounding rectangles in an image."""
 
 from __future__ import annotations
 
@@ -13,27 +13,32 @@ from lidar_perception.simulation.solids import BOX, ELLIPSOID, Solids
 
 
 class Windows(NamedTuple):
-    """Windows of P solids; no ray outside hits the solid.
+    """Windows of P solids. Only rays in the window of a solid can hit it.
 
     Attributes:
         first: (P,) int64 first column, 0 .. columns - 1.
-        count: (P,) int64 number of columns, which may continue past the last one at 0.
-        beams: (P, rings) bool.
-        near: (P,) m; no hit is nearer.
+        count: (P,) int64 number of columns; after the last column of the grid follows column 0.
+        beams: (P, rings) bool, beams that can hit the solid.
+        min_range: (P,) lower bound of the range of a hit, m.
     """
 
     first: np.ndarray
-    count: np.ndarray  # type: ignore[assignment]  # a tuple has a count of its own
+    count: np.ndarray  # type: ignore[assignment]  # overrides tuple.count
     beams: np.ndarray
-    near: np.ndarray
+    min_range: np.ndarray
 
 
 class Grid(NamedTuple):
-    """Properties of the sensor and its motion that the windows of all solids need.
+    """Grid of rays, and the motion of the sensor.
 
-    rise and fall: (rings,) slopes of a beam's highest and lowest rays; lift: (rings,) m; wide:
-    margin in azimuth, rad; begin and end of the turn: seconds after the stamp; moves: anything
-    moves.
+    Attributes:
+        columns, rate, max_range: See Sensor.
+        stamp, yaw_rate: See Motion.
+        begin, end: Begin and end of the turn, seconds after the stamp.
+        margin: Margin in azimuth, rad.
+        moves: The sensor or a solid moves.
+        lift: (rings,) start of each beam on the z axis, m.
+        rise, fall: (rings,) slopes of the highest and the lowest ray of each beam.
     """
 
     columns: int
@@ -42,7 +47,7 @@ class Grid(NamedTuple):
     yaw_rate: float
     begin: float
     end: float
-    wide: float
+    margin: float
     max_range: float
     moves: bool
     lift: np.ndarray
@@ -51,13 +56,13 @@ class Grid(NamedTuple):
 
 
 def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION, margin: float = 0.0) -> Windows:
-    """Find the windows of solids in the sensor's frame at the stamp.
+    """Find the windows of solids.
 
     Args:
-        solids: The solids.
-        sensor: The sensor; its beams may start at different heights.
+        solids: Solids in the sensor's frame at the stamp.
+        sensor: The sensor.
         motion: Motion of the sensor.
-        margin: Largest deviation of rays from the sensor's, rad.
+        margin: Largest angle between a ray and its beam, rad.
     """
     relative = solids.velocity - np.asarray(motion.velocity, np.float64)
     since = sensor.times() - motion.stamp / sensor.rate
@@ -78,23 +83,25 @@ def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION, mar
         fall,
     )
     count = len(solids)
-    found = Windows(
+    windows = Windows(
         np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, sensor.rings), bool), np.empty(count)
     )
-    shapes = (np.array(part, float, order="C") for part in (solids.centre, solids.half, solids.axes, relative))
-    _fill_windows(found, grid, np.array(solids.kind), *shapes)
-    return found
+    arrays = (np.array(values, float, order="C") for values in (solids.centre, solids.half, solids.axes, relative))
+    _fill_windows(windows, grid, np.array(solids.kind), *arrays)
+    return windows
 
 
 @njit(cache=True, nogil=True)
-def _fill_windows(found, grid, kind, centre, half, axes, relative):
-    corners, facing, reach = np.empty((16, 3)), np.empty((3, 3)), np.empty(3)
+def _fill_windows(windows, grid, kind, centre, half, axes, relative):
+    corners, box_axes, box_half = np.empty((16, 3)), np.empty((3, 3)), np.empty(3)
     for p in range(len(kind)):
-        # The time of the full revolution gives a window, which gives the time when the sensor faces it.
+        # Iterate: the window for the whole turn limits the time at which the sensor faces the solid.
         begin, end = (grid.begin, grid.end) if grid.moves else (0.0, 0.0)
         for _ in range(3 if grid.moves else 1):
             ahead = _find_direction(centre[p], relative[p], (begin + end) / 2)
-            _fill_corners(corners, facing, reach, kind[p], centre[p], half[p], axes[p], relative[p], ahead, begin, end)
+            _fill_corners(
+                corners, box_axes, box_half, kind[p], centre[p], half[p], axes[p], relative[p], ahead, begin, end
+            )
             first, count = _find_columns(corners, grid, begin, end)
             latest = grid.columns // 2 - first
             earliest = latest - count + 1
@@ -103,50 +110,53 @@ def _fill_windows(found, grid, kind, centre, half, axes, relative):
                 turn = grid.columns * grid.rate
                 begin = earliest % grid.columns / turn - grid.stamp / grid.rate
                 end = latest % grid.columns / turn - grid.stamp / grid.rate
-        found.first[p], found.count[p] = first % grid.columns, count
-        found.near[p] = _fill_beams(corners, facing, ahead, grid, found.beams[p]) - 1e-6
+        windows.first[p], windows.count[p] = first % grid.columns, count
+        windows.min_range[p] = _fill_beams(corners, box_axes, ahead, grid, windows.beams[p]) - 1e-6
 
 
 @njit(cache=True, nogil=True)
 def _find_direction(centre, relative, since):
-    """Return the horizontal direction to a solid."""
+    """Return the horizontal direction (x, y) to a solid at a time."""
     x, y = centre[0] + relative[0] * since, centre[1] + relative[1] * since
-    far = max(math.hypot(x, y), 1e-9)
-    return x / far, y / far
+    distance = max(math.hypot(x, y), 1e-9)
+    return x / distance, y / distance
 
 
 @njit(cache=True, nogil=True)
-def _fill_corners(corners, facing, reach, kind, centre, half, axes, relative, ahead, begin, end):
-    """Fill the corners (16, 3) of a box around a solid from begin to end (s), and its axes.
+def _fill_corners(corners, box_axes, box_half, kind, centre, half, axes, relative, ahead, begin, end):
+    """Fill the corners (16, 3) of a box around a solid at begin and end (s), its axes and its half sizes.
 
     Round solids get a box that faces the sensor, which is tighter.
     """
     if kind == BOX:
-        facing[:] = axes
-        reach[:] = half
+        box_axes[:] = axes
+        box_half[:] = half
     else:
-        facing[:] = 0.0
-        facing[0, 0], facing[1, 0] = ahead
-        facing[0, 1], facing[1, 1] = -ahead[1], ahead[0]
-        facing[2, 2] = 1.0
+        box_axes[:] = 0.0
+        box_axes[0, 0], box_axes[1, 0] = ahead
+        box_axes[0, 1], box_axes[1, 1] = -ahead[1], ahead[0]
+        box_axes[2, 2] = 1.0
         for i in range(3):
             a, b, c = 0.0, 0.0, 0.0
             for j in range(3):
-                a += facing[j, i] * axes[j, 0] * half[0]
-                b += facing[j, i] * axes[j, 1] * half[1]
-                c += facing[j, i] * axes[j, 2] * half[2]
-            reach[i] = math.sqrt(a * a + b * b + (c * c)) if kind == ELLIPSOID else (math.sqrt(a * a + b * b) + abs(c))
+                a += box_axes[j, i] * axes[j, 0] * half[0]
+                b += box_axes[j, i] * axes[j, 1] * half[1]
+                c += box_axes[j, i] * axes[j, 2] * half[2]
+            if kind == ELLIPSOID:
+                box_half[i] = math.sqrt(a * a + b * b + (c * c))
+            else:
+                box_half[i] = math.sqrt(a * a + b * b) + abs(c)
     for n in range(16):
         since = begin if n < 8 else end
         for i in range(3):
             corners[n, i] = centre[i] + relative[i] * since
             for j in range(3):
-                corners[n, i] += facing[i, j] * (reach[j] if n >> j & 1 else -reach[j])
+                corners[n, i] += box_axes[i, j] * (box_half[j] if n >> j & 1 else -box_half[j])
 
 
 @njit(cache=True, nogil=True)
 def _find_columns(corners, grid, begin, end):
-    """Return the first column and the number of columns; the sensor turns meanwhile."""
+    """Return the first column and the number of columns of a window, with the rotation of the sensor."""
     x, y = 0.0, 0.0
     for n in range(16):
         x, y = x + corners[n, 0], y + corners[n, 1]
@@ -155,29 +165,29 @@ def _find_columns(corners, grid, begin, end):
         bearing = math.atan2(corners[n, 1], corners[n, 0]) - middle
         bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
         low, high = min(low, bearing), max(high, bearing)
-    around = high - low >= np.pi  # the sensor is above or below the box
-    turned = grid.yaw_rate * begin, grid.yaw_rate * end
-    low, high = low - max(turned) - grid.wide, high - min(turned) + grid.wide
+    is_overhead = high - low >= np.pi  # the sensor is above or below the box
+    yaws = grid.yaw_rate * begin, grid.yaw_rate * end
+    low, high = low - max(yaws) - grid.margin, high - min(yaws) + grid.margin
     step = 2 * np.pi / grid.columns
     first = math.floor((middle + low) / step)
     count = math.ceil((middle + high) / step) - first + 1
-    if around or count >= grid.columns:
+    if is_overhead or count >= grid.columns:
         return 0, grid.columns
     return first, count
 
 
 @njit(cache=True, nogil=True)
-def _fill_beams(corners, facing, ahead, grid, beams):
-    """Fill which beams (rings,) reach the height of the box; return its distance from the z axis."""
+def _fill_beams(corners, box_axes, ahead, grid, beams):
+    """Fill the beams (rings,) bool that can hit the box, and return its distance from the z axis."""
     near, far, bottom, top = 0.0, 0.0, np.inf, -np.inf
-    for side in range(3):  # horizontal directions: two sides of the box, and towards it
-        x, y = ahead if side == 2 else (facing[0, side], facing[1, side])
-        long = max(math.hypot(x, y), 1e-9)
-        least, most = np.inf, -np.inf
+    for side in range(3):  # two sides of the box, and the direction towards it
+        x, y = ahead if side == 2 else (box_axes[0, side], box_axes[1, side])
+        length = max(math.hypot(x, y), 1e-9)
+        low, high = np.inf, -np.inf
         for n in range(16):
-            along = (x * corners[n, 0] + y * corners[n, 1]) / long
-            least, most = min(least, along), max(most, along)
-        near = max(near, least, -most)
+            along = (x * corners[n, 0] + y * corners[n, 1]) / length
+            low, high = min(low, along), max(high, along)
+        near = max(near, low, -high)
     for n in range(16):
         far = max(far, math.hypot(corners[n, 0], corners[n, 1]))
         bottom, top = min(bottom, corners[n, 2]), max(top, corners[n, 2])

@@ -1,7 +1,6 @@
 """Augmentation of labelled scenes: pure functions with the random generator as an argument.
 
-Apart from noise and slopes, points in a box stay in it. A scene is a cloud with boxes in the frame
-of a level sensor.
+Points in a box stay in it, except for noise and slopes. A scene is in the frame of a level sensor.
 """
 
 from __future__ import annotations
@@ -12,14 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidar_perception.geometry import bev_iou, elevation_angles, is_within, to_box_frame, wrap_angle
-from lidar_perception.training.params import AugmentParams, IntensityParams, NoiseParams, ThingParams
+from lidar_perception.training.params import AugmentParams, BackgroundParams, IntensityParams, NoiseParams
 from lidar_perception.training.pasting import MIN_RANGE_M, find_points_in_box
 from lidar_perception.types import SENSOR_HEIGHT
 
-BEAM_STEP = np.radians(0.4)  # elevation step between two beams
+BEAM_STEP = np.radians(0.4)  # spacing of the beams in elevation
 REFLECTOR_INTENSITY = 0.99
-FADE_RANGE_M = 15.0  # range at which the intensity fade has no effect
-BOX_MARGIN_M = 0.01  # points this close to a box belong to it, because labels are rounded
+FADE_RANGE_M = 15.0  # range at which the fading of the intensity has no effect
+BOX_MARGIN_M = 0.01  # points within this margin belong to a box, since labels are rounded
 
 
 @dataclass(frozen=True)
@@ -30,21 +29,21 @@ class TrainingScene:
         points: (N, 4) float32, x y z intensity.
         boxes: (M, 7) float64, x y z l w h yaw.
         class_ids: (M,) int into CLASSES.
-        wanted: (M,) bool, True for objects to detect; False for those too hidden to be labelled.
-        around: The labels are all around, not only ahead.
+        detectable: (M,) bool, False for objects that are too hidden to be detected.
+        around: Objects in all directions are labelled, not only those ahead.
         height: Height of the sensor above the ground in metres.
     """
 
     points: np.ndarray
     boxes: np.ndarray
     class_ids: np.ndarray
-    wanted: np.ndarray
+    detectable: np.ndarray
     around: bool = False
     height: float = SENSOR_HEIGHT
 
 
 def augment_scene(scene: TrainingScene, params: AugmentParams, rng: np.random.Generator) -> TrainingScene:
-    """Apply every change except those of turn_and_crop and database.paste_objects."""
+    """Apply all random changes except those of turn_and_crop and database.paste_objects."""
     scene = move_objects(scene, params.object_turn, params.object_shift, rng)
     if rng.random() < params.flip:
         scene = flip_scene(scene)
@@ -63,9 +62,9 @@ def augment_scene(scene: TrainingScene, params: AugmentParams, rng: np.random.Ge
 def turn_and_crop(
     scene: TrainingScene, params: AugmentParams, low: np.ndarray, high: np.ndarray, rng: np.random.Generator
 ) -> TrainingScene:
-    """Turn the scene, and keep what the other changes can move between low and high (3,), in m.
+    """Rotate the scene at random, and crop it to the region between low and high (3,) in m.
 
-    Done first, since most of a scan is elsewhere.
+    The crop has a margin for the other changes. It comes first, since most points are outside.
     """
     turn = np.pi if scene.around and params.turn else params.turn
     scene = turn_scene(scene, rng.uniform(-turn, turn))
@@ -75,17 +74,17 @@ def turn_and_crop(
 
 
 def crop_scene(scene: TrainingScene, low: np.ndarray, high: np.ndarray) -> TrainingScene:
-    """Keep points between low and high (3,), and boxes whose centre is, seen from above."""
-    kept = np.ones(len(scene.points), bool)
+    """Keep the points between low and high (3,) in m, and the boxes whose centre is within these limits of x and y."""
+    keep = np.ones(len(scene.points), bool)
     for axis in range(3):
-        kept &= (scene.points[:, axis] >= low[axis]) & (scene.points[:, axis] < high[axis])
+        keep &= (scene.points[:, axis] >= low[axis]) & (scene.points[:, axis] < high[axis])
     inside = is_within(scene.boxes, low, high)
     return replace(
         scene,
-        points=scene.points[kept],
+        points=scene.points[keep],
         boxes=scene.boxes[inside],
         class_ids=scene.class_ids[inside],
-        wanted=scene.wanted[inside],
+        detectable=scene.detectable[inside],
     )
 
 
@@ -97,7 +96,7 @@ def flip_scene(scene: TrainingScene) -> TrainingScene:
 
 
 def turn_scene(scene: TrainingScene, angle: float) -> TrainingScene:
-    """Turn the scene counter-clockwise about the sensor, in rad."""
+    """Rotate the scene counter-clockwise about the sensor by an angle in rad."""
     cos, sin = np.cos(angle), np.sin(angle)
     matrix = np.array([[cos, sin], [-sin, cos]])
     points, boxes = scene.points.copy(), scene.boxes.copy()
@@ -108,7 +107,7 @@ def turn_scene(scene: TrainingScene, angle: float) -> TrainingScene:
 
 
 def scale_scene(scene: TrainingScene, factor: float) -> TrainingScene:
-    """Multiply every length by factor."""
+    """Multiply all coordinates and sizes by factor."""
     points, boxes = scene.points.copy(), scene.boxes.copy()
     points[:, :3] *= np.float32(factor)
     boxes[:, :6] *= factor
@@ -116,15 +115,12 @@ def scale_scene(scene: TrainingScene, factor: float) -> TrainingScene:
 
 
 def drop_points(scene: TrainingScene, share: float, rng: np.random.Generator) -> TrainingScene:
-    """Drop about this share of the points, at random."""
+    """Drop a random share of the points."""
     return replace(scene, points=scene.points[rng.random(len(scene.points)) >= share])
 
 
 def change_intensity(scene: TrainingScene, factor: float, offset: float) -> TrainingScene:
-    """Multiply intensities by factor and add offset, clipped to 0 .. 1.
-
-    An intensity of 0 stays 0: sensors report it for the weakest returns, at any scale.
-    """
+    """Multiply intensities by factor and add offset, clipped to 0 .. 1; an intensity of 0 stays 0."""
     points = scene.points.copy()
     positive = points[:, 3] > 0
     points[positive, 3] = np.clip(points[positive, 3] * factor + offset, 0, 1)
@@ -132,10 +128,10 @@ def change_intensity(scene: TrainingScene, factor: float, offset: float) -> Trai
 
 
 def distort_intensity(points: np.ndarray, params: IntensityParams, rng: np.random.Generator) -> np.ndarray:
-    """Change or remove the intensities of points (N, 4), as other sensors report them.
+    """Change the intensities of points (N, 4) to those of another sensor, or set all to 0.
 
-    Removed intensities are 0, and an intensity of 0 stays 0. Gain and gamma need no change, since
-    they have no effect on what networks read, see normalize_intensity.
+    An intensity of 0 stays 0. Gain and gamma are not changed, since normalize_intensity removes
+    them.
     """
     points = points.copy()
     if rng.random() < params.no_intensity:
@@ -155,7 +151,7 @@ def distort_intensity(points: np.ndarray, params: IntensityParams, rng: np.rando
 
 
 def add_reflector(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Make a random range of heights of one thing retroreflective. points: (N, 4), N >= 1."""
+    """Make a random range of heights of an object with points (N, 4), N >= 1, retroreflective."""
     points = points.copy()
     height = points[:, 2]
     low, high = np.sort(rng.uniform(height.min(), height.max(), 2))
@@ -163,18 +159,19 @@ def add_reflector(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return points
 
 
-def vary_thing(
-    points: np.ndarray, foot: np.ndarray, params: ThingParams, rng: np.random.Generator
+def vary_background(
+    points: np.ndarray, foot: np.ndarray, params: BackgroundParams, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stretch one background thing about its foot and change its intensity, at random.
+    """Stretch a background object about its foot and change its intensity, at random.
 
     Args:
-        points: (N, 4) points of the thing, N >= 1.
-        foot: (3,) point on the ground that stays where it is.
-        params: Limits; width and height change by factors up to exp(things_stretch).
+        points: (N, 4) points of the object, N >= 1.
+        foot: (3,) point on the ground that does not move.
+        params: Limits of the changes.
+        rng: Random generator.
 
     Returns:
-        (N, 4) changed points, and the (3,) factors of the lengths, equal along x and y.
+        (N, 4) changed points, and the factors (3,) of the sizes, equal along x and y.
     """
     wide, high = np.exp(rng.uniform(-params.things_stretch, params.things_stretch, 2))
     factors = np.array([wide, wide, high])
@@ -188,19 +185,21 @@ def vary_thing(
 
 
 def add_range_noise(points: np.ndarray, params: NoiseParams, rng: np.random.Generator) -> np.ndarray:
-    """Shift points (N, 4) along their rays by random errors within the limits of params."""
+    """Add range noise with random standard deviations to points (N, 4), see blur_ranges."""
     return blur_ranges(points, rng.uniform(0, params.beam_noise), rng.uniform(0, params.range_noise), rng)
 
 
 def blur_ranges(points: np.ndarray, beam: float, point: float, rng: np.random.Generator) -> np.ndarray:
-    """Shift points (N, 4) along their rays by an error of their beam and one of each point.
+    """Add range noise to points (N, 4): an error for each beam and one for each point.
 
-    Real beams do not agree: on KITTI the points of one pole scatter by 0.07 to 0.1 m in depth, the
-    means of its beams by 0.035 to 0.07 m. A simulated pole has no such scatter.
+    The beams of real sensors have different range biases: on a pole in KITTI, points scatter by
+    0.07 to 0.1 m in depth, and the means of the beams by 0.035 to 0.07 m.
 
     Args:
-        beam: Standard deviation in metres of the error that all points of an elevation share.
-        point: Standard deviation in metres of each point's own error.
+        points: (N, 4).
+        beam: Standard deviation of the error of a beam (the points of one elevation), m.
+        point: Standard deviation of the error of a point, m.
+        rng: Random generator.
     """
     ranges = np.maximum(np.linalg.norm(points[:, :3], axis=1), MIN_RANGE_M)
     beams = np.floor(elevation_angles(points) / BEAM_STEP).astype(np.int64)
@@ -213,13 +212,14 @@ def blur_ranges(points: np.ndarray, beam: float, point: float, rng: np.random.Ge
 
 
 def raise_scene(scene: TrainingScene, height: float, slopes: ArrayLike = (0.0, 0.0)) -> TrainingScene:
-    """Raise the scene, as if the sensor were lower, and slope the ground.
+    """Raise the scene, as if the sensor were lower, and tilt the ground.
 
     Boxes stay upright, so points may leave their box if the slopes are not 0.
 
     Args:
-        height: Metres to raise the scene.
-        slopes: Rise of the ground along x and y (2,), m/m.
+        scene: Scene, which is not changed.
+        height: Shift along z, m.
+        slopes: (2,) slopes of the ground along x and y, m/m.
     """
     points, boxes = scene.points.copy(), scene.boxes.copy()
     points[:, 2] += (height + scene.points[:, :2] @ np.asarray(slopes)).astype(np.float32)
@@ -228,11 +228,13 @@ def raise_scene(scene: TrainingScene, height: float, slopes: ArrayLike = (0.0, 0
 
 
 def move_objects(scene: TrainingScene, turn: float, shift: float, rng: np.random.Generator) -> TrainingScene:
-    """Turn and shift each object with its points, unless it touches another one before or after.
+    """Rotate and shift each object with its points at random, unless it touches another box before or after.
 
     Args:
-        turn: Largest angle about the object's centre, rad.
-        shift: Standard deviation of the shift along x and along y, metres.
+        scene: Scene, which is not changed.
+        turn: Largest rotation about the object's centre, rad.
+        shift: Standard deviation of the shift along x and along y, m.
+        rng: Random generator.
     """
     points, boxes = scene.points.copy(), scene.boxes.copy()
     if not (turn or shift):
@@ -253,12 +255,12 @@ def move_objects(scene: TrainingScene, turn: float, shift: float, rng: np.random
 
 
 def move_with_box(xyz: np.ndarray, box: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Return points (N, 3), float32, moved like a box (7,) that moves to the pose of goal (7,)."""
+    """Move points (N, 3) with a box (7,) to the pose of another box, goal (7,), as float32."""
     relative = to_box_frame(xyz.astype(np.float64), box)
     about = np.array([0.0, 0, 0, 0, 0, 0, -goal[6]])
     return (to_box_frame(relative, about) + goal[:3]).astype(np.float32)
 
 
 def enlarge_boxes(boxes: np.ndarray, margin: float = BOX_MARGIN_M) -> np.ndarray:
-    """Return boxes (M, 7) with a margin on every side, in metres."""
+    """Add a margin in metres to all sides of boxes (M, 7)."""
     return boxes + [0, 0, 0, 2 * margin, 2 * margin, 2 * margin, 0]

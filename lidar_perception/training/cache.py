@@ -1,4 +1,4 @@
-"""Cache of files that take long to compute, which interrupted and later runs reuse."""
+"""Cache of computed files on disk, for interrupted and later runs."""
 
 from __future__ import annotations
 
@@ -23,24 +23,18 @@ Content = TypeVar("Content")
 
 
 class CacheError(InputError):
-    """Raised if the cache cannot be written; a scene that cannot be read is a plain InputError."""
+    """Error: the cache cannot be written. A scene that cannot be read is a plain InputError."""
 
 
 def cache_path(cache: Path | None, *key: Any) -> Path | None:
-    """Return the file of the cache for a key, which any change of the key's repr changes.
-
-    None without a cache.
-    """
+    """Return the path of the cache file for a key; None without a cache. Equal keys have equal reprs."""
     if cache is None:
         return None
     return cache / f"{hashlib.sha1(repr((*key, __version__)).encode()).hexdigest()[:20]}.npz"
 
 
 def file_fingerprint(file: Path) -> tuple[str, int, int]:
-    """Return path, size in bytes and modification time in ns, which change with the content.
-
-    Size and time are 0 for a missing file.
-    """
+    """Return path, size in bytes and modification time in ns of a file; size and time are 0 if it is missing."""
     try:
         stat = file.stat()
     except OSError:
@@ -48,21 +42,21 @@ def file_fingerprint(file: Path) -> tuple[str, int, int]:
     return str(file.resolve()), stat.st_size, stat.st_mtime_ns
 
 
-def load_or_make(
+def load_or_compute(
     path: Path | None,
-    make: Callable[[], Content],
-    read: Callable[[Any], Content],
+    compute: Callable[[], Content],
+    from_arrays: Callable[[Any], Content],
     to_arrays: Callable[[Content], dict[str, Any]],
     max_gb: float = np.inf,
 ) -> Content:
-    """Return the content of a cache file; make and write it if it is missing or damaged.
+    """Load a cache file, or compute and write its content if it is missing or damaged.
 
     Args:
-        path: The .npz file, or None for no cache.
-        make: Computes the content.
-        read: Content from the arrays of the file.
-        to_arrays: Arrays to write.
-        max_gb: Write only while the folder is smaller than this.
+        path: Path of the .npz file, or None for no cache.
+        compute: Computes the content.
+        from_arrays: Converts the arrays of the file to the content.
+        to_arrays: Converts the content to arrays.
+        max_gb: The file is written only while the folder is smaller than this.
 
     Raises:
         CacheError: The file cannot be written.
@@ -70,10 +64,10 @@ def load_or_make(
     if path is not None and path.is_file():
         try:
             with np.load(path) as file:
-                return read(file)
+                return from_arrays(file)
         except (OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile):
-            path.unlink(missing_ok=True)  # recreated below
-    content = make()
+            path.unlink(missing_ok=True)
+    content = compute()
     if path is not None and (max_gb == np.inf or folder_size(path.parent) < max_gb * 1e9):
         try:
             write_arrays(path, to_arrays(content))
@@ -99,38 +93,39 @@ def folder_size(folder: Path) -> int:
 
 
 def find_missing(source: Any, numbers: Sequence[int]) -> list[int]:
-    """Return those of the scene numbers for which a source has no cache file yet."""
+    """Return the scene numbers without a cache file; none if the source has no cache."""
     return [i for i in numbers if (path := source.path(i)) is not None and not path.is_file()]
 
 
 def fill_cache(sources: Sequence[Any], numbers: Sequence[Sequence[int]], jobs: int, title: str) -> None:
-    """Cache scenes of several sources in several processes, each missing file once.
+    """Write the missing cache files of several sources in several processes.
 
-    Scenes that cannot be read are skipped here and reported when training reads them.
+    Scenes that cannot be read are skipped; training reports them later.
 
     Args:
-        sources: Sources with path(i) and keep(i).
+        sources: Sources with path(i) and store(i).
         numbers: Scene numbers of each source.
+        jobs: Number of processes.
+        title: Title of the progress bar.
 
     Raises:
         CacheError: A file cannot be written.
     """
-    items = [(k, i) for k, (source, some) in enumerate(zip(sources, numbers)) for i in find_missing(source, some)]
+    items = [(k, i) for k, source in enumerate(sources) for i in find_missing(source, numbers[k])]
     if not items:
         return
-    for _ in show_progress(
-        run_in_processes(partial(_make_keeper, tuple(sources)), items, jobs, title), title, len(items)
-    ):
+    results = run_in_processes(partial(_make_store_function, tuple(sources)), items, jobs, title)
+    for _ in show_progress(results, title, len(items)):
         pass
 
 
-def _make_keeper(sources: tuple[Any, ...]) -> Callable[[tuple[int, int]], None]:
-    def keep(item: tuple[int, int]) -> None:
+def _make_store_function(sources: tuple[Any, ...]) -> Callable[[tuple[int, int]], None]:
+    def store(item: tuple[int, int]) -> None:
         try:
-            sources[item[0]].keep(item[1])
+            sources[item[0]].store(item[1])
         except CacheError:
             raise
         except InputError:
             return
 
-    return keep
+    return store

@@ -1,4 +1,4 @@
-"""Fitting of additive models of log-odds, as candidates/confidence.py reads them, to samples."""
+"""Fit of additive log-odds models, which candidates/confidence.py evaluates."""
 
 from __future__ import annotations
 
@@ -8,14 +8,11 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-PENALTY = 1.0  # chosen on held-out streets
+PENALTY = 1.0  # of squared steps, chosen on held-out streets
 
 
 def compute_ramps(values: np.ndarray, knots: tuple[float, ...]) -> np.ndarray:
-    """Return the position of each value (K,) between successive knots: (K, len(knots) - 1), 0 .. 1.
-
-    NaN values give 0.
-    """
+    """Return the position 0 .. 1 of values (K,) in each interval between knots, (K, len(knots) - 1); 0 for NaN."""
     low, high = np.array(knots[:-1]), np.array(knots[1:])
     return np.nan_to_num(np.clip((values[:, None] - low) / (high - low), 0.0, 1.0))
 
@@ -27,16 +24,16 @@ def fit_curves(
     knots: Mapping[str, tuple[float, ...]],
     rising: Mapping[str, int] = {},
 ) -> dict:
-    """Fit one curve to each feature, by penalised logistic regression on its steps between knots.
+    """Fit a piecewise linear curve to each feature by logistic regression on its steps between knots.
 
-    The penalty keeps curves level where samples are missing.
+    A penalty on the steps keeps curves constant where there are no samples.
 
     Args:
-        features: Values (K,) by name. One extra step stands for NaN values.
+        features: Values (K,) by name. NaN values get a step of their own.
         hit: (K,) bool, the outcome.
         weight: (K,) weights of the samples.
         knots: Knots of each feature's curve.
-        rising: 1 for features whose curve must not fall, -1 for those that must not rise.
+        rising: 1 for features whose curve must not fall, -1 for features whose curve must not rise.
 
     Returns:
         The model as JSON data: "bias", and "curves" by feature.

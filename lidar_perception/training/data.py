@@ -1,6 +1,6 @@
-"""Batches of samples from scenes: an endless stream whose n-th element depends on n and the seed.
+"""Batches of samples from an endless stream of scenes.
 
-Neither the number of worker processes nor an interruption changes the samples.
+The n-th sample depends only on n and the seed, not on worker processes or interruptions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PREFETCH = 4  # batches that each worker prepares in advance
 
 
 class Item(NamedTuple):
-    """A sample, and the reasons for which other scenes were skipped before it."""
+    """A sample, and the reasons why scenes before it were skipped."""
 
     sample: Any
     skipped: tuple[str, ...] = ()
@@ -29,15 +29,15 @@ class Item(NamedTuple):
 
 @dataclass(frozen=True)
 class Stream:
-    """Endless sequence of samples: each epoch has every scene of all sources in a new order.
+    """Endless sequence of samples, in which each epoch has every scene of all sources in a new order.
 
     A scene that cannot be read or prepared (InputError) is skipped and replaced by the next one.
     stream[n] raises InputError if no scene can be used.
 
     Attributes:
         sources: Sources with scene(i) and a length.
-        prepare: prepare(scene, rng) makes the sample.
-        seed: Seed of order and samples.
+        prepare: prepare(scene, rng) makes a sample.
+        seed: Seed of the order and of the samples.
     """
 
     sources: tuple[Any, ...]
@@ -63,7 +63,7 @@ class Stream:
 
 
 def find_source(sources: Sequence[Any], n: int) -> tuple[Any, int]:
-    """Return the source of the n-th scene of concatenated sources, and its number there."""
+    """Return the source of the n-th scene of concatenated sources, and the scene's number in it."""
     for source in sources:
         if n < len(source):
             return source, n
@@ -73,9 +73,11 @@ def find_source(sources: Sequence[Any], n: int) -> tuple[Any, int]:
 
 @dataclass(frozen=True)
 class SceneReader:
-    """Reads the n-th scene of concatenated sources as an Item; its sample is None on failure.
+    """Concatenated sources whose n-th element is an Item; its sample is None if it cannot be read.
 
-    read(source, i) reads one scene, or raises InputError.
+    Attributes:
+        sources: Sources with a length.
+        read: read(source, i) reads one scene, or raises InputError.
     """
 
     sources: tuple[Any, ...]
@@ -93,14 +95,14 @@ class SceneReader:
 
 @dataclass
 class Batches:
-    """Batches of a stream: batches(step) iterates over those of that step and all later ones.
+    """Batches of a stream; batches(step) iterates over the batches of this step and all later ones.
 
     Attributes:
         stream: The samples.
-        size: Samples in a batch.
+        size: Samples per batch.
         jobs: Worker processes, 0 for none.
-        rank, world: Number of this process and of all processes that train together.
-        skipped: Count of each reason for which a scene was skipped; each is printed once.
+        rank, world: Rank of this process, and number of processes that train together.
+        skipped: Number of skipped scenes by reason; each reason is printed once.
     """
 
     stream: Stream
@@ -112,11 +114,11 @@ class Batches:
 
     @property
     def epoch(self) -> int:
-        """Steps of one pass over the data, at least 1."""
+        """Steps per epoch, at least 1."""
         return max(1, round(len(self.stream) / (self.size * self.world)))
 
     def numbers(self, step: int) -> Iterator[list[int]]:
-        """Yield the elements of the stream for each step from `step` on."""
+        """Yield the stream indices of each batch from `step` on."""
         for i in count(step):
             first = (i * self.world + self.rank) * self.size
             yield list(range(first, first + self.size))
@@ -131,10 +133,10 @@ class Batches:
 
 
 def load_items(items: Any, numbers: Iterator[list[int]], jobs: int) -> Iterator[list[Any]]:
-    """Yield [items[n] for n in group] for each group of numbers, in order.
+    """Load groups of items in worker processes: yield [items[n] for n in group] in order.
 
     Args:
-        items: Anything that can be indexed and sent to other processes.
+        items: Sequence that can be pickled.
         numbers: Groups of indices.
         jobs: Worker processes; 0 loads in this process.
 

@@ -1,4 +1,4 @@
-"""Database of cut objects, and pasting them into scenes: ground-truth sampling (Yan 2018)."""
+"""Database of objects cut from scenes, and pasting of them into other scenes (Yan 2018)."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ import numpy as np
 
 from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN
 from lidar_perception.geometry import bev_iou, is_within
-from lidar_perception.training.augment import BOX_MARGIN_M, TrainingScene, enlarge_boxes, turn_scene, vary_thing
+from lidar_perception.training.augment import BOX_MARGIN_M, TrainingScene, enlarge_boxes, turn_scene, vary_background
 from lidar_perception.training.cache import write_arrays
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pasting import estimate_floor, paste_object
 from lidar_perception.types import InputError
 
-FLOOR_REACH_M = 3.0  # points within this distance along both axes show the ground under an object
-FLOOR_SHARE = 0.1  # fraction of these points that are below the ground
-MAX_STEP_M = 1.0  # maximum difference in ground height between the two scenes
-BLOCKING_HEIGHTS_M = (0.63, 2.23)  # heights above the ground of points that can hide people
-SECTORS = 720  # sectors of a revolution
-MAX_DIRECTIONS = 64  # number of directions drawn for each object
-MAX_TRIES = 3  # maximum objects tried for each missing one
-THING = -1  # class of background objects, see cut_objects.py
-MAX_HIDDEN_SHARE = 0.3  # scene points in front of an object, as a fraction of its points
+# The ground below an object is this quantile of the heights of the points around it.
+FLOOR_HALF_SIZE_M, FLOOR_QUANTILE = 3.0, 0.1
+MAX_STEP_M = 1.0  # difference of the ground heights in the two scenes
+BLOCKING_HEIGHTS_M = (0.63, 2.23)  # above the ground, of points that can hide people
+SECTORS = 720  # of a turn
+MAX_DIRECTIONS = 64  # that are tried for an object
+MAX_TRIES = 3  # candidates for each missing object
+BACKGROUND_ID = -1  # class id of background objects, see cut_objects.py
+MAX_HIDDEN_SHARE = 0.3  # scene points in front of an object, as a share of its points
 
 
 @dataclass(frozen=True)
 class Database:
-    """K objects with P points in all.
+    """K objects with P points in total.
 
     Attributes:
         boxes: (K, 7) float64.
-        class_ids: (K,) int32, THING for background.
-        points: (P, 4) float32; those of object i are points[first[i]:first[i + 1]].
+        class_ids: (K,) int32, BACKGROUND_ID for background.
+        points: (P, 4) float32; object i has points[first[i]:first[i + 1]].
         first: (K + 1,) int64.
     """
 
@@ -47,7 +47,7 @@ class Database:
         return len(self.boxes)
 
     def get_points(self, i: int) -> np.ndarray:
-        """Return the (N, 4) points of an object, in the frame of its scene."""
+        """Return the points (N, 4) of object i in the frame of its scene."""
         return self.points[self.first[i] : self.first[i + 1]]
 
     def save(self, path: Path) -> None:
@@ -56,14 +56,12 @@ class Database:
 
     @staticmethod
     def load(path: Path) -> Database:
-        """Read a file that save wrote. Raise InputError for any other file."""
+        """Read a file written by save. Raise InputError if the file is not valid."""
         try:
             with np.load(path) as arrays:
                 return Database(**arrays)
         except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
-            raise InputError(
-                f"cannot read the objects {path}: {error}; remove the file, and it is made again"
-            ) from None
+            raise InputError(f"cannot read the objects {path}: {error}; remove the file to recreate it") from None
 
 
 def paste_objects(
@@ -74,16 +72,19 @@ def paste_objects(
     high: np.ndarray,
     rng: np.random.Generator,
 ) -> TrainingScene:
-    """Paste objects into a scene until it has the number of each class that params give.
+    """Paste objects into a scene until it has the number of objects of each class given by params.
 
-    At most MAX_TRIES objects are tried for each missing one. An object keeps its distance from the
-    sensor and is put on the ground, in a random direction in which its centre is between low and
-    high and nothing stands in front of it. It is left out if it would touch another box, be hidden
-    or have no ground. Points in its box and in its shadow are dropped.
+    An object keeps its distance from the sensor and is put on the ground in a random direction
+    with free view. It is not pasted if it would touch another box, be hidden or have no ground.
+    Points in its box and in its shadow are dropped. At most MAX_TRIES objects are tried for each
+    missing one.
 
     Args:
-        database: Objects, and background things, which get no box.
-        low, high: (2 or more,) region of the centres, metres.
+        scene: Scene, which is not changed.
+        database: Objects and background objects; the latter get no box.
+        params: Number of objects by class, and the augmentation of background.
+        low, high: (2 or more,) region of the centres of pasted objects, m.
+        rng: Random generator.
     """
     points, boxes = scene.points, scene.boxes
     class_ids = []
@@ -92,7 +93,7 @@ def paste_objects(
         (CAR, params.cars),
         (PEDESTRIAN, params.pedestrians),
         (CYCLIST, params.cyclists),
-        (THING, params.things),
+        (BACKGROUND_ID, params.things),
     ):
         candidates = np.flatnonzero(database.class_ids == class_id)
         missing = number - int((scene.class_ids == class_id).sum())
@@ -100,30 +101,30 @@ def paste_objects(
             if missing == 0:
                 break
             box, own = database.boxes[i], database.get_points(i)
-            if class_id == THING:
-                box, own = vary_boxed_thing(box, own, params, rng)
+            if class_id == BACKGROUND_ID:
+                box, own = vary_background_box(box, own, params, rng)
             pasted = _paste(box, own, points, boxes, free, low, high, rng)
             if pasted is not None:
                 points, boxes = pasted
                 class_ids.append(class_id)
                 missing -= 1
     new = np.array(class_ids, scene.class_ids.dtype)
-    objects = new != THING
+    is_object = new != BACKGROUND_ID
     return replace(
         scene,
         points=points,
-        boxes=np.concatenate([scene.boxes, boxes[len(scene.boxes) :][objects]]),
-        class_ids=np.concatenate([scene.class_ids, new[objects]]),
-        wanted=np.concatenate([scene.wanted, np.ones(objects.sum(), bool)]),
+        boxes=np.concatenate([scene.boxes, boxes[len(scene.boxes) :][is_object]]),
+        class_ids=np.concatenate([scene.class_ids, new[is_object]]),
+        detectable=np.concatenate([scene.detectable, np.ones(is_object.sum(), bool)]),
     )
 
 
-def vary_boxed_thing(
+def vary_background_box(
     box: np.ndarray, points: np.ndarray, params: AugmentParams, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Vary a thing's box (7,) and points (N, 4) about the centre of its foot, see vary_thing."""
+    """Vary the box (7,) and points (N, 4) of a background object, see vary_background."""
     foot = box[:3] - [0, 0, box[5] / 2]
-    points, factors = vary_thing(points, foot, params, rng)
+    points, factors = vary_background(points, foot, params, rng)
     box = box.copy()
     box[3:6] *= factors
     box[2] = foot[2] + box[5] / 2
@@ -131,15 +132,15 @@ def vary_boxed_thing(
 
 
 def _paste(box, own, points, boxes, free, low, high, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return points and boxes of the scene with one more object, or None if it does not fit."""
+    """Return the points and boxes of the scene with the object, or None if it does not fit."""
     turn = _draw_turn(box, free, low, high, rng)
     if turn is None:
         return None
     box, own = _turn_about_sensor(box, own, turn)
     if bev_iou(enlarge_boxes(box[None]), enlarge_boxes(boxes)).any():
         return None
-    step = estimate_floor(points, box, FLOOR_REACH_M, FLOOR_SHARE) - (box[2] - box[5] / 2)
-    if not abs(step) <= MAX_STEP_M:  # NaN if there is no ground
+    step = estimate_floor(points, box, FLOOR_HALF_SIZE_M, FLOOR_QUANTILE) - (box[2] - box[5] / 2)
+    if not abs(step) <= MAX_STEP_M:  # NaN: no ground
         return None
     box[2] += step
     own[:, 2] += np.float32(step)
@@ -148,11 +149,12 @@ def _paste(box, own, points, boxes, free, low, high, rng: np.random.Generator) -
 
 
 def _free_depths(points: np.ndarray, height: float) -> np.ndarray:
-    """Return the approximate free view in each direction from -pi on: (SECTORS,) metres."""
+    """Return the distance (SECTORS,) in m of the nearest obstacle in each sector, which start at -pi."""
     above = points[:, 2] + height
-    things = points[(above > BLOCKING_HEIGHTS_M[0]) & (above < BLOCKING_HEIGHTS_M[1])]
+    obstacles = points[(above > BLOCKING_HEIGHTS_M[0]) & (above < BLOCKING_HEIGHTS_M[1])]
+    x, y = obstacles[:, 0], obstacles[:, 1]
     free = np.full(SECTORS, np.inf)
-    np.minimum.at(free, _to_sectors(np.arctan2(things[:, 1], things[:, 0])), np.hypot(things[:, 0], things[:, 1]))
+    np.minimum.at(free, _to_sectors(np.arctan2(y, x)), np.hypot(x, y))
     return free
 
 
@@ -163,7 +165,7 @@ def _to_sectors(angles: np.ndarray) -> np.ndarray:
 def _draw_turn(
     box: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.ndarray, rng: np.random.Generator
 ) -> float | None:
-    """Draw an angle about the sensor that turns a box (7,) into the region and into free view."""
+    """Draw a rotation about the sensor that moves a box (7,) into the region and into free view; None if impossible."""
     distance, half = np.hypot(box[0], box[1]), np.hypot(box[3], box[4]) / 2
     turns = rng.uniform(-np.pi, np.pi, MAX_DIRECTIONS)
     angles = np.arctan2(box[1], box[0]) + turns
@@ -175,7 +177,7 @@ def _draw_turn(
 
 
 def _turn_about_sensor(box: np.ndarray, points: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
-    """Turn a box and its points (N, 4) about the sensor."""
+    """Rotate a box (7,) and its points (N, 4) about the sensor by an angle in rad."""
     scene = TrainingScene(points, box[None], np.zeros(1, int), np.ones(1, bool))
     scene = turn_scene(scene, angle)
     return scene.boxes[0], scene.points

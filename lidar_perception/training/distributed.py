@@ -1,4 +1,7 @@
-"""Training of one network in several processes that torchrun starts; a single one has rank 0."""
+"""Communication between the processes of a training run that torchrun started.
+
+A run in a single process has rank 0 and world size 1.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from datetime import timedelta
 import torch
 from torch import distributed
 
-TIMEOUT = timedelta(hours=2)  # time that the other processes wait while rank 0 validates
+TIMEOUT = timedelta(hours=2)  # for a validation on rank 0
 
 
 @contextmanager
@@ -33,7 +36,7 @@ def join_process_group(device: torch.device) -> Iterator[torch.device]:
 
 
 def get_rank() -> int:
-    """Return the number of this process, from 0."""
+    """Return the rank of this process, from 0."""
     return distributed.get_rank() if distributed.is_initialized() else 0
 
 
@@ -43,7 +46,7 @@ def get_world_size() -> int:
 
 
 def is_true_anywhere(flag: bool, device: torch.device) -> bool:
-    """Return True if flag is true in any process. Every process must call this."""
+    """Return True if flag is True in any process. All processes must call this."""
     if get_world_size() == 1:
         return flag
     value = torch.tensor(int(flag), device=device)
@@ -52,7 +55,7 @@ def is_true_anywhere(flag: bool, device: torch.device) -> bool:
 
 
 def find_minimum(number: float, device: torch.device) -> float:
-    """Return the smallest number of all processes. Every process must call this."""
+    """Return the minimum of a number over all processes. All processes must call this."""
     if get_world_size() == 1:
         return number
     value = torch.tensor(number, device=device)
@@ -61,6 +64,6 @@ def find_minimum(number: float, device: torch.device) -> float:
 
 
 def wait_for_all() -> None:
-    """Wait until every process has called this."""
+    """Wait until all processes have called this."""
     if get_world_size() > 1:
         distributed.barrier()

@@ -16,7 +16,7 @@ from lidar_perception.training.scenes import RecordedScenes
 from lidar_perception.types import InputError
 
 T = TypeVar("T")
-TOO_FEW = "one frame cannot be split into frames to train and to validate on; give --val"
+TOO_FEW_FRAMES = "one frame cannot be split into training and validation frames; give --val"
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class LabelledFrames:
     """Frames of a recording.
 
     Attributes:
-        path: The recording.
+        path: Path of the recording.
         frames: The frames.
-        drives: The frames follow each other in time.
-        height: Height of the sensor above the ground in metres; None: as the recording says.
+        drives: The frames are consecutive in time.
+        height: Height of the sensor above the ground in metres; None uses that of the recording.
     """
 
     path: Path
@@ -36,41 +36,47 @@ class LabelledFrames:
     height: float | None = None
 
     def to_scenes(self, view: bool = True) -> RecordedScenes:
-        """Return the frames as a source of scenes. view: see RecordedScenes."""
+        """Convert the frames to a source of scenes. view: see RecordedScenes."""
         return RecordedScenes(self.path, tuple(frame.name for frame in self.frames), view, self.height)
 
     def exclude(self, others: Iterable[LabelledFrames], purpose: str) -> LabelledFrames:
-        """Return the frames that others do not contain, under any path.
+        """Remove the frames that others contain, under any path.
+
+        Args:
+            others: Frames to remove.
+            purpose: "train on" or "validate on", for the error message.
 
         Raises:
-            InputError: No frame is left for the purpose.
+            InputError: No frame remains.
         """
         excluded = {key for other in others for frame in other.frames for key in _frame_keys(frame)}
-        left = tuple(frame for frame in self.frames if excluded.isdisjoint(_frame_keys(frame)))
-        if not left:
+        remaining = tuple(frame for frame in self.frames if excluded.isdisjoint(_frame_keys(frame)))
+        if not remaining:
             raise InputError(
-                f"{self.path}: no frame is left to {purpose}, as no frame may be "
-                "trained on and validated on; give other frames, or leave --val out "
-                "to hold some out"
+                f"{self.path}: no frame is left to {purpose}, since training and validation must not share "
+                "frames; give other frames, or omit --val to hold out a part of the data"
             )
-        return replace(self, frames=left)
+        return replace(self, frames=remaining)
 
     def split(self, share: float, seed: int) -> tuple[LabelledFrames, LabelledFrames]:
-        """Split into frames to train on, and a share of those with labels to validate on.
+        """Split off a share of the labelled frames for validation.
 
-        Frames of drives are split by draw_drives, others by draw_items.
+        Frames of drives are drawn by draw_drives, others by draw_items.
+
+        Returns:
+            Training and validation frames.
 
         Raises:
             InputError: There are fewer than two frames.
         """
         if self.drives:
             labelled = [frame for frame in self.frames if may_have_labels(frame)] or self.frames
-            runs = [[labelled[i] for i in run] for several in split_drives(labelled).values() for run in several]
+            runs = [[labelled[i] for i in run] for drives in split_drives(labelled).values() for run in drives]
             names = {frame.name for frame in draw_drives(runs, share, seed)}
         else:
             names = {frame.name for frame in draw_items(self.frames, share, seed)}
         if not 0 < len(names) < len(self.frames):
-            raise InputError(TOO_FEW)
+            raise InputError(TOO_FEW_FRAMES)
         parts = [
             tuple(frame for frame in self.frames if (frame.name in names) == held_out) for held_out in (False, True)
         ]
@@ -80,17 +86,17 @@ class LabelledFrames:
 def open_labelled_frames(
     path: Path, split: Path | None = None, height: float = 0.0, mixed: bool = False
 ) -> LabelledFrames:
-    """Return the frames of a recording.
+    """Open the frames of a recording.
 
     Args:
-        path: The recording.
+        path: Path of the recording.
         split: File that names the frames to use; None for all.
-        height: Height of the sensor in metres, which overrides the recording unless mixed. 0: as
-            the recording says, or else as its first clouds show.
+        height: Height of the sensor in metres. 0 uses that of the recording, or measures it on the
+            first clouds. If mixed, the height of the recording has priority.
         mixed: Simulated scans are used too, and height is the height of their sensor.
 
     Raises:
-        InputError: Something is missing, or the recording has no labelled boxes.
+        InputError: A file is missing, or the recording has no labelled boxes.
     """
     recording = open_recording(path, split=split)
     recording.require(BOXES, "train")
@@ -107,7 +113,7 @@ def _find_height(recording: Recording, height: float, mixed: bool) -> float | No
 
 
 def may_have_labels(frame: Frame) -> bool:
-    """Return True if a frame has labels, or broken ones, which are reported when they are read."""
+    """Return True if a frame has labels, or labels that cannot be read (reported later)."""
     try:
         return frame.truth() is not None
     except InputError:
@@ -115,17 +121,14 @@ def may_have_labels(frame: Frame) -> bool:
 
 
 def _frame_keys(frame: Frame) -> set[tuple[Path, str]]:
-    """Return keys of a frame that do not depend on the path of its recording.
-
-    They are its file, or its name in each file of a bag.
-    """
+    """Return keys of a frame that are the same for any path of its recording: (file, name in a bag)."""
     if frame.points is not None:
         return {(frame.points.resolve(), "")}
     return {(file.resolve(), frame.name) for file in frame.files}
 
 
 def draw_items(items: Sequence[T], share: float, seed: int) -> list[T]:
-    """Draw a share of the items, at least one and not all, in their order.
+    """Draw a random share of the items, at least one and not all, in their order.
 
     Raises:
         InputError: There are fewer than two items.
@@ -135,28 +138,27 @@ def draw_items(items: Sequence[T], share: float, seed: int) -> list[T]:
 
 
 def draw_drives(drives: Sequence[Sequence[T]], share: float, seed: int) -> list[T]:
-    """Draw a share of all items, at least one and not all, as whole drives.
+    """Draw a share of all items, at least one and not all, as complete drives and the end of one more.
 
-    The end of one more drive fills the share up. Neighbours in time are too similar to be split at
-    random.
+    Consecutive frames are too similar to be separated at random.
 
     Raises:
         InputError: There are fewer than two items.
     """
-    left = _count_held_out(sum(map(len, drives)), share)
+    missing = _count_held_out(sum(map(len, drives)), share)
     order = np.random.default_rng(seed).permutation(len(drives))
-    whole: list[T] = []
+    complete: list[T] = []
     longer: list[Sequence[T]] = []
     for drive in (drives[i] for i in order):
-        if len(drive) <= left:
-            whole.extend(drive)
-            left -= len(drive)
+        if len(drive) <= missing:
+            complete.extend(drive)
+            missing -= len(drive)
         else:
             longer.append(drive)
-    return [*whole, *(longer[0][-left:] if left else ())]
+    return [*complete, *(longer[0][-missing:] if missing else ())]
 
 
 def _count_held_out(count: int, share: float) -> int:
     if count < 2:
-        raise InputError(TOO_FEW)
+        raise InputError(TOO_FEW_FRAMES)
     return min(max(round(share * count), 1), count - 1)

@@ -1,7 +1,7 @@
-"""Fitting of the fused detector's curves to simulated scans of a sensor.
+"""Fit of the confidence curves of the fused detector to simulated scans.
 
-The curves turn the evidence of PointPillars, silhouettes and the PointNet into one probability, see
-detectors/fused/evidence.py.
+The curves combine the evidence of PointPillars, silhouettes and the PointNet to one probability,
+see detectors/fused/evidence.py.
 """
 
 from __future__ import annotations
@@ -31,72 +31,71 @@ from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training.curves import fit_curves
 from lidar_perception.training.params import FusedTraining
 from lidar_perception.training.scenes import SimulatedScenes
-from lidar_perception.training.sources import FIRST_FITTED_SCENE
+from lidar_perception.training.sources import FIRST_FIT_SEED
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError
 
-MAX_CENTRE_DISTANCE_M = 0.5  # maximum centre distance of a match with a pedestrian or cyclist
-MIN_SAMPLES = 20  # minimum number of correct and of wrong proposals of a class to fit its curves
-MIN_PROBABILITY = 1e-6  # probabilities are clipped at this value in the log loss
-# Defaults for weights whose header does not name the sensor and the scene.
-DEFAULT_SENSOR, DEFAULT_SCENE = "hdl64e", "street"
+MAX_CENTRE_DISTANCE_M = 0.5  # of a correct proposal of a pedestrian or cyclist
+MIN_SAMPLES = 20  # correct and wrong proposals of a class, each, to fit its curves
+MIN_PROBABILITY = 1e-6  # in the log loss
+DEFAULT_SENSOR, DEFAULT_SCENE = "hdl64e", "street"  # for weights whose header has none
 
 
 @dataclass(frozen=True)
 class Samples:
-    """K proposals.
+    """K proposals with their evidence.
 
     Attributes:
         class_ids: (K,) int into CLASSES.
-        right: (K,) bool, the proposal is correct.
+        correct: (K,) bool, the proposal is correct.
         scans: (K,) int, number of the scan.
-        evidence: (K,) of each source, by name.
+        evidence: (K,) log-odds by name of the source.
     """
 
     class_ids: np.ndarray
-    right: np.ndarray
+    correct: np.ndarray
     scans: np.ndarray
     evidence: Evidence
 
     def take(self, chosen: np.ndarray) -> Samples:
-        """Return the proposals of a mask or of indices."""
+        """Select proposals by a mask or by indices."""
         return Samples(
             self.class_ids[chosen],
-            self.right[chosen],
+            self.correct[chosen],
             self.scans[chosen],
             {name: odds[chosen] for name, odds in self.evidence.items()},
         )
 
     @staticmethod
     def concatenate(parts: Sequence[Samples]) -> Samples:
-        """Return the proposals of all parts, one at least."""
+        """Concatenate one or more sets of proposals."""
         join = np.concatenate
         return Samples(
             join([part.class_ids for part in parts]),
-            join([part.right for part in parts]),
+            join([part.correct for part in parts]),
             join([part.scans for part in parts]),
             {name: join([part.evidence[name] for part in parts]) for name in parts[0].evidence},
         )
 
 
 class CurveScore(NamedTuple):
-    """Mean log loss of curves, and their correct and wrong proposals above the threshold."""
+    """Mean log loss of curves, and number of correct and wrong proposals above the default threshold."""
 
     loss: float
-    right: int
+    correct: int
     wrong: int
 
 
 class ClassFit(NamedTuple):
-    """Result of fitting one class.
+    """Result of the fit of one class.
 
     Attributes:
-        proposals, right: Number of proposals, and of correct ones.
+        proposals, correct: Number of proposals, and of correct ones.
         before: Score of the previous curves.
-        after: Score of curves fitted to the other half of the scans; None with too few proposals.
+        after: Score of the new curves by cross-validation; None with too few proposals.
     """
 
     proposals: int
-    right: int
+    correct: int
     before: CurveScore
     after: CurveScore | None
 
@@ -109,13 +108,15 @@ def fit_fusion(
     Args:
         weights: Checkpoint of PointPillars; None for the packaged one.
         classifier: Checkpoint of the PointNet; None for the packaged one.
-        out: File to write, see detectors/fused/fusion.py.
+        out: Fusion file to write, see detectors/fused/fusion.py.
+        params: Simulated scans.
+        jobs: Number of processes.
 
     Returns:
         The fit of each class.
 
     Raises:
-        InputError: Something cannot be used. Raised before a scan is simulated.
+        InputError: An input cannot be used; raised before any scan is simulated.
     """
     own = FusedParams(
         weights=str(weights or ""), classifier=str(classifier or ""), range=params.range, threads=1, warm_up=False
@@ -125,7 +126,7 @@ def fit_fusion(
     params = fill_from_header(params, header)
     sensor = find_sensor(params.sensor, params.mount_height or _find_trained_height(header))
     scenes = Scenes(None, params.people, params.scene)
-    scenes.scene_types()  # raises InputError for an unknown scene type
+    scenes.scene_types()  # raises InputError for an unknown scene
     around = detector.range == "around"
     errors.print(
         f"{params.scans} {params.scene} scans of {params.sensor} at {sensor.height:g} m, "
@@ -134,7 +135,7 @@ def fit_fusion(
     for network in header, other:
         if warning := network.find_height_mismatch(sensor.height):
             errors.print(f"{NETWORKS[network.network][0]}: {warning}")
-    source = SimulatedScenes(FIRST_FITTED_SCENE, params.scans, sensor, scenes, around=around)
+    source = SimulatedScenes(FIRST_FIT_SEED, params.scans, sensor, scenes, around=around)
     models, fits = fit_classes(simulate_samples(FusedDetectorParams(fused=own), source, jobs), load_shipped_models())
     write_fusion(
         out,
@@ -146,14 +147,14 @@ def fit_fusion(
             "scene": params.scene,
             "scans": params.scans,
             "range": "around" if around else "ahead",
-            "proposals, hits": {name: [fit.proposals, fit.right] for name, fit in fits.items()},
+            "proposals, hits": {name: [fit.proposals, fit.correct] for name, fit in fits.items()},
         },
     )
     return fits
 
 
 def fill_from_header(params: FusedTraining, header: Header) -> FusedTraining:
-    """Fill an empty sensor and scene with those that the weights were trained on.
+    """Replace an empty sensor or scene by those on which the weights were trained.
 
     Raises:
         InputError: The file of that sensor is missing.
@@ -162,7 +163,7 @@ def fill_from_header(params: FusedTraining, header: Header) -> FusedTraining:
     name = sensor.get("name") or DEFAULT_SENSOR
     if not params.sensor and Path(name).suffix in (".yaml", ".yml") and not Path(name).is_file():
         raise InputError(
-            f"the weights are for the sensor {name}, which is missing; give its path, or another sensor, with --sensor"
+            f"the weights were trained for the sensor {name}, whose file is missing; give its path with --sensor"
         )
     return replace(
         params,
@@ -172,7 +173,7 @@ def fill_from_header(params: FusedTraining, header: Header) -> FusedTraining:
 
 
 def _find_trained_height(header: Header) -> float:
-    """Return the sensor height in metres that the weights were trained for, 0 if unknown."""
+    """Return the sensor height in metres for which the weights were trained, 0 if unknown."""
     height = _read_sensor(header).get("height")
     return height if isinstance(height, float) else 0.0
 
@@ -183,42 +184,42 @@ def _read_sensor(header: Header) -> dict[str, Any]:
 
 
 def collect_samples(frame: Frame, proposals: Proposals, scan: int) -> Samples:
-    """Return the proposals of a simulated frame that count, and whether each is correct.
+    """Match the proposals of a simulated frame with its labels.
 
-    Proposals outside the image do not count if there is a camera. Of several correct ones about an
-    object only the best counts, as only one is kept. Proposals on objects that merely resemble the
-    class (a van for a car) do not count, as in the evaluation of detections.
+    Some proposals are ignored: those outside the image, if there is a camera; duplicates on an
+    object that a better proposal has already matched; and those on objects of a similar class (a
+    van for a car), as in KITTI's protocol.
     """
-    truth, camera, found = frame.truth(), frame.camera(), proposals.detections
-    assert truth is not None  # simulated scans always have it
-    centres = found.boxes[:, :3] - np.array([0, 0, frame.sensor_height - SENSOR_HEIGHT], np.float32)
-    in_view = np.ones(len(found), bool) if camera is None else camera.in_view(centres)
-    kept, right = [], []
-    for class_id in np.unique(found.class_ids):
-        own = np.flatnonzero((found.class_ids == class_id) & in_view)
-        own = own[np.argsort(-found.scores[own], kind="stable")]
-        name, boxes = CLASSES[class_id], found.boxes[own]
+    truth, camera, detections = frame.truth(), frame.camera(), proposals.detections
+    assert truth is not None  # simulated frames always have it
+    centres = detections.boxes[:, :3] - np.array([0, 0, frame.sensor_height - SENSOR_HEIGHT], np.float32)
+    in_view = np.ones(len(detections), bool) if camera is None else camera.in_view(centres)
+    selected, correct = [], []
+    for class_id in np.unique(detections.class_ids):
+        own = np.flatnonzero((detections.class_ids == class_id) & in_view)
+        own = own[np.argsort(-detections.scores[own], kind="stable")]
+        name, boxes = CLASSES[class_id], detections.boxes[own]
         hits = _match_boxes(boxes, truth.of_class(class_id), name)
         similar = truth.of_class(CLASSES.index(NEIGHBOURS.get(name, name)))
-        taken = np.zeros(hits.shape[1], bool)
+        is_matched = np.zeros(hits.shape[1], bool)
         for i, hit, similar_hit in zip(own, hits, _match_boxes(boxes, similar, name)):
-            free = np.flatnonzero(hit & ~taken)
-            if not len(free) and (hit.any() or similar_hit.any()):
-                continue  # the object is already detected, or its class is only similar
-            taken[free[:1]] = True
-            kept.append(i)
-            right.append(len(free) > 0)
-    chosen = np.array(kept, np.int64)
+            unmatched = np.flatnonzero(hit & ~is_matched)
+            if not len(unmatched) and (hit.any() or similar_hit.any()):
+                continue
+            is_matched[unmatched[:1]] = True
+            selected.append(i)
+            correct.append(len(unmatched) > 0)
+    indices = np.array(selected, np.int64)
     return Samples(
-        found.class_ids[chosen],
-        np.array(right, bool),
-        np.full(len(chosen), scan),
-        {name: odds[chosen] for name, odds in proposals.evidence.items()},
+        detections.class_ids[indices],
+        np.array(correct, bool),
+        np.full(len(indices), scan),
+        {name: odds[indices] for name, odds in proposals.evidence.items()},
     )
 
 
 def _match_boxes(boxes: np.ndarray, objects: np.ndarray, name: str) -> np.ndarray:
-    """Return (K, M) bool: which boxes (K, 7) of a class are correct about which objects (M, 7)."""
+    """Return (K, M) bool, True where a proposed box (K, 7) of a class matches an object (M, 7)."""
     hits = bev_iou(boxes, objects) > DETECTED[name].relaxed
     if name != CLASSES[CAR]:
         hits |= centre_distances(boxes, objects) < MAX_CENTRE_DISTANCE_M
@@ -226,18 +227,11 @@ def _match_boxes(boxes: np.ndarray, objects: np.ndarray, name: str) -> np.ndarra
 
 
 def simulate_samples(params: FusedDetectorParams, scenes: SimulatedScenes, jobs: int) -> Samples:
-    """Return the proposals in all scans; the same for any number of processes."""
-    parts = sorted(
-        show_progress(
-            run_in_processes(
-                partial(_make_sampler, params, scenes), range(len(scenes)), jobs, "detected in simulated scans"
-            ),
-            "simulating and detecting",
-            len(scenes),
-        ),
-        key=lambda part: part[0],
-    )
-    return Samples.concatenate([part for _, part in parts])
+    """Simulate all scans and collect the proposals in them; the result does not depend on jobs."""
+    make_sampler = partial(_make_sampler, params, scenes)
+    results = run_in_processes(make_sampler, range(len(scenes)), jobs, "detected in simulated scans")
+    parts = dict(show_progress(results, "simulating and detecting", len(scenes)))
+    return Samples.concatenate([parts[i] for i in sorted(parts)])
 
 
 def _make_sampler(params: FusedDetectorParams, scenes: SimulatedScenes) -> Callable[[int], tuple[int, Samples]]:
@@ -252,9 +246,12 @@ def _make_sampler(params: FusedDetectorParams, scenes: SimulatedScenes) -> Calla
 
 
 def fit_classes(samples: Samples, before: Models) -> tuple[Models, dict[str, ClassFit]]:
-    """Fit the curves of each class, and score old and new ones on scans they were not fitted to.
+    """Fit the curves of each class, and score old and new curves.
 
-    Classes with too few samples keep their curves from `before`, if any.
+    Classes with too few samples keep their curves in `before`, if any.
+
+    Returns:
+        The curves, and the fit by class.
     """
     models, fits = dict(before), {}
     for name in DETECTED:
@@ -264,8 +261,8 @@ def fit_classes(samples: Samples, before: Models) -> tuple[Models, dict[str, Cla
             models[name] = fit_class(name, own)
             after = _cross_validate(name, own)
         fits[name] = ClassFit(
-            len(own.right),
-            int(own.right.sum()),
+            len(own.correct),
+            int(own.correct.sum()),
             _score(own, compute_probabilities(before, own.class_ids, own.evidence)),
             after,
         )
@@ -273,20 +270,20 @@ def fit_classes(samples: Samples, before: Models) -> tuple[Models, dict[str, Cla
 
 
 def has_enough_samples(own: Samples) -> bool:
-    """Return True with enough correct and wrong proposals in both halves of the scans."""
-    halves = [own.right[own.scans % 2 == half] for half in range(2)]
+    """Return True if both halves of the scans have enough correct and wrong proposals."""
+    halves = [own.correct[own.scans % 2 == half] for half in range(2)]
     return all(min(right.sum(), (~right).sum()) >= MIN_SAMPLES / 2 for right in halves)
 
 
 def fit_class(name: str, own: Samples) -> dict:
-    """Return the model of a class, fitted to its proposals."""
+    """Fit the curves of a class to its proposals, see curves.fit_curves."""
     knots = {source: k for source, k in KNOTS.items() if (source, name) != ("silhouette", CLASSES[CAR])}
     features = {source: own.evidence[source] for source in knots}
-    return fit_curves(features, own.right, np.ones(len(own.right)), knots, dict.fromkeys(knots, 1))
+    return fit_curves(features, own.correct, np.ones(len(own.correct)), knots, dict.fromkeys(knots, 1))
 
 
 def _cross_validate(name: str, own: Samples) -> CurveScore:
-    scores = np.zeros(len(own.right), np.float32)
+    scores = np.zeros(len(own.correct), np.float32)
     for half in range(2):
         in_half = own.scans % 2 == half
         model = {name: fit_class(name, own.take(~in_half))}
@@ -298,10 +295,10 @@ def _cross_validate(name: str, own: Samples) -> CurveScore:
 def _score(own: Samples, scores: np.ndarray) -> CurveScore:
     if not len(scores):
         return CurveScore(0.0, 0, 0)
-    likelihood = np.where(own.right, scores, 1 - scores)
+    likelihood = np.where(own.correct, scores, 1 - scores)
     passed = scores >= ScoreParams().get(CLASSES[own.class_ids[0]])
     return CurveScore(
         float(-np.log(np.maximum(likelihood, MIN_PROBABILITY)).mean()),
-        int((passed & own.right).sum()),
-        int((passed & ~own.right).sum()),
+        int((passed & own.correct).sum()),
+        int((passed & ~own.correct).sum()),
     )

@@ -13,18 +13,18 @@ from lidar_perception.types import InputError
 
 
 class Table:
-    """A CSV file with a column "step", whose rows are flushed. The first row sets the columns."""
+    """CSV file with a column "step" and further columns, which the first added row determines."""
 
     def __init__(self, path: Path, step: int):
-        """Open a table and drop rows after `step`, which a run wrote after its last save."""
+        """Open a table, and drop the rows after `step` that a killed run wrote after its last save."""
         self.path, self.columns = path, None
         self.stream: TextIO | None = None
         rows = _read_rows(path)
         if rows:
             self.columns = rows[0]
-            kept = [rows[0]] + [row for row in rows[1:] if len(row) == len(rows[0]) and int(row[0]) <= step]
+            valid = [row for row in rows[1:] if len(row) == len(rows[0]) and int(row[0]) <= step]
             text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows(kept)
+            csv.writer(text, lineterminator="\n").writerows([rows[0], *valid])
             write_text(path, text.getvalue())
 
     def add(self, step: int, values: dict[str, float]) -> None:
@@ -45,7 +45,7 @@ class Table:
     def close(self) -> None:
         """Close the file."""
         if self.stream is not None:
-            with suppress(OSError):  # the disk is full, which add() has reported
+            with suppress(OSError):  # add() has already reported a full disk
                 self.stream.close()
 
 
@@ -65,7 +65,7 @@ def _read_rows(path: Path) -> list[list[str]]:
 
 
 class Log:
-    """The logs in a folder: log.csv (losses), validation.csv (metrics) and TensorBoard events."""
+    """Logs of a run in its folder: log.csv (losses), validation.csv (metrics) and TensorBoard events."""
 
     def __init__(self, folder: Path, step: int):
         self.tables = {"loss": Table(folder / "log.csv", step), "validation": Table(folder / "validation.csv", step)}
@@ -76,12 +76,12 @@ class Log:
             return
         self.board = SummaryWriter(folder / "tensorboard", purge_step=step + 1 if step else None)
 
-    def add(self, kind: str, step: int, values: dict[str, float]) -> None:
-        """Append a row of kind "loss" or "validation"."""
-        self.tables[kind].add(step, values)
+    def add(self, table: str, step: int, values: dict[str, float]) -> None:
+        """Append a row to the table "loss" or "validation"."""
+        self.tables[table].add(step, values)
         for name, value in values.items():
             if self.board is not None and value is not None:
-                self.board.add_scalar(f"{kind}/{name}", value, step)
+                self.board.add_scalar(f"{table}/{name}", value, step)
 
     def close(self) -> None:
         """Close all files."""

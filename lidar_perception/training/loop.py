@@ -1,4 +1,4 @@
-"""The training loop of every network of the package.
+"""Training loop that all networks share.
 
 A network provides a Task. The loop provides one-cycle AdamW, mixed precision, gradient clipping,
 averaged weights, validation, logs, and a state on disk from which a killed run resumes.
@@ -30,9 +30,9 @@ from lidar_perception.training.run import Progress, Run, Task
 from lidar_perception.training.run_directory import RunDirectory
 from lidar_perception.types import InputError
 
-WARM_UP_S = 60.0  # time until the duration of a step is known
-MEMORY_S = 600.0  # time constant of the weights in the mean step duration
-SPARE_STEPS = 2  # safety margin of the time budget, in steps
+WARM_UP_S = 60.0  # before the duration of a step is estimated
+DECAY_S = 600.0  # time constant of the moving average of the step duration
+SPARE_STEPS = 2  # reserve, since durations vary
 
 
 def train(
@@ -44,22 +44,26 @@ def train(
     until: float = math.inf,
     validation: float = 0.0,
 ) -> Progress:
-    """Train until the steps are done, the time is over, or SIGINT or SIGTERM arrives.
+    """Train until all steps are done, the time is over, or SIGINT or SIGTERM arrives, and save the state.
 
-    The state is saved at the end. If fewer steps fit into the time, the learning rate falls
-    faster, so that it ends as low as planned. The same task and seed give the same weights on the
-    CPU, whether the run was interrupted or not.
+    If fewer steps than planned fit into the time, the learning rate falls faster, to the same final
+    value. On the CPU, the same task and seed give the same weights, even after an interruption.
 
     Args:
-        out: Folder of the run. Gets the state for resuming, log.csv, validation.csv, and what
-            task.save writes.
-        resume: Continue the run in out; without one there, begin one.
-        until: time.monotonic() at which to stop, the last validation included.
+        task: Network, loss, data and validation.
+        params: Length of the training and optimizer.
+        out: Folder of the run, for its state, log.csv, validation.csv, and the files of task.save.
+        device: Device of the network.
+        resume: Continue the run in out, if there is one.
+        until: Value of time.monotonic() by which the last validation must end.
         validation: Expected duration of the first validation, in seconds.
 
+    Returns:
+        Progress at the end.
+
     Raises:
-        InputError: out holds a run and resume is False, or a run with other settings; nothing
-            can be written; or the loss is not finite for too many steps.
+        InputError: out contains a run and resume is False, or a run with other settings; out is not
+            writable; or the loss is not finite for too many steps.
     """
     directory = RunDirectory(out)
     directory.require_no_state(resume)
@@ -69,10 +73,10 @@ def train(
     run = Run(task, params, device)
     if path.exists():
         run.load(_read_state(path, run.settings()))
-    wait_for_all()  # wait until every process has read the file that rank 0 replaces
+    wait_for_all()  # rank 0 replaces the file that the others have read above
     log = Log(out, run.progress.step) if get_rank() == 0 else None
-    begun = time.monotonic() - run.progress.seconds
-    pace, warned = Pace(until, run.validate_steps, validation), False
+    start = time.monotonic() - run.progress.seconds
+    pace, has_warned = Pace(until, run.validate_steps, validation), False
     try:
         with _catch_signals() as stop, make_progress() as bar:
             line = bar.add_task("training", total=run.steps, completed=int(run.position), visible=get_rank() == 0)
@@ -85,7 +89,7 @@ def train(
                 run.progress.late = is_true_anywhere(pace.is_over(), device) and not run.done
                 due = run.is_validation_due() and (run.done or not is_true_anywhere(pace.is_over(2), device))
                 if due or (run.progress.late and run.progress.step > run.progress.validated):
-                    _save_state(path, run)  # saved first, because validation takes a while
+                    _save_state(path, run)  # the run may be killed during the validation
                     with pace.time_validation(), pause_progress(bar):
                         _validate(run, log)
                     _save_state(path, run)
@@ -95,16 +99,15 @@ def train(
                 step = run.progress.step
                 pace.count_step()
                 if until < math.inf:
-                    fit = step + max(0.0, find_minimum(pace.steps_left(step), device))
-                    run.shorten_schedule(fit - step)
-                    if fit < 0.9 * run.steps and not warned and get_rank() == 0:
-                        warned = True
+                    steps_left = max(0.0, find_minimum(pace.steps_left(step), device))
+                    run.shorten_schedule(steps_left)
+                    if step + steps_left < 0.9 * run.steps and not has_warned and get_rank() == 0:
+                        has_warned = True
                         errors.print(
-                            f"slower than planned, {pace.step_duration:.2g} s a step: "
-                            f"about {fit:.0f} of {run.steps} steps fit into the budget, "
-                            "so the learning rate falls faster"
+                            f"slower than planned, {pace.step_duration:.2g} s per step: about {step + steps_left:.0f} "
+                            f"of {run.steps} steps fit into the budget, so the learning rate falls faster"
                         )
-                run.progress.seconds = time.monotonic() - begun
+                run.progress.seconds = time.monotonic() - start
                 bar.update(line, completed=run.position)
                 if row is not None:
                     bar.update(line, description=f"loss {row['loss']:.3f} lr {row['lr']:.1e}")
@@ -119,15 +122,18 @@ def train(
 
 
 class Pace:
-    """Estimates how many steps fit into the remaining time.
+    """Estimate of the number of steps that fit into the remaining time.
 
-    There is one validation after every validate_steps steps, and one at the end.
+    Args:
+        until: Value of time.monotonic() at the end of the budget.
+        validate_steps: Steps between validations; there is one more at the end.
+        validation: Expected duration of a validation, in seconds.
     """
 
     def __init__(self, until: float, validate_steps: int, validation: float = 0.0):
         self.until, self.validate_steps, self.validation = until, validate_steps, validation
-        self.begun = self.last_step = time.monotonic()
-        self.steps = self.seconds = 0.0  # weighted sums in which earlier steps have less weight
+        self.start = self.last_step = time.monotonic()
+        self.steps = self.seconds = 0.0  # exponentially weighted sums
 
     @property
     def step_duration(self) -> float:
@@ -135,51 +141,50 @@ class Pace:
         return self.seconds / self.steps
 
     def is_over(self, validations: int = 1) -> bool:
-        """Return True if only the time of this many validations is left."""
+        """Return True if the remaining time is only sufficient for this many validations."""
         return time.monotonic() + validations * self.validation >= self.until
 
     def count_step(self) -> None:
         """Record the end of a step."""
         now = time.monotonic()
-        passed, self.last_step = now - self.last_step, now
-        weight = math.exp(-passed / MEMORY_S)
-        self.steps, self.seconds = weight * self.steps + 1, weight * self.seconds + passed
+        duration, self.last_step = now - self.last_step, now
+        weight = math.exp(-duration / DECAY_S)
+        self.steps, self.seconds = weight * self.steps + 1, weight * self.seconds + duration
 
     def steps_left(self, step: int) -> float:
-        """Return how many steps fit after this one: below 1 if none, inf while unknown."""
+        """Return the number of steps that fit after this one: below 1 for none, inf while unknown."""
         now = time.monotonic()
-        if now - self.begun < WARM_UP_S or self.until == math.inf:
+        if now - self.start < WARM_UP_S or self.until == math.inf:
             return math.inf
-        since = step % self.validate_steps
+        since = step % self.validate_steps  # steps since the last validation
         left = self.until - now - self.validation + since * self.step_duration
-        whole, rest = divmod(left, self.validate_steps * self.step_duration + self.validation)
-        return whole * self.validate_steps + min(rest / self.step_duration, self.validate_steps) - since - SPARE_STEPS
+        cycles, rest = divmod(left, self.validate_steps * self.step_duration + self.validation)
+        return cycles * self.validate_steps + min(rest / self.step_duration, self.validate_steps) - since - SPARE_STEPS
 
     @contextmanager
     def time_validation(self) -> Iterator[None]:
-        """Measure the validation inside; its duration does not count as part of a step."""
-        begun = time.monotonic()
+        """Measure the duration of the validation in this context, and exclude it from the step duration."""
+        start = time.monotonic()
         yield
-        self.validation = time.monotonic() - begun
+        self.validation = time.monotonic() - start
         self.last_step += self.validation
 
 
 def _validate(run: Run, log: Log | None) -> None:
-    """Validate the averaged weights in rank 0, which has the log, and save the best and last."""
+    """Validate the averaged weights on rank 0, which has the log, and save the best and last weights."""
     progress = run.progress
     progress.validated = progress.step
     if log is not None:
         metrics, calibration = run.task.validate(run.average.module)
         log.add("validation", progress.step, metrics)
-        shown = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
-        errors.print(f"step {progress.step}: {shown}")
+        errors.print(f"step {progress.step}: {', '.join(f'{name} {value:.4g}' for name, value in metrics.items())}")
         if np.isnan(metrics["score"]):
             errors.print("the validation frames contain no object, so the latest weights count as the best")
-        better = progress.best is None or not metrics["score"] <= progress.best
-        if better:
+        is_best = progress.best is None or not metrics["score"] <= progress.best
+        if is_best:
             progress.best, progress.best_step = metrics["score"], progress.step
         record = {**vars(progress), "metrics": metrics, "calibration": calibration}
-        if better:
+        if is_best:
             run.task.save("best", run.average.module, record)
         if run.done or progress.late:
             run.task.save("last", run.average.module, record)
@@ -199,9 +204,9 @@ def _write_state(path: Path, run: Run) -> None:
 
 
 def _next_batch(batches: Iterator[Any], path: Path, run: Run) -> Any:
-    """Return the next batch. If a process that prepares them was killed, save the state first.
+    """Return the next batch. If a worker process was killed, save the state and raise InputError.
 
-    Only rank 0 saves, without waiting: the other processes may be at an earlier step.
+    Only rank 0 saves, and it does not wait for the others, which may be at an earlier step.
     """
     try:
         return next(batches)
@@ -212,40 +217,39 @@ def _next_batch(batches: Iterator[Any], path: Path, run: Run) -> Any:
 
 
 def _read_state(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
-    """Read a state. Raise InputError if it is damaged or of a run with other settings."""
+    """Read a state. Raise InputError if it is damaged, or if its run has other settings."""
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-        before = state["asked"]
+        saved_settings = state["asked"]
     except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"cannot read {path}: {reason}; remove it to start again") from None
-    if different := find_differences(before, settings):
+    if different := find_differences(saved_settings, settings):
         raise InputError(
-            f"{path} is of a run with {'; '.join(different[:3])}; resume it with the "
-            "same settings, or give another --out"
+            f"{path} is of a run with {'; '.join(different[:3])}; resume it with the same settings, "
+            "or give another --out"
         )
     return state
 
 
 @contextmanager
 def _catch_signals() -> Iterator[threading.Event]:
-    """Yield an event that the first SIGINT or SIGTERM sets; a second one ends the process."""
+    """Yield an event that the first SIGINT or SIGTERM sets; a second signal ends the process."""
     event = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield event
         return
-    numbers: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.getsignal(number) for number in numbers}
+    old_handlers: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def set_event(number: int, _: Any) -> None:
         event.set()
-        signal.signal(number, before[number])
+        signal.signal(number, old_handlers[number])
         errors.print("stopping after this step; press Ctrl-C again to stop at once")
 
-    for number in numbers:
+    for number in old_handlers:
         signal.signal(number, set_event)
     try:
         yield event
     finally:
-        for number, handler in before.items():
+        for number, handler in old_handlers.items():
             signal.signal(number, handler)

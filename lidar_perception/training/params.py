@@ -8,14 +8,13 @@ from typing import Any
 from lidar_perception.detectors.params import make_range_param
 from lidar_perception.param_fields import Params, flatten, param
 
-# A resumed run may change these.
-CHANGEABLE = ("log_steps", "save_steps", "max_skipped", "data.cache", "data.cache_gb")
-PAPER_SHARE = 751 / 7518  # fraction of the frames that paper B holds out
+CHANGEABLE = ("log_steps", "save_steps", "max_skipped", "data.cache", "data.cache_gb")  # when a run is resumed
+PAPER_SHARE = 751 / 7518  # of the frames that paper B holds out
 
 
 @dataclass(frozen=True)
 class LoopParams(Params):
-    """Length and rate of the training, and how often something is written."""
+    """Length of the training, optimizer, and intervals of validations, checkpoints and logs."""
 
     steps: int = param(0, "Training steps. 0: determined by the epochs or the budget.", low=0, high=10**9)
     epochs: float = param(0.0, "Passes over the data, if steps is 0. 0: determined by the budget.", low=0.0, high=1e5)
@@ -51,21 +50,21 @@ class LoopParams(Params):
     seed: int = param(0, "Seed of the weights, the order of the scenes and their augmentation.", low=0, high=2**31 - 1)
 
     def fixed_settings(self) -> dict[str, Any]:
-        """Return the parameters, by dotted name, that a resumed run must have in common."""
+        """Return the parameters by dotted name that must not change when a run is resumed."""
         return {name: value for name, value in flatten(self).items() if name not in CHANGEABLE}
 
     def total_steps(self, epoch: int) -> int:
-        """Return the number of steps; 0: the budget decides. epoch: steps of an epoch."""
+        """Return the number of steps, 0 if the budget determines it. epoch: steps per epoch."""
         return self.steps or (max(1, round(self.epochs * epoch)) if self.epochs else 0)
 
     def validation_steps(self, epoch: int) -> int:
-        """Return the steps between validations; 0: the budget decides. epoch: steps of an epoch."""
+        """Return the steps between validations, 0 if the budget determines them. epoch: steps per epoch."""
         return self.validate_steps or (max(1, round(self.validate_epochs * epoch)) if self.validate_epochs else 0)
 
 
 @dataclass(frozen=True)
 class NoiseParams(Params):
-    """Errors of the ranges."""
+    """Noise of the ranges."""
 
     beam_noise: float = param(
         0.08,
@@ -81,7 +80,7 @@ class NoiseParams(Params):
 
 @dataclass(frozen=True)
 class IntensityParams(Params):
-    """Changes of the intensity of whole scans, before it is normalized."""
+    """Augmentation of the intensity of whole scans, before it is normalized."""
 
     no_intensity: float = param(0.5, "Probability that a scene has no intensity.", low=0.0, high=1.0)
     fade: float = param(
@@ -95,8 +94,8 @@ class IntensityParams(Params):
 
 
 @dataclass(frozen=True)
-class ThingParams(NoiseParams):
-    """Changes of background that resembles objects."""
+class BackgroundParams(NoiseParams):
+    """Augmentation of background that resembles objects."""
 
     things_stretch: float = param(
         0.5,
@@ -113,8 +112,8 @@ class ThingParams(NoiseParams):
 
 
 @dataclass(frozen=True)
-class AugmentParams(ThingParams, IntensityParams):
-    """Changes of scenes. 0 switches a change off."""
+class AugmentParams(BackgroundParams, IntensityParams):
+    """Augmentation of scenes. 0 switches a change off."""
 
     crowded: float = param(
         0.7, "Probability that objects from other scenes are pasted into a scene.", low=0.0, high=1.0
@@ -189,7 +188,7 @@ class DataParams(Params):
 
 @dataclass(frozen=True)
 class SceneTraining(LoopParams):
-    """Parameters of a training that may simulate its scenes."""
+    """Parameters of training on recorded or simulated scenes."""
 
     scene: str = param(
         "street",
@@ -247,11 +246,8 @@ class PointPillarsTraining(SceneTraining):
 
 
 @dataclass(frozen=True)
-class ClusterAugmentParams(ThingParams, IntensityParams):
-    """Clusters to train on, and their changes. 0 switches a change off.
-
-    The background clusters are the things of ThingParams.
-    """
+class ClusterAugmentParams(BackgroundParams, IntensityParams):
+    """Number of clusters to train on, and their augmentation. 0 switches a change off."""
 
     objects: int = param(24, "Maximum number of clusters of each class per scene.", low=1, high=1000)
     background: int = param(40, "Maximum number of background clusters per scene.", low=0, high=10_000)

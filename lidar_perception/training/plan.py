@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 
 from lidar_perception.types import InputError
 
-RESERVE_SHARE = 0.1  # fraction of the budget reserved for everything that was not measured
-STARTUP_S = 20.0  # time until all processes run
-MAX_PREPARATION_SHARE = 0.25  # maximum fraction of the time to create scenes
-VALIDATION_SHARE = 0.12  # fraction of the time to validate
+RESERVE_SHARE = 0.1  # of the budget, for everything that is not measured
+STARTUP_S = 20.0  # to start the processes
+MAX_PREPARATION_SHARE = 0.25  # of the time, to prepare scenes
+VALIDATION_SHARE = 0.12  # of the time
 SCANS_RANGE, VAL_SCANS_RANGE = (24, 3000), (16, 200)
 MAX_VALIDATIONS = 6
-PASSES_RANGE = 4, 80  # passes over the scenes: fewer undertrain, more teach nothing new
-FULL_RANGE_STEPS = 12_000  # number of steps from which training covers the full detection range
-MIN_STEPS = 20  # minimum number of steps for any effect
+EPOCHS_RANGE = 4, 80
+FULL_RANGE_STEPS = 12_000  # runs with at least this many steps cover the whole detection range
+MIN_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -22,11 +22,11 @@ class Speed:
     """Measured durations in seconds.
 
     Attributes:
-        scan: To simulate a scan on one core; 0 if nothing is simulated.
-        cut: To cut objects or clusters out of a scan on one core.
-        step: A training step on the reduced range.
-        whole: A training step on the whole range.
-        frame: To validate a frame.
+        scan: Simulation of a scan on one core; 0 if nothing is simulated.
+        cut: Cutting of objects or clusters from a scan on one core.
+        step: Training step on the reduced range.
+        whole: Training step on the whole range.
+        frame: Validation of a frame.
         scan_mb: Size of a cached scan, MB.
     """
 
@@ -40,13 +40,13 @@ class Speed:
 
 @dataclass(frozen=True)
 class Plan:
-    """Numbers of a training run.
+    """Plan of a training run.
 
     Attributes:
-        scans, val_scans: Simulated scans to train on and to validate on.
-        cuts: Scenes that objects or clusters are cut from.
-        steps: Training steps.
-        validate_steps: Steps from one validation to the next.
+        scans, val_scans: Numbers of simulated training and validation scans.
+        cuts: Number of scenes from which objects or clusters are cut.
+        steps: Number of training steps.
+        validate_steps: Steps between validations.
         part: Train on the reduced range only.
     """
 
@@ -60,13 +60,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Data:
-    """Scenes that are available.
+    """Available scenes.
 
     Attributes:
-        simulated, val_simulated: Scans are simulated to train on, and to validate on.
-        recorded, val_recorded: Recorded scenes to train on, and to validate on.
-        batch: Scenes in a step.
-        most_cuts: Largest number of scenes to cut objects or clusters from.
+        simulated, val_simulated: Training or validation scans are simulated.
+        recorded, val_recorded: Numbers of recorded training and validation scenes.
+        batch: Scenes per step.
+        most_cuts: Largest number of scenes from which objects or clusters are cut.
     """
 
     simulated: bool
@@ -77,65 +77,63 @@ class Data:
     most_cuts: int
 
 
-def fit_plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(), epochs: float = 0.0) -> Plan:
-    """Return the plan that makes the best use of a time budget.
+def fit_plan(hours: float, cores: int, speed: Speed, data: Data, fixed: Plan = Plan(), epochs: float = 0.0) -> Plan:
+    """Fit a plan to a time budget.
 
-    It has as many scans as can be seen four times, in at most a quarter of the time. The steps get
-    the time that scans and validations leave.
+    It has as many scans as can be used in EPOCHS_RANGE[0] epochs and prepared in
+    MAX_PREPARATION_SHARE of the time. The rest of the time, without validations, is for the steps.
 
     Args:
-        given: Numbers that are fixed where not 0, even if they exceed the budget; part=False
-            rules out the reduced range.
-        epochs: Fixed passes over the data, 0 for none.
+        hours: Budget.
+        cores: CPU cores that prepare scenes.
+        speed: Measured durations.
+        data: Available scenes.
+        fixed: Numbers other than 0 are kept, even if they exceed the budget; part=False excludes
+            the reduced range.
+        epochs: Number of epochs, 0 to fit it.
 
     Raises:
         InputError: The budget is too short for MIN_STEPS.
     """
-    fitting = _fit_any(hours, cores, speed, data, given, epochs)
-    if given.steps or epochs or fitting.steps >= MIN_STEPS:
-        return fitting
-    enough = hours
-    while _fit_any(enough, cores, speed, data, given, epochs).steps < MIN_STEPS:
-        enough = 1.2 * enough
+    plan = _fit_unchecked(hours, cores, speed, data, fixed, epochs)
+    if fixed.steps or epochs or plan.steps >= MIN_STEPS:
+        return plan
+    min_hours = hours
+    while _fit_unchecked(min_hours, cores, speed, data, fixed, epochs).steps < MIN_STEPS:
+        min_hours = 1.2 * min_hours
     raise InputError(
-        f"a budget of {hours:g} h is too short for {MIN_STEPS} steps on this "
-        f"machine: give --budget {1.05 * enough:.2g} or more, or fewer --data-scans "
-        "and --data-val-scans"
+        f"a budget of {hours:g} h is too short for {MIN_STEPS} steps on this machine: "
+        f"give --budget {1.05 * min_hours:.2g} or more, or fewer --data-scans and --data-val-scans"
     )
 
 
-def _fit_any(hours: float, cores: int, speed: Speed, data: Data, given: Plan, epochs: float) -> Plan:
+def _fit_unchecked(hours: float, cores: int, speed: Speed, data: Data, fixed: Plan, epochs: float) -> Plan:
     """Fit a plan whose number of steps may be too small."""
     time = 3600 * hours * (1 - RESERVE_SHARE) - STARTUP_S
-    scans, val, steps = given.scans, given.val_scans, given.steps
+    scans, val_scans, steps = fixed.scans, fixed.val_scans, fixed.steps
     if data.simulated and not scans:
         preparation = (speed.scan + speed.cut) / cores
-        scans = _clip(
-            min(
-                MAX_PREPARATION_SHARE * time / preparation,
-                (1 - VALIDATION_SHARE) * time / (preparation + PASSES_RANGE[0] * speed.step / data.batch),
-            ),
-            SCANS_RANGE,
-        )
+        preparable = MAX_PREPARATION_SHARE * time / preparation
+        trainable = (1 - VALIDATION_SHARE) * time / (preparation + EPOCHS_RANGE[0] * speed.step / data.batch)
+        scans = _clip(min(preparable, trainable), SCANS_RANGE)
         scans = min(scans, steps * data.batch) if steps else scans
     scenes = (scans if data.simulated else 0) + data.recorded
-    if data.val_simulated and not val:
-        val = _clip(min(scenes / 8, VALIDATION_SHARE * time / MAX_VALIDATIONS / speed.frame), VAL_SCANS_RANGE)
+    if data.val_simulated and not val_scans:
+        val_scans = _clip(min(scenes / 8, VALIDATION_SHARE * time / MAX_VALIDATIONS / speed.frame), VAL_SCANS_RANGE)
     epoch = max(1, round(scenes / data.batch))
     steps = steps or (max(1, round(epochs * epoch)) if epochs else 0)
-    unstepped = Plan(scans, val, given.cuts or min(scenes, data.most_cuts), steps, given.validate_steps)
-    validation = speed.frame * (val + data.val_recorded)
+    plan = Plan(scans, val_scans, fixed.cuts or min(scenes, data.most_cuts), steps, fixed.validate_steps)
+    validation = speed.frame * (val_scans + data.val_recorded)
     validations = max(1, min(MAX_VALIDATIONS, int(VALIDATION_SHARE * time / validation)))
-    left = time - preparation_duration(unstepped, cores, speed) - validations * validation
-    part = given.part and left / speed.whole < FULL_RANGE_STEPS
-    steps = steps or max(0, min(int(left / (speed.step if part else speed.whole)), PASSES_RANGE[1] * epoch))
-    return replace(
-        unstepped, part=part, steps=steps, validate_steps=given.validate_steps or max(1, -(-steps // validations))
-    )
+    time_left = time - preparation_duration(plan, cores, speed) - validations * validation
+    part = fixed.part and time_left / speed.whole < FULL_RANGE_STEPS
+    steps = steps or max(0, min(int(time_left / (speed.step if part else speed.whole)), EPOCHS_RANGE[1] * epoch))
+    validate_steps = fixed.validate_steps or max(1, -(-steps // validations))
+    return replace(plan, part=part, steps=steps, validate_steps=validate_steps)
 
 
 def preparation_duration(plan: Plan, cores: int, speed: Speed) -> float:
-    """Return the duration of making all scenes, in seconds."""
+    """Return the duration of simulating and cutting all scenes, in seconds."""
     return (speed.scan * (plan.scans + plan.val_scans) + speed.cut * plan.cuts) / cores
 
 

@@ -34,11 +34,15 @@ MIN_FREE_GB = 0.5  # free disk space to leave
 
 @dataclass(frozen=True)
 class Planner:
-    """Plans the run of a request.
+    """Planner of a training run.
 
     Attributes:
-        params: Parameters as requested, without a plan.
-        speed: Durations that were measured before; None: they are measured.
+        trainer: Trainer of the network.
+        request: Data and budget.
+        params: Parameters as requested by the user.
+        sensor: Sensor of simulated scans.
+        device: Device of the network.
+        speed: Durations; None measures them.
     """
 
     trainer: Trainer
@@ -49,18 +53,18 @@ class Planner:
     speed: Speed | None = None
 
     def make_plan(self, settings: dict[str, Any]) -> PlannedRun:
-        """Measure this machine, then print and return the plan that fits the budget.
+        """Measure this machine, and print and return a plan that fits the budget.
 
         Raises:
-            InputError: No scene can be used, the budget is too short, or the disk too small.
+            InputError: No scene can be used, the budget is too short, or the disk is too small.
         """
         params = self.params
         sources, held_out = self.open_few_scenes()
         if (speed := self.speed) is None:
             errors.print("measuring this machine with a few scenes ...")
             speed = self.measure_speed(sources, held_out)
-        data = self.describe_scenes(sources, held_out)
-        given = Plan(
+        data = self.count_scenes(sources, held_out)
+        fixed = Plan(
             params.data.scans,
             params.data.val_scans,
             0,
@@ -68,7 +72,7 @@ class Planner:
             params.validate_steps,
             bool(self.trainer.reduced_range(params)),
         )
-        plan = fit_plan(self.request.budget or DEFAULT_BUDGET_H, count_cores(), speed, data, given, params.epochs)
+        plan = fit_plan(self.request.budget or DEFAULT_BUDGET_H, count_cores(), speed, data, fixed, params.epochs)
         if params.validate_epochs and not params.validate_steps:
             epoch = max(1, round((plan.scans + data.recorded) / data.batch))
             plan = replace(plan, validate_steps=params.validation_steps(epoch))
@@ -76,8 +80,8 @@ class Planner:
         self._print_plan(plan, speed, data, find_recorded_height(sources))
         return PlannedRun(settings, plan, speed, data)
 
-    def describe_scenes(self, sources: Sequence[Any], held_out: Sequence[Any]) -> Data:
-        """Return the numbers of the scenes of open_few_scenes()."""
+    def count_scenes(self, sources: Sequence[Any], held_out: Sequence[Any]) -> Data:
+        """Count the training and validation scenes."""
         return Data(
             has_simulated(sources),
             has_simulated(held_out),
@@ -102,11 +106,11 @@ class Planner:
         )
 
     def open_few_scenes(self) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Return sources to train on and to validate on, with few simulated scans and no cache."""
+        """Open the training and validation sources with few simulated scans and no cache."""
         return open_scenes(self.request, limit_to_few_scans(self.params), self.sensor)
 
     def measure_speed(self, sources: Sequence[Any], held_out: Sequence[Any]) -> Speed:
-        """Measure this machine with the sources of open_few_scenes()."""
+        """Measure durations on this machine with the sources from open_few_scenes."""
         scenes, scan, scan_mb = _time_scans((*sources, *held_out))
         cut, step, whole, frame = self.trainer.measure_speed(
             limit_to_few_scans(self.params), scenes, held_out, self.device
@@ -126,17 +130,16 @@ class Planner:
         )
         part = self.trainer.reduced_range(params) if plan.part else {}
         region = f" up to {part['ahead']:g} m ahead and {part['aside']:g} m aside" if part else ""
-        often = f"every {plan.validate_steps} steps" if plan.validate_steps < plan.steps else "at the end"
+        interval = f"every {plan.validate_steps} steps" if plan.validate_steps < plan.steps else "at the end"
         errors.print(
-            f"{self.trainer.name}: {scenes}, {plan.steps} steps of {data.batch} scenes"
-            f"{region}, validated {often} on "
-            f"{plan.val_scans + data.val_recorded} other scenes"
+            f"{self.trainer.name}: {scenes}, {plan.steps} steps of {data.batch} scenes{region}, "
+            f"validated {interval} on {plan.val_scans + data.val_recorded} other scenes"
         )
         steps, validations = training_durations(plan, speed, data)
         cutting = preparation_duration(replace(plan, scans=0, val_scans=0), count_cores(), speed)
         parts = {
             "simulating": preparation_duration(plan, count_cores(), speed) - cutting,
-            self.trainer.cutting: cutting,
+            self.trainer.cutting_title: cutting,
             "steps": steps,
             "validation": validations,
         }
@@ -149,7 +152,7 @@ class Planner:
 
 
 def open_scenes(request: TrainingRequest, params: Any, sensor: Sensor) -> tuple[tuple, tuple]:
-    """Return the sources of scenes to train on and to validate on."""
+    """Open the training and validation sources of a request, see sources.open_sources."""
     around = getattr(params, "range", "") == "around"
     return open_sources(
         request.data,
@@ -166,7 +169,7 @@ def open_scenes(request: TrainingRequest, params: Any, sensor: Sensor) -> tuple[
 
 
 def limit_to_few_scans(params: Any) -> Any:
-    """Return the parameters with so few scans that they are quickly simulated, and no cache."""
+    """Return the parameters with few simulated scans and no cache."""
     return with_values(params, {"data.scans": 8, "data.val_scans": 1, "data.cache": ""})
 
 
@@ -176,7 +179,7 @@ def has_simulated(sources: Sequence[Any]) -> bool:
 
 
 def find_recorded_height(sources: Sequence[Any]) -> float | None:
-    """Return the sensor height of the recordings in metres, None without any or if they differ."""
+    """Return the sensor height of the recordings in metres; None if there are none, or the heights differ."""
     heights = [source.sensor_height for source in sources if isinstance(source, RecordedScenes)]
     if not heights or max(heights) - min(heights) >= MIN_HEIGHT_DIFFERENCE_M:
         return None
@@ -190,20 +193,17 @@ def _count_recorded(sources: Sequence[Any]) -> int:
 def _time_scans(sources: Sequence[Any]) -> tuple[Iterable[Item], float, float]:
     """Return a few scenes, and the duration (s) and size (MB) of a simulated scan.
 
-    The duration includes the scan's share of making its scene. Without simulated scans both are 0
-    and the recorded scenes are read on demand. The sources have no cache.
+    The duration includes a share of making the scene. Without simulated scans, both are 0 and the
+    scenes are recorded ones, read on demand.
     """
     for source in sources:
         if isinstance(source, SimulatedScenes):
             count = source.per_scene
-            source.scene(0)  # triggers compilation of the simulator
-            begun = time.perf_counter()
+            source.scene(0)  # compiles the simulator
+            start = time.perf_counter()
             scenes = [source.scene(i) for i in range(count, count + min(count, MAX_TIMED_SCENES))]
-            return (
-                [Item(scene) for scene in scenes],
-                (time.perf_counter() - begun) / len(scenes),
-                scenes[0].points.nbytes * 1.02e-6,
-            )
+            duration = (time.perf_counter() - start) / len(scenes)
+            return [Item(scene) for scene in scenes], duration, scenes[0].points.nbytes * 1.02e-6
     recorded = SceneReader(tuple(sources), lambda source, i: source.scene(i))
     return (recorded[n] for n in range(len(recorded))), 0.0, 0.0
 
@@ -213,6 +213,6 @@ def _require_disk_space(cache: Path, max_gb: float, plan: Plan, speed: Speed) ->
     free = shutil.disk_usage(cache).free / 1e9
     if needed + MIN_FREE_GB > free:
         raise InputError(
-            f"{cache} needs {needed:.1f} GB for scans, and {free:.1f} GB are free: "
+            f"{cache} needs {needed:.1f} GB for scans, but only {free:.1f} GB are free: "
             "give fewer --data-scans, a smaller --data-cache-gb or another --out"
         )

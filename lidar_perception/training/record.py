@@ -1,4 +1,4 @@
-"""Records of a training run: the header of its checkpoints, and its metrics."""
+"""Checkpoints of a training run, their initial weights, and the metrics of a validation."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from lidar_perception.training.run import Validation
 from lidar_perception.types import InputError
 
 
-def make_save(
+def make_save_function(
     out: Path, config: Any, params: LoopParams, batches: Batches, about: dict[str, Any], commit: str
 ) -> Callable[[str, nn.Module, dict[str, Any]], None]:
-    """Return the save function of a Task, which writes out/name.safetensors."""
+    """Return a function save(name, module, record) that writes out/name.safetensors, see Task.save."""
 
     def save(name: str, module: nn.Module, record: dict[str, Any]) -> None:
         training = {
@@ -48,40 +48,41 @@ def make_save(
     return save
 
 
-def load_initial_weights(network: Net, init: Path | None, kind: type[Config]) -> Net:
-    """Load the tensors of a checkpoint that fit the network, and report how many do."""
+def load_initial_weights(network: Net, init: Path | None, config_type: type[Config]) -> Net:
+    """Load the tensors of a checkpoint that fit the network; print a message if some do not fit."""
     if init is not None:
-        taken, count = copy_matching_weights(network, init, kind)
-        if taken < count:
-            errors.print(f"{taken} of {count} tensors are from {init}, the others begin at random")
+        loaded, count = copy_matching_weights(network, init, config_type)
+        if loaded < count:
+            errors.print(f"{loaded} of {count} tensors are from {init}, the others are initialised at random")
     return network
 
 
-def report_skipped(skipped: Sequence[str], left: int, reported: set[str]) -> None:
-    """Print why validation frames were skipped, and add the reasons to those already reported.
+def report_skipped(skipped: Sequence[str], remaining: int, reported: set[str]) -> None:
+    """Print the reasons why validation frames were skipped, each once.
 
     Args:
-        left: Number of frames that remain.
-        reported: Reasons that were printed before.
+        skipped: Reasons.
+        remaining: Number of frames that were not skipped.
+        reported: Reasons that were printed before; new ones are added.
 
     Raises:
-        InputError: No frame is left.
+        InputError: No frame remains.
     """
     for reason in dict.fromkeys(skipped):
         if reason not in reported:
             errors.print(f"validation: {reason}")
     reported.update(skipped)
-    if left == 0:
+    if remaining == 0:
         raise InputError(f"no frame to validate on can be used ({next(iter(skipped), 'there is none')})")
 
 
 def round_metrics(metrics: dict[str, float]) -> dict[str, float | None]:
-    """Return metrics for JSON, in which NaN is None."""
+    """Round metrics to 3 digits for JSON, with None for NaN."""
     return {key: None if math.isnan(value) else round(value, 3) for key, value in metrics.items()}
 
 
 def summarize_report(report: DetectionReport, score: str, classes: Sequence[str]) -> Validation:
-    """Return metrics and calibration, as Task.validate does, of a network's own scores."""
+    """Return metrics and calibration for Task.validate."""
     return (
         select_metrics(report.compute(), score, classes),
         fit_calibrations(Comparison.of(report.frames)) if report.frames else {},
@@ -89,15 +90,15 @@ def summarize_report(report: DetectionReport, score: str, classes: Sequence[str]
 
 
 def select_metrics(content: dict[str, Any], score: str, classes: Sequence[str]) -> dict[str, float]:
-    """Return each class's AP at the relaxed BEV and strict 3D overlaps (moderate, R40).
+    """Select the AP of each class at the relaxed BEV and strict 3D overlaps (moderate, R40).
 
     Args:
-        content: Content of a DetectionReport.
-        score: "bev" or "map": the AP whose mean over the classes is the "score".
+        content: Result of DetectionReport.compute.
+        score: "bev" or "map": the AP whose mean over the classes becomes the metric "score".
         classes: Names of the classes.
 
     Returns:
-        Metrics by name, NaN where there are no objects. The score ignores such classes.
+        Metrics by name; NaN for a class without objects, which the score ignores.
     """
     metrics: dict[str, float] = {}
     for name in classes:
@@ -105,5 +106,5 @@ def select_metrics(content: dict[str, Any], score: str, classes: Sequence[str]) 
             value = content["ap"].get(name, {}).get(row, {}).get("moderate")
             metrics[f"{name}_{row}"] = float("nan") if value is None else value["r40"]
     row = "bev_relaxed" if score == "bev" else "3d"
-    known = [v for name in classes if not np.isnan(v := metrics[f"{name}_{row}"])]
-    return {"score": float(np.mean(known)) if known else float("nan"), **metrics}
+    valid = [v for name in classes if not np.isnan(v := metrics[f"{name}_{row}"])]
+    return {"score": float(np.mean(valid)) if valid else float("nan"), **metrics}

@@ -1,11 +1,11 @@
-"""The request for a training run, the same for every network."""
+"""Request for a training run of any network."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-PACKAGE = Path("package")  # value of --init and --proposer for the weights that ship with it
+PACKAGE = Path("package")  # value of --init and --proposer that means the packaged weights
 
 
 @dataclass(frozen=True)
@@ -13,15 +13,15 @@ class TrainingRequest:
     """Data, output folder and limits of a training run.
 
     Attributes:
-        data, val: Paths of recordings, or "sim", to train on and to validate on.
-        split, val_split: Files that name the frames of data and of val to use.
+        data, val: Paths of training and validation recordings, or "sim".
+        split, val_split: Files with the names of the frames in data and val to use; None for all.
         out: Folder of the run.
         resume: Continue the run in out, if there is one.
-        init: Checkpoint to start from, or PACKAGE.
+        init: Checkpoint with initial weights, or PACKAGE; None for random weights.
         device: "auto", "cpu" or a CUDA device.
-        jobs: Processes that prepare scenes; 0 prepares them in this process.
-        budget: Hours that the run may take. None: no limit if the number of steps is given,
-            else planning.DEFAULT_BUDGET_H.
+        jobs: Number of worker processes that prepare scenes; 0 prepares them in this process.
+        budget: Time limit of the run in hours. None: planning.DEFAULT_BUDGET_H, or no limit if the
+            number of steps is given.
     """
 
     data: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""State of a training run: the network, its optimizer and weight average, and a step of them."""
+"""State of a training run: network, optimizer and weight average; and one training step."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ Validation = tuple[dict[str, float], dict[str, tuple[float, float]]]  # see Task
 
 @dataclass(frozen=True)
 class Task(Generic[Net]):
-    """A network to train, and how.
+    """A network with its loss, data, validation and checkpoints.
 
     Attributes:
         module: The network, on its device.
-        loss: loss(module, batch) -> (scalar to minimise, parts to log). Calls module as a
-            function, since it may be wrapped for several processes.
-        batches: batches(step) -> batches from that step (counted from 0) on, always the same.
+        loss: loss(module, batch) -> (scalar to minimise, parts to log). It must call module as a
+            function, since module may be wrapped for several processes.
+        batches: batches(step) -> iterator over the batches from this step (from 0) on, always the
+            same.
         validate: validate(module) -> (metrics, calibration). The metric "score" selects the best
-            weights; the calibration turns scores into probabilities, see
+            weights; the calibration converts scores to probabilities, see
             detectors/calibration.py.
-        save: save(name, module, record) writes weights named "best" or "last"; the record fits
-            into JSON.
-        epoch: Steps of one pass over the data.
-        about: Further settings that a resumed run must have in common.
+        save: save(name, module, record) writes the weights "best" or "last"; the record is JSON data.
+        epoch: Steps per epoch.
+        about: Further settings that must not change when the run is resumed.
     """
 
     module: Net
@@ -50,16 +50,16 @@ class Task(Generic[Net]):
 
 @dataclass
 class Progress:
-    """Progress of a run, as it is stored.
+    """Progress of a run. The names of the attributes are part of the format of the state.
 
     Attributes:
-        step: Steps done.
-        skipped: Steps skipped because of a loss or gradient that was not finite.
-        in_a_row: Skipped steps since the last good one.
+        step: Number of finished steps.
+        skipped: Number of steps skipped because the loss or gradient was not finite.
+        in_a_row: Number of consecutive skipped steps.
         best, best_step: Best score so far and its step.
         validated: Step of the last validation.
-        seconds: Time spent.
-        left_out: Planned steps removed from the schedule for lack of time.
+        seconds: Duration of the run.
+        left_out: Number of planned steps removed from the schedule for lack of time.
         stopped: A signal stopped the run.
         late: The time budget is spent.
     """
@@ -77,7 +77,7 @@ class Progress:
 
 
 class Run:
-    """Everything that changes from step to step."""
+    """State of a training run that changes with every step."""
 
     def __init__(self, task: Task, params: LoopParams, device: torch.device):
         self.task, self.params, self.device = task, params, device
@@ -85,7 +85,7 @@ class Run:
         self.validate_steps = params.validation_steps(task.epoch)
         self.module = task.module
         self.average = WeightAverage(self.module, params.ema)
-        # Norm statistics start as means over all steps, so that the initial values have no effect.
+        # At first, norm statistics are means over all steps, so that their initial values do not matter.
         self.norms = [
             (m, m.momentum)
             for m in self.module.modules()
@@ -103,7 +103,7 @@ class Run:
 
     @property
     def position(self) -> float:
-        """Position in the schedule, 0 .. steps: the steps done and left out."""
+        """Position in the schedule, 0 .. steps: finished steps plus removed ones."""
         return self.progress.step + self.progress.left_out
 
     @property
@@ -112,22 +112,22 @@ class Run:
         return self.position >= self.steps
 
     def shorten_schedule(self, fit: float) -> None:
-        """Leave out steps evenly so that `fit` more steps reach the end of the schedule."""
+        """Remove steps evenly, so that the schedule ends after `fit` more steps."""
         left, fit = self.steps - self.position, max(fit, 1.0)
-        if left > fit:  # once fit is 1, exactly one step is left, without rounding errors
+        if left > fit:  # with fit = 1, exactly one step is left
             self.progress.left_out = self.steps - self.progress.step - (left - left / fit + 1)
 
     def is_validation_due(self) -> bool:
-        """Return True if the weights are to be validated after the last step."""
+        """Return True if the current weights must be validated."""
         step = self.progress.step
         return step > self.progress.validated and (step % self.validate_steps == 0 or self.done)
 
     def settings(self) -> dict[str, Any]:
-        """Return everything that a resumed run must have in common."""
+        """Return the settings that must not change when the run is resumed."""
         return {**self.params.fixed_settings(), **self.task.about, "steps": self.steps, "processes": get_world_size()}
 
     def state(self) -> dict[str, Any]:
-        """Return everything needed to resume, for torch.save."""
+        """Return the state from which the run can be resumed, for torch.save."""
         cuda = torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
         return {
             "module": self.module.state_dict(),
@@ -142,7 +142,7 @@ class Run:
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Restore what state() returned."""
+        """Restore a state returned by state()."""
         self.module.load_state_dict(state["module"])
         self.average.module.load_state_dict(state["average"])
         self.average.updates = state["updates"]
@@ -157,17 +157,17 @@ class Run:
         """Train on one batch.
 
         Returns:
-            Values to log, or None if the step was skipped: then only the counters have changed.
+            Values to log, or None if the step was skipped and only the counters changed.
 
         Raises:
-            InputError: Too many steps in a row were not finite.
+            InputError: Loss or gradient was not finite in too many consecutive steps.
         """
         rate, beta = compute_one_cycle(self.position, self.steps, self.params.lr, self.params.warm_share)
         for group in self.optimizer.param_groups:
             group["lr"], group["betas"] = rate, (beta, group["betas"][1])
         for norm, momentum in self.norms:
             norm.momentum = max(momentum, 1 / (self.progress.step + 1))
-        # A batch that is not finite changes the norm statistics even if its step is skipped.
+        # To undo the change of the norm statistics if the step is skipped.
         buffers = [(buffer, buffer.clone()) for buffer in self.module.buffers()]
         self.wrapped.train()
         with torch.autocast(self.device.type, self.format) if self.format else nullcontext():
@@ -181,9 +181,8 @@ class Run:
             self.progress.in_a_row += 1
             if self.progress.in_a_row >= self.params.max_skipped:
                 raise InputError(
-                    f"the loss or its gradient was not finite in "
-                    f"{self.progress.in_a_row} steps in a row, up to step "
-                    f"{self.progress.step}; lower --lr or check the data"
+                    f"the loss or its gradient was not finite in {self.progress.in_a_row} consecutive steps, up to "
+                    f"step {self.progress.step}; lower --lr or check the data"
                 )
             return None
         self.progress.in_a_row = 0
@@ -196,7 +195,7 @@ class Run:
         }
 
     def _descend(self, total: Tensor) -> float:
-        """Step along the gradient. Returns its norm, not finite if the step was skipped."""
+        """Make an optimizer step. Return the norm of the gradient, not finite if the step was skipped."""
         if is_true_anywhere(not torch.isfinite(total).item(), self.device):
             return math.nan
         self.optimizer.zero_grad(set_to_none=True)

@@ -1,4 +1,4 @@
-"""The folder of a training run: its files, its plan, and its lock."""
+"""Folder of a training run: its files, its plan, and its lock."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from lidar_perception.training.plan import Data, Plan, Speed
 from lidar_perception.types import InputError
 
 RUN = "run.json"  # settings, measured speed and plan of the first start
-STATE = "last.pt"  # state needed to resume the run
+STATE = "last.pt"  # state from which a run is resumed
 WEIGHTS = "best.safetensors", "last.safetensors"
-SCANS = "scans"  # folder of the cache, unless another one is given
-WRITTEN = (RUN, STATE, *WEIGHTS, "objects.npz", "log.csv", "validation.csv")
+SCANS = "scans"  # the cache, unless another one is given
+RUN_FILES = (RUN, STATE, *WEIGHTS, "objects.npz", "log.csv", "validation.csv")
 MAX_RUN_BYTES = 10**6
 
 
 class PlannedRun(NamedTuple):
-    """A planned run, as in run.json. settings: those that a resumed run must have, too."""
+    """Content of run.json. settings must not change when the run is resumed."""
 
     settings: dict[str, Any]
     plan: Plan
@@ -51,43 +51,41 @@ class RunDirectory:
         return self.path / RUN
 
     def require_no_run(self, resume: bool) -> None:
-        """Check that a run may begin here.
+        """Check that a run can be started or resumed in this folder.
 
         Raises:
-            InputError: The folder holds a run and resume is False, has weights that belong to no
-                run and would be replaced, or cannot be written.
+            InputError: The folder contains a run and resume is False, contains weights without a
+                run, or is not writable.
         """
         files = self.plan_file, self.state_file
         for file in files:
             self._require_absent(file, resume)
         for name in WEIGHTS:
             if not any(file.exists() for file in files) and (self.path / name).exists():
-                raise InputError(
-                    f"{self.path / name} belongs to no run that could be resumed, and "
-                    "would be replaced; give another --out"
-                )
+                raise InputError(f"{self.path / name} exists and would be replaced; give another --out")
 
     def require_no_state(self, resume: bool) -> None:
-        """Raise InputError as require_no_run does, for the state alone."""
+        """Raise InputError if the folder contains a state and resume is False, or is not writable."""
         self._require_absent(self.state_file, resume)
 
     def _require_absent(self, file: Path, resume: bool) -> None:
         check_writable_folder(self.path)
         if file.exists() and not resume:
-            raise InputError(f"{self.path} holds a training run already; give --resume to resume it, or another --out")
+            raise InputError(
+                f"{self.path} already contains a training run; give --resume to resume it, or another --out"
+            )
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep other processes from writing into the folder, and end at SIGTERM as at Ctrl-C.
+        """Lock the folder, treat SIGTERM like Ctrl-C, and remove temporary files of a killed run.
 
-        Removes temporary files that a killed run left. Of processes that train together only
-        rank 0 does this.
+        Does nothing in processes other than rank 0.
         """
         if get_rank() > 0:
             yield
             return
         with lock_folder(self.path), _interrupt_on_sigterm():
-            remove_temporaries(self.path, *WRITTEN)
+            remove_temporaries(self.path, *RUN_FILES)
             for folder in (self.path / SCANS, *(self.path / SCANS).glob("*/")):
                 remove_temporaries(folder, "*.npz")
             yield
@@ -119,22 +117,17 @@ class RunDirectory:
             raise InputError(f"cannot read {self.plan_file}: {error!r}; give another --out") from None
         if different:
             raise InputError(
-                f"{self.path} holds a run with {'; '.join(different[:3])}; resume it "
-                "with the same settings, or give another --out"
+                f"{self.path} contains a run with {'; '.join(different[:3])}; resume it with the same settings, "
+                "or give another --out"
             )
         return run
 
 
 @contextmanager
 def _interrupt_on_sigterm() -> Iterator[None]:
-    """Raise KeyboardInterrupt on SIGTERM, as on ctrl-C.
-
-    Only in the main thread, and only if there is no other handler.
-    """
-    if (
-        threading.current_thread() is not threading.main_thread()
-        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
-    ):
+    """Raise KeyboardInterrupt on SIGTERM, if this is the main thread and there is no other handler."""
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield
         return
     signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -1,7 +1,7 @@
 """Sources of labelled scenes: recordings, and simulated scenes with a cache on disk.
 
-A source has a length, scene(i) to train on, and frame(i) to validate on. It can be sent to other
-processes: each opens the files that it reads.
+A source has a length, scene(i) for training and frame(i) for validation. It can be pickled: each
+process opens the files that it reads.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from lidar_perception.simulation.drive import choose_drive_frame, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.cache import cache_path, file_fingerprint, folder_size, load_or_make
+from lidar_perception.training.cache import cache_path, file_fingerprint, folder_size, load_or_compute
 from lidar_perception.types import GroundTruth, InputError, PointCloud
 
 
@@ -35,10 +35,10 @@ class RecordedScenes:
     """Frames of a recording.
 
     Attributes:
-        path: The recording.
+        path: Path of the recording.
         names: Names of the frames.
-        view: Use only the points in the image if there is a camera, as labels end there.
-        height: Height of the sensor above the ground in metres; None: as the recording says.
+        view: Use only the points in the image if there is a camera, since labels end there.
+        height: Height of the sensor above the ground in metres; None uses that of the recording.
     """
 
     path: Path
@@ -56,7 +56,7 @@ class RecordedScenes:
         return {name: by_name[name] for name in self.names}
 
     def __getstate__(self) -> dict:
-        return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # not pickled, see above
+        return {k: v for k, v in self.__dict__.items() if k != "_frames"}
 
     @property
     def sensor_height(self) -> float:
@@ -64,14 +64,14 @@ class RecordedScenes:
         return self._frames[self.names[0]].sensor_height
 
     def key(self, i: int) -> str:
-        """Return a cache key of scene i, which changes when one of its files is written."""
+        """Return the cache key of scene i, which changes when one of its files changes."""
         frame = self._frames[self.names[i]]
         return repr(
             (*map(file_fingerprint, frame.files), split_topic(self.path)[1], frame.name, self.view, frame.sensor_height)
         )
 
     def scene(self, i: int) -> TrainingScene:
-        """Return scene i to train on. Raise InputError, naming the file, if it is broken."""
+        """Return scene i for training. Raise InputError with the name of the file if it cannot be read."""
         frame, truth = self._labelled_frame(i)
         scan, camera = frame.load(), frame.camera()
         points = scan.points()
@@ -82,7 +82,7 @@ class RecordedScenes:
         )
 
     def frame(self, i: int) -> Frame:
-        """Return the whole scan to validate on. Raise InputError if it has no labels."""
+        """Return frame i for validation, with all points. Raise InputError if it has no labels."""
         return self._labelled_frame(i)[0]
 
     def _labelled_frame(self, i: int) -> tuple[Frame, GroundTruth]:
@@ -95,19 +95,19 @@ class RecordedScenes:
 
 @dataclass(frozen=True)
 class SimulatedScenes:
-    """Simulated scans of the scenes first, first + 1, ...
+    """Simulated scans of the scenes with the seeds first, first + 1, ...
 
     Attributes:
         first: Seed of the first scene.
         count: Number of scans.
         sensor: The sensor.
-        scenes: Kinds of scenes.
-        cache: Folder that keeps scans, or None.
-        cache_gb: Size of the cache, GB, from which on nothing is added to it.
-        per_scene: Scans of each scene, spread over its drive. Making a scene takes as long as
-            scanning it once.
-        around: Frames to validate on have labels in the image of a camera that looks ahead, left,
-            behind and right in turn, instead of ahead only.
+        scenes: Types of the scenes.
+        cache: Folder of cached scans, or None.
+        cache_gb: Largest size of the cache, GB.
+        per_scene: Number of scans of each scene, spread over its drive. Several save time, since
+            making a scene takes as long as simulating a scan.
+        around: The camera of the validation frames, which limits the labels, points ahead, left,
+            behind and right in turn, instead of always ahead.
     """
 
     first: int
@@ -123,12 +123,12 @@ class SimulatedScenes:
         return self.count
 
     def locate(self, i: int) -> tuple[int, int]:
-        """Return the seed of scan i's scene, and the number of the frame in its drive."""
+        """Return the seed of the scene of scan i, and the number of the scan in its drive."""
         scene, part = divmod(i, self.per_scene)
         return self.first + scene, choose_drive_frame(part, self.per_scene, self.sensor)
 
     def key(self, i: int) -> str:
-        """Return a cache key of scan i."""
+        """Return the cache key of scan i."""
         return repr((self.sensor, tuple(self.scenes), self.locate(i)))
 
     def path(self, i: int) -> Path | None:
@@ -136,18 +136,14 @@ class SimulatedScenes:
         return cache_path(self.cache, self.key(i))
 
     def scene(self, i: int) -> TrainingScene:
-        """Return scene i to train on, with labels all around."""
+        """Return scan i for training, with labels in all directions."""
         frame, truth = self.scan(i)
         return TrainingScene(
             frame.points(), truth.boxes, truth.class_ids, find_labelled(truth), True, self.sensor.height
         )
 
     def frame(self, i: int) -> Frame:
-        """Return scan i to validate on.
-
-        It has the labels that KITTI would have in a camera's image, or all labels for scenes
-        without a camera.
-        """
+        """Return scan i for validation, with KITTI's labels in the camera image, or all labels without a camera."""
         scan, truth = self.scan(i)
         scene, part = self.locate(i)
         if not self.scenes.camera:
@@ -163,10 +159,10 @@ class SimulatedScenes:
 
     def scan(self, i: int) -> tuple[PointCloud, GroundTruth]:
         """Return scan i with all its objects, from the cache if possible."""
-        return load_or_make(self.path(i), lambda: self._simulate(i), _read_scan, _scan_arrays, self.cache_gb)
+        return load_or_compute(self.path(i), lambda: self._simulate(i), _from_arrays, _to_arrays, self.cache_gb)
 
-    def keep(self, i: int) -> None:
-        """Put scan i into the cache, if there is room."""
+    def store(self, i: int) -> None:
+        """Write scan i to the cache, if there is room."""
         if self.cache is not None and folder_size(self.cache) < self.cache_gb * 1e9:
             self.scan(i)
 
@@ -178,14 +174,14 @@ class SimulatedScenes:
 EXTRAS = ("track_id", "truncated", "occluded", "num_points", "visible")
 
 
-def _scan_arrays(scan: tuple[PointCloud, GroundTruth]) -> dict[str, np.ndarray]:
+def _to_arrays(scan: tuple[PointCloud, GroundTruth]) -> dict[str, np.ndarray]:
     frame, truth = scan
     assert frame.intensity is not None  # simulated scans always have it
     extras = {name: np.array([e[name] for e in truth.extras]) for name in EXTRAS}
     return dict(xyz=frame.xyz, intensity=frame.intensity, boxes=truth.boxes, class_ids=truth.class_ids, **extras)
 
 
-def _read_scan(arrays: Any) -> tuple[PointCloud, GroundTruth]:
+def _from_arrays(arrays: Any) -> tuple[PointCloud, GroundTruth]:
     columns = [arrays[name].tolist() for name in EXTRAS]
     extras = [dict(zip(EXTRAS, row)) for row in zip(*columns)]
     return (

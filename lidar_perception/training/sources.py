@@ -1,4 +1,4 @@
-"""The sources of scenes to train on and to validate on."""
+"""Sources of training and validation scenes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from lidar_perception.training.params import DataParams
 from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
 from lidar_perception.types import InputError
 
-SIM = "sim"  # value that selects simulated scenes instead of a path
-# First seeds of the scenes for training, validation and curve fitting. Nothing else uses
-# seeds near them.
-FIRST_SCENE, FIRST_VALIDATION_SCENE, FIRST_FITTED_SCENE = 10_000_000, 20_000_000, 30_000_000
+SIM = "sim"  # means simulated scenes instead of a path
+# First seeds of the scenes for training, validation and the fit of curves; far from all other seeds.
+FIRST_TRAINING_SEED, FIRST_VALIDATION_SEED, FIRST_FIT_SEED = 10_000_000, 20_000_000, 30_000_000
 
 
 def open_sources(
@@ -31,26 +30,29 @@ def open_sources(
     scene: str = "street",
     height: float = 0.0,
 ) -> tuple[tuple, tuple]:
-    """Return the sources to train on and those to validate on, which share no frame.
+    """Open the sources of training and validation scenes, which share no frame.
 
     Args:
         data, val, split, val_split: See TrainingRequest.
         params: Numbers of scans, cache and held-out share.
-        seed: Draws the held-out frames.
+        seed: Seed of the choice of held-out frames.
         sensor: Sensor of the simulated scans.
-        around: Validate simulated scenes all around, not only ahead.
-        scene: Simulated scenes, see Scenes.
+        around: Validate simulated scenes in all directions, not only ahead.
+        scene: Types of simulated scenes, see Scenes.
         height: Height of the sensor, see open_labelled_frames.
 
+    Returns:
+        Training sources and validation sources.
+
     Raises:
-        InputError: Something is missing, or an option would have no effect.
+        InputError: A file is missing, or an option would have no effect.
     """
     folders = [Path(name) for name in data if name != SIM]
     val_folders = [Path(name) for name in val if name != SIM] or ([] if val else folders)
     if split is not None and len(folders) != 1:
-        raise InputError("--split names frames of one recording in --data; give one")
+        raise InputError("--split needs exactly one recording to train on")
     if val_split is not None and len(val_folders) != 1:
-        raise InputError("--val-split names frames of one recording; give one in --val")
+        raise InputError("--val-split needs exactly one recording in --val")
     mixed = SIM in (*data, *val)
     training = [open_labelled_frames(folder, split, height, mixed) for folder in folders]
     if val or val_split is not None:
@@ -58,7 +60,7 @@ def open_sources(
     else:
         pairs = [frames.split(params.val_share, seed) for frames in training]
         training, held_out = [first for first, _ in pairs], [second for _, second in pairs]
-    if split is not None and val_split is None:  # the frames of --split remain in the training set
+    if split is not None and val_split is None:  # --split has priority
         held_out = [frames.exclude(training, "validate on") for frames in held_out]
     else:
         training = [frames.exclude(held_out, "train on") for frames in training]
@@ -67,21 +69,12 @@ def open_sources(
     simulate = partial(
         SimulatedScenes, sensor=sensor, cache_gb=params.cache_gb, cache=Path(params.cache) if params.cache else None
     )
-    if SIM in (*data, *val):
-        Scenes(None, params.people, scene).scene_types()  # raises InputError before any work
+    scenes, val_scenes = Scenes(None, params.people, scene), Scenes(None, params.val_people, scene)
+    if mixed:
+        scenes.scene_types()  # raises InputError for an unknown scene
     if SIM in data:
-        sources.append(
-            simulate(
-                FIRST_SCENE,
-                params.scans,
-                scenes=Scenes(None, params.people, scene),
-                per_scene=min(params.street_scans, longest_drive(sensor)),
-            )
-        )
+        per_scene = min(params.street_scans, longest_drive(sensor))
+        sources.append(simulate(FIRST_TRAINING_SEED, params.scans, scenes=scenes, per_scene=per_scene))
     if SIM in (val or data):
-        val_sources.append(
-            simulate(
-                FIRST_VALIDATION_SCENE, params.val_scans, scenes=Scenes(None, params.val_people, scene), around=around
-            )
-        )
+        val_sources.append(simulate(FIRST_VALIDATION_SEED, params.val_scans, scenes=val_scenes, around=around))
     return tuple(sources), tuple(val_sources)

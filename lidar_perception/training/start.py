@@ -1,4 +1,4 @@
-"""Training run from a request: plan it, prepare the scenes, train, and resume after a stop."""
+"""Start or resume of a training run: plan, preparation of the scenes, and training."""
 
 from __future__ import annotations
 
@@ -42,7 +42,13 @@ from lidar_perception.types import InputError
 
 
 class TrainingResult(NamedTuple):
-    """End of a run. steps: number of planned steps; batches: the samples that it was fed."""
+    """Result of a training run.
+
+    Attributes:
+        progress: Progress at the end.
+        steps: Number of planned steps.
+        batches: Batches that the network was trained on.
+    """
 
     progress: Progress
     steps: int
@@ -52,25 +58,25 @@ class TrainingResult(NamedTuple):
 def start_training(
     trainer: Trainer, request: TrainingRequest, params: Any, commit: str = "", speed: Speed | None = None
 ) -> TrainingResult | None:
-    """Train a network, or resume a run.
+    """Start or resume a training run.
 
-    The first start measures this machine, makes a plan and keeps it in the run's folder; a resumed
-    run follows the same plan. All prepared scenes are cached, so a run may be killed at any time.
+    The first start measures this machine and writes a plan into the run's folder; a resumed run
+    follows the same plan. All prepared scenes are cached, so a run may be killed at any time.
 
     Args:
-        trainer: The network to train.
+        trainer: Trainer of the network.
         request: Data, output folder and limits.
-        params: Parameters of the network's training.
-        commit: Version of the code, written into the checkpoints.
-        speed: Durations for the plan, where they are known; None: this machine is measured.
+        params: Parameters of the training.
+        commit: Version of the code, for the header of the checkpoints.
+        speed: Durations for the plan; None measures them on this machine.
 
     Returns:
-        The end of the run; None in all but the first of several processes.
+        Result of the run; None in all processes but rank 0.
 
     Raises:
-        InputError: Something cannot be used. Checked before the long computations where possible.
+        InputError: An input cannot be used. Inputs are checked before long computations where possible.
     """
-    begun = time.monotonic()
+    start = time.monotonic()
     init = trainer.packaged_weights(params) if request.init == PACKAGE else request.init
     directory = RunDirectory(request.out)
     _check_request(request, directory, init)
@@ -83,7 +89,7 @@ def start_training(
     settings = _collect_settings(request, params, sensor, init)
     chosen = torch.device(find_device(request.device))
     with join_process_group(chosen) as device, directory.lock():
-        wait_for_all()  # wait until every process has read the files that rank 0 writes
+        wait_for_all()  # rank 0 writes files that the others have checked above
         planner = Planner(trainer, request, params, sensor, device, speed)
         if get_rank() == 0:
             make_folder(Path(params.data.cache))
@@ -110,7 +116,7 @@ def start_training(
             "sensor": _describe_sensor(params, sensor, sources),
         }
         task = trainer.make_task(params, batches, validation, request.out, device, about, commit, init)
-        until = math.inf if hours is None else begun + 3600 * hours
+        until = math.inf if hours is None else start + 3600 * hours
         progress = train(
             task, params, request.out, device, request.resume, until, validation_duration(run.plan, run.speed, run.data)
         )
@@ -118,7 +124,7 @@ def start_training(
 
 
 def _check_request(request: TrainingRequest, directory: RunDirectory, init: Path | None) -> None:
-    """Raise InputError before anything is written."""
+    """Raise InputError for an invalid budget, init or output folder."""
     if request.budget is not None and not 0 < request.budget < math.inf:
         raise InputError(f"--budget {request.budget:g} must be a number of hours above 0")
     if init is not None:
@@ -136,7 +142,7 @@ def _explain_interrupt() -> Iterator[None]:
 
 
 def _make_plan(planner: Planner, directory: RunDirectory, settings: dict[str, Any]) -> None:
-    """Write the plan, unless an earlier start did."""
+    """Write the plan if the run has none yet."""
     if directory.plan_file.is_file():
         errors.print(f"resuming {directory.path}")
     else:
@@ -148,14 +154,13 @@ def _prepare_scenes(
 ) -> None:
     simulated = [s for s in (*sources, *held_out) if isinstance(s, SimulatedScenes)]
     fill_cache(simulated, [range(len(s)) for s in simulated], request.jobs, "simulating")
-    fill_cache(*cuts, request.jobs, trainer.cutting)
+    fill_cache(*cuts, request.jobs, trainer.cutting_title)
 
 
 def _collect_settings(request: TrainingRequest, params: Any, sensor: Sensor, init: Path | None) -> dict[str, Any]:
-    """Return everything that a resumed run must have in common.
+    """Return the settings that must not change when the run is resumed.
 
-    Files are represented by their content, since a split may name other frames later and weights
-    may be replaced. Raises InputError for missing scenes.
+    Splits and weights are represented by their content, since their files may change.
     """
     sources, held_out = open_scenes(request, limit_to_few_scans(params), sensor)
     weights = sha256(init.read_bytes()).hexdigest()[:12] if init else ""
@@ -165,20 +170,20 @@ def _collect_settings(request: TrainingRequest, params: Any, sensor: Sensor, ini
         "val": list(request.val),
         "split": str(request.split or ""),
         "val_split": str(request.val_split or ""),
-        "frame_names": _digest_names(sources),
-        "val_frame_names": _digest_names(held_out),
+        "frame_names": _hash_frame_names(sources),
+        "val_frame_names": _hash_frame_names(held_out),
         "init": str(request.init or ""),
         "init_weights": weights,
         "sensor": asdict(sensor),
     }
 
 
-def _digest_names(sources: Sequence[Any]) -> list[str]:
+def _hash_frame_names(sources: Sequence[Any]) -> list[str]:
     return [hash_names(source.names) for source in sources if isinstance(source, RecordedScenes)]
 
 
 def _describe_sensor(params: Any, sensor: Sensor, sources: Sequence[Any]) -> dict[str, Any]:
-    """Return the sensor for the header of a checkpoint: the simulated one, or the real height."""
+    """Describe the sensor for the header of a checkpoint: the simulated sensor, or the height of the real one."""
     if has_simulated(sources):
         return {"name": params.sensor, "height": sensor.height, "beams": sensor.rings}
     height = find_recorded_height(sources)

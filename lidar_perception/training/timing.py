@@ -1,4 +1,4 @@
-"""Measured durations of the parts of a training run."""
+"""Measurement of the durations of a training run."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ Result = TypeVar("Result")
 
 
 def measure_duration(work: Callable[[], Result]) -> tuple[float, Result]:
-    """Return how long work() takes, in seconds, and its result."""
-    begun = time.perf_counter()
+    """Return the duration of work() in seconds, and its result."""
+    start = time.perf_counter()
     result = work()
-    return time.perf_counter() - begun, result
+    return time.perf_counter() - start, result
 
 
 def select_usable_scenes(scenes: Iterable[Item], prepare: Callable[[Any], Any]) -> list[Any]:
-    """Return the first scenes, at most MAX_TIMED_SCENES, that prepare(scene) accepts.
+    """Return the first scenes, at most MAX_TIMED_SCENES, for which prepare(scene) raises no InputError.
 
     Raises:
-        InputError: No scene can be used; the message gives the first reason.
+        InputError: No scene can be used; the message contains the first reason.
     """
     chosen: list[Any] = []
     reasons: list[str] = []
@@ -54,10 +54,10 @@ def select_usable_scenes(scenes: Iterable[Item], prepare: Callable[[Any], Any]) 
 
 
 def find_readable_frame(scenes: SceneReader, is_typical: Callable[[Any], bool] = lambda _: True) -> Any:
-    """Return the first validation frame that can be read and is typical, else the first readable.
+    """Return the first readable validation frame for which is_typical is True, else the first readable one.
 
     Raises:
-        InputError: No frame can be read; the message gives the first reason.
+        InputError: No frame can be read; the message contains the first reason.
     """
     fallback: Any = None
     reasons: list[str] = []
@@ -75,12 +75,14 @@ def find_readable_frame(scenes: SceneReader, is_typical: Callable[[Any], bool] =
 def measure_step(
     module: nn.Module, loss: Callable, prepare: Callable[[], Sequence[Any]], params: LoopParams, device: torch.device
 ) -> float:
-    """Return the duration of one training step in seconds, with its share of sample preparation.
+    """Return the duration of one training step in seconds, including the preparation of its samples on all cores.
 
     Args:
         module: Network to train; its gradients and statistics change.
         loss: loss(module, batch), as in run.Task.
-        prepare: Returns a few samples. Training runs it in other processes.
+        prepare: Returns a few samples.
+        params: Batch size and number format.
+        device: Device of the network.
     """
     prepare()  # triggers compilation of kernels
     preparation, samples = measure_duration(prepare)

@@ -1,4 +1,4 @@
-"""The interface of a network to training: everything about a run that depends on the network."""
+"""Interface of a trainer: the parts of a training run that depend on the network."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from lidar_perception.training.run import Task
 
 
 class Cuts(NamedTuple):
-    """Sources of objects or clusters cut from scenes, and the scene numbers to cut of each."""
+    """Sources of objects or clusters cut from scenes, and the numbers of the scenes to cut in each source."""
 
     sources: list[Any]
     numbers: list[Sequence[int]]
 
 
 class StepSpeed(NamedTuple):
-    """Measured durations in seconds, see plan.Speed."""
+    """The measured durations of plan.Speed that depend on the network, in seconds."""
 
     cut: float
     step: float
@@ -29,24 +29,21 @@ class StepSpeed(NamedTuple):
 
 
 class Trainer(Protocol):
-    """Training of one network. Parameters may have a plan applied or not."""
+    """Training of one network. The params of all methods are the parameters of its training."""
 
     @property
     def name(self) -> str:
         """Name of the network in messages."""
 
     @property
-    def cutting(self) -> str:
-        """Title of the progress bar while scenes are cut."""
+    def cutting_title(self) -> str:
+        """Title of the progress bar while objects or clusters are cut."""
 
     def max_cuts(self, params: Any) -> int:
-        """Return the largest number of scenes to cut."""
+        """Return the largest number of scenes from which objects or clusters are cut."""
 
     def reduced_range(self, params: Any) -> dict[str, Any]:
-        """Return the parameters that restrict training to a part of the range, which is faster.
-
-        Empty if there is no such choice.
-        """
+        """Return values of parameters that limit training to a part of the range, which is faster; {} if impossible."""
 
     def measure_speed(
         self, params: Any, scenes: Iterable[Item], held_out: Sequence[Any], device: torch.device
@@ -54,18 +51,18 @@ class Trainer(Protocol):
         """Measure durations on the first usable scenes. Raise InputError if none can be used."""
 
     def packaged_weights(self, params: Any) -> Path:
-        """Return the weights that ship with the package. Raise InputError if there are none."""
+        """Return the path of the packaged weights. Raise InputError if there are none."""
 
     def make_cuts(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any], cache: Path) -> Cuts:
-        """Return the objects or clusters to cut from the scenes; nothing is cut yet."""
+        """Make the sources of cut objects or clusters; nothing is cut yet."""
 
     def collect_cuts(self, params: Any, cuts: Cuts, out: Path) -> None:
-        """Write the cut objects or clusters into out, in the form that training reads."""
+        """Write the cut objects or clusters to the folder out for training."""
 
     def make_streams(
         self, params: Any, sources: Sequence[Any], held_out: Sequence[Any], cuts: Cuts, out: Path
     ) -> tuple[Stream, SceneReader]:
-        """Return the samples to train on and the scenes to validate on."""
+        """Return the stream of training samples and the validation scenes."""
 
     def make_task(
         self,
@@ -78,15 +75,15 @@ class Trainer(Protocol):
         commit: str,
         init: Path | None,
     ) -> Task:
-        """Return the task of the training loop.
+        """Make the task of the training loop.
 
         Args:
-            params: Parameters of the training, with a plan.
-            batches: Samples to train on.
-            held_out: Scenes to validate on.
+            params: Parameters of the training, with the numbers of the plan.
+            batches: Batches of training samples.
+            held_out: Validation scenes.
             out: Folder for best.safetensors and last.safetensors.
             device: Device of the network.
-            about: Description of the data for the header; a resumed run must have the same.
+            about: Description of the data for the header, which must be the same in a resumed run.
             commit: Version of the code for the header.
-            init: Checkpoint to start from, see checkpoint.copy_matching_weights.
+            init: Checkpoint with initial weights, see checkpoint.copy_matching_weights; None for random ones.
         """

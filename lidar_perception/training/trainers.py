@@ -1,4 +1,4 @@
-"""The trainer of each network, by the parameters of its training."""
+"""Choice of the trainer by the parameters of the training."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from lidar_perception.training.trainer import Trainer
 
 
 def make_trainer(params: PointPillarsTraining | PointNetTraining) -> Trainer:
-    """Return the trainer of a network. Raise InputError if its proposer has no weights."""
+    """Make the trainer for these parameters. Raise InputError if params.proposer has no weights."""
     if isinstance(params, PointNetTraining):
         find_proposer(params)
         return PointNetTrainer(make_pointnet_config(params.network))
-    seen: dict[str, Any] = {**RANGES["around"]} if params.range == "around" else {}
-    return PointPillarsTrainer(make_config(params.version, params.size, **seen))  # default: ahead
+    detection_range: dict[str, Any] = {**RANGES["around"]} if params.range == "around" else {}  # default: ahead
+    return PointPillarsTrainer(make_config(params.version, params.size, **detection_range))

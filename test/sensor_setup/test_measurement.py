@@ -10,7 +10,7 @@ from tilted_samples import BARE, MOUNTS, simulate_clouds
 
 from lidar_perception.data.raw_clouds import choose_clouds, open_clouds
 from lidar_perception.sensor_setup.measurement.beams import Beams, find_beams
-from lidar_perception.sensor_setup.measurement.measure import match_model, measure_sensor
+from lidar_perception.sensor_setup.measurement.measure import find_matching_model, measure_sensor
 from lidar_perception.sensor_setup.measurement.mount import find_ground_plane, measure_mount
 from lidar_perception.sensor_setup.measurement.scans import measure_intensity, read_scan
 from lidar_perception.sensor_setup.report.files import format_params, format_sensor
@@ -46,15 +46,15 @@ def test_tilted_sensor_is_measured_correctly(name):
     assert mount.height == pytest.approx(height, abs=0.02)
     assert np.degrees([mount.roll, mount.pitch]) == pytest.approx([roll, pitch], abs=0.2)
     assert m.mounting.heading.degrees == pytest.approx(0, abs=10)
-    assert m.view.coverage.still is False
+    assert m.view.coverage.stationary is False
     for kind in ("intensity", "ring", "time"):
         column = driver[kind]
         assert (column[0] if column else f"no {kind}") in next(
             row.value for row in list_values(m) if row.name == "columns"
         )
     if driver["intensity"]:
-        assert m.intensity.full == driver["intensity"][2] and m.intensity.sure
-        assert m.intensity.zeros == pytest.approx(
+        assert m.intensity.full_scale == driver["intensity"][2] and m.intensity.is_certain
+        assert m.intensity.zero_share == pytest.approx(
             float(np.mean(np.concatenate([s.intensity for s in m.source.scans]) == 0))
         )
     if driver["time"]:
@@ -105,9 +105,9 @@ def test_model_is_recognised_by_its_beams(name):
     beams = Beams(up, 0 * up, 0 * up, 0 * up, [], "ring")
     number = np.arange(len(up))
     for seen in up, up[number % 7 != 3], up + 0.05 * (-1) ** number:
-        assert match_model(beams._replace(elevations=seen)) == ("" if sensor.wander else name)
+        assert find_matching_model(beams._replace(elevations=seen)) == ("" if sensor.wander else name)
     for half, rows in ((12.5, 126), (11.25, 112), (12.5, 60)):
-        assert not match_model(beams._replace(elevations=np.linspace(half, -half, rows)))
+        assert not find_matching_model(beams._replace(elevations=np.linspace(half, -half, rows)))
 
 
 def test_height_hint_counts_without_ground():
@@ -158,7 +158,7 @@ def test_cloud_without_columns_warns():
     m = measure("pandarxt-32")
     text = "\n".join(find_warnings(m))
     assert "there is no intensity" in text and "the rate is unknown" in text
-    assert "silent: 1  # no intensity was seen" in format_sensor(m)
+    assert "silent: 1  # no intensity in the clouds" in format_sensor(m)
     assert "input.intensity_max" not in choose_params(m)
 
 

@@ -78,10 +78,10 @@ def test_heading_is_x_of_base_even_when_reversing(yaw):
     assert ReceptionParams(ahead=ahead) and not written.keys() - {"intensity_max"}
 
 
-def test_driving_to_and_fro_needs_odometry():
+def test_driving_back_and_forth_needs_odometry():
     shifts = {(i, i + 1): (-1) ** i * np.array([2.0, 0.5]) for i in range(8)}
     went = {pair: (-1) ** pair[0] * np.array([0.5, -2.0]) for pair in shifts}
-    assert "to and fro" in estimate_heading(shifts, {}).problem
+    assert "back and forth" in estimate_heading(shifts, {}).problem
     assert estimate_heading(shifts, went).degrees == pytest.approx(90)
     off = {pair: (np.cos(i), np.sin(i)) for i, pair in enumerate(shifts)}
     assert "does not agree" in estimate_heading(shifts, off).problem
@@ -97,7 +97,7 @@ def test_odometry_of_sensor_shows_its_heading():
 def test_partial_odometry_does_not_mean_standing_still():
     _, poses = drive()
     m = measure_drive(RecordedPoses("base_link", poses={COUNT - 1: poses[-1]}))
-    assert m.view.coverage.still is False
+    assert m.view.coverage.stationary is False
     assert not any("stands still" in line for line in find_warnings(m))
 
 

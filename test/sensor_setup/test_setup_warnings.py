@@ -13,7 +13,7 @@ from lidar_perception.data.raw_clouds import _to_message
 from lidar_perception.robot.crop import select_points
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placement import make_tilted_pose
-from lidar_perception.sensor_setup.measurement.coverage import is_standing_still
+from lidar_perception.sensor_setup.measurement.coverage import is_stationary
 from lidar_perception.sensor_setup.measurement.measure import measure_sensor
 from lidar_perception.sensor_setup.measurement.mount import is_on_ground, measure_mount
 from lidar_perception.sensor_setup.measurement.recorded_poses import NO_POSES
@@ -73,12 +73,12 @@ def test_motion_of_robot_is_recognised():
     scans = change_scans(None)
     one, drives = measure(scans[:1]), measure(scans)
     still = measure(scans[:1] * 5, (0, 1, 2, 3, 4))
-    assert warns(one, "only one cloud", "record") and one.view.coverage.still is None
-    assert warns(still, "stands still", "record") and still.view.coverage.still
+    assert warns(one, "only one cloud", "record") and one.view.coverage.stationary is None
+    assert warns(still, "stands still", "record") and still.view.coverage.stationary
     assert not warns(drives, "stands still") and not warns(drives, "only one cloud")
 
 
-def test_robots_body_is_found_and_cropped():
+def test_robot_body_is_found_and_cropped():
     """The body is a curved panel behind the sensor."""
     rng = np.random.default_rng(0)
 
@@ -162,7 +162,7 @@ def make_scan(xyz):
 def test_walls_along_path_are_not_body(half):
     m = measure(list(simulate_scans(half)), range(8))
     c = m.view.coverage
-    assert c.still is False and c.has_walls and not c.can_crop and not c.blocked
+    assert c.stationary is False and c.has_walls and not c.can_crop and not c.blocked
     assert warns(m, "walls", "crop.body")
     c = measure(list(simulate_scans(body=1.5)), range(8)).view.coverage
     assert c.can_crop and not c.has_walls and c.blocked
@@ -172,14 +172,14 @@ def test_walls_along_path_are_not_body(half):
 def test_robot_stands_still_while_people_pass():
     around = np.random.default_rng(0).uniform(5, 50, (16, 360))
     passed = np.array([np.where(np.arange(360) // 36 == i, 4.5, around) for i in range(10)])
-    assert is_standing_still(passed)
-    assert is_standing_still(np.roll(passed, 1, axis=0)[:2]) is not None
+    assert is_stationary(passed)
+    assert is_stationary(np.roll(passed, 1, axis=0)[:2]) is not None
     moving = np.array([np.roll(around, 10 * i, axis=1) for i in range(10)])
-    assert is_standing_still(moving) is False
+    assert is_stationary(moving) is False
     scans = list(simulate_scans(body=0.5))
     poses = {i: make_tilted_pose(0, 0, 0.6) for i in range(8)}
     parked = measure_sensor(scans, range(8), "parked", 8, None, NO_POSES._replace(poses=poses))
-    assert parked.view.coverage.still and warns(parked, "stands still")
+    assert parked.view.coverage.stationary and warns(parked, "stands still")
     assert len(parked.view.coverage.box) and not parked.view.coverage.blocked
     # A slow robot hardly moves between successive clouds, either.
     numbers = [40 * (i // 2) + i % 2 for i in range(8)]
@@ -188,7 +188,7 @@ def test_robot_stands_still_while_people_pass():
         for n, scan in zip(numbers, simulate_scans())
     ]
     m = measure_sensor(slow, numbers, "slow", 160, None)
-    assert m.mounting.heading.distance < 0.1 and m.view.coverage.still is False
+    assert m.mounting.heading.distance < 0.1 and m.view.coverage.stationary is False
 
 
 def test_poses_show_motion_on_uniform_ground():
@@ -200,9 +200,9 @@ def test_poses_show_motion_on_uniform_ground():
         poses = {i: make_tilted_pose(0, 0, 0) for i in range(8)}
         poses[7][0, 3] = distance
         m = measure_sensor(ground, range(8), "field", 8, None, NO_POSES._replace(poses=poses))
-        assert (m.view.coverage.still is False) == drives == m.view.coverage.can_crop
+        assert (m.view.coverage.stationary is False) == drives == m.view.coverage.can_crop
         assert drives != warns(m, "stands still")
-        assert not warns(m, "unknown whether the robot moved")
+        assert not warns(m, "cannot tell whether the robot moved")
 
 
 def test_clouds_in_ground_frame_are_recognised():
@@ -221,7 +221,7 @@ def test_tilted_sensor_has_no_blind_sky_and_nearest_ground(roll, pitch):
     assert np.degrees(mount.pitch) == pytest.approx(pitch, abs=0.5) and not mount.is_level
     assert m.view.coverage.view == (0, 360) and not make_sensor(m).blocked
     assert warns(m, "level sensor")
-    nearest = min(np.hypot(*(s.xyz[p.on] @ lean.T)[:, :2].T).min() for s, p in zip(m.source.scans, mount.planes))
+    nearest = min(np.hypot(*(s.xyz[p.inliers] @ lean.T)[:, :2].T).min() for s, p in zip(m.source.scans, mount.planes))
     assert choose_params(m)["ground.patchwork.min_range"][0] <= nearest
 
 
@@ -307,7 +307,7 @@ def test_heading_is_measured_at_any_speed(name):
         )
 
 
-def test_cloud_in_turned_frame_has_no_beams_and_gets_grid():
+def test_rotated_frame_gives_grid_instead_of_beams():
     def level(points):
         points = turn_by([[0.906, 0, 0.423], [0, 1, 0], [-0.423, 0, 0.906]])(points)
         points["ring"] = 0
@@ -362,11 +362,11 @@ def test_mixed_frames_gaps_and_jumping_stamps_are_reported():
     lossy = np.delete(stamps, [20, 21, 50])
     m = measure(scans, stamps=lossy)
     assert warns(m, "several frames") and warns(m, "3 clouds are missing")
-    assert m.timing.missing == 3 and m.timing.rate == pytest.approx(10)
+    assert m.timing.missing_count == 3 and m.timing.rate == pytest.approx(10)
     back = measure_timing(scans, np.concatenate([stamps, stamps]))
-    assert back.backwards == 1 and back.missing == 0
+    assert back.backward_count == 1 and back.missing_count == 0
     drives = measure_timing(scans, np.concatenate([stamps, stamps + 10**12]))
-    assert drives.missing == 0
+    assert drives.missing_count == 0
 
 
 @pytest.mark.parametrize(
@@ -383,15 +383,15 @@ def test_mixed_frames_gaps_and_jumping_stamps_are_reported():
 def test_intensity_scale(values, full, sure):
     scan = replace_intensity(change_scans(None)[0], values)
     found = measure_intensity([scan])
-    assert (found.full, found.sure) == (full, sure)
+    assert (found.full_scale, found.is_certain) == (full, sure)
     assert measure_intensity([scan._replace(intensity=None)]) is None
     assert measure_intensity([scan._replace(intensity=np.zeros(9))]) is None
 
 
-def test_whole_intensities_need_all_scans_and_nearest_counts():
+def test_integer_scale_uses_all_scans():
     scan = change_scans(None)[0]
     dark = replace_intensity(scan, np.zeros(20_000))
-    assert not measure_intensity([dark, replace_intensity(scan, np.linspace(0, 0.9, 9_000))]).whole
+    assert not measure_intensity([dark, replace_intensity(scan, np.linspace(0, 0.9, 9_000))]).is_integer
     m = measure(change_scans(None))
     near = replace(m, view=m.view._replace(min_range=0.4))
     assert m.pattern.model and make_sensor(near).min_range == 0.4

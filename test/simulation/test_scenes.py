@@ -67,7 +67,7 @@ def test_trajectory_derivatives_are_exact():
             assert (after.heading - before.heading) / (2 * h) == pytest.approx(now.yaw_rate, abs=1e-6)
             assert abs(now.heading) < 0.71 and np.hypot(*now.velocity) < 1.5 / np.cos(0.7)
             assert np.allclose(np.tan(now.heading) * now.velocity[0], now.velocity[1])
-    assert way.sampled(20.0, 0.1).shape == (201, 3)
+    assert way.sample(20.0, 0.1).shape == (201, 3)
     assert Trajectory().at(7.0) == (0.0, 0.0, 0.0, (0.0, 0.0), 0.0)
 
 

@@ -40,7 +40,7 @@ def test_scan_cache_is_bounded_and_makes_a_scan_once():
 
 
 def test_recording_of_several_drives_needs_a_sequence():
-    frames = [*simulate_frames(119, 2, streets_of=1)]
+    frames = [*simulate_frames(119, 2, frames_per_drive=1)]
     recording = Recording(Path("two"), "simulated", frames)
     with pytest.raises(InputError, match="--sequence"):
         select_drive(recording)

@@ -32,7 +32,7 @@ SEED, FRAMES = 127, 6  # a street with people near and far
 
 @pytest.fixture(scope="module")
 def drive(streets):
-    frames = list(simulate_frames(SEED, FRAMES, streets_of=20))
+    frames = list(simulate_frames(SEED, FRAMES, frames_per_drive=20))
     return Drive("simulated", Recording(Path("simulated"), "simulated", frames, frozenset({BOXES, POSES})))
 
 

@@ -105,11 +105,11 @@ def test_cluster_gets_label_of_most_of_its_points(rng):
     labels, owners = label_clusters(clusters, BOXES, names, CONFIG.classes)
     assert labels.tolist() == [0, 1, 2, UNKNOWN, 3] and owners.tolist() == [0, 1, 2, -1, -1]
     # a third in the box is neither object nor background, a tenth is background
-    for share, wanted in ((0.9, 0), (0.3, UNKNOWN), (0.1, 3)):
+    for share, expected in ((0.9, 0), (0.3, UNKNOWN), (0.1, 3)):
         points = clusters.points[:60].copy()
         points[int(60 * share) :, 2] += 5
         one = Clusters(points, np.array([0, 60]), np.array([1]))
-        assert label_clusters(one, BOXES, names, CONFIG.classes)[0].tolist() == [wanted]
+        assert label_clusters(one, BOXES, names, CONFIG.classes)[0].tolist() == [expected]
     none = label_clusters(clusters, np.zeros((0, 7)), ids(), CONFIG.classes)
     assert none[0].tolist() == [3] * 5 and none[1].tolist() == [-1] * 5
     points = label_points(clusters.points[:, :3], BOXES, names, CONFIG.classes)
@@ -219,14 +219,14 @@ class RepeatedScene:
 def test_scene_is_cut_by_clustering_and_around_objects(rng, tmp_path):
     scene = a_scene(rng)
     made = cut_clusters(scene, CONFIG, 5)
-    assert set(made.labels[~made.loose]) == {0, 1, UNKNOWN}  # the cyclist is not wanted
-    assert made.labels[made.loose].tolist() == [0, 1]
-    assert np.array_equal(made.boxes[made.loose], BOXES[:2])
+    assert set(made.labels[~made.is_box_crop]) == {0, 1, UNKNOWN}  # the cyclist is not detectable
+    assert made.labels[made.is_box_crop].tolist() == [0, 1]
+    assert np.array_equal(made.boxes[made.is_box_crop], BOXES[:2])
     assert not made.boxes[made.labels == UNKNOWN].any() and made.boxes[made.labels == 1].any()
     source = CutScenes(RepeatedScene(scene), CONFIG, 5, tmp_path)
     first, again = source.scene(0), source.scene(0)  # the second from the cache
     assert len(list(tmp_path.iterdir())) == 1
-    for name in ("labels", "boxes", "loose"):
+    for name in ("labels", "boxes", "is_box_crop"):
         assert np.array_equal(getattr(first, name), getattr(again, name))
     assert np.array_equal(first.clusters.points, again.clusters.points)
     next(tmp_path.iterdir()).write_bytes(b"broken")
@@ -254,7 +254,7 @@ def test_clusters_equal_those_of_detector_at_scene_height(rng):
     )
     detector(PointCloud(scene.points[:, :3].copy(), scene.points[:, 3].copy()))
     made = cut_clusters(scene, CONFIG, 5)
-    assert sum(read) == (~made.loose).sum() > 3
+    assert sum(read) == (~made.is_box_crop).sum() > 3
 
 
 def test_share_of_scenes_is_sparse_and_always_the_same(rng, tmp_path):
@@ -273,8 +273,8 @@ def test_share_of_scenes_is_sparse_and_always_the_same(rng, tmp_path):
         thinned, again = all_.scene(i), all_.scene(i)  # the second from the cache
         assert np.array_equal(thinned.clusters.points, again.clusters.points)
         assert known >= set(map(bytes, thinned.clusters.points[:, :3]))
-        sizes.append(thinned.clusters.sizes[(thinned.labels == 0) & thinned.loose][0])
-    car = whole.clusters.sizes[(whole.labels == 0) & whole.loose][0]
+        sizes.append(thinned.clusters.sizes[(thinned.labels == 0) & thinned.is_box_crop][0])
+    car = whole.clusters.sizes[(whole.labels == 0) & whole.is_box_crop][0]
     expected = np.array([all_.draw_share(i) for i in range(count)]) * car
     assert (np.abs(sizes - expected) < 5 * np.sqrt(expected)).all()
 
@@ -291,21 +291,21 @@ def test_wrong_proposals_become_decoys_unless_they_touch_label(rng, tmp_path, mo
     )
     plain, made = (cut_clusters(scene, CONFIG, 5, path) for path in (None, tmp_path))
     none = len(CONFIG.classes)
-    boxes = made.boxes[made.loose & (made.labels == none)]
+    boxes = made.boxes[made.is_box_crop & (made.labels == none)]
     assert [np.isclose(boxes, box, atol=1e-5).all(axis=1).sum() for box in (empty, near)] == [1, 0]
-    assert np.array_equal(made.labels[~made.loose], plain.labels[~plain.loose])
-    assert (made.labels[made.loose] < none).sum() == 1
+    assert np.array_equal(made.labels[~made.is_box_crop], plain.labels[~plain.is_box_crop])
+    assert (made.labels[made.is_box_crop] < none).sum() == 1
 
 
 def test_half_of_background_is_decoys(rng):
     scene = sample_scene(rng)
     background = np.flatnonzero(scene.labels == 3)
     for decoys in (0, 4, 30):
-        loose = np.isin(np.arange(len(scene.labels)), background[:decoys])
+        is_box_crop = np.isin(np.arange(len(scene.labels)), background[:decoys])
         judge = ClusterPreparation(CONFIG, ClusterAugmentParams(background=20), True)
-        chosen = judge._draw_clusters(replace(scene, loose=loose), rng)
+        chosen = judge._draw_clusters(replace(scene, is_box_crop=is_box_crop), rng)
         assert (scene.labels[chosen] == 3).sum() == 20
-        assert loose[chosen].sum() == min(decoys, 10)
+        assert is_box_crop[chosen].sum() == min(decoys, 10)
 
 
 def sample_scene(rng, count=40):
@@ -326,7 +326,7 @@ def test_sample_limits_each_class_and_drops_unknown(rng):
     sample = ClusterPreparation(CONFIG, params)(scene, rng)
     assert np.bincount(sample.labels, minlength=4).tolist() == [7, 7, 0, 5]
     assert np.array_equal(sample.has_box, sample.labels < 3)
-    nothing = CutScene(scene.clusters, np.full(len(scene.labels), UNKNOWN), scene.boxes, scene.loose)
+    nothing = CutScene(scene.clusters, np.full(len(scene.labels), UNKNOWN), scene.boxes, scene.is_box_crop)
     with pytest.raises(InputError, match="no cluster"):
         ClusterPreparation(CONFIG, params)(nothing, rng)
 

@@ -63,10 +63,10 @@ def test_fitted_scores_are_probabilities_in_any_order_of_scans(seed):
     scores = compute_probabilities(models, other.class_ids, other.evidence)
     for low in np.arange(0.1, 0.9, 0.2):
         chosen = (scores >= low) & (scores < low + 0.2)
-        assert abs(other.right[chosen].mean() - scores[chosen].mean()) < 0.08
+        assert abs(other.correct[chosen].mean() - scores[chosen].mean()) < 0.08
     assert fits["Pedestrian"].after.loss < fits["Pedestrian"].before.loss
     assert fits["Pedestrian"].proposals == 4000
-    assert fits["Pedestrian"].right == own.right.sum()
+    assert fits["Pedestrian"].correct == own.correct.sum()
     again, _ = fit_classes(own.take(rng.permutation(4000)), load_shipped_models())
     for curve, before in zip(again["Pedestrian"]["curves"].values(), models["Pedestrian"]["curves"].values()):
         np.testing.assert_allclose(curve["values"], before["values"], atol=0.02)
@@ -78,7 +78,7 @@ def test_curves_are_not_fitted_to_too_few_samples():
     rng = np.random.default_rng(0)
     for right in (0, MIN_SAMPLES // 2 - 1, MIN_SAMPLES * 3):
         own = draw_samples(rng, 500, CAR)
-        own.right[:] = np.arange(500) < right
+        own.correct[:] = np.arange(500) < right
         own.scans[:] = np.arange(500) % 2
         models, fits = fit_classes(own, load_shipped_models())
         assert (models["Car"] == load_shipped_models()["Car"]) == (right < MIN_SAMPLES)
@@ -104,7 +104,7 @@ def test_object_counts_once_and_van_does_not_count(camera: Camera | None):
     expected = {1.0: True, 2.0: True, 4.0: True, 5.0: False}
     if camera is not None:
         del expected[2.0]  # the car behind
-    assert dict(zip(own.evidence["network"].tolist(), own.right.tolist())) == expected
+    assert dict(zip(own.evidence["network"].tolist(), own.correct.tolist())) == expected
     assert set(own.scans.tolist()) == {7}
 
 

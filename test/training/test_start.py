@@ -297,7 +297,7 @@ def test_run_is_not_resumed_with_changed_split_or_weights(tmp_path, monkeypatch)
     def resume() -> str:
         return str(CliRunner().invoke(cli, arguments).exception)
 
-    assert "holds a run" not in resume() + resume()
+    assert "contains a run" not in resume() + resume()
     write(split, "000000\n000001\n000003\n")
     assert "frame_names" in resume() and "init" not in resume()
     write(split, "000000\n000001\n000002\n")

@@ -80,7 +80,7 @@ def test_proposer_is_recorded_and_must_be_pointpillars(cache, tmp_path):
     assert result.exit_code == 0, result.output
     training = read_header(tmp_path / "run/last.safetensors").training
     assert training["params"]["proposer"] == "package"
-    for file, words in ((tmp_path / "none", "no checkpoint"), (find_judge_weights(), "no PointPillars")):
+    for file, words in ((tmp_path / "none", "no checkpoint"), (find_judge_weights(), "not a PointPillars checkpoint")):
         result = train(cache, tmp_path / "bad", **{"--proposer": file})
         assert isinstance(result.exception, InputError) and words in str(result.exception)
         assert not (tmp_path / "bad").exists()

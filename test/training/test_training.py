@@ -177,13 +177,13 @@ def test_settings_without_effect_may_differ_when_resuming():
 
 
 def spoil_batch(toy: Toy, what: str):
-    step, inputs, wanted = next(toy.batches(0))
+    step, inputs, target = next(toy.batches(0))
     if what == "input":
         inputs = inputs.clone()
         inputs[0, 0] = torch.nan
     elif what == "gradient":  # the loss itself is finite
         toy.loss = lambda module, batch: ((module(inputs).sum() * 0).abs().sqrt() + 1, {})
-    return step, inputs, wanted * (torch.inf if what == "loss" else 1)
+    return step, inputs, target * (torch.inf if what == "loss" else 1)
 
 
 @pytest.mark.parametrize("what", ["input", "loss", "gradient"])
@@ -220,11 +220,11 @@ def _with_loss(run: Run, loss) -> Run:
 def test_too_many_nonfinite_steps_in_a_row_are_an_error(tmp_path):
     class Broken(Toy):
         def batches(self, step):
-            for now, inputs, wanted in super().batches(step):
-                yield now, inputs, wanted * (torch.nan if now > 2 else 1)
+            for now, inputs, target in super().batches(step):
+                yield now, inputs, target * (torch.nan if now > 2 else 1)
 
     params = LoopParams(**{**vars(PARAMS), "max_skipped": 4})
-    with pytest.raises(InputError, match="in 4 steps in a row, up to step 7"):
+    with pytest.raises(InputError, match="in 4 consecutive steps, up to step 7"):
         train(Broken().task(), params, tmp_path)
 
 

@@ -28,7 +28,7 @@ from lidar_perception.training.augment import (
     turn_scene,
 )
 from lidar_perception.training.cut_objects import cut_objects, join_databases
-from lidar_perception.training.database import THING, Database, paste_objects, vary_boxed_thing
+from lidar_perception.training.database import BACKGROUND_ID, Database, paste_objects, vary_background_box
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pasting import find_points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
@@ -193,7 +193,7 @@ def test_pasted_objects_touch_nothing_and_keep_points(seed):
     old, count = len(scene.boxes), len(fuller.boxes)
     assert not any_touch(fuller.boxes)
     assert np.array_equal(fuller.boxes[:old], scene.boxes)
-    assert len(fuller.class_ids) == len(fuller.wanted) == count
+    assert len(fuller.class_ids) == len(fuller.detectable) == count
     for kind, most in ((CAR, 4), (PEDESTRIAN, 4), (CYCLIST, 0)):
         present = (fuller.class_ids == kind).sum()
         assert present <= max(most, (scene.class_ids == kind).sum())
@@ -260,16 +260,16 @@ def test_posts_are_pasted_without_boxes():
     post = wall(8.0, (2.9, 3.1), (-1.73, 0.6))
     walker = one_walker(9.0)
     scene = street_with(post, walker.points, wall(11.0, (-8, -5), (-1.73, 0.5)))
-    scene = replace(scene, boxes=walker.boxes, class_ids=walker.class_ids, wanted=np.ones(1, bool))
+    scene = replace(scene, boxes=walker.boxes, class_ids=walker.class_ids, detectable=np.ones(1, bool))
     database = cut_objects(scene, ("Pedestrian",), 5)
-    assert database.class_ids.tolist() == [PEDESTRIAN, THING]
+    assert database.class_ids.tolist() == [PEDESTRIAN, BACKGROUND_ID]
     assert len(cut_objects(scene, ("Car",), 5)) == 0
     box, own = database.boxes[1], database.get_points(1)
     assert (own[:, 0] == 8).all() and len(own) > 0.8 * len(post)
     assert box[:2] == pytest.approx([8, 3], abs=0.05) and box[5] == pytest.approx(2.33, abs=0.1)
     params = replace(STILL, things=1, things_stretch=0, things_intensity=0, things_shine=0)
     fuller = paste_objects(street_with(), database, params, *AREA, np.random.default_rng(0))
-    assert len(fuller.boxes) == len(fuller.class_ids) == len(fuller.wanted) == 0
+    assert len(fuller.boxes) == len(fuller.class_ids) == len(fuller.detectable) == 0
     added = fuller.points[-len(own) :]
     np.testing.assert_allclose(np.hypot(added[:, 0], added[:, 1]), np.hypot(own[:, 0], own[:, 1]), atol=1e-4)
     assert added[:, 2].max() == pytest.approx(0.6, abs=0.1)
@@ -302,7 +302,7 @@ def test_reflector_spans_range_of_heights(seed):
     for box in scene.boxes:
         own = scene.points[find_points_in_box(scene.points, box, 0.0)]
         own[:, 3] = 0.3
-        _, points = vary_boxed_thing(box, own, replace(STILL_THINGS, things_shine=1), rng)
+        _, points = vary_background_box(box, own, replace(STILL_THINGS, things_shine=1), rng)
         bright = points[:, 3] > 0.9
         assert (points[~bright, 3] == np.float32(0.3)).all()
         if bright.any():
@@ -316,12 +316,12 @@ def test_stretched_things_keep_their_foot(seed):
     changes = replace(STILL_THINGS, things_stretch=0.5, things_intensity=0.4)
     for box in scene.boxes:
         own = scene.points[find_points_in_box(scene.points, box, 0.0)]
-        stretched, points = vary_boxed_thing(box, own, changes, rng)
+        stretched, points = vary_background_box(box, own, changes, rng)
         assert len(find_points_in_box(points, stretched, 1e-3)) == len(own)
         assert stretched[2] - stretched[5] / 2 == pytest.approx(box[2] - box[5] / 2)
         assert stretched[[0, 1, 6]] == pytest.approx(box[[0, 1, 6]])
         assert (np.abs(np.log(stretched[3:6] / box[3:6])) <= 0.5).all()
-        same, still = vary_boxed_thing(box, own, STILL_THINGS, rng)
+        same, still = vary_background_box(box, own, STILL_THINGS, rng)
         np.testing.assert_allclose(same, box, atol=1e-12)
         np.testing.assert_allclose(still, own, atol=1e-6)
 

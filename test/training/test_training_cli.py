@@ -95,7 +95,7 @@ def test_trained_network_opens_as_detector(tmp_path, cache, tiny_size):
         "bf16",
     )
     assert other.exit_code == 0, other.output
-    assert "the others begin at random" in other.output
+    assert "the others are initialised at random" in other.output
     assert read_header(tmp_path / "other/last.safetensors").config.high == header.config.high
 
 

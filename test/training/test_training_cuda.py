@@ -25,7 +25,7 @@ def run_on(device: str, version: str, amp: str) -> tuple[Run, list]:
     scene = TrainingScene(
         points=two_objects(),
         boxes=BOXES.numpy().astype(np.float64),
-        wanted=np.ones(2, bool),
+        detectable=np.ones(2, bool),
         class_ids=np.array([CAR, PEDESTRIAN]),
     )
     batch = [ScenePreparation(config, STILL)(scene, np.random.default_rng(0))] * 2

@@ -64,7 +64,7 @@ def test_cached_scans_equal_simulated_ones(tmp_path, monkeypatch):
         monkeypatch.setattr(scenes_module, "simulate_scan", None)  # the second comes from the cache
     monkeypatch.undo()
     (file,) = (tmp_path / "cache").iterdir()
-    file.write_bytes(file.read_bytes()[:100])  # a broken one is made again
+    file.write_bytes(file.read_bytes()[:100])  # a damaged file is computed again
     assert np.array_equal(cached.scan(1)[0].xyz, frame.xyz)
     full = SimulatedScenes(7, 2, SENSOR, cache=tmp_path / "cache", cache_gb=1e-9)
     full.scan(0)
@@ -76,7 +76,7 @@ def test_hidden_simulated_objects_are_not_wanted():
     _, truth = source.scan(0)
     scene = source.scene(0)
     seen = [e["visible"] >= 0.15 and e["num_points"] >= 5 for e in truth.extras]
-    assert scene.around and scene.wanted.tolist() == seen and 0 < sum(seen) < len(seen)
+    assert scene.around and scene.detectable.tolist() == seen and 0 < sum(seen) < len(seen)
     assert drive.simulate_scan(7, 0, SENSOR).frame.xyz.shape == scene.points[:, :3].shape
     assert scene.height == source.frame(0).sensor_height == 1.73
 
@@ -126,7 +126,9 @@ def scene_of_two(**changes) -> TrainingScene:
     boxes = BOXES.numpy().astype(np.float64)
     return TrainingScene(
         **{
-            **dict(points=two_objects(), boxes=boxes, wanted=np.ones(2, bool), class_ids=np.array([CAR, PEDESTRIAN])),
+            **dict(
+                points=two_objects(), boxes=boxes, detectable=np.ones(2, bool), class_ids=np.array([CAR, PEDESTRIAN])
+            ),
             **changes,
         }
     )
@@ -142,7 +144,7 @@ def test_samples_have_inputs_of_version(version):
     sample = ScenePreparation(config, STILL)(scene_of_two(), np.random.default_rng(0))
     assert sample.points.shape[1] == config.point_columns
     assert (sample.cluster_map is not None) == config.pseudo_map
-    assert sample.labels.tolist() == [0, 1] and sample.counted.all()
+    assert sample.labels.tolist() == [0, 1] and sample.is_target.all()
     np.testing.assert_allclose(sample.boxes, BOXES, atol=1e-5)
     loss = make_loss(config, torch.device("cpu"))
     from lidar_perception.detectors.pointpillars.network import make_network
@@ -154,7 +156,7 @@ def test_samples_have_inputs_of_version(version):
 def test_share_of_scenes_gets_pasted_objects(tmp_path):
     cut_objects(scene_of_two(), tiny().classes, 1).save(tmp_path / "objects.npz")
     rng, scene = np.random.default_rng(0), scene_of_two()
-    scene = replace(scene, boxes=scene.boxes[:1], class_ids=scene.class_ids[:1], wanted=scene.wanted[:1])
+    scene = replace(scene, boxes=scene.boxes[:1], class_ids=scene.class_ids[:1], detectable=scene.detectable[:1])
 
     def numbers(crowded: float) -> list[int]:
         prepare = ScenePreparation(
@@ -173,18 +175,18 @@ def test_anchors_on_uncounted_objects_are_ignored():
     whole = ScenePreparation(config, STILL)(scene_of_two(), rng)
     found = labels_of(whole, anchors)
     for scene, prepare in (
-        (scene_of_two(wanted=np.array([False, True])), ScenePreparation(config, STILL)),
+        (scene_of_two(detectable=np.array([False, True])), ScenePreparation(config, STILL)),
         (scene_of_two(class_ids=np.array([VAN, PEDESTRIAN])), ScenePreparation(config, STILL)),
     ):
         sample = prepare(scene, rng)
-        assert sample.counted.tolist() == [False, True]
+        assert sample.is_target.tolist() == [False, True]
         labels = labels_of(sample, anchors)
         assert (labels != 0).all() and torch.equal(labels[kinds == 1], found[kinds == 1])
         near = (labels == IGNORED) & (kinds == 0)
         assert near.any() and (near | (labels == BACKGROUND) | (kinds != 0)).all()
         assert (found[near] != BACKGROUND).all()
     few_points = ScenePreparation(config, STILL, min_points=10**4)(scene_of_two(), rng)
-    assert not few_points.counted.any()
+    assert not few_points.is_target.any()
 
 
 def test_scene_without_points_in_range_is_refused():
@@ -288,7 +290,7 @@ def test_samples_do_not_depend_on_sensor_height():
             assert np.allclose(made.points, usual.points, atol=1e-5)
             assert np.allclose(made.boxes, usual.boxes, atol=1e-5)
             assert np.array_equal(made.labels, usual.labels)
-            assert np.array_equal(made.counted, usual.counted)
+            assert np.array_equal(made.is_target, usual.is_target)
 
 
 @pytest.mark.parametrize("quarter", range(4))

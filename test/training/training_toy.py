@@ -31,9 +31,9 @@ class Toy:
         return Task(self.module, self.loss, self.batches, self.validate, self.save, 4, about)
 
     def loss(self, module, batch):
-        step, inputs, wanted = batch
+        step, inputs, target = batch
         self.before(step)
-        error = (module(inputs) - wanted).square().mean()
+        error = (module(inputs) - target).square().mean()
         return error, {"half": error.detach() / 2}
 
     def batches(self, step):

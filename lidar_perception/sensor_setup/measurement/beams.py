@@ -1,4 +1,4 @@
-"""The beams of the sensor: their elevations, the beam of each point, and the noise along them."""
+"""Beams of the sensor: their elevations, the beam of each point, azimuth step and range noise."""
 
 from __future__ import annotations
 
@@ -11,22 +11,21 @@ from scipy.signal import find_peaks, peak_prominences
 
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-MIN_BEAM_POINTS = 30  # minimum points of a beam in a scan for a fit
+MIN_BEAM_POINTS = 30  # of a beam in a scan
 MAX_BEAMS = 300
-BIN = 0.02  # bin width of the elevation histogram, in degrees
-MIN_RANGE_M = 2.0  # at shorter range, small offsets of a beam change its elevation much
-# Maximum scatter of a beam's points about it in degrees (median over the beams), if beams
-# are identified by the ring column, the order of the points, or the elevation.
+BIN = 0.02  # degrees, of the histogram of elevations
+MIN_RANGE_M = 2.0  # nearer points are ignored, since the beam's offset changes their elevation
+# Largest median scatter of a beam's points in degrees, by the method that identified the beams.
 MAX_SPREAD = {"ring": 3.0, "order": 0.12, "elevation": 0.01}
-MIN_PEAK_SHARE = 0.75  # minimum fraction of points in the inner half of the spacing between peaks
-MIN_USUAL_SHARE = 0.2  # minimum fraction of scans that must agree on a number of beams
-SECTORS = 72  # sectors of a revolution
+MIN_PEAK_SHARE = 0.75  # of the points that are near a peak of the histogram
+MIN_COUNT_SHARE = 0.2  # of the scans that must have the same number of beams
+SECTORS = 72  # of a turn
 MAX_LIFT_ERROR_M = 0.01
-MIN_LIFT_M = 0.03  # beams whose origins are closer together share one origin
-MAX_LIFT_M = 0.5  # larger than any sensor is high
-ANGLE_RESOLUTION = 1e-3  # rounding of angles, in degrees
-MAX_GAP_STEPS = 3.5  # maximum gap, in azimuth steps, whose lost returns are counted
-PIECE_POINTS = 9  # number of neighbouring returns to fit a parabola to
+MIN_LIFT_M = 0.03  # smaller lifts are measurement errors
+MAX_LIFT_M = 0.5  # larger than any sensor
+ANGLE_RESOLUTION = 1e-3  # degrees
+MAX_GAP_STEPS = 3.5  # largest gap of lost returns that is used to measure the azimuth step
+PIECE_POINTS = 9  # neighbouring returns to which a parabola is fitted
 
 
 class Beams(NamedTuple):
@@ -34,10 +33,9 @@ class Beams(NamedTuple):
 
     Attributes:
         elevations: (B,) degrees.
-        lifts: (B,) m along the z axis to the start of the beam; 0 if all start at one point.
-        spread: (B,) median distance of a beam's points from it, degrees.
-        error: (B,) error of the elevation in degrees, from its scatter between scans, or within
-            one.
+        lifts: (B,) z of the origin of each beam, m; 0 if all beams start at one point.
+        spread: (B,) median deviation of a beam's points from its elevation, degrees.
+        error: (B,) standard error of the elevation, degrees.
         labels: Beam of each point of each scan, (N,) int64, -1 for none.
         method: How beams were identified: "ring", "order" or "elevation".
     """
@@ -51,11 +49,11 @@ class Beams(NamedTuple):
 
 
 def find_beams(scans: Sequence[Scan]) -> Beams | None:
-    """Find the beams of a sensor that turns about its z axis.
+    """Find the beams of a sensor that spins about its z axis.
 
     Returns:
-        The beams; None if none are found, for example with a non-repeating scan pattern, or if the
-        frame is rotated relative to the sensor.
+        The beams; None if the scan pattern does not repeat, or if the frame of the cloud is rotated
+        relative to the sensor.
     """
     for method, label in (("ring", _label_by_ring), ("order", _label_by_order), ("elevation", _label_by_elevation)):
         labels = label(scans)
@@ -64,7 +62,7 @@ def find_beams(scans: Sequence[Scan]) -> Beams | None:
         beams = _fit_beams(scans, labels, method)
         if beams is None or len(beams.elevations) < 2:
             continue
-        # A pattern that does not repeat has no beams, even if there is a ring column.
+        # A non-repeating pattern has no beams, even if the cloud has a ring column.
         limit = min(MAX_SPREAD[method], float(np.median(-np.diff(beams.elevations))) / 2)
         if np.median(beams.spread) <= limit and np.abs(beams.lifts).max() <= MAX_LIFT_M:
             return beams
@@ -79,7 +77,7 @@ def _label_by_ring(scans: Sequence[Scan]) -> list[np.ndarray] | None:
 
 
 def _label_by_order(scans: Sequence[Scan]) -> list[np.ndarray] | None:
-    """Label points of clouds like KITTI's, in which each beam's full turn follows the previous."""
+    """Label points by their order, if the cloud contains the turn of one beam after the other, like KITTI's."""
     labels = []
     for scan in scans:
         best: tuple[float, np.ndarray] | None = None
@@ -99,51 +97,50 @@ def _label_by_order(scans: Sequence[Scan]) -> list[np.ndarray] | None:
         if best is None:
             return None
         labels.append(best[1])
-    # A beam without points shifts the numbers of the following ones. Therefore only scans with one number
-    # of beams are used: the greatest common one.
+    # A beam without points shifts the labels of the following beams. So only scans with the largest
+    # frequent number of beams are used.
     shares = np.bincount([int(label[-1]) for label in labels]) / len(labels)
-    usual = int(np.flatnonzero(shares >= min(MIN_USUAL_SHARE, shares.max())).max())
-    return [label if label[-1] == usual else np.full(len(label), -1) for label in labels]
+    last_beam = int(np.flatnonzero(shares >= min(MIN_COUNT_SHARE, shares.max())).max())
+    return [label if label[-1] == last_beam else np.full(len(label), -1) for label in labels]
 
 
 def _label_by_elevation(scans: Sequence[Scan]) -> list[np.ndarray] | None:
     """Label points by the peaks of the histogram of elevations."""
     far = [scan.elevation[scan.range > MIN_RANGE_M] for scan in scans]
-    whole = [scan.elevation for scan in scans]
-    points = np.concatenate(far if sum(map(len, far)) > 0.3 * sum(map(len, whole)) else whole)
+    elevations = [scan.elevation for scan in scans]
+    points = np.concatenate(far if sum(map(len, far)) > 0.3 * sum(map(len, elevations)) else elevations)
     edges = np.arange(-90.0, 90.0 + BIN, BIN)
     counts = gaussian_filter1d(np.histogram(points, edges)[0].astype(float), 1.0)
-    # Relative to several high peaks, since two beams may have the same elevation.
+    # Thresholds are relative to several peaks, since the highest may be two beams of one elevation.
     tall = np.sort(counts)[-20:].mean()
     peaks, _ = find_peaks(counts, height=0.01 * tall, prominence=0.005 * tall)
-    real = [p for p, q in zip(peaks, peak_prominences(counts, peaks)[0]) if q > 0.5 * counts[p]]
-    if not 2 <= len(real) <= MAX_BEAMS:
+    isolated = [p for p, q in zip(peaks, peak_prominences(counts, peaks)[0]) if q > 0.5 * counts[p]]
+    if not 2 <= len(isolated) <= MAX_BEAMS:
         return None
-    middle = (edges[:-1] + edges[1:])[real] / 2
-    borders = np.concatenate([[-90.0], (middle[1:] + middle[:-1]) / 2, [90.0]])
-    room = np.minimum(np.diff(borders)[1:-1], 2.0) if len(middle) > 2 else np.diff(middle)
-    which = np.clip(np.searchsorted(borders, points) - 1, 0, len(middle) - 1)
-    inner: np.ndarray = np.abs(points - middle[which]) < np.median(room) / 4
-    if inner.mean() < MIN_PEAK_SHARE:
+    centers = (edges[:-1] + edges[1:])[isolated] / 2
+    borders = np.concatenate([[-90.0], (centers[1:] + centers[:-1]) / 2, [90.0]])
+    spacing = float(np.median(np.minimum(np.diff(borders)[1:-1], 2.0) if len(centers) > 2 else np.diff(centers)))
+    highest = len(centers) - 1
+    nearest = np.clip(np.searchsorted(borders, points) - 1, 0, highest)
+    is_near_peak: np.ndarray = np.abs(points - centers[nearest]) < spacing / 4
+    if is_near_peak.mean() < MIN_PEAK_SHARE:
         return None
-    highest = len(middle) - 1
-    reach = np.median(room) / 2
     labels = []
-    for elevation in whole:
-        k = np.clip(np.searchsorted(borders, elevation) - 1, 0, highest)
-        labels.append(np.where(np.abs(elevation - middle[k]) < max(reach, 0.1), highest - k, -1))
+    for elevation in elevations:
+        nearest = np.clip(np.searchsorted(borders, elevation) - 1, 0, highest)
+        labels.append(np.where(np.abs(elevation - centers[nearest]) < max(spacing / 2, 0.1), highest - nearest, -1))
     return labels
 
 
 class _Points(NamedTuple):
-    """Points of one beam in all scans: distance from the axis and z in m, and scan and sector."""
+    """Points of one beam in all scans: distance from the z axis and z (m), and SECTORS * scan + sector."""
 
     distance: np.ndarray
     z: np.ndarray
     sector: np.ndarray
 
     def elevation(self, lift: float) -> np.ndarray:
-        """Return elevations in degrees as seen from `lift` metres up the axis."""
+        """Return elevations in degrees, seen from the point (0, 0, lift)."""
         return np.degrees(np.arctan2(self.z - lift, self.distance))
 
 
@@ -170,16 +167,16 @@ def _fit_beams(scans: Sequence[Scan], labels: list[np.ndarray], method: str) -> 
     if len(known) < 2:
         return None
     beams = [_Points(*map(np.concatenate, zip(*rows[k]))) for k in known]
-    lifts, sure = _fit_lifts(beams)
+    lifts, reliable = _fit_lifts(beams)
     elevations, spread, error = (np.empty(len(known)) for _ in range(3))
     for n, (beam, lift) in enumerate(zip(beams, lifts)):
         up = beam.elevation(lift)
         elevations[n], spread[n] = np.median(up), _mad(up)
-        # With few scans, the parts of one scan differ more than the scans.
+        # With few scans, the error comes from the scatter between quarters of the scans.
         part = beam.sector // SECTORS if len(scans) >= 5 else beam.sector // (SECTORS // 4)
         middles = np.array([np.median(up[part == i]) for i in np.unique(part)])
         error[n] = 1.2533 * 1.4826 * _mad(middles) / np.sqrt(len(middles))
-        if lifts.any() and not sure[n]:
+        if lifts.any() and not reliable[n]:
             error[n] += np.degrees(MAX_LIFT_ERROR_M / np.median(beam.distance))
     down = np.argsort(-elevations, kind="stable")
     # Beams with indistinguishable elevations count as one.
@@ -192,36 +189,36 @@ def _fit_beams(scans: Sequence[Scan], labels: list[np.ndarray], method: str) -> 
 
 
 def _fit_lifts(beams: list[_Points]) -> tuple[np.ndarray, np.ndarray]:
-    """Fit where each beam starts on the axis: the line z = lift + tan(elevation) * distance.
+    """Fit the origin of each beam on the z axis with the line z = lift + tan(elevation) * distance.
 
     Returns:
-        (B,) lifts in metres, and (B,) bool of the beams whose points have enough different
-        distances to show it. The other beams get the lift of their neighbours. All lifts are 0
-        unless the sure ones differ from 0.
+        lifts: (B,) m. A beam whose points have too similar distances gets the lift of its
+            neighbours. All are 0 if the reliable lifts are below MIN_LIFT_M.
+        reliable: (B,) bool, beams whose lift was measured.
     """
-    lift, sure = np.zeros(len(beams)), np.zeros(len(beams), bool)
+    lift, reliable = np.zeros(len(beams)), np.zeros(len(beams), bool)
     for n, beam in enumerate(beams):
         every = max(1, len(beam.z) // 20_000)
         distance, z = beam.distance[::every], beam.z[::every]
-        weight = 1.0 / np.maximum(distance, 0.5)  # turns the residuals into angles
-        kept, off = np.ones(len(z), bool), np.zeros(len(z))
+        weight = 1.0 / np.maximum(distance, 0.5)  # so that residuals are angles
+        inliers, residual = np.ones(len(z), bool), np.zeros(len(z))
         for _ in range(4):
-            if kept.sum() < MIN_BEAM_POINTS:
+            if inliers.sum() < MIN_BEAM_POINTS:
                 break
-            a = np.column_stack([np.ones(kept.sum()), distance[kept]]) * weight[kept, None]
-            (lift[n], slope), *_ = np.linalg.lstsq(a, z[kept] * weight[kept], rcond=None)
-            off = np.abs(z - lift[n] - slope * distance) * weight
-            kept = off <= max(3 * 1.4826 * float(np.median(off)), 1e-5)
-        reach = float(np.subtract(*np.percentile(weight, [90, 10])))
-        scatter = 1.4826 * float(np.median(off))
-        # Returns of one sector are similar, so they count as one sample.
-        sure[n] = reach > 0.04 and scatter / reach / np.sqrt(len(np.unique(beam.sector))) < MAX_LIFT_ERROR_M
-    if not sure.any() or np.median(np.abs(lift[sure])) < MIN_LIFT_M:
-        return np.zeros(len(beams)), sure
-    known = np.flatnonzero(sure)
-    for n in np.flatnonzero(~sure).tolist():
-        lift[n] = np.median(lift[known[np.argsort(np.abs(known - n))[:5]]])
-    return lift, sure
+            a = np.column_stack([np.ones(inliers.sum()), distance[inliers]]) * weight[inliers, None]
+            (lift[n], slope), *_ = np.linalg.lstsq(a, z[inliers] * weight[inliers], rcond=None)
+            residual = np.abs(z - lift[n] - slope * distance) * weight
+            inliers = residual <= max(3 * 1.4826 * float(np.median(residual)), 1e-5)
+        span = float(np.subtract(*np.percentile(weight, [90, 10])))
+        scatter = 1.4826 * float(np.median(residual))
+        # Returns of one sector are similar and count as one.
+        reliable[n] = span > 0.04 and scatter / span / np.sqrt(len(np.unique(beam.sector))) < MAX_LIFT_ERROR_M
+    if not reliable.any() or np.median(np.abs(lift[reliable])) < MIN_LIFT_M:
+        return np.zeros(len(beams)), reliable
+    references = np.flatnonzero(reliable)
+    for n in np.flatnonzero(~reliable).tolist():
+        lift[n] = np.median(lift[references[np.argsort(np.abs(references - n))[:5]]])
+    return lift, reliable
 
 
 def _mad(values: np.ndarray) -> float:
@@ -229,10 +226,12 @@ def _mad(values: np.ndarray) -> float:
 
 
 def measure_azimuth_step(scans: Sequence[Scan], beams: Beams) -> tuple[float, float]:
-    """Return the azimuth step in degrees, and the share of second returns.
+    """Measure the azimuth step and the share of second returns.
 
-    The step is the distance of neighbouring firings of a beam, the median over beams and scans; NaN
-    if no beam has enough points. Second returns have the azimuth of their neighbour.
+    Returns:
+        step: Angle between neighbouring firings of a beam in degrees, the median over beams and
+            scans; NaN if no beam has enough points.
+        second_returns: Share of the points that have the same azimuth as their neighbour.
     """
     steps, doubles = [], []
     for scan, label in zip(scans, beams.labels):
@@ -247,8 +246,7 @@ def measure_azimuth_step(scans: Sequence[Scan], beams: Beams) -> tuple[float, fl
             gaps = gaps[gaps >= ANGLE_RESOLUTION]
             if len(gaps) < MIN_BEAM_POINTS // 2:
                 continue
-            # Encoders round azimuths, so gaps differ and their mean is used. A gap of lost returns
-            # has several steps.
+            # The mean, since encoders round azimuths. A gap of lost returns spans several steps.
             step = float(np.median(gaps))
             for _ in range(3):
                 used = gaps[(gaps > 0.4 * step) & (gaps < MAX_GAP_STEPS * step)]
@@ -260,10 +258,10 @@ def measure_azimuth_step(scans: Sequence[Scan], beams: Beams) -> tuple[float, fl
 
 
 def measure_range_noise(scans: Sequence[Scan], beams: Beams, step: float) -> float:
-    """Return the standard deviation of ranges about smooth surfaces in m; NaN if unknown.
+    """Return the standard deviation of the range on smooth surfaces in m; NaN if unknown.
 
-    A parabola is fitted to pieces of PIECE_POINTS neighbouring returns of a beam. Pieces on rough
-    surfaces scatter more, so the peak of the distribution counts.
+    Parabolas are fitted to PIECE_POINTS neighbouring returns of a beam. The result is the most
+    frequent residual, since residuals on rough surfaces are larger.
 
     Args:
         step: Azimuth step in degrees.

@@ -13,29 +13,28 @@ from lidar_perception.sensor_setup.measurement.beams import Beams
 from lidar_perception.sensor_setup.measurement.mount import Mount
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-SECTORS = 360  # sectors of a revolution
-NEAR_BODY_M = 1.0  # constant returns this close come from the robot, even if it stands still
-MAX_BODY_M = 4.0  # constant returns this close come from the robot if it moves
-MAX_ROBOT_SIZE_M = (5.5, 2.6)  # maximum length and width, those of a van
-MAX_BODY_SHARE = 0.3  # maximum fraction of all points; more points are walls along the robot's path
-MAX_FOREIGN_SHARE = 0.2  # max fraction of points in the body box that do not belong to the robot
-MIN_BODY_SCANS = 0.7  # minimum fraction of scans with a return from the body
-MAX_BODY_VARIATION_M = 0.06  # maximum variation of the body's range
-MIN_BODY_HEIGHT_M = 0.15  # minimum height of the body above the ground
-MIN_CELLS = 20  # minimum number of (sector, beam) cells; fewer may be chance
-MARGIN_M = 0.05  # margin around the body box
-MIN_FAR_M = 4.0  # minimum range of far returns, which show whether the robot moves
-MIN_CHANGE_M = 0.3  # a far return has changed if its range differs by this much between scans
-QUANTILES = (0.1, 0.9)  # quantiles over the scans to compare, so that passers-by do not count
-MAX_STILL_SHARE = 0.3  # if a smaller fraction of far returns changed, the robot stands still
-MAX_GROUND_RANGE_M = 30.0  # maximum range at which the ground reliably returns
-MIN_BLIND = 3  # minimum width of a blind sector in degrees; narrower gaps may be chance
-MIN_SEEN_SHARE = 0.35  # min fraction of sectors with a return for a beam to be informative
-ROW_STEP = 2.0  # elevation step between rows if there are no beams, in degrees
+SECTORS = 360  # of a turn
+NEAR_BODY_M = 1.0  # constant returns this near are the robot's, even if it stands still
+MAX_BODY_M = 4.0  # constant returns this near are the robot's if it drives
+MAX_ROBOT_SIZE_M = (5.5, 2.6)  # length and width, up to a van
+MAX_BODY_SHARE = 0.3  # of all points; more are walls along the robot's path
+MAX_FOREIGN_SHARE = 0.2  # of the points in the box of the robot's body
+MIN_BODY_SCANS = 0.7  # share of the scans with a return of the body
+MAX_BODY_VARIATION_M = 0.06  # of its range
+MIN_BODY_HEIGHT_M = 0.15  # above the ground
+MIN_CELLS = 20  # smallest body, in cells of one sector and beam
+MARGIN_M = 0.05  # around the body
+# The robot stands still if less than MAX_CHANGED_SHARE of the returns beyond MIN_FAR_M change their
+# range by MIN_CHANGE_M between these quantiles of the scans (extremes are people passing by).
+MIN_FAR_M, MIN_CHANGE_M, QUANTILES, MAX_CHANGED_SHARE = 4.0, 0.3, (0.1, 0.9), 0.3
+MAX_GROUND_RANGE_M = 30.0  # nearer ground gives a return
+MIN_BLIND = 3  # degrees; narrower gaps are noise
+MIN_SEEN_SHARE = 0.35  # of the sectors with a return, for a beam that can show blind sectors
+ROW_STEP = 2.0  # degrees between rows if there are no beams
 
 
 class Coverage(NamedTuple):
-    """Coverage by R rows (beams) and 360 sectors.
+    """Field of view and occlusions of a sensor, on a grid of R rows (beams) and 360 sectors.
 
     Attributes:
         rows: (R,) elevations in degrees of the beams, or of rows without beams, descending.
@@ -44,9 +43,9 @@ class Coverage(NamedTuple):
         box: (6,) box around the body's points, lower then upper corner, m; empty without any.
         foreign_share: Share of the points in the box that are not the body's.
         body_share: Share of all points that are the body's.
-        has_walls: More returns are constant than a robot's body has, as with walls along its path.
-            Then only returns within NEAR_BODY_M count as body.
-        still: The robot stood still; None if unknown.
+        has_walls: The constant returns are too many for a robot's body, for example because of walls
+            along its path. Then only returns within NEAR_BODY_M count as body.
+        stationary: The robot stands still; None if unknown.
         blocked: (first row, from, to) of blind sectors, degrees counter-clockwise.
         view: (from, to) of the azimuths with returns, degrees.
     """
@@ -58,13 +57,13 @@ class Coverage(NamedTuple):
     foreign_share: float
     body_share: float
     has_walls: bool
-    still: bool | None
+    stationary: bool | None
     blocked: list[tuple[int, float, float]]
     view: tuple[float, float]
 
     @property
     def can_crop(self) -> bool:
-        """True if the box can be cropped: it has no walls, and few other points or a small size."""
+        """True if cropping the box removes little but the body: no walls, few other points or a small box."""
         return (
             len(self.box) > 0
             and not self.has_walls
@@ -73,7 +72,7 @@ class Coverage(NamedTuple):
 
 
 class NearestReturns(NamedTuple):
-    """NearestReturns returns of S scans by R rows and 360 sectors.
+    """Nearest return of each cell in S scans, on a grid of R rows and 360 sectors.
 
     Attributes:
         rows: (R,) elevations, see Coverage.
@@ -87,27 +86,27 @@ class NearestReturns(NamedTuple):
 
 
 def find_nearest_returns(scans: Sequence[Scan], beams: Beams | None) -> NearestReturns:
-    """Return the nearest returns of each scan."""
+    """Find the nearest return of each scan in each cell."""
     rows, labels = _assign_rows(scans, beams)
     ranges = np.full((len(scans), len(rows), SECTORS), np.inf, np.float32)
     for image, scan, label in zip(ranges, scans, labels):
-        known = label >= 0
-        np.minimum.at(image, (label[known], _to_sectors(scan)[known]), scan.range[known].astype(np.float32))
+        valid = label >= 0
+        np.minimum.at(image, (label[valid], _to_sectors(scan)[valid]), scan.range[valid].astype(np.float32))
     return NearestReturns(rows, labels, ranges)
 
 
 def measure_coverage(
-    scans: Sequence[Scan], nearest: NearestReturns, mount: Mount | None, still: bool | None
+    scans: Sequence[Scan], nearest: NearestReturns, mount: Mount | None, stationary: bool | None
 ) -> Coverage:
-    """Measure the coverage of all scans together.
+    """Measure field of view, blind sectors and the robot's body on all scans together.
 
     Args:
         mount: Mount of the sensor; None if unknown.
-        still: The robot stands still; None if unknown.
+        stationary: The robot stands still; None if unknown.
     """
     rows, labels, ranges = nearest
     seen = np.isfinite(ranges).mean(axis=0)
-    body, middle = _find_body(ranges, rows, mount, still)
+    body, middle = _find_body(ranges, rows, mount, stationary)
     own, box = _select_body(scans, labels, body, middle)
     total = sum(len(scan.xyz) for scan in scans)
     wide, long = np.sort(box[3:5] - box[:2]) if len(box) else (0.0, 0.0)
@@ -117,13 +116,13 @@ def measure_coverage(
     if has_walls:
         body = _drop_small(body & (middle < NEAR_BODY_M))
         own, box = _select_body(scans, labels, body, middle)
-    # Only cells that point at the ground can be blind; a tilted sensor sees the sky in others.
+    # A cell without returns is blind only if it points to the ground; others may point to the sky.
     sees_ground = (
         np.zeros(seen.shape, bool)
         if mount is None
         else (_cell_directions(rows) @ mount.normal * MAX_GROUND_RANGE_M < -mount.height)
     )
-    sees_ground |= not sees_ground.any()  # unknown, for example high above the ground
+    sees_ground |= not sees_ground.any()  # no cell reaches the ground, for example on a tall vehicle
     open_ = (seen > 0).any(axis=0) | ~sees_ground.any(axis=0)
     inside = [~select_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
     foreign = float(sum((i & ~m).sum() for i, m in zip(inside, own)) / max(1, sum(i.sum() for i in inside)))
@@ -135,22 +134,22 @@ def measure_coverage(
         foreign,
         sum(m.sum() for m in own) / max(1, total),
         has_walls,
-        still,
+        stationary,
         [],
         _find_view(open_),
     )
-    # If the robot stands still, it may be a person next to the robot.
-    hiding = body & (coverage.can_crop and still is False)
+    # If the robot stands still, the constant returns may be a person next to it.
+    hiding = body & (coverage.can_crop and stationary is False)
     return coverage._replace(blocked=_find_blocked(((seen == 0) & sees_ground) | hiding, open_, seen, hiding))
 
 
 def _select_body(
     scans: Sequence[Scan], labels: Sequence[np.ndarray], body: np.ndarray, middle: np.ndarray
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Select the points in cells of the body (R, 360) at the cells' ranges.
+    """Select the points of the body: in its cells (R, 360), at their median range (R, 360).
 
     Returns:
-        (N,) bool for each scan, and the box (6,) around these points, empty without any.
+        (N,) bool for each scan, and the box (6,) around these points, empty without points.
     """
     own = [
         _look_up(scan, label, body, False)
@@ -160,7 +159,7 @@ def _select_body(
     points = np.concatenate([scan.xyz[m] for scan, m in zip(scans, own)])
     if not len(points):
         return own, np.zeros(0)
-    # A few returns near the body, for example from people, do not enlarge the box.
+    # Percentiles, so that a few returns next to the body do not widen the box.
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
     return own, np.concatenate([low - MARGIN_M, high + MARGIN_M])
 
@@ -177,18 +176,18 @@ def _to_sectors(scan: Scan) -> np.ndarray:
 
 
 def _look_up(scan: Scan, labels: np.ndarray, cells: np.ndarray, default: float) -> np.ndarray:
-    """Return the values (N,) of cells (R, 360) at each point, default for points of no row."""
+    """Return the value of each point's cell in cells (R, 360), as (N,); default for points without a row."""
     return np.where(labels >= 0, cells[labels, _to_sectors(scan)], default).astype(cells.dtype)
 
 
-def is_standing_still(ranges: np.ndarray) -> bool | None:
-    """Return True if far returns are mostly constant, so that the robot stands still.
+def is_stationary(ranges: np.ndarray) -> bool | None:
+    """Return True if most far returns are constant, which shows that the robot stands still.
 
     Args:
-        ranges: (S, R, 360) ranges in m of S scans, inf without a return.
+        ranges: (S, R, 360) ranges of S scans in m, inf without a return.
 
     Returns:
-        None for one scan, or with too few far returns.
+        True or False; None for a single scan, or with too few far returns.
     """
     if len(ranges) < 2:
         return None
@@ -201,27 +200,25 @@ def is_standing_still(ranges: np.ndarray) -> bool | None:
     far = first + last > 2 * MIN_FAR_M
     if far.sum() < 100:
         return None
-    return bool(((last - first)[far] > MIN_CHANGE_M).mean() < MAX_STILL_SHARE)
+    return bool(((last - first)[far] > MIN_CHANGE_M).mean() < MAX_CHANGED_SHARE)
 
 
 def _find_body(
-    ranges: np.ndarray, rows: np.ndarray, mount: Mount | None, still: bool | None
+    ranges: np.ndarray, rows: np.ndarray, mount: Mount | None, stationary: bool | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (R, 360) bool of cells with a constant near return, and the median ranges."""
-    found = np.isfinite(ranges)
-    share = found.mean(axis=0)
-    filled = np.where(found, ranges, np.nan)
-    none = ~found.any(axis=0)
-    filled[:, none] = 1e9
-    middle = np.nanmedian(filled, axis=0)
-    varies = np.nanmedian(np.abs(filled - middle), axis=0)
-    steady = (share >= MIN_BODY_SCANS) & (varies <= MAX_BODY_VARIATION_M) & (len(ranges) >= 3)
-    if still is False and len(ranges) >= 5 and mount is not None:  # otherwise the floor would count as body
-        body = steady & (middle < MAX_BODY_M)
-        body &= middle * (_cell_directions(rows) @ mount.normal) + mount.height > MIN_BODY_HEIGHT_M
+    """Return the cells with a constant near return, (R, 360) bool, and the median ranges (R, 360)."""
+    has_return = np.isfinite(ranges)
+    filled = np.where(has_return, ranges, np.nan)
+    filled[:, ~has_return.any(axis=0)] = 1e9
+    median = np.nanmedian(filled, axis=0)
+    variation = np.nanmedian(np.abs(filled - median), axis=0)
+    constant = (has_return.mean(axis=0) >= MIN_BODY_SCANS) & (variation <= MAX_BODY_VARIATION_M) & (len(ranges) >= 3)
+    if stationary is False and len(ranges) >= 5 and mount is not None:  # else the floor would count
+        body = constant & (median < MAX_BODY_M)
+        body &= median * (_cell_directions(rows) @ mount.normal) + mount.height > MIN_BODY_HEIGHT_M
     else:
-        body = steady & (middle < NEAR_BODY_M)
-    return _drop_small(body), middle
+        body = constant & (median < NEAR_BODY_M)
+    return _drop_small(body), median
 
 
 def _drop_small(body: np.ndarray) -> np.ndarray:
@@ -237,14 +234,17 @@ def _cell_directions(rows: np.ndarray) -> np.ndarray:
 def _find_blocked(
     blind: np.ndarray, open_: np.ndarray, seen: np.ndarray, body: np.ndarray
 ) -> list[tuple[int, float, float]]:
-    """Return sectors in which a beam and all lower ones are blind; all beams outside open_ (360,).
+    """Find sectors in which a beam and all lower beams are blind; outside open_ (360,), all beams are.
 
-    Beams with few returns, such as those to the sky, show no blind sectors.
+    Beams with few returns, such as those into the sky, cannot show blind sectors and are ignored.
+
+    Returns:
+        (first row, from, to) of each sector, in degrees.
     """
     informative = (seen[:, open_] > 0).mean(axis=1) >= MIN_SEEN_SHARE if open_.any() else np.zeros(len(seen), bool)
     if not informative.any():
         return []
-    # Lowest informative beam with a return in each sector, counted from below.
+    # The lowest informative beam with a return in each sector.
     hidden = np.where(informative[:, None], blind, True)
     lowest = len(blind) - np.cumprod(hidden[::-1], axis=0).sum(axis=0)
     candidates = np.append(np.flatnonzero(informative), len(blind))
@@ -253,7 +253,7 @@ def _find_blocked(
         first = np.where((first == row + 1) & body[row], row, first)
     first = np.where(open_, first, 0)
     out = []
-    step = max(1, len(blind) // 16)  # rounded, so that neighbours merge
+    step = max(1, len(blind) // 16)  # coarse rows, so that adjacent sectors merge
     level = np.where(first < len(blind), -(-first // step) * step, len(blind))
     level = np.minimum(level, np.where(first < len(blind), len(blind) - 1, len(blind)))
     turn = int(np.argmax(np.diff(level, prepend=level[-1]) != 0))
@@ -266,7 +266,7 @@ def _find_blocked(
 
 
 def _find_view(open_: np.ndarray) -> tuple[float, float]:
-    """Return the azimuths from the end of the widest gap to its beginning; 0, 360 without a gap."""
+    """Return the field of view (from, to) in degrees, which leaves out the widest gap; (0, 360) without a gap."""
     if not open_.any() or open_.all():
         return 0.0, 360.0
     turn = int(np.argmax(open_))

@@ -15,7 +15,7 @@ from lidar_perception.sensor_setup.measurement.beams import Beams, find_beams, m
 from lidar_perception.sensor_setup.measurement.coverage import (
     Coverage,
     find_nearest_returns,
-    is_standing_still,
+    is_stationary,
     measure_coverage,
 )
 from lidar_perception.sensor_setup.measurement.motion import (
@@ -34,20 +34,19 @@ from lidar_perception.sensor_setup.measurement.timing import Timing, measure_tim
 from lidar_perception.simulation.sensor import SENSOR_NAMES, find_sensor
 from lidar_perception.types import InputError
 
-MAX_MODEL_ERROR = 0.15  # median difference in degrees between beams of two sensors of one model
-# The same for a different number of beams, as a fraction of the model's beam spacing. Beams of any
-# sensor are a quarter of it from the nearest beam.
+MAX_MODEL_ERROR = 0.15  # degrees, median difference between beams of the sensor and of its model
+# Limit if beams are missing, as a share of the model's beam spacing; a random sensor has 1 / 4.
 MAX_PARTIAL_ERROR = 1 / 6
 MIN_SCANS = 5  # fewer cannot separate the robot from its surroundings
-MIN_OUTDOOR_RANGE_M = 30.0  # if all returns are closer, the room limits the range instead of the sensor
-MAX_OWN_SPREAD = 0.01  # spread of a beam's elevations in degrees above which the points have been transformed
-MIN_MOTION_M = 0.1  # a robot that moved less is considered standing
-MIN_POSE_MOTION_M = 2.0  # minimum motion according to the poses, which drift while the robot stands
-PEOPLE_ELEVATIONS = (-15.0, 5.0)  # elevations of beams that hit people, in degrees
+MIN_OUTDOOR_RANGE_M = 30.0  # if nothing is farther, the room limits the range and not the sensor
+MAX_RAW_SPREAD = 0.01  # degrees between points of a beam in a raw cloud
+MIN_MOTION_M = 0.1  # a robot that moves less stands still
+MIN_POSE_MOTION_M = 2.0  # the same by recorded poses, which drift
+PEOPLE_ELEVATIONS = (-15.0, 5.0)  # degrees, of the beams that hit people
 
 
 class CloudSource(NamedTuple):
-    """Measured clouds. name: of the recording; total: number of its clouds."""
+    """Clouds that were measured, with the name of their recording and the total number of clouds in it."""
 
     name: str
     scans: tuple[Scan, ...]
@@ -65,14 +64,14 @@ class CloudSource(NamedTuple):
 
 
 class ScanPattern(NamedTuple):
-    """Beams of the sensor.
+    """Scan pattern of the sensor.
 
     Attributes:
         beams: The beams; None if there are none.
-        azimuth_step: Degrees, NaN without beams.
+        azimuth_step: Angle between two firings in degrees, NaN without beams.
         second_returns: Share of the points that are second returns.
-        range_noise: Metres, NaN if unknown.
-        model: Sensor of config/sensors with such beams, "" for none.
+        range_noise: Standard deviation of the range in metres, NaN if unknown.
+        model: Sensor of config/sensors with the same beams, "" for none.
     """
 
     beams: Beams | None
@@ -83,15 +82,12 @@ class ScanPattern(NamedTuple):
 
     @property
     def is_moved(self) -> bool:
-        """True if points are not where the sensor measured them, as after motion correction."""
-        return self.beams is not None and float(np.median(self.beams.spread)) > MAX_OWN_SPREAD
+        """True if points are not where the sensor measured them, for example after motion correction."""
+        return self.beams is not None and float(np.median(self.beams.spread)) > MAX_RAW_SPREAD
 
     @property
     def prefers_model(self) -> bool:
-        """True if the model's beams are more reliable than the measured ones, which agree.
-
-        That is so if points were moved, or beams are missing.
-        """
+        """True if the model's beams are more reliable: points were moved, or beams have no returns."""
         if not self.model or self.beams is None:
             return False
         count, model_count = len(self.beams.elevations), find_sensor(self.model).rings
@@ -99,7 +95,7 @@ class ScanPattern(NamedTuple):
 
 
 class View(NamedTuple):
-    """Coverage of the sensor, and the range of returns that are not of the robot, in metres."""
+    """Coverage of the sensor, and the nearest and farthest return (m) outside the robot's body."""
 
     coverage: Coverage
     min_range: float
@@ -110,11 +106,11 @@ class Mounting(NamedTuple):
     """Mounting of the sensor on the robot.
 
     Attributes:
-        mount: Pose over the ground; None if unknown.
-        on_ground: The origin of the clouds is on the ground, and the mount is unknown.
-        heading: Direction in which the robot drives; None without ground.
+        mount: Pose above the ground; None if unknown.
+        on_ground: The origin of the clouds is on the ground, so the mount is unknown.
+        heading: Driving direction of the robot; None if no ground was found.
         recorded: Poses in the recording.
-        height_hint: Height that the user gave in metres; None without one.
+        height_hint: Height given by the user in metres; None if not given.
     """
 
     mount: Mount | None
@@ -126,7 +122,7 @@ class Mounting(NamedTuple):
 
 @dataclass(frozen=True)
 class SensorMeasurement:
-    """Everything that was measured."""
+    """Result of measure_sensor. intensity is None if the clouds have no usable intensity."""
 
     source: CloudSource
     pattern: ScanPattern
@@ -161,32 +157,35 @@ def measure_sensor(
     """Measure a sensor and its mounting.
 
     Args:
-        numbers: Their numbers in the recording.
+        scans: Scans of the recording.
+        numbers: Numbers of the scans in the recording.
         source: Name of the recording.
         total: Number of clouds in the recording.
-        stamps_ns: Stamps of all clouds in ns; None without any.
+        stamps_ns: Stamps of all clouds of the recording in ns; None if they have none.
         recorded: Poses in the recording.
         height_hint: Height of the sensor in metres, if known.
 
     Raises:
-        InputError: The clouds are of several drivers, or of a 2D scanner.
+        InputError: The clouds have several layouts, or come from a 2D scanner.
     """
     if len({scan.columns for scan in scans}) > 1:
         raise InputError(
             f"{source} has clouds of several layouts ({', '.join(scans[0].columns)} "
-            "and others), as of several sensors; give those of one"
+            "and others), probably of several sensors; use the clouds of one sensor"
         )
     require_3d(np.concatenate([scan.elevation for scan in scans]), source)
     pattern = _measure_pattern(scans)
     mount = measure_mount(scans)
     nearest = find_nearest_returns(scans, pattern.beams)
-    # On a field, the uniform surroundings of a moving robot look constant.
-    still = False if recorded.distance >= MIN_POSE_MOTION_M else is_standing_still(nearest.ranges)
-    heading = _find_heading(scans, numbers, mount, still, recorded)
-    # People and doors change the surroundings of a standing robot.
-    still = True if len(scans) > 1 and _measure_distance(scans, mount, heading, recorded) < MIN_MOTION_M else still
-    view = _measure_view(scans, measure_coverage(scans, nearest, mount, still))
-    # Level beams of the sensor itself are in a plane through its origin, too.
+    # Uniform surroundings, such as a field, look constant although the robot moves.
+    stationary = False if recorded.distance >= MIN_POSE_MOTION_M else is_stationary(nearest.ranges)
+    heading = _find_heading(scans, numbers, mount, stationary, recorded)
+    # People and doors change the surroundings although the robot stands still.
+    stationary = (
+        True if len(scans) > 1 and _measure_distance(scans, mount, heading, recorded) < MIN_MOTION_M else stationary
+    )
+    view = _measure_view(scans, measure_coverage(scans, nearest, mount, stationary))
+    # The level beams of a sensor also are in a plane through its origin.
     may_be_on_ground = mount is None and (pattern.beams is None or pattern.is_moved)
     return SensorMeasurement(
         CloudSource(source, tuple(scans), total),
@@ -204,7 +203,7 @@ def _measure_pattern(scans: Sequence[Scan]) -> ScanPattern:
     if beams is not None:
         step, second_returns = measure_azimuth_step(scans, beams)
         noise = measure_range_noise(scans, beams, step)
-    return ScanPattern(beams, step, second_returns, noise, match_model(beams))
+    return ScanPattern(beams, step, second_returns, noise, find_matching_model(beams))
 
 
 def _measure_view(scans: Sequence[Scan], coverage: Coverage) -> View:
@@ -220,14 +219,14 @@ def _measure_view(scans: Sequence[Scan], coverage: Coverage) -> View:
 
 
 def _find_heading(
-    scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None, still: bool | None, recorded: RecordedPoses
+    scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None, stationary: bool | None, recorded: RecordedPoses
 ) -> Heading | None:
     if mount is None:
         return None
-    shifts = find_shifts(draw_images(_level_scans(scans, mount), moves=still is False), numbers)
+    shifts = find_shifts(draw_images(_level_scans(scans, mount), moves=stationary is False), numbers)
     if recorded.base or not recorded.poses:
         return estimate_heading(shifts, compute_shifts(recorded.poses, shifts))
-    # Odometry of the sensor itself gives its motion, but not the x axis of a base.
+    # Odometry of the sensor itself shows its motion, but not the x axis of the base.
     level = invert_pose(mount.pose)
     poses = {number: sensor @ level for number, sensor in recorded.poses.items()}
     return estimate_heading(compute_shifts(poses, shifts), {})
@@ -240,13 +239,13 @@ def _level_scans(scans: Sequence[Scan], mount: Mount) -> list[np.ndarray]:
 def _measure_distance(
     scans: Sequence[Scan], mount: Mount | None, heading: Heading | None, recorded: RecordedPoses
 ) -> float:
-    """Return the distance that the robot covered in metres, NaN if unclear.
+    """Return the distance travelled in metres, NaN if unknown.
 
-    It comes from the poses, else from clouds near each other and from the first and the last one,
-    since the robot may be slow.
+    Without recorded poses it is the largest shift between neighbouring clouds, or between the first
+    and the last cloud if the robot is slow.
     """
     distance = recorded.distance
-    # If only some clouds have poses, the robot may have been standing there.
+    # If only some clouds have poses, the robot may have stopped at these.
     if len(recorded.poses) == len(scans) or distance >= MIN_MOTION_M:
         return distance
     if mount is None or heading is None:
@@ -256,8 +255,8 @@ def _measure_distance(
     return np.nan if shift is None else float(np.maximum(heading.distance, np.hypot(*shift)))
 
 
-def match_model(beams: Beams | None) -> str:
-    """Return the sensor of config/sensors that has these beams, or most of them; "" for none."""
+def find_matching_model(beams: Beams | None) -> str:
+    """Return the name of the sensor in config/sensors with these beams, or most of them; "" for none."""
     best, error = "", MAX_MODEL_ERROR
     if beams is None:
         return best

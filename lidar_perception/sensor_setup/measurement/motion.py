@@ -1,4 +1,4 @@
-"""Motion of the robot between scans, seen from above, and its heading in the sensor's frame."""
+"""Motion of the robot between scans by correlation of bird's-eye images, and its heading."""
 
 from __future__ import annotations
 
@@ -10,40 +10,40 @@ from scipy.fft import irfft2, rfft2
 
 from lidar_perception.geometry import wrap_angle
 
-CELL_M, HALF_SIZE_M = 0.2, 40.0  # cell size and half width of the BEV images
-LOW_M, HIGH_M = 0.3, 3.0  # heights above the ground of the points in these images
-MIN_SHIFT_M = 0.3  # minimum shift that gives a direction
-MIN_PEAK_RATIO = 1.2  # minimum ratio of a clear peak to the rest of the correlation
-PEAK_HALF_SIZE = 5  # cells around a peak that are excluded from the rest
-# Cells occupied in this fraction of the scans move with the robot, like lines of a beam on a straight
-# wall do. Only with this many scans.
-LOCKED_SHARE, MIN_LOCKED_SCANS = 0.7, 5
-GAPS = (1, 2, 4, 8, 16)  # index differences between the clouds that are compared
-MIN_AGREEMENT = 0.8  # minimum length of the mean direction vector, 0 to 1
-MAX_STRAIGHT_TURN = 5.0  # max rotation between scans in degrees; in turns, an off-centre sensor moves sideways
-MIN_ERROR = 7.0  # minimum error in degrees, since walls can mislead all pairs of one place
-MAX_OFF_AXIS = 10.0  # tolerance between x axis and heading in degrees, added to twice the error
+CELL_M, HALF_SIZE_M = 0.2, 40.0  # of the bird's-eye images
+LOW_M, HIGH_M = 0.3, 3.0  # heights above the ground of the points in the images
+MIN_SHIFT_M = 0.3  # smaller shifts have no clear direction
+MIN_PEAK_RATIO = 1.2  # of a clear peak to the rest of the correlation
+PEAK_HALF_SIZE = 5  # cells around a peak that do not count as the rest
+# With at least MIN_STATIC_SCANS scans, cells occupied in this share of them are ignored: they move
+# with the robot, for example where a beam hits a straight wall.
+STATIC_SHARE, MIN_STATIC_SCANS = 0.7, 5
+GAPS = (1, 2, 4, 8, 16)  # differences of the numbers of clouds that are compared
+MIN_AGREEMENT = 0.8  # of the directions: length of their mean unit vector
+MAX_STRAIGHT_TURN = 5.0  # degrees between scans; in tighter turns a sensor off the centre moves sideways
+MIN_ERROR = 7.0  # degrees, since walls can bias all shifts of one place
+MAX_OFF_AXIS = 10.0  # degrees between x and the heading, in addition to twice the error
 
 
 class Shift(NamedTuple):
-    """Motion of a sensor from one scan to another: m forward and left in its own frame."""
+    """Motion of a sensor between two scans, in metres forward (x) and left (y) in its own frame."""
 
     x: float
     y: float
 
 
-Shifts = Mapping[tuple[int, int], Shift | None]  # (scan, scan) -> shift, None if unclear
+Shifts = Mapping[tuple[int, int], Shift | None]  # by the numbers of two scans; None if ambiguous
 
 
 class Heading(NamedTuple):
-    """Direction in which the robot drives, or the x axis of its base.
+    """Driving direction of the robot, or the x axis of its base.
 
     Attributes:
         degrees: Angle from the cloud's x axis, counter-clockwise; NaN if unknown.
         error: Standard error of the angle in degrees.
-        distance: Longest shift in metres, NaN if most are not clear.
-        problem: Why the heading is unknown, "" if it is known.
-        from_base: It is the base's x axis, in whichever direction the robot drove.
+        distance: Longest shift in metres, NaN if most shifts are ambiguous.
+        problem: Reason why the heading is unknown, "" if it is known.
+        from_base: The heading is the base's x axis, even if the robot drove backwards.
     """
 
     degrees: float
@@ -59,7 +59,7 @@ class Heading(NamedTuple):
 
     @property
     def may_be_reversed(self) -> bool:
-        """True if x may point ahead although is_off_axis, because the robot drove backwards."""
+        """True if the heading may be opposite to the forward direction, because the robot drove backwards."""
         return not self.from_base and abs(self.degrees) > 180 - 2 * MAX_OFF_AXIS
 
 
@@ -69,21 +69,20 @@ def wrap_degrees(degrees: float | np.ndarray) -> Any:
 
 
 def compute_spectrum(image: np.ndarray) -> np.ndarray:
-    """Return the zero-padded spectrum of an image of draw_images, for find_shift."""
+    """Return the zero-padded 2D spectrum of an image, for find_shift."""
     return rfft2(image, (2 * len(image), 2 * len(image)))
 
 
 def find_shift(before: np.ndarray, after: np.ndarray) -> Shift | None:
-    """Return the shift between two images at which they agree best (correlation by FFT).
+    """Find the shift at which two images correlate best.
 
-    A turn by a few degrees blurs the correlation but does no harm: the shift then is that of the
-    path between the scans.
+    A rotation by a few degrees between the scans blurs the correlation, but does not bias it.
 
     Args:
-        before, after: Spectra of the images.
+        before, after: Spectra of the images, see compute_spectrum.
 
     Returns:
-        The shift; None if no shift agrees clearly.
+        The shift; None if the correlation has no clear peak.
     """
     size = len(before)
     match = irfft2(before * np.conj(after))
@@ -98,7 +97,7 @@ def find_shift(before: np.ndarray, after: np.ndarray) -> Shift | None:
 
 
 def _refine_peak(match: np.ndarray, best: tuple[np.intp, ...], axis: int) -> float:
-    """Return the offset of a parabola through a peak and its neighbours, in cells, -0.5 .. 0.5."""
+    """Return the subcell offset of a peak by a parabola through its neighbours, in -0.5 .. 0.5 cells."""
     around = [list(best) for _ in range(3)]
     for cell, step in zip(around, (-1, 0, 1)):
         cell[axis] = (cell[axis] + step) % len(match)
@@ -107,11 +106,11 @@ def _refine_peak(match: np.ndarray, best: tuple[np.intp, ...], axis: int) -> flo
 
 
 def draw_images(scans: Sequence[np.ndarray], moves: bool) -> np.ndarray:
-    """Draw points above the ground as images from above.
+    """Draw bird's-eye images of the points above the ground.
 
     Args:
-        scans: S arrays of points (N, 3) in the level frame, z = 0 on the ground.
-        moves: The robot is known to move, so that cells occupied in most scans are left out.
+        scans: S arrays of points (N, 3) in a level frame, z = 0 on the ground.
+        moves: The robot moves, so cells that are occupied in most scans are cleared.
 
     Returns:
         (S, cells, cells) float32, 1 in occupied cells.
@@ -121,20 +120,20 @@ def draw_images(scans: Sequence[np.ndarray], moves: bool) -> np.ndarray:
         drawn = (xyz[:, 2] > LOW_M) & (xyz[:, 2] < HIGH_M) & (np.abs(xyz[:, :2]) < HALF_SIZE_M).all(axis=1)
         cells = ((xyz[drawn, :2] + HALF_SIZE_M) / CELL_M).astype(int)
         image[cells[:, 0], cells[:, 1]] = 1.0
-    if moves and len(scans) >= MIN_LOCKED_SCANS:
-        images *= images.mean(axis=0) < LOCKED_SHARE
+    if moves and len(scans) >= MIN_STATIC_SCANS:
+        images *= images.mean(axis=0) < STATIC_SHARE
     return images
 
 
 def find_shifts(images: np.ndarray, numbers: Sequence[int]) -> Shifts:
-    """Return the shift from each scan to a later one, over the first of GAPS with MIN_SHIFT_M.
+    """Find the shift of each scan to a later one, over the shortest gap with at least MIN_SHIFT_M.
 
     Args:
-        images: Images of draw_images.
+        images: (S, cells, cells) images from draw_images.
         numbers: Numbers of their clouds in the recording.
 
     Returns:
-        Shifts by pairs of numbers. If the robot moves less, the longest gap counts.
+        Shift of each pair of clouds; over the longest gap if the robot moves less than MIN_SHIFT_M.
     """
     shifts: dict[tuple[int, int], Shift | None] = {}
     spectra = dict(zip(numbers, map(compute_spectrum, images), strict=True))
@@ -150,14 +149,14 @@ def find_shifts(images: np.ndarray, numbers: Sequence[int]) -> Shifts:
 
 
 def compute_shifts(poses: Mapping[int, np.ndarray], pairs: Shifts) -> Shifts:
-    """Return the shifts of the base between pairs of scans, in its own frame, from its poses.
+    """Compute the shifts of the base between pairs of scans, in its own frame, from its poses.
 
     Args:
         poses: (4, 4) poses of the base by number of the scan.
-        pairs: Pairs of scans; those without poses are left out.
+        pairs: Pairs of scans. Pairs without poses are left out.
 
     Returns:
-        Shifts, None if the base turned by more than MAX_STRAIGHT_TURN.
+        Shift of each pair, None if the base turned by more than MAX_STRAIGHT_TURN.
     """
     steps = {pair: np.linalg.solve(poses[pair[0]], poses[pair[1]]) for pair in pairs if set(pair) <= poses.keys()}
     return {
@@ -169,29 +168,22 @@ def compute_shifts(poses: Mapping[int, np.ndarray], pairs: Shifts) -> Shifts:
 
 
 def estimate_heading(shifts: Shifts, base: Shifts) -> Heading:
-    """Return the mean direction of the shifts that are long enough.
+    """Estimate the heading as the mean direction of all shifts of at least MIN_SHIFT_M.
 
     Args:
         shifts: Shifts of the sensor.
-        base: Shifts of the base between the same scans, see compute_shifts; empty if unknown. With
-            them, the heading is the direction of the base's x axis.
+        base: Shifts of the base between the same scans, see compute_shifts. If not empty, the
+            heading is the direction of the base's x axis.
     """
-    every = np.array([complex(*shift) for shift in shifts.values() if shift is not None])
-    far = {
-        pair: complex(*shift) for pair, shift in shifts.items() if shift is not None and np.hypot(*shift) >= MIN_SHIFT_M
-    }
-    distance = float(np.abs(every).max(initial=0.0))
-    if not far and 2 * len(every) <= len(shifts):
-        return Heading(
-            np.nan,
-            np.nan,
-            np.nan,
-            "the surroundings have too few features, or too similar ones, to see how the robot moved",
-        )
+    valid = {pair: complex(*shift) for pair, shift in shifts.items() if shift is not None}
+    far = {pair: shift for pair, shift in valid.items() if np.hypot(shift.real, shift.imag) >= MIN_SHIFT_M}
+    distance = float(np.abs(list(valid.values())).max(initial=0.0))
+    if not far and 2 * len(valid) <= len(shifts):
+        problem = "the surroundings have too few distinct features to measure the robot's motion"
+        return Heading(np.nan, np.nan, np.nan, problem)
     if not far:
-        return Heading(
-            np.nan, np.nan, distance, f"the robot moved only {distance:.1f} m between the clouds that were compared"
-        )
+        problem = f"the robot moved only {distance:.1f} m between the clouds that were compared"
+        return Heading(np.nan, np.nan, distance, problem)
     by_base = {
         pair: far[pair] / complex(*step)
         for pair, step in base.items()
@@ -202,9 +194,9 @@ def estimate_heading(shifts: Shifts, base: Shifts) -> Heading:
     agreement = min(abs(mean), 1.0)
     if agreement < MIN_AGREEMENT:
         problem = (
-            "the motion in the clouds and in the odometry does not agree"
+            "the motion of the clouds does not agree with the odometry"
             if by_base
-            else f"the robot turned, or drove to and fro: {len(turns)} shifts have different directions"
+            else f"the robot turned or drove back and forth: {len(turns)} shifts have different directions"
         )
         return Heading(np.nan, np.nan, distance, problem, bool(by_base))
     error = max(float(np.degrees(np.sqrt(-2 * np.log(agreement)) / np.sqrt(len(turns)))), MIN_ERROR)

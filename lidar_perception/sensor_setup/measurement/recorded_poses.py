@@ -1,4 +1,4 @@
-"""Poses that a recording contains: where the sensor is mounted, and how the robot moved."""
+"""Poses in a recording: the mount of the sensor, and the motion of the robot."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ class RecordedPoses(NamedTuple):
     """Poses from the TF and odometry of a recording.
 
     Attributes:
-        base: The robot's frame, "" for none.
+        base: Base frame of the robot, "" for none.
         mount: (4, 4) pose of the sensor in the base; None if TF does not contain it.
         footprint: (4, 4) pose of the sensor in base_footprint; None if TF does not contain it.
-        poses: Pose of the base in a fixed frame by number of the cloud. Without a base, the pose of
-            the sensor.
-        left_out: Number of transforms and odometry messages that are no valid poses.
-        problem: Why most clouds have no pose although the recording has some, else "".
+        poses: (4, 4) pose of the base (of the sensor, without a base) in a fixed frame, by number
+            of the cloud.
+        invalid_count: Number of transforms and odometry messages with invalid poses.
+        problem: Reason why most clouds have no pose although the recording has poses, else "".
     """
 
     base: str = ""
     mount: np.ndarray | None = None
     footprint: np.ndarray | None = None
     poses: Mapping[int, np.ndarray] = {}
-    left_out: int = 0
+    invalid_count: int = 0
     problem: str = ""
 
     @property
@@ -50,12 +50,12 @@ class RecordedPoses(NamedTuple):
 
     @property
     def heading(self) -> float:
-        """Angle from x of the levelled sensor to x of the base in degrees; NaN if unknown."""
+        """Direction of the base's x axis in the levelled sensor frame, in degrees; NaN if unknown."""
         return np.nan if self.mount is None else float(-np.degrees(np.arctan2(self.mount[1, 0], self.mount[0, 0])))
 
     @property
     def distance(self) -> float:
-        """Distance that the robot covered along x or y in metres; NaN without poses."""
+        """Extent of the robot's path along x or y, the larger one, in metres; NaN without poses."""
         return float(np.ptp([pose[:2, 3] for pose in self.poses.values()], axis=0).max()) if self.poses else np.nan
 
 
@@ -63,33 +63,29 @@ NO_POSES = RecordedPoses()
 
 
 def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int], stamps_ns: np.ndarray | None) -> RecordedPoses:
-    """Return what the odometry and TF of a bag contain.
+    """Read the mount of the sensor and the poses of clouds from the odometry and TF of a bag.
 
     Args:
-        poses: Poses of the bag; None for a recording without any.
-        numbers: Numbers of the clouds to find poses for.
-        stamps_ns: Stamps of all clouds, ns.
+        poses: Poses of the bag; None for a recording without poses.
+        numbers: Numbers of the clouds whose poses are looked up.
+        stamps_ns: Stamps of all clouds, ns; None if they have none.
     """
     if poses is None or stamps_ns is None or not (poses.base or poses.odometry):
         return NO_POSES
     base = poses.base
     mount = poses.find_mount(base) if base else None
     by_cloud = {}
-    # Odometry without child_frame_id may describe another frame than the base.
-    is_nameless = poses.odometry and not poses.odometry_child
-    for number in () if is_nameless else numbers:
+    # Odometry without child_frame_id may be of another frame than the base.
+    has_child = not poses.odometry or poses.odometry_child
+    for number in numbers if has_child else ():
         pose = _find_base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))
         if pose is not None:
             by_cloud[number] = pose
-    problem = (
-        ""
-        if 2 * len(by_cloud) >= len(numbers) or not poses.available
-        else (
-            "the odometry has no child_frame_id"
-            if is_nameless
-            else f"{len(numbers) - len(by_cloud)} of {len(numbers)} clouds have no pose at their time"
-        )
-    )
+    problem = ""
+    if 2 * len(by_cloud) < len(numbers) and poses.available:
+        problem = f"{len(numbers) - len(by_cloud)} of {len(numbers)} clouds have no pose at their time"
+        if not has_child:
+            problem = "the odometry has no child_frame_id"
     return RecordedPoses(base, mount, poses.find_mount(FOOTPRINT), by_cloud, poses.invalid_count, problem)
 
 

@@ -1,4 +1,4 @@
-"""Clouds in the driver's format, and the meaning of their columns."""
+"""Raw clouds with the columns of the driver, and the scale of their intensity."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ from lidar_perception.wire.point_times import NAMES as TIMES
 from lidar_perception.wire.point_times import read_point_times
 from msg_utils.point_cloud2 import to_array
 
-# Columns with the beam number, as named by Velodyne and Ouster, Hesai and Nebula, Livox, RoboSense
-# and others.
+# Columns with the beam number in the drivers of Velodyne, Ouster, Hesai, Nebula, Livox and RoboSense.
 RING_FIELDS = ("ring", "channel", "line", "laser_id", "laser_number", "row")
-MAX_MEDIAN_RANGE_M = 250.0  # maximum for a cloud in metres in the sensor's frame
-MAX_SPREAD_M = 200.0  # maximum median distance to the cloud's centre for a cloud in metres in another frame
-MIN_ELEVATION_SPAN = 1.0  # in degrees; a sensor with a smaller span scans a plane
-MIN_POINTS = 100  # minimum number of usable points of a cloud
+MAX_MEDIAN_RANGE_M = 250.0  # of a cloud in the sensor's frame, if its unit is metres
+MAX_SPREAD_M = 200.0  # median distance to the cloud's centre in any frame, if the unit is metres
+MIN_ELEVATION_SPAN = 1.0  # degrees; less means a 2D scanner
+MIN_POINTS = 100  # usable points of a cloud
 
 
 class Scan(NamedTuple):
-    """N usable points of a cloud, in the driver's order.
+    """N usable points of a cloud, in the order of the driver.
 
     Attributes:
         xyz: (N, 3) float64, m.
@@ -33,13 +32,13 @@ class Scan(NamedTuple):
         elevation: (N,) degrees above the horizon of the sensor.
         range: (N,) m from the sensor.
         ground_range: (N,) m from the z axis.
-        intensity: (N,) float64 in the cloud's own scale, or None.
-        ring: (N,) int64 number of the beam, or None.
-        seconds: (N,) float64 after the stamp, or None.
+        intensity: (N,) float64 in the scale of the cloud, or None.
+        ring: (N,) int64 beam number, or None.
+        seconds: (N,) float64 seconds after the stamp, or None.
         stamp_ns: Stamp of the cloud, ns.
         frame_id: Frame of the cloud.
         columns: Names of the cloud's columns.
-        time_problem: Why its times cannot be read; "" if they can, or without any.
+        time_problem: Reason why the time column cannot be read, "" for none.
     """
 
     xyz: np.ndarray
@@ -57,10 +56,14 @@ class Scan(NamedTuple):
 
 
 def read_scan(msg: Any, name: str = "the cloud") -> Scan:
-    """Return a PointCloud2 as a Scan.
+    """Convert a PointCloud2 to a Scan.
+
+    Args:
+        msg: sensor_msgs/PointCloud2.
+        name: Name of the cloud in error messages.
 
     Raises:
-        InputError: It has too few usable points, or its coordinates cannot be metres.
+        InputError: The cloud has too few usable points, or its coordinates cannot be metres.
     """
     try:
         frame, indices = to_point_cloud(msg)
@@ -69,7 +72,7 @@ def read_scan(msg: Any, name: str = "the cloud") -> Scan:
     if len(frame) < MIN_POINTS:
         raise InputError(
             f"{name} has {len(frame)} usable points, too few to measure the sensor; "
-            "record while it turns, in a place with walls or ground in view"
+            "record while the sensor spins, with walls or ground in view"
         )
     xyz = frame.xyz.astype(np.float64)
     ranges = np.linalg.norm(xyz, axis=1)
@@ -106,60 +109,59 @@ def _require_metres(xyz: np.ndarray, name: str) -> None:
         return
     if np.median(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)) < MAX_SPREAD_M:
         raise InputError(
-            f"{name}: half of its points are farther than {median_range:.0f} m from "
-            "the origin and near each other, so it is in a frame such as map; give "
-            "the driver's own cloud"
+            f"{name}: half of the points are farther than {median_range:.0f} m from the origin and near each "
+            "other, so the cloud is in a frame such as map; use the driver's own cloud"
         )
     raise InputError(
-        f"{name}: half of its points are farther than {median_range:.0f} m, so its "
-        "coordinates seem to be millimetres; divide x y z by 1000 in the driver"
+        f"{name}: half of the points are farther than {median_range:.0f} m, so the coordinates are probably "
+        "millimetres; divide x y z by 1000 in the driver"
     )
 
 
 def require_3d(degrees: np.ndarray, name: str) -> None:
-    """Raise InputError if elevations (N,), N > 0, in degrees, are all in one plane."""
+    """Raise InputError if all elevations (N,), N > 0, in degrees, are equal, as from a 2D scanner."""
     if np.subtract(*np.percentile(degrees, [99, 1])) < MIN_ELEVATION_SPAN:
-        raise InputError(f"{name}: all points are in one plane, as from a 2D scanner; give clouds of a 3D LiDAR")
+        raise InputError(f"{name}: all points are in one plane, as from a 2D scanner; use clouds of a 3D LiDAR")
 
 
-def _read_column(points: np.ndarray, indices: np.ndarray, names: Sequence[str], kind: type) -> np.ndarray | None:
+def _read_column(points: np.ndarray, indices: np.ndarray, names: Sequence[str], dtype: type) -> np.ndarray | None:
     name = next((n for n in names if n in (points.dtype.names or ())), None)
     if name is None or points.dtype[name].shape:
         return None
-    return points[name].take(indices).astype(kind)
+    return points[name].take(indices).astype(dtype)
 
 
 class IntensityScale(NamedTuple):
-    """Intensities of all scans together.
+    """Scale of the intensities of all scans.
 
     Attributes:
-        full: Value of a full reflection, see intensity.infer_full_scale; the greatest value if
-            that is far beyond it.
-        sure: The values show the scale.
-        whole: All values are whole numbers.
-        greatest: Greatest value.
-        zeros: Share of returns with intensity 0.
+        full_scale: Value of a full reflection, see intensity.infer_full_scale; the maximum if that
+            is far larger.
+        is_certain: The values are large enough to determine the scale.
+        is_integer: All values are whole numbers.
+        maximum: Largest value.
+        zero_share: Share of returns with intensity 0.
     """
 
-    full: float
-    sure: bool
-    whole: bool
-    greatest: float
-    zeros: float
+    full_scale: float
+    is_certain: bool
+    is_integer: bool
+    maximum: float
+    zero_share: float
 
 
 def measure_intensity(scans: Sequence[Scan]) -> IntensityScale | None:
-    """Return the scale of the intensities; None without any, or if all are equal."""
-    found = [scan.intensity for scan in scans if scan.intensity is not None]
-    values = np.concatenate(found) if found else np.zeros(0)
+    """Measure the scale of the intensities; None if there are none, or all are equal."""
+    values = np.concatenate([np.zeros(0), *(scan.intensity for scan in scans if scan.intensity is not None)])
     values = values[np.isfinite(values)]
     if not len(values) or values.min() == values.max():
         return None
-    greatest = float(values.max())
-    sample = values[:: max(1, len(values) // 10_000)]  # sampled over all scans, because one may begin with zeros
-    whole = bool((sample == np.round(sample)).all())
+    maximum = float(values.max())
+    sample = values[:: max(1, len(values) // 10_000)]  # over all scans, since one may begin with zeros
+    is_integer = bool((sample == np.round(sample)).all())
     # No known driver sends whole numbers up to 1 as floats, so they count as integers.
-    full = infer_full_scale(values, np.int64 if whole else values.dtype)
-    if greatest > MAX_UNIT * full:
-        full = greatest
-    return IntensityScale(full, full <= 1.0 or greatest > 0.5 * full, whole, greatest, float((values == 0).mean()))
+    full_scale = infer_full_scale(values, np.int64 if is_integer else values.dtype)
+    if maximum > MAX_UNIT * full_scale:
+        full_scale = maximum
+    is_certain = full_scale <= 1.0 or maximum > 0.5 * full_scale
+    return IntensityScale(full_scale, is_certain, is_integer, maximum, float((values == 0).mean()))

@@ -1,4 +1,4 @@
-"""The measured sensor as a sensor that can be simulated."""
+"""Conversion of a measurement to a simulated sensor."""
 
 from __future__ import annotations
 
@@ -11,23 +11,35 @@ from lidar_perception.sensor_setup.measurement.beams import Beams
 from lidar_perception.sensor_setup.measurement.measure import MIN_OUTDOOR_RANGE_M, SensorMeasurement
 from lidar_perception.simulation.sensor import Sensor, find_sensor
 
-DEFAULT_STEP = 0.2  # default azimuth step in degrees
+DEFAULT_STEP = 0.2  # degrees between firings
+MODEL_FIELDS = (
+    "divergence",
+    "reach",
+    "pulse",
+    "min_range",
+    "max_range",
+    "range_noise",
+    "rate",
+    "silent",
+    "floor",
+    "fade",
+)
 
 
 def make_sensor(m: SensorMeasurement) -> Sensor:
-    """Return the measured sensor, turned over if it is mounted upside down.
+    """Make a simulated sensor from a measurement; its z axis points up even if it is mounted upside down.
 
     Properties that clouds do not show, such as the divergence of the beams, are those of the model
-    with the same beams, or the defaults. A sensor without beams becomes a grid of the same view
-    whose beams wander, with as many points in a turn.
+    with the same beams, or defaults. A sensor without beams becomes a grid with the same field of
+    view and number of points, whose beams wander.
     """
-    sensor = _make_in_own_frame(m)
+    sensor = _make_in_sensor_frame(m)
     mount = m.mounting.mount
     return sensor if mount is None or not mount.upside_down else _turn_upside_down(sensor)
 
 
 def _turn_upside_down(sensor: Sensor) -> Sensor:
-    """Turn a sensor, whose blocked sectors are of all beams, about its x axis by half a turn."""
+    """Rotate a sensor by 180 degrees about its x axis. Its blocked sectors must hide all beams."""
     return replace(
         sensor,
         elevations=tuple(sensor.wander - up for up in reversed(sensor.elevations)),
@@ -36,28 +48,10 @@ def _turn_upside_down(sensor: Sensor) -> Sensor:
     )
 
 
-def _make_in_own_frame(m: SensorMeasurement) -> Sensor:
+def _make_in_sensor_frame(m: SensorMeasurement) -> Sensor:
     pattern, coverage, mounting = m.pattern, m.view.coverage, m.mounting
     model = find_sensor(pattern.model) if pattern.model else None
-    fields: dict[str, Any] = (
-        {}
-        if model is None
-        else {
-            name: getattr(model, name)
-            for name in (
-                "divergence",
-                "reach",
-                "pulse",
-                "min_range",
-                "max_range",
-                "range_noise",
-                "rate",
-                "silent",
-                "floor",
-                "fade",
-            )
-        }
-    )
+    fields: dict[str, Any] = {} if model is None else {name: getattr(model, name) for name in MODEL_FIELDS}
     if m.intensity is None:
         fields["silent"] = 1.0
     if np.isfinite(pattern.range_noise):
@@ -69,29 +63,28 @@ def _make_in_own_frame(m: SensorMeasurement) -> Sensor:
         fields["height"] = round(mounting.mount.height, 3)
     elif mounting.height_hint is not None:
         fields["height"] = mounting.height_hint
-    # The nearest surface may be far away, like the ground, or closer than the data sheet's minimum.
+    # The measured minimum is used only if it is smaller, since there may be no surface near the sensor.
     min_range = fields.get("min_range", Sensor.min_range)
     if m.view.min_range < min_range:
         fields["min_range"] = float(np.floor(100 * m.view.min_range) / 100)
     if pattern.beams is None:
         return _make_grid(m, fields)
-    # In a single place the surroundings hide more than the robot does, so only the ends of the view
-    # count there. The same holds if lower beams do not point lower.
-    has_moved = (
-        coverage.still is False
-        and not m.source.has_few_scans
-        and (mounting.mount is not None and mounting.mount.is_level)
-    )
-    fields["blocked"] = tuple(b for b in coverage.blocked if has_moved or b[0] == 0)
-    up, lifts = _select_beams(pattern.beams, model if pattern.prefers_model else None, fields)
+    # Sectors that hide only lower beams are reliable if the robot moved, and if the sensor is level.
+    has_moved = coverage.stationary is False and not m.source.has_few_scans
+    is_level = mounting.mount is not None and mounting.mount.is_level
+    fields["blocked"] = tuple(b for b in coverage.blocked if (has_moved and is_level) or b[0] == 0)
+    elevations, lifts = _select_beams(pattern.beams, model if pattern.prefers_model else None, fields)
     if lifts.any():
         fields["lifts"] = tuple(lifts.tolist())
     step = pattern.azimuth_step if np.isfinite(pattern.azimuth_step) else DEFAULT_STEP
-    return Sensor(tuple(up.tolist()), float(np.radians(step)), **fields)
+    return Sensor(tuple(elevations.tolist()), float(np.radians(step)), **fields)
 
 
 def _select_beams(beams: Beams, model: Sensor | None, fields: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Return elevations in rad and lifts, measured or of a model, and adapt the blocked sectors."""
+    """Return the elevations (rad) and lifts of the model, or measured ones for None.
+
+    Beam numbers in fields["blocked"] are converted to those of the model.
+    """
     elevations = np.radians(np.round(beams.elevations, 4))
     if model is None:
         return elevations, np.round(beams.lifts, 4)

@@ -9,10 +9,10 @@ import numpy as np
 
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-MIN_GAP = 1.5  # stamp gap, as a multiple of the usual one, from which clouds count as missing
-MAX_GAP = 1000  # multiple of the usual gap; longer gaps separate drives
-RATES = (0.5, 100.0)  # plausible rotation rates in revolutions per second
-MIN_STAMPS = 4  # minimum number of stamps to compute a rate
+# Clouds are missing if two stamps are this many median periods apart. Longer gaps separate drives.
+MIN_GAP, MAX_GAP = 1.5, 1000
+MIN_RATE, MAX_RATE = 0.5, 100.0  # turns per second of real sensors
+MIN_STAMPS = 4  # to measure the rate
 
 
 class Timing(NamedTuple):
@@ -21,32 +21,32 @@ class Timing(NamedTuple):
     Attributes:
         rate: Turns per second, NaN if unknown.
         source: Source of the rate: "stamps", "times of the points" or "nothing".
-        missing: Number of clouds missing between the recorded ones.
-        backwards: Number of stamps that are not after the previous one.
+        missing_count: Number of clouds missing between the recorded ones.
+        backward_count: Number of stamps that are not later than the previous one.
     """
 
     rate: float
     source: str
-    missing: int = 0
-    backwards: int = 0
+    missing_count: int = 0
+    backward_count: int = 0
 
 
 def measure_timing(scans: Sequence[Scan], stamps_ns: np.ndarray | None) -> Timing:
-    """Measure rate and losses.
+    """Measure the rate of the sensor, and count missing clouds.
 
     Args:
-        scans: Scans, whose points may have times.
-        stamps_ns: (M,) stamps of all clouds in ns; None without any.
+        scans: Scans. Without stamps, the times of their points give the rate.
+        stamps_ns: (M,) stamps of all clouds in ns; None if they have none.
     """
     spans = [float(np.nanmax(s.seconds) - np.nanmin(s.seconds)) for s in scans if s.seconds is not None]
     if stamps_ns is not None and len(stamps_ns) >= MIN_STAMPS:
         steps = np.diff(stamps_ns) * 1e-9
         forward = steps[steps > 0]
-        usual = float(np.median(forward)) if len(forward) else 0.0
-        if usual > 0 and RATES[0] <= 1 / usual <= RATES[1]:
-            gaps = forward[(forward > MIN_GAP * usual) & (forward < MAX_GAP * usual)]
-            missing = int((np.round(gaps / usual) - 1).sum())
-            return Timing(1 / usual, "stamps", missing, int((steps <= 0).sum()))
-    if spans and RATES[0] <= 1 / max(np.median(spans), 1e-9) <= RATES[1]:
+        period = float(np.median(forward)) if len(forward) else 0.0
+        if period > 0 and MIN_RATE <= 1 / period <= MAX_RATE:
+            gaps = forward[(forward > MIN_GAP * period) & (forward < MAX_GAP * period)]
+            missing_count = int((np.round(gaps / period) - 1).sum())
+            return Timing(1 / period, "stamps", missing_count, int((steps <= 0).sum()))
+    if spans and MIN_RATE <= 1 / max(np.median(spans), 1e-9) <= MAX_RATE:
         return Timing(1 / float(np.median(spans)), "times of the points")
     return Timing(np.nan, "nothing")

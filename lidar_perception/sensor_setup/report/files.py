@@ -19,16 +19,13 @@ LINE_WIDTH = 98
 
 def format_sensor(m: SensorMeasurement) -> str:
     """Return the text of sensor.yaml, see simulation.sensor.load_sensor."""
-    sensor = make_sensor(m)
+    sensor, default = make_sensor(m), Sensor((0.0,), 0.1)
     comments = _explain_sensor(m, sensor)
     values = {
         "name": m.pattern.model or "measured",
         "height": sensor.height,
         "rate": sensor.rate,
         "azimuth_step": round(float(np.degrees(sensor.azimuth_step)), 6),
-    }
-    default = Sensor((0.0,), 0.1)
-    values |= {
         "min_range": sensor.min_range,
         "max_range": sensor.max_range,
         "range_noise": sensor.range_noise,
@@ -44,38 +41,24 @@ def format_sensor(m: SensorMeasurement) -> str:
         values["wander"] = round(float(np.degrees(sensor.wander)), 4)
     if sensor.fade != default.fade:
         values["fade"] = list(sensor.fade)
-    text = (
-        _format_header(
-            m,
-            _describe_origin(m),
-            "Angles in degrees, lengths in metres; docs/how-to/own-sensor.md describes every field.",
-        )
-        + "\n"
-    )
-    text += "".join(
-        f"{key}: {_format_scalar(value)}" + (f"  # {comments[key]}" if key in comments else "") + "\n"
-        for key, value in values.items()
-    )
+    units = "Angles in degrees, lengths in metres; docs/how-to/own-sensor.md describes every field."
+    text = _format_header(m, _describe_origin(m), units) + "\n"
+    for key, value in values.items():
+        text += f"{key}: {_format_scalar(value)}" + (f"  # {comments[key]}" if key in comments else "") + "\n"
     text += _format_list("elevations", np.degrees(sensor.elevations), 4)
     if sensor.lifts:
         text += _format_list("lifts", sensor.lifts, 4)
     if sensor.blocked:
-        text += "blocked:  # [first beam, from, to]: it and all lower beams see nothing there\n"
+        text += "blocked:  # [first beam, from, to]: sector without returns of this beam and all lower ones\n"
         text += "".join(f"- [{ring}, {a:g}, {b:g}]\n" for ring, a, b in sensor.blocked)
     return text
 
 
 def format_params(m: SensorMeasurement) -> str:
-    """Return the text of robot.param.yaml, with the reason of each parameter."""
+    """Return the text of robot.param.yaml, with the reason for the value of each parameter."""
     chosen = choose_params(m)
-    lines = [
-        _format_header(
-            m,
-            f"{_describe_origin(m)} All other parameters keep their defaults. "
-            "Nodes ignore parameters that they do not have.",
-        ),
-        "/**:",
-    ]
+    about = "All other parameters keep their defaults. Nodes ignore parameters that they do not have."
+    lines = [_format_header(m, f"{_describe_origin(m)} {about}"), "/**:"]
     tree: dict[str, Any] = {}
     for name, (value, reason) in chosen.items():
         *path, last = name.split(".")
@@ -91,40 +74,32 @@ def _explain_sensor(m: SensorMeasurement, sensor: Sensor) -> dict[str, str]:
     """Return a comment for each value of sensor.yaml."""
     pattern, mounting, view = m.pattern, m.mounting, m.view
     unmeasured = "not measured; " + (f"that of {pattern.model}" if pattern.model else "a default")
+    height = "not measured: no ground in view" if mounting.height_hint is None else HINT_REASON
+    if mounting.mount is not None:
+        height = f"+- {mounting.mount.error[0]:.3f}"
+    has_min_range = view.min_range < sensor.min_range + 0.01
     return {
-        "height": f"+- {mounting.mount.error[0]:.3f}"
-        if mounting.mount is not None
-        else "not measured: no ground in view"
-        if mounting.height_hint is None
-        else HINT_REASON,
+        "height": height,
         "rate": f"from {m.timing.source}" if np.isfinite(m.timing.rate) else "not measured",
-        "azimuth_step": f"{sensor.columns} firings in a turn",
-        "min_range": "the nearest return that is not the robot's own"
-        if view.min_range < sensor.min_range + 0.01
-        else unmeasured,
-        "max_range": "the farthest return" if view.max_range >= MIN_OUTDOOR_RANGE_M else unmeasured,
-        "range_noise": unmeasured if np.isnan(pattern.range_noise) else "about smooth surfaces",
+        "azimuth_step": f"{sensor.columns} firings per turn",
+        "min_range": "nearest return outside the robot's body" if has_min_range else unmeasured,
+        "max_range": "farthest return" if view.max_range >= MIN_OUTDOOR_RANGE_M else unmeasured,
+        "range_noise": unmeasured if np.isnan(pattern.range_noise) else "on smooth surfaces",
         "divergence": unmeasured,
         "reach": unmeasured,
-        "silent": "no intensity was seen" if m.intensity is None else unmeasured,
+        "silent": "no intensity in the clouds" if m.intensity is None else unmeasured,
     }
 
 
 def _describe_origin(m: SensorMeasurement) -> str:
-    return (
-        f"Measured by 'lidar-perception setup' from {len(m.source.scans)} of {m.source.total} "
-        f"clouds of {m.source.name}."
-    )
+    count = f"{len(m.source.scans)} of {m.source.total}"
+    return f"Measured by 'lidar-perception setup' from {count} clouds of {m.source.name}."
 
 
 def _format_header(m: SensorMeasurement, *about: str) -> str:
     """Return comments that describe the file, followed by the warnings."""
     lines = (*about, *(f"Warning: {line}" for line in find_warnings(m)))
-    return "\n".join(
-        part
-        for line in lines
-        for part in textwrap.wrap(line, LINE_WIDTH, initial_indent="# ", subsequent_indent="#   ")
-    )
+    return "\n".join(textwrap.fill(line, LINE_WIDTH, initial_indent="# ", subsequent_indent="#   ") for line in lines)
 
 
 def _format_scalar(value: Any) -> str:
@@ -144,12 +119,7 @@ def _format_tree(tree: Mapping[str, Any], indent: int) -> list[str]:
             lines += [f"{pad}{name}:", *_format_tree(value, indent + 2)]
             continue
         number, reason = value
-        lines += [
-            line
-            for part in reason.split("\n")
-            for line in textwrap.wrap(
-                part, LINE_WIDTH - indent, initial_indent=f"{pad}# ", subsequent_indent=f"{pad}# "
-            )
-        ]
+        for line in reason.split("\n"):
+            lines += textwrap.wrap(line, LINE_WIDTH - indent, initial_indent=f"{pad}# ", subsequent_indent=f"{pad}# ")
         lines.append(f"{pad}{name}: {format_value(number)}")
     return lines

@@ -1,4 +1,4 @@
-"""Riders of bicycles and motorcycles, and both without a rider."""
+"""Bicycles and motorcycles, with and without riders."""
 
 from __future__ import annotations
 
@@ -10,34 +10,24 @@ import numpy as np
 
 from lidar_perception.classes import CLASSES, CYCLIST
 from lidar_perception.simulation.shapes.people import find_knee
-from lidar_perception.simulation.shapes.thing import (
-    METAL,
-    PLATE,
-    RUBBER,
-    SKIN,
-    Thing,
-    block,
-    disc,
-    draw_size,
-    make_rigid,
-    rod,
-)
-from lidar_perception.simulation.solids import BOX, ELLIPSOID, compute_extents, part, parts
+from lidar_perception.simulation.shapes.primitives import METAL, PLATE, RUBBER, SKIN, block, box, disc, ellipsoid, rod
+from lidar_perception.simulation.shapes.scene_object import SceneObject, draw_size, make_rigid
+from lidar_perception.simulation.solids import compute_extents, make_parts
 
 BICYCLE, MOTORCYCLE, BICYCLIST, MOTORCYCLIST = 11, 15, 31, 32
-CRANK_M, GEAR_M = 0.17, 5.0  # length of a crank, distance per crank revolution
-SPOKE_TRANSMISSION = 0.5  # fraction of beams that pass between the spokes
-FRAME_TRANSMISSION = 0.6  # fraction of beams that pass between stays, chain and pedals, and through the rack
-THIGH, SHANK = 0.26, 0.27  # lengths down to the pedal, as fractions of the rider's height
+CRANK_M, GEAR_M = 0.17, 5.0  # length of a crank, distance per turn of the cranks
+SPOKE_TRANSMISSION = 0.5  # share of the beams that pass between the spokes
+FRAME_TRANSMISSION = 0.6  # share of the beams that pass between stays, chain, pedals and rack
+THIGH, SHANK = 0.26, 0.27  # lengths as shares of the rider's height
 
 
 class RiderBuild(NamedTuple):
-    """A rider on a bicycle.
+    """Properties of a cyclist.
 
     Attributes:
         size: Length, width, height in m.
-        lean: Tilt of the trunk, rad.
-        phase: Angle of the cranks, rad.
+        lean: Forward tilt of the trunk, rad.
+        phase: Initial angle of the cranks, rad.
         frame, coat, trousers, head: Reflectances.
         load: "", "basket" or "backpack".
     """
@@ -52,8 +42,8 @@ class RiderBuild(NamedTuple):
     load: str = ""
 
 
-def make_cyclist(rng: np.random.Generator) -> Thing:
-    """Make a riding cyclist; the box has the length of the bicycle and width of the handlebar."""
+def make_cyclist(rng: np.random.Generator) -> SceneObject:
+    """Make a riding cyclist. Its box has the length of the bicycle and the width of the handlebar."""
     size = draw_size(rng, CLASSES[CYCLIST])
     rider = RiderBuild(
         size,
@@ -65,14 +55,11 @@ def make_cyclist(rng: np.random.Generator) -> Thing:
         rng.uniform(0.15, 0.75),
         ("", "basket", "backpack")[rng.integers(3)],
     )
-    return Thing(partial(pose_rider, rider=rider), size, CLASSES[CYCLIST])
+    return SceneObject(partial(pose_rider, rider=rider), size, CLASSES[CYCLIST])
 
 
 def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
-    """Return the parts (P,) PART of a rider after a distance in m.
-
-    The cranks turn; the wheels are discs that half of the beams pass.
-    """
+    """Return the parts (P,) PART of a cyclist after a distance travelled in m, which turns the cranks."""
     length, width, height = rider.size
     seat = 0.53 * height
     trunk = (height - seat) / (0.31 * cos(rider.lean) + 0.16)  # the rider's height
@@ -87,15 +74,14 @@ def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
     head = (neck[0] + 0.03, 0.0, height - 0.075 * trunk)
     rows = [
         *_bicycle_parts(length, width / 2, (bar_x, bar_z), rider.frame),
-        part(ELLIPSOID, head, (0.057 * trunk, 0.047 * trunk, 0.075 * trunk), reflectance=(SKIN + rider.head) / 2),
-        part(
-            ELLIPSOID,
+        ellipsoid(head, (0.057 * trunk, 0.047 * trunk, 0.075 * trunk), (SKIN + rider.head) / 2),
+        ellipsoid(
             (along(0.15)[0], 0.0, along(0.15)[1]),
             (0.08 * trunk, min(0.125 * trunk, 0.42 * width), 0.17 * trunk),
+            rider.coat,
             pitch=rider.lean,
-            reflectance=rider.coat,
         ),
-        part(ELLIPSOID, (hip[0], 0.0, seat + 0.02), (0.16, min(0.17, 0.4 * width), 0.11), reflectance=rider.trousers),
+        ellipsoid((hip[0], 0.0, seat + 0.02), (0.16, min(0.17, 0.4 * width), 0.11), rider.trousers),
     ]
     turn = rider.phase + 2 * pi * travelled / GEAR_M
     for side, at in ((-1, turn), (1, turn + pi)):
@@ -104,56 +90,47 @@ def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
         x, z = find_knee(hip, foot, thigh, shank)
         y = side * 0.11
         rows += [
-            rod((*hip[:1], y, seat), (x, y, z), 0.085, reflectance=rider.trousers),
-            rod((x, y, z), (foot[0], y, foot[1] + 0.03), 0.06, reflectance=rider.trousers),
-            part(BOX, (foot[0] + 0.05, y, foot[1]), (0.13, 0.045, 0.03), reflectance=RUBBER),
+            rod((*hip[:1], y, seat), (x, y, z), 0.085, rider.trousers),
+            rod((x, y, z), (foot[0], y, foot[1] + 0.03), 0.06, rider.trousers),
+            box((foot[0] + 0.05, y, foot[1]), (0.13, 0.045, 0.03), RUBBER),
             rod(
                 (shoulder[0], side * min(0.11 * trunk, 0.36 * width), shoulder[1]),
                 (bar_x, side * (width / 2 - 0.06), bar_z),
                 0.05,
-                reflectance=rider.coat,
+                rider.coat,
             ),
         ]
     if rider.load == "basket":
         rows.append(
-            block(
-                (bar_x + 0.05, -0.16, bar_z - 0.3),
-                (bar_x + 0.33, 0.16, bar_z - 0.05),
-                reflectance=METAL,
-                transmission=0.4,
-            )
+            block((bar_x + 0.05, -0.16, bar_z - 0.3), (bar_x + 0.33, 0.16, bar_z - 0.05), METAL, transmission=0.4)
         )
     elif rider.load == "backpack":
         x, z = along(0.18)
-        rows.append(
-            part(
-                ELLIPSOID, (x - 0.17 * up, 0.0, z + 0.17 * ahead), (0.1, 0.14, 0.22), pitch=rider.lean, reflectance=0.2
-            )
-        )
-    return parts(rows, BICYCLIST)
+        rows.append(ellipsoid((x - 0.17 * up, 0.0, z + 0.17 * ahead), (0.1, 0.14, 0.22), 0.2, pitch=rider.lean))
+    return make_parts(rows, BICYCLIST)
 
 
 def _bicycle_parts(length: float, half_bar: float, bar: tuple, frame: float) -> list[tuple]:
-    """Return wheels, tubes, handlebar at bar (x, z), and the parts between and above the wheels.
+    """Return wheels, tubes, and a handlebar at bar (x, z) with this half width.
 
-    Parts are as thick as wide beams see them: 46 % of the points of KITTI's cyclists are lower than
-    0.42 of their height, 22 % also more than 0.35 m from the centre (10 cyclists up to 40 m).
+    Parts are thicker than real ones, since beams are wide: 46 % of the points of KITTI's cyclists
+    are below 0.42 of their height, 22 % also more than 0.35 m from the centre (10 cyclists up to
+    40 m away).
     """
     radius = 0.19 * length
     axle, crank = length / 2 - radius, (-0.02 * length, 0.0, 0.88 * radius)
-    wheel = dict(reflectance=0.3, transmission=SPOKE_TRANSMISSION)
     return [
-        disc((-axle, 0, radius), radius, 0.03, **wheel),
-        disc((axle, 0, radius), radius, 0.03, **wheel),
+        disc((-axle, 0, radius), radius, 0.03, 0.3, transmission=SPOKE_TRANSMISSION),
+        disc((axle, 0, radius), radius, 0.03, 0.3, transmission=SPOKE_TRANSMISSION),
         block(
             (-axle - 0.2, -0.06, 0.5 * radius),
             (crank[0] + 0.1, 0.06, 2 * radius + 0.1),
-            reflectance=frame,
+            frame,
             transmission=FRAME_TRANSMISSION,
         ),
-        rod((axle, 0, radius), (bar[0], 0, bar[1]), 0.04, reflectance=frame),
-        rod(crank, (0.85 * bar[0], 0, 0.8 * bar[1]), 0.05, reflectance=frame),
-        rod((bar[0], -half_bar, bar[1]), (bar[0], half_bar, bar[1]), 0.018, reflectance=METAL),
+        rod((axle, 0, radius), (bar[0], 0, bar[1]), 0.04, frame),
+        rod(crank, (0.85 * bar[0], 0, 0.8 * bar[1]), 0.05, frame),
+        rod((bar[0], -half_bar, bar[1]), (bar[0], half_bar, bar[1]), 0.018, METAL),
     ]
 
 
@@ -163,35 +140,37 @@ def make_bicycle(rng: np.random.Generator) -> np.ndarray:
     seat = (-0.15 * length, 0.92)
     rows = [
         *_bicycle_parts(length, 0.3, (0.22 * length, 1.02), rng.uniform(0.05, 0.5)),
-        part(ELLIPSOID, (seat[0], 0, seat[1]), (0.13, 0.08, 0.05), reflectance=RUBBER),
-        block((seat[0] - 0.4, -0.04, 0.68), (seat[0] - 0.38, 0.04, 0.74), reflectance=PLATE),
+        ellipsoid((seat[0], 0, seat[1]), (0.13, 0.08, 0.05), RUBBER),
+        block((seat[0] - 0.4, -0.04, 0.68), (seat[0] - 0.38, 0.04, 0.74), PLATE),
     ]
-    return parts(rows, BICYCLE)
+    return make_parts(rows, BICYCLE)
 
 
 def make_motorcycle(rng: np.random.Generator) -> np.ndarray:
     """Make a parked motorcycle or scooter (P,) PART."""
-    return parts(_motorcycle_parts(rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5), rng.uniform(0.25, 0.31)), MOTORCYCLE)
+    return make_parts(
+        _motorcycle_parts(rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5), rng.uniform(0.25, 0.31)), MOTORCYCLE
+    )
 
 
 def _motorcycle_parts(length: float, paint: float, radius: float) -> list[tuple]:
-    """Return the rows of a motorcycle; radius: of the wheels, in metres."""
+    """Return the parts of a motorcycle with this length, reflectance and radius of the wheels."""
     axle = length / 2 - radius
     return [
-        disc((-axle, 0, radius), radius, 0.07, reflectance=RUBBER),
-        disc((axle, 0, radius), radius, 0.06, reflectance=RUBBER),
-        part(ELLIPSOID, (0, 0, 0.5), (0.45, 0.18, 0.28), reflectance=paint),
-        part(ELLIPSOID, (-0.45, 0, 0.78), (0.4, 0.15, 0.09), reflectance=RUBBER),
-        part(ELLIPSOID, (0.18, 0, 0.85), (0.28, 0.17, 0.14), reflectance=paint),
-        rod((axle, 0, radius), (axle - 0.3, 0, 1.02), 0.06, reflectance=METAL),
-        rod((axle - 0.3, -0.36, 1.02), (axle - 0.3, 0.36, 1.02), 0.02, reflectance=METAL),
-        block((-length / 2 + 0.05, -0.1, 0.55), (-length / 2 + 0.07, 0.1, 0.7), reflectance=PLATE),
+        disc((-axle, 0, radius), radius, 0.07, RUBBER),
+        disc((axle, 0, radius), radius, 0.06, RUBBER),
+        ellipsoid((0, 0, 0.5), (0.45, 0.18, 0.28), paint),
+        ellipsoid((-0.45, 0, 0.78), (0.4, 0.15, 0.09), RUBBER),
+        ellipsoid((0.18, 0, 0.85), (0.28, 0.17, 0.14), paint),
+        rod((axle, 0, radius), (axle - 0.3, 0, 1.02), 0.06, METAL),
+        rod((axle - 0.3, -0.36, 1.02), (axle - 0.3, 0.36, 1.02), 0.02, METAL),
+        block((-length / 2 + 0.05, -0.1, 0.55), (-length / 2 + 0.07, 0.1, 0.7), PLATE),
     ]
 
 
-def make_motorcyclist(rng: np.random.Generator) -> Thing:
-    """Make a rider of a motorcycle or scooter, labelled as a cyclist; some have a passenger."""
-    length, trunk = rng.uniform(1.7, 2.15), rng.uniform(0.52, 0.62)  # hip to the base of the neck
+def make_motorcyclist(rng: np.random.Generator) -> SceneObject:
+    """Make a rider on a motorcycle or scooter, some with a passenger. Its label is Cyclist."""
+    length, trunk = rng.uniform(1.7, 2.15), rng.uniform(0.52, 0.62)  # trunk from the hip to the neck
     rows = _motorcycle_parts(length, rng.uniform(0.05, 0.6), rng.uniform(0.2, 0.31))
     lean, bar = rng.uniform(0.05, 0.4), length / 2 - 0.55
     riders = [bar - rng.uniform(0.45, 0.6)]
@@ -202,28 +181,24 @@ def make_motorcyclist(rng: np.random.Generator) -> Thing:
         shoulder = (hip + sin(lean) * trunk, 0.82 + cos(lean) * trunk)
         head = (shoulder[0] + 0.04, 0.0, shoulder[1] + 0.17)
         rows += [
-            part(
-                ELLIPSOID,
-                ((hip + shoulder[0]) / 2, 0.0, (0.82 + shoulder[1]) / 2),
-                (0.14, 0.21, 0.6 * trunk),
-                pitch=lean,
-                reflectance=coat,
+            ellipsoid(
+                ((hip + shoulder[0]) / 2, 0.0, (0.82 + shoulder[1]) / 2), (0.14, 0.21, 0.6 * trunk), coat, pitch=lean
             ),
-            part(ELLIPSOID, head, (0.14, 0.12, 0.14), reflectance=helmet),
+            ellipsoid(head, (0.14, 0.12, 0.14), helmet),
         ]
         for side in (-1, 1):
             knee_x, foot = hip + 0.42, (hip + 0.3, side * 0.2, 0.3)
             rows += [
-                rod((hip, side * 0.1, 0.82), (knee_x, side * 0.2, 0.74), 0.085, reflectance=trousers),
-                rod((knee_x, side * 0.2, 0.74), foot, 0.06, reflectance=trousers),
+                rod((hip, side * 0.1, 0.82), (knee_x, side * 0.2, 0.74), 0.085, trousers),
+                rod((knee_x, side * 0.2, 0.74), foot, 0.06, trousers),
                 rod(
                     (shoulder[0], side * 0.19, shoulder[1] - 0.05),
                     (min(bar, shoulder[0] + 0.55), side * 0.3, 1.0),
                     0.05,
-                    reflectance=coat,
+                    coat,
                 ),
             ]
-    made = parts(rows, MOTORCYCLIST)
-    _, high = compute_extents(made)
+    parts = make_parts(rows, MOTORCYCLIST)
+    _, high = compute_extents(parts)
     size = (length, 2 * float(high[:, 1].max()), float(high[:, 2].max()))
-    return make_rigid(made, size, CLASSES[CYCLIST])
+    return make_rigid(parts, size, CLASSES[CYCLIST])

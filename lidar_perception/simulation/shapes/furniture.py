@@ -1,120 +1,124 @@
 """Street furniture, much of it as large as a person.
 
-Each function returns (P,) PART. Fixed things reach into the ground. Fronts face +x.
+Each function returns (P,) PART with the front facing +x. Fixed objects reach below the ground.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from lidar_perception.simulation.shapes.thing import GLASS, METAL, PLATE, RUBBER, block, disc, rod
-from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, part, parts
+from lidar_perception.simulation.shapes.primitives import (
+    GLASS,
+    METAL,
+    PLATE,
+    RUBBER,
+    block,
+    cylinder,
+    disc,
+    ellipsoid,
+    rod,
+)
+from lidar_perception.simulation.solids import make_parts
 
 BUILDING, FENCE, VEGETATION, POLE, SIGN, OTHER = 50, 51, 70, 80, 81, 99
-FOOT_M = -0.3  # bottom of fixed objects, sunk into the ground
+FOOT_M = -0.3  # bottom of fixed objects, below the ground
 
 
 def make_pole(rng: np.random.Generator) -> np.ndarray:
     """Make a bare mast of 2.5 to 8 m."""
-    return parts([_post(rng.uniform(2.5, 8.0), rng.uniform(0.04, 0.12))], POLE)
+    return make_parts([_post(rng.uniform(2.5, 8.0), rng.uniform(0.04, 0.12))], POLE)
 
 
 def make_lamp(rng: np.random.Generator) -> np.ndarray:
     """Make a street lamp of 4 to 8 m: mast, base with a door, arm to +x, head."""
     height, arm = rng.uniform(4.0, 8.0), rng.uniform(0.4, 1.5)
-    return parts(
+    return make_parts(
         [
             _post(height, 0.06),
             _post(1.1, 0.09),
-            rod((0, 0, height), (arm, 0, height + 0.1), 0.03, reflectance=METAL),
-            part(ELLIPSOID, (arm + 0.25, 0, height + 0.08), (0.35, 0.14, 0.08), reflectance=METAL),
+            rod((0, 0, height), (arm, 0, height + 0.1), 0.03, METAL),
+            ellipsoid((arm + 0.25, 0, height + 0.08), (0.35, 0.14, 0.08), METAL),
         ],
         POLE,
     )
 
 
 def make_traffic_light(rng: np.random.Generator) -> np.ndarray:
-    """Make a mast with lights at 2.2 m, a button, and up to two signs below."""
+    """Make a mast with lights at 2.2 m, a push button, and up to two signs."""
     height, own = rng.uniform(3.0, 3.5), rng.spawn(1)[0]
     rows = [
         _post(height, 0.07),
-        block((0.08, -0.15, height - 0.95), (0.3, 0.15, height), reflectance=0.05),
-        block((0.06, -0.28, height - 1.0), (0.08, 0.28, height + 0.05), reflectance=0.1),
-        block((-0.16, -0.06, 1.0), (-0.06, 0.06, 1.25), reflectance=0.4),
+        block((0.08, -0.15, height - 0.95), (0.3, 0.15, height), 0.05),
+        block((0.06, -0.28, height - 1.0), (0.08, 0.28, height + 0.05), 0.1),
+        block((-0.16, -0.06, 1.0), (-0.06, 0.06, 1.25), 0.4),
     ]
-    return parts(rows + [_plate(0.1, *own.uniform((0.5, 0.2), (1.6, 0.35))) for _ in range(own.integers(3))], POLE)
+    return make_parts(rows + [_plate(0.1, *own.uniform((0.5, 0.2), (1.6, 0.35))) for _ in range(own.integers(3))], POLE)
 
 
 def make_sign(rng: np.random.Generator) -> np.ndarray:
-    """Make a post with one or two retroreflective plates facing +x; some are low, as on islands.
+    """Make a post with one or two retroreflective plates; some are low, as on traffic islands.
 
-    Half of the low ones are on a mast. Of KITTI's clusters as wide as a person, 15 % are partly
-    retroreflective, most of them low.
+    Half of the low plates are on a mast. In KITTI, 15 % of the clusters as wide as a person are
+    partly retroreflective, most of them low.
     """
     low = rng.uniform(1.7, 2.2) if rng.random() < 0.6 else rng.uniform(0.4, 1.0)
     size, own = rng.uniform(0.25, 0.4), rng.spawn(1)[0]
     plates = [(low, size)] + ([(low + 2 * size + 0.05, 0.2)] if rng.random() < 0.4 else [])
     mast = low < 1.0 and own.random() < 0.5
     rows = [_post(own.uniform(2.5, 4.0), 0.07) if mast else _post(low + 2 * size, 0.035)]
-    return parts(rows + [_plate(0.08 if mast else 0.04, z, half) for z, half in plates], POLE)
+    return make_parts(rows + [_plate(0.08 if mast else 0.04, z, half) for z, half in plates], POLE)
 
 
 def _plate(x: float, z: float, half: float) -> tuple:
-    """Return the plate of a sign at x with its bottom at z."""
-    return block((x, -half, z), (x + 0.02, half, z + 2 * half), reflectance=PLATE, semantic=SIGN)
+    """Return a square plate at x, with its bottom at z."""
+    return block((x, -half, z), (x + 0.02, half, z + 2 * half), PLATE, semantic=SIGN)
 
 
 def make_fence(rng: np.random.Generator, length: float) -> np.ndarray:
-    """Make a fence along x, centred: posts, two rails, and bars or boards with gaps.
+    """Make a fence, centred along x: posts, two rails, and bars or boards with gaps.
 
-    Beams at flatter angles hit the bars more often.
+    Beams at grazing angles hit the bars more often.
     """
     height, x = rng.uniform(0.8, 1.9), length / 2
-    rows = [rod((at, 0, -0.5), (at, 0, height), 0.04, reflectance=METAL) for at in np.linspace(0.04 - x, x - 0.04, 5)]
-    rows += [
-        block((-x, -0.02, share * height), (x, 0.02, share * height + 0.05), reflectance=METAL) for share in (0.15, 0.9)
-    ]
+    rows = [rod((at, 0, -0.5), (at, 0, height), 0.04, METAL) for at in np.linspace(0.04 - x, x - 0.04, 5)]
+    rows += [block((-x, -0.02, share * height), (x, 0.02, share * height + 0.05), METAL) for share in (0.15, 0.9)]
     rows.append(
-        block((-x, -0.012, 0.05), (x, 0.012, 0.98 * height), reflectance=0.3, density=rng.choice((12.0, 25.0, 80.0)))
+        block((-x, -0.012, 0.05), (x, 0.012, 0.98 * height), 0.3, density=rng.choice((12.0, 25.0, 80.0)))
     )  # passes 0.75, 0.55, 0.15
-    return parts(rows, FENCE)
+    return make_parts(rows, FENCE)
 
 
 def make_wall(rng: np.random.Generator, length: float) -> np.ndarray:
-    """Make a garden wall along x, centred, with a coping and piers at its ends."""
+    """Make a garden wall, centred along x, with a coping and piers at its ends."""
     height, x, tone = rng.uniform(0.5, 2.2), length / 2, rng.uniform(0.3, 0.5)
     rows = [
-        block((-x, -0.12, -0.6), (x, 0.12, height), reflectance=tone),
-        block((-x, -0.16, height), (x, 0.16, height + 0.06), reflectance=0.4),
+        block((-x, -0.12, -0.6), (x, 0.12, height), tone),
+        block((-x, -0.16, height), (x, 0.16, height + 0.06), 0.4),
     ]
-    rows += [block((s * x, -0.2, -0.6), (s * (x - 0.4), 0.2, height + 0.2), reflectance=tone) for s in (-1, 1)]
-    return parts(rows, FENCE)
+    rows += [block((s * x, -0.2, -0.6), (s * (x - 0.4), 0.2, height + 0.2), tone) for s in (-1, 1)]
+    return make_parts(rows, FENCE)
 
 
 def make_litter_bin(rng: np.random.Generator) -> np.ndarray:
-    """Make a standing round litter bin, or one on a post."""
+    """Make a round litter bin, standing or on a post."""
     grey = rng.uniform(0.1, 0.5)
     if rng.random() < 0.5:
         high, radius = rng.uniform(0.7, 1.2), rng.uniform(0.2, 0.35)
-        return parts(
-            [
-                _cylinder(0.0, high, radius, grey),
-                part(ELLIPSOID, (0, 0, high), (radius, radius, 0.15), reflectance=grey),
-            ],
-            OTHER,
+        return make_parts(
+            [_cylinder(0.0, high, radius, grey), ellipsoid((0, 0, high), (radius, radius, 0.15), grey)], OTHER
         )
-    return parts([_post(1.15, 0.03), part(CYLINDER, (0.22, 0, 0.8), (0.19, 0.19, 0.28), reflectance=grey)], OTHER)
+    return make_parts([_post(1.15, 0.03), cylinder((0.22, 0, 0.8), (0.19, 0.19, 0.28), grey)], OTHER)
 
 
 def make_wheelie_bin(rng: np.random.Generator) -> np.ndarray:
     """Make a bin on wheels, of 120 l or 1100 l."""
     half, high = ((0.25, 0.24), 0.93) if rng.random() < 0.75 else ((0.55, 0.65), 1.3)
     x, y = half
-    return parts(
+    return make_parts(
         [
-            block((-x, -0.9 * y, 0.1), (x, 0.9 * y, high), reflectance=rng.uniform(0.1, 0.4)),
-            block((-x - 0.05, -y, high), (x + 0.04, y, high + 0.08), reflectance=0.2),
-            disc((0.1 - x, 0, 0.1), 0.1, y, reflectance=RUBBER),
+            block((-x, -0.9 * y, 0.1), (x, 0.9 * y, high), rng.uniform(0.1, 0.4)),
+            block((-x - 0.05, -y, high), (x + 0.04, y, high + 0.08), 0.2),
+            disc((0.1 - x, 0, 0.1), 0.1, y, RUBBER),
         ],
         OTHER,
     )
@@ -125,95 +129,91 @@ def make_bollard(rng: np.random.Generator) -> np.ndarray:
     high, radius = rng.uniform(0.6, 1.1), rng.uniform(0.05, 0.14)
     rows = [
         _cylinder(FOOT_M, high, radius, rng.uniform(0.1, 0.5)),
-        part(ELLIPSOID, (0, 0, high), (radius, radius, 0.06), reflectance=0.3),
+        ellipsoid((0, 0, high), (radius, radius, 0.06), 0.3),
     ]
     if rng.random() < 0.3:
         rows.append(_cylinder(high - 0.2, high - 0.1, radius + 0.003, PLATE))
-    return parts(rows, POLE)
+    return make_parts(rows, POLE)
 
 
 def make_beacon(rng: np.random.Generator) -> np.ndarray:
-    """Make a mostly retroreflective post or board of 0.8 to 1.6 m, as on islands and at roadworks.
+    """Make a retroreflective post or board of 0.8 to 1.6 m, as on traffic islands and at roadworks.
 
-    It is narrower than a person, about as high, and visible from far. Some have a base or a round
-    sign.
+    It is about as high as a person, but narrower. Some have a base or a round sign.
     """
     high, low, half = rng.uniform((0.8, 0.05, 0.06), (1.6, 0.4, 0.3))
     if rng.random() < 0.5:
         rows = [_cylinder(FOOT_M, low, 0.8 * half, 0.3), _cylinder(low, high, half, PLATE)]
     else:
-        rows = [_post(low, 0.04), block((-0.03, -half, low), (0.03, half, high), reflectance=PLATE)]
+        rows = [_post(low, 0.04), block((-0.03, -half, low), (0.03, half, high), PLATE)]
     if rng.random() < 0.4:
-        rows.append(block((-0.4, -0.2, 0.0), (0.4, 0.2, 0.1), reflectance=RUBBER))
+        rows.append(block((-0.4, -0.2, 0.0), (0.4, 0.2, 0.1), RUBBER))
     if rng.random() < 0.3:
-        rows += [_post(high + 0.5, 0.04), part(ELLIPSOID, (0, 0, high + 0.3), (0.03, 0.3, 0.3), reflectance=PLATE)]
-    return parts(rows, SIGN)
+        rows += [_post(high + 0.5, 0.04), ellipsoid((0, 0, high + 0.3), (0.03, 0.3, 0.3), PLATE)]
+    return make_parts(rows, SIGN)
 
 
 def make_cabinet(rng: np.random.Generator) -> np.ndarray:
     """Make a telephone or power cabinet of 0.8 to 1.7 m."""
     x, y, high = rng.uniform((0.15, 0.2, 0.8), (0.3, 0.8, 1.7))
-    return parts(
+    return make_parts(
         [
-            block((-x, -y, FOOT_M), (x, y, high), reflectance=rng.uniform(0.2, 0.5)),
-            block((-x - 0.03, -y - 0.03, high), (x + 0.03, y + 0.03, high + 0.05), reflectance=0.35),
+            block((-x, -y, FOOT_M), (x, y, high), rng.uniform(0.2, 0.5)),
+            block((-x - 0.03, -y - 0.03, high), (x + 0.03, y + 0.03, high + 0.05), 0.35),
         ],
         OTHER,
     )
 
 
 def make_bench(rng: np.random.Generator) -> np.ndarray:
-    """Make a bench with a back, facing +x; the seat is 0.45 m high."""
+    """Make a bench with a back and a seat at 0.45 m."""
     y = rng.uniform(0.7, 1.0)
-    wood = dict(reflectance=rng.uniform(0.2, 0.4))
+    wood = rng.uniform(0.2, 0.4)
     rows = [
-        block((-0.22, -y, 0.41), (0.25, y, 0.45), transmission=0.2, **wood),
-        block((-0.29, -y, 0.55), (-0.25, y, 0.85), transmission=0.2, **wood),
+        block((-0.22, -y, 0.41), (0.25, y, 0.45), wood, transmission=0.2),
+        block((-0.29, -y, 0.55), (-0.25, y, 0.85), wood, transmission=0.2),
     ]
-    rows += [block((-0.27, s * y * 0.75, FOOT_M), (-0.2, s * (y * 0.75 - 0.06), 0.85), **wood) for s in (-1, 1)]
-    rows += [block((0.15, s * y * 0.75, FOOT_M), (0.22, s * (y * 0.75 - 0.06), 0.42), **wood) for s in (-1, 1)]
-    return parts(rows, OTHER)
+    rows += [block((-0.27, s * y * 0.75, FOOT_M), (-0.2, s * (y * 0.75 - 0.06), 0.85), wood) for s in (-1, 1)]
+    rows += [block((0.15, s * y * 0.75, FOOT_M), (0.22, s * (y * 0.75 - 0.06), 0.42), wood) for s in (-1, 1)]
+    return make_parts(rows, OTHER)
 
 
 def make_shopping_trolley(rng: np.random.Generator) -> np.ndarray:
     """Make a shopping trolley with a wire basket."""
     rows = [
-        block((-0.4, -0.28, 0.55), (0.45, 0.28, 1.0), reflectance=METAL, density=rng.uniform(0.7, 1.2)),
-        rod((-0.5, -0.27, 1.05), (-0.5, 0.27, 1.05), 0.02, reflectance=0.2),
-        block((-0.4, -0.25, 0.15), (0.45, 0.25, 0.25), reflectance=METAL, transmission=0.6),
+        block((-0.4, -0.28, 0.55), (0.45, 0.28, 1.0), METAL, density=rng.uniform(0.7, 1.2)),
+        rod((-0.5, -0.27, 1.05), (-0.5, 0.27, 1.05), 0.02, 0.2),
+        block((-0.4, -0.25, 0.15), (0.45, 0.25, 0.25), METAL, transmission=0.6),
     ]
-    rows += [rod((-0.35, s * 0.25, 0.1), (-0.45, s * 0.25, 1.0), 0.02, reflectance=METAL) for s in (-1, 1)]
-    rows += [disc((x, 0.0, 0.06), 0.06, 0.27, reflectance=RUBBER, transmission=0.7) for x in (-0.35, 0.4)]
-    return parts(rows, OTHER)
+    rows += [rod((-0.35, s * 0.25, 0.1), (-0.45, s * 0.25, 1.0), 0.02, METAL) for s in (-1, 1)]
+    rows += [disc((x, 0.0, 0.06), 0.06, 0.27, RUBBER, transmission=0.7) for x in (-0.35, 0.4)]
+    return make_parts(rows, OTHER)
 
 
 def make_phone_box(rng: np.random.Generator) -> np.ndarray:
     """Make a phone box: four posts, panes, a roof and the telephone."""
     half, high = 0.45, rng.uniform(2.2, 2.4)
     rows = [
-        rod((sx * half, sy * half, FOOT_M), (sx * half, sy * half, high), 0.04, reflectance=METAL)
+        rod((sx * half, sy * half, FOOT_M), (sx * half, sy * half, high), 0.04, METAL)
         for sx in (-1, 1)
         for sy in (-1, 1)
     ]
+    rows += [block((-half, s * half, 0.3), (half, s * (half - 0.01), high), GLASS, transmission=0.7) for s in (-1, 1)]
     rows += [
-        block((-half, s * half, 0.3), (half, s * (half - 0.01), high), reflectance=GLASS, transmission=0.7)
-        for s in (-1, 1)
+        block((-half - 0.05, -half - 0.05, high), (half + 0.05, half + 0.05, high + 0.15), 0.3),
+        block((-half, -half + 0.05, FOOT_M), (-half + 0.25, half - 0.05, 1.7), 0.3),
     ]
-    rows += [
-        block((-half - 0.05, -half - 0.05, high), (half + 0.05, half + 0.05, high + 0.15), reflectance=0.3),
-        block((-half, -half + 0.05, FOOT_M), (-half + 0.25, half - 0.05, 1.7), reflectance=0.3),
-    ]
-    return parts(rows, OTHER)
+    return make_parts(rows, OTHER)
 
 
 def make_advertising_column(rng: np.random.Generator) -> np.ndarray:
     """Make a round advertising column of 2.5 to 3.6 m."""
     high, radius = rng.uniform(2.5, 3.6), rng.uniform(0.5, 0.7)
-    return parts(
+    return make_parts(
         [
             _cylinder(FOOT_M, high, radius, rng.uniform(0.3, 0.5)),
             _cylinder(high, high + 0.15, radius + 0.08, 0.3),
-            part(ELLIPSOID, (0, 0, high + 0.15), (radius, radius, 0.25), reflectance=0.3),
+            ellipsoid((0, 0, high + 0.15), (radius, radius, 0.25), 0.3),
         ],
         OTHER,
     )
@@ -222,9 +222,9 @@ def make_advertising_column(rng: np.random.Generator) -> np.ndarray:
 def make_cone(rng: np.random.Generator) -> np.ndarray:
     """Make a traffic cone of 0.5 to 0.75 m with a retroreflective band."""
     high = rng.uniform(0.5, 0.75)
-    return parts(
+    return make_parts(
         [
-            block((-0.19, -0.19, 0), (0.19, 0.19, 0.03), reflectance=0.3),
+            block((-0.19, -0.19, 0), (0.19, 0.19, 0.03), 0.3),
             _cylinder(0.03, 0.4 * high, 0.13, 0.4),
             _cylinder(0.4 * high, 0.7 * high, 0.09, PLATE),
             _cylinder(0.7 * high, high, 0.05, 0.4),
@@ -234,19 +234,14 @@ def make_cone(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_planter(rng: np.random.Generator) -> np.ndarray:
-    """Make a tub with a plant, together as high as a person."""
+    """Make a tub with a plant, about as high as a person."""
     high = rng.uniform(0.35, 0.6)
     tall = rng.uniform(0.35, 0.65)
-    return parts(
+    return make_parts(
         [
             _cylinder(0.0, high, 0.32, rng.uniform(0.25, 0.45)),
-            part(
-                ELLIPSOID,
-                (0, 0, high + 0.9 * tall),
-                (0.3, 0.28, tall),
-                reflectance=0.34,
-                semantic=VEGETATION,
-                density=rng.uniform(2, 6),
+            ellipsoid(
+                (0, 0, high + 0.9 * tall), (0.3, 0.28, tall), 0.34, semantic=VEGETATION, density=rng.uniform(2, 6)
             ),
         ],
         OTHER,
@@ -257,50 +252,50 @@ def make_parasol(rng: np.random.Generator) -> np.ndarray:
     """Make a cafe table with two chairs under a parasol."""
     high = rng.uniform(2.1, 2.5)
     rows = [
-        rod((0, 0, 0), (0, 0, high), 0.025, reflectance=METAL),
-        part(ELLIPSOID, (0, 0, high), (1.3, 1.3, 0.2), reflectance=0.35),
+        rod((0, 0, 0), (0, 0, high), 0.025, METAL),
+        ellipsoid((0, 0, high), (1.3, 1.3, 0.2), 0.35),
         _cylinder(0.7, 0.74, 0.4, 0.35),
     ]
     for s in (-1, 1):
         rows += [
-            block((s * 0.55, -0.2, 0.0), (s * 0.95, 0.2, 0.45), reflectance=0.25, transmission=0.6),
-            block((s * 0.92, -0.2, 0.45), (s * 0.95, 0.2, 0.9), reflectance=0.25, transmission=0.3),
+            block((s * 0.55, -0.2, 0.0), (s * 0.95, 0.2, 0.45), 0.25, transmission=0.6),
+            block((s * 0.92, -0.2, 0.45), (s * 0.95, 0.2, 0.9), 0.25, transmission=0.3),
         ]
-    return parts(rows, OTHER)
+    return make_parts(rows, OTHER)
 
 
 def make_hydrant(rng: np.random.Generator) -> np.ndarray:
     """Make a pump, hydrant or parking meter: a post with a thicker head."""
     high = rng.uniform(0.9, 1.5)
-    return parts(
+    return make_parts(
         [
             _cylinder(FOOT_M, high, rng.uniform(0.04, 0.12), 0.3),
-            part(ELLIPSOID, (0, 0, high - 0.15), (0.14, 0.17, 0.22), reflectance=rng.uniform(0.1, 0.4)),
+            ellipsoid((0, 0, high - 0.15), (0.14, 0.17, 0.22), rng.uniform(0.1, 0.4)),
         ],
         OTHER,
     )
 
 
 def make_stairs(rng: np.random.Generator, length: float) -> np.ndarray:
-    """Make stairs along x, centred, up to +y from y = 0, with a landing and handrails."""
+    """Make stairs, centred along x, that rise from y = 0 towards +y, with a landing and handrails."""
     x, count, rise = length / 2, int(rng.integers(2, 7)), rng.uniform(0.12, 0.17)
     end = 0.3 * count + rng.uniform(0.5, 2.0)
-    rows = [block((-x, 0.3 * i, FOOT_M), (x, end, rise * (i + 1)), reflectance=0.4) for i in range(count)]
+    rows = [block((-x, 0.3 * i, FOOT_M), (x, end, rise * (i + 1)), 0.4) for i in range(count)]
     for at in np.linspace(-x + 0.05, x - 0.05, max(2, int(length / 4) + 1)):
         top = (at, 0.3 * count, rise * count + 0.9)
         rows += [
-            rod((at, 0.0, 0.9), top, 0.025, reflectance=METAL),
-            rod((at, 0.05, 0.0), (at, 0.05, 0.9), 0.02, reflectance=METAL),
-            rod((at, 0.3 * count, 0.0), top, 0.02, reflectance=METAL),
+            rod((at, 0.0, 0.9), top, 0.025, METAL),
+            rod((at, 0.05, 0.0), (at, 0.05, 0.9), 0.02, METAL),
+            rod((at, 0.3 * count, 0.0), top, 0.02, METAL),
         ]
-    return parts(rows, BUILDING)
+    return make_parts(rows, BUILDING)
 
 
 def make_bicycle_stand(rng: np.random.Generator) -> np.ndarray:
-    """Make a hoop that bicycles are locked to."""
+    """Make a hoop for locking bicycles."""
     high = rng.uniform(0.7, 0.9)
-    rows = [rod((s * 0.35, 0, FOOT_M), (s * 0.35, 0, high), 0.025, reflectance=METAL) for s in (-1, 1)]
-    return parts([*rows, rod((-0.35, 0, high), (0.35, 0, high), 0.025, reflectance=METAL)], POLE)
+    rows = [rod((s * 0.35, 0, FOOT_M), (s * 0.35, 0, high), 0.025, METAL) for s in (-1, 1)]
+    return make_parts([*rows, rod((-0.35, 0, high), (0.35, 0, high), 0.025, METAL)], POLE)
 
 
 def _post(height: float, radius: float) -> tuple:
@@ -308,10 +303,10 @@ def _post(height: float, radius: float) -> tuple:
 
 
 def _cylinder(low: float, high: float, radius: float, reflectance: float) -> tuple:
-    return part(CYLINDER, (0, 0, (low + high) / 2), (radius, radius, (high - low) / 2), reflectance=reflectance)
+    return cylinder((0, 0, (low + high) / 2), (radius, radius, (high - low) / 2), reflectance)
 
 
-# Objects that a detector may confuse with a person.
+# Makers of objects that a detector may confuse with a person.
 PERSON_SIZED = (
     make_sign,
     make_beacon,

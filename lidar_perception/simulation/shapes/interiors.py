@@ -1,7 +1,7 @@
-"""Parts of interiors: pieces of walls, and furniture.
+"""Wall elements and furniture of interiors.
 
-Walls are along x, centred, with their face at y = 0 towards -y, and the rest behind it. Furniture
-faces +x. Each function returns (P,) PART.
+Each function returns (P,) PART. Walls are centred along x with their face at y = 0 facing -y.
+Furniture faces +x.
 """
 
 from __future__ import annotations
@@ -9,226 +9,208 @@ from __future__ import annotations
 import numpy as np
 
 from lidar_perception.simulation.shapes.furniture import BUILDING, FOOT_M, OTHER
-from lidar_perception.simulation.shapes.thing import GLASS, METAL, RUBBER, block, disc, rod
-from lidar_perception.simulation.solids import CYLINDER, part, parts
+from lidar_perception.simulation.shapes.primitives import GLASS, METAL, RUBBER, block, cylinder, disc, rod
+from lidar_perception.simulation.solids import make_parts
 
 DOOR_HEIGHT_M = 2.1
 WALL_THICKNESS_M = 0.2
 
 
 def make_wall(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """Make a wall with a skirting, some with a rail, a board or a picture."""
+    """Make a wall with a skirting board, some with a handrail, a notice board or a picture."""
     x = length / 2
-    rows = [
-        _wall_panel((-x, x), FOOT_M, height, rng),
-        block((-x, -0.015, 0.0), (x, 0.0, 0.1), reflectance=rng.uniform(0.1, 0.5)),
-    ]
+    rows = [_wall_panel((-x, x), FOOT_M, height, rng), block((-x, -0.015, 0.0), (x, 0.0, 0.1), rng.uniform(0.1, 0.5))]
     pick = rng.random()
     if pick < 0.15:
-        rows.append(block((-x, -0.08, 0.85), (x, -0.03, 0.95), reflectance=0.3))
+        rows.append(block((-x, -0.08, 0.85), (x, -0.03, 0.95), 0.3))
     elif pick < 0.45 and length > 1.5:
         wide, low = rng.uniform(0.3, 0.45) * length, rng.uniform(0.9, 1.3)
-        rows.append(
-            block((-wide, -0.04, low), (wide, 0.0, low + rng.uniform(0.4, 0.9)), reflectance=rng.uniform(0.1, 0.8))
-        )
-    return parts(rows, BUILDING)
+        rows.append(block((-wide, -0.04, low), (wide, 0.0, low + rng.uniform(0.4, 0.9)), rng.uniform(0.1, 0.8)))
+    return make_parts(rows, BUILDING)
 
 
 def make_door(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """Make a door in its frame; one in three is open to a room."""
+    """Make a door in a wall; one in three is open and shows a room."""
     x, half = length / 2, min(0.5, 0.45 * length)
     rows = _opening_parts(rng, x, half, DOOR_HEIGHT_M, height)
     tone = rng.uniform(0.15, 0.6)
     if rng.random() < 0.33:
         leaf = half if rng.random() < 0.5 else -half
         rows += [
-            block((leaf - 0.02, 0.0, 0.0), (leaf + 0.02, 0.9, DOOR_HEIGHT_M), reflectance=tone),
+            block((leaf - 0.02, 0.0, 0.0), (leaf + 0.02, 0.9, DOOR_HEIGHT_M), tone),
             *_room_parts(rng, x + rng.uniform(0.5, 1.5), height),
         ]
     else:
         rows += [
-            block((-half, 0.1, 0.0), (half, 0.15, DOOR_HEIGHT_M), reflectance=tone),
-            rod((0.8 * half, 0.05, 1.05), (0.6 * half, 0.05, 1.05), 0.015, reflectance=METAL),
+            block((-half, 0.1, 0.0), (half, 0.15, DOOR_HEIGHT_M), tone),
+            rod((0.8 * half, 0.05, 1.05), (0.6 * half, 0.05, 1.05), 0.015, METAL),
         ]
-    return parts(rows, BUILDING)
+    return make_parts(rows, BUILDING)
 
 
 def make_glazing(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """Make panes between posts from the floor up, with a room behind."""
-    return parts(
+    """Make a wall of glass panes between posts, with a room behind."""
+    return make_parts(
         [*_pane_parts(rng, length, min(height, rng.uniform(2.3, 3.0)), height), *_room_parts(rng, length / 2, height)],
         BUILDING,
     )
 
 
 def make_window(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """Make panes between posts from the floor up, with nothing behind."""
-    return parts(_pane_parts(rng, length, height - 0.3, height), BUILDING)
+    """Make a wall of glass panes between posts, with nothing behind."""
+    return make_parts(_pane_parts(rng, length, height - 0.3, height), BUILDING)
 
 
 def make_passage(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """Make the opening of another corridor."""
+    """Make the opening to another corridor."""
     x, far = length / 2, rng.uniform(6.0, 25.0)
     rows = [
-        block((s * x, 0.0, FOOT_M), (s * (x + WALL_THICKNESS_M), far, height), reflectance=rng.uniform(0.4, 0.7))
-        for s in (-1, 1)
+        block((s * x, 0.0, FOOT_M), (s * (x + WALL_THICKNESS_M), far, height), rng.uniform(0.4, 0.7)) for s in (-1, 1)
     ]
     rows += [
-        block((-x, far, FOOT_M), (x, far + WALL_THICKNESS_M, height), reflectance=0.5),
-        block((-x, WALL_THICKNESS_M, height), (x, far, height + WALL_THICKNESS_M), reflectance=0.6),
+        block((-x, far, FOOT_M), (x, far + WALL_THICKNESS_M, height), 0.5),
+        block((-x, WALL_THICKNESS_M, height), (x, far, height + WALL_THICKNESS_M), 0.6),
     ]
-    return parts(rows, BUILDING)
+    return make_parts(rows, BUILDING)
 
 
 def _wall_panel(x: tuple, low: float, high: float, rng: np.random.Generator) -> tuple:
-    return block((x[0], 0.0, low), (x[1], WALL_THICKNESS_M, high), reflectance=rng.uniform(0.4, 0.75))
+    return block((x[0], 0.0, low), (x[1], WALL_THICKNESS_M, high), rng.uniform(0.4, 0.75))
 
 
 def _opening_parts(rng, x: float, half: float, top: float, height: float) -> list[tuple]:
     """Return the wall around an opening."""
-    tone = dict(reflectance=rng.uniform(0.4, 0.75))
+    tone = rng.uniform(0.4, 0.75)
     return [
-        block((-x, 0.0, FOOT_M), (-half, WALL_THICKNESS_M, height), **tone),
-        block((half, 0.0, FOOT_M), (x, WALL_THICKNESS_M, height), **tone),
-        block((-half, 0.0, top), (half, WALL_THICKNESS_M, height), **tone),
+        block((-x, 0.0, FOOT_M), (-half, WALL_THICKNESS_M, height), tone),
+        block((half, 0.0, FOOT_M), (x, WALL_THICKNESS_M, height), tone),
+        block((-half, 0.0, top), (half, WALL_THICKNESS_M, height), tone),
     ]
 
 
 def _room_parts(rng, x: float, height: float) -> list[tuple]:
-    """Return the walls of the room behind, with one piece of furniture."""
-    far, tone = rng.uniform(2.5, 6.0), dict(reflectance=rng.uniform(0.4, 0.7))
+    """Return the walls of a room behind an opening, with one piece of furniture."""
+    far, tone = rng.uniform(2.5, 6.0), rng.uniform(0.4, 0.7)
     wide, deep, high = rng.uniform((0.3, 0.2, 0.7), (0.7, 0.5, 2.0))
     at = rng.uniform(-0.4, 0.4) * x
     return [
-        block((-x, far, FOOT_M), (x, far + WALL_THICKNESS_M, height), **tone),
-        *(block((s * x, WALL_THICKNESS_M, FOOT_M), (s * (x - 0.1), far, height), **tone) for s in (-1, 1)),
-        block((-x, WALL_THICKNESS_M, height), (x, far, height + WALL_THICKNESS_M), **tone),
-        block((at - wide, far - 2 * deep, 0.0), (at + wide, far, high), reflectance=0.3),
+        block((-x, far, FOOT_M), (x, far + WALL_THICKNESS_M, height), tone),
+        *(block((s * x, WALL_THICKNESS_M, FOOT_M), (s * (x - 0.1), far, height), tone) for s in (-1, 1)),
+        block((-x, WALL_THICKNESS_M, height), (x, far, height + WALL_THICKNESS_M), tone),
+        block((at - wide, far - 2 * deep, 0.0), (at + wide, far, high), 0.3),
     ]
 
 
 def _pane_parts(rng, length: float, top: float, height: float) -> list[tuple]:
-    """Return panes that beams pass at random, with a rail below and wall above."""
+    """Return glass panes up to top, with a rail below and wall above."""
     x, count = length / 2, max(round(length / rng.uniform(1.2, 2.0)), 1)
     rows = [
-        block((-x, 0.06, 0.05), (x, 0.08, top), reflectance=GLASS, transmission=rng.uniform(0.6, 0.9)),
-        block((-x, 0.04, 0.0), (x, 0.1, rng.uniform(0.06, 0.2)), reflectance=METAL),
+        block((-x, 0.06, 0.05), (x, 0.08, top), GLASS, transmission=rng.uniform(0.6, 0.9)),
+        block((-x, 0.04, 0.0), (x, 0.1, rng.uniform(0.06, 0.2)), METAL),
     ]
-    rows += [
-        block((at - 0.03, 0.02, 0.0), (at + 0.03, 0.12, top), reflectance=METAL) for at in np.linspace(-x, x, count + 1)
-    ]
+    rows += [block((at - 0.03, 0.02, 0.0), (at + 0.03, 0.12, top), METAL) for at in np.linspace(-x, x, count + 1)]
     if top < height:
         rows.append(_wall_panel((-x, x), top, height, rng))
     return rows
 
 
 def make_ceiling(rng: np.random.Generator, length: float, width: float, height: float) -> np.ndarray:
-    """Make a ceiling, centred, some with lamps or joists below it."""
+    """Make a ceiling centred at the origin, some with lamps or joists."""
     x, y = length / 2, width / 2
-    rows = [block((-x, -y, height), (x, y, height + 0.3), reflectance=rng.uniform(0.4, 0.75))]
+    rows = [block((-x, -y, height), (x, y, height + 0.3), rng.uniform(0.4, 0.75))]
     count, deep = int(length / rng.uniform(3.0, 6.0)), rng.uniform(0.05, 0.4)
     deep = min(deep, height - 2.35)
     if rng.random() < 0.7:
         rows += [
-            block((at - 0.15, -0.9 * y, height - deep), (at + 0.15, 0.9 * y, height), reflectance=0.5)
+            block((at - 0.15, -0.9 * y, height - deep), (at + 0.15, 0.9 * y, height), 0.5)
             for at in np.linspace(-x, x, count)
         ]
-    return parts(rows, BUILDING)
+    return make_parts(rows, BUILDING)
 
 
 def make_column(rng: np.random.Generator, height: float) -> np.ndarray:
-    """Make a round or square column up to the ceiling."""
+    """Make a round or square column."""
     half, tone = rng.uniform(0.12, 0.4), rng.uniform(0.3, 0.7)
     if rng.random() < 0.5:
-        return parts([part(CYLINDER, (0, 0, height / 2), (half, half, height / 2), reflectance=tone)], BUILDING)
-    return parts([block((-half, -half, FOOT_M), (half, half, height), reflectance=tone)], BUILDING)
+        return make_parts([cylinder((0, 0, height / 2), (half, half, height / 2), tone)], BUILDING)
+    return make_parts([block((-half, -half, FOOT_M), (half, half, height), tone)], BUILDING)
 
 
 def make_shelf(rng: np.random.Generator, length: float) -> np.ndarray:
-    """Make a shelf along x, open to both sides, with goods on its boards."""
+    """Make a shelf along x, open to both sides, with goods."""
     x, y, high = length / 2, rng.uniform(0.2, 0.35), rng.uniform(1.2, 2.2)
     levels = np.arange(0.1, high, rng.uniform(0.35, 0.5))
-    rows = [block((s * x, -y, 0.0), (s * (x - 0.04), y, high), reflectance=METAL) for s in (-1, 1)]
+    rows = [block((s * x, -y, 0.0), (s * (x - 0.04), y, high), METAL) for s in (-1, 1)]
     for z, left, right, tall, deep, tone in zip(levels, *rng.random((5, len(levels)))):
-        rows.append(block((-x, -y, z), (x, y, z + 0.03), reflectance=0.4))
+        rows.append(block((-x, -y, z), (x, y, z + 0.03), 0.4))
         rows.append(
             block(
                 (-x + 0.6 * left * x, -(0.5 + 0.4 * deep) * y, z + 0.03),
                 (x - 0.6 * right * x, 0.9 * y, z + 0.1 + 0.2 * tall),
-                reflectance=0.1 + 0.5 * tone,
+                0.1 + 0.5 * tone,
             )
         )
-    return parts(rows, OTHER)
+    return make_parts(rows, OTHER)
 
 
 def make_table(rng: np.random.Generator, length: float, width: float) -> np.ndarray:
-    """Make a table of 0.7 to 0.78 m on four legs or a foot, some with a thing on it."""
+    """Make a table of 0.7 to 0.78 m on four legs or a central foot, some with an object on it."""
     x, y, high = length / 2, width / 2, rng.uniform(0.7, 0.78)
-    rows = [block((-x, -y, high - 0.04), (x, y, high), reflectance=rng.uniform(0.2, 0.6))]
+    rows = [block((-x, -y, high - 0.04), (x, y, high), rng.uniform(0.2, 0.6))]
     if rng.random() < 0.6:
         rows += [
-            rod((sx * 0.9 * x, sy * 0.85 * y, 0), (sx * 0.9 * x, sy * 0.85 * y, high), 0.025, reflectance=METAL)
+            rod((sx * 0.9 * x, sy * 0.85 * y, 0), (sx * 0.9 * x, sy * 0.85 * y, high), 0.025, METAL)
             for sx in (-1, 1)
             for sy in (-1, 1)
         ]
     else:
-        rows += [
-            rod((0, 0, 0), (0, 0, high), 0.05, reflectance=METAL),
-            block((-0.3, -0.3, 0.0), (0.3, 0.3, 0.03), reflectance=METAL),
-        ]
+        rows += [rod((0, 0, 0), (0, 0, high), 0.05, METAL), block((-0.3, -0.3, 0.0), (0.3, 0.3, 0.03), METAL)]
     if rng.random() < 0.5:
         at = rng.uniform(-0.6, 0.6) * x
         rows.append(
-            block(
-                (at - 0.2, -0.15, high),
-                (at + 0.2, 0.15, high + rng.uniform(0.05, 0.35)),
-                reflectance=rng.uniform(0.05, 0.6),
-            )
+            block((at - 0.2, -0.15, high), (at + 0.2, 0.15, high + rng.uniform(0.05, 0.35)), rng.uniform(0.05, 0.6))
         )
-    return parts(rows, OTHER)
+    return make_parts(rows, OTHER)
 
 
 def make_chair(rng: np.random.Generator) -> np.ndarray:
     """Make an empty chair."""
-    tone, back = dict(reflectance=rng.uniform(0.1, 0.5)), rng.uniform(0.8, 0.95)
-    rows = [
-        block((-0.2, -0.21, 0.42), (0.22, 0.21, 0.46), **tone),
-        block((-0.22, -0.2, 0.5), (-0.19, 0.2, back), **tone),
-    ]
+    tone, back = rng.uniform(0.1, 0.5), rng.uniform(0.8, 0.95)
+    rows = [block((-0.2, -0.21, 0.42), (0.22, 0.21, 0.46), tone), block((-0.22, -0.2, 0.5), (-0.19, 0.2, back), tone)]
     if rng.random() < 0.7:
         rows += [
-            rod((sx * 0.19, sy * 0.18, 0), (sx * 0.19, sy * 0.18, 0.44), 0.015, reflectance=METAL)
+            rod((sx * 0.19, sy * 0.18, 0), (sx * 0.19, sy * 0.18, 0.44), 0.015, METAL)
             for sx in (-1, 1)
             for sy in (-1, 1)
         ]
     else:  # office chair on castors
         rows += [
-            rod((0, 0, 0.06), (0, 0, 0.44), 0.03, reflectance=METAL),
-            part(CYLINDER, (0, 0, 0.06), (0.28, 0.28, 0.03), reflectance=RUBBER, transmission=0.5),
+            rod((0, 0, 0.06), (0, 0, 0.44), 0.03, METAL),
+            cylinder((0, 0, 0.06), (0.28, 0.28, 0.03), RUBBER, transmission=0.5),
         ]
-    return parts(rows, OTHER)
+    return make_parts(rows, OTHER)
 
 
 def make_counter(rng: np.random.Generator) -> np.ndarray:
-    """Make a counter that faces +x."""
+    """Make a service counter."""
     y, high = rng.uniform(1.0, 2.5), rng.uniform(0.95, 1.2)
-    return parts(
+    return make_parts(
         [
-            block((-0.35, -y, 0.0), (0.3, y, high), reflectance=rng.uniform(0.2, 0.6)),
-            block((-0.4, -y - 0.05, high), (0.4, y + 0.05, high + 0.05), reflectance=0.4),
+            block((-0.35, -y, 0.0), (0.3, y, high), rng.uniform(0.2, 0.6)),
+            block((-0.4, -y - 0.05, high), (0.4, y + 0.05, high + 0.05), 0.4),
         ],
         OTHER,
     )
 
 
 def make_display(rng: np.random.Generator) -> np.ndarray:
-    """Make a display board on a foot, as wide and high as a person."""
+    """Make a display board on a foot, about as wide and high as a person."""
     y, low, high = rng.uniform((0.2, 0.1, 1.5), (0.5, 0.9, 2.0))
-    return parts(
+    return make_parts(
         [
-            block((-0.03, -y, low), (0.03, y, high), reflectance=rng.uniform(0.1, 0.7)),
-            rod((0, 0, 0), (0, 0, high), 0.025, reflectance=METAL),
-            block((-0.25, -0.8 * y, 0.0), (0.25, 0.8 * y, 0.03), reflectance=METAL),
+            block((-0.03, -y, low), (0.03, y, high), rng.uniform(0.1, 0.7)),
+            rod((0, 0, 0), (0, 0, high), 0.025, METAL),
+            block((-0.25, -0.8 * y, 0.0), (0.25, 0.8 * y, 0.03), METAL),
         ],
         OTHER,
     )
@@ -237,10 +219,10 @@ def make_display(rng: np.random.Generator) -> np.ndarray:
 def make_machine(rng: np.random.Generator) -> np.ndarray:
     """Make a vending machine, wardrobe or locker."""
     x, y, high = rng.uniform((0.2, 0.25, 1.4), (0.45, 0.6, 2.0))
-    return parts(
+    return make_parts(
         [
-            block((-x, -y, 0.0), (x, y, high), reflectance=rng.uniform(0.1, 0.6)),
-            block((x, -0.8 * y, 0.7), (x + 0.01, 0.4 * y, high - 0.15), reflectance=GLASS),
+            block((-x, -y, 0.0), (x, y, high), rng.uniform(0.1, 0.6)),
+            block((x, -0.8 * y, 0.7), (x + 0.01, 0.4 * y, high - 0.15), GLASS),
         ],
         OTHER,
     )
@@ -252,30 +234,20 @@ def make_boxes(rng: np.random.Generator) -> np.ndarray:
     for x, y, high, turn, tone in rng.random((rng.integers(2, 5), 5)).tolist():
         half, tall = (0.15 + 0.15 * x, 0.15 + 0.15 * y), 0.2 + 0.3 * high
         rows.append(
-            block(
-                (-half[0], -half[1], z),
-                (half[0], half[1], z + tall),
-                yaw=0.5 * (turn - 0.5),
-                reflectance=0.2 + 0.4 * tone,
-            )
+            block((-half[0], -half[1], z), (half[0], half[1], z + tall), 0.2 + 0.4 * tone, yaw=0.5 * (turn - 0.5))
         )
         z += tall
-    return parts(rows, OTHER)
+    return make_parts(rows, OTHER)
 
 
 def make_coat_stand(rng: np.random.Generator) -> np.ndarray:
     """Make a coat stand with coats."""
     high, wide, low = rng.uniform((1.6, 0.12, 0.5), (1.85, 0.25, 1.1))
-    return parts(
+    return make_parts(
         [
-            rod((0, 0, 0), (0, 0, high), 0.025, reflectance=METAL),
-            part(CYLINDER, (0, 0, 0.02), (0.22, 0.22, 0.02), reflectance=METAL),
-            part(
-                CYLINDER,
-                (0, 0, (low + high) / 2 - 0.1),
-                (wide, 0.8 * wide, (high - low) / 2),
-                reflectance=rng.uniform(0.1, 0.5),
-            ),
+            rod((0, 0, 0), (0, 0, high), 0.025, METAL),
+            cylinder((0, 0, 0.02), (0.22, 0.22, 0.02), METAL),
+            cylinder((0, 0, (low + high) / 2 - 0.1), (wide, 0.8 * wide, (high - low) / 2), rng.uniform(0.1, 0.5)),
         ],
         OTHER,
     )
@@ -284,14 +256,12 @@ def make_coat_stand(rng: np.random.Generator) -> np.ndarray:
 def make_cart(rng: np.random.Generator) -> np.ndarray:
     """Make a cart for cleaning, mail or trays."""
     x, y, high = rng.uniform((0.3, 0.22, 0.8), (0.5, 0.3, 1.5))
-    rows = [block((-x, -y, z), (x, y, z + 0.04), reflectance=METAL) for z in np.linspace(0.2, high, 3)]
-    rows += [
-        rod((sx * x, sy * y, 0.1), (sx * x, sy * y, high), 0.02, reflectance=METAL) for sx in (-1, 1) for sy in (-1, 1)
-    ]
-    rows += [disc((sx * 0.8 * x, 0, 0.06), 0.06, y, reflectance=RUBBER, transmission=0.7) for sx in (-1, 1)]
-    rows.append(block((-0.8 * x, -0.8 * y, 0.24), (0.2 * x, 0.8 * y, 0.7 * high), reflectance=rng.uniform(0.1, 0.6)))
-    return parts(rows, OTHER)
+    rows = [block((-x, -y, z), (x, y, z + 0.04), METAL) for z in np.linspace(0.2, high, 3)]
+    rows += [rod((sx * x, sy * y, 0.1), (sx * x, sy * y, high), 0.02, METAL) for sx in (-1, 1) for sy in (-1, 1)]
+    rows += [disc((sx * 0.8 * x, 0, 0.06), 0.06, y, RUBBER, transmission=0.7) for sx in (-1, 1)]
+    rows.append(block((-0.8 * x, -0.8 * y, 0.24), (0.2 * x, 0.8 * y, 0.7 * high), rng.uniform(0.1, 0.6)))
+    return make_parts(rows, OTHER)
 
 
-# Objects that a detector may confuse with a person.
+# Makers of objects that a detector may confuse with a person.
 PERSON_SIZED = (make_display, make_machine, make_boxes, make_coat_stand, make_cart, make_chair)

@@ -1,4 +1,4 @@
-"""Trees, bushes and hedges, whose leaves some beams pass."""
+"""Trees, bushes and hedges with partly transparent foliage."""
 
 from __future__ import annotations
 
@@ -6,81 +6,77 @@ from math import cos, pi, sin
 
 import numpy as np
 
-from lidar_perception.simulation.shapes.thing import interpolate, rod
-from lidar_perception.simulation.solids import BOX, ELLIPSOID, part, parts
+from lidar_perception.simulation.shapes.primitives import box, ellipsoid, rod
+from lidar_perception.simulation.solids import make_parts
 
 VEGETATION, TRUNK = 70, 71
-BARK, LEAVES = 0.31, 0.34  # reflectances: medians of trunk and vegetation in a scan of SemanticKITTI
-WOOD = {"reflectance": BARK, "semantic": TRUNK}
+BARK, LEAVES = 0.31, 0.34  # medians of trunk and vegetation in a scan of SemanticKITTI
 
 
 def make_tree(rng: np.random.Generator, height: float | None = None) -> np.ndarray:
-    """Make a broad-leaved tree (P,) PART: trunk, boughs, a crown and three smaller balls of leaves.
+    """Make a broad-leaved tree as (P,) PART: trunk, boughs, a crown and three smaller balls of leaves.
 
-    No leaves are below a third of the height, which is drawn if not given. The trunk begins 0.3 m
-    below the ground.
+    The lowest third has no leaves. The trunk begins 0.3 m below the ground.
+
+    Args:
+        height: Height in m; None draws it.
     """
     height = rng.uniform(4.0, 11.0) if height is None else height
     fork, radius = height * rng.uniform(0.33, 0.42), height * rng.uniform(0.016, 0.026)
     top = (*rng.uniform(-0.03, 0.03, 2) * height, 0.75 * height)
-    rows = [rod((0, 0, -0.3), (0, 0, fork), radius, **WOOD), rod((0, 0, fork), top, 0.6 * radius, **WOOD)]
+    rows = [
+        rod((0, 0, -0.3), (0, 0, fork), radius, BARK, semantic=TRUNK),
+        rod((0, 0, fork), top, 0.6 * radius, BARK, semantic=TRUNK),
+    ]
     turn, spread = rng.uniform(0, 2 * np.pi), height * rng.uniform(0.1, 0.2)
     for at in (turn, turn + pi):
         end = (spread * cos(at), spread * sin(at), 0.62 * height)
-        rows.append(rod((0, 0, fork), end, 0.4 * radius, **WOOD))
+        rows.append(rod((0, 0, fork), end, 0.4 * radius, BARK, semantic=TRUNK))
     wide, tall = height * rng.uniform(0.2, 0.3), height - fork
     leaves = [_draw_foliage(rng, (0, 0, fork + 0.55 * tall), (wide, wide, 0.45 * tall), (0.4, 1.0))]
     for i, (a, b, c, up, *rest) in enumerate(rng.random((3, 7)).tolist()):
         at = turn + 1.0 + 2.1 * i
-        centre = (0.7 * wide * cos(at), 0.7 * wide * sin(at), fork + tall * interpolate(up, 0.25, 0.7))
+        centre = (0.7 * wide * cos(at), 0.7 * wide * sin(at), fork + tall * _interpolate(up, 0.25, 0.7))
         half = (
-            height * interpolate(a, 0.12, 0.2),
-            height * interpolate(b, 0.12, 0.2),
-            height * interpolate(c, 0.1, 0.16),
+            height * _interpolate(a, 0.12, 0.2),
+            height * _interpolate(b, 0.12, 0.2),
+            height * _interpolate(c, 0.1, 0.16),
         )
         leaves.append(_leaf_ball(rest, centre, half, (0.6, 2.0)))
-    return parts(rows + leaves, VEGETATION)
+    return make_parts(rows + leaves, VEGETATION)
 
 
 def make_conifer(rng: np.random.Generator) -> np.ndarray:
-    """Make a conifer (P,) PART with boughs down to the ground."""
+    """Make a conifer as (P,) PART, with boughs down to the ground."""
     height = rng.uniform(2.5, 9.0)
-    stem = rod((0, 0, -0.3), (0, 0, 0.8 * height), 0.015 * height, **WOOD)
+    stem = rod((0, 0, -0.3), (0, 0, 0.8 * height), 0.015 * height, BARK, semantic=TRUNK)
     tall = 0.2 * height
     rows = [
         _draw_foliage(rng, (0, 0, max(z * height, tall + 0.1)), (r * height, r * height, tall), (1.0, 2.0))
         for z, r in ((0.2, 0.2), (0.4, 0.16), (0.6, 0.11), (0.8, 0.06))
     ]
-    return parts([stem, *rows], VEGETATION)
+    return make_parts([stem, *rows], VEGETATION)
 
 
 def make_bush(rng: np.random.Generator) -> np.ndarray:
-    """Make a bush (P,) PART of 0.6 to 2 m: three overlapping balls of leaves."""
+    """Make a bush of 0.6 to 2 m as (P,) PART: three overlapping balls of leaves."""
     high = rng.uniform(0.3, 1.0)
     rows = []
     for x, y, a, b, c, *rest in rng.random((3, 8)).tolist():
-        half = (high * interpolate(a, 0.6, 1.1), high * interpolate(b, 0.6, 1.1), high * interpolate(c, 0.8, 1.2))
+        half = (high * _interpolate(a, 0.6, 1.1), high * _interpolate(b, 0.6, 1.1), high * _interpolate(c, 0.8, 1.2))
         rows.append(_leaf_ball(rest, ((x - 0.5) * high, (y - 0.5) * high, 0.8 * high), half, (1.5, 5.0)))
-    return parts(rows, VEGETATION)
+    return make_parts(rows, VEGETATION)
 
 
 def make_hedge(rng: np.random.Generator, length: float) -> np.ndarray:
-    """Make a hedge (P,) PART along x, centred, with an uneven top, from 0.3 m below the ground."""
+    """Make a hedge as (P,) PART, centred along x, with an uneven top; it begins 0.3 m below the ground."""
     height, half = rng.uniform(0.8, 2.0), rng.uniform(0.25, 0.5)
-    rows = [
-        part(
-            BOX,
-            (0, 0, height / 2 - 0.15),
-            (length / 2, half, height / 2 + 0.15),
-            reflectance=LEAVES,
-            density=rng.uniform(4, 10),
-        )
-    ]
+    rows = [box((0, 0, height / 2 - 0.15), (length / 2, half, height / 2 + 0.15), LEAVES, density=rng.uniform(4, 10))]
     rows += [
         _draw_foliage(rng, (x, 0, height), (length / 8, 1.1 * half, rng.uniform(0.08, 0.2)), (2, 6))
         for x in np.linspace(-0.38, 0.38, 4) * length
     ]
-    return parts(rows, VEGETATION)
+    return make_parts(rows, VEGETATION)
 
 
 def _draw_foliage(rng: np.random.Generator, centre: tuple, half: tuple, density: tuple) -> tuple:
@@ -88,13 +84,13 @@ def _draw_foliage(rng: np.random.Generator, centre: tuple, half: tuple, density:
 
 
 def _leaf_ball(drawn: list[float], centre: tuple, half: tuple, density: tuple) -> tuple:
-    """Return a ball of leaves; drawn: numbers 0 .. 1 for its yaw, reflectance and density."""
+    """Return a ball of leaves; drawn: three random numbers for yaw, reflectance and density."""
     turn, tone, thick = drawn
-    return part(
-        ELLIPSOID,
-        centre,
-        half,
-        yaw=turn * pi,
-        reflectance=LEAVES * interpolate(tone, 0.8, 1.25),
-        density=interpolate(thick, *density),
+    return ellipsoid(
+        centre, half, LEAVES * _interpolate(tone, 0.8, 1.25), yaw=turn * pi, density=_interpolate(thick, *density)
     )
+
+
+def _interpolate(share: float, low: float, high: float) -> float:
+    """Return low + share * (high - low). Faster than rng.uniform for numbers that are drawn together."""
+    return low + (high - low) * share

@@ -1,6 +1,6 @@
-"""Labelled clusters, cut from scenes by the package's own ground and clustering, with a cache.
+"""Labelled clusters cut from scenes by ground segmentation and clustering, with a cache.
 
-So the network is trained on the errors of the pipeline: split and merged objects, and background.
+The network is thus trained on the errors of the pipeline: split and merged objects, and background.
 """
 
 from __future__ import annotations
@@ -25,45 +25,47 @@ from lidar_perception.intensity import normalize_intensity
 from lidar_perception.scoring.detections import draw_subset
 from lidar_perception.scoring.points.clusters import UNKNOWN, label_clusters
 from lidar_perception.training.augment import TrainingScene, raise_scene
-from lidar_perception.training.cache import cache_path, file_fingerprint, load_or_make
+from lidar_perception.training.cache import cache_path, file_fingerprint, load_or_compute
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, PointCloud
 
-SPARSE_SHARES = 0.08, 0.7  # minimum and maximum fraction of points left in a sparse scene
-MIN_POINTS_LEFT = 3  # minimum points left of a cluster in a sparse or augmented scene
-OBJECT_MARGIN_M = 0.3  # points this close to an object are cut out with it
-MAX_DECOYS = 24  # number of random decoys in a scene without a proposer
-MAX_PROPOSALS = 14  # maximum proposals of each class in a scene with a proposer
-MAX_RANDOM_DECOYS = 8  # number of random decoys in a scene with a proposer
+SPARSE_SHARES = 0.08, 0.7  # smallest and largest share of the points of a sparse scene
+MIN_POINTS_LEFT = 3  # of a cluster in a sparse or augmented scene
+OBJECT_MARGIN_M = 0.3  # margin of the boxes by which objects are cut
+MAX_DECOYS = 24  # random decoys per scene without a proposer
+MAX_RANDOM_DECOYS = 8  # random decoys per scene with a proposer
+MAX_PROPOSALS = 14  # decoys of each class per scene from a proposer
 
 
 @dataclass(frozen=True)
 class CutScene:
-    """K clusters of a scene.
+    """K labelled clusters of a scene.
 
     Attributes:
         clusters: The clusters.
-        labels: (K,) int64, as scoring.points.clusters.labelled gives them.
+        labels: (K,) int64, see scoring.points.clusters.label_clusters.
         boxes: (K, 7) float64 boxes of the objects, 0 for background.
-        loose: (K,) bool, True for clusters that are not made by clustering but consist of all
-            obstacle points around an object or decoy.
+        is_box_crop: (K,) bool, True for clusters that were cut by the box of an object or decoy,
+            instead of by clustering.
     """
 
     clusters: Clusters
     labels: np.ndarray
     boxes: np.ndarray
-    loose: np.ndarray
+    is_box_crop: np.ndarray
 
 
 @dataclass(frozen=True)
 class CutScenes:
-    """A source whose scene(i) is the CutScene of scene i, see cut_clusters.
+    """Source whose scene(i) is the CutScene of scene i, see cut_clusters.
 
     Attributes:
-        min_points: Clusters with fewer points are left out.
-        cache: Folder that keeps the clusters, or None.
+        scenes: Source of scenes.
+        config: Configuration of the network, with ground segmentation and clustering.
+        min_points: Clusters with fewer points are ignored.
+        cache: Folder of cached clusters, or None.
         proposer: PointPillars checkpoint whose wrong proposals become decoys, or None.
-        sparse: Share of the scenes that lose points before they are cut, as from a sparser
-            sensor; always the same ones.
+        sparse: Share of the scenes that are subsampled before the cut, to imitate a sparser sensor.
+            The choice depends only on the number of the scene.
     """
 
     scenes: Any
@@ -77,11 +79,11 @@ class CutScenes:
         return len(self.scenes)
 
     def frame(self, i: int) -> Frame:
-        """Return the frame of scene i, to validate on."""
+        """Return the frame of scene i for validation."""
         return self.scenes.frame(i)
 
     def draw_share(self, i: int) -> float:
-        """Return the share of its points that scene i keeps."""
+        """Return the share of the points to which scene i is subsampled."""
         rng = np.random.default_rng(i)
         if rng.random() >= self.sparse:
             return 1.0
@@ -102,19 +104,19 @@ class CutScenes:
             *sparse,
         )
 
-    def keep(self, i: int) -> None:
-        """Put the clusters of scene i into the cache."""
+    def store(self, i: int) -> None:
+        """Write the clusters of scene i to the cache."""
         self.scene(i)
 
     def scene(self, i: int) -> CutScene:
-        """Return the clusters of scene i. Raise InputError, naming the file, for a broken scene."""
-        return load_or_make(self.path(i), lambda: self._cut(i), _from_arrays, _to_arrays)
+        """Return the clusters of scene i. Raise InputError if the scene cannot be read."""
+        return load_or_compute(self.path(i), lambda: self._cut(i), _from_arrays, _to_arrays)
 
     def _cut(self, i: int) -> CutScene:
         scene, min_points, share = self.scenes.scene(i), self.min_points, self.draw_share(i)
         if share < 1:
-            left = draw_subset(len(scene.points), share, str(i))
-            scene = replace(scene, points=scene.points[left])
+            indices = draw_subset(len(scene.points), share, str(i))
+            scene = replace(scene, points=scene.points[indices])
             min_points = min(min_points, MIN_POINTS_LEFT)
         return cut_clusters(scene, self.config, min_points, self.proposer)
 
@@ -122,60 +124,64 @@ class CutScenes:
 def cut_clusters(
     scene: TrainingScene, config: PointNetConfig, min_points: int, proposer: Path | None = None
 ) -> CutScene:
-    """Cut a scene into labelled clusters, as from a sensor at SENSOR_HEIGHT.
+    """Cut a scene into labelled clusters in the frame of a sensor at SENSOR_HEIGHT.
 
-    After the clusters come the loose ones: the points around each wanted object, and decoys, which
-    are background cut out in the same way. The network needs both, since it also classifies the
-    points in a detector's boxes. Clusters of objects that are not wanted are UNKNOWN.
+    The clusters are followed by box crops: the points around each detectable object, and decoys,
+    which are background cut in the same way. They are needed since the network also classifies
+    the points in the boxes of a detector. Clusters of objects that are not detectable are UNKNOWN.
 
     Args:
-        min_points: Clusters with fewer points are left out.
-        proposer: PointPillars checkpoint, some of whose wrong proposals become decoys.
+        scene: Scene.
+        config: Configuration of the network, with ground segmentation and clustering.
+        min_points: Clusters with fewer points are ignored.
+        proposer: PointPillars checkpoint whose wrong proposals become decoys, or None.
     """
-    sensed = scene.points[:, :3]  # clustering uses the density that the sensor sees
+    raw_xyz = scene.points[:, :3]  # clustering adapts to the density in the sensor's frame
     scene = raise_scene(scene, scene.height - SENSOR_HEIGHT)
     frame = PointCloud(np.ascontiguousarray(scene.points[:, :3]), normalize_intensity(scene.points[:, 3]))
     ground = segment_ground(frame, config.ground)
-    clusters = make_clusters(frame, cluster_obstacles(frame.xyz, ground, config.clustering, sensed), min_points, ground)
+    clusters = make_clusters(
+        frame, cluster_obstacles(frame.xyz, ground, config.clustering, raw_xyz), min_points, ground
+    )
     labels, owners = label_clusters(clusters, scene.boxes, scene.class_ids, config.classes)
-    unwanted = (owners >= 0) & ~np.append(scene.wanted, False)[owners]
-    labels[unwanted], owners[unwanted] = UNKNOWN, -1
+    is_hidden = (owners >= 0) & ~np.append(scene.detectable, False)[owners]
+    labels[is_hidden], owners[is_hidden] = UNKNOWN, -1
     boxes = np.zeros((len(clusters), 7))
     boxes[owners >= 0] = scene.boxes[owners[owners >= 0]]
     background = len(config.classes)
-    wanted = [i for i in np.flatnonzero(scene.wanted) if CLASSES[scene.class_ids[i]] in config.classes]
+    objects = [i for i in np.flatnonzero(scene.detectable) if CLASSES[scene.class_ids[i]] in config.classes]
     decoys = drop_touching(make_decoys(clusters.take(np.flatnonzero(labels == background)), config), scene.boxes)
-    proposed = np.zeros((0, 7))
+    proposals = np.zeros((0, 7))
     if proposer is not None:
         decoys = decoys[:MAX_RANDOM_DECOYS]
-        proposed = drop_touching(propose_boxes(frame, proposer), scene.boxes)
-    cut_boxes = np.concatenate([scene.boxes[wanted].reshape(-1, 7), proposed, decoys])
-    cut_labels = np.append(
-        [config.classes.index(CLASSES[scene.class_ids[i]]) for i in wanted],
-        np.full(len(cut_boxes) - len(wanted), background),
+        proposals = drop_touching(propose_boxes(frame, proposer), scene.boxes)
+    crop_regions = np.concatenate([scene.boxes[objects].reshape(-1, 7), proposals, decoys])
+    crop_labels = np.append(
+        [config.classes.index(CLASSES[scene.class_ids[i]]) for i in objects],
+        np.full(len(crop_regions) - len(objects), background),
     ).astype(np.int64)
     obstacles = frame.take(np.flatnonzero(~ground))
-    loose = crop_boxes(cut_boxes, obstacles, OBJECT_MARGIN_M)
-    kept = np.flatnonzero(loose.sizes >= min_points)
-    loose = loose.take(kept).with_ground(frame.xyz.compress(ground, axis=0))
+    crops = crop_boxes(crop_regions, obstacles, OBJECT_MARGIN_M)
+    indices = np.flatnonzero(crops.sizes >= min_points)
+    crops = crops.take(indices).with_ground(frame.xyz.compress(ground, axis=0))
     both = Clusters(
-        np.concatenate([clusters.points, loose.points]),
-        np.concatenate([clusters.first, clusters.first[-1] + loose.first[1:]]),
-        np.concatenate([clusters.ids, np.full(len(loose), -1)]),
-        np.concatenate([clusters.ground, loose.ground]),
+        np.concatenate([clusters.points, crops.points]),
+        np.concatenate([clusters.first, clusters.first[-1] + crops.first[1:]]),
+        np.concatenate([clusters.ids, np.full(len(crops), -1)]),
+        np.concatenate([clusters.ground, crops.ground]),
     )
     return CutScene(
         both,
-        np.concatenate([labels, cut_labels[kept]]),
-        np.concatenate([boxes, cut_boxes[kept]]),
+        np.concatenate([labels, crop_labels[indices]]),
+        np.concatenate([boxes, crop_regions[indices]]),
         np.arange(len(both)) >= len(clusters),
     )
 
 
 def make_decoys(background: Clusters, config: PointNetConfig) -> np.ndarray:
-    """Return boxes (D, 7) of object size on background clusters, the same for the same clusters.
+    """Return boxes (D, 7) of object size on random background clusters, D <= MAX_DECOYS.
 
-    At most MAX_DECOYS, each near the mean of a cluster and on the ground there.
+    Each box is near the mean of a cluster and stands on the ground. The result is deterministic.
     """
     rng = np.random.default_rng(len(background.points))
     chosen = rng.permutation(len(background))[:MAX_DECOYS]
@@ -194,34 +200,31 @@ def make_decoys(background: Clusters, config: PointNetConfig) -> np.ndarray:
 
 
 def propose_boxes(frame: PointCloud, proposer: Path) -> np.ndarray:
-    """Return the boxes (P, 7) that PointPillars proposes at any score.
+    """Return the best MAX_PROPOSALS boxes of each class that PointPillars proposes, (P, 7).
 
     Args:
         frame: Cloud of a sensor at SENSOR_HEIGHT.
         proposer: Checkpoint of PointPillars.
-
-    Returns:
-        The best MAX_PROPOSALS boxes of each class.
     """
-    found = _load_proposer(proposer).propose(frame).detections
-    return np.concatenate([found.boxes[found.class_ids == i][:MAX_PROPOSALS] for i in range(len(CLASSES))])
+    proposals = _load_proposer(proposer).propose(frame).detections
+    return np.concatenate([proposals.boxes[proposals.class_ids == i][:MAX_PROPOSALS] for i in range(len(CLASSES))])
 
 
 @lru_cache(maxsize=1)
 def _load_proposer(path: Path) -> PointPillarsDetector:
-    """Load a proposer with the lowest score that `fused` uses, once in each process."""
+    """Load a proposer, once per process, with the score threshold of `fused`."""
     params = DetectorParams(pointpillars=PointPillarsParams(warm_up=False))
     return load_detector(path, "cpu", params).with_raw_scores().with_min_score(FusedParams().proposals)
 
 
-def drop_touching(found: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Return those of boxes (D, 7) that touch none of the labelled boxes (M, 7)."""
+def drop_touching(candidates: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Return the candidate boxes (D, 7) that touch no labelled box (M, 7)."""
     enlarged = boxes + [0, 0, 0, 2 * OBJECT_MARGIN_M, 2 * OBJECT_MARGIN_M, 0, 0]
-    return found[~(bev_iou(found, enlarged) > 0).any(axis=1)]
+    return candidates[~(bev_iou(candidates, enlarged) > 0).any(axis=1)]
 
 
 def _to_arrays(scene: CutScene) -> dict[str, np.ndarray]:
-    return dict(**vars(scene.clusters), labels=scene.labels, boxes=scene.boxes, loose=scene.loose)
+    return dict(**vars(scene.clusters), labels=scene.labels, boxes=scene.boxes, loose=scene.is_box_crop)
 
 
 def _from_arrays(arrays: Any) -> CutScene:

@@ -1,4 +1,4 @@
-"""The training task of the PointNet: samples, loss and validation."""
+"""Training task of the PointNet: samples, loss and validation."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import show_progress
 from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.training.augment import add_range_noise, distort_intensity, vary_thing
+from lidar_perception.training.augment import add_range_noise, distort_intensity, vary_background
 from lidar_perception.training.params import ClusterAugmentParams
 from lidar_perception.training.pointnet.cut_scenes import MIN_POINTS_LEFT, CutScene, CutScenes
 from lidar_perception.training.record import summarize_report
 from lidar_perception.training.run import Validation
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
-MIN_SCORED_POINTS = 10  # minimum points of a cluster that counts in the accuracy
+MIN_SCORED_POINTS = 10  # of a cluster that is included in the accuracy
 
 
 @dataclass(frozen=True)
 class ClusterSample:
-    """K clusters with their targets.
+    """Training sample of K clusters.
 
     Attributes:
         inputs: Input of the network.
         labels: (K,) int64 classes.
         targets: Encoded boxes.
-        has_box: (K,) bool, the box target counts.
+        has_box: (K,) bool, True for objects, whose box target is valid.
     """
 
     inputs: ClusterInput
@@ -55,11 +55,12 @@ class ClusterSample:
 
 @dataclass(frozen=True)
 class ClusterPreparation:
-    """Preparation of a ClusterSample: some clusters of a scene are drawn and augmented.
+    """Preparation of a ClusterSample: random clusters of a scene are augmented.
 
     Attributes:
-        augment: Numbers of clusters, and limits of the changes.
-        with_decoys: Half of the background consists of decoys, if there are enough.
+        config: Configuration of the network.
+        augment: Numbers of clusters, and limits of the augmentation.
+        with_decoys: Up to half of the background consists of decoys.
     """
 
     config: PointNetConfig
@@ -67,18 +68,18 @@ class ClusterPreparation:
     with_decoys: bool = False
 
     def __call__(self, scene: CutScene, rng: np.random.Generator) -> ClusterSample:
-        """Prepare a scene. Raise InputError if it has no cluster to learn from."""
+        """Make the sample of a scene. Raise InputError if the scene has no usable cluster."""
         chosen = self._draw_clusters(scene, rng)
         if len(chosen) == 0:
-            raise InputError("a scene has no cluster to learn from")
+            raise InputError("a scene has no cluster to train on")
         labels, boxes = scene.labels[chosen], scene.boxes[chosen].copy()
         clusters = scene.clusters.take(chosen)
         background = np.flatnonzero(labels == len(self.config.classes))
         feet = np.column_stack([compute_centroids(clusters.points, clusters.first), clusters.floor])
         for k in background:
             own = slice(clusters.first[k], clusters.first[k + 1])
-            clusters.points[own], _ = vary_thing(clusters.points[own], feet[k], self.augment, rng)
-        clusters, boxes = augment_clusters(clusters, boxes, scene.loose[chosen], self.augment, rng)
+            clusters.points[own], _ = vary_background(clusters.points[own], feet[k], self.augment, rng)
+        clusters, boxes = augment_clusters(clusters, boxes, scene.is_box_crop[chosen], self.augment, rng)
         inputs = make_network_input(clusters, self.config.points, int(rng.integers(1 << 30)), self.config.farthest)
         has_box = (labels >= 0) & (labels < len(self.config.classes))
         classes = np.where(has_box, labels, 0)
@@ -86,29 +87,36 @@ class ClusterPreparation:
         return ClusterSample(inputs, labels, targets, has_box)
 
     def _draw_clusters(self, scene: CutScene, rng: np.random.Generator) -> np.ndarray:
-        """Draw objects up to a number of each class, and some background."""
+        """Draw clusters of each class and of the background, up to the numbers in self.augment."""
         chosen = []
         for label in range(len(self.config.classes) + 1):
             limit = self.augment.background if label == len(self.config.classes) else self.augment.objects
             own = rng.permutation(np.flatnonzero(scene.labels == label))
             if self.with_decoys and label == len(self.config.classes):
-                decoys = own[scene.loose[own]][: limit // 2]
-                own = np.concatenate([decoys, own[~scene.loose[own]]])
+                decoys = own[scene.is_box_crop[own]][: limit // 2]
+                own = np.concatenate([decoys, own[~scene.is_box_crop[own]]])
             chosen.append(own[:limit])
         return np.sort(np.concatenate(chosen))
 
 
 def augment_clusters(
-    clusters: Clusters, boxes: np.ndarray, loose: np.ndarray, params: ClusterAugmentParams, rng: np.random.Generator
+    clusters: Clusters,
+    boxes: np.ndarray,
+    is_box_crop: np.ndarray,
+    params: ClusterAugmentParams,
+    rng: np.random.Generator,
 ) -> tuple[Clusters, np.ndarray]:
-    """Change clusters at random.
+    """Augment clusters.
 
-    All are flipped and scaled in the same way. Each loses points, gets noise, and may be moved away
-    with as many points as the sensor would see there. Loose clusters are cut at a shifted box.
+    All clusters are flipped and scaled in the same way. Each one loses points, gets noise, and may
+    be moved away, with fewer points accordingly. Box crops are cut again by a shifted box.
 
     Args:
+        clusters: K clusters, which are not changed.
         boxes: (K, 7) boxes.
-        loose: (K,) bool, see CutScene.
+        is_box_crop: (K,) bool, see CutScene.
+        params: Limits of the changes.
+        rng: Random generator.
 
     Returns:
         The changed clusters and boxes.
@@ -117,7 +125,7 @@ def augment_clusters(
     number = np.repeat(np.arange(count), clusters.sizes)
     points, boxes = clusters.points.copy(), boxes.copy()
     keep = np.ones(len(points), bool)
-    for k in np.flatnonzero(loose):
+    for k in np.flatnonzero(is_box_crop):
         part = slice(clusters.first[k], clusters.first[k + 1])
         shifted = boxes[k] + rng.normal(0, params.box_shift, 7) * [1, 1, 0.5, 0, 0, 0, 0.3]
         shifted[3:6] *= rng.uniform(0.9, 1.15, 3)
@@ -141,7 +149,7 @@ def augment_clusters(
     boxes[:, :6] *= scale
     points[:, 2] += floor[number].astype(np.float32)
     boxes[:, 2] += floor
-    # Random vertical shift, because the ground height is uncertain.
+    # Imitate errors of the estimated ground height.
     floor = floor + height + rng.uniform(-0.5, 0.5, count) * params.height
     if rng.random() < params.flip:
         points[:, 1] *= -1
@@ -156,7 +164,7 @@ def augment_clusters(
 
 
 def _group_means(values: np.ndarray, number: np.ndarray, count: int) -> np.ndarray:
-    """Return the means (count, D) of values (P, D) by group number (P,), 0 for empty groups."""
+    """Return the mean (count, D) of the values (P, D) of each group number (P,), 0 for empty groups."""
     sums = np.stack([np.bincount(number, column, minlength=count) for column in values.T], axis=1)
     return sums / np.maximum(np.bincount(number, minlength=count), 1)[:, None]
 
@@ -187,9 +195,15 @@ def make_loss(config: PointNetConfig, device: torch.device) -> Callable:
 
 @dataclass(frozen=True)
 class ValidationClusters:
-    """A scene to validate on: the clusters that clustering made, and the truth of the frame.
+    """Validation scene with K clusters.
 
-    labels: (K,) int64; height: height of the sensor in metres.
+    Attributes:
+        name: Name of the frame.
+        clusters: The clusters, without box crops.
+        labels: (K,) int64, see CutScene.
+        truth: Labels of the frame.
+        calibration: Camera of the frame, or None.
+        height: Height of the sensor in metres.
     """
 
     name: str
@@ -201,14 +215,14 @@ class ValidationClusters:
 
 
 def load_validation_clusters(source: CutScenes, i: int) -> ValidationClusters:
-    """Return scene i of a source. Raise InputError, naming the file, if it cannot be used."""
+    """Load scene i of a source. Raise InputError if it cannot be read."""
     scene = source.scene(i)
-    made = np.flatnonzero(~scene.loose)
+    indices = np.flatnonzero(~scene.is_box_crop)
     frame = source.frame(i)
     return ValidationClusters(
         frame.name,
-        scene.clusters.take(made),
-        scene.labels[made],
+        scene.clusters.take(indices),
+        scene.labels[indices],
         frame.truth(),
         frame.calibration(),
         frame.sensor_height,
@@ -216,13 +230,13 @@ def load_validation_clusters(source: CutScenes, i: int) -> ValidationClusters:
 
 
 def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) -> Validation:
-    """Calibrate the network on one or more scenes, and score it.
+    """Calibrate the network on one or more scenes, and evaluate it.
 
     Returns:
         Metrics and calibration, see Task.validate. The score is the mean BEV AP at the relaxed
-        overlaps (moderate, R40). The accuracies are shares of clusters with at least
-        MIN_SCORED_POINTS points, and of the objects among them, whose class is correct; NaN
-        without any.
+        overlaps (moderate, R40). accuracy is the percentage of clusters with at least
+        MIN_SCORED_POINTS points whose class is correct, object_accuracy that of the objects among
+        them; NaN without clusters.
     """
     config = network.config
     labels = np.concatenate([s.labels for s in scenes])
@@ -245,12 +259,12 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
         boxes = restore_detections(boxes, SensorPoseParams(height=scene.height))
         report.update(FrameDetections(scene.name, scene.truth, boxes, scene.calibration))
     metrics, calibration = summarize_report(report, "bev", config.classes)
-    known = (labels >= 0) & (sizes >= MIN_SCORED_POINTS)
-    probabilities = np.concatenate([p.probabilities for p in predictions])[known]
-    right, objects = probabilities.argmax(axis=1) == labels[known], labels[known] < len(config.classes)
+    scored = (labels >= 0) & (sizes >= MIN_SCORED_POINTS)
+    probabilities, labels = np.concatenate([p.probabilities for p in predictions])[scored], labels[scored]
+    correct, is_object = probabilities.argmax(axis=1) == labels, labels < len(config.classes)
     return {
         **metrics,
-        "accuracy": 100 * float(right.mean()) if len(right) else math.nan,
-        "object_accuracy": 100 * float(right[objects].mean()) if objects.any() else math.nan,
-        "calibration_error": calibration_error(probabilities, labels[known]),
+        "accuracy": 100 * float(correct.mean()) if len(correct) else math.nan,
+        "object_accuracy": 100 * float(correct[is_object].mean()) if is_object.any() else math.nan,
+        "calibration_error": calibration_error(probabilities, labels),
     }, calibration

@@ -1,4 +1,4 @@
-"""Trainer of the PointNet: its speed, and the clusters of all scenes."""
+"""Trainer of the PointNet."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ from lidar_perception.training.pointnet.task import (
     make_loss,
     validate_network,
 )
-from lidar_perception.training.record import load_initial_weights, make_save, report_skipped
+from lidar_perception.training.record import load_initial_weights, make_save_function, report_skipped
 from lidar_perception.training.request import PACKAGE
 from lidar_perception.training.run import Task, Validation
 from lidar_perception.training.timing import find_readable_frame, measure_duration, measure_step, select_usable_scenes
 from lidar_perception.training.trainer import Cuts, StepSpeed
 from lidar_perception.types import InputError
 
-TIMED_FRAMES = 8  # frames validated together, so that the calibration adds little time
+TIMED_FRAMES = 8  # validated together, so that the duration of the calibration matters little
 
 
 def find_proposer(params: PointNetTraining) -> Path | None:
-    """Return the file that params.proposer names, None without one.
+    """Return the path of the checkpoint in params.proposer, None if it is empty.
 
     Raises:
-        InputError: The file is missing, or is no PointPillars.
+        InputError: The file is missing, or is not a PointPillars checkpoint.
     """
     if params.proposer in ("", str(PACKAGE)):
         return pointpillars_file(PointPillarsParams()) if params.proposer else None
     path = require_weights(params.proposer, "proposer")
     if read_network_name(path) != POINTPILLARS:
-        raise InputError(f"{path} is no PointPillars, whose weights `proposer` names")
+        raise InputError(f"{path} is not a PointPillars checkpoint; give one with --proposer")
     return path
 
 
@@ -59,28 +59,28 @@ class PointNetTrainer:
     """Trainer of the PointNet in one configuration; see Trainer for the methods."""
 
     config: PointNetConfig
-    cutting: str = "cutting clusters"
+    cutting_title: str = "cutting clusters"
 
     @property
     def name(self) -> str:
         return f"PointNet {self.config.title}".strip()
 
     def packaged_weights(self, params: PointNetTraining) -> Path:
-        """Return the weights of the improved network, which fit the others in part."""
+        """Return the weights of the improved network, which partly fit the other configurations."""
         return weights_file(PointNetParams())
 
     def max_cuts(self, params: PointNetTraining) -> int:
-        """Return a number larger than any data set, since all scenes are cut."""
+        """Return a number larger than any data set, since clusters are cut from all scenes."""
         return 10**9
 
     def reduced_range(self, params: PointNetTraining) -> dict[str, Any]:
-        """Return nothing: clusters are used at any range."""
+        """Return {}, since clusters at all ranges are used."""
         return {}
 
     def measure_speed(
         self, params: PointNetTraining, scenes: Iterable[Item], held_out: Sequence[Any], device: torch.device
     ) -> StepSpeed:
-        """Measure durations with clusters of the first usable scenes."""
+        """Measure durations on the clusters of the first usable scenes."""
         prepare = ClusterPreparation(self.config, params.augment)
         make_rng, proposer = partial(np.random.default_rng, 0), find_proposer(params)
 
@@ -90,7 +90,7 @@ class PointNetTrainer:
         def prepare_scene(scene: TrainingScene) -> Any:
             return prepare(cut_scene(scene), make_rng())
 
-        chosen = select_usable_scenes(scenes, prepare_scene)  # also triggers compilation
+        chosen = select_usable_scenes(scenes, prepare_scene)  # also compiles kernels
         cutting, parts = measure_duration(lambda: [cut_scene(scene) for scene in chosen])
         network = make_pointnet(self.config).to(device)
         step = measure_step(
@@ -114,7 +114,7 @@ class PointNetTrainer:
         return StepSpeed(cutting / len(chosen), step, step, validation / TIMED_FRAMES)
 
     def make_cuts(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any], cache: Path) -> Cuts:
-        """Return the clusters of all scenes."""
+        """Return sources of clusters, cut from all scenes."""
         cut = partial(
             CutScenes,
             config=self.config,
@@ -126,7 +126,7 @@ class PointNetTrainer:
         return Cuts(cuts, [range(len(source)) for source in cuts])
 
     def collect_cuts(self, params: PointNetTraining, cuts: Cuts, out: Path) -> None:
-        """Do nothing: training reads the cache."""
+        """Do nothing, since training reads the cache."""
 
     def make_streams(
         self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any], cuts: Cuts, out: Path
@@ -162,7 +162,7 @@ class PointNetTrainer:
             make_loss(self.config, device),
             batches,
             validate,
-            make_save(out, self.config, params, batches, about, commit),
+            make_save_function(out, self.config, params, batches, about, commit),
             batches.epoch,
             about,
         )

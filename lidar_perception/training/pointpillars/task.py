@@ -1,4 +1,4 @@
-"""The training task of PointPillars: samples, loss and validation."""
+"""Training task of PointPillars: samples, loss and validation."""
 
 from __future__ import annotations
 
@@ -47,44 +47,43 @@ from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pasting import find_points_in_box
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, GroundTruth, InputError, PointCloud
 
-# Boxes with a low score hardly change the AP, and validation is faster without them.
+# Boxes with low scores are omitted: they hardly change the AP, but take time.
 VALIDATION_PARAMS = DetectorParams(
     pointpillars=PointPillarsParams(scores=ScoreParams.for_all_classes(0.1), warm_up=False)
 )
-# Similar class -> class, such as Van -> Car and Person_sitting -> Pedestrian.
-CLASS_BY_SIMILAR = {other: name for name, other in NEIGHBOURS.items()}
-MIN_TOUCH_IOU = 1e-6  # minimum IoU of an anchor that touches a box
+CLASS_BY_SIMILAR = {other: name for name, other in NEIGHBOURS.items()}  # {"Van": "Car", ...}
+MIN_TOUCH_IOU = 1e-6  # of an anchor that touches a box
 DONT_CARE_LABEL = -2  # label of a box of the class DontCare
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One scene for the network.
+    """Training sample of one scene.
 
     Attributes:
         points, cluster_map: See expert.NetworkInput.
         boxes: (M, 7) float32.
         labels: (M,) int64 into the config's classes; DONT_CARE_LABEL for a region without labels.
-        counted: (M,) bool, the object must be found; the others may be found or not.
-        targets: Targets of the anchors, made with the sample since several processes make samples
-            and one trains.
+        is_target: (M,) bool, True for objects that must be detected; the others are ignored.
+        targets: Targets of the anchors.
     """
 
     points: np.ndarray
     cluster_map: np.ndarray | None
     boxes: np.ndarray
     labels: np.ndarray
-    counted: np.ndarray
+    is_target: np.ndarray
     targets: SparseTargets
 
 
 @dataclass(frozen=True)
 class ScenePreparation:
-    """Preparation of a Sample: a scene is augmented, cropped, and gets expert columns.
+    """Preparation of a Sample: a scene is augmented and cropped, and expert columns are added.
 
     Attributes:
-        augment: Limits of the changes.
-        min_points: Objects with fewer points need not be found.
+        config: Configuration of the network.
+        augment: Limits of the augmentation.
+        min_points: Objects with fewer points are ignored.
         database: File of objects to paste, or None.
     """
 
@@ -105,7 +104,7 @@ class ScenePreparation:
         return {k: v for k, v in self.__dict__.items() if k not in ("_objects", "_anchors")}
 
     def __call__(self, scene: TrainingScene, rng: np.random.Generator) -> Sample:
-        """Prepare a scene. Raise InputError if no point is in the detection range."""
+        """Make the sample of a scene. Raise InputError if no point is in the detection range."""
         lift = np.array([0, 0, scene.height - SENSOR_HEIGHT])  # shift to a sensor at SENSOR_HEIGHT
         low, high = np.array(self.config.low) - lift, np.array(self.config.high) - lift
         scene = turn_and_crop(scene, self.augment, low, high, rng)
@@ -113,27 +112,28 @@ class ScenePreparation:
             scene = paste_objects(scene, self._objects, self.augment, low, high, rng)
         scene = augment_scene(scene, self.augment, rng)
         frame = PointCloud(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
-        seen = NormalizedView.of(frame, SensorPoseParams(height=scene.height), self.config.low, self.config.high).frame
-        inputs = make_network_input(seen, self.config)
+        pose = SensorPoseParams(height=scene.height)
+        view = NormalizedView.of(frame, pose, self.config.low, self.config.high).frame
+        inputs = make_network_input(view, self.config)
         if len(inputs.points) < 2:
             raise InputError("a scene has no point in the detection range")
-        boxes, labels, counted = self._select_objects(raise_scene(scene, lift[2]), seen.xyz)
-        targets = _assign_targets(boxes, labels, counted, self._anchors, self.config)
-        return Sample(inputs.points, inputs.cluster_map, boxes, labels, counted, to_sparse(targets))
+        boxes, labels, is_target = self._select_objects(raise_scene(scene, lift[2]), view.xyz)
+        targets = _assign_targets(boxes, labels, is_target, self._anchors, self.config)
+        return Sample(inputs.points, inputs.cluster_map, boxes, labels, is_target, to_sparse(targets))
 
     def _select_objects(self, scene: TrainingScene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
         low, high = np.array(self.config.low), np.array(self.config.high)
         names = [CLASSES[i] for i in scene.class_ids]
         labels = np.array([self._label(CLASS_BY_SIMILAR.get(name, name)) for name in names], np.int64)
-        kept = np.flatnonzero(is_within(scene.boxes, low, high) & (labels != -1))
-        counted = [
-            bool(scene.wanted[i])
+        indices = np.flatnonzero(is_within(scene.boxes, low, high) & (labels != -1))
+        is_target = [
+            bool(scene.detectable[i])
             and names[i] not in CLASS_BY_SIMILAR
             and labels[i] != DONT_CARE_LABEL
             and len(find_points_in_box(xyz, scene.boxes[i], 0.0)) >= self.min_points
-            for i in kept
+            for i in indices
         ]
-        return scene.boxes[kept].astype(np.float32), labels[kept], np.array(counted, bool)
+        return scene.boxes[indices].astype(np.float32), labels[indices], np.array(is_target, bool)
 
     def _label(self, name: str) -> int:
         if name == CLASSES[DONT_CARE]:
@@ -142,18 +142,15 @@ class ScenePreparation:
 
 
 def reduce_range(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig:
-    """Return the config with a shorter detection range, rounded up to whole cells.
+    """Return the config with a shorter detection range, rounded up to whole cells of the feature map.
 
     Args:
-        ahead: Range ahead, and behind if the config covers that, in metres; 0 keeps it.
-        aside: Range to each side in metres; 0 keeps it.
+        config: Configuration of the network.
+        ahead: Range ahead, and behind if the config covers it, in metres; 0 does not change it.
+        aside: Range to each side in metres; 0 does not change it.
     """
     step = config.cell * np.prod(config.block_strides)
-
-    def whole(length: float) -> float:
-        return float(np.ceil(round(length / step, 6)) * step)
-
-    x, y = whole(ahead), whole(aside)
+    x, y = (float(np.ceil(round(length / step, 6)) * step) for length in (ahead, aside))
     (back, right, bottom), (front, left, top) = config.low, config.high
     if ahead:
         front = min(front, max(back, 0.0) + x)
@@ -164,19 +161,18 @@ def reduce_range(config: NetworkConfig, ahead: float, aside: float) -> NetworkCo
 
 
 def _assign_targets(
-    boxes: np.ndarray, labels: np.ndarray, counted: np.ndarray, anchors: Tensor, config: NetworkConfig
+    boxes: np.ndarray, labels: np.ndarray, is_target: np.ndarray, anchors: Tensor, config: NetworkConfig
 ) -> Targets:
-    """Return the targets of one sample.
+    """Assign the anchors to the objects of one sample.
 
-    Anchors on objects that do not count, and those of any class that touch a DontCare region, are
-    neither object nor background.
+    Anchors on objects that are no targets, and anchors that touch a DontCare region, are ignored.
     """
-    all_boxes, classes, wanted = map(torch.from_numpy, (boxes, labels, counted))
-    targets = assign(anchors, config, all_boxes[wanted], classes[wanted])
+    all_boxes, classes, mask = map(torch.from_numpy, (boxes, labels, is_target))
+    targets = assign(anchors, config, all_boxes[mask], classes[mask])
     anchor_labels = targets.labels[0]
     for index, spec in enumerate(config.anchors):
         for others, min_iou in (
-            (all_boxes[~wanted & (classes == index)], spec.unmatched),
+            (all_boxes[~mask & (classes == index)], spec.unmatched),
             (all_boxes[classes == DONT_CARE_LABEL], MIN_TOUCH_IOU),
         ):
             candidates = find_near_anchors(anchors, config, others, index)
@@ -209,22 +205,22 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
 def load_validation_frame(config: NetworkConfig, source: Any, i: int) -> Frame:
     """Load frame i of a source.
 
-    Without a camera, only labels whose centre is in the detection range stay, since the network is
-    trained on these.
+    Without a camera, labels whose centre is outside the detection range are removed.
 
     Raises:
-        InputError: A file cannot be used; the message names it.
+        InputError: The frame cannot be read.
     """
     frame = source.frame(i)
     truth, calibration = frame.truth(), frame.calibration()
     if calibration is None and truth is not None:
-        kept = np.flatnonzero(is_within(truth.boxes, config.low, config.high))
-        truth = GroundTruth.of(truth.boxes[kept], truth.class_ids[kept], [truth.extras[k] for k in kept], truth.notes)
+        inside = np.flatnonzero(is_within(truth.boxes, config.low, config.high))
+        extras = [truth.extras[i] for i in inside]
+        truth = GroundTruth.of(truth.boxes[inside], truth.class_ids[inside], extras, truth.notes)
     return Frame.of(frame.name, frame.load(), truth, calibration, sensor_height=frame.sensor_height)
 
 
 def validate_detector(detector: Detector, scenes: SceneReader, jobs: int = 0) -> DetectionReport:
-    """Evaluate a detector on every scene by KITTI's protocol."""
+    """Evaluate a detector on all validation scenes by KITTI's protocol."""
     report = DetectionReport()
     items = load_items(scenes, ([n] for n in range(len(scenes))), jobs)
     for (item,) in show_progress(items, "validating", len(scenes)):
@@ -235,7 +231,7 @@ def validate_detector(detector: Detector, scenes: SceneReader, jobs: int = 0) ->
 
 
 def detect_in_frame(frame: Frame, detector: Detector) -> FrameDetections[Detections]:
-    """Run a detector on a loaded frame, at the height of its sensor."""
+    """Run a detector on a loaded frame, with the frame's sensor height."""
     height = frame.sensor_height
     if height != SENSOR_HEIGHT:
         detector = detector.with_sensor_height(height)

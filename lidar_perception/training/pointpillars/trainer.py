@@ -1,4 +1,4 @@
-"""Trainer of PointPillars: its speed, and the objects that are pasted into scenes."""
+"""Trainer of PointPillars."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from lidar_perception.training.pointpillars.task import (
     reduce_range,
     validate_detector,
 )
-from lidar_perception.training.record import load_initial_weights, make_save, report_skipped, summarize_report
+from lidar_perception.training.record import load_initial_weights, make_save_function, report_skipped, summarize_report
 from lidar_perception.training.run import Task, Validation
 from lidar_perception.training.timing import find_readable_frame, measure_duration, measure_step, select_usable_scenes
 from lidar_perception.training.trainer import Cuts, StepSpeed
 from lidar_perception.types import InputError
 
 OBJECTS = "objects.npz"
-# Range (forward, sideways) in metres that contains most objects.
+# Ranges ahead and aside in metres that contain most objects.
 REDUCED_RANGES = {"ahead": (46.08, 23.04), "around": (30.72, 30.72)}
 
 
@@ -50,7 +50,7 @@ class PointPillarsTrainer:
     """Trainer of PointPillars in one configuration; see Trainer for the methods."""
 
     config: NetworkConfig
-    cutting: str = "cutting objects"
+    cutting_title: str = "cutting objects"
 
     @property
     def name(self) -> str:
@@ -61,20 +61,20 @@ class PointPillarsTrainer:
         return weights_file(PointPillarsParams(version=params.version, size=params.size))
 
     def max_cuts(self, params: PointPillarsTraining) -> int:
-        """Return the number of scenes that objects are cut from; 0 if none are pasted."""
+        """Return the number of scenes from which objects are cut; 0 if no objects are pasted."""
         augment = params.augment
         pasted = augment.crowded and (augment.cars or augment.pedestrians or augment.cyclists or augment.things)
         return augment.database_scans if pasted else 0
 
     def reduced_range(self, params: PointPillarsTraining) -> dict[str, Any]:
-        """Return the range that contains most objects; nothing if the user gives a range."""
+        """Return the range that contains most objects; {} if the user gave a range."""
         ahead, aside = REDUCED_RANGES[params.range]
         return {} if params.ahead or params.aside else {"ahead": ahead, "aside": aside}
 
     def measure_speed(
         self, params: PointPillarsTraining, scenes: Iterable[Item], held_out: Sequence[Any], device: torch.device
     ) -> StepSpeed:
-        """Measure durations, with objects pasted from the scenes themselves."""
+        """Measure durations on the first usable scenes, with objects that are cut from them."""
 
         def cut_all() -> list[Database]:
             return [cut_objects(scene, self.config.classes, params.data.min_points) for scene in chosen]
@@ -109,19 +109,18 @@ class PointPillarsTrainer:
     def make_cuts(
         self, params: PointPillarsTraining, sources: Sequence[Any], held_out: Sequence[Any], cache: Path
     ) -> Cuts:
-        """Return the objects of some scenes, which are drawn with the seed."""
+        """Return sources of objects, cut from random scenes."""
         ends = np.cumsum([0, *map(len, sources)])
         chosen = np.random.default_rng(params.seed).permutation(ends[-1])[: self.max_cuts(params)]
-        cuts = [
-            CutObjects(source, self.config.classes, params.data.min_points, cache / "objects") for source in sources
+        min_points, folder = params.data.min_points, cache / "objects"
+        cuts = [CutObjects(source, self.config.classes, min_points, folder) for source in sources]
+        numbers = [
+            np.sort(chosen[(chosen >= first) & (chosen < end)] - first).tolist() for first, end in pairwise(ends)
         ]
-        return Cuts(
-            cuts,
-            [np.sort(chosen[(chosen >= first) & (chosen < end)] - first).tolist() for first, end in pairwise(ends)],
-        )
+        return Cuts(cuts, numbers)
 
     def collect_cuts(self, params: PointPillarsTraining, cuts: Cuts, out: Path) -> None:
-        """Write all cut objects into OBJECTS."""
+        """Write all cut objects to out / OBJECTS."""
         if not self.max_cuts(params) or (out / OBJECTS).is_file():
             return
         parts = []
@@ -129,7 +128,7 @@ class PointPillarsTrainer:
             for i in numbers:
                 try:
                     parts.append(source.scene(i))
-                except InputError:  # reported when training reads it
+                except InputError:  # training reports it later
                     continue
         join_databases(parts).save(out / OBJECTS)
 
@@ -172,7 +171,7 @@ class PointPillarsTrainer:
             make_loss(reduced, device),
             batches,
             validate,
-            make_save(out, self.config, params, batches, about, commit),
+            make_save_function(out, self.config, params, batches, about, commit),
             batches.epoch,
             about,
         )

@@ -1,4 +1,4 @@
-"""Things of a scene: sizes, parts and poses."""
+"""Objects of a scene: sizes, parts and poses."""
 
 from functools import cache, partial
 
@@ -17,9 +17,10 @@ from lidar_perception.simulation.shapes import (
     vegetation,
     vehicles,
 )
-from lidar_perception.simulation.shapes.thing import SIZES, block, disc, draw_size, rod
+from lidar_perception.simulation.shapes.primitives import block, disc, rod
+from lidar_perception.simulation.shapes.scene_object import SIZES, draw_size
 from lidar_perception.simulation.shapes.vehicles import SIDE
-from lidar_perception.simulation.solids import compute_extents, parts, place_parts
+from lidar_perception.simulation.solids import compute_extents, make_parts, place_parts
 from lidar_perception.simulation.terrain import Ground
 from lidar_perception.types import CLASSES
 
@@ -66,48 +67,48 @@ SCENERY = {
 SEMANTICS = {10, 11, 15, 16, 18, 20, 30, 31, 32, 50, 51, 70, 71, 80, 81, 99}
 
 
-def make_parts(make, seed):
-    """Return the parts of a thing, labelled or not."""
-    thing = make(np.random.default_rng(seed))
-    return thing.parts(0.7) if hasattr(thing, "parts") else thing
+def draw_parts(make, seed):
+    """Return the parts of a obj, labelled or not."""
+    obj = make(np.random.default_rng(seed))
+    return obj.parts(0.7) if hasattr(obj, "parts") else obj
 
 
-def find_extents(made):
-    low, high = compute_extents(made)
+def find_extents(parts):
+    low, high = compute_extents(parts)
     return low.min(axis=0), high.max(axis=0)
 
 
-def find_stride(thing):
-    return 2 * thing.parts.keywords["build"].step
+def find_stride(obj):
+    return 2 * obj.parts.keywords["build"].step
 
 
 @pytest.mark.parametrize("name", [*LABELLED, *SCENERY])
 def test_parts_are_valid(name):
     make, most = {**LABELLED, **SCENERY}[name]
     for seed in SEEDS:
-        made = make_parts(make, seed)
-        assert 0 < len(made) <= most
-        assert np.isin(made["kind"], (0, 1, 2)).all()
-        assert set(made["semantic"].tolist()) <= SEMANTICS
+        parts = draw_parts(make, seed)
+        assert 0 < len(parts) <= most
+        assert np.isin(parts["kind"], (0, 1, 2)).all()
+        assert set(parts["semantic"].tolist()) <= SEMANTICS
         for field in ("centre", "half", "pitch", "yaw"):
-            assert np.isfinite(made[field]).all(), field
-        assert (made["half"] > 0).all() and (made["density"] > 0).all()
-        assert (made["reflectance"] >= 0).all() and (made["reflectance"] <= 1).all()
-        assert (made["transmission"] >= 0).all() and (made["transmission"] < 1).all()
+            assert np.isfinite(parts[field]).all(), field
+        assert (parts["half"] > 0).all() and (parts["density"] > 0).all()
+        assert (parts["reflectance"] >= 0).all() and (parts["reflectance"] <= 1).all()
+        assert (parts["transmission"] >= 0).all() and (parts["transmission"] < 1).all()
 
 
 @pytest.mark.parametrize("name", LABELLED)
-def test_box_covers_body_of_labelled_thing(name):
+def test_box_covers_body_of_labelled_object(name):
     make, _ = LABELLED[name]
     for seed in SEEDS:
-        thing = make(np.random.default_rng(seed))
-        assert thing.label in CLASSES
-        low, high = compute_extents(thing.parts(0.0))
-        body = np.abs((low + high)[:, 1] / 2) < thing.size[1] / 2  # all but the mirrors
+        obj = make(np.random.default_rng(seed))
+        assert obj.label in CLASSES
+        low, high = compute_extents(obj.parts(0.0))
+        body = np.abs((low + high)[:, 1] / 2) < obj.size[1] / 2  # all but the mirrors
         low, high = low[body].min(axis=0), high[body].max(axis=0)
-        length, width, height = thing.size
+        length, width, height = obj.size
         width -= 2 * SIDE if name in ("car", "parked", "van") else 0.0
-        if thing.label != "Pedestrian":
+        if obj.label != "Pedestrian":
             assert np.allclose(low, (-length / 2, -width / 2, 0.0), atol=1e-6)
             assert np.allclose(high, (length / 2, width / 2, height), atol=1e-6)
         assert np.isclose(high[1] - low[1], width)
@@ -118,23 +119,23 @@ def test_box_covers_body_of_labelled_thing(name):
 def test_box_of_pedestrian_holds_for_whole_stride(name):
     make, _ = LABELLED[name]
     for seed in SEEDS:
-        thing = make(np.random.default_rng(seed))
-        hulls = [find_extents(thing.parts(x)) for x in np.linspace(0, find_stride(thing), 101)]
+        obj = make(np.random.default_rng(seed))
+        hulls = [find_extents(obj.parts(x)) for x in np.linspace(0, find_stride(obj), 101)]
         low, high = np.array(hulls).transpose(1, 0, 2)
         assert np.abs(low[:, 2]).max() < 1e-9  # a foot is always on the ground
-        assert high[:, 2].max() <= thing.size[2] + 0.002
-        assert high[:, 2].max() > thing.size[2] - 0.005
-        assert np.isclose(high[:, 1].max(), thing.size[1] / 2)
+        assert high[:, 2].max() <= obj.size[2] + 0.002
+        assert high[:, 2].max() > obj.size[2] - 0.005
+        assert np.isclose(high[:, 1].max(), obj.size[1] / 2)
         if name != "stander":
-            assert abs(low[:, 0].min() + thing.size[0] / 2) < 0.01
-            assert abs(high[:, 0].max() - thing.size[0] / 2) < 0.01
+            assert abs(low[:, 0].min() + obj.size[0] / 2) < 0.01
+            assert abs(high[:, 0].max() - obj.size[0] / 2) < 0.01
 
 
 def test_foot_on_ground_does_not_slide():
     for seed in SEEDS:
-        thing = people.make_pedestrian(np.random.default_rng(seed), 1.3)
-        ways = np.linspace(0, find_stride(thing), 401)
-        feet = np.array([thing.parts(x)[-2:] for x in ways])
+        obj = people.make_pedestrian(np.random.default_rng(seed), 1.3)
+        ways = np.linspace(0, find_stride(obj), 401)
+        feet = np.array([obj.parts(x)[-2:] for x in ways])
         tip = (
             feet["centre"][..., 0]
             + feet["half"][..., 0] * np.cos(feet["pitch"])
@@ -148,21 +149,21 @@ def test_foot_on_ground_does_not_slide():
 
 
 def test_walk_repeats_after_stride_and_mirrors_after_step():
-    thing = people.make_pedestrian(np.random.default_rng(3), 1.4)
-    now, later = thing.parts(0.2), thing.parts(0.2 + find_stride(thing))
+    obj = people.make_pedestrian(np.random.default_rng(3), 1.4)
+    now, later = obj.parts(0.2), obj.parts(0.2 + find_stride(obj))
     assert np.allclose(now["centre"], later["centre"])
     low, high = compute_extents(now)
-    low_step, _ = compute_extents(thing.parts(0.2 + find_stride(thing) / 2))
+    low_step, _ = compute_extents(obj.parts(0.2 + find_stride(obj) / 2))
     assert np.allclose(np.sort(low[:, 0]), np.sort(low_step[:, 0]))
     assert np.allclose(np.sort(high[:, 1]), np.sort(-low_step[:, 1]))
 
 
 def test_limbs_are_connected_and_keep_length():
     """Limbs keep their length between joints; knees bend forward."""
-    thing = people.make_pedestrian(np.random.default_rng(4), 1.4)
-    height = thing.size[2]
-    for x in np.linspace(0, find_stride(thing), 50):
-        thigh, shank = (thing.parts(x)[[-6, -5]], thing.parts(x)[[-4, -3]])
+    obj = people.make_pedestrian(np.random.default_rng(4), 1.4)
+    height = obj.size[2]
+    for x in np.linspace(0, find_stride(obj), 50):
+        thigh, shank = (obj.parts(x)[[-6, -5]], obj.parts(x)[[-4, -3]])
         for row in (*thigh, *shank):
             assert 0.24 * height < 2 * row["half"][2] < 0.25 * height
 
@@ -184,19 +185,19 @@ def test_load_does_not_change_width_or_height_of_box(carried):
 
 def test_wheels_stay_on_road_while_pedals_turn():
     for seed in SEEDS:
-        thing = cyclists.make_cyclist(np.random.default_rng(seed))
-        poses = [thing.parts(x) for x in np.linspace(0, 5, 41)]
-        for made in poses:
-            assert np.allclose(compute_extents(made[:2])[0][:, 2], 0.0, atol=1e-9)
-            low, high = find_extents(made)
-            assert np.allclose(high - low, thing.size, atol=1e-6)
+        obj = cyclists.make_cyclist(np.random.default_rng(seed))
+        poses = [obj.parts(x) for x in np.linspace(0, 5, 41)]
+        for parts in poses:
+            assert np.allclose(compute_extents(parts[:2])[0][:, 2], 0.0, atol=1e-9)
+            low, high = find_extents(parts)
+            assert np.allclose(high - low, obj.size, atol=1e-6)
         assert not np.array_equal(poses[0]["centre"], poses[4]["centre"])
 
 
 @pytest.mark.parametrize("style", ["HATCHBACK", "SEDAN", "ESTATE", "SUV", "MINIBUS", "PANEL_VAN"])
 def test_vehicles_are_symmetric(style):
-    made = vehicles.make_body((4.2, 1.7, 1.6), getattr(vehicles, style), 0.3, 0.8, driver=False)
-    low, high = compute_extents(made)
+    parts = vehicles.make_body((4.2, 1.7, 1.6), getattr(vehicles, style), 0.3, 0.8, driver=False)
+    low, high = compute_extents(parts)
     mirrored = np.stack([low[:, 0], -high[:, 1], low[:, 2], high[:, 0], -low[:, 1], high[:, 2]], 1)
     there = np.hstack([low, high])
     far = np.abs(mirrored[:, None] - there).max(axis=2).min(axis=1)
@@ -205,18 +206,18 @@ def test_vehicles_are_symmetric(style):
 
 def test_beam_can_pass_through_windows_of_car():
     """Above the belt and behind the screens only pillars and seats are solid."""
-    made = vehicles.make_body((4.0, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.85, driver=False)
-    low, high = compute_extents(made)
+    parts = vehicles.make_body((4.0, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.85, driver=False)
+    low, high = compute_extents(parts)
     x, z = -0.45, 1.25  # between the pillars in the middle and at the back, above the seats
     met = (low[:, 0] < x) & (x < high[:, 0]) & (low[:, 2] < z) & (z < high[:, 2])
-    assert (made["transmission"][met] > 0.5).all() and met.sum() == 2
+    assert (parts["transmission"][met] > 0.5).all() and met.sum() == 2
 
 
-def scan_thing(thing, distance, yaw, seed):
-    """Return the xyz that the HDL-64E sees of a thing at a distance ahead; z above its bottom."""
-    made = thing.parts(0.4 * seed)
-    base = np.tile([distance, 0.0, -1.73], (len(made), 1))
-    solids = place_parts(made, base, np.full(len(made), yaw), np.ones(len(made)), np.zeros((len(made), 3)))
+def scan_object(obj, distance, yaw, seed):
+    """Return the xyz that the HDL-64E sees of a obj at a distance ahead; z above its bottom."""
+    parts = obj.parts(0.4 * seed)
+    base = np.tile([distance, 0.0, -1.73], (len(parts), 1))
+    solids = place_parts(parts, base, np.full(len(parts), yaw), np.ones(len(parts)), np.zeros((len(parts), 3)))
     hits = cast_rays(solids, Ground(), np.array([0.0, 0.0, 1e4]), HDL64E, NO_MOTION, seed)
     xyz = make_returns(hits, HDL64E, NO_MOTION, np.random.default_rng(seed)).xyz
     return xyz + np.array([0.0, 0.0, 1.73])
@@ -226,9 +227,9 @@ def test_low_share_of_cyclist_agrees_with_kitti():
     """46 % of the points of 10 KITTI cyclists are below 0.42 of their height."""
     shares = []
     for seed in SEEDS:
-        thing = cyclists.make_cyclist(np.random.default_rng(seed))
-        heights = scan_thing(thing, 20.0, 0.5 * seed, seed)[:, 2]
-        shares.append((heights[heights > 0.15] < 0.42 * thing.size[2]).mean())
+        obj = cyclists.make_cyclist(np.random.default_rng(seed))
+        heights = scan_object(obj, 20.0, 0.5 * seed, seed)[:, 2]
+        shares.append((heights[heights > 0.15] < 0.42 * obj.size[2]).mean())
     assert 0.40 < np.mean(shares) < 0.52
 
 
@@ -238,8 +239,8 @@ def test_share_above_belt_of_car_falls_with_range(distance, low, high):
     seen from behind at 12 to 25, 25 to 40 and 40 to 70 m, whose lower parts are often hidden."""
     shares = []
     for seed in range(16):
-        thing = vehicles.make_car(np.random.default_rng(seed))
-        heights = scan_thing(thing, distance, 0.0, seed)[:, 2] / thing.size[2]
+        obj = vehicles.make_car(np.random.default_rng(seed))
+        heights = scan_object(obj, distance, 0.0, seed)[:, 2] / obj.size[2]
         if (heights > 0.15).sum() >= 8:
             shares.append((heights[heights > 0.15] > 0.65).mean())
     assert low < np.mean(shares) < high
@@ -249,7 +250,7 @@ def test_share_above_belt_of_car_falls_with_range(distance, low, high):
 def scan_cars_from_front():
     """Return 24 cars and their points from 20 m away."""
     cars = [vehicles.make_car(np.random.default_rng(seed)) for seed in range(24)]
-    return [(car, scan_thing(car, 20.0, np.pi + 0.05 * (seed % 5 - 2), seed)) for seed, car in enumerate(cars)]
+    return [(car, scan_object(car, 20.0, np.pi + 0.05 * (seed % 5 - 2), seed)) for seed, car in enumerate(cars)]
 
 
 @pytest.mark.parametrize(
@@ -259,22 +260,17 @@ def test_only_bumper_reaches_front_of_box(zone, low, high):
     """A quarter of the points of a zone of heights are within 0.07, 0.17 and 0.60 m of the end of
     the box: medians of 42 to 59 cars of KITTI seen from the front."""
     depths = []
-    for thing, points in scan_cars_from_front():
+    for obj, points in scan_cars_from_front():
         x, y, z = points.T
-        met = (
-            (np.abs(y) < 0.45 * thing.size[1])
-            & (z > zone[0] * thing.size[2])
-            & (z < zone[1] * thing.size[2])
-            & (x < 21.0)
-        )
-        depths.append(np.percentile(x[met] - 20.0 + thing.size[0] / 2, 25))
+        met = (np.abs(y) < 0.45 * obj.size[1]) & (z > zone[0] * obj.size[2]) & (z < zone[1] * obj.size[2]) & (x < 21.0)
+        depths.append(np.percentile(x[met] - 20.0 + obj.size[0] / 2, 25))
     assert low < np.median(depths) < high
 
 
 @pytest.mark.parametrize("length", [3.2, 3.8, 4.5])
 def test_seats_do_not_reveal_length_of_car(length):
-    made = vehicles.make_body((length, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.8, driver=False)
-    seats = made[np.isclose(made["transmission"], 0.75)]
+    parts = vehicles.make_body((length, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.8, driver=False)
+    seats = parts[np.isclose(parts["transmission"], 0.75)]
     assert len(seats) == 2 and np.ptp(seats["centre"][:, 0]) > 0.4
 
 
@@ -312,12 +308,13 @@ def test_size_table_agrees_with_labels(data):
 def test_scenery_is_on_or_in_ground(name):
     make, _ = SCENERY[name]
     for seed in SEEDS:
-        low, high = find_extents(make_parts(make, seed))
+        low, high = find_extents(draw_parts(make, seed))
         assert low[2] <= 1e-9 < high[2]
 
 
 def test_rods_and_discs_have_given_ends():
-    made = parts([rod((0, 0, 0), (3, 4, 12), 1e-6), disc((1, 2, 3), 0.5, 0.1), block((1, -1, 2), (0, 1, 0))], 10)
-    low, high = compute_extents(made)
+    rows = [rod((0, 0, 0), (3, 4, 12), 1e-6, 0.3), disc((1, 2, 3), 0.5, 0.1, 0.3), block((1, -1, 2), (0, 1, 0), 0.3)]
+    parts = make_parts(rows, 10)
+    low, high = compute_extents(parts)
     assert np.allclose(low, [(0, 0, 0), (0.5, 1.9, 2.5), (0, -1, 0)], atol=1e-5)
     assert np.allclose(high, [(3, 4, 12), (1.5, 2.1, 3.5), (1, 1, 2)], atol=1e-5)
