@@ -1,4 +1,4 @@
-"""Actors of a scene: things that move along straight lines and never collide."""
+"""Actors of a scene: objects that stand, or move along straight lines, and never collide."""
 
 from __future__ import annotations
 
@@ -16,25 +16,29 @@ from lidar_perception.simulation.solids import compute_hull
 from lidar_perception.simulation.trajectory import Trajectory
 
 HEAD_ROOM_M = 2.2  # parts above this height do not block anyone
-SIGHT_M, FAR_SIGHT_M = 80.0, 120.0  # maximum distance of objects in a scan; the latter applies to
-LARGE_M = 5.0  # objects of at least this size
+# Maximum distance of objects in a scan, and that of objects of at least LARGE_M.
+SIGHT_M, FAR_SIGHT_M, LARGE_M = 80.0, 120.0, 5.0
 STEP_S = 0.1  # time between the robot positions that others keep clear of
 
 
-def make_prop(made: np.ndarray) -> SceneObject:
-    """Return a thing without a label, of parts (P,) PART."""
-    return make_rigid(made, (0.0, 0.0, 0.0), "")
+def make_prop(parts: np.ndarray) -> SceneObject:
+    """Make an object without a label from parts (P,) PART."""
+    return make_rigid(parts, (0.0, 0.0, 0.0), "")
 
 
 @dataclass(frozen=True)
 class Actor:
-    """A thing at x, y in the world at time 0, in m.
+    """An object with its motion: straight ahead from time start to stop, standing before and after.
 
-    It moves straight ahead at speed (m/s) from start to stop (s), and stands before and after.
-    Things without a label have size (0, 0, 0).
+    Attributes:
+        obj: The object.
+        x, y: Position in the world at time 0, m.
+        heading: rad.
+        speed: m/s.
+        start, stop: Times of the motion, s.
     """
 
-    thing: SceneObject
+    obj: SceneObject
     x: float
     y: float
     heading: float = 0.0
@@ -44,9 +48,9 @@ class Actor:
 
     @cached_property
     def footprint(self) -> np.ndarray:
-        """Footprint (8,) float64, see below; for walkers it contains the box of all poses."""
-        x0, y0, _, x1, y1, _ = compute_hull(self.thing.parts(0.0), HEAD_ROOM_M)
-        length, width, _ = self.thing.size
+        """Footprint (8,) float64, see X, Y, HEADING, ... below. It contains the labelled box in all poses."""
+        x0, y0, _, x1, y1, _ = compute_hull(self.obj.parts(0.0), HEAD_ROOM_M)
+        length, width, _ = self.obj.size
         x0, x1 = min(x0, -length / 2), max(x1, length / 2)
         y0, y1 = min(y0, -width / 2), max(y1, width / 2)
         x, y = (x0 + x1) / 2, (y0 + y1) / 2
@@ -65,34 +69,33 @@ class Actor:
         )
 
 
-# A footprint is a row [x y heading, half length, half width, speed, start, stop]: the rectangle
-# around the parts of an actor below HEAD_ROOM_M, with its centre x y at time 0.
+# Columns of a footprint: the rectangle around the parts of an actor below HEAD_ROOM_M, with its
+# centre at time 0, half length and half width in m, and the motion of the actor.
 X, Y, HEADING, LENGTH, WIDTH, SPEED, START, STOP = range(8)
 
 
 @njit(cache=True, nogil=True)
-def _touches_any(one, many, reach, seconds, gap):
-    """Return True if one touches any of many; reach (M,): _max_reach of these."""
-    far = _max_reach(one, seconds) + gap
-    for m in range(len(many)):
-        x, y, near = many[m, X] - one[X], many[m, Y] - one[Y], far + reach[m]
-        if 0 <= near and x * x + y * y <= near * near and footprints_touch(one, many[m], seconds, gap):
+def _touches_any(footprint, others, radii, seconds, gap):
+    """Return True if a footprint touches any of others (M, 8), whose motion radii are radii (M,)."""
+    radius = _motion_radius(footprint, seconds) + gap
+    for m in range(len(others)):
+        x, y, limit = others[m, X] - footprint[X], others[m, Y] - footprint[Y], radius + radii[m]
+        if 0 <= limit and x * x + y * y <= limit * limit and footprints_touch(footprint, others[m], seconds, gap):
             return True
     return False
 
 
 @njit(cache=True, nogil=True)
-def _max_reach(one, seconds):
-    """Return the largest distance from its first centre that a footprint ever reaches."""
-    return math.hypot(one[LENGTH], one[WIDTH]) + one[SPEED] * seconds
+def _motion_radius(footprint, seconds):
+    """Return the radius of a circle around the first centre of a footprint that it never leaves, in m."""
+    return math.hypot(footprint[LENGTH], footprint[WIDTH]) + footprint[SPEED] * seconds
 
 
 @njit(cache=True, nogil=True)
 def footprints_touch(one, other, seconds, gap):
-    """Return True if two footprints (8,) ever come within gap metres in 0 .. seconds.
+    """Return True if two footprints (8,) come within gap metres at any time in 0 .. seconds.
 
-    Exact for gap 0: convex shapes that slide along straight lines touch while their projections on
-    the normals of all sides do.
+    Separating axis theorem for moving rectangles; exact for gap 0.
     """
     times = np.empty(6)
     times[:] = (one[START], one[STOP], other[START], other[STOP], 0.0, seconds)
@@ -106,17 +109,17 @@ def footprints_touch(one, other, seconds, gap):
         for side in range(4):
             angle = (one if side < 2 else other)[HEADING] + side % 2 * np.pi / 2
             cos, sin = math.cos(angle), math.sin(angle)
-            reach = gap
+            width = gap
             for f in (one, other):
-                turned = angle - f[HEADING]
-                reach += f[LENGTH] * abs(math.cos(turned)) + f[WIDTH] * abs(math.sin(turned))
-            near = x * cos + y * sin
+                rotation = angle - f[HEADING]
+                width += f[LENGTH] * abs(math.cos(rotation)) + f[WIDTH] * abs(math.sin(rotation))
+            distance = x * cos + y * sin
             change = (next_x - x) * cos + (next_y - y) * sin
             if abs(change) >= 1e-9:
-                one_end, other_end = (-reach - near) / change, (reach - near) / change
-                enter = max(enter, min(one_end, other_end))
-                leave = min(leave, max(one_end, other_end))
-            elif abs(near) > reach:
+                first, second = (-width - distance) / change, (width - distance) / change
+                enter = max(enter, min(first, second))
+                leave = min(leave, max(first, second))
+            elif abs(distance) > width:
                 enter = 2.0
         if enter <= leave:
             return True
@@ -126,36 +129,34 @@ def footprints_touch(one, other, seconds, gap):
 @njit(cache=True, nogil=True)
 def _compute_offset(one, other, t):
     """Return the vector from the centre of one to that of the other at time t."""
-    way = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
-    other_way = other[SPEED] * min(max(t - other[START], 0.0), other[STOP] - other[START])
+    moved = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
+    other_moved = other[SPEED] * min(max(t - other[START], 0.0), other[STOP] - other[START])
     return (
-        other[X] + math.cos(other[HEADING]) * other_way - one[X] - math.cos(one[HEADING]) * way,
-        other[Y] + math.sin(other[HEADING]) * other_way - one[Y] - math.sin(one[HEADING]) * way,
+        other[X] + math.cos(other[HEADING]) * other_moved - one[X] - math.cos(one[HEADING]) * moved,
+        other[Y] + math.sin(other[HEADING]) * other_moved - one[Y] - math.sin(one[HEADING]) * moved,
     )
 
 
 @njit(cache=True, nogil=True)
-def _touches_trajectory(one, way, radius):
-    """Return True if a footprint (8,) comes within radius of a trajectory (T, 3), [t x y].
+def _touches_trajectory(footprint, trajectory, radius):
+    """Return True if a footprint (8,) comes within radius of a sampled trajectory (T, 3), [t x y].
 
-    Both move between the samples, so half the distance of a step is added.
+    Half of the motion between two samples is added to the radius.
     """
-    cos, sin = math.cos(one[HEADING]), math.sin(one[HEADING])
-    for k in range(len(way)):
-        t, last = way[k, 0], way[max(k - 1, 0)]
-        moved = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
-        x, y = way[k, 1] - one[X] - cos * moved, way[k, 2] - one[Y] - sin * moved
-        outside = math.hypot(
-            max(abs(cos * x + sin * y) - one[LENGTH], 0.0), max(abs(cos * y - sin * x) - one[WIDTH], 0.0)
-        )
-        covered = one[SPEED] * (t - last[0]) + math.hypot(way[k, 1] - last[1], way[k, 2] - last[2])
-        if outside < radius + covered / 2:
+    cos, sin = math.cos(footprint[HEADING]), math.sin(footprint[HEADING])
+    for k in range(len(trajectory)):
+        (t, x, y), last = trajectory[k], trajectory[max(k - 1, 0)]
+        step = footprint[SPEED] * (t - last[0]) + math.hypot(x - last[1], y - last[2])
+        moved = footprint[SPEED] * min(max(t - footprint[START], 0.0), footprint[STOP] - footprint[START])
+        x, y = x - footprint[X] - cos * moved, y - footprint[Y] - sin * moved
+        ahead, aside = abs(cos * x + sin * y) - footprint[LENGTH], abs(cos * y - sin * x) - footprint[WIDTH]
+        if math.hypot(max(ahead, 0.0), max(aside, 0.0)) < radius + step / 2:
             return True
     return False
 
 
 class ActorSet:
-    """Actors of a scene, to which others are admitted if they never touch them."""
+    """Actors of a scene that never touch each other."""
 
     def __init__(
         self,
@@ -176,28 +177,32 @@ class ActorSet:
         self._path = np.empty((0, 3)) if trajectory is None else trajectory.sample(seconds, STEP_S)
         self._radius = radius
         self.actors: list[Actor] = []
-        self._taken, self._reach, self._used = np.empty((64, 8)), np.empty(64), 0
-        for row in () if keep_clear is None else keep_clear:
-            self._take(row)
+        self._footprints, self._radii, self._count = np.empty((64, 8)), np.empty(64), 0
+        for footprint in () if keep_clear is None else keep_clear:
+            self._append(footprint)
 
     def admit(self, *group: Actor, gap: float = 0.1) -> bool:
-        """Add a group if it never comes within gap of other actors or the robot, or touches itself."""
-        before = self._used
+        """Add a group of actors, unless they come within gap of other actors or the robot, or touch each other.
+
+        Returns:
+            True if the group was added.
+        """
+        before = self._count
         for actor in group:
-            row, own = actor.footprint, slice(before, self._used)
+            footprint, own = actor.footprint, slice(before, self._count)
             if (
-                _touches_trajectory(row, self._path, self._radius + gap)
-                or _touches_any(row, self._taken[:before], self._reach, self.seconds, gap)
-                or _touches_any(row, self._taken[own], self._reach[own], self.seconds, 0.0)
+                _touches_trajectory(footprint, self._path, self._radius + gap)
+                or _touches_any(footprint, self._footprints[:before], self._radii, self.seconds, gap)
+                or _touches_any(footprint, self._footprints[own], self._radii[own], self.seconds, 0.0)
             ):
-                self._used = before
+                self._count = before
                 return False
-            self._take(row)
+            self._append(footprint)
         self.actors += group
         return True
 
     def admit_each(self, actors: Iterable[Actor], gap: float = 0.1) -> None:
-        """Add each actor that never comes within gap of others or the robot."""
+        """Add each of the actors that never comes within gap of others or the robot."""
         for actor in actors:
             self.admit(actor, gap=gap)
 
@@ -205,10 +210,10 @@ class ActorSet:
         """Add a group without a check, such as people on a bench."""
         self.actors += group
         for actor in group:
-            self._take(actor.footprint)
+            self._append(actor.footprint)
 
-    def _take(self, row: np.ndarray) -> None:
-        if self._used == len(self._taken):  # double the capacity
-            self._taken, self._reach = np.tile(self._taken, (2, 1)), np.tile(self._reach, 2)
-        self._taken[self._used], self._reach[self._used] = row, _max_reach(row, self.seconds)
-        self._used += 1
+    def _append(self, footprint: np.ndarray) -> None:
+        if self._count == len(self._footprints):  # double the capacity
+            self._footprints, self._radii = np.tile(self._footprints, (2, 1)), np.tile(self._radii, 2)
+        self._footprints[self._count], self._radii[self._count] = footprint, _motion_radius(footprint, self.seconds)
+        self._count += 1

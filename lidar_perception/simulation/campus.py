@@ -1,4 +1,4 @@
-"""Campus scenes with no or slow cars: forecourts, squares and paths around a robot's trajectory."""
+"""Campus scenes for robots: forecourts, squares and paths, with few and slow cars."""
 
 from __future__ import annotations
 
@@ -24,10 +24,9 @@ SHOULDER_M = 0.6  # distance from a path to benches and lamps
 
 @dataclass(frozen=True)
 class CampusKind:
-    """A kind of campus.
+    """Parameters of a kind of campus, which is laid out around the trajectory of the robot.
 
-    Ranges (low, high) are drawn from uniformly. Lengths are in m, shares and chances 0 .. 1. The
-    court is laid out around the trajectory of the robot.
+    Pairs (low, high) are the ranges of uniform distributions. Lengths are in m.
     """
 
     share: float  # fraction of scenes of this kind
@@ -92,7 +91,7 @@ CAMPUS_KINDS = {
 def make_campus(
     rng: np.random.Generator, kind: CampusKind, people: float
 ) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
-    """Make a court with its surroundings, things and people, and a robot's trajectory."""
+    """Make ground, actors and trajectory of a campus scene; people: factor for the number of people."""
     trajectory = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
     court = Court.around(
         trajectory.sample(DRIVE_SECONDS, 1.0)[:, 1:],
@@ -107,8 +106,8 @@ def make_campus(
     for side in sides:
         walk = lane + 3.0 if lane and side == right else SHOULDER_M if kind.path else 0.0
         front = {**FRONTS, **CAMPUS_FRONTS}[str(rng.choice(names, p=shares))]
-        for thing in front(rng, side._replace(walk=walk)):
-            actors.admit(thing, gap=-0.8 if is_plant(thing) else 0.1)
+        for obj in front(rng, side._replace(walk=walk)):
+            actors.admit(obj, gap=-0.8 if is_plant(obj) else 0.1)
     if lane:
         actors.admit_each(_fill_lane(rng, right, lane), gap=0.3)
     for side in (left, right):
@@ -125,7 +124,7 @@ def make_campus(
             actors.add(*others)
     for along in scatter(rng, court.floor.length, kind.riders * people):
         actors.admit(
-            court.floor.put(
+            court.floor.place(
                 make_cyclist(rng),
                 along,
                 rng.uniform(0.6, max(court.floor.walk - 0.6, 0.7)),
@@ -139,9 +138,9 @@ def make_campus(
 
 
 def _draw_ground(rng, kind: CampusKind, court: Court, lane: float) -> Ground:
-    """Draw pavement, with a lane beyond its edge, or a path through mown grass."""
+    """Draw the ground: pavement, pavement with a lane on its right, or a path through grass."""
     slopes = np.tan(np.radians(rng.normal(0.0, 0.7, 2))).tolist()
-    look = dict(
+    surface = dict(
         slope_x=slopes[0],
         slope_y=slopes[1],
         wave=rng.uniform(0.0, 0.06),
@@ -154,27 +153,27 @@ def _draw_ground(rng, kind: CampusKind, court: Court, lane: float) -> Ground:
     )
     if kind.path:
         return Ground(
-            **{**look, "curb_height": rng.uniform(0.0, 0.04)},
+            **{**surface, "curb_height": rng.uniform(0.0, 0.04)},
             curb_left=court.y1,
             curb_right=court.y0,
             walk=0.0,
             camber=rng.uniform(0.0, 0.02),
         )
     if lane:
-        return Ground(**look, curb_left=court.y0, curb_right=court.y0 - lane, camber=rng.uniform(0.0, 0.02))
-    return PAVEMENT._replace(**{**look, "curb_height": 0.0})
+        return Ground(**surface, curb_left=court.y0, curb_right=court.y0 - lane, camber=rng.uniform(0.0, 0.02))
+    return PAVEMENT._replace(**{**surface, "curb_height": 0.0})
 
 
 def _build_entrance(rng, side: Side) -> Iterator[Actor]:
-    """Yield glass halls with stairs in front, between houses or trees."""
+    """Yield glass halls, some with stairs, and squares between them."""
     along, line = rng.uniform(0, 8), side.walk + 2.5
     while along < side.length - 8:
         long = min(rng.uniform(12, 35), side.length - along)
         if rng.random() < 0.75:
-            yield side.put(make_glass_hall(rng, long, rng.uniform(8, 15)), along + long / 2, line)
+            yield side.place(make_glass_hall(rng, long, rng.uniform(8, 15)), along + long / 2, line)
             if rng.random() < 0.6:
                 wide = rng.uniform(3.0, 0.7 * long)
-                yield side.put(furniture.make_stairs(rng, wide), along + long / 2, line - 2.4)
+                yield side.place(furniture.make_stairs(rng, wide), along + long / 2, line - 2.4)
         else:
             yield from FRONTS["square"](
                 rng,
@@ -188,10 +187,10 @@ def _build_entrance(rng, side: Side) -> Iterator[Actor]:
 def _build_hedge(rng, side: Side) -> Iterator[Actor]:
     """Yield a hedge or low wall with gaps, and a lawn with trees behind."""
     along, line = 0.0, side.walk + rng.uniform(1.0, 2.5)
-    made = (vegetation.make_hedge, vegetation.make_hedge, furniture.make_wall)[rng.integers(3)]
+    make = (vegetation.make_hedge, vegetation.make_hedge, furniture.make_wall)[rng.integers(3)]
     while along < side.length - 4:
         long = min(rng.uniform(4, 18), side.length - along)
-        yield side.put(made(rng, long), along + long / 2, line)
+        yield side.place(make(rng, long), along + long / 2, line)
         along += long + rng.uniform(1.5, 8)
     yield from FRONTS["verge"](rng, side._replace(walk=line + 2.0))
 
@@ -200,39 +199,39 @@ CAMPUS_FRONTS = {"entrance": _build_entrance, "hedge": _build_hedge}
 
 
 def _fill_lane(rng, side: Side, lane: float) -> Iterator[Actor]:
-    """Yield cars that wait at the kerb, and a few that drive slowly."""
+    """Yield cars that stand at the curb, and a few that drive slowly."""
     for along in scatter(rng, side.length, 5.0):
         make = make_car if rng.random() < 0.75 else make_van
-        thing = make(rng, driver=bool(rng.random() < 0.5))
-        yield side.put(thing, along, 0.3 + thing.size[1] / 2, np.pi)
+        obj = make(rng, driver=bool(rng.random() < 0.5))
+        yield side.place(obj, along, 0.3 + obj.size[1] / 2, np.pi)
     for along in scatter(rng, side.length, 1.5):
-        yield side.put(make_car(rng), along, lane - 1.4, np.pi * rng.integers(2), speed=rng.uniform(1.5, 5.0))
+        yield side.place(make_car(rng), along, lane - 1.4, np.pi * rng.integers(2), speed=rng.uniform(1.5, 5.0))
 
 
 def _furnish_edge(rng, side: Side, kind: CampusKind, kerb: bool) -> Iterator[Actor]:
-    """Yield rows of lamps and trees, bollards along a kerb, and scattered things."""
+    """Yield rows of lamps, trees and bollards, and scattered objects along an edge of the court."""
     out = SHOULDER_M if kind.path else -0.5
     if kerb:
         bollard, gap = make_prop(furniture.make_bollard(rng)), rng.uniform(1.4, 2.5)
-        yield from (side.put(bollard, along, -0.3) for along in np.arange(1.0, side.length, gap))
+        yield from (side.place(bollard, along, -0.3) for along in np.arange(1.0, side.length, gap))
         out = -1.6
-    for made, chance in ((furniture.make_lamp, 0.8), (vegetation.make_tree, 0.5), (furniture.make_bollard, 0.2)):
+    for make, chance in ((furniture.make_lamp, 0.8), (vegetation.make_tree, 0.5), (furniture.make_bollard, 0.2)):
         if rng.random() < chance:
             for along in space_evenly(rng, side.length, rng.uniform(7, 20)):
-                yield side.put(made(rng), along, out + rng.normal(0, 0.1), -np.pi / 2)
+                yield side.place(make(rng), along, out + rng.normal(0, 0.1), -np.pi / 2)
     if not kind.path:
         yield from place_against(rng, side, (*furniture.PERSON_SIZED, furniture.make_pole), kind.edge)
         return
     for along in scatter(rng, side.length, kind.edge):
-        yield side.put(make_clutter(rng), along, rng.uniform(0.6, 1.2), rng.uniform(-np.pi, np.pi))
+        yield side.place(make_clutter(rng), along, rng.uniform(0.6, 1.2), rng.uniform(-np.pi, np.pi))
 
 
 def _place_rack(rng, side: Side, along: float, out: float) -> Iterator[Actor]:
     """Yield a row of bicycle stands, most with a bicycle."""
     for i in range(rng.integers(2, 9)):
-        yield side.put(furniture.make_bicycle_stand(rng), along + 0.9 * i, out, np.pi / 2)
+        yield side.place(furniture.make_bicycle_stand(rng), along + 0.9 * i, out, np.pi / 2)
         if rng.random() < 0.75:
-            yield side.put(
+            yield side.place(
                 make_bicycle(rng),
                 along + 0.9 * i + 0.42,
                 out + rng.normal(0, 0.1),
@@ -241,8 +240,8 @@ def _place_rack(rng, side: Side, along: float, out: float) -> Iterator[Actor]:
 
 
 def _place_things(rng, court: Court, kind: CampusKind, people: float) -> Iterator[list[Actor]]:
-    """Yield planters, trees, benches, cafe chairs with people, and things on the pavement."""
-    for x, y in court.spots(rng, kind.things):
+    """Yield the objects on the pavement, each with the people on it: trees, chairs, parasols, benches and clutter."""
+    for x, y in court.draw_positions(rng, kind.things):
         turn, pick = rng.uniform(-np.pi, np.pi), rng.random()
         if pick < 0.2:
             yield [Actor(make_prop(vegetation.make_tree(rng, rng.uniform(4.0, 8.0))), x, y)]

@@ -31,7 +31,7 @@ def place_standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
         first, wide = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 0.7) * (many > 1)
         angles = first + 2 * np.pi / many * np.arange(many)
         yield [
-            side.put(
+            side.place(
                 make_person(rng), along + wide * np.cos(a), out + wide * np.sin(a), a + np.pi + rng.normal(0, 0.15)
             )
             for a in angles
@@ -57,7 +57,7 @@ def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Act
         moves = _draw_moves(rng, speed, 0.2)
         many = rng.choice([1, 2, 3], p=WALKING_PROBABILITIES)
         yield [
-            side.put(make_person(rng, speed), along + rng.uniform(-0.2, 0.2), out + 0.85 * i, turn, **moves)
+            side.place(make_person(rng, speed), along + rng.uniform(-0.2, 0.2), out + 0.85 * i, turn, **moves)
             for i in range(many)
         ]
 
@@ -70,7 +70,7 @@ def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
         court: The court.
         rate: Groups per 100 square metres.
     """
-    for x, y in court.spots(rng, rate):
+    for x, y in court.draw_positions(rng, rate):
         speed, turn = _draw_speed(rng), rng.uniform(-np.pi, np.pi)
         moves = _draw_moves(rng, speed, 0.5)
         many = rng.choice([1, 2, 3], p=WALKING_PROBABILITIES)
@@ -123,7 +123,7 @@ def place_wheelchairs(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
     """Yield people in wheelchairs along a side, rate per 100 m."""
     for along in scatter(rng, side.length, rate):
         yield [
-            side.put(
+            side.place(
                 make_wheelchair(rng),
                 along,
                 rng.uniform(0.5, max(side.walk - 0.5, 0.6)),
@@ -136,8 +136,8 @@ def place_wheelchairs(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
 def place_bench(rng, side: Side, along: float, out: float, people: float, share: float = 0.25) -> list[Actor]:
     """Return a bench with its back to the outside of a side, and people on a random share of its seats."""
     sitters = [
-        side.put(make_sitting_person(rng, chair=False), along + aside, out, -np.pi / 2)
+        side.place(make_sitting_person(rng, chair=False), along + aside, out, -np.pi / 2)
         for aside in (-0.45, 0.45)
         if rng.random() < min(share * people, 0.8)
     ]
-    return [side.put(furniture.make_bench(rng), along, out, -np.pi / 2), *sitters]
+    return [side.place(furniture.make_bench(rng), along, out, -np.pi / 2), *sitters]

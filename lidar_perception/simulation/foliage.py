@@ -12,7 +12,7 @@ from lidar_perception.simulation.hashing import hash_uniform, mix_bits
 # Size of the cells, and share of the cells that contain leaves. The gaps split a crown into several
 # DBSCAN clusters, as in KITTI.
 CELL_M, LEAF_SHARE = 0.5, 0.25
-MAX_STEPS = 12  # of a ray, which then passes
+MAX_STEPS = 12  # maximum steps of a ray through foliage, after which it passes
 
 
 @njit(cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""Interiors: corridors, halls, canteens and stores around a robot's trajectory."""
+"""Interior scenes for robots: corridors, halls, canteens and stores."""
 
 from __future__ import annotations
 
@@ -22,10 +22,9 @@ SEAT_WIDTH_M = 0.65  # width of a table per person
 
 @dataclass(frozen=True)
 class IndoorKind:
-    """A kind of interior.
+    """Parameters of a kind of interior, which is laid out around the trajectory of the robot.
 
-    Ranges (low, high) are drawn from uniformly. Lengths are in m, shares and chances 0 .. 1. The
-    walls are laid out around the trajectory of the robot.
+    Pairs (low, high) are the ranges of uniform distributions. Lengths are in m.
     """
 
     share: float  # fraction of scenes of this kind
@@ -105,13 +104,13 @@ WALLS = {  # kind -> (function, minimum length, maximum length)
     "passage": (interiors.make_passage, 1.8, 3.2),
     "window": (interiors.make_window, 3.0, 9.0),
 }
-THINGS = (*interiors.PERSON_SIZED, furniture.make_planter, furniture.make_litter_bin, furniture.make_cabinet)
+OBJECTS = (*interiors.PERSON_SIZED, furniture.make_planter, furniture.make_litter_bin, furniture.make_cabinet)
 
 
 def make_interior(
     rng: np.random.Generator, kind: IndoorKind, people: float
 ) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
-    """Make a level floor with walls, ceiling, furniture and people, and a robot's trajectory."""
+    """Make ground, actors and trajectory of an interior; people: factor for the number of people."""
     trajectory = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
     actors = ActorSet(DRIVE_SECONDS, trajectory=trajectory, radius=ROBOT_RADIUS_M)
     court = Court.around(
@@ -120,35 +119,35 @@ def make_interior(
     height = rng.uniform(*kind.height)
     for side in court.sides():
         actors.add(*_build_walls(rng, side, kind, height))
-    for what in kind.fill:
-        for first, *others in FILLS[what](rng, court, height, people):
+    for name in kind.fill:
+        for first, *others in FILLS[name](rng, court, height, people):
             if actors.admit(first, gap=0.8 if others else 0.3):
                 actors.add(*others)
     for side in court.sides():
-        actors.admit_each(place_against(rng, side, THINGS, kind.at_walls), gap=0.05)
-    for x, y in court.inner(0.8).spots(rng, kind.things):
-        made = THINGS[rng.integers(len(THINGS))](rng)
-        actors.admit(Actor(make_prop(made), x, y, rng.uniform(-np.pi, np.pi)), gap=0.3)
+        actors.admit_each(place_against(rng, side, OBJECTS, kind.at_walls), gap=0.05)
+    for x, y in court.inner(0.8).draw_positions(rng, kind.things):
+        parts = OBJECTS[rng.integers(len(OBJECTS))](rng)
+        actors.admit(Actor(make_prop(parts), x, y, rng.uniform(-np.pi, np.pi)), gap=0.3)
     crowd.fill_court(rng, actors, court, people, kind.along, kind.across, kind.standers)
     # Placed last because it does not block people.
-    lid = court.inner(-interiors.WALL_THICKNESS_M)
-    ceiling = interiors.make_ceiling(rng, lid.x1 - lid.x0, lid.y1 - lid.y0, height)
+    area = court.inner(-interiors.WALL_THICKNESS_M)
+    ceiling = interiors.make_ceiling(rng, area.x1 - area.x0, area.y1 - area.y0, height)
     actors.add(Actor(make_prop(ceiling), *court.centre))
     return PAVEMENT._replace(sidewalk=rng.uniform(0.2, 0.6)), tuple(actors.actors), trajectory
 
 
 def _build_walls(rng, side: Side, kind: IndoorKind, height: float) -> Iterator[Actor]:
-    """Yield a wall piece by piece, or windows with plants outside."""
+    """Yield the segments of a wall, or windows with plants outside."""
     names, shares = list(kind.walls), list(kind.walls.values())
     outer = rng.random() < kind.outer
     along = 0.0
     while along < side.length:
-        made, low, high = WALLS["window" if outer else str(rng.choice(names, p=shares))]
-        left = side.length - along
-        if left < low + 0.5:
-            made, low, high = interiors.make_wall, left, left
-        length = min(rng.uniform(low, high), left)
-        yield side.put(made(rng, length, height), along + length / 2, 0.0)
+        make, low, high = WALLS["window" if outer else str(rng.choice(names, p=shares))]
+        remaining = side.length - along
+        if remaining < low + 0.5:
+            make, low, high = interiors.make_wall, remaining, remaining
+        length = min(rng.uniform(low, high), remaining)
+        yield side.place(make(rng, length, height), along + length / 2, 0.0)
         along += length
     if outer:
         yield from FRONTS["verge"](rng, side._replace(walk=WINDOW_VIEW_M))
@@ -156,33 +155,33 @@ def _build_walls(rng, side: Side, kind: IndoorKind, height: float) -> Iterator[A
 
 def _place_columns(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
     """Yield rows of equal columns."""
-    made = make_prop(interiors.make_column(rng, height))
+    column = make_prop(interiors.make_column(rng, height))
     (dx, dy), (x, y) = rng.uniform(5.0, 10.0, 2), rng.uniform(1.0, 5.0, 2)
     for at_x in np.arange(court.x0 + x, court.x1 - 1, dx):
         for at_y in np.arange(court.y0 + y, court.y1 - 1, dy):
-            yield [Actor(made, at_x, at_y)]
+            yield [Actor(column, at_x, at_y)]
 
 
 def _place_benches(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
-    """Yield benches along the walls, and counters."""
+    """Yield benches along the walls, with people, and counters."""
     for side in court.sides():
         for along in space_evenly(rng, side.length, rng.uniform(4.0, 12.0)):
             if rng.random() < 0.6:
                 yield crowd.place_bench(rng, side, along, -rng.uniform(0.4, 1.0), people)
         if rng.random() < 0.4:
             yield [
-                side.put(interiors.make_counter(rng), rng.uniform(0, side.length), -rng.uniform(1.2, 2.5), -np.pi / 2)
+                side.place(interiors.make_counter(rng), rng.uniform(0, side.length), -rng.uniform(1.2, 2.5), -np.pi / 2)
             ]
 
 
 def _scatter_tables(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
-    """Yield scattered tables."""
-    for x, y in court.inner(1.5).spots(rng, 1.5):
+    """Yield tables at random positions, each with its chairs and people."""
+    for x, y in court.inner(1.5).draw_positions(rng, 1.5):
         yield _set_table(rng, x, y, rng.uniform(-np.pi, np.pi), people)
 
 
 def _line_up_tables(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
-    """Yield rows of tables."""
+    """Yield rows of tables, each with its chairs and people."""
     dx, dy = rng.uniform(2.2, 3.5, 2)
     turn = np.pi / 2 * rng.integers(2)
     for x in np.arange(court.x0 + 1.3, court.x1 - 1.2, dx):
@@ -194,7 +193,7 @@ def _line_up_tables(rng, court: Court, height: float, people: float) -> Iterator
 
 
 def _set_table(rng, x: float, y: float, turn: float, people: float) -> list[Actor]:
-    """Return a table with chairs and people at its long sides."""
+    """Return a table, and the chairs and people at its long sides."""
     long, wide = rng.uniform((0.7, 0.65), (2.0, 0.9))
     table = Actor(make_prop(interiors.make_table(rng, long, wide)), x, y, turn)
     line, around = Side(x, y, turn, 0.0, 0.0, ""), []
@@ -203,9 +202,9 @@ def _set_table(rng, x: float, y: float, turn: float, people: float) -> list[Acto
         for side in (-1, 1):
             out, pick = side * (wide / 2 + rng.uniform(0.2, 0.4)), rng.random()
             if pick < min(0.35 * people, 0.8):
-                around.append(line.put(make_sitting_person(rng), along, out, -side * np.pi / 2))
+                around.append(line.place(make_sitting_person(rng), along, out, -side * np.pi / 2))
             elif pick < 0.85:
-                around.append(line.put(interiors.make_chair(rng), along, out, -side * np.pi / 2 + rng.normal(0, 0.3)))
+                around.append(line.place(interiors.make_chair(rng), along, out, -side * np.pi / 2 + rng.normal(0, 0.3)))
     return [table, *around]
 
 

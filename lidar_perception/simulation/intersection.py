@@ -1,7 +1,7 @@
 """Compiled intersection of one ray with one solid.
 
-All solids are unit shapes under a linear map. A ray is within a unit shape while it is within all
-the slabs and quadrics that bound it (Kay and Kajiya, SIGGRAPH 1986).
+A solid is a unit shape under a linear map. A unit shape is the intersection of slabs and quadrics
+(Kay and Kajiya, SIGGRAPH 1986).
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from lidar_perception.simulation.terrain import compute_brightness
 
 
 class CompiledSolids(NamedTuple):
-    """P solids for compiled code; fields that are not listed are those of Solids.
+    """P solids for compiled code. Other attributes are those of Solids.
 
     Attributes:
-        matrix: (P, 3, 3) map to the unit shape.
-        offset: (P, 3) image of the frame's origin.
-        drift: (P, 3) image of the sensor's velocity relative to the solid.
-        plant: (P,) uint64, seed of the leaves.
-        salt: (P,) uint64, seed of random numbers.
+        matrix: (P, 3, 3) linear map from the sensor's frame to the unit shape.
+        offset: (P, 3) origin of the sensor's frame in the frame of the unit shape.
+        drift: (P, 3) velocity of the sensor relative to the solid, in the frame of the unit shape.
+        plant: (P,) uint64 seed of the leaves.
+        salt: (P,) uint64 seed of all other random numbers.
     """
 
     matrix: np.ndarray
@@ -44,10 +44,10 @@ class CompiledSolids(NamedTuple):
 
 
 def compile_solids(solids: Solids, motion: Motion, salt: np.uint64) -> CompiledSolids:
-    """Convert solids for a scan. motion: of the sensor; salt: seed of the scan."""
+    """Convert solids for compiled code; motion: motion of the sensor; salt: seed of the scan."""
     matrix = np.swapaxes(solids.axes, 1, 2) / solids.half[:, :, None]
     slides = np.asarray(motion.velocity, np.float64) - solids.velocity
-    # Copies, since Numba compiles again for read-only arrays and other memory layouts.
+    # Copies, since Numba would compile again for read-only arrays and other memory layouts.
     density, transmission, reflectance = (
         np.array(part, np.float64) for part in (solids.density, solids.transmission, solids.reflectance)
     )
@@ -68,9 +68,14 @@ def compile_solids(solids: Solids, motion: Motion, salt: np.uint64) -> CompiledS
 
 @njit(cache=True, nogil=True)
 def to_unit_frame(shapes, s, way, since, lift):
-    """Return start and direction (x, y, z) of a ray in the frame of unit shape s.
+    """Transform a ray to the frame of unit shape s: start and direction (x, y, z).
 
-    since: seconds after the stamp; lift: height of its start above the sensor's origin, m.
+    Args:
+        shapes: CompiledSolids.
+        s: Index of the solid.
+        way: Direction (x, y, z) of the ray in the sensor's frame.
+        since: Time of the ray after the stamp, s.
+        lift: Start of the ray on the z axis, m.
     """
     m, o, v = shapes.matrix[s], shapes.offset[s], shapes.drift[s]
     start = (
@@ -90,7 +95,7 @@ def to_unit_frame(shapes, s, way, since, lift):
 def intersect_shape(kind, start, way):
     """Return the ranges at which a ray enters and leaves a unit shape, (inf, -inf) for a miss.
 
-    A ray exactly along a cylinder, or in the face of a box, misses.
+    A ray exactly along the axis of a cylinder or in the face of a box is a miss.
     """
     enter, leave = -np.inf, np.inf
     for i in range(3):
@@ -117,9 +122,9 @@ def intersect_shape(kind, start, way):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_stop_range(shapes, s, start, way, enter, leave, number, leaf_share):
-    """Return the range at which solid s stops a ray that passes through its shape, else inf.
+    """Return the range at which solid s stops a ray, inf if the ray passes through leaves or glass.
 
-    A ray that starts within an opaque solid is not stopped. number: number of the ray; leaf_share: see
+    A ray that starts in an opaque solid is not stopped. number: number of the ray; leaf_share: see
     foliage.py.
     """
     t = enter if enter > 0 else np.inf
@@ -139,11 +144,10 @@ def find_stop_range(shapes, s, start, way, enter, leave, number, leaf_share):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def shade_hit(shapes, s, way, since, lift, number):
-    """Return brightness and cosine of the incidence of a ray that ends on solid s."""
+    """Return the brightness of a ray that ends on solid s, and the cosine of its angle of incidence."""
     reflectance = shapes.reflectance[s]
     if shapes.density[s] < np.inf:
-        # Leaves face all directions. Neighbouring points of vegetation differ as much on
-        # SemanticKITTI.
+        # Leaves face all directions. The scatter is that of neighbouring points in SemanticKITTI.
         scatter = hash_uniform(6, shapes.salt[s] + np.uint64(number))
         return compute_brightness(reflectance, 0.5) * (0.5 + scatter), 1.0
     start, along = to_unit_frame(shapes, s, way, since, lift)
@@ -165,7 +169,7 @@ def shade_hit(shapes, s, way, since, lift, number):
 
 @njit(cache=True, nogil=True)
 def _normal(kind, x, y, z):
-    """Return the outward normal of a unit shape at a point of its surface."""
+    """Return the outward normal of a unit shape at a surface point."""
     if kind == ELLIPSOID:
         return x, y, z
     if kind == CYLINDER:

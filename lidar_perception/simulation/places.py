@@ -1,4 +1,4 @@
-"""Lines and rectangles in which things are placed."""
+"""Lines and rectangles in which objects are placed."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from lidar_perception.simulation.solids import compute_extents
 
 
 class Side(NamedTuple):
-    """A line along which things are placed, such as a curb.
+    """A line along which objects are placed, such as a curb.
 
     Attributes:
-        x, y, heading, length: Start, direction and length, in m and rad.
-        walk: Width of the sidewalk to its left, m.
-        front: Kind of the front beyond the sidewalk, see roadside.FRONTS.
-        parking: Width of the parking strip to its right, m.
+        x, y: Start, m.
+        heading: Direction, rad.
+        length: m.
+        walk: Width of the sidewalk on its left, m.
+        front: Type of the front beyond the sidewalk, see roadside.FRONTS.
+        parking: Width of the parking strip on its right, m.
     """
 
     x: float
@@ -31,20 +33,24 @@ class Side(NamedTuple):
     front: str
     parking: float = 0.0
 
-    def put(self, thing: SceneObject | np.ndarray, along: float, out: float, turn: float = 0.0, **moves) -> Actor:
-        """Return an actor `along` the curb and `out` from it (m), turned against the line (rad).
+    def place(self, obj: SceneObject | np.ndarray, along: float, out: float, turn: float = 0.0, **motion) -> Actor:
+        """Place an object relative to the line.
 
-        Parts (P,) PART become a thing without a label.
+        Args:
+            obj: The object, or the parts (P,) PART of an object without a label.
+            along: Distance along the line from its start, m.
+            out: Distance from the line to its left, m.
+            turn: Heading relative to the line, rad.
+            motion: speed, start and stop of the actor.
         """
-        thing = make_prop(thing) if isinstance(thing, np.ndarray) else thing
+        obj = make_prop(obj) if isinstance(obj, np.ndarray) else obj
         cos, sin = math.cos(self.heading), math.sin(self.heading)
-        return Actor(
-            thing, self.x + cos * along - sin * out, self.y + sin * along + cos * out, self.heading + turn, **moves
-        )
+        x, y = self.x + cos * along - sin * out, self.y + sin * along + cos * out
+        return Actor(obj, x, y, self.heading + turn, **motion)
 
 
 class Court(NamedTuple):
-    """A rectangle from x0, y0 to x1, y1 in the world, m."""
+    """A rectangle from (x0, y0) to (x1, y1) in the world, m."""
 
     x0: float
     y0: float
@@ -52,13 +58,16 @@ class Court(NamedTuple):
     y1: float
 
     @staticmethod
-    def around(way: np.ndarray, ends: np.ndarray, wide: np.ndarray) -> Court:
+    def around(path: np.ndarray, ends: np.ndarray, sides: np.ndarray) -> Court:
         """Return the court around a path (T, 2).
 
-        ends: (2,) margins behind and ahead; wide: (2,) margins to the right and left, m.
+        Args:
+            path: (T, 2) points, m.
+            ends: (2,) margins behind and ahead, m.
+            sides: (2,) margins to the right and left, m.
         """
-        low, high = way.min(axis=0), way.max(axis=0)
-        return Court(*(low - [ends[0], wide[0]]).tolist(), *(high + [ends[1], wide[1]]).tolist())
+        low, high = path.min(axis=0), path.max(axis=0)
+        return Court(*(low - [ends[0], sides[0]]).tolist(), *(high + [ends[1], sides[1]]).tolist())
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -67,42 +76,42 @@ class Court(NamedTuple):
 
     @property
     def floor(self) -> Side:
-        """The edge at y0 as a line with the whole court to its left."""
+        """The edge at y0 as a line with the court on its left."""
         return Side(self.x0, self.y0, 0.0, self.x1 - self.x0, self.y1 - self.y0, "")
 
     def sides(self, walk: float = 0.0, front: str = "") -> tuple[Side, Side, Side, Side]:
-        """Return the edges at y1, x0, y0, x1 as lines with the outside to their left."""
-        long, wide = self.x1 - self.x0, self.y1 - self.y0
+        """Return the edges at y1, x0, y0, x1 as lines with the outside on their left."""
+        length, width = self.x1 - self.x0, self.y1 - self.y0
         return (
-            Side(self.x0, self.y1, 0.0, long, walk, front),
-            Side(self.x0, self.y0, np.pi / 2, wide, walk, front),
-            Side(self.x1, self.y0, np.pi, long, walk, front),
-            Side(self.x1, self.y1, -np.pi / 2, wide, walk, front),
+            Side(self.x0, self.y1, 0.0, length, walk, front),
+            Side(self.x0, self.y0, np.pi / 2, width, walk, front),
+            Side(self.x1, self.y0, np.pi, length, walk, front),
+            Side(self.x1, self.y1, -np.pi / 2, width, walk, front),
         )
 
     def inner(self, margin: float) -> Court:
-        """Return the rectangle without a margin, m."""
+        """Shrink the rectangle by a margin in m."""
         return Court(self.x0 + margin, self.y0 + margin, self.x1 - margin, self.y1 - margin)
 
-    def spots(self, rng: np.random.Generator, rate: float) -> Iterator[tuple[float, float]]:
-        """Yield random positions (x, y), rate per 100 square metres in the mean."""
+    def draw_positions(self, rng: np.random.Generator, rate: float) -> Iterator[tuple[float, float]]:
+        """Yield random positions (x, y), on average `rate` per 100 square metres."""
         area = max(self.x1 - self.x0, 0.0) * max(self.y1 - self.y0, 0.0)
         for _ in range(rng.poisson(area * rate / 100)):
             yield rng.uniform(self.x0, self.x1), rng.uniform(self.y0, self.y1)
 
 
 def place_against(rng: np.random.Generator, side: Side, makers: Sequence[Callable], rate: float) -> Iterator[Actor]:
-    """Yield things inside a side with their backs to it, rate per 100 m, made by random makers."""
+    """Yield objects on the inside of a side with their backs to it, from random makers, on average `rate` per 100 m."""
     for along in scatter(rng, side.length, rate):
-        made = makers[int(rng.integers(len(makers)))](rng)
-        low, _ = compute_extents(made)
-        yield side.put(made, along, low[:, 0].min() - 0.05, -np.pi / 2 + rng.normal(0, 0.02))
+        parts = makers[int(rng.integers(len(makers)))](rng)
+        low, _ = compute_extents(parts)
+        yield side.place(parts, along, low[:, 0].min() - 0.05, -np.pi / 2 + rng.normal(0, 0.02))
 
 
 def space_evenly(rng, length: float, spacing: float) -> np.ndarray:
-    """Return positions along a length, spacing apart in the mean."""
-    places = np.arange(rng.uniform(0, spacing), length, spacing)
-    return np.clip(places + rng.uniform(-0.2, 0.2, len(places)) * spacing, 0, length)
+    """Return jittered positions along a length with this mean spacing, m."""
+    positions = np.arange(rng.uniform(0, spacing), length, spacing)
+    return np.clip(positions + rng.uniform(-0.2, 0.2, len(positions)) * spacing, 0, length)
 
 
 def scatter(rng, length: float, rate: float) -> np.ndarray:

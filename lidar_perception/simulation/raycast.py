@@ -1,12 +1,12 @@
-"""First hits of all rays of a turn, compiled.
+"""First hits of all rays of one revolution of the sensor, compiled.
 
-Solids are drawn into the grid of firings and beams as triangles into a picture, each into its
-window (windows.py) of a depth buffer. Unlabelled solids come last, from near to far, so that one
-comparison finds most of their rays hidden. The ground, which takes longest, is cast where it may be
-nearer. Beams at the edges of solids are cast a second time, into their footprint, see edges.py.
+Solids are rasterised into a depth buffer of firings and beams, each into its window (windows.py).
+Unlabelled solids come last, from near to far, since most of their rays are then hidden. The ground,
+which takes longest, is intersected only where it may be nearer. Rays at the edges of solids are cast
+a second time, into the footprint of the beam, see edges.py.
 
-Solids are in the sensor's frame at the stamp. The ground is in the world, against which that frame
-is turned about z only.
+Solids are in the sensor's frame at the stamp. The ground is in the world frame, relative to which the
+sensor's frame is rotated only about z.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class Hits(NamedTuple):
     Attributes:
         range: float64 m; inf without a hit, 0 if the ray starts in a tuft of grass.
         brightness: float64, 0..1.
-        cosine: float64 cosine of the incidence, 0 without a hit.
-        owner: int32 object, 0 for none.
+        cosine: float64 cosine of the angle of incidence, 0 without a hit.
+        owner: int32 track id of the object, 0 for none.
         semantic: uint16 class; 0 without a hit, 1 (outlier) between two surfaces, see edges.py.
         solid: int32 index of the solid, -1 for none.
-        reached: reached[k] rays would hit object k if it were alone.
+        reached: (objects + 1,) int64, number of rays that would hit each object if it were alone.
     """
 
     range: np.ndarray
@@ -56,12 +56,12 @@ class Hits(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """The rays of a turn for compiled code.
+    """Rays of one revolution, for compiled code.
 
     Attributes:
-        direction: (columns, rings, 3) in the sensor's frame at the stamp.
-        since: (columns,) s after the stamp.
-        lift: (rings,) m above the sensor's origin.
+        direction: (columns, rings, 3) unit vectors in the sensor's frame at the stamp.
+        since: (columns,) time after the stamp, s.
+        lift: (rings,) start of each beam on the z axis, m.
     """
 
     direction: np.ndarray
@@ -78,7 +78,7 @@ def cast_rays(
     seed: int = 0,
     heading: float = 0.0,
 ) -> Hits:
-    """Cast all rays of one turn of a sensor.
+    """Cast all rays of one revolution of a sensor.
 
     Args:
         solids: Solids in the sensor's frame at the stamp.
@@ -86,12 +86,12 @@ def cast_rays(
         position: (3,) position of the sensor in the world at the stamp, m.
         sensor: The sensor.
         motion: Motion of the sensor in its own frame.
-        seed: Seed of the random choices; its lowest 64 bits count.
+        seed: Seed of foliage, glass and edges; its lowest 64 bits are used.
         heading: Heading of the sensor in the world, rad.
     """
     salt = np.uint64(mix_bits(np.uint64(seed % (1 << 64))))
-    made = make_rays(sensor, motion)
-    turn = Turn(made.direction, made.since, sensor.origins()[:, 2].copy())
+    rays = make_rays(sensor, motion)
+    turn = Turn(rays.direction, rays.since, sensor.origins()[:, 2].copy())
     windows = find_windows(solids, sensor, motion, sensor.divergence / 2)
     scene = (
         compile_solids(solids, motion, salt),
@@ -125,22 +125,22 @@ def cast_rays(
 
 @njit(cache=True, nogil=True)
 def _cast_first(
-    hits, turn, only, shapes, windows, order, ground, position, velocity, facing, max_range, leaf_share, counting
+    hits, turn, mask, shapes, windows, order, ground, position, velocity, facing, max_range, leaf_share, counting
 ):
-    """Fill the hits of the rays in only, (columns, rings) bool, and reached if counting.
+    """Fill the hits of the rays in the mask (columns, rings), and hits.reached if counting.
 
-    order: solids owner by owner, then those without an owner from near to far.
+    order: indices of the solids, first by owner, then those without an owner from near to far.
     """
     hits.range[:] = np.inf
     hits.solid[:] = -1
-    _draw_solids(hits, turn, only, shapes, windows, order, max_range, leaf_share, counting)
-    columns, rings = only.shape
+    _draw_solids(hits, turn, mask, shapes, windows, order, max_range, leaf_share, counting)
+    columns, rings = mask.shape
     for column in range(columns):
         since = turn.since[column]
         along, aside, up = _to_world(velocity, facing)
         x, y, z = position[0] + along * since, position[1] + aside * since, position[2] + up * since
         for ring in range(rings):
-            if only[column, ring]:
+            if mask[column, ring]:
                 way = _way(turn, column, ring)
                 start, down = (x, y, z + turn.lift[ring]), _to_world(way, facing)
                 far, s = hits.range[column, ring], hits.solid[column, ring]
@@ -162,7 +162,7 @@ def _cast_first(
 
 @njit(cache=True, nogil=True)
 def _to_world(vector, facing):
-    """Turn a vector (x, y, z) from the sensor's frame to the world. facing: cos and sin of heading."""
+    """Rotate a vector (x, y, z) from the sensor's frame to the world; facing: cos and sin of the heading."""
     cos, sin = facing
     return cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]
 
@@ -174,8 +174,8 @@ def _way(turn, column, ring):
 
 
 @njit(cache=True, nogil=True)
-def _draw_solids(hits, turn, only, shapes, windows, order, max_range, leaf_share, counting):
-    columns, rings = only.shape
+def _draw_solids(hits, turn, mask, shapes, windows, order, max_range, leaf_share, counting):
+    columns, rings = mask.shape
     latest = np.zeros((columns, rings), np.int32)  # last owner hit by each ray
     for s in order:
         owner, near = shapes.owner[s], windows.min_range[s]
@@ -188,7 +188,7 @@ def _draw_solids(hits, turn, only, shapes, windows, order, max_range, leaf_share
         for step in range(windows.count[s] if highest < lowest else 0):
             column = (windows.first[s] + step) % columns
             for ring in range(highest, lowest):
-                if not windows.beams[s, ring] or not only[column, ring]:
+                if not windows.beams[s, ring] or not mask[column, ring]:
                     continue
                 far = hits.range[column, ring]
                 if near > far and not counts:
@@ -203,19 +203,19 @@ def _draw_solids(hits, turn, only, shapes, windows, order, max_range, leaf_share
                 if counts and latest[column, ring] != owner:
                     latest[column, ring] = owner
                     hits.reached[owner] += 1
-                # If hits differ by less than float32 resolves, the lower solid wins in any order.
+                # If hits are equal in float32, the solid with the lower index wins, in any order.
                 t32, far32, before = np.float32(t), np.float32(far), hits.solid[column, ring]
                 if t32 < far32 or (t32 == far32 and (before < 0 or s < before)):
                     hits.range[column, ring], hits.solid[column, ring] = t, s
 
 
 @njit(cache=True, nogil=True)
-def _turn_into_footprints(direction, only, divergence, salt):
-    """Turn the rays in only to random places in their beams' footprints."""
-    columns, rings = only.shape
+def _turn_into_footprints(direction, mask, divergence, salt):
+    """Rotate the rays in the mask to random points in the footprints of their beams."""
+    columns, rings = mask.shape
     for column in range(columns):
         for ring in range(rings):
-            if only[column, ring]:
+            if mask[column, ring]:
                 way = direction[column, ring]
                 way[0], way[1], way[2] = draw_in_footprint(
                     (way[0], way[1], way[2]), divergence, salt + np.uint64(ring * columns + column)
@@ -223,12 +223,12 @@ def _turn_into_footprints(direction, only, divergence, salt):
 
 
 @njit(cache=True, nogil=True)
-def _merge_edges(hits, other, only, pulse, salt):
-    """Merge the hits of both rays of the beams in only into hits."""
-    columns, rings = only.shape
+def _merge_edges(hits, other, mask, pulse, salt):
+    """Merge the hits of both rays of the beams in the mask, in place into hits."""
+    columns, rings = mask.shape
     for column in range(columns):
         for ring in range(rings):
-            if only[column, ring]:
+            if mask[column, ring]:
                 _write_hit(
                     hits,
                     column,

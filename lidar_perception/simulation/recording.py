@@ -12,7 +12,7 @@ from lidar_perception.simulation.drive import longest_drive, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 
-DRIVE_GAP_NS = 10 * 10**9  # between the drives through two scenes
+DRIVE_GAP_NS = 10 * 10**9  # gap between the drives through two scenes, as in KITTI's recordings
 
 
 class SimulatedFrames(ComputedFrames):

@@ -1,7 +1,7 @@
 """Scenes, and their content in the LiDAR frame at any time of a drive.
 
-A scene is a ground, things that stand or move on it, and the trajectory of the sensor. It is a
-street for a car, or a campus or interior for a robot.
+A scene consists of a ground, actors, and the trajectory of the sensor. It is a street for a car, or
+a campus or interior for a robot.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ EGO_HALF_SIZE_M = (3.0, 1.1)  # half length and half width of the area kept clea
 
 
 class Scenes(NamedTuple):
-    """A selection of scenes, see make_scene.
+    """Selection of scenes, see make_scene.
 
     Attributes:
-        kind: One kind of the scene type; None for all.
-        people: Number of people as a multiple of the usual one.
+        kind: Kind of the scene type, such as "city"; None for all kinds.
+        people: Factor for the usual number of people.
         scene: One of SCENE_TYPES, or several separated by commas, which alternate with the seed.
     """
 
@@ -43,7 +43,7 @@ class Scenes(NamedTuple):
     scene: str = "street"
 
     def scene_types(self) -> list[SceneType]:
-        """Return the scene types in their order. Raise InputError for a value that is not allowed."""
+        """Return the scene types in order. Raise InputError for an invalid attribute."""
         if not 0 <= self.people <= MAX_PEOPLE:
             raise InputError(f"people = {self.people} must be 0 .. {MAX_PEOPLE}, such as 1")
         names = self.scene.split(",")
@@ -64,7 +64,7 @@ class Scenes(NamedTuple):
 
     @property
     def camera(self) -> bool:
-        """True if all have a forward camera, which limits the labels to its image."""
+        """True if all scene types have a forward camera, which limits the labels to its image."""
         return all(scene_type.camera for scene_type in self.scene_types())
 
 
@@ -72,16 +72,28 @@ ALL_STREETS = Scenes()
 CROWDED_ZONES = Scenes("zone", 3.0)  # for demos and tests of pedestrian detectors
 
 
+# An actor. forward: unit vector; class: into CLASSES, -1 without a label; track: 0 without a label; sight:
+# maximum distance at which it is visible; feet: height of the lowest ground below an unlabelled actor that
+# never moves, NaN for others (it may be too long to stand on the slope).
+ACTOR_ROW = np.dtype(
+    [
+        *(("xy", float, 2), ("forward", float, 2), ("size", float, 3)),
+        *((name, float) for name in ("heading", "speed", "start", "stop", "sight", "feet")),
+        *((name, np.int32) for name in ("class", "track")),
+    ]
+)
+
+
 class SceneMoment(NamedTuple):
     """A scene at one time, in the sensor's frame.
 
     Attributes:
-        solids: Solids of all things in sight.
+        solids: Solids of all objects in sight.
         position: (3,) position of the sensor in the world, m.
         heading: Heading of the sensor in the world, rad.
         boxes: (K, 7), see GroundTruth.
         class_ids: (K,) int32.
-        track_ids: (K,) int32 from 1 on, which are also the owners of the solids.
+        track_ids: (K,) int32, from 1; also the owners of the solids.
         speeds: (K,) m/s over the ground.
         motion: Motion of the sensor.
     """
@@ -98,10 +110,14 @@ class SceneMoment(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """Things on a ground, and the trajectory of a sensor.
+    """Ground, actors, and the trajectory of a sensor that stays upright.
 
-    Robots and vehicles stay upright, so the ground has its slope in the LiDAR frame too. The
-    labelled actors have the track ids 1, 2, ... in their order. seconds: length of the drive.
+    Attributes:
+        ground: The ground.
+        actors: All actors. Labelled ones have the track ids 1, 2, ... in this order.
+        trajectory: Trajectory of the sensor.
+        kind: Kind of the scene type.
+        seconds: Duration of the drive.
     """
 
     ground: Ground
@@ -121,7 +137,7 @@ class Scene:
     def at(self, t: float, sensor_height: float) -> SceneMoment:
         """Return the scene after t seconds, for a sensor at this height above the ground in m."""
         along, pose = self.trajectory.at(t), self.sensor_pose(t, sensor_height)
-        sensor, turned = pose[:3, 3].copy(), pose[:3, :3]
+        sensor, rotation = pose[:3, 3].copy(), pose[:3, :3]
         ego = sensor[:2]
         a = self._table
         travelled = a["speed"] * np.clip(t - a["start"], 0.0, a["stop"] - a["start"])
@@ -129,94 +145,65 @@ class Scene:
         near = np.flatnonzero(np.hypot(*(flat - ego).T) <= a["sight"])
         a, travelled, flat = a[near], travelled[near], flat[near]
         feet = np.where(np.isnan(a["feet"]), surface_height(self.ground, *flat.T), a["feet"])
-        base = (np.column_stack([flat, feet]) - sensor) @ turned
+        base = (np.column_stack([flat, feet]) - sensor) @ rotation
         heading = a["heading"] - along.heading
         speed = np.where((a["start"] <= t) & (t < a["stop"]), a["speed"], 0.0)
-        velocity = self._add_climb(a["forward"] * speed[:, None]) @ turned
+        velocity = self._add_climb(a["forward"] * speed[:, None]) @ rotation
 
-        made = [self.actors[i].thing.parts(s) for i, s in zip(near.tolist(), travelled.tolist())]
-        whose = np.repeat(np.arange(len(made)), [len(m) for m in made])
-        solids = place_parts(_join_parts(made), base[whose], heading[whose], a["track"][whose], velocity[whose])
+        parts = [self.actors[i].obj.parts(s) for i, s in zip(near.tolist(), travelled.tolist())]
+        owner = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
+        solids = place_parts(_join_parts(parts), base[owner], heading[owner], a["track"][owner], velocity[owner])
 
-        known = np.flatnonzero(a["track"])
-        boxes = np.column_stack([base, a["size"], heading])[known]
+        labelled = np.flatnonzero(a["track"])
+        boxes = np.column_stack([base, a["size"], heading])[labelled]
         boxes[:, 2] += boxes[:, 5] / 2
-        moved = (self._add_climb(np.array([along.velocity])) @ turned)[0]
-        motion = Motion(tuple(moved.tolist()), along.yaw_rate)
-        return SceneMoment(
-            solids, sensor, along.heading, boxes, a["class"][known], a["track"][known], speed[known], motion
-        )
+        sensor_velocity = (self._add_climb(np.array([along.velocity])) @ rotation)[0]
+        motion = Motion(tuple(sensor_velocity.tolist()), along.yaw_rate)
+        a = a[labelled]
+        return SceneMoment(solids, sensor, along.heading, boxes, a["class"], a["track"], speed[labelled], motion)
 
     @cached_property
     def _table(self) -> np.ndarray:
-        """One row per actor.
-
-        feet: lowest ground below things that never move and have no label, since they may be too
-        long to stand on a slope; NaN for the rest.
-        """
-        rows = []
-        for a in self.actors:
-            x0, y0, z0, x1, y1, z1 = compute_hull(a.thing.parts(0.0))
-            level, span = math.hypot(x1 - x0, y1 - y0), max(x1 - x0, y1 - y0, z1 - z0)
-            label = a.thing.label
-            rows.append(
-                (
-                    (a.x, a.y),
-                    a.heading,
-                    (math.cos(a.heading), math.sin(a.heading)),
-                    a.speed,
-                    a.start,
-                    a.stop,
-                    a.thing.size,
-                    CLASSES.index(label) if label else -1,
-                    0,
-                    level / 2 + (FAR_SIGHT_M if span > LARGE_M else SIGHT_M),
-                    np.nan,
-                )
-            )
-        table = np.array(
-            rows,
-            [
-                ("xy", float, 2),
-                ("heading", float),
-                ("forward", float, 2),
-                ("speed", float),
-                ("start", float),
-                ("stop", float),
-                ("size", float, 3),
-                ("class", np.int32),
-                ("track", np.int32),
-                ("sight", float),
-                ("feet", float),
-            ],
-        )
-        known = table["class"] >= 0
-        table["track"] = np.where(known, np.cumsum(known), 0)
-        fixed = np.flatnonzero((table["speed"] == 0) & ~known)
+        """Properties of the actors as (A,) ACTOR_ROW."""
+        table = np.empty(len(self.actors), ACTOR_ROW)
+        for row, a in zip(table, self.actors):
+            x0, y0, z0, x1, y1, z1 = compute_hull(a.obj.parts(0.0))
+            radius = math.hypot(x1 - x0, y1 - y0) / 2
+            is_large = max(x1 - x0, y1 - y0, z1 - z0) > LARGE_M
+            row["xy"], row["heading"] = (a.x, a.y), a.heading
+            row["speed"], row["start"], row["stop"] = a.speed, a.start, a.stop
+            row["forward"] = math.cos(a.heading), math.sin(a.heading)
+            row["size"] = a.obj.size
+            row["class"] = CLASSES.index(a.obj.label) if a.obj.label else -1
+            row["sight"] = radius + (FAR_SIGHT_M if is_large else SIGHT_M)
+        is_labelled = table["class"] >= 0
+        table["track"] = np.where(is_labelled, np.cumsum(is_labelled), 0)
+        table["feet"] = np.nan
+        fixed = np.flatnonzero((table["speed"] == 0) & ~is_labelled)
         footprints = np.array([self.actors[i].footprint for i in fixed]).reshape(-1, 8)
         corners = _compute_corners(footprints)
         table["feet"][fixed] = surface_height(self.ground, *corners).min(axis=1)
         return table
 
     def _add_climb(self, flat: np.ndarray) -> np.ndarray:
-        """Return velocities (n, 3) along the slope of the ground from those in the plane (n, 2)."""
+        """Add the vertical velocity on the sloping ground to horizontal velocities (N, 2): (N, 3)."""
         slope = np.array([self.ground.slope_x, self.ground.slope_y])
         return np.column_stack([flat, flat @ slope])
 
 
-def _join_parts(made: list[np.ndarray]) -> np.ndarray:
-    """Concatenate parts (P,) PART; np.concatenate takes as long as casting them."""
-    whole = np.empty(sum(map(len, made)), PART)
+def _join_parts(arrays: list[np.ndarray]) -> np.ndarray:
+    """Concatenate arrays (P,) PART; much faster than np.concatenate."""
+    joined = np.empty(sum(map(len, arrays)), PART)
     end = 0
-    for one in made:
-        begin, end = end, end + len(one)
-        whole[begin:end] = one
-    return whole
+    for parts in arrays:
+        begin, end = end, end + len(parts)
+        joined[begin:end] = parts
+    return joined
 
 
-def _compute_corners(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _compute_corners(footprints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return x and y (A, 4) of the corners of footprints (A, 8) at time 0."""
-    x, y, heading, length, width = f[:, :5, None].transpose(1, 0, 2)
+    x, y, heading, length, width = footprints[:, :5, None].transpose(1, 0, 2)
     ahead, aside = length * np.array([1, 1, -1, -1]), width * np.array([1, -1, 1, -1])
     return (
         x + np.cos(heading) * ahead - np.sin(heading) * aside,
@@ -225,19 +212,17 @@ def _compute_corners(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0, scene: str = "street") -> Scene:
-    """Make the scene of a seed.
-
-    Things that would ever touch those placed before them are dropped.
+    """Make the scene of a seed. Objects that would touch others at any time are dropped.
 
     Args:
         seed: Seed, 0 or more.
-        kind: Kind of the scene type; None draws one by their shares.
-        people: Multiple of the usual number of pedestrians, sitting people and cyclists that are
-            tried. On streets 1 is close to KITTI's labels; 0 is none.
+        kind: Kind of the scene type; None draws one.
+        people: Factor for the usual number of pedestrians, sitting people and cyclists. On streets,
+            1 is similar to KITTI.
         scene: See Scenes.
 
     Raises:
-        InputError: A value is not allowed.
+        InputError: A value is invalid.
     """
     if seed < 0:
         raise InputError(f"seed = {seed} must not be negative")
@@ -252,7 +237,7 @@ def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0, scen
 def _make_street(
     rng: np.random.Generator, kind: StreetKind, people: float
 ) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
-    """Make a street along x, on which a car drives at y = 0."""
+    """Make a street along x with a car that drives at y = 0."""
     street = draw_street(rng, kind, DRIVE_SECONDS)
     ego = [0.0, 0.0, 0.0, *EGO_HALF_SIZE_M, street.speed, 0.0, np.inf]
     actors = ActorSet(DRIVE_SECONDS, np.array([ego]))
@@ -265,9 +250,9 @@ class SceneType(NamedTuple):
     """A type of scene.
 
     Attributes:
-        kinds: Kinds by name, each with the share of its being drawn.
+        kinds: Parameters of each kind by name, with the probability `share`.
         make: make(rng, kind, people) returns ground, actors and trajectory.
-        camera: It has a forward camera, see Scenes.
+        camera: The scenes have a forward camera, see Scenes.
     """
 
     kinds: dict[str, Any]

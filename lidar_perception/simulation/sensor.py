@@ -1,4 +1,4 @@
-"""Models of spinning LiDARs: directions and times of their rays, and files that describe them."""
+"""Models of spinning LiDARs: directions and times of their rays, and sensor files."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ MAX_RAYS = 5_000_000  # per revolution, about 100 bytes each; the densest sensor
 
 @dataclass(frozen=True)
 class Sensor:
-    """A LiDAR that turns about its z axis; angles in radians, lengths in metres.
+    """A LiDAR that spins about its z axis; angles in radians, lengths in metres.
 
     Raises:
         InputError: A value is impossible, such as no beams, a height that is not positive,
-            max_range <= min_range, more than MAX_BEAMS beams, or MAX_RAYS rays in a turn.
+            max_range <= min_range, more than MAX_BEAMS beams, or MAX_RAYS rays per revolution.
     """
 
     elevations: tuple[float, ...]  # one per beam, descending; ring 0 is the highest
@@ -117,10 +117,10 @@ class Sensor:
         return len(self.elevations)
 
     def at_turn(self, number: int) -> Sensor:
-        """Return the sensor in one turn, which differs from turn to turn if its beams wander.
+        """Return the sensor in one revolution; only sensors with wandering beams change.
 
-        All beams are lower by the same share of wander. Over the turns the shares are evenly
-        distributed (golden ratio).
+        All beams are lowered by the same fraction of wander. Over the revolutions, the fractions
+        are evenly distributed (golden ratio).
         """
         if not self.wander:
             return self
@@ -128,24 +128,24 @@ class Sensor:
         return replace(self, elevations=tuple(up - lower for up in self.elevations))
 
     def directions(self) -> np.ndarray:
-        """Return unit vectors (columns, rings, 3), float64, counter-clockwise from ahead."""
+        """Return the unit vectors (columns, rings, 3) float64 of all rays, counter-clockwise from x."""
         return _directions(self.elevations, self.columns).copy()
 
     def origins(self) -> np.ndarray:
-        """Return the starts of the beams in the sensor's frame, (rings, 3) float64 m."""
+        """Return the origins of the beams in the sensor's frame, (rings, 3) float64 m."""
         return np.column_stack([np.zeros((self.rings, 2)), self.lifts or np.zeros(self.rings)])
 
     def times(self) -> np.ndarray:
-        """Return seconds since the start of the turn, (columns,) float64, 0 <= time < 1 / rate.
+        """Return the time of each firing since the start of the revolution, (columns,) float64 s.
 
-        As on KITTI's car the sensor turns clockwise from the rear, so it points ahead in the
-        middle of the turn.
+        The sensor spins clockwise from the rear, as on KITTI's car, so it points ahead in the
+        middle of the revolution.
         """
         columns = self.columns
         return (columns // 2 - np.arange(columns)) % columns / (columns * self.rate)
 
     def open_rays(self) -> np.ndarray:
-        """Return (columns, rings) bool: the ray is not blocked by the vehicle."""
+        """Return (columns, rings) bool, False for rays that the vehicle blocks."""
         azimuth, ring = np.arange(self.columns) * (360 / self.columns), np.arange(self.rings)
         free = np.ones((self.columns, self.rings), bool)
         for first, start, end in self.blocked:
@@ -157,7 +157,7 @@ class Sensor:
 
 @lru_cache(maxsize=2)
 def _directions(elevations: tuple[float, ...], columns: int) -> np.ndarray:
-    """Return Sensor.directions, which the scans of a sensor share."""
+    """Compute Sensor.directions, cached."""
     azimuth = np.arange(columns)[:, None] * (2 * np.pi / columns)
     elevation = np.asarray(elevations)
     flat = np.cos(elevation)
@@ -165,13 +165,13 @@ def _directions(elevations: tuple[float, ...], columns: int) -> np.ndarray:
 
 
 class Motion(NamedTuple):
-    """Motion of the sensor during a turn.
+    """Motion of the sensor during a revolution.
 
     Attributes:
         velocity: (3,) m/s in the sensor's frame at the stamp.
         yaw_rate: rad/s, counter-clockwise.
-        stamp: Share of the turn before the stamp, 0 .. 1. In the middle, as in KITTI, boxes at the
-            stamp fit objects straight ahead.
+        stamp: Time of the stamp as a fraction of the revolution; 0.5 as in KITTI, when the sensor
+            points ahead.
     """
 
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -183,10 +183,12 @@ NO_MOTION = Motion()
 
 
 class Rays(NamedTuple):
-    """All rays of a turn in the sensor's frame at the stamp, float64.
+    """All rays of a revolution in the sensor's frame at the stamp, float64.
 
-    origin and direction: (columns, rings, 3), m and unit vectors; since: (columns,) seconds after
-    the stamp.
+    Attributes:
+        origin: (columns, rings, 3) m.
+        direction: (columns, rings, 3) unit vectors.
+        since: (columns,) time after the stamp, s.
     """
 
     origin: np.ndarray
@@ -195,7 +197,7 @@ class Rays(NamedTuple):
 
 
 def make_rays(sensor: Sensor, motion: Motion = NO_MOTION) -> Rays:
-    """Return the rays of a turn while the sensor moves."""
+    """Compute the rays of a revolution of a moving sensor."""
     since = sensor.times() - motion.stamp / sensor.rate
     moved = since[:, None] * np.asarray(motion.velocity, np.float64)
     direction = sensor.directions()
@@ -211,9 +213,14 @@ def make_rays(sensor: Sensor, motion: Motion = NO_MOTION) -> Rays:
 def make_generic_sensor(
     beams: int, lowest: float, highest: float, azimuth_step: float, rate: float, **fields: Any
 ) -> Sensor:
-    """Return a sensor with evenly spaced beams.
+    """Make a sensor with evenly spaced beams.
 
-    Angles are in degrees, the rate in turns per second. Other fields of Sensor are given by name.
+    Args:
+        beams: Number of beams.
+        lowest, highest: Elevations of the lowest and the highest beam, degrees.
+        azimuth_step: Angle between two firings, degrees.
+        rate: Revolutions per second.
+        fields: Other fields of Sensor.
 
     Raises:
         InputError: A value is impossible.
@@ -233,12 +240,12 @@ def make_generic_sensor(
 def load_sensor(path: str | Path) -> Sensor:
     """Load a sensor from a YAML file.
 
-    The file has the fields of Sensor by name, with all angles in degrees (also divergence and
-    wander), and optionally a name. elevations, azimuth_step and rate are required. Examples are
-    sensors/*.yaml; `setup` writes such a file.
+    The file contains the fields of Sensor, with all angles in degrees, and optionally a name.
+    elevations, azimuth_step and rate are required. Examples are sensors/*.yaml; `setup` writes such
+    a file.
 
     Raises:
-        InputError: The file is no sensor file, or describes an impossible sensor.
+        InputError: The file is not a sensor file, or describes an impossible sensor.
     """
     remedy = "see config/sensors/ for examples, or measure one with 'lidar-perception setup'"
     text = read_text(path, MAX_BYTES)
@@ -247,7 +254,7 @@ def load_sensor(path: str | Path) -> Sensor:
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"{path} is not YAML: {shorten_error(error)}") from None
     if not isinstance(content, dict):
-        raise InputError(f"{path} describes no sensor; {remedy}")
+        raise InputError(f"{path} does not describe a sensor; {remedy}")
     values = {key: value for key, value in content.items() if key != "name"}
     known = {field.name for field in fields(Sensor)}
     if unknown := [key for key in values if key not in known]:
@@ -272,7 +279,7 @@ DEGREE_FIELDS = ("elevations", "azimuth_step", "divergence", "wander")
 
 
 def _convert_field(key: str, value: Any) -> Any:
-    """Convert a value of the file to the unit of its field. Raise InputError for a wrong type."""
+    """Convert a value of a sensor file to the unit of its field. Raise InputError for a wrong type."""
     shape = FIELD_SHAPES.get(key, ())
     if value == [] and shape[:1] == (0,):
         return ()
@@ -303,7 +310,7 @@ def _are_whole(numbers: np.ndarray) -> bool:
 
 
 def _normalize_name(name: str) -> str:
-    """Return a sensor's name in lower case without punctuation."""
+    """Convert the name of a sensor to lower case without punctuation."""
     return "".join(c for c in name.lower() if c.isalnum())
 
 
@@ -324,12 +331,12 @@ GENERIC_FORMAT = "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE (degrees, turns a secon
 
 
 def find_sensor(name: str, height: float = 0.0) -> Sensor:
-    """Return the sensor of a name, which may be a preset, a YAML file or a generic sensor.
+    """Find a sensor by its name.
 
     Args:
         name: Preset in any spelling (vlp-16, VLP16), YAML file (see load_sensor), or generic sensor
             (see GENERIC_FORMAT).
-        height: Height above the ground in m; 0 keeps that of the sensor.
+        height: Height above the ground in m; 0 uses that of the sensor.
 
     Raises:
         InputError: There is no such sensor; the message lists the presets.

@@ -19,10 +19,10 @@ PARALLEL_STRIP_M, ACROSS_STRIP_M = 2.2, 5.0
 
 @dataclass(frozen=True)
 class StreetKind:
-    """A kind of street.
+    """Parameters of a kind of street.
 
-    Ranges (low, high) are drawn from uniformly. Lengths are in m, speeds in m/s, rates per 100 m;
-    shares, chances and weights of fronts are 0 .. 1.
+    Pairs (low, high) are the ranges of uniform distributions. Lengths are in m, speeds in m/s, and
+    numbers of objects and people per 100 m.
     """
 
     share: float  # fraction of streets of this kind, a free choice
@@ -137,7 +137,14 @@ STREET_KINDS = {
 
 
 class Lane(NamedTuple):
-    """A lane with its centre line at y; direction: 1 or -1 along x; use: road, rail or cycle."""
+    """A lane.
+
+    Attributes:
+        y: Position of the centre line, m.
+        direction: 1 or -1 along x.
+        speed: Speed of its traffic, m/s.
+        use: "road", "rail" or "cycle".
+    """
 
     y: float
     direction: int
@@ -146,10 +153,16 @@ class Lane(NamedTuple):
 
 
 class Street(NamedTuple):
-    """A street from draw_street.
+    """Layout of a street along x.
 
-    blocks: sides between the crossings; arms: sides of the side streets; speed: of the ego vehicle;
-    start, end: x of both ends.
+    Attributes:
+        kind: Parameters of the street.
+        ground: The ground.
+        lanes: Lanes; the first is that of the ego vehicle.
+        blocks: Curbs between the crossings.
+        arms: Curbs of the side streets.
+        speed: Speed of the ego vehicle, m/s.
+        start, end: x of both ends, m.
     """
 
     kind: StreetKind
@@ -163,7 +176,7 @@ class Street(NamedTuple):
 
 
 def draw_street(rng: np.random.Generator, kind: StreetKind, seconds: float) -> Street:
-    """Draw a street long enough for a drive of this duration."""
+    """Draw a street that is long enough for a drive of this duration."""
     speed = 0.0 if rng.random() < kind.stands else rng.uniform(*kind.speed)
     start, end = -BEHIND_M, speed * seconds + AHEAD_M
     parking = 0.0
@@ -171,10 +184,10 @@ def draw_street(rng: np.random.Generator, kind: StreetKind, seconds: float) -> S
         parking = ACROSS_STRIP_M if rng.random() < kind.across else PARALLEL_STRIP_M
     lanes, right, left = _draw_lanes(rng, kind, speed, parking)
     walk, crossings = rng.uniform(*kind.walk), _draw_crossings(rng, kind, start, end)
-    # Slopes in 27 scans of KITTI: 0.67 +- 0.2 degrees ahead (the sensor's own pitch), +- 0.45
-    # aside. With these heights of grass and litter, cells of 1 m next to the road scatter about
-    # their planes as on KITTI: 5 to 40 m away 3 to 5 cm at the upper quartile, 36 to 52 % of them
-    # more than 1 cm (real: 42 to 49). Wave, camber and reflectances are guesses.
+    # Slopes as in 27 scans of KITTI: 0.67 +- 0.2 degrees ahead (pitch of the sensor), +- 0.45 aside.
+    # Heights of grass and litter give the roughness of KITTI's ground next to the road: the residual of
+    # plane fits to cells of 1 m, 5 to 40 m away, is more than 1 cm in 36 to 52 % of the cells (real: 42
+    # to 49). Wave, camber and reflectances are guesses.
     slope_x, slope_y = np.tan(np.radians(rng.normal((0.6, 0.05), (0.25, 0.4))))
     ground = Ground(
         slope_x,
@@ -212,7 +225,7 @@ def draw_street(rng: np.random.Generator, kind: StreetKind, seconds: float) -> S
 
 
 def _draw_lanes(rng, kind: StreetKind, speed: float, parking: float) -> tuple[tuple[Lane, ...], float, float]:
-    """Draw the lanes, the ego vehicle's first, and the y of the right and left curbs."""
+    """Draw the lanes, beginning with that of the ego vehicle, and the y of the right and the left curb."""
     width = rng.uniform(*kind.lane)
     lanes, right = [Lane(0.0, 1, speed)], -width / 2
     for _ in range(rng.integers(*kind.extra_lanes)):
@@ -222,8 +235,8 @@ def _draw_lanes(rng, kind: StreetKind, speed: float, parking: float) -> tuple[tu
     ways = [-1] * len(use)
     if rng.random() < kind.rails:
         use, ways = ["rail", "rail", *use], [1, -1, *ways]
-    for what, way in zip(use, ways):
-        lanes.append(Lane(left + width / 2, way, _draw_lane_speed(rng, kind), what))
+    for lane_use, direction in zip(use, ways):
+        lanes.append(Lane(left + width / 2, direction, _draw_lane_speed(rng, kind), lane_use))
         left += width
     strip = 1.6 if rng.random() < kind.cycle else 0.0
     if strip:
@@ -237,19 +250,26 @@ def _draw_lane_speed(rng, kind: StreetKind) -> float:
 
 
 def _draw_crossings(rng, kind: StreetKind, start: float, end: float) -> tuple[tuple[float, float], ...]:
-    """Draw x intervals of side streets, not near the ends."""
-    found, x = [], start + rng.uniform(0.1, 1.0) * kind.crossing[1]
+    """Draw the x intervals (low, high) of side streets, not near the ends."""
+    crossings, x = [], start + rng.uniform(0.1, 1.0) * kind.crossing[1]
     while x < end - 20:
         width = rng.uniform(5.5, 7.0) + 2 * PARALLEL_STRIP_M * (rng.random() < kind.parking)
-        found.append((x, x + width))
+        crossings.append((x, x + width))
         x += width + rng.uniform(*kind.crossing)
-    return tuple(found)
+    return tuple(crossings)
 
 
 def _make_arm(front: str, x: float, land: int, curb: float, up: int, walk: float, parking: float) -> Side:
-    """Return one side of a side street at x, which begins behind the houses at a curb.
+    """Return one curb of a side street.
 
-    It leads towards up * y, and its front is on the side land * x.
+    Args:
+        front: Type of its front.
+        x: Position, m.
+        land: 1 or -1, side of the front along x.
+        curb: y of the street's curb at which the side street begins, m.
+        up: 1 or -1, direction of the side street along y.
+        walk: Width of the street's sidewalk, m.
+        parking: Width of the parking strip, m.
     """
     near = curb + up * (walk + 9.0)
     return Side(

@@ -1,9 +1,9 @@
-"""The ground: a sloping road with waves and camber, side streets, and sidewalks and grass beyond.
+"""Ground: a sloping road with waves and camber, side streets, sidewalks and grass.
 
-It is a smooth relief in the world (x along the street, y left, z up, metres), raised by the height
-of the curb beyond the curbs. A ray is above both the relief and the raised relief until it hits the
-latter. There it ends, or it continues to a curb or the road. Before that it may hit bumps, which
-are everywhere, and tufts and litter in patches.
+The ground is a smooth relief in the world frame (x along the street, y left, z up, metres), which is
+raised by the curb height beyond the curbs. A ray is intersected with the raised relief first. If that
+point is on the road, the ray continues to the road or a curb. Bumps, tufts of grass and litter on the
+surface may stop the ray earlier.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ MAX_TUFT_DISTANCE_M, TUFT_STEPS = 6.0, 8  # length of a grazing ray to search fo
 
 
 class Ground(NamedTuple):
-    """A ground, in metres, see the module.
+    """Parameters of a ground, in metres.
 
-    The relief is slope_x x + slope_y y + wave sin(2 pi x / wavelength) cos(2 pi y / wavelength),
-    minus the camber.
+    The height of the relief is slope_x * x + slope_y * y + wave * sin(2 pi x / wavelength) *
+    cos(2 pi y / wavelength), minus the camber.
     """
 
     slope_x: float = 0.0
@@ -56,9 +56,13 @@ PAVEMENT = Ground(curb_left=-1e6, curb_right=-1e6 - 1)  # level ground that is a
 
 
 class GroundHit(NamedTuple):
-    """Hit of a ray on the ground: range in m, brightness, cosine of the incidence, and class.
+    """Hit of a ray on the ground; without a hit, the range is inf and the rest is 0.
 
-    Without a hit the range is inf and the rest 0.
+    Attributes:
+        range: Metres.
+        brightness: Brightness, 0 .. 1.
+        cosine: Cosine of the angle of incidence.
+        semantic: SemanticKITTI class.
     """
 
     range: float
@@ -69,16 +73,16 @@ class GroundHit(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def compute_brightness(reflectance, cosine):
-    """Return the brightness of a surface, less dependent on the incidence than Lambert's law.
+    """Return the brightness of a surface from its reflectance and the cosine of the angle of incidence.
 
-    On KITTI's scans the road has the same intensity at 20 m, at grazing incidence, as at 6 m. A
-    retroreflector is equally bright from all directions.
+    It depends less on the incidence than Lambert's law: in KITTI, the road has the same intensity
+    at 6 m as at 20 m, at grazing incidence. A retroreflector is equally bright from all directions.
     """
     return reflectance * (1 - 0.25 * (1 - cosine) * (reflectance < RETROREFLECTOR))
 
 
 def to_compiled(ground: Ground) -> Ground:
-    """Return the ground for compiled code, with crossings as an array (C, 2)."""
+    """Convert a ground for compiled code: crossings as an array (C, 2), all other values as floats."""
     return Ground._make(
         np.array(value, np.float64).reshape(-1, 2) if name == "crossings" else float(value)
         for name, value in ground._asdict().items()
@@ -86,7 +90,7 @@ def to_compiled(ground: Ground) -> Ground:
 
 
 def surface_height(ground: Ground, x, y) -> np.ndarray:
-    """Return the height of road, sidewalk or grass at x, y (arrays) in m, without roughness."""
+    """Return the height of the ground at arrays x and y in m, without bumps and tufts."""
     x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
     return _heights(to_compiled(ground), x.ravel(), y.ravel()).reshape(x.shape)
 
@@ -103,9 +107,15 @@ def _heights(ground, x, y):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cast_ground(ground, start, way, max_range):
-    """Return the GroundHit of a ray that starts above the road.
+    """Intersect a ray that starts above the road with the ground.
 
-    ground: from to_compiled; start, way: (x, y, z) in the world; max_range: m.
+    Args:
+        ground: Ground from to_compiled.
+        start, way: Origin and direction (x, y, z) of the ray in the world.
+        max_range: Largest range, m.
+
+    Returns:
+        The GroundHit.
     """
     nothing = GroundHit(np.inf, 0.0, 0.0, 0)
     if not way[2] - ground.slope_x * way[0] - ground.slope_y * way[1] < -1e-3:
@@ -129,9 +139,9 @@ def cast_ground(ground, start, way, max_range):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def min_ground_range(ground, start, way):
-    """Return a range, cheap to compute, before which a ray does not hit the ground.
+    """Return a lower bound of the range at which a ray hits the ground, inf if it does not descend.
 
-    inf if the ray does not descend.
+    It is much cheaper than cast_ground.
     """
     closing = ground.slope_x * way[0] + ground.slope_y * way[1] - way[2]
     if closing <= 1e-3:
@@ -144,14 +154,14 @@ def min_ground_range(ground, start, way):
 
 @njit(cache=True, nogil=True)
 def _stays_on_road(ground, start, way, t):
-    """Return True if a ray is between the curbs up to range t."""
+    """Return True if a ray stays between the curbs up to range t."""
     y, end = start[1], start[1] + t * way[1]
     return ground.curb_right < min(y, end) and max(y, end) < ground.curb_left
 
 
 @njit(cache=True, nogil=True)
 def _relief(ground, x, y):
-    """Return height and slopes along x and y at x, y, without curbs."""
+    """Return the height of the relief at x, y, and its slopes along x and y."""
     middle, half = (ground.curb_left + ground.curb_right) / 2, (ground.curb_left - ground.curb_right) / 2
     aside = y - middle
     height = ground.slope_x * x + ground.slope_y * y - ground.camber * min(abs(aside), half)
@@ -179,13 +189,13 @@ def _is_in_side_street(ground, x):
 
 @njit(cache=True, nogil=True)
 def _is_raised(ground, x, y):
-    """Return True if x, y is beyond the curbs and in no side street."""
+    """Return True if x, y is beyond the curbs and not in a side street."""
     return (y <= ground.curb_right or y >= ground.curb_left) and not _is_in_side_street(ground, x)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intersect_relief(ground, start, way, lift, t, max_range):
-    """Return the range of the relief raised by lift, by Newton's method from t; inf if none."""
+    """Intersect a ray with the relief raised by lift, by Newton's method from range t; inf without a hit."""
     for _ in range(10):
         height, slope_x, slope_y = _relief(ground, start[0] + t * way[0], start[1] + t * way[1])
         gap = start[2] + t * way[2] - height - lift
@@ -198,7 +208,13 @@ def _intersect_relief(ground, start, way, lift, t, max_range):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intersect_raised(ground, start, way, low, max_range):
-    """Return the range with curbs, given that of the relief, and the cosine at a curb, else 0."""
+    """Intersect a ray with sidewalks and curbs.
+
+    low: range of the intersection with the relief.
+
+    Returns:
+        The range of the first hit, and the cosine of the incidence if it is a curb, else 0.
+    """
     high = _intersect_relief(ground, start, way, ground.curb_height, min(low, max_range), max_range)
     if high < np.inf and _is_raised(ground, start[0] + high * way[0], start[1] + high * way[1]):
         return high, 0.0
@@ -217,9 +233,10 @@ def _intersect_raised(ground, start, way, low, max_range):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _intersect_tufts(ground, start, way, t, cosine):
-    """Return the range of the first tuft or bump before the ground at t, else t.
+    """Return the range of the first tuft or bump on a ray that hits the ground at range t, else t.
 
-    The low end of the ray is searched in TUFT_STEPS steps. 0 if the ray starts in a tuft.
+    The last part of the ray is searched in TUFT_STEPS steps. The result is 0 if the ray starts in a
+    tuft.
     """
     step = min(max(ground.rough, ground.litter) / cosine, MAX_TUFT_DISTANCE_M) / TUFT_STEPS
     end, begin = start[1] + t * way[1], start[1] + (t - TUFT_STEPS * step) * way[1]
@@ -240,9 +257,9 @@ def _intersect_tufts(ground, start, way, t, cosine):
 
 @njit(cache=True, nogil=True)
 def tuft_height(ground, x, y, least):
-    """Return the height of tufts and bumps at x, y: patches with nearly bare ground between.
+    """Return the height of tufts and bumps at x, y, which are high in patches.
 
-    0 if it is certainly not above least.
+    The result is 0 if the height is certainly not above `least`, which is faster.
     """
     patch = min(max((_bumps(x / PATCH, y / PATCH) - BARE_SHARE) * PATCH_STEEPNESS, BARE_HEIGHT_SHARE), 1.0)
     if not patch * max(ground.rough, ground.litter) > least:
@@ -254,7 +271,7 @@ def tuft_height(ground, x, y, least):
 
 @njit(cache=True, nogil=True)
 def _surface(ground, x, y):
-    """Return class and reflectance of the ground at x, y."""
+    """Return SemanticKITTI class and reflectance of the ground at x, y."""
     beyond = max(y - ground.curb_left, ground.curb_right - y)
     if _is_in_side_street(ground, x):
         return ROAD, ground.road
@@ -265,7 +282,7 @@ def _surface(ground, x, y):
 
 @njit(cache=True, nogil=True)
 def _bumps(x, y):
-    """Return value noise at x, y, 0 .. 1, which is constant in time."""
+    """Return smooth noise in 0 .. 1 at x, y, the same at all times."""
     x, y = x / GRAIN_M, y / GRAIN_M
     left, low = math.floor(x), math.floor(y)
     place = (np.int64(left) << 32) + np.int64(low)

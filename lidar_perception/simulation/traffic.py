@@ -1,4 +1,4 @@
-"""Vehicles, cyclists and people of a street, moving, parked, standing or sitting."""
+"""Vehicles, cyclists and people of a street."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ MOTORCYCLIST_SHARE = 0.3  # fraction of motorcyclists among the riders at the ed
 
 
 def populate(rng: np.random.Generator, street: Street, actors: ActorSet, people: float) -> None:
-    """Add all labelled actors, and parked bicycles and motorcycles."""
+    """Add all labelled actors of a street, and parked bicycles and motorcycles.
+
+    people: factor for the number of people.
+    """
     kind, blocks = street.kind, street.blocks
     for lane in street.lanes:
         for group in _queue_vehicles(rng, lane, street, actors.seconds):
@@ -48,10 +51,7 @@ def populate(rng: np.random.Generator, street: Street, actors: ActorSet, people:
 
 
 def _draw_vehicles(rng, use: str) -> list[SceneObject]:
-    """Draw a vehicle of a lane, with its trailer if any.
-
-    The shares are tuned so that the labels of many scenes are close to KITTI's.
-    """
+    """Draw a vehicle of a lane, and its trailer if it has one. The frequencies are similar to KITTI's labels."""
     if use == "rail":
         return [make_tram(rng)]
     pick = rng.random()
@@ -61,7 +61,7 @@ def _draw_vehicles(rng, use: str) -> list[SceneObject]:
 
 
 def make_trailer(rng) -> SceneObject:
-    """Make a closed single-axle trailer."""
+    """Make a closed single-axle trailer, labelled Misc."""
     length, width, height = size = tuple(rng.uniform((1.8, 1.3, 0.9), (3.8, 1.9, 2.3)).tolist())
     x, y = length / 2, width / 2
     rows = [
@@ -72,41 +72,41 @@ def make_trailer(rng) -> SceneObject:
 
 
 def _queue_vehicles(rng, lane: Lane, street: Street, seconds: float) -> Iterator[list[Actor]]:
-    """Yield the vehicles of a lane that are ever in sight, none close to the ego vehicle."""
+    """Yield the vehicles of a lane that come into sight, with a distance to the ego vehicle."""
     if lane.use == "cycle":
         return
-    ours, way = lane is street.lanes[0], lane.direction
-    # Distance by which the ego vehicle gets ahead of the lane.
-    past = (street.speed - way * lane.speed) * seconds
-    x, last = sorted((-way * SIGHT_M, way * SIGHT_M))
-    x, last = x + min(past, 0.0), last + max(past, 0.0)
-    stop_lines = [25.0] if ours else [edge[way < 0] for edge in street.ground.crossings]
+    is_ego_lane, direction = lane is street.lanes[0], lane.direction
+    # Distance that the ego vehicle gains on the lane.
+    gain = (street.speed - direction * lane.speed) * seconds
+    x, last = sorted((-direction * SIGHT_M, direction * SIGHT_M))
+    x, last = x + min(gain, 0.0), last + max(gain, 0.0)
+    stop_lines = [25.0] if is_ego_lane else [edge[direction < 0] for edge in street.ground.crossings]
     waiting = rng.uniform(0, 40)
     while True:
         group = _draw_vehicles(rng, lane.use)
         length = sum(t.size[0] for t in group) + DRAWBAR_M * (len(group) - 1)
-        least = 1.2 + lane.speed
-        x += least + rng.exponential(street.kind.headway * lane.speed + 1.0) * (2.0 if lane.use == "rail" else 1.0)
+        min_gap = 1.2 + lane.speed
+        x += min_gap + rng.exponential(street.kind.headway * lane.speed + 1.0) * (2.0 if lane.use == "rail" else 1.0)
         if x + length > last:
             return
-        back, front = (x, x + length) if way > 0 else (x + length, x)
+        back, front = (x, x + length) if direction > 0 else (x + length, x)
         x += length
-        if lane.speed == 0.0 and not any(0 < (line - front) * way < waiting for line in stop_lines):
+        if lane.speed == 0.0 and not any(0 < (line - front) * direction < waiting for line in stop_lines):
             continue
-        if ours and min(back, front) - 2.5 < least and max(back, front) + 2.5 > -least:
+        if is_ego_lane and min(back, front) - 2.5 < min_gap and max(back, front) + 2.5 > -min_gap:
             continue
         speed = lane.speed * rng.uniform(0.98, 1.02)
-        aside, head = rng.normal(0, 0.12), np.pi * (way < 0)
+        aside, heading = rng.normal(0, 0.12), np.pi * (direction < 0)
         actors = []
-        for thing in group:
-            middle = front - way * thing.size[0] / 2
-            actors.append(Actor(thing, middle, lane.y + aside, head, speed))
-            front = middle - way * (thing.size[0] / 2 + DRAWBAR_M)
+        for obj in group:
+            middle = front - direction * obj.size[0] / 2
+            actors.append(Actor(obj, middle, lane.y + aside, heading, speed))
+            front = middle - direction * (obj.size[0] / 2 + DRAWBAR_M)
         yield actors
 
 
 def _fill_side_street(rng, crossing: tuple[float, float], ground) -> Iterator[Actor]:
-    """Yield cars that wait at the street, drive away from it or cross it."""
+    """Yield the vehicles of a side street that wait at the street, drive away from it or cross it."""
     low, high = crossing
     strip = parking_width(crossing)
     quarter = (high - low - 2 * strip) / 4 + strip
@@ -115,16 +115,19 @@ def _fill_side_street(rng, crossing: tuple[float, float], ground) -> Iterator[Ac
         coming, going = coming + up * quarter, going - up * quarter
         y = curb + up * rng.uniform(0.5, 1.0 + ground.walk)
         while rng.random() < 0.5:
-            thing = _draw_vehicles(rng, "road")[0]
-            yield Actor(thing, coming, y + up * thing.size[0] / 2, -up * np.pi / 2)
-            y += up * (thing.size[0] + rng.uniform(1, 3))
+            obj = _draw_vehicles(rng, "road")[0]
+            yield Actor(obj, coming, y + up * obj.size[0] / 2, -up * np.pi / 2)
+            y += up * (obj.size[0] + rng.uniform(1, 3))
         for chance, far in ((0.25, rng.uniform(5, 50)), (0.3, -rng.uniform(15, 100))):
             if rng.random() < chance:
                 yield Actor(_draw_vehicles(rng, "road")[0], going, curb + up * far, up * np.pi / 2, rng.uniform(3, 9))
 
 
-def _park_vehicles(rng, side: Side, taken: float) -> Iterator[Actor]:
-    """Yield rows along the curb, cars in driveways, and some car parks behind the sidewalk."""
+def _park_vehicles(rng, side: Side, occupied: float) -> Iterator[Actor]:
+    """Yield parked vehicles: along the curb, in driveways, and in car parks behind the sidewalk.
+
+    occupied: share of the parking spaces that are occupied.
+    """
 
     def vehicle():
         pick = rng.random()
@@ -135,22 +138,22 @@ def _park_vehicles(rng, side: Side, taken: float) -> Iterator[Actor]:
     def across(out, angle):
         spacing = 2.6 / abs(np.sin(angle))
         for along in np.arange(FREE_CORNER_M, side.length - FREE_CORNER_M, spacing):
-            if rng.random() < taken:
+            if rng.random() < occupied:
                 turn = angle + np.pi * (rng.random() < 0.3) + rng.normal(0, 0.03)
-                yield side.put(make_car(rng, driver=False), along, out + rng.normal(0, 0.15), turn)
+                yield side.place(make_car(rng, driver=False), along, out + rng.normal(0, 0.15), turn)
 
     if side.parking > PARALLEL_STRIP_M:
         yield from across(-side.parking / 2 - 0.1, rng.choice([1.57, 2.2]))
     along = FREE_CORNER_M
     while side.parking == PARALLEL_STRIP_M and along < side.length - FREE_CORNER_M - 4:
-        thing = vehicle()
-        if rng.random() < taken:
+        obj = vehicle()
+        if rng.random() < occupied:
             turn = np.pi * (rng.random() < 0.95) + rng.normal(0, 0.025)
-            yield side.put(thing, along + thing.size[0] / 2, -0.25 - thing.size[1] / 2 + rng.normal(0, 0.06), turn)
-        along += thing.size[0] + rng.uniform(0.7, 1.8)
+            yield side.place(obj, along + obj.size[0] / 2, -0.25 - obj.size[1] / 2 + rng.normal(0, 0.06), turn)
+        along += obj.size[0] + rng.uniform(0.7, 1.8)
     if side.front == "garden":
         for along in scatter(rng, side.length, 6.0):
-            yield side.put(
+            yield side.place(
                 make_car(rng, driver=False),
                 along,
                 side.walk + rng.uniform(3, 6),
@@ -161,13 +164,13 @@ def _park_vehicles(rng, side: Side, taken: float) -> Iterator[Actor]:
 
 
 def _place_seats(rng, side: Side, rate: float, people: float) -> Iterator[list[Actor]]:
-    """Yield benches with their backs to the wall and people on them, and cafe chairs."""
+    """Yield benches at the wall, each with the people on it, and people on cafe chairs."""
     for along in scatter(rng, side.length, 8 * rate):
         yield place_bench(rng, side, along, max(side.walk - 0.7, 1.5), people, 0.2)
     for along in scatter(rng, side.length, rate * people):
         out = side.walk - rng.uniform(0.8, 2.5)
         for aside in rng.uniform((-0.9, 0.5), (-0.5, 0.9)):
-            yield [side.put(make_sitting_person(rng), along + aside, out, np.pi * (aside > 0) + rng.normal(0, 0.2))]
+            yield [side.place(make_sitting_person(rng), along + aside, out, np.pi * (aside > 0) + rng.normal(0, 0.2))]
 
 
 def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterator[Actor]:
@@ -178,15 +181,15 @@ def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterato
         (ground.curb_right + ground.parking + 0.6, 1),
         (ground.curb_left - ground.parking - 0.6, -1),
     ]
-    for y, way in places:
+    for y, direction in places:
         speed = rng.uniform(3.5, 5.5)
-        first = street.start - (street.speed * seconds if way > 0 else 0.0)
+        first = street.start - (street.speed * seconds if direction > 0 else 0.0)
         for x in first + scatter(rng, street.end - first, kind.riders * people * (2.0 if lanes else 1.0)):
             make = make_motorcyclist if rng.random() < MOTORCYCLIST_SHARE else make_cyclist
-            yield Actor(make(rng), x, y + rng.normal(0, 0.1), np.pi * (way < 0), speed * rng.uniform(0.95, 1.05))
+            yield Actor(make(rng), x, y + rng.normal(0, 0.1), np.pi * (direction < 0), speed * rng.uniform(0.95, 1.05))
     for side in (*street.blocks, *_find_crosswalks(street)):
         for along in scatter(rng, side.length, kind.riders * people * 0.5):
-            yield side.put(
+            yield side.place(
                 make_cyclist(rng),
                 along,
                 max(side.walk, 1.0) * rng.uniform(0.5, 0.7),
@@ -196,9 +199,9 @@ def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterato
     for side in street.blocks:
         for along in scatter(rng, side.length, kind.clutter / 6 if side.walk else 0.0):
             out, turn = rng.choice([0.9, max(side.walk - 1.0, 0.9)]), rng.normal(np.pi / 2, 0.2)
-            made = make_bicycle if rng.random() < 0.75 else make_motorcycle
+            make = make_bicycle if rng.random() < 0.75 else make_motorcycle
             for i in range(rng.integers(1, 6)):
-                yield side.put(made(rng), along + 0.75 * i, out, turn)
+                yield side.place(make(rng), along + 0.75 * i, out, turn)
 
 
 def _find_crosswalks(street: Street) -> list[Side]:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-PENALTY = 1.0  # of squared steps, chosen on held-out streets
+PENALTY = 1.0  # weight of the squared steps in the loss, chosen on held-out streets
 
 
 def compute_ramps(values: np.ndarray, knots: tuple[float, ...]) -> np.ndarray:

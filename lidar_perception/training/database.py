@@ -18,11 +18,11 @@ from lidar_perception.types import InputError
 
 # The ground below an object is this quantile of the heights of the points around it.
 FLOOR_HALF_SIZE_M, FLOOR_QUANTILE = 3.0, 0.1
-MAX_STEP_M = 1.0  # difference of the ground heights in the two scenes
-BLOCKING_HEIGHTS_M = (0.63, 2.23)  # above the ground, of points that can hide people
-SECTORS = 720  # of a turn
-MAX_DIRECTIONS = 64  # that are tried for an object
-MAX_TRIES = 3  # candidates for each missing object
+MAX_STEP_M = 1.0  # maximum difference in ground height between the two scenes
+BLOCKING_HEIGHTS_M = (0.63, 2.23)  # heights above the ground of points that can hide people
+SECTORS = 720  # sectors of a revolution
+MAX_DIRECTIONS = 64  # number of directions drawn for each object
+MAX_TRIES = 3  # maximum objects tried for each missing one
 BACKGROUND_ID = -1  # class id of background objects, see cut_objects.py
 MAX_HIDDEN_SHARE = 0.3  # scene points in front of an object, as a share of its points
 

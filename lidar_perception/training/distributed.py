@@ -13,7 +13,7 @@ from datetime import timedelta
 import torch
 from torch import distributed
 
-TIMEOUT = timedelta(hours=2)  # for a validation on rank 0
+TIMEOUT = timedelta(hours=2)  # time that the other processes wait while rank 0 validates
 
 
 @contextmanager

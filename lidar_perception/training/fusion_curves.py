@@ -34,10 +34,10 @@ from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.training.sources import FIRST_FIT_SEED
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError
 
-MAX_CENTRE_DISTANCE_M = 0.5  # of a correct proposal of a pedestrian or cyclist
-MIN_SAMPLES = 20  # correct and wrong proposals of a class, each, to fit its curves
-MIN_PROBABILITY = 1e-6  # in the log loss
-DEFAULT_SENSOR, DEFAULT_SCENE = "hdl64e", "street"  # for weights whose header has none
+MAX_CENTRE_DISTANCE_M = 0.5  # maximum centre distance of a match with a pedestrian or cyclist
+MIN_SAMPLES = 20  # minimum number of correct and of wrong proposals of a class to fit its curves
+MIN_PROBABILITY = 1e-6  # probabilities are clipped at this value in the log loss
+DEFAULT_SENSOR, DEFAULT_SCENE = "hdl64e", "street"  # defaults for weights whose header has none
 
 
 @dataclass(frozen=True)

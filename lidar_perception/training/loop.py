@@ -30,9 +30,9 @@ from lidar_perception.training.run import Progress, Run, Task
 from lidar_perception.training.run_directory import RunDirectory
 from lidar_perception.types import InputError
 
-WARM_UP_S = 60.0  # before the duration of a step is estimated
-DECAY_S = 600.0  # time constant of the moving average of the step duration
-SPARE_STEPS = 2  # reserve, since durations vary
+WARM_UP_S = 60.0  # time until the duration of a step is known
+DECAY_S = 600.0  # time constant of the weights in the mean step duration
+SPARE_STEPS = 2  # safety margin of the time budget, in steps
 
 
 def train(

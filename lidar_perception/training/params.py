@@ -9,7 +9,7 @@ from lidar_perception.detectors.params import make_range_param
 from lidar_perception.param_fields import Params, flatten, param
 
 CHANGEABLE = ("log_steps", "save_steps", "max_skipped", "data.cache", "data.cache_gb")  # when a run is resumed
-PAPER_SHARE = 751 / 7518  # of the frames that paper B holds out
+PAPER_SHARE = 751 / 7518  # fraction of the frames that paper B holds out
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 from lidar_perception.types import InputError
 
-RESERVE_SHARE = 0.1  # of the budget, for everything that is not measured
-STARTUP_S = 20.0  # to start the processes
-MAX_PREPARATION_SHARE = 0.25  # of the time, to prepare scenes
-VALIDATION_SHARE = 0.12  # of the time
+RESERVE_SHARE = 0.1  # fraction of the budget reserved for everything that is not measured
+STARTUP_S = 20.0  # time until all processes run
+MAX_PREPARATION_SHARE = 0.25  # maximum fraction of the time for the preparation of scenes
+VALIDATION_SHARE = 0.12  # fraction of the time for validations
 SCANS_RANGE, VAL_SCANS_RANGE = (24, 3000), (16, 200)
 MAX_VALIDATIONS = 6
 EPOCHS_RANGE = 4, 80

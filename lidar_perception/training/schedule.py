@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 START_DIVISOR, END_DIVISOR = 10.0, 1e4  # the first rate is lr / 10, the last lr / 10 / 1e4
-MAX_MOMENTUM, MIN_MOMENTUM = 0.95, 0.85  # at the lowest and the highest rate
+MAX_MOMENTUM, MIN_MOMENTUM = 0.95, 0.85  # momentum at the lowest and the highest rate
 
 
 def compute_one_cycle(step: float, steps: int, lr: float, warm_share: float) -> tuple[float, float]:

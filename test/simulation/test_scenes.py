@@ -74,7 +74,7 @@ def test_trajectory_derivatives_are_exact():
 @pytest.mark.parametrize("scene, kind", ROBOTS)
 def test_actors_never_touch_robot_or_each_other(scene, kind):
     made = make_cached_scene(scene, kind)
-    props = [a for a in made.actors if not a.thing.label]
+    props = [a for a in made.actors if not a.obj.label]
     fixed = make_flat_boxes(np.array([a.footprint for a in props]), 0.0)
     for t in np.linspace(0.0, made.seconds, 9):
         moment, pose = made.at(t, 0.6), made.sensor_pose(t, 0.6)
@@ -85,7 +85,7 @@ def test_actors_never_touch_robot_or_each_other(scene, kind):
             assert {moment.class_ids[i - 1], moment.class_ids[j - 1]} == {SITTING}
         there = fixed - [*pose[:2, 3], 0, 0, 0, 0, 0]
         assert not len(find_overlaps(np.concatenate([robot, there]), 1))
-    assert any(a.thing.label in ("Pedestrian", "Person_sitting") for a in made.actors)
+    assert any(a.obj.label in ("Pedestrian", "Person_sitting") for a in made.actors)
 
 
 @pytest.mark.parametrize("scene, kind", ROBOTS)

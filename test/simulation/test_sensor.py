@@ -138,7 +138,7 @@ def test_file_in_degrees_gives_sensor_in_radians(tmp_path):
         ("[1, 2", "not YAML"),
         ("rate: 2024-13-45", "not YAML"),
         ("rate: " + "1" * 5000, "not YAML"),
-        ("- 1", "describes no sensor"),
+        ("- 1", "does not describe a sensor"),
         ("azimuth_step: 1", "elevations"),
         ("elevations: [1]\nazimuth_step: 1\nrate: 10\nbeams: 3", "no 'beams'; known are"),
         ("elevations: 3\nazimuth_step: 1\nrate: 10", "elevations = 3 must be a list of numbers"),

@@ -30,7 +30,7 @@ make_cached_scene = cache(lambda kind, seed, people=1.0: make_scene(seed, kind, 
 def test_nothing_ever_overlaps(kind, seed):
     """Labelled and unlabelled things and the ego vehicle, except people on benches and plants."""
     scene = make_cached_scene(kind, seed)
-    props = [a for a in scene.actors if not a.thing.label]
+    props = [a for a in scene.actors if not a.obj.label]
     plants = np.array([is_plant(a) for a in props])
     fixed = make_flat_boxes(np.array([a.footprint for a in props]), 0.0)
     assert not len(find_overlaps(fixed[~plants], sum(~plants)))
@@ -55,7 +55,7 @@ def test_everything_is_on_ground(kind, seed):
     for track, box in zip(m.track_ids, m.boxes):
         lowest = low[m.solids.owner == track].min()
         assert abs(lowest - (box[2] - box[5] / 2)) < 0.12
-    for actor in [a for a in scene.actors if not a.thing.label][::15]:
+    for actor in [a for a in scene.actors if not a.obj.label][::15]:
         m = replace(scene, actors=(actor,)).at(actor.x / max(scene.trajectory.speed, 0.1), HEIGHT)
         if len(m.solids):
             foot = (m.solids.centre[:, 2] - np.abs(m.solids.axes[:, 2] * m.solids.half).sum(axis=1)).min() + m.position[
@@ -116,10 +116,7 @@ def test_islands_are_at_crossings_and_off_lanes():
         middle = [
             a
             for a in scene.actors
-            if not a.thing.label
-            and a.speed == 0.0
-            and 1.3 < a.y < 2.8
-            and (a.thing.parts(0.0)["semantic"] == SIGN).any()
+            if not a.obj.label and a.speed == 0.0 and 1.3 < a.y < 2.8 and (a.obj.parts(0.0)["semantic"] == SIGN).any()
         ]
         edges = np.ravel(scene.ground.crossings)
         for actor in middle:
@@ -154,7 +151,7 @@ def test_streets_have_objects_that_kitti_labels():
 
 def test_people_option_scales_number_of_people():
     def people(factor):
-        labels = [a.thing.label for a in make_cached_scene("residential", 0, factor).actors]
+        labels = [a.obj.label for a in make_cached_scene("residential", 0, factor).actors]
         return sum(label in ("Pedestrian", "Person_sitting", "Cyclist") for label in labels)
 
     assert people(0.0) == 0 < people(1.0) < people(4.0) / 2

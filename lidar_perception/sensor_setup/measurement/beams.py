@@ -11,21 +11,21 @@ from scipy.signal import find_peaks, peak_prominences
 
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-MIN_BEAM_POINTS = 30  # of a beam in a scan
+MIN_BEAM_POINTS = 30  # minimum points of a beam in a scan for a fit
 MAX_BEAMS = 300
-BIN = 0.02  # degrees, of the histogram of elevations
+BIN = 0.02  # bin width of the elevation histogram, in degrees
 MIN_RANGE_M = 2.0  # nearer points are ignored, since the beam's offset changes their elevation
 # Largest median scatter of a beam's points in degrees, by the method that identified the beams.
 MAX_SPREAD = {"ring": 3.0, "order": 0.12, "elevation": 0.01}
-MIN_PEAK_SHARE = 0.75  # of the points that are near a peak of the histogram
-MIN_COUNT_SHARE = 0.2  # of the scans that must have the same number of beams
-SECTORS = 72  # of a turn
-MAX_LIFT_ERROR_M = 0.01
+MIN_PEAK_SHARE = 0.75  # minimum fraction of points near a peak of the histogram
+MIN_COUNT_SHARE = 0.2  # minimum fraction of scans that must agree on a number of beams
+SECTORS = 72  # sectors of a revolution
+MAX_LIFT_ERROR_M = 0.01  # maximum error of a reliable lift
 MIN_LIFT_M = 0.03  # smaller lifts are measurement errors
 MAX_LIFT_M = 0.5  # larger than any sensor
-ANGLE_RESOLUTION = 1e-3  # degrees
-MAX_GAP_STEPS = 3.5  # largest gap of lost returns that is used to measure the azimuth step
-PIECE_POINTS = 9  # neighbouring returns to which a parabola is fitted
+ANGLE_RESOLUTION = 1e-3  # rounding of angles, in degrees
+MAX_GAP_STEPS = 3.5  # maximum gap, in azimuth steps, that is used to measure the azimuth step
+PIECE_POINTS = 9  # number of neighbouring returns to fit a parabola to
 
 
 class Beams(NamedTuple):
@@ -200,7 +200,7 @@ def _fit_lifts(beams: list[_Points]) -> tuple[np.ndarray, np.ndarray]:
     for n, beam in enumerate(beams):
         every = max(1, len(beam.z) // 20_000)
         distance, z = beam.distance[::every], beam.z[::every]
-        weight = 1.0 / np.maximum(distance, 0.5)  # so that residuals are angles
+        weight = 1.0 / np.maximum(distance, 0.5)  # turns the residuals into angles
         inliers, residual = np.ones(len(z), bool), np.zeros(len(z))
         for _ in range(4):
             if inliers.sum() < MIN_BEAM_POINTS:

@@ -13,24 +13,24 @@ from lidar_perception.sensor_setup.measurement.beams import Beams
 from lidar_perception.sensor_setup.measurement.mount import Mount
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-SECTORS = 360  # of a turn
-NEAR_BODY_M = 1.0  # constant returns this near are the robot's, even if it stands still
-MAX_BODY_M = 4.0  # constant returns this near are the robot's if it drives
-MAX_ROBOT_SIZE_M = (5.5, 2.6)  # length and width, up to a van
-MAX_BODY_SHARE = 0.3  # of all points; more are walls along the robot's path
-MAX_FOREIGN_SHARE = 0.2  # of the points in the box of the robot's body
-MIN_BODY_SCANS = 0.7  # share of the scans with a return of the body
-MAX_BODY_VARIATION_M = 0.06  # of its range
-MIN_BODY_HEIGHT_M = 0.15  # above the ground
-MIN_CELLS = 20  # smallest body, in cells of one sector and beam
-MARGIN_M = 0.05  # around the body
+SECTORS = 360  # sectors of a revolution
+NEAR_BODY_M = 1.0  # constant returns this close come from the robot, even if it stands still
+MAX_BODY_M = 4.0  # constant returns this close come from the robot if it drives
+MAX_ROBOT_SIZE_M = (5.5, 2.6)  # maximum length and width, those of a van
+MAX_BODY_SHARE = 0.3  # maximum fraction of all points; more points are walls along the robot's path
+MAX_FOREIGN_SHARE = 0.2  # maximum fraction of points in the body box that do not belong to the robot
+MIN_BODY_SCANS = 0.7  # minimum fraction of scans with a return from the body
+MAX_BODY_VARIATION_M = 0.06  # maximum variation of the body's range
+MIN_BODY_HEIGHT_M = 0.15  # minimum height of the body above the ground
+MIN_CELLS = 20  # minimum number of (sector, beam) cells of a body; fewer may be chance
+MARGIN_M = 0.05  # margin around the body box
 # The robot stands still if less than MAX_CHANGED_SHARE of the returns beyond MIN_FAR_M change their
 # range by MIN_CHANGE_M between these quantiles of the scans (extremes are people passing by).
 MIN_FAR_M, MIN_CHANGE_M, QUANTILES, MAX_CHANGED_SHARE = 4.0, 0.3, (0.1, 0.9), 0.3
-MAX_GROUND_RANGE_M = 30.0  # nearer ground gives a return
-MIN_BLIND = 3  # degrees; narrower gaps are noise
-MIN_SEEN_SHARE = 0.35  # of the sectors with a return, for a beam that can show blind sectors
-ROW_STEP = 2.0  # degrees between rows if there are no beams
+MAX_GROUND_RANGE_M = 30.0  # maximum range at which the ground reliably returns
+MIN_BLIND = 3  # minimum width of a blind sector in degrees; narrower gaps may be chance
+MIN_SEEN_SHARE = 0.35  # minimum fraction of sectors with a return for a beam that can show blind sectors
+ROW_STEP = 2.0  # elevation step between rows if there are no beams, in degrees
 
 
 class Coverage(NamedTuple):

@@ -10,19 +10,19 @@ from scipy.fft import irfft2, rfft2
 
 from lidar_perception.geometry import wrap_angle
 
-CELL_M, HALF_SIZE_M = 0.2, 40.0  # of the bird's-eye images
+CELL_M, HALF_SIZE_M = 0.2, 40.0  # cell size and half width of the bird's-eye images
 LOW_M, HIGH_M = 0.3, 3.0  # heights above the ground of the points in the images
-MIN_SHIFT_M = 0.3  # smaller shifts have no clear direction
-MIN_PEAK_RATIO = 1.2  # of a clear peak to the rest of the correlation
-PEAK_HALF_SIZE = 5  # cells around a peak that do not count as the rest
+MIN_SHIFT_M = 0.3  # minimum shift that gives a direction
+MIN_PEAK_RATIO = 1.2  # minimum ratio of a clear peak to the rest of the correlation
+PEAK_HALF_SIZE = 5  # cells around a peak that are excluded from the rest
 # With at least MIN_STATIC_SCANS scans, cells occupied in this share of them are ignored: they move
 # with the robot, for example where a beam hits a straight wall.
 STATIC_SHARE, MIN_STATIC_SCANS = 0.7, 5
-GAPS = (1, 2, 4, 8, 16)  # differences of the numbers of clouds that are compared
-MIN_AGREEMENT = 0.8  # of the directions: length of their mean unit vector
-MAX_STRAIGHT_TURN = 5.0  # degrees between scans; in tighter turns a sensor off the centre moves sideways
-MIN_ERROR = 7.0  # degrees, since walls can bias all shifts of one place
-MAX_OFF_AXIS = 10.0  # degrees between x and the heading, in addition to twice the error
+GAPS = (1, 2, 4, 8, 16)  # differences between the numbers of clouds that are compared
+MIN_AGREEMENT = 0.8  # minimum length of the mean direction vector, 0 to 1
+MAX_STRAIGHT_TURN = 5.0  # maximum rotation between scans in degrees; in turns, an off-centre sensor moves sideways
+MIN_ERROR = 7.0  # minimum error in degrees, since walls can bias all shifts of one place
+MAX_OFF_AXIS = 10.0  # tolerance between x axis and heading in degrees, added to twice the error
 
 
 class Shift(NamedTuple):
@@ -32,7 +32,7 @@ class Shift(NamedTuple):
     y: float
 
 
-Shifts = Mapping[tuple[int, int], Shift | None]  # by the numbers of two scans; None if ambiguous
+Shifts = Mapping[tuple[int, int], Shift | None]  # (scan, scan) -> shift, None if ambiguous
 
 
 class Heading(NamedTuple):

@@ -13,18 +13,19 @@ from lidar_perception.ground.threshold import fit_plane, fit_plane_by_ransac, he
 from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-TILTED_GROUND = ThresholdParams(max_slope=45.0, inlier_distance=0.08)  # at the largest tilt of a sensor
-MIN_DISTANCE_M = 0.3  # of ground points from the sensor, beyond the robot
+TILTED_GROUND = ThresholdParams(max_slope=45.0, inlier_distance=0.08)  # allows for the largest tilt of a sensor
+MIN_DISTANCE_M = 0.3  # minimum distance of ground points, outside the robot
 RADIUS_RATIO = 2.5  # the plane is fitted up to this multiple of the distance of the nearest ground
 MIN_RADIUS_M, MAX_RADIUS_M = 5.0, 25.0
-MIN_SHARE = 0.12  # of the low points that are on the plane
+MIN_SHARE = 0.12  # minimum fraction of the low points that are on the plane
 MIN_POINTS = 60
-INLIER_DISTANCE_M = 0.05  # of the points that the final plane is fitted to
-MIN_DEPTH_M, MAX_BELOW_SHARE = 0.3, 0.25  # points this far below the plane, relative to its inliers
-SECTORS = 6  # of a scan; each is left out once to estimate the error
-MIN_HEIGHT_M = 0.1  # a nearer plane is the surface on which the sensor is mounted
-UPSIDE_DOWN_RATIO = 8.0  # of points on a floor overhead to points below; a ceiling has fewer
-MIN_EXTENT_M = 1.5  # of the plane
+INLIER_DISTANCE_M = 0.05  # inlier distance of the final plane fit
+# Depth of points below the plane, and their maximum number relative to the inliers.
+MIN_DEPTH_M, MAX_BELOW_SHARE = 0.3, 0.25
+SECTORS = 6  # sectors of a scan, each left out once to estimate the error
+MIN_HEIGHT_M = 0.1  # a closer surface is what the sensor stands on
+UPSIDE_DOWN_RATIO = 8.0  # ratio of points above to points below from which the surface above is the floor
+MIN_EXTENT_M = 1.5  # minimum extent of the plane
 OFFSET_M = 1.0  # clouds are lowered by this to find a floor at their origin
 
 

@@ -17,10 +17,10 @@ from msg_utils.point_cloud2 import to_array
 
 # Columns with the beam number in the drivers of Velodyne, Ouster, Hesai, Nebula, Livox and RoboSense.
 RING_FIELDS = ("ring", "channel", "line", "laser_id", "laser_number", "row")
-MAX_MEDIAN_RANGE_M = 250.0  # of a cloud in the sensor's frame, if its unit is metres
-MAX_SPREAD_M = 200.0  # median distance to the cloud's centre in any frame, if the unit is metres
-MIN_ELEVATION_SPAN = 1.0  # degrees; less means a 2D scanner
-MIN_POINTS = 100  # usable points of a cloud
+MAX_MEDIAN_RANGE_M = 250.0  # maximum for a cloud in metres in the sensor's frame
+MAX_SPREAD_M = 200.0  # maximum median distance to the cloud's centre for a cloud in metres in another frame
+MIN_ELEVATION_SPAN = 1.0  # in degrees; a sensor with a smaller span scans a plane
+MIN_POINTS = 100  # minimum number of usable points of a cloud
 
 
 class Scan(NamedTuple):

@@ -12,7 +12,7 @@ from lidar_perception.sensor_setup.measurement.scans import Scan
 # Clouds are missing if two stamps are this many median periods apart. Longer gaps separate drives.
 MIN_GAP, MAX_GAP = 1.5, 1000
 MIN_RATE, MAX_RATE = 0.5, 100.0  # turns per second of real sensors
-MIN_STAMPS = 4  # to measure the rate
+MIN_STAMPS = 4  # minimum number of stamps to compute a rate
 
 
 class Timing(NamedTuple):

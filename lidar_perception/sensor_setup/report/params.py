@@ -23,12 +23,12 @@ Choices = dict[str, tuple[Any, str]]  # value and reason by name of the paramete
 # The paper's neighbourhoods (0.15, 0.30, 0.50 m up to 15, 30, 45 m) are this multiple of the beam
 # spacing of the HDL-64E at the end of each band.
 EPS_BEAMS = 1.33
-RANGE_LIMITS_M = (15.0, 30.0, 45.0)  # ends of the bands; the paper has the first two
-MAX_EPS_M = (0.5, 0.7, 0.9, 1.0)  # larger values merge people who walk side by side
+RANGE_LIMITS_M = (15.0, 30.0, 45.0)  # range limits of the bands; the paper has the first two
+MAX_EPS_M = (0.5, 0.7, 0.9, 1.0)  # maximum eps per band; larger values merge people who walk side by side
 MIN_SAMPLES = 3
-DENSITY_SHARE = 0.75  # of the sensor's density, so that clouds of this sensor do not count as sparse
+DENSITY_SHARE = 0.75  # fraction of the sensor's density, so that clouds of this sensor do not count as sparse
 NO_INTENSITY_MAX = 1e9  # full scale at which every intensity is read as 0
-MIN_RANGE_SHARE = 0.9  # of the distance of the nearest ground, where Patchwork++ starts
+MIN_RANGE_SHARE = 0.9  # fraction of the distance to the nearest ground at which Patchwork++ starts
 PATCHWORK_RANGE_M = 80.0  # default of ground.patchwork.max_range
 HINT_REASON = "from --height-hint; no ground in view"
 

@@ -12,15 +12,15 @@ from lidar_perception.sensor_setup.measurement.motion import MAX_OFF_AXIS, wrap_
 from lidar_perception.sensor_setup.measurement.recorded_poses import FOOTPRINT
 from lidar_perception.simulation.sensor import find_sensor
 
-MAX_SLOPE_SPREAD = 1.0  # degrees between scans; more means sloping ground or a swaying robot
+MAX_SLOPE_SPREAD = 1.0  # maximum variation of the slope between scans of level ground, in degrees
 MAX_HEIGHT_M = 5.0  # highest plausible mount of a sensor
-MAX_TILT = 6.0  # degrees of roll or pitch that need no check in a second place
-MAX_TILT_DIFFERENCE = 2.0  # degrees between TF and ground in addition to the error, for road camber
-MAX_HEIGHT_DIFFERENCE_M = 0.1  # between the ground and TF or --height-hint
-MAX_MISSING_SHARE = 0.01  # of the clouds
-MIN_GROUND_SHARE = 0.9  # of the scans
-MIN_TURN_S = 0.02  # shortest duration of a turn
-MAX_SECOND_RETURNS = 0.05  # share of the points
+MAX_TILT = 6.0  # maximum roll or pitch in degrees that needs no check in a second place
+MAX_TILT_DIFFERENCE = 2.0  # tolerance between TF and ground in degrees, beyond the error; allows for road camber
+MAX_HEIGHT_DIFFERENCE_M = 0.1  # tolerance between the ground and TF or --height-hint
+MAX_MISSING_SHARE = 0.01  # maximum fraction of missing clouds
+MIN_GROUND_SHARE = 0.9  # minimum fraction of scans with ground
+MIN_TURN_S = 0.02  # minimum span of the point times of a revolution
+MAX_SECOND_RETURNS = 0.05  # maximum fraction of second returns
 
 
 def find_warnings(m: SensorMeasurement) -> list[str]:

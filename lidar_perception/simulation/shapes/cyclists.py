@@ -15,9 +15,9 @@ from lidar_perception.simulation.shapes.scene_object import SceneObject, draw_si
 from lidar_perception.simulation.solids import compute_extents, make_parts
 
 BICYCLE, MOTORCYCLE, BICYCLIST, MOTORCYCLIST = 11, 15, 31, 32
-CRANK_M, GEAR_M = 0.17, 5.0  # length of a crank, distance per turn of the cranks
-SPOKE_TRANSMISSION = 0.5  # share of the beams that pass between the spokes
-FRAME_TRANSMISSION = 0.6  # share of the beams that pass between stays, chain, pedals and rack
+CRANK_M, GEAR_M = 0.17, 5.0  # length of a crank, distance per crank revolution
+SPOKE_TRANSMISSION = 0.5  # fraction of beams that pass between the spokes
+FRAME_TRANSMISSION = 0.6  # fraction of beams that pass between stays, chain, pedals and rack
 THIGH, SHANK = 0.26, 0.27  # lengths as shares of the rider's height
 
 

@@ -37,7 +37,7 @@ def _truck_parts(length: float, width: float, load: float, cab: float, colour: f
     """Return the parts of a truck; load and cab are the heights of load and cab in m."""
     x, y, radius, floor = length / 2, width / 2, 0.48, 1.15
     back, belt, roof = x - min(2.2, 0.24 * length), 0.62 * cab, cab - 0.25
-    transmission = 0.75  # of the windows
+    transmission = 0.75  # fraction of beams that pass the windows
     rows = [
         block((-x, -y, floor), (back - 0.35, y, load), cargo),
         block((0.3 - x, -0.45, 0.6), (back, 0.45, floor), 0.1),
@@ -98,7 +98,7 @@ def _coach_parts(
     length, width, height = size
     x, y = length / 2, width / 2
     belt, top, floor = 0.38 * height, 0.82 * height, 0.45
-    transmission = 0.7  # of the windows
+    transmission = 0.7  # fraction of beams that pass the windows
     rows = [
         block((0.4 - x, -0.97 * y, top), (x - 0.4, 0.97 * y, height), colour),
         block((0.3 - x, -0.95 * y, 0.25), (x - 0.3, 0.95 * y, floor), 0.15),

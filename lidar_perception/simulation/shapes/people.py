@@ -17,9 +17,9 @@ PERSON, OTHER = 30, 99
 CARRIED = ("", "backpack", "bag", "umbrella", "trolley", "pram")
 WHEEL_TRANSMISSION = 0.6  # fraction of beams that pass between the spokes of a wheelchair
 
-STANCE = 0.54  # share of a stride with the foot on the ground (0.6 for real people)
+STANCE = 0.54  # fraction of a stride with the foot on the ground; real walkers: 0.6
 MIN_LENGTH_SHARE = 0.3  # smallest length of a box as a share of its height, as in KITTI
-HEEL_OFF = 0.6  # share of the stance after which the heel rises
+HEEL_OFF = 0.6  # fraction of the stance after which the heel rises
 # Lengths as shares of the height (Drillis and Contini 1966).
 THIGH, SHANK, ANKLE, FOOT, SHOULDER, UPPER_ARM, FOREARM = (0.245, 0.246, 0.039, 0.152, 0.818, 0.186, 0.2)
 REACH = 0.99 * (THIGH + SHANK)

@@ -32,16 +32,16 @@ LIGHTS = 0.9  # reflectance
 # in the middle third up to 0.7 of the height, 0.15 m at 0.86 of the half width, 0.4 m at 0.96. Sides
 # are 0.04 m inside the box, which may include the mirrors.
 BUMPER = 0.29  # height of the foremost point, as a share of the height
-BONNET = 0.13  # m from the front of the box to the middle of the bonnet's edge
-CORNER = 0.3  # m from the front of the box to the sides of the bonnet's edge
-TAIL = 0.07  # m from the rear of the box to the flat part of the tail
+BONNET = 0.13  # distance from the front of the box to the middle of the bonnet's edge, m
+CORNER = 0.3  # distance from the front of the box to the sides of that edge, m
+TAIL = 0.07  # distance from the rear of the box to the flat part of the tail, m
 TAIL_FLAT, TAIL_SIDE = 0.59, 0.95  # ends of the flat and the round part, as shares of the half width
-TAIL_ROUND = 0.45  # m, length of the round part
+TAIL_ROUND = 0.45  # length of the round part, m
 TAIL_LOW, TAIL_TOP = 0.22, 0.67  # ends of the closed part of the tail, as shares of the height
-SIDE = 0.035  # m from the side of the box to the body
-DOME = 0.09  # m, rise of the roof in its middle
+SIDE = 0.035  # distance from the side of the box to the body, m
+DOME = 0.09  # rise of the roof in the middle, m
 REFLECTANCE_SPREAD = 0.7  # standard deviation of the log reflectance of the parts of a car
-LEG_ROOM_M = 0.5  # smallest distance from a bench to the front seats
+LEG_ROOM_M = 0.5  # minimum distance from a bench to the front seats
 
 
 class Style(NamedTuple):

@@ -29,7 +29,7 @@ from lidar_perception.training.cache import cache_path, file_fingerprint, load_o
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, PointCloud
 
 SPARSE_SHARES = 0.08, 0.7  # smallest and largest share of the points of a sparse scene
-MIN_POINTS_LEFT = 3  # of a cluster in a sparse or augmented scene
+MIN_POINTS_LEFT = 3  # minimum points of a cluster in a sparse or augmented scene
 OBJECT_MARGIN_M = 0.3  # margin of the boxes by which objects are cut
 MAX_DECOYS = 24  # random decoys per scene without a proposer
 MAX_RANDOM_DECOYS = 8  # random decoys per scene with a proposer

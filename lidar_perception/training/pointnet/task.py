@@ -33,7 +33,7 @@ from lidar_perception.training.record import summarize_report
 from lidar_perception.training.run import Validation
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
-MIN_SCORED_POINTS = 10  # of a cluster that is included in the accuracy
+MIN_SCORED_POINTS = 10  # minimum points of a cluster that is included in the accuracy
 
 
 @dataclass(frozen=True)

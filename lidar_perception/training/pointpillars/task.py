@@ -52,7 +52,7 @@ VALIDATION_PARAMS = DetectorParams(
     pointpillars=PointPillarsParams(scores=ScoreParams.for_all_classes(0.1), warm_up=False)
 )
 CLASS_BY_SIMILAR = {other: name for name, other in NEIGHBOURS.items()}  # {"Van": "Car", ...}
-MIN_TOUCH_IOU = 1e-6  # of an anchor that touches a box
+MIN_TOUCH_IOU = 1e-6  # minimum IoU of an anchor that touches a box
 DONT_CARE_LABEL = -2  # label of a box of the class DontCare
 
 
