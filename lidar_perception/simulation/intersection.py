@@ -67,13 +67,13 @@ def compile_solids(solids: Solids, motion: Motion, salt: np.uint64) -> CompiledS
 
 
 @njit(cache=True, nogil=True)
-def to_unit_frame(shapes, s, way, since, lift):
+def to_unit_frame(shapes, s, direction, since, lift):
     """Transform a ray to the frame of unit shape s: start and direction (x, y, z).
 
     Args:
         shapes: CompiledSolids.
         s: Index of the solid.
-        way: Direction (x, y, z) of the ray in the sensor's frame.
+        direction: Direction (x, y, z) of the ray in the sensor's frame.
         since: Time of the ray after the stamp, s.
         lift: Start of the ray on the z axis, m.
     """
@@ -83,7 +83,7 @@ def to_unit_frame(shapes, s, way, since, lift):
         o[1] + m[1, 2] * lift + v[1] * since,
         o[2] + m[2, 2] * lift + v[2] * since,
     )
-    x, y, z = way
+    x, y, z = direction
     return start, (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z,
         m[1, 0] * x + m[1, 1] * y + m[1, 2] * z,
@@ -92,7 +92,7 @@ def to_unit_frame(shapes, s, way, since, lift):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def intersect_shape(kind, start, way):
+def intersect_shape(kind, start, direction):
     """Return the ranges at which a ray enters and leaves a unit shape, (inf, -inf) for a miss.
 
     A ray exactly along the axis of a cylinder or in the face of a box is a miss.
@@ -100,13 +100,13 @@ def intersect_shape(kind, start, way):
     enter, leave = -np.inf, np.inf
     for i in range(3):
         if kind == BOX or (kind == CYLINDER and i == 2):
-            inverse = 1 / way[i]
+            inverse = 1 / direction[i]
             a, b = (-1 - start[i]) * inverse, (1 - start[i]) * inverse
             if math.isnan(a) or math.isnan(b):
                 return np.inf, -np.inf
             enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
     if kind != BOX:
-        (x, y, z), (u, v, w) = start, way
+        (x, y, z), (u, v, w) = start, direction
         if kind == CYLINDER:  # distance from the axis, not from the centre
             z, w = 0.0, 0.0
         square = u * u + v * v + w * w
@@ -121,7 +121,7 @@ def intersect_shape(kind, start, way):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_stop_range(shapes, s, start, way, enter, leave, number, leaf_share):
+def find_stop_range(shapes, s, start, direction, enter, leave, number, leaf_share):
     """Return the range at which solid s stops a ray, inf if the ray passes through leaves or glass.
 
     A ray that starts in an opaque solid is not stopped. number: number of the ray; leaf_share: see
@@ -136,21 +136,21 @@ def find_stop_range(shapes, s, start, way, enter, leave, number, leaf_share):
             1 / math.sqrt(m[1, 0] ** 2 + m[1, 1] ** 2 + m[1, 2] ** 2),
             1 / math.sqrt(m[2, 0] ** 2 + m[2, 1] ** 2 + m[2, 2] ** 2),
         )
-        t = trace_foliage(start, way, half, enter, leave, shapes.density[s], shapes.plant[s], key, leaf_share)
+        t = trace_foliage(start, direction, half, enter, leave, shapes.density[s], shapes.plant[s], key, leaf_share)
     if shapes.transmission[s] > 0 and hash_uniform(2, key) < shapes.transmission[s]:
         return np.inf
     return t
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def shade_hit(shapes, s, way, since, lift, number):
+def shade_hit(shapes, s, direction, since, lift, number):
     """Return the brightness of a ray that ends on solid s, and the cosine of its angle of incidence."""
     reflectance = shapes.reflectance[s]
     if shapes.density[s] < np.inf:
         # Leaves face all directions. The scatter is that of neighbouring points in SemanticKITTI.
         scatter = hash_uniform(6, shapes.salt[s] + np.uint64(number))
         return compute_brightness(reflectance, 0.5) * (0.5 + scatter), 1.0
-    start, along = to_unit_frame(shapes, s, way, since, lift)
+    start, along = to_unit_frame(shapes, s, direction, since, lift)
     enter, _ = intersect_shape(shapes.kind[s], start, along)
     x, y, z = _normal(
         shapes.kind[s], start[0] + enter * along[0], start[1] + enter * along[1], start[2] + enter * along[2]
@@ -161,7 +161,7 @@ def shade_hit(shapes, s, way, since, lift, number):
         m[0, 1] * x + m[1, 1] * y + m[2, 1] * z,
         m[0, 2] * x + m[1, 2] * y + m[2, 2] * z,
     )
-    cosine = abs(out[0] * way[0] + out[1] * way[1] + out[2] * way[2]) / math.sqrt(
+    cosine = abs(out[0] * direction[0] + out[1] * direction[1] + out[2] * direction[2]) / math.sqrt(
         out[0] ** 2 + out[1] ** 2 + out[2] ** 2
     )
     return compute_brightness(reflectance, cosine), cosine

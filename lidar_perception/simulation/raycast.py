@@ -141,8 +141,8 @@ def _cast_first(
         x, y, z = position[0] + along * since, position[1] + aside * since, position[2] + up * since
         for ring in range(rings):
             if mask[column, ring]:
-                way = _way(turn, column, ring)
-                start, down = (x, y, z + turn.lift[ring]), _to_world(way, facing)
+                direction = _get_direction(turn, column, ring)
+                start, down = (x, y, z + turn.lift[ring]), _to_world(direction, facing)
                 far, s = hits.range[column, ring], hits.solid[column, ring]
                 if not far < min_ground_range(ground, start, down):
                     hit = cast_ground(ground, start, down, max_range)
@@ -152,7 +152,9 @@ def _cast_first(
                         )
                         continue
                 if s >= 0:
-                    brightness, cosine = shade_hit(shapes, s, way, since, turn.lift[ring], ring * columns + column)
+                    brightness, cosine = shade_hit(
+                        shapes, s, direction, since, turn.lift[ring], ring * columns + column
+                    )
                     _write_hit(
                         hits, column, ring, RayHit(far, brightness, cosine, shapes.owner[s], shapes.semantic[s], s)
                     )
@@ -168,9 +170,9 @@ def _to_world(vector, facing):
 
 
 @njit(cache=True, nogil=True)
-def _way(turn, column, ring):
-    way = turn.direction[column, ring]
-    return way[0], way[1], way[2]
+def _get_direction(turn, column, ring):
+    x, y, z = turn.direction[column, ring]
+    return x, y, z
 
 
 @njit(cache=True, nogil=True)
@@ -193,11 +195,13 @@ def _draw_solids(hits, turn, mask, shapes, windows, order, max_range, leaf_share
                 far = hits.range[column, ring]
                 if near > far and not counts:
                     continue
-                start, way = to_unit_frame(shapes, s, _way(turn, column, ring), turn.since[column], turn.lift[ring])
-                enter, leave = intersect_shape(shapes.kind[s], start, way)
+                start, direction = to_unit_frame(
+                    shapes, s, _get_direction(turn, column, ring), turn.since[column], turn.lift[ring]
+                )
+                enter, leave = intersect_shape(shapes.kind[s], start, direction)
                 if not (enter <= leave and leave > 0) or (np.float32(enter) > np.float32(far) and not counts):
                     continue
-                t = find_stop_range(shapes, s, start, way, enter, leave, ring * columns + column, leaf_share)
+                t = find_stop_range(shapes, s, start, direction, enter, leave, ring * columns + column, leaf_share)
                 if not t < leave or t > max_range:
                     continue
                 if counts and latest[column, ring] != owner:
@@ -216,9 +220,9 @@ def _turn_into_footprints(direction, mask, divergence, salt):
     for column in range(columns):
         for ring in range(rings):
             if mask[column, ring]:
-                way = direction[column, ring]
-                way[0], way[1], way[2] = draw_in_footprint(
-                    (way[0], way[1], way[2]), divergence, salt + np.uint64(ring * columns + column)
+                ray = direction[column, ring]
+                ray[0], ray[1], ray[2] = draw_in_footprint(
+                    (ray[0], ray[1], ray[2]), divergence, salt + np.uint64(ring * columns + column)
                 )
 
 

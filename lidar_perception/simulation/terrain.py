@@ -106,44 +106,44 @@ def _heights(ground, x, y):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cast_ground(ground, start, way, max_range):
+def cast_ground(ground, start, direction, max_range):
     """Intersect a ray that starts above the road with the ground.
 
     Args:
         ground: Ground from to_compiled.
-        start, way: Origin and direction (x, y, z) of the ray in the world.
+        start, direction: Origin and direction (x, y, z) of the ray in the world.
         max_range: Largest range, m.
 
     Returns:
         The GroundHit.
     """
     nothing = GroundHit(np.inf, 0.0, 0.0, 0)
-    if not way[2] - ground.slope_x * way[0] - ground.slope_y * way[1] < -1e-3:
+    if not direction[2] - ground.slope_x * direction[0] - ground.slope_y * direction[1] < -1e-3:
         return nothing
-    t, edge = _intersect_relief(ground, start, way, 0.0, 0.0, max_range), 0.0
-    if ground.curb_height and not (t <= max_range and _stays_on_road(ground, start, way, t)):
-        t, edge = _intersect_raised(ground, start, way, t, max_range)
+    t, edge = _intersect_relief(ground, start, direction, 0.0, 0.0, max_range), 0.0
+    if ground.curb_height and not (t <= max_range and _stays_on_road(ground, start, direction, t)):
+        t, edge = _intersect_raised(ground, start, direction, t, max_range)
     if not t <= max_range:
         return nothing
     cosine = edge  # replaced if the ray hits a curb
     if not edge:
-        _, slope_x, slope_y = _relief(ground, start[0] + t * way[0], start[1] + t * way[1])
-        cosine = min(max(slope_x * way[0] + slope_y * way[1] - way[2], 1e-3), 1.0)
+        _, slope_x, slope_y = _relief(ground, start[0] + t * direction[0], start[1] + t * direction[1])
+        cosine = min(max(slope_x * direction[0] + slope_y * direction[1] - direction[2], 1e-3), 1.0)
         if ground.rough or ground.litter:
-            t = _intersect_tufts(ground, start, way, t, cosine)
-    semantic, reflectance = _surface(ground, start[0] + t * way[0], start[1] + t * way[1])
+            t = _intersect_tufts(ground, start, direction, t, cosine)
+    semantic, reflectance = _surface(ground, start[0] + t * direction[0], start[1] + t * direction[1])
     if edge:
         semantic, reflectance = SIDEWALK, ground.sidewalk
     return GroundHit(t, compute_brightness(reflectance, cosine), cosine, semantic)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def min_ground_range(ground, start, way):
+def min_ground_range(ground, start, direction):
     """Return a lower bound of the range at which a ray hits the ground, inf if it does not descend.
 
     It is much cheaper than cast_ground.
     """
-    closing = ground.slope_x * way[0] + ground.slope_y * way[1] - way[2]
+    closing = ground.slope_x * direction[0] + ground.slope_y * direction[1] - direction[2]
     if closing <= 1e-3:
         return np.inf
     height = start[2] - ground.slope_x * start[0] - ground.slope_y * start[1] - abs(ground.wave)
@@ -153,9 +153,9 @@ def min_ground_range(ground, start, way):
 
 
 @njit(cache=True, nogil=True)
-def _stays_on_road(ground, start, way, t):
+def _stays_on_road(ground, start, direction, t):
     """Return True if a ray stays between the curbs up to range t."""
-    y, end = start[1], start[1] + t * way[1]
+    y, end = start[1], start[1] + t * direction[1]
     return ground.curb_right < min(y, end) and max(y, end) < ground.curb_left
 
 
@@ -194,12 +194,12 @@ def _is_raised(ground, x, y):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _intersect_relief(ground, start, way, lift, t, max_range):
+def _intersect_relief(ground, start, direction, lift, t, max_range):
     """Intersect a ray with the relief raised by lift, by Newton's method from range t; inf without a hit."""
     for _ in range(10):
-        height, slope_x, slope_y = _relief(ground, start[0] + t * way[0], start[1] + t * way[1])
-        gap = start[2] + t * way[2] - height - lift
-        closing = slope_x * way[0] + slope_y * way[1] - way[2]
+        height, slope_x, slope_y = _relief(ground, start[0] + t * direction[0], start[1] + t * direction[1])
+        gap = start[2] + t * direction[2] - height - lift
+        closing = slope_x * direction[0] + slope_y * direction[1] - direction[2]
         t = min(max(t + gap / max(closing, 1e-4), 0.0), 2 * max_range)
         if abs(gap) <= 1e-4:  # the remaining error is far smaller
             return t
@@ -207,7 +207,7 @@ def _intersect_relief(ground, start, way, lift, t, max_range):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _intersect_raised(ground, start, way, low, max_range):
+def _intersect_raised(ground, start, direction, low, max_range):
     """Intersect a ray with sidewalks and curbs.
 
     low: range of the intersection with the relief.
@@ -215,31 +215,31 @@ def _intersect_raised(ground, start, way, low, max_range):
     Returns:
         The range of the first hit, and the cosine of the incidence if it is a curb, else 0.
     """
-    high = _intersect_relief(ground, start, way, ground.curb_height, min(low, max_range), max_range)
-    if high < np.inf and _is_raised(ground, start[0] + high * way[0], start[1] + high * way[1]):
+    high = _intersect_relief(ground, start, direction, ground.curb_height, min(low, max_range), max_range)
+    if high < np.inf and _is_raised(ground, start[0] + high * direction[0], start[1] + high * direction[1]):
         return high, 0.0
     t, edge = low, 0.0
     for i in range(2 + 2 * len(ground.crossings)):
         axis, line = 1, ground.curb_left if i == 0 else ground.curb_right
         if i >= 2:
             axis, line = 0, ground.crossings[(i - 2) // 2, i % 2]
-        at = (line - start[axis]) / way[axis]
+        at = (line - start[axis]) / direction[axis]
         if high < at < t:
             beyond = at + 1e-4
-            if _is_raised(ground, start[0] + beyond * way[0], start[1] + beyond * way[1]):
-                t, edge = at, abs(way[axis])
+            if _is_raised(ground, start[0] + beyond * direction[0], start[1] + beyond * direction[1]):
+                t, edge = at, abs(direction[axis])
     return t, edge
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _intersect_tufts(ground, start, way, t, cosine):
+def _intersect_tufts(ground, start, direction, t, cosine):
     """Return the range of the first tuft or bump on a ray that hits the ground at range t, else t.
 
     The last part of the ray is searched in TUFT_STEPS steps. The result is 0 if the ray starts in a
     tuft.
     """
     step = min(max(ground.rough, ground.litter) / cosine, MAX_TUFT_DISTANCE_M) / TUFT_STEPS
-    end, begin = start[1] + t * way[1], start[1] + (t - TUFT_STEPS * step) * way[1]
+    end, begin = start[1] + t * direction[1], start[1] + (t - TUFT_STEPS * step) * direction[1]
     left, right = ground.curb_left - ground.parking, ground.curb_right + ground.parking
     first = TUFT_STEPS - 1
     if max(end, begin) <= left and min(end, begin) >= right:
@@ -248,7 +248,9 @@ def _intersect_tufts(ground, start, way, t, cosine):
         back = k * step
         if back >= t:
             continue  # behind the sensor
-        top = tuft_height(ground, start[0] + (t - back) * way[0], start[1] + (t - back) * way[1], back * cosine)
+        top = tuft_height(
+            ground, start[0] + (t - back) * direction[0], start[1] + (t - back) * direction[1], back * cosine
+        )
         above = top / cosine  # the ray has this height at this distance before t
         if above > back:
             return max(t - min(above, back + step), 0.0)

@@ -59,7 +59,7 @@ def is_kept(point, params):
         CROP,
     ],
 )
-def test_crop_equals_a_plain_implementation(params):
+def test_crop_equals_plain_implementation(params):
     xyz = make_points()
     expected = [is_kept(p, params) for p in xyz]
     np.testing.assert_array_equal(select_points(xyz, params), expected)
@@ -68,7 +68,7 @@ def test_crop_equals_a_plain_implementation(params):
 
 
 @given(st.integers(0, 1000), st.floats(-180, 180))
-def test_a_rotated_sector_keeps_the_rotated_points(seed, angle):
+def test_rotated_sector_keeps_rotated_points(seed, angle):
     xyz = make_points(200, seed).astype(np.float64)
     rotated = Rotation.from_euler("z", angle, degrees=True).apply(xyz)
     edges = np.array([20.0, 75.0])
@@ -78,7 +78,7 @@ def test_a_rotated_sector_keeps_the_rotated_points(seed, angle):
     np.testing.assert_array_equal(before[~near], after[~near])
 
 
-def test_the_body_is_a_box_in_the_base_frame():
+def test_body_is_box_in_base_frame():
     base = np.eye(4)
     base[:3, :3] = Rotation.from_euler("zyx", [2.0, 0.4, -0.3]).as_matrix()
     base[:3, 3] = 0.5, -0.2, 1.1
@@ -90,7 +90,7 @@ def test_the_body_is_a_box_in_the_base_frame():
 
 
 @pytest.mark.parametrize("roll, pitch, ahead", [(0, 0, 180), (180, 0, 0), (15, -20, 90)])
-def test_sectors_do_not_depend_on_the_mounting(roll, pitch, ahead):
+def test_sectors_do_not_depend_on_mounting(roll, pitch, ahead):
     level = find_level_transform(make_tilted_pose(*np.radians([roll, pitch])), np.radians(ahead))
     straight = make_points().astype(np.float64)
     params = CropParams(sectors=(150.0, 210.0, 60.0, 90.0), min_range=2.0)
@@ -100,13 +100,13 @@ def test_sectors_do_not_depend_on_the_mounting(roll, pitch, ahead):
     )
 
 
-def test_a_disabled_crop_returns_the_same_frame():
+def test_disabled_crop_returns_same_frame():
     frame = PointCloud(make_points())
     indices, same = crop_frame(frame, CropParams())
     assert same is frame and indices.tolist() == list(range(len(frame)))
 
 
-def test_cropping_in_and_before_the_pipeline_is_the_same():
+def test_cropping_in_and_before_pipeline_is_same():
     """Indices refer to the given cloud, and a second crop removes nothing."""
     frame = PointCloud(np.ascontiguousarray(scene()[:, :3]))
     params = with_values(PipelineParams(), {"crop.min_range": 4.0, "crop.sectors": (90.0, 270.0)})
@@ -119,7 +119,7 @@ def test_cropping_in_and_before_the_pipeline_is_the_same():
     assert len(crop_frame(before, params.crop)[0]) == len(before)
 
 
-def test_a_cropped_message_has_the_points_of_a_cropped_frame():
+def test_cropped_message_has_points_of_cropped_frame():
     cloud = np.zeros(300, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     for i, name in enumerate("xyz"):
         cloud[name] = make_points(300)[:, i]
@@ -140,6 +140,6 @@ def test_a_cropped_message_has_the_points_of_a_cropped_frame():
         ({"min_range": 5.0, "max_range": 4.0}, "at least min_range"),
     ],
 )
-def test_an_invalid_crop_is_refused_with_the_remedy(values, words):
+def test_invalid_crop_is_refused_with_remedy(values, words):
     with pytest.raises(ValueError, match=words):
         CropParams(**values)

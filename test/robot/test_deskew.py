@@ -26,7 +26,7 @@ def test_deskew_inverts_skew(velocity, rotation):
     np.testing.assert_allclose(deskew(skew(xyz, seconds, poses), seconds, poses), xyz, atol=1e-4)
 
 
-def test_deskew_equals_a_loop_over_the_points():
+def test_deskew_equals_loop_over_points():
     xyz, seconds = make_sweep()
     velocity, rotation = np.array([15.0, 0.3, -0.2]), np.array([0.02, -0.1, 0.7])
     steps = 400  # the arc is integrated in small straight steps
@@ -43,7 +43,7 @@ def test_deskew_equals_a_loop_over_the_points():
     assert np.abs(np.array(expected) - xyz[:40]).max() > 0.5
 
 
-def test_points_of_a_static_sensor_do_not_move():
+def test_points_of_static_sensor_do_not_move():
     xyz, seconds = make_sweep()
     pose = np.tile(np.eye(4), (1, 1, 1))
     pose[0, :3, :3] = Rotation.from_rotvec([0.3, 1.0, -2.0]).as_matrix()
@@ -69,7 +69,7 @@ def test_poses_are_looked_up_once_and_for_few_times(count):
     assert calls == [MAX_POSES + 1]
 
 
-def test_constant_motion_of_a_car_is_a_circle():
+def test_constant_motion_of_car_is_circle():
     """At 10 m/s and 0.5 rad/s, the radius is 20 m."""
     at = np.linspace(-1, 1, 21)
     poses = make_constant_motion([10.0, 0, 0], [0, 0, 0.5])(at)

@@ -43,7 +43,7 @@ def make_tree(seed=0):
 
 
 @given(seeds, st.floats(0, 2))
-def test_lookup_equals_a_composition_by_scipy(seed, seconds):
+def test_lookup_equals_composition_by_scipy(seed, seconds):
     tree, poses, (times, translations, quaternions) = make_tree(seed)
     stamp = min(START + round(seconds * SECOND_NS), int(times[-1]))
     since = (times - START).astype(float)
@@ -105,7 +105,7 @@ def test_poses_are_not_extrapolated_by_default():
 
 
 @given(seeds, st.floats(0.02, 0.4))
-def test_max_gap_extrapolates_the_last_two_poses(seed, seconds):
+def test_max_gap_extrapolates_last_two_poses(seed, seconds):
     tree, _, (times, _, _) = make_tree(seed)
     last, beyond = int(times[-1]), round(seconds * SECOND_NS)
     before, now = (tree.lookup("odom", "base", t) for t in (int(times[-2]), last))
@@ -146,7 +146,7 @@ def test_unconnected_frames_are_named():
         tree.lookup("map", "tower", START)
 
 
-def test_a_loop_is_an_error():
+def test_loop_is_error():
     tree = TransformTree()
     for parent, child in (("a", "b"), ("b", "c"), ("c", "a")):
         tree.set(parent, child, 0, [0, 0, 0], [0, 0, 0, 1], static=True)
@@ -154,7 +154,7 @@ def test_a_loop_is_an_error():
         tree.lookup("x", "b", 0)
 
 
-def test_a_jump_back_in_time_forgets_moving_transforms():
+def test_jump_back_in_time_forgets_moving_transforms():
     tree, _, (times, _, _) = make_tree()
     fixed = tree.lookup("map", "odom", 0)
     tree.set("odom", "base", START - 20 * SECOND_NS, [1, 2, 3], [0, 0, 0, 1])
@@ -220,7 +220,7 @@ def test_memory_is_bounded(monkeypatch):
         (dict(child=""), "two frames with names"),
     ],
 )
-def test_an_invalid_transform_is_refused_and_not_stored(change, words):
+def test_invalid_transform_is_refused_and_not_stored(change, words):
     tree = TransformTree()
     good = dict(parent="a", child="b", stamp_ns=0, translation=[1, 2, 3], quaternion=[0, 0, 0, 1.001], static=True)
     tree.set(**good)

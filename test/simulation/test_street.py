@@ -27,7 +27,7 @@ make_cached_scene = cache(lambda kind, seed, people=1.0: make_scene(seed, kind, 
 
 
 @pytest.mark.parametrize("kind, seed", EVERY)
-def test_nothing_ever_overlaps(kind, seed):
+def test_actors_never_overlap(kind, seed):
     """Labelled and unlabelled things and the ego vehicle, except people on benches and plants."""
     scene = make_cached_scene(kind, seed)
     props = [a for a in scene.actors if not a.obj.label]

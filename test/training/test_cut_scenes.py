@@ -183,7 +183,7 @@ def test_augmented_clusters_stay_in_boxes_and_thin_with_range(rng):
     assert np.allclose(wrap_angle(twice[1] - BOXES), 0, atol=1e-6)
 
 
-def test_loose_clusters_are_cut_near_boxes_and_never_empty(rng):
+def test_box_crops_are_near_boxes_and_never_empty(rng):
     clusters = fill_boxes(rng, BOXES * [1, 1, 1, 1.4, 1.4, 1.4, 1], 300)
     made, boxes = augment_clusters(clusters, BOXES, np.ones(4, bool), STILL, rng)
     assert np.allclose(boxes, BOXES) and (made.sizes < 300).all() and (made.sizes > 80).all()

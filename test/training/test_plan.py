@@ -80,7 +80,7 @@ def test_more_time_or_cores_give_larger_plan():
     assert slow.scans < fit_plan(1.0, 4, SPEED, SIM).scans
 
 
-def test_given_numbers_are_kept():
+def test_fixed_numbers_are_kept():
     made = fit_plan(1.0, 2, SPEED, SIM, Plan(scans=30, val_scans=7, steps=5000, validate_steps=11, part=False))
     assert made == Plan(30, 7, 30, 5000, 11, False)  # it takes longer than the budget
     assert fit_plan(1.0, 2, SPEED, SIM, Plan(scans=100), epochs=3).steps == 75

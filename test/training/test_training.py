@@ -217,7 +217,7 @@ def _with_loss(run: Run, loss) -> Run:
     return run
 
 
-def test_too_many_nonfinite_steps_in_a_row_are_an_error(tmp_path):
+def test_too_many_nonfinite_steps_are_an_error(tmp_path):
     class Broken(Toy):
         def batches(self, step):
             for now, inputs, target in super().batches(step):

@@ -311,7 +311,7 @@ def test_reflector_spans_range_of_heights(seed):
 
 
 @given(seeds)
-def test_stretched_things_keep_their_foot(seed):
+def test_stretched_background_keeps_its_foot(seed):
     scene, rng = random_scene(seed), np.random.default_rng(seed)
     changes = replace(STILL_THINGS, things_stretch=0.5, things_intensity=0.4)
     for box in scene.boxes:

@@ -208,7 +208,7 @@ def test_bad_input_is_refused_at_once(tmp_path, tiny_size, arguments, reason):
     assert not (tmp_path / "run" / "last.pt").exists()
 
 
-def test_papers_share_is_held_out_and_every_field_has_flag():
+def test_share_of_paper_is_held_out_by_default():
     assert round(PAPER_SHARE * 7518) == 751
     text = train("--help").output
     for group in PointPillarsTraining, DataParams:
@@ -216,7 +216,7 @@ def test_papers_share_is_held_out_and_every_field_has_flag():
             assert "--" in text and f.name.replace("_", "-") in text
 
 
-def test_out_that_is_file_fails_before_data_is_made(tmp_path, monkeypatch):
+def test_file_as_out_is_refused_before_simulation(tmp_path, monkeypatch):
     def never(*_):
         raise AssertionError("data was prepared")
 

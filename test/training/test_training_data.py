@@ -71,7 +71,7 @@ def test_cached_scans_equal_simulated_ones(tmp_path, monkeypatch):
     assert len(list((tmp_path / "cache").iterdir())) == 1
 
 
-def test_hidden_simulated_objects_are_not_wanted():
+def test_hidden_simulated_objects_are_not_detectable():
     source = SimulatedScenes(7, 1, SENSOR)
     _, truth = source.scan(0)
     scene = source.scene(0)
@@ -168,7 +168,7 @@ def test_share_of_scenes_gets_pasted_objects(tmp_path):
     assert set(none) == {1} and set(some) == {1, 2} and sum(every) > sum(none)
 
 
-def test_anchors_on_uncounted_objects_are_ignored():
+def test_anchors_on_hidden_objects_are_ignored():
     config = tiny()
     anchors, kinds = anchor_tensors(config)
     rng = np.random.default_rng(0)
