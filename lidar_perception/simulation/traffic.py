@@ -199,9 +199,9 @@ def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterato
     for side in street.blocks:
         for along in scatter(rng, side.length, kind.clutter / 6 if side.walk else 0.0):
             out, turn = rng.choice([0.9, max(side.walk - 1.0, 0.9)]), rng.normal(np.pi / 2, 0.2)
-            make = make_bicycle if rng.random() < 0.75 else make_motorcycle
+            maker = make_bicycle if rng.random() < 0.75 else make_motorcycle
             for i in range(rng.integers(1, 6)):
-                yield side.place(make(rng), along + 0.75 * i, out, turn)
+                yield side.place(maker(rng), along + 0.75 * i, out, turn)
 
 
 def _find_crosswalks(street: Street) -> list[Side]:
