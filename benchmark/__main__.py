@@ -38,8 +38,8 @@ from lidar_perception.scoring.centres.report import select_pedestrians
 from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
-FULL_SCAN = 60_000  # minimum points of a full scan; one cropped to the camera's view has about 20,000
-FEW = 3  # minimum number of pedestrian frames; with fewer, other frames are used too
+MIN_FULL_SCAN_POINTS = 60_000  # minimum points of a full scan; one cropped to the camera's view has about 20,000
+MIN_PEDESTRIAN_FRAMES = 3  # minimum number of pedestrian frames; with fewer, other frames are used too
 
 
 @click.command(context_settings=dict(help_option_names=["-h", "--help"]))
@@ -88,13 +88,15 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     """
     keep_freed_memory()
     recordings = [open_recording(path) for path in data]
-    recording = next((each for each in recordings if {BOXES, CAMERA} <= each.has), recordings[0])
+    recording = next((candidate for candidate in recordings if {BOXES, CAMERA} <= candidate.has), recordings[0])
     recording.require(BOXES, "benchmark")
     recording.require(CAMERA, "benchmark")
     frames = [f for f in recording if len(select_pedestrians(f.truth()))]
     if not frames:
         raise InputError(f"{recording.path} has no frame with a Pedestrian label")
-    labelled = [f for each in recordings if POINT_LABELS in each.has for f in choose_evenly(each.frames, count)]
+    labelled = [
+        f for candidate in recordings if POINT_LABELS in candidate.has for f in choose_evenly(candidate.frames, count)
+    ]
     warm_up()
     content: dict[str, Any] = {
         "machine": {
@@ -103,7 +105,7 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
             "python": platform.python_version(),
             "numpy": np.__version__,
         },
-        "peers": {p.package: p.version() for p in peers.ALL},
+        "peers": {p.package: p.read_version() for p in peers.ALL},
         "candidates": compare_candidates(frames, repeat),
     }
     print_comparison(content["candidates"])
@@ -122,8 +124,8 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     if labelled:
         content["ground_scores"] = ground.measure_labelled(labelled, repeat)
         print_ground(content["ground_scores"])
-    for each in recordings:
-        if drives := measure_recording(each):
+    for candidate in recordings:
+        if drives := measure_recording(candidate):
             content["tracking"] = drives
             print_tracking(drives)
     content["startup"] = measure_startup(repeat)
@@ -137,24 +139,24 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
 
 def _with_camera(recording: Recording, pedestrian: list[Frame], count: int) -> list[tuple]:
     """Return (scan, camera) of frames with a pedestrian, or of any frames if these are few."""
-    chosen = pedestrian if len(pedestrian) >= FEW else recording.frames
-    return [(f.load(), f.camera()) for f in choose_evenly(chosen, count)]
+    selected = pedestrian if len(pedestrian) >= MIN_PEDESTRIAN_FRAMES else recording.frames
+    return [(f.load(), f.camera()) for f in choose_evenly(selected, count)]
 
 
 def _full_scans(recording: Recording, count: int) -> list[PointCloud]:
-    whole = [f for f in recording if len(f.load()) > FULL_SCAN]
-    return [f.load() for f in choose_evenly(whole, count)]
+    full_scans = [f for f in recording if len(f.load()) > MIN_FULL_SCAN_POINTS]
+    return [f.load() for f in choose_evenly(full_scans, count)]
 
 
 def _measure(in_view: list[np.ndarray], scans: list[PointCloud], repeat: int) -> dict:
     """Measure and print each algorithm and its peers."""
-    whole = [f.xyz for f in scans]
-    near, far, rest = (
+    full_scans = [f.xyz for f in scans]
+    obstacles_in_view, obstacles, cloth_obstacles = (
         [xyz.compress(~segment(xyz), axis=0) for xyz in clouds]
         for clouds, segment in (
             (in_view, segment_by_threshold),
-            (whole, segment_by_threshold),
-            (whole, segment_by_cloth),
+            (full_scans, segment_by_threshold),
+            (full_scans, segment_by_cloth),
         )
     )
     content = {}
@@ -163,18 +165,18 @@ def _measure(in_view: list[np.ndarray], scans: list[PointCloud], repeat: int) ->
         content[name] = result
         print_measured(result)
 
-    show("dbscan_in_view", clustering.measure_dbscan("DBSCAN, in view", near, repeat, 12))
+    show("dbscan_in_view", clustering.measure_dbscan("DBSCAN, in view", obstacles_in_view, repeat, 12))
     show("threshold_in_view", ground.measure_threshold("Threshold, in view", in_view, repeat))
     if not scans:
-        errors.print(f"no scan has more than {FULL_SCAN} points: whole scans are not measured")
+        errors.print(f"no scan has more than {MIN_FULL_SCAN_POINTS} points: whole scans are not measured")
         return content
-    show("dbscan_whole_scan", clustering.measure_dbscan("DBSCAN, whole scan", far, repeat, 20))
+    show("dbscan_whole_scan", clustering.measure_dbscan("DBSCAN, whole scan", obstacles, repeat, 20))
     for threshold in ("global", "local"):
-        show(f"euclidean_{threshold}", clustering.measure_euclidean(rest, threshold, repeat))
-    show("paper_c", clustering.measure_paper_c(whole, repeat))
-    show("threshold", ground.measure_threshold("Threshold, whole scan", whole, repeat))
+        show(f"euclidean_{threshold}", clustering.measure_euclidean(cloth_obstacles, threshold, repeat))
+    show("paper_c", clustering.measure_paper_c(full_scans, repeat))
+    show("threshold", ground.measure_threshold("Threshold, whole scan", full_scans, repeat))
     show("patchwork", ground.measure_patchwork(scans, repeat))
-    show("cloth", ground.measure_cloth(whole, repeat))
+    show("cloth", ground.measure_cloth(full_scans, repeat))
     return content
 
 

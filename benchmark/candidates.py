@@ -16,51 +16,51 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.scoring.centres.report import select_pedestrians
 
-SAME = 0.02  # max distance in metres between equal boxes; two RANSAC planes differ a little
+MAX_DIFFERENCE_M = 0.02  # max distance in metres between equal boxes; two RANSAC planes differ a little
 
 
 def compare_candidates(frames: list[Frame], repeat: int) -> dict:
     """Return the median times of both, and how well their results agree."""
-    ours: dict[str, list[float]] = {}
-    plain: dict[str, list[float]] = {}
-    best: dict[str, list[float]] = {}
-    agree = {
+    our_ms: dict[str, list[float]] = {}
+    plain_ms: dict[str, list[float]] = {}
+    best_ms: dict[str, list[float]] = {}
+    agreement = {
         "frames": len(frames),
         "labels_identical": 0,
         "candidates_same_given_ground": 0,
         "candidates": 0,
         "candidates_same": 0,
     }
-    for f in show_progress(frames, "timing", len(frames)):
-        truth, scan, camera = select_pedestrians(f.truth()), f.load(), f.camera()
+    for frame in show_progress(frames, "timing", len(frames)):
+        truth, scan, camera = select_pedestrians(frame.truth()), frame.load(), frame.camera()
         arguments = scan.xyz, camera.projection, camera.width, camera.height, truth
-        theirs = [plain_stm_cpa.candidates(*arguments) for _ in range(min(repeat, 3))]
-        mine = [find_candidates(scan, make_truth_source(truth), camera, PAPER) for _ in range(repeat)]
-        _median_of_steps(plain, [r["ms"] for r in theirs])
-        _median_of_steps(ours, [found.ms for _, found in mine])
+        plain_results = [plain_stm_cpa.find_candidates(*arguments) for _ in range(min(repeat, 3))]
+        our_results = [find_candidates(scan, make_truth_source(truth), camera, PAPER) for _ in range(repeat)]
+        _median_of_steps(plain_ms, [r["ms"] for r in plain_results])
+        _median_of_steps(our_ms, [refined.ms for _, refined in our_results])
         _median_of_steps(
-            best, [find_candidates(scan, make_truth_source(truth), camera, BEST)[1].ms for _ in range(repeat)]
+            best_ms, [find_candidates(scan, make_truth_source(truth), camera, BEST)[1].ms for _ in range(repeat)]
         )
-        result = theirs[0]
+        result = plain_results[0]
         # Given the same ground, the clusters and candidates must be identical.
         ids = cluster_obstacles(result["points"], result["ground"], PAPER.clustering)
-        agree["labels_identical"] += np.array_equal(ids, result["labels"])
+        agreement["labels_identical"] += np.array_equal(ids, result["labels"])
         boxes = fit_grounded_boxes(result["points"], result["ground"], ids)
         segmented = SegmentedCloud(np.arange(len(ids)), result["points"], result["ground"], ids, boxes)
-        found = refine_segmented(segmented, make_truth_source(truth), PAPER)
-        agree["candidates_same_given_ground"] += all(
-            len(getattr(found, s)) == len(result[s]) == _count_shared(getattr(found, s).boxes, result[s])
+        refined = refine_segmented(segmented, make_truth_source(truth), PAPER)
+        agreement["candidates_same_given_ground"] += all(
+            len(getattr(refined, s)) == len(result[s]) == _count_shared(getattr(refined, s).boxes, result[s])
             for s in STAGES
         )
         # Each implementation with its own RANSAC.
-        agree["candidates"] += max(len(mine[0][1].final), len(result["final"]))
-        agree["candidates_same"] += _count_shared(mine[0][1].final.boxes, result["final"])
+        agreement["candidates"] += max(len(our_results[0][1].final), len(result["final"]))
+        agreement["candidates_same"] += _count_shared(our_results[0][1].final.boxes, result["final"])
     medians = {
         name: {k: float(np.median(v)) for k, v in steps.items()}
-        for name, steps in (("ours_ms", ours), ("plain_ms", plain), ("best_ms", best))
+        for name, steps in (("ours_ms", our_ms), ("plain_ms", plain_ms), ("best_ms", best_ms))
     }
     ratios = {k: medians["plain_ms"][k] / medians["ours_ms"][k] for k in medians["plain_ms"]}
-    return {**medians, "times_faster": ratios, "agreement": agree}
+    return {**medians, "times_faster": ratios, "agreement": agreement}
 
 
 def _median_of_steps(times: dict[str, list[float]], runs: list[dict[str, float]]) -> None:
@@ -71,10 +71,10 @@ def _median_of_steps(times: dict[str, list[float]], runs: list[dict[str, float]]
 
 
 def _count_shared(a: np.ndarray, b: np.ndarray) -> int:
-    """Count the boxes of a that have one in b within SAME metres in every value."""
+    """Count the boxes of a that have one in b within MAX_DIFFERENCE_M metres in every value."""
     if len(a) == 0 or len(b) == 0:
         return 0
-    return int((np.abs(a[:, None] - b[None]).max(axis=2) <= SAME).any(axis=1).sum())
+    return int((np.abs(a[:, None] - b[None]).max(axis=2) <= MAX_DIFFERENCE_M).any(axis=1).sum())
 
 
 def print_comparison(content: dict) -> None:
@@ -82,21 +82,21 @@ def print_comparison(content: dict) -> None:
     for name in ("step", "plain", "ours", "times faster", "ours, best"):
         table.add_column(name, justify="left" if name == "step" else "right")
     for step, best in content["best_ms"].items():
-        peer = content["plain_ms"].get(step)
+        plain_ms = content["plain_ms"].get(step)
         table.add_row(
             step,
-            "" if peer is None else f"{peer:.2f}",
+            "" if plain_ms is None else f"{plain_ms:.2f}",
             f"{content['ours_ms'][step]:.2f}",
-            "" if peer is None else f"{content['times_faster'][step]:.1f}",
+            "" if plain_ms is None else f"{content['times_faster'][step]:.1f}",
             f"{best:.2f}",
             style="bold" if step == "total" else "",
         )
     console.print(table)
-    agree = content["agreement"]
+    agreement = content["agreement"]
     console.print(
-        f"cluster labels identical in {agree['labels_identical']} of {agree['frames']} "
+        f"cluster labels identical in {agreement['labels_identical']} of {agreement['frames']} "
         "frames, border points included; candidates of all stages the same in "
-        f"{agree['candidates_same_given_ground']} (same ground for both); with each "
-        f"its own RANSAC {agree['candidates_same']} of {agree['candidates']} final "
+        f"{agreement['candidates_same_given_ground']} (same ground for both); with each "
+        f"its own RANSAC {agreement['candidates_same']} of {agreement['candidates']} final "
         "candidates are the same"
     )

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from benchmark import peers, plain_euclidean
 from benchmark.rows import add_target, compute_speedup, make_measurement, make_row
-from benchmark.timing import SLOW_REPEAT, Clock, choose_evenly, run_in_child, thin
+from benchmark.timing import SLOW_REPEAT, Clock, choose_evenly, run_in_child, thin_cloud
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import DbscanParams, EuclideanParams
@@ -29,24 +29,24 @@ def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: fl
     The target refers to the faster of scikit-learn's two. Labels must equal scikit-learn's, border
     points included; for the other peers noise and the partition of the core points must be equal.
     """
-    here = [p for p in peers.DBSCANS if not p.missing()]
-    rows = {p.name: make_row(p.name, note=p.missing()) for p in peers.DBSCANS}
+    installed = [p for p in peers.DBSCANS if not p.find_problem()]
+    rows = {p.name: make_row(p.name, note=p.find_problem()) for p in peers.DBSCANS}
     ms: dict[str, float] = {}
     for group, run in (
-        ([p for p in here if p != peers.WHEEL], measure_dbscans),
-        ([p for p in here if p == peers.WHEEL], partial(run_in_child, measure_dbscans)),
+        ([p for p in installed if p != peers.WHEEL], measure_dbscans),
+        ([p for p in installed if p == peers.WHEEL], partial(run_in_child, measure_dbscans)),
     ):
         if group:
             times, same, differ = run([peers.DBSCANS.index(p) for p in group], clouds, repeat, title)
             ms |= times
             rows |= {p.name: compute_speedup(p.name, times, None, same[p.name], differ[p.name]) for p in group}
-    faster = min((p.name for p in peers.SKLEARN), key=lambda name: ms[name])
-    rows[faster] = add_target(rows[faster], target)
+    faster_peer = min((p.name for p in peers.SKLEARN), key=lambda name: ms[name])
+    rows[faster_peer] = add_target(rows[faster_peer], target)
     return make_measurement(title, len(clouds), np.median([len(c) for c in clouds]), list(rows.values()))
 
 
 def measure_dbscans(
-    chosen: list[int], clouds: list[np.ndarray], repeat: int, title: str
+    indices: list[int], clouds: list[np.ndarray], repeat: int, title: str
 ) -> tuple[dict, Counter, Counter]:
     """Measure our DBSCAN and the chosen peers.
 
@@ -54,27 +54,29 @@ def measure_dbscans(
     times, the number of clouds with equal results, and the number of points that only one of the
     two calls noise.
     """
-    group = [peers.DBSCANS[i] for i in chosen]
+    group = [peers.DBSCANS[i] for i in indices]
 
-    def calls(xyz):
+    def make_calls(xyz):
         return {
-            **{p.name: partial(peers.by_bands, p.run, xyz) for p in group},
+            **{p.name: partial(peers.cluster_by_bands, p.run, xyz) for p in group},
             "ours": partial(distance_aware_dbscan, xyz),
         }
 
-    clock = Clock(repeat, calls(thin(clouds[0])))
+    clock = Clock(repeat, make_calls(thin_cloud(clouds[0])))
     same: Counter[str] = Counter()
     differ: Counter[str] = Counter()
     for xyz in show_progress(clouds, title, len(clouds)):
-        found = clock.time(calls(xyz))
-        ours, core = found["ours"], find_core_points(xyz)
+        results = clock.time(make_calls(xyz))
+        our_labels, is_core = results["ours"], find_core_points(xyz)
         for p in group:
-            theirs = found[p.name]
+            peer_labels = results[p.name]
             same[p.name] += (
-                np.array_equal(theirs, ours) if p in peers.SKLEARN else have_same_clusters(theirs, ours, core)
+                np.array_equal(peer_labels, our_labels)
+                if p in peers.SKLEARN
+                else have_same_clusters(peer_labels, our_labels, is_core)
             )
-            differ[p.name] += int(((theirs == 0) != (ours == 0)).sum())
-    return clock.medians(), same, differ
+            differ[p.name] += int(((peer_labels == 0) != (our_labels == 0)).sum())
+    return clock.compute_medians(), same, differ
 
 
 def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> dict:
@@ -86,15 +88,18 @@ def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> 
     if threshold == "local":
         clouds, repeat = choose_evenly(clouds, (len(clouds) + 1) // 2), min(repeat, SLOW_REPEAT)
 
-    def calls(xyz):
-        return {PLAIN: partial(plain_euclidean.euclidean, xyz, params), "ours": partial(cluster_euclidean, xyz, params)}
+    def make_calls(xyz):
+        return {
+            PLAIN: partial(plain_euclidean.cluster_euclidean, xyz, params),
+            "ours": partial(cluster_euclidean, xyz, params),
+        }
 
     title = f"Adaptive Euclidean, {threshold} threshold, whole scan"
-    clock, same = Clock(repeat, calls(thin(clouds[0]))), 0
+    clock, same = Clock(repeat, make_calls(thin_cloud(clouds[0]))), 0
     for xyz in show_progress(clouds, title, len(clouds)):
-        found = clock.time(calls(xyz))
-        same += have_same_clusters(found[PLAIN], found["ours"], found["ours"] > 0)
-    rows = [compute_speedup(PLAIN, clock.medians(), 3, same)]
+        results = clock.time(make_calls(xyz))
+        same += have_same_clusters(results[PLAIN], results["ours"], results["ours"] > 0)
+    rows = [compute_speedup(PLAIN, clock.compute_medians(), 3, same)]
     return make_measurement(title, len(clouds), np.median([len(c) for c in clouds]), rows)
 
 
@@ -105,14 +110,14 @@ def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
         rest = xyz.compress(~segment_by_cloth(xyz), axis=0)
         return cluster_euclidean(rest, EuclideanParams(threshold=threshold))
 
-    def calls(xyz):
+    def make_calls(xyz):
         return {"cloth": partial(segment_by_cloth, xyz), **{t: partial(segment, xyz, t) for t in ("global", "local")}}
 
     title = "Paper C: cloth and Euclidean, whole scan"
-    clock = Clock(repeat, calls(thin(scans[0])))
+    clock = Clock(repeat, make_calls(thin_cloud(scans[0])))
     for xyz in show_progress(scans, title, len(scans)):
-        clock.time(calls(xyz))
-    ms = clock.medians()
+        clock.time(make_calls(xyz))
+    ms = clock.compute_medians()
     rows = [make_row(f"({t} threshold)", ours_ms=ms[t], value=ms[t], unit="ms", target=60) for t in ("global", "local")]
     return make_measurement(title, len(scans), np.median([len(s) for s in scans]), rows, cloth_ms=ms["cloth"])
 
@@ -120,17 +125,17 @@ def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
 def find_core_points(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
     """Return the mask (N,) of points with min_samples points of their band within its eps."""
 
-    def labels(band, eps, min_samples):
+    def label_core_points(band, eps, min_samples):
         tree = cKDTree(band.astype(np.float64))
-        found = tree.query_ball_point(tree.data, eps, return_length=True)
-        return np.where(found >= min_samples, 0, -1)
+        counts = tree.query_ball_point(tree.data, eps, return_length=True)
+        return np.where(counts >= min_samples, 0, -1)
 
-    return peers.by_bands(labels, xyz, params) > 0
+    return peers.cluster_by_bands(label_core_points, xyz, params) > 0
 
 
-def have_same_clusters(a: np.ndarray, b: np.ndarray, core: np.ndarray) -> bool:
+def have_same_clusters(a: np.ndarray, b: np.ndarray, is_core: np.ndarray) -> bool:
     """Return True if labels a and b (N,) have equal noise (0) and partition core points equally."""
     if not np.array_equal(a == 0, b == 0):
         return False
-    pairs = np.unique(np.stack([a[core], b[core]]), axis=1)
+    pairs = np.unique(np.stack([a[is_core], b[is_core]]), axis=1)
     return all(len(np.unique(side)) == pairs.shape[1] for side in pairs)

@@ -34,9 +34,9 @@ from lidar_perception.runs.threads import get_thread_count, set_thread_count
 from lidar_perception.types import PointCloud
 
 PAPER_TO_V0 = {"v0": 1.0, "v1": 1.06, "v2": 1.86, "v3": 2.48, "v4": 3.54}  # time relative to V0 in paper B, RTX 4090
-TARGET = 1.6  # target: V4 takes less than this factor times V0
+MAX_V4_TO_V0 = 1.6  # target: V4 takes less than this factor times V0
 CANDIDATES = 200  # anchors above the threshold, typical of a street
-FEW = 3  # scans for the full network on a CPU, which takes half a second per frame
+MAX_SLOW_SCANS = 3  # scans for the full network on a CPU, which takes half a second per frame
 
 
 def measure_detection(scans: list[PointCloud], repeat: int, sizes: Sequence[str] = tuple(SIZES)) -> dict:
@@ -46,15 +46,15 @@ def measure_detection(scans: list[PointCloud], repeat: int, sizes: Sequence[str]
     thresholds, which let CANDIDATES anchors pass.
     """
     device = find_device()
-    name = torch.cuda.get_device_name(device) if device != CPU else read_cpu_name()
-    content: dict[str, Any] = {"device": name, "threads": get_thread_count(), "sizes": {}}
+    device_name = torch.cuda.get_device_name(device) if device != CPU else read_cpu_name()
+    content: dict[str, Any] = {"device": device_name, "threads": get_thread_count(), "sizes": {}}
     for size in sizes:
-        chosen = choose_evenly(scans, FEW) if (size, device) == ("full", CPU) else scans
-        detectors = {version: _make_detector(version, size, device, chosen[0]) for version in VERSIONS}
+        selected = choose_evenly(scans, MAX_SLOW_SCANS) if (size, device) == ("full", CPU) else scans
+        detectors = {version: _make_detector(version, size, device, selected[0]) for version in VERSIONS}
         content["sizes"][size] = {
-            "frames": len(chosen),
-            "points": float(np.median([len(s) for s in chosen])),
-            "versions": _compute_medians(detectors, chosen, repeat, f"PointPillars {size}"),
+            "frames": len(selected),
+            "points": float(np.median([len(s) for s in selected])),
+            "versions": _compute_medians(detectors, selected, repeat, f"PointPillars {size}"),
         }
     return content
 
@@ -68,18 +68,18 @@ def _compute_medians(
             for version, detector in detectors.items():
                 timings = detector(scan).timings
                 ms[version][i, j] = [timings[step] for step in STEPS]
-    found: dict[str, dict] = {}
+    figures_by_version: dict[str, dict] = {}
     for version, runs in ms.items():
         steps = np.median(np.median(runs, axis=1), axis=0)
         total = float(np.median(np.median(runs.sum(axis=2), axis=1)))
-        found[version] = {
+        figures_by_version[version] = {
             "ms": dict(zip(STEPS, steps.tolist())),
             "total_ms": total,
             "share": dict(zip(STEPS, (steps / steps.sum()).tolist())),
-            "to_v0": total / found["v0"]["total_ms"] if found else 1.0,
+            "to_v0": total / figures_by_version["v0"]["total_ms"] if figures_by_version else 1.0,
             "paper_to_v0": PAPER_TO_V0[version],
         }
-    return found
+    return figures_by_version
 
 
 class RecordingNetwork:
@@ -110,9 +110,9 @@ def _make_detector(version: str, size: str, device: str, scan: PointCloud) -> Po
     detector.warm_up()
     detector(scan)
     assert recording.logits is not None
-    best = np.sort(expit(recording.logits.max(axis=1)))
-    least = float(best[-min(CANDIDATES, len(best))])
-    detector = detector.with_min_score(least)
+    scores = np.sort(expit(recording.logits.max(axis=1)))
+    threshold = float(scores[-min(CANDIDATES, len(scores))])
+    detector = detector.with_min_score(threshold)
     detector.proposer.network = recording.network
     detector(scan)
     return detector
@@ -128,18 +128,22 @@ def print_detection(content: dict) -> None:
         )
         for name in ("version", *STEPS, "total", "to v0", "paper's"):
             table.add_column(name, justify="left" if name == "version" else "right")
-        for version, found in figures["versions"].items():
+        for version, version_figures in figures["versions"].items():
             table.add_row(
                 version,
-                *(f"{found['ms'][step]:.1f} ({100 * found['share'][step]:.0f} %)" for step in STEPS),
-                f"{found['total_ms']:.1f}",
-                f"{found['to_v0']:.2f}",
-                f"{found['paper_to_v0']:.2f}",
+                *(
+                    f"{version_figures['ms'][step]:.1f} ({100 * version_figures['share'][step]:.0f} %)"
+                    for step in STEPS
+                ),
+                f"{version_figures['total_ms']:.1f}",
+                f"{version_figures['to_v0']:.2f}",
+                f"{version_figures['paper_to_v0']:.2f}",
             )
         console.print(table)
         ratio = figures["versions"]["v4"]["to_v0"]
         console.print(
-            f"v4 takes {ratio:.2f} of the time of v0, target < {TARGET}: " + ("met" if ratio < TARGET else "not met")
+            f"v4 takes {ratio:.2f} of the time of v0, target < {MAX_V4_TO_V0}: "
+            + ("met" if ratio < MAX_V4_TO_V0 else "not met")
         )
 
 
@@ -152,19 +156,19 @@ def measure_engines(scans: list[PointCloud], repeat: int, detectors: Sequence[st
     set_thread_count(1)
     rows = []
     for weights in detectors:
-        for range_ in "ahead", "around":
+        for range_name in "ahead", "around":
             engines = {
                 name: open_detector(
-                    weights, "cpu", range=range_, settings={f"{weights}.threads": 1, f"{weights}.engine": engine}
+                    weights, "cpu", range=range_name, settings={f"{weights}.threads": 1, f"{weights}.engine": engine}
                 )
                 for name, engine in (("torch", "torch"), ("ours", "sparse"))
             }
-            name, same = f"{weights} {range_}, engine torch", 0
+            name, same = f"{weights} {range_name}, engine torch", 0
             clock = Clock(repeat, {}, process_time)
             for scan in show_progress(scans, name, len(scans)):
-                found = clock.time({each: partial(detector, scan) for each, detector in engines.items()})
-                same += _have_same_detections(found["torch"], found["ours"])
-            ms = clock.medians()
+                results = clock.time({each: partial(detector, scan) for each, detector in engines.items()})
+                same += _have_same_detections(results["torch"], results["ours"])
+            ms = clock.compute_medians()
             rows.append(compute_speedup(name, {name: ms["torch"], "ours": ms["ours"]}, same=same))
     set_thread_count(threads)
     title = f"Sparse engine, CPU ms of one thread at a load of {os.getloadavg()[0]:.1f}"

@@ -1,4 +1,4 @@
-"""Both trackers on simulated drives that were not used to tune parameters, with intervals.
+"""Our tracker and AB3DMOT on simulated drives that were not used to tune parameters, with intervals.
 
     python -m benchmark.drives --drives 20 --seconds 20 --cache folder --json tracks.json
 
@@ -19,7 +19,7 @@ import numpy as np
 from rich.table import Table
 
 from benchmark.plain_ab3dmot import PlainAb3dmot
-from benchmark.tracking import Step, TrackedFrame, peer, tracker
+from benchmark.tracking import Step, TrackedFrame, make_peer_step, make_tracker_step
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.seed_sources import make_automatic_source
 from lidar_perception.candidates.seeds import load_seeds
@@ -47,7 +47,7 @@ DETECTORS = {
     **dict.fromkeys(NETWORKS, (tuple(DETECTED), ScoreParams().car)),
     "candidates": (("Pedestrian",), BEST.confidence.threshold),
 }
-RESAMPLED, LEAST, INTERVAL = 2000, 0.001, (2.5, 97.5)
+RESAMPLE_COUNT, MIN_DETECTION_SCORE, INTERVAL_PERCENTILES = 2000, 0.001, (2.5, 97.5)
 Drive = list[tuple[TrackedFrame, dict[str, Detections]]]
 Counts = dict[str, tuple[HotaCounts, ClearCounts]]
 
@@ -59,13 +59,13 @@ def detect(street: int, frames: int, people: float) -> Drive:
         "candidates": CandidateDetector(make_automatic_source(load_seeds(), params), FORWARD_CAMERA.camera(), params),
         **{name: open_detector(name, "cpu") for name in NETWORKS},
     }
-    detectors = {name: each.with_min_score(LEAST) for name, each in detectors.items()}
+    detectors = {name: detector.with_min_score(MIN_DETECTION_SCORE) for name, detector in detectors.items()}
     drive = []
     for i in range(frames):
         scan = simulate_scan(street, i, HDL64E, Scenes(None, people))
-        found = {name: _detect_street(each, scan.frame) for name, each in detectors.items()}
+        detections = {name: _detect_street(detector, scan.frame) for name, detector in detectors.items()}
         drive.append(
-            (TrackedFrame(Detections.none(), make_kitti_labels(scan.truth), scan.frame.stamp_ns, scan.pose), found)
+            (TrackedFrame(Detections.none(), make_kitti_labels(scan.truth), scan.frame.stamp_ns, scan.pose), detections)
         )
     return drive
 
@@ -91,57 +91,59 @@ def load_detections(folder: Path, street: int, frames: int, people: float) -> Dr
 def count_tracks(drive: list[TrackedFrame], step: Step, classes: tuple[str, ...]) -> Counts:
     """Count the tracks of a drive by class."""
     frames = []
-    for seen in drive:
-        ids, found = step(seen)
-        frames.append(make_pairs(seen.truth, to_tracked_labels(ids, found), FORWARD_CAMERA))
-    return {name: (count_hota(own := [drop_ignored(f[name]) for f in frames]), count_clear(own)) for name in classes}
+    for frame in drive:
+        ids, detections = step(frame)
+        frames.append(make_pairs(frame.truth, to_tracked_labels(ids, detections), FORWARD_CAMERA))
+    return {
+        name: (count_hota(pairs := [drop_ignored(f[name]) for f in frames]), count_clear(pairs)) for name in classes
+    }
 
 
 def measure_drives(drives: list[Drive], detector: str, params: TrackingParams) -> dict:
     """Return the scores of both trackers with intervals, by class."""
-    classes, operating = DETECTORS[detector]
-    chosen = [[replace(seen, found=found[detector]) for seen, found in drive] for drive in drives]
-    peers = [count_tracks(drive, peer(PlainAb3dmot(), operating), classes) for drive in chosen]
-    ours = [count_tracks(drive, tracker(params), classes) for drive in chosen]
-    return {name: _scores([p[name] for p in peers], [o[name] for o in ours]) for name in classes}
+    classes, min_score = DETECTORS[detector]
+    selected = [[replace(seen, found=found[detector]) for seen, found in drive] for drive in drives]
+    peers = [count_tracks(drive, make_peer_step(PlainAb3dmot(), min_score), classes) for drive in selected]
+    ours = [count_tracks(drive, make_tracker_step(params), classes) for drive in selected]
+    return {name: _compare_scores([p[name] for p in peers], [o[name] for o in ours]) for name in classes}
 
 
-def _scores(peers: list[tuple], ours: list[tuple]) -> dict:
+def _compare_scores(peers: list[tuple], ours: list[tuple]) -> dict:
     labels = [clear.tp + clear.fn for _, clear in ours]
-    both = {}
-    for name, counted in ("peer", peers), ("ours", ours):
-        clear = sum((c for _, c in counted), ClearCounts())
-        hota = resample(counted, lambda chosen: sum((h for h, _ in chosen), HotaCounts()).compute_scores()["HOTA"])
-        both[name] = {
-            **sum((h for h, _ in counted), HotaCounts()).compute_scores(),
+    scores = {}
+    for name, drive_counts in ("peer", peers), ("ours", ours):
+        clear = sum((c for _, c in drive_counts), ClearCounts())
+        hota = resample(drive_counts, lambda drawn: sum((h for h, _ in drawn), HotaCounts()).compute_scores()["HOTA"])
+        scores[name] = {
+            **sum((h for h, _ in drive_counts), HotaCounts()).compute_scores(),
             **clear.compute_scores(),
-            "interval": _interval(hota),
+            "interval": _compute_interval(hota),
             "switches": clear.switches,
             "fragments": clear.fragments,
             "hits": clear.tp,
             "false": clear.fp,
         }
-        both[name]["values"] = hota
-    difference = np.subtract(both["ours"].pop("values"), both["peer"].pop("values"))
+        scores[name]["values"] = hota
+    difference = np.subtract(scores["ours"].pop("values"), scores["peer"].pop("values"))
     return {
         "labels": sum(labels),
-        **both,
-        "gain": both["ours"]["HOTA"] - both["peer"]["HOTA"],
-        "gain_interval": _interval(difference),
+        **scores,
+        "gain": scores["ours"]["HOTA"] - scores["peer"]["HOTA"],
+        "gain_interval": _compute_interval(difference),
     }
 
 
 def resample(drives: list, value: Callable[[list], float]) -> np.ndarray:
-    """Return values (RESAMPLED,) over drives drawn with replacement.
+    """Return values (RESAMPLE_COUNT,) over drives drawn with replacement.
 
     The draws are the same for the same number of drives, so differences are paired.
     """
-    draws = np.random.default_rng(0).integers(0, len(drives), (RESAMPLED, len(drives)))
+    draws = np.random.default_rng(0).integers(0, len(drives), (RESAMPLE_COUNT, len(drives)))
     return np.array([value([drives[i] for i in draw]) for draw in draws])
 
 
-def _interval(values: np.ndarray) -> list[float]:
-    return [float(v) for v in np.percentile(values, INTERVAL)]
+def _compute_interval(values: np.ndarray) -> list[float]:
+    return [float(v) for v in np.percentile(values, INTERVAL_PERCENTILES)]
 
 
 def print_drives(content: dict) -> None:
@@ -150,21 +152,23 @@ def print_drives(content: dict) -> None:
     for name in "detector", "class", "boxes", "HOTA", "gain", "switches", "precision", "recall":
         table.add_column(name)
     for detector, classes in content["detectors"].items():
-        for name, own in classes.items():
-            pair = [f"{100 * own['peer'][k]:.1f}, {100 * own['ours'][k]:.1f}" for k in ("HOTA", "precision", "recall")]
+        for name, scores in classes.items():
+            pair = [
+                f"{100 * scores['peer'][k]:.1f}, {100 * scores['ours'][k]:.1f}" for k in ("HOTA", "precision", "recall")
+            ]
             table.add_row(
                 detector,
                 name,
-                str(own["labels"]),
+                str(scores["labels"]),
                 pair[0],
-                f"{100 * own['gain']:+.1f} [{_range(own['gain_interval'])}]",
-                f"{own['peer']['switches']}, {own['ours']['switches']}",
+                f"{100 * scores['gain']:+.1f} [{_format_interval(scores['gain_interval'])}]",
+                f"{scores['peer']['switches']}, {scores['ours']['switches']}",
                 *pair[1:],
             )
     console.print(table)
 
 
-def _range(interval: list[float]) -> str:
+def _format_interval(interval: list[float]) -> str:
     return " .. ".join(f"{100 * v:+.1f}" for v in interval)
 
 

@@ -1,4 +1,4 @@
-"""Thin wrappers of peers that are packages; a peer that is not installed reports it."""
+"""Peers from other packages, some of which may not be installed."""
 
 from __future__ import annotations
 
@@ -19,15 +19,19 @@ from lidar_perception.ground.params import ClothParams, PatchworkParams
 
 @dataclass(frozen=True)
 class Peer:
-    """An algorithm of a package; run has the signature of its kind, package is its name on PyPI."""
+    """An algorithm of another package.
+
+    package: name on PyPI.
+    run: the algorithm, with the signature stated above its section of this module.
+    """
 
     name: str
     package: str
     module: str
     run: Callable
 
-    def missing(self) -> str:
-        """Reason why it cannot run here, empty if it can."""
+    def find_problem(self) -> str:
+        """Return the reason why the peer cannot run here, or ""."""
         try:
             importlib.import_module(self.module)
         except ModuleNotFoundError:
@@ -36,14 +40,14 @@ class Peer:
             return "cannot be imported"
         return ""
 
-    def version(self) -> str:
-        return self.missing() or metadata.version(self.package)
+    def read_version(self) -> str:
+        return self.find_problem() or metadata.version(self.package)
 
 
 # DBSCAN: points (N, 3) float32, eps, min_samples -> (N,) labels, -1 for noise.
 
 
-def _sklearn(jobs: int | None) -> Callable:
+def _make_sklearn_dbscan(jobs: int | None) -> Callable:
     def run(xyz, eps, min_samples):
         from sklearn.cluster import DBSCAN
 
@@ -52,13 +56,13 @@ def _sklearn(jobs: int | None) -> Callable:
     return run
 
 
-def _wheel(xyz, eps, min_samples):
+def _run_dbscan_wheel(xyz, eps, min_samples):
     from dbscan import DBSCAN
 
     return DBSCAN(xyz.astype(np.float64), eps, min_samples)[0]
 
 
-def _open3d(xyz, eps, min_samples):
+def _run_open3d_dbscan(xyz, eps, min_samples):
     import open3d
 
     points = open3d.utility.Vector3dVector(xyz.astype(np.float64))
@@ -66,43 +70,43 @@ def _open3d(xyz, eps, min_samples):
 
 
 SKLEARN = (
-    Peer("scikit-learn", "scikit-learn", "sklearn", _sklearn(None)),
-    Peer("sklearn, n_jobs=-1", "scikit-learn", "sklearn", _sklearn(-1)),
+    Peer("scikit-learn", "scikit-learn", "sklearn", _make_sklearn_dbscan(None)),
+    Peer("sklearn, n_jobs=-1", "scikit-learn", "sklearn", _make_sklearn_dbscan(-1)),
 )
-OPEN3D = Peer("Open3D", "open3d", "open3d", _open3d)
+OPEN3D = Peer("Open3D", "open3d", "open3d", _run_open3d_dbscan)
 # Its threads keep polling after the call and use a quarter of a core until the process ends.
-WHEEL = Peer("dbscan", "dbscan", "dbscan", _wheel)
+WHEEL = Peer("dbscan", "dbscan", "dbscan", _run_dbscan_wheel)
 DBSCANS = (*SKLEARN, WHEEL, OPEN3D)
 
 
-def by_bands(run: Callable, xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
-    """Cluster band by band with a DBSCAN; labels (N,) as of distance_aware_dbscan, 0 noise."""
+def cluster_by_bands(run: Callable, xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
+    """Cluster each band with a DBSCAN. Return labels (N,) as distance_aware_dbscan does, 0 = noise."""
     band = np.searchsorted(np.asarray(params.range_limits), horizontal_range(xyz), side="right")
-    labels, last = np.zeros(len(xyz), np.int32), 0
+    labels, max_label = np.zeros(len(xyz), np.int32), 0
     for i, eps in enumerate(params.eps):
         members = np.flatnonzero(band == i)
         if len(members):
-            found = run(xyz[members], eps, params.min_samples)
-            labels[members] = np.where(found >= 0, found + last + 1, 0)
-            last += int(found.max()) + 1
+            band_labels = run(xyz[members], eps, params.min_samples)
+            labels[members] = np.where(band_labels >= 0, band_labels + max_label + 1, 0)
+            max_label += int(band_labels.max()) + 1
     return labels
 
 
 # RANSAC: points (N, 3), mask (N,) of low points to fit a plane to -> ground mask (N,).
 
-TRIALS = 2000  # maximum number of trials, as in paper A
+MAX_TRIALS = 2000  # maximum number of trials, as in paper A
 
 
-def _ransac(xyz: np.ndarray, low: np.ndarray) -> np.ndarray:
+def _run_ransac(xyz: np.ndarray, low: np.ndarray) -> np.ndarray:
     from sklearn.linear_model import LinearRegression, RANSACRegressor
 
-    found = RANSACRegressor(LinearRegression(), max_trials=TRIALS, residual_threshold=0.1, random_state=0).fit(
+    model = RANSACRegressor(LinearRegression(), max_trials=MAX_TRIALS, residual_threshold=0.1, random_state=0).fit(
         xyz[low, :2], xyz[low, 2]
     )
-    return np.abs(xyz[:, 2] - found.predict(xyz[:, :2])) <= 0.1
+    return np.abs(xyz[:, 2] - model.predict(xyz[:, :2])) <= 0.1
 
 
-RANSAC = Peer("scikit-learn's RANSAC", "scikit-learn", "sklearn", _ransac)
+RANSAC = Peer("scikit-learn's RANSAC", "scikit-learn", "sklearn", _run_ransac)
 
 
 # Ground segmentation. Both libraries print on file descriptor 1.
@@ -122,10 +126,8 @@ def silence_stdout() -> Iterator[None]:
         os.close(null)
 
 
-def _bare_patchwork(
-    points: np.ndarray, sensor_height: float, params: PatchworkParams = PatchworkParams()
-) -> np.ndarray:
-    """Return the indices of the ground among points (N, 4) float32, by a new object."""
+def _run_patchwork(points: np.ndarray, sensor_height: float, params: PatchworkParams = PatchworkParams()) -> np.ndarray:
+    """Return the indices of the ground among points (N, 4) float32, with a new object."""
     import pypatchworkpp
 
     settings = pypatchworkpp.Parameters()
@@ -139,10 +141,10 @@ def _bare_patchwork(
     return engine.getGroundIndices()
 
 
-def _falling_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()):
-    """Return indices of the ground among points (N, 3) float64, as the wheel's own vector.
+def _run_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()):
+    """Return the indices of the ground among points (N, 3) float64, in the wheel's own type.
 
-    No point may be far away: the wheel aborts the process if the grid does not fit into memory.
+    Points must not be far away: the wheel aborts the process if the grid does not fit into memory.
     Rigidness 3 and 500 iterations are its defaults.
     """
     import CSF
@@ -158,6 +160,6 @@ def _falling_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()):
     return ground
 
 
-PATCHWORK = Peer("pypatchworkpp", "pypatchworkpp", "pypatchworkpp", _bare_patchwork)
-CLOTH = Peer("cloth-simulation-filter", "cloth-simulation-filter", "CSF", _falling_cloth)
+PATCHWORK = Peer("pypatchworkpp", "pypatchworkpp", "pypatchworkpp", _run_patchwork)
+CLOTH = Peer("cloth-simulation-filter", "cloth-simulation-filter", "CSF", _run_cloth)
 ALL = (*DBSCANS, PATCHWORK, CLOTH)

@@ -19,11 +19,11 @@ GATES = {"Car": 6.0, "Pedestrian": 1.0, "Cyclist": 6.0}
 OTHER_GATE = 6.0
 
 # State: x y z yaw l w h, and the change of x y z per frame.
-STEP = np.eye(10)
-STEP[:3, 7:] = np.eye(3)
-SEEN = np.eye(7, 10)
-FIRST = np.diag([10.0] * 7 + [10_000.0] * 3)
-DRIFT = np.diag([1.0] * 7 + [0.01] * 3)
+TRANSITION = np.eye(10)
+TRANSITION[:3, 7:] = np.eye(3)
+MEASUREMENT = np.eye(7, 10)
+INITIAL_COVARIANCE = np.diag([10.0] * 7 + [10_000.0] * 3)
+PROCESS_NOISE = np.diag([1.0] * 7 + [0.01] * 3)
 
 
 @dataclass
@@ -31,30 +31,32 @@ class _Track:
     number: int
     state: np.ndarray
     score: float
-    covariance: np.ndarray = field(default_factory=lambda: FIRST.copy())
+    covariance: np.ndarray = field(default_factory=lambda: INITIAL_COVARIANCE.copy())
     hits: int = 1
     age: int = 0
 
     def predict(self) -> None:
-        self.state = STEP @ self.state
-        self.covariance = STEP @ self.covariance @ STEP.T + DRIFT
+        self.state = TRANSITION @ self.state
+        self.covariance = TRANSITION @ self.covariance @ TRANSITION.T + PROCESS_NOISE
         self.age += 1
 
     def update(self, measured: np.ndarray, score: float) -> None:
-        turn = (measured[3] - self.state[3] + np.pi) % (2 * np.pi) - np.pi
-        if abs(turn) > np.pi / 2:  # the detector confused front and back
+        yaw_change = (measured[3] - self.state[3] + np.pi) % (2 * np.pi) - np.pi
+        if abs(yaw_change) > np.pi / 2:  # the detector confused front and back
             self.state[3] += np.pi
-            turn -= np.sign(turn) * np.pi
+            yaw_change -= np.sign(yaw_change) * np.pi
         difference = measured - self.state[:7]
-        difference[3] = turn
-        gain = self.covariance @ SEEN.T @ np.linalg.inv(SEEN @ self.covariance @ SEEN.T + np.eye(7))
+        difference[3] = yaw_change
+        gain = (
+            self.covariance @ MEASUREMENT.T @ np.linalg.inv(MEASUREMENT @ self.covariance @ MEASUREMENT.T + np.eye(7))
+        )
         self.state = self.state + gain @ difference
-        self.covariance = (np.eye(10) - gain @ SEEN) @ self.covariance
+        self.covariance = (np.eye(10) - gain @ MEASUREMENT) @ self.covariance
         self.score, self.hits, self.age = score, self.hits + 1, 0
 
 
 class PlainAb3dmot:
-    """tracker(detections, pose) -> ids (K,), Detections; pose (4, 4) of the sensor or None."""
+    """Tracker from detections and the sensor pose (4, 4) to ids (K,) and Detections."""
 
     def __init__(self) -> None:
         self.tracks: dict[int, list[_Track]] = {}
@@ -65,32 +67,32 @@ class PlainAb3dmot:
         pose = np.eye(4) if pose is None else pose
         self.frames += 1
         ids, boxes, classes, scores = [], [], [], []
-        for kind in sorted({*self.tracks, *detections.class_ids.tolist()}):
-            for track in self._of_class(kind, detections[detections.class_ids == kind], pose):
+        for class_id in sorted({*self.tracks, *detections.class_ids.tolist()}):
+            for track in self._track_class(class_id, detections[detections.class_ids == class_id], pose):
                 ids.append(track.number)
                 boxes.append(_transform(track.state[[0, 1, 2, 4, 5, 6, 3]], np.linalg.inv(pose)))
-                classes.append(kind)
+                classes.append(class_id)
                 scores.append(track.score)
         return np.array(ids, int), Detections.of(np.reshape(boxes, (-1, 7)), np.array(classes, int), np.array(scores))
 
-    def _of_class(self, kind: int, detections: Detections, pose: np.ndarray) -> list[_Track]:
-        tracks = self.tracks.setdefault(kind, [])
-        moved = (_transform(box.astype(float), pose) for box in detections.boxes)
-        measured = [box[[0, 1, 2, 6, 3, 4, 5]] for box in moved]
+    def _track_class(self, class_id: int, detections: Detections, pose: np.ndarray) -> list[_Track]:
+        tracks = self.tracks.setdefault(class_id, [])
+        boxes = (_transform(box.astype(float), pose) for box in detections.boxes)
+        measurements = [box[[0, 1, 2, 6, 3, 4, 5]] for box in boxes]
         for track in tracks:
             track.predict()
-        gate, free = GATES.get(CLASSES[kind], OTHER_GATE), set(range(len(measured)))
-        if tracks and measured:
-            distance = np.array([[np.linalg.norm(m[:3] - t.state[:3]) for t in tracks] for m in measured])
+        gate, unassigned = GATES.get(CLASSES[class_id], OTHER_GATE), set(range(len(measurements)))
+        if tracks and measurements:
+            distance = np.array([[np.linalg.norm(m[:3] - t.state[:3]) for t in tracks] for m in measurements])
             for i, j in zip(*linear_sum_assignment(distance)):
                 if distance[i, j] <= gate:
-                    tracks[j].update(measured[i], float(detections.scores[i]))
-                    free.discard(int(i))
-        for i in sorted(free):
-            tracks.append(_Track(self.next, np.append(measured[i], np.zeros(3)), float(detections.scores[i])))
+                    tracks[j].update(measurements[i], float(detections.scores[i]))
+                    unassigned.discard(int(i))
+        for i in sorted(unassigned):
+            tracks.append(_Track(self.next, np.append(measurements[i], np.zeros(3)), float(detections.scores[i])))
             self.next += 1
-        self.tracks[kind] = [t for t in tracks if t.age < MAX_AGE]
-        return [t for t in self.tracks[kind] if t.hits >= MIN_HITS or self.frames <= MIN_HITS]
+        self.tracks[class_id] = [t for t in tracks if t.age < MAX_AGE]
+        return [t for t in self.tracks[class_id] if t.hits >= MIN_HITS or self.frames <= MIN_HITS]
 
 
 def _transform(box: np.ndarray, pose: np.ndarray) -> np.ndarray:

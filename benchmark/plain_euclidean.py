@@ -15,30 +15,30 @@ from scipy.spatial import cKDTree
 
 from lidar_perception.clustering.params import EuclideanParams
 
-AT_ONCE = 4_000_000  # maximum number of neighbours held in memory: about 300 MB
+MAX_NEIGHBOURS = 4_000_000  # maximum number of neighbours held in memory: about 300 MB
 
 
-def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams()) -> np.ndarray:
+def cluster_euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams()) -> np.ndarray:
     """Cluster points (N, 3) float32, metres, as (N,) int32: 0 none, 1..K."""
     if len(xyz) == 0:
         return np.zeros(0, np.int32)
     tree = cKDTree(np.asarray(xyz, np.float32).astype(np.float64))
-    reach = _thresholds(tree, params)
-    found = tree.query_ball_point(tree.data, reach, return_length=True)
-    leads = found >= params.beta * np.log(len(xyz))
-    leaders = _components(tree, reach, leads)
-    labels = _numbered(_with_followers(tree, reach, leads, leaders), params.min_size)
-    return _merged(tree.data, labels, params.gamma) if params.gamma > 0 else labels
+    thresholds = _compute_thresholds(tree, params)
+    counts = tree.query_ball_point(tree.data, thresholds, return_length=True)
+    is_leader = counts >= params.beta * np.log(len(xyz))
+    components = _connect_leaders(tree, thresholds, is_leader)
+    labels = _number_clusters(_assign_followers(tree, thresholds, is_leader, components), params.min_size)
+    return _merge_clusters(tree.data, labels, params.gamma) if params.gamma > 0 else labels
 
 
-def _thresholds(tree: cKDTree, params: EuclideanParams) -> np.ndarray:
+def _compute_thresholds(tree: cKDTree, params: EuclideanParams) -> np.ndarray:
     """Compute the thresholds (N,) of Eq. 6 or Eq. 11, rounded to float32."""
     if params.threshold == "global":
         nearest = tree.query(tree.data, k=2)[0][:, 1]  # inf if there is only one point
         mean = np.full(tree.n, nearest.mean() if tree.n > 1 else 0.0)
     else:
         total, count = np.zeros(tree.n), np.zeros(tree.n, np.int64)
-        for i, j, squared in _neighbours(tree, np.ones(tree.n, bool), params.radius):
+        for i, j, squared in _find_neighbours(tree, np.ones(tree.n, bool), params.radius):
             other = (i != j) & (squared <= params.radius * params.radius)
             total += np.bincount(i[other], np.sqrt(squared[other]), tree.n)
             count += np.bincount(i[other], minlength=tree.n)
@@ -46,41 +46,43 @@ def _thresholds(tree: cKDTree, params: EuclideanParams) -> np.ndarray:
     return (params.alpha * mean).astype(np.float32).astype(np.float64)
 
 
-def _neighbours(tree: cKDTree, wanted: np.ndarray, radius: float) -> Iterator[tuple]:
+def _find_neighbours(tree: cKDTree, selected: np.ndarray, radius: float) -> Iterator[tuple]:
     """Return rows of the wanted points, rows of points within radius of them, squared distances.
 
     A few more points at the border are included. The search runs in parts to bound memory.
     """
-    rows = tree.indices[wanted[tree.indices]]  # in tree order, so that each part is spatially compact
+    rows = tree.indices[selected[tree.indices]]  # in tree order, so that each part is spatially compact
     if len(rows) == 0:
         return
     count = tree.query_ball_point(tree.data[rows], radius, return_length=True)
-    cuts = np.flatnonzero(np.diff(np.cumsum(count) // AT_ONCE)) + 1
+    cuts = np.flatnonzero(np.diff(np.cumsum(count) // MAX_NEIGHBOURS)) + 1
     for part in np.split(rows, cuts):
-        near = cKDTree(tree.data[part]).sparse_distance_matrix(tree, radius * (1 + 1e-9), output_type="ndarray")
-        i, j = part[near["i"]], near["j"]
+        pairs = cKDTree(tree.data[part]).sparse_distance_matrix(tree, radius * (1 + 1e-9), output_type="ndarray")
+        i, j = part[pairs["i"]], pairs["j"]
         offset = tree.data[i] - tree.data[j]
         offset *= offset
         yield i, j, offset[:, 0] + offset[:, 1] + offset[:, 2]
 
 
-def _components(tree: cKDTree, reach: np.ndarray, leads: np.ndarray) -> np.ndarray:
+def _connect_leaders(tree: cKDTree, thresholds: np.ndarray, is_leader: np.ndarray) -> np.ndarray:
     """Return the component (N,) of each leader (Eq. 8); followers are separate."""
     component = np.arange(tree.n)
-    for i, j, squared in _neighbours(tree, leads, reach[leads].max(initial=0.0)):
-        link = leads[j] & (squared <= reach[i] ** 2)
-        edges = component[i[link]], component[j[link]]
+    for i, j, squared in _find_neighbours(tree, is_leader, thresholds[is_leader].max(initial=0.0)):
+        is_linked = is_leader[j] & (squared <= thresholds[i] ** 2)
+        edges = component[i[is_linked]], component[j[is_linked]]
         graph = coo_matrix((np.ones(len(edges[0]), bool), edges), (tree.n, tree.n))
         component = connected_components(graph, directed=False)[1][component]
     return component
 
 
-def _with_followers(tree: cKDTree, reach: np.ndarray, leads: np.ndarray, component: np.ndarray) -> np.ndarray:
+def _assign_followers(
+    tree: cKDTree, thresholds: np.ndarray, is_leader: np.ndarray, component: np.ndarray
+) -> np.ndarray:
     """Return the component (N,) of each point, -1 for followers without a leader."""
-    result = np.where(leads, component, -1)
-    for i, j, squared in _neighbours(tree, ~leads, reach[leads].max(initial=0.0)):
-        reached = leads[j] & (squared <= reach[j] ** 2)
-        i, j, squared = i[reached], j[reached], squared[reached]
+    result = np.where(is_leader, component, -1)
+    for i, j, squared in _find_neighbours(tree, ~is_leader, thresholds[is_leader].max(initial=0.0)):
+        is_near = is_leader[j] & (squared <= thresholds[j] ** 2)
+        i, j, squared = i[is_near], j[is_near], squared[is_near]
         x, y, z = tree.data[j].T
         order = np.lexsort((z, y, x, squared, i))
         follower, first = np.unique(i[order], return_index=True)
@@ -88,17 +90,17 @@ def _with_followers(tree: cKDTree, reach: np.ndarray, leads: np.ndarray, compone
     return result
 
 
-def _numbered(component: np.ndarray, min_size: int = 1) -> np.ndarray:
+def _number_clusters(component: np.ndarray, min_size: int = 1) -> np.ndarray:
     """Number the components of at least min_size points 1..K by their first point, (N,) int32."""
-    kept = component >= 0
-    kept[kept] = np.bincount(component[kept])[component[kept]] >= min_size
-    _, first, inverse = np.unique(component[kept], return_index=True, return_inverse=True)
+    is_kept = component >= 0
+    is_kept[is_kept] = np.bincount(component[is_kept])[component[is_kept]] >= min_size
+    _, first, inverse = np.unique(component[is_kept], return_index=True, return_inverse=True)
     labels = np.zeros(len(component), np.int32)
-    labels[kept] = np.argsort(np.argsort(first))[inverse] + 1
+    labels[is_kept] = np.argsort(np.argsort(first))[inverse] + 1
     return labels
 
 
-def _merged(points: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
+def _merge_clusters(points: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
     """Merge by Eq. 9; the diameter of a cluster is the diagonal of its axis-aligned box."""
     count = labels.max(initial=0)
     if count < 2:
@@ -118,4 +120,4 @@ def _merged(points: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
     pairs = np.concatenate(first), np.concatenate(second)
     graph = coo_matrix((np.ones(len(pairs[0]), bool), pairs), (count, count))
     component = connected_components(graph, directed=False)[1]
-    return _numbered(np.where(labels > 0, component[labels - 1], -1))
+    return _number_clusters(np.where(labels > 0, component[labels - 1], -1))

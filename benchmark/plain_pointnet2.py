@@ -14,20 +14,20 @@ from torch import Tensor, nn
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 
 
-def farthest(xyz: Tensor, count: int) -> Tensor:
+def sample_farthest(xyz: Tensor, count: int) -> Tensor:
     """Return indices (B, count) of points (B, N, 3), each farthest from the previous ones."""
     batch, size = xyz.shape[:2]
-    chosen = torch.zeros(batch, count, dtype=torch.long)
-    apart, last = torch.full((batch, size), 1e10), torch.zeros(batch, dtype=torch.long)
-    every = torch.arange(batch)
+    indices = torch.zeros(batch, count, dtype=torch.long)
+    distances, last = torch.full((batch, size), 1e10), torch.zeros(batch, dtype=torch.long)
+    batch_rows = torch.arange(batch)
     for i in range(count):
-        chosen[:, i] = last
-        apart = torch.minimum(apart, ((xyz - xyz[every, last][:, None]) ** 2).sum(-1))
-        last = apart.argmax(dim=1)
-    return chosen
+        indices[:, i] = last
+        distances = torch.minimum(distances, ((xyz - xyz[batch_rows, last][:, None]) ** 2).sum(-1))
+        last = distances.argmax(dim=1)
+    return indices
 
 
-def ball(radius: float, count: int, xyz: Tensor, centres: Tensor) -> Tensor:
+def query_ball(radius: float, count: int, xyz: Tensor, centres: Tensor) -> Tensor:
     """Return indices (B, M, count) of the first points within the radius of centres (B, M, 3)."""
     size = xyz.shape[1]
     indices = torch.arange(size).expand(*centres.shape[:2], size).clone()
@@ -48,11 +48,12 @@ class SetAbstraction(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, xyz: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-        every = torch.arange(len(xyz))[:, None]
-        centres = xyz[every, farthest(xyz, self.count)]
-        indices = ball(self.radius, self.neighbours, xyz, centres)
+        batch_rows = torch.arange(len(xyz))[:, None]
+        centres = xyz[batch_rows, sample_farthest(xyz, self.count)]
+        indices = query_ball(self.radius, self.neighbours, xyz, centres)
         rows = torch.cat(
-            [xyz[every[:, :, None], indices] - centres[:, :, None], features[every[:, :, None], indices]], dim=-1
+            [xyz[batch_rows[:, :, None], indices] - centres[:, :, None], features[batch_rows[:, :, None], indices]],
+            dim=-1,
         )
         return centres, self.layers(rows.permute(0, 3, 2, 1)).amax(dim=2).transpose(1, 2)
 

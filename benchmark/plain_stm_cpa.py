@@ -20,7 +20,7 @@ CPA_RANGE, CPA_STEPS, CPA_DECREMENT, CPA_MIN = (15.0, 30.0), 2, 0.10, 0.20
 KERNEL = np.ones((3, 3), np.uint8)
 
 
-def candidates(
+def find_candidates(
     xyz: np.ndarray,
     projection: np.ndarray,
     width: int,
@@ -33,23 +33,23 @@ def candidates(
     Returns points in view, ground, labels, boxes by stage (K, 7) and ms by step. A given ground
     replaces RANSAC's, to compare the other steps separately.
     """
-    t = [perf_counter()]
+    times = [perf_counter()]
     homogeneous = np.column_stack([xyz, np.ones(len(xyz))]) @ projection.T
     depth = homogeneous[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = homogeneous[:, 0] / depth, homogeneous[:, 1] / depth
     points = xyz[(depth > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)]
-    t.append(perf_counter())
+    times.append(perf_counter())
 
     low = points[:, 2] < Z_MAX
     if ground is None:
         ransac = RANSACRegressor(LinearRegression(), max_trials=TRIALS, residual_threshold=INLIER, random_state=0).fit(
             points[low, :2], points[low, 2]
         )
-        away = np.abs(points[:, 2] - ransac.predict(points[:, :2]))
-        ground = low & (away <= INLIER)
+        distances_to_plane = np.abs(points[:, 2] - ransac.predict(points[:, :2]))
+        ground = low & (distances_to_plane <= INLIER)
     plane = LinearRegression().fit(points[ground, :2], points[ground, 2])
-    t.append(perf_counter())
+    times.append(perf_counter())
 
     labels = np.full(len(points), -1)
     distance = np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2)
@@ -57,54 +57,54 @@ def candidates(
         band = ~ground & (distance >= near) & (distance < far)
         if band.sum() == 0:
             continue
-        found = DBSCAN(eps=eps, min_samples=MIN_SAMPLES).fit(points[band]).labels_
-        labels[band] = np.where(found >= 0, found + labels.max() + 1, -1)
+        band_labels = DBSCAN(eps=eps, min_samples=MIN_SAMPLES).fit(points[band]).labels_
+        labels[band] = np.where(band_labels >= 0, band_labels + labels.max() + 1, -1)
     clusters = [points[labels == k] for k in range(labels.max() + 1)]
-    t.append(perf_counter())
+    times.append(perf_counter())
 
-    boxes = np.array([_box(c, plane) for c in clusters]).reshape(-1, 7)
-    t.append(perf_counter())
+    boxes = np.array([_fit_box(c, plane) for c in clusters]).reshape(-1, 7)
+    times.append(perf_counter())
 
     seed_box = pedestrians[np.argmin(np.hypot(pedestrians[:, 0], pedestrians[:, 1]))]
-    seed = points[~ground][_inside(points[~ground], seed_box)]
-    kept = [k for k in range(len(boxes)) if abs(boxes[k, 5] - seed_box[5]) <= HEIGHT_TOLERANCE]
-    t.append(perf_counter())
-    template = _silhouette(seed, 0)
-    plain = {k: _cosine(_silhouette(clusters[k], 0), template) for k in kept}
-    t.append(perf_counter())
-    final = dict(plain)
-    for k in kept:
+    seed = points[~ground][_is_inside(points[~ground], seed_box)]
+    matching = [k for k in range(len(boxes)) if abs(boxes[k, 5] - seed_box[5]) <= HEIGHT_TOLERANCE]
+    times.append(perf_counter())
+    template = _draw_silhouette(seed, 0)
+    stm_scores = {k: _compute_cosine(_draw_silhouette(clusters[k], 0), template) for k in matching}
+    times.append(perf_counter())
+    cpa_scores = dict(stm_scores)
+    for k in matching:
         if CPA_RANGE[0] <= np.hypot(boxes[k, 0], boxes[k, 1]) < CPA_RANGE[1]:
-            final[k] = _cosine(_silhouette(clusters[k], CPA_STEPS), template)
-    t.append(perf_counter())
+            cpa_scores[k] = _compute_cosine(_draw_silhouette(clusters[k], CPA_STEPS), template)
+    times.append(perf_counter())
 
     steps = ("view", "ground", "clustering", "boxes", "height", "stm", "cpa")
     return {
         "points": points,
         "ground": ground,
         "labels": labels + 1,
-        "stage1": boxes[kept],
-        "stage2": boxes[[k for k in kept if plain[k] >= TAU]],
-        "final": boxes[[k for k in kept if final[k] >= TAU]],
-        "ms": {s: 1e3 * (b - a) for s, a, b in zip(steps, t, t[1:])},
+        "stage1": boxes[matching],
+        "stage2": boxes[[k for k in matching if stm_scores[k] >= TAU]],
+        "final": boxes[[k for k in matching if cpa_scores[k] >= TAU]],
+        "ms": {s: 1e3 * (b - a) for s, a, b in zip(steps, times, times[1:])},
     }
 
 
-def _box(cluster: np.ndarray, plane: LinearRegression) -> list[float]:
+def _fit_box(cluster: np.ndarray, plane: LinearRegression) -> list[float]:
     low, high = cluster.min(axis=0), cluster.max(axis=0)
     centre = (low + high) / 2
     bottom = min(low[2], plane.predict(centre[None, :2])[0])
     return [*centre[:2], (bottom + high[2]) / 2, *(high - low)[:2], high[2] - bottom, 0.0]
 
 
-def _inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
+def _is_inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
     offset = points - box[:3]
     along = offset[:, 0] * np.cos(box[6]) + offset[:, 1] * np.sin(box[6])
     across = offset[:, 1] * np.cos(box[6]) - offset[:, 0] * np.sin(box[6])
     return (np.abs(along) <= box[3] / 2) & (np.abs(across) <= box[4] / 2) & (np.abs(offset[:, 2]) <= box[5] / 2)
 
 
-def _silhouette(cluster: np.ndarray, steps: int) -> np.ndarray:
+def _draw_silhouette(cluster: np.ndarray, steps: int) -> np.ndarray:
     cluster = cluster.astype(float)
     centroid = cluster.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov(cluster[:, :2].T))
@@ -113,15 +113,15 @@ def _silhouette(cluster: np.ndarray, steps: int) -> np.ndarray:
         lateral = -lateral
     y, z = (cluster - centroid)[:, :2] @ lateral, cluster[:, 2] - centroid[2]
     scales = [1.0] + [max(CPA_MIN, 1 - k * CPA_DECREMENT) for k in range(1, steps + 1)]
-    every_y = np.concatenate([s * y for s in scales])
-    every_z = np.concatenate([s * z for s in scales])
-    columns = (every_y - y.min()) / max(np.ptp(y), 1e-6) * COLUMNS
-    rows = (z.max() - every_z) / max(np.ptp(z), 1e-6) * ROWS
+    all_y = np.concatenate([s * y for s in scales])
+    all_z = np.concatenate([s * z for s in scales])
+    columns = (all_y - y.min()) / max(np.ptp(y), 1e-6) * COLUMNS
+    rows = (z.max() - all_z) / max(np.ptp(z), 1e-6) * ROWS
     image = np.zeros((ROWS, COLUMNS), np.uint8)
     image[np.minimum(rows.astype(int), ROWS - 1), np.minimum(columns.astype(int), COLUMNS - 1)] = 1
     closed = cv2.morphologyEx(image, cv2.MORPH_CLOSE, KERNEL)
     return cv2.dilate(closed, KERNEL).ravel().astype(float)
 
 
-def _cosine(a: np.ndarray, b: np.ndarray) -> float:
+def _compute_cosine(a: np.ndarray, b: np.ndarray) -> float:
     return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))

@@ -26,14 +26,14 @@ from lidar_perception.runs.terminal import console
 from lidar_perception.runs.threads import get_thread_count
 from lidar_perception.types import PointCloud
 
-COUNT = 100  # number of clusters
-NETWORK, WHOLE = 40.0, 120.0  # targets in ms for the network and for the whole detector
+MAX_CLUSTERS = 100  # number of clusters
+MAX_NETWORK_MS, MAX_DETECTOR_MS = 40.0, 120.0  # targets in ms for the network and for the whole detector
 
 
 def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
     """Measure median times over whole scans.
 
-    The networks have random weights, which do not affect time, and process COUNT clusters of a
+    The networks have random weights, which do not affect time, and process MAX_CLUSTERS clusters of a
     scan, or as many as it has.
     """
     torch.manual_seed(0)
@@ -51,21 +51,21 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
     for scan in scans:
         ground = segment_ground(scan, config.ground)
         cluster_ids = cluster_obstacles(scan.xyz, ground, config.clustering)
-        every = make_clusters(scan, cluster_ids, 5, ground)
-        some = every.take(np.arange(min(COUNT, len(every))))
-        calls: Calls = {name: partial(predict, network, some) for name, network in networks.items()}
-        calls["plain PointNet++ (SSG)"] = partial(_plain, plain, some, config.points)
+        all_clusters = make_clusters(scan, cluster_ids, 5, ground)
+        clusters = all_clusters.take(np.arange(min(MAX_CLUSTERS, len(all_clusters))))
+        calls: Calls = {name: partial(predict, network, clusters) for name, network in networks.items()}
+        calls["plain PointNet++ (SSG)"] = partial(_predict_plain, plain, clusters, config.points)
         calls["detector"] = partial(detector, scan)
         time_interleaved(calls, 1)
         ms, results = time_interleaved(calls, repeat)
         rows.append(ms)
         steps.append([results["detector"].timings[step] for step in STEPS])
-        counts.append((len(some), len(every), len(scan)))
-    middle = np.median(counts, axis=0)
+        counts.append((len(clusters), len(all_clusters), len(scan)))
+    medians = np.median(counts, axis=0)
     return {
-        "clusters": float(middle[0]),
-        "all_clusters": float(middle[1]),
-        "points": float(middle[2]),
+        "clusters": float(medians[0]),
+        "all_clusters": float(medians[1]),
+        "points": float(medians[2]),
         "threads": get_thread_count(),
         "scans": len(rows),
         "ms": {name: float(np.median([row[name] for row in rows])) for name in rows[0]},
@@ -74,7 +74,7 @@ def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
 
 
 @torch.inference_mode()
-def _plain(network: PlainPointNet2, clusters: Clusters, count: int) -> torch.Tensor:
+def _predict_plain(network: PlainPointNet2, clusters: Clusters, count: int) -> torch.Tensor:
     return network(torch.from_numpy(make_network_input(clusters, count).points))
 
 
@@ -96,12 +96,12 @@ def print_pointnet(content: dict) -> None:
         table.add_row(titles.get(name, name), f"{ms[name]:.1f}", f"{ms[name] / ms['improved']:.2f}")
     console.print(table)
     console.print(
-        f"network {ms['improved']:.1f} ms, target < {NETWORK:.0f}: "
-        f"{'reached' if ms['improved'] < NETWORK else 'missed'}"
+        f"network {ms['improved']:.1f} ms, target < {MAX_NETWORK_MS:.0f}: "
+        f"{'reached' if ms['improved'] < MAX_NETWORK_MS else 'missed'}"
     )
     steps = ", ".join(f"{step} {value:.1f}" for step, value in content["steps"].items())
     console.print(
         f"whole detector {ms['detector']:.1f} ms ({steps}) for {content['points']:.0f} "
-        f"points, {content['all_clusters']:.0f} clusters, target < {WHOLE:.0f}: "
-        f"{'reached' if ms['detector'] < WHOLE else 'missed'}"
+        f"points, {content['all_clusters']:.0f} clusters, target < {MAX_DETECTOR_MS:.0f}: "
+        f"{'reached' if ms['detector'] < MAX_DETECTOR_MS else 'missed'}"
     )

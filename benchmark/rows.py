@@ -83,8 +83,8 @@ def print_measured(content: dict) -> None:
         met = "" if r["met"] is None else "yes" if r["met"] else Text("no", "red")
         table.add_row(
             r["name"],
-            _ms(r["peer_ms"]),
-            _ms(r["ours_ms"]),
+            _format_ms(r["peer_ms"]),
+            _format_ms(r["ours_ms"]),
             r["note"] or format_value(r["value"], r["unit"]),
             format_target(r["target"], r["unit"]),
             met,
@@ -105,14 +105,14 @@ def print_ground(content: dict) -> None:
         table.add_section()
         table.add_row(protocol, style="bold")
         for method, report in content["methods"].items():
-            shown = [report.get("note", "")]
+            cells = [report.get("note", "")]
             if "protocols" in report:
                 scores = report["protocols"][protocol]
-                shown = [f"{scores[k]:.4f}" for k in ("precision", "recall", "f1")]
-                shown.append(_ms(report["ms"]))
-            table.add_row(method, *shown)
+                cells = [f"{scores[k]:.4f}" for k in ("precision", "recall", "f1")]
+                cells.append(_format_ms(report["ms"]))
+            table.add_row(method, *cells)
     console.print(table)
 
 
-def _ms(value: float | None) -> str:
+def _format_ms(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}" if value < 100 else f"{value:.0f}"

@@ -1,5 +1,5 @@
-"""Start of a process that detects: CPU time and memory until the detector is ready, with compiled
-code in the cache, against the same with torch; and CPU time with an empty cache."""
+"""CPU time and memory of a process until its detector is ready: with compiled code in the cache, with
+torch, and with an empty cache."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmark.rows import make_measurement, make_row
 
-CODE = {
+CODE_BY_NAME = {
     "fused": "import lidar_perception; lidar_perception.load_detector(device='cpu')",
     "fused, engine torch": "from lidar_perception.detectors.open import open_detector; "
     "open_detector(device='cpu', settings={'fused.engine': 'torch'})",
@@ -24,7 +24,7 @@ CODE = {
     "from lidar_perception.candidates.warm_up import warm_up_ground; "
     "warm_up_ground(P().ground)",
 }
-PRINT = """
+PRINT_USAGE = """
 import resource
 usage = resource.getrusage(resource.RUSAGE_SELF)
 status = open('/proc/self/status').read()
@@ -37,9 +37,9 @@ def measure_startup(repeat: int, cold: tuple[str, ...] = ("fused", "clustering")
     """Measure start-ups.
 
     Args:
-        cold: names in CODE that are also compiled from nothing, which takes a minute or more.
+        cold: names in CODE_BY_NAME that are also measured with an empty cache, which takes minutes.
     """
-    runs = {name: np.median([_start(code) for _ in range(repeat)], axis=0) for name, code in CODE.items()}
+    runs = {name: np.median([_run_process(code) for _ in range(repeat)], axis=0) for name, code in CODE_BY_NAME.items()}
     rows = [
         make_row(
             WITH_TORCH,
@@ -51,21 +51,21 @@ def measure_startup(repeat: int, cold: tuple[str, ...] = ("fused", "clustering")
     rows += [make_row(f"{name}, peak memory", value=memory, unit="MB") for name, (_, memory) in runs.items()]
     for name in cold:
         with tempfile.TemporaryDirectory() as folder:
-            seconds, _ = _start(CODE[name], NUMBA_CACHE_DIR=folder)
+            seconds, _ = _run_process(CODE_BY_NAME[name], NUMBA_CACHE_DIR=folder)
         rows.append(make_row(f"{name}, compiled from nothing", ours_ms=1e3 * seconds))
     title = f"Start of a process, CPU ms at a load of {os.getloadavg()[0]:.1f}"
     return make_measurement(title, repeat, 0, rows)
 
 
-def _start(code: str, **variables: str) -> tuple[float, float]:
+def _run_process(code: str, **variables: str) -> tuple[float, float]:
     """Return CPU seconds and peak memory in MB of a process that runs some code."""
-    done = subprocess.run(
-        [sys.executable, "-c", code + PRINT],
+    process = subprocess.run(
+        [sys.executable, "-c", code + PRINT_USAGE],
         text=True,
         check=True,
         capture_output=True,
         env={**os.environ, **variables},
         cwd=Path(__file__).resolve().parents[1],
     )
-    seconds, memory = map(float, done.stdout.split())
+    seconds, memory = map(float, process.stdout.split())
     return seconds, memory

@@ -47,7 +47,7 @@ class Clock:
             self.ms.setdefault(name, []).append(value)
         return results
 
-    def medians(self) -> dict[str, float]:
+    def compute_medians(self) -> dict[str, float]:
         """Return the medians over frames."""
         return {name: float(np.median(v)) for name, v in self.ms.items()}
 
@@ -65,6 +65,6 @@ def choose_evenly(items: Sequence, count: int) -> list:
     return [items[i] for i in np.linspace(0, len(items) - 1, count).round().astype(int)]
 
 
-def thin(xyz: np.ndarray) -> np.ndarray:
+def thin_cloud(xyz: np.ndarray) -> np.ndarray:
     """Return every 20th point, to warm up with."""
     return np.ascontiguousarray(xyz[::20])

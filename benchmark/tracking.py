@@ -23,8 +23,20 @@ from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, GroundTruth
 
-OPERATING = ScoreParams().car  # minimum score of the peer's input, because the peer ignores scores
-SHOWN = ("HOTA", "DetA", "AssA", "MOTA", "sAMOTA", "AMOTA", "switches", "fragments", "labels", "true_tracks", "tracks")
+PEER_MIN_SCORE = ScoreParams().car  # minimum score of the peer's input, because the peer ignores scores
+SHOWN_METRICS = (
+    "HOTA",
+    "DetA",
+    "AssA",
+    "MOTA",
+    "sAMOTA",
+    "AMOTA",
+    "switches",
+    "fragments",
+    "labels",
+    "true_tracks",
+    "tracks",
+)
 Step = Callable[["TrackedFrame"], tuple[np.ndarray, Detections]]
 
 
@@ -50,10 +62,10 @@ def measure_recording(recording: Recording) -> dict:
         truth, frame = frame.truth(), frame.with_cached_scan()
         if truth is not None and all("track_id" in extra for extra in truth.extras):
             if frame.sequence not in drives:
-                pose_of = make_pose_reader(source)
+                read_pose = make_pose_reader(source)
             drives.setdefault(frame.sequence, []).append(
                 TrackedFrame(
-                    detector(frame.load()).detections, truth, frame.stamp_ns, pose_of(frame), frame.calibration()
+                    detector(frame.load()).detections, truth, frame.stamp_ns, read_pose(frame), frame.calibration()
                 )
             )
     return measure_tracking(drives) if drives else {}
@@ -66,51 +78,59 @@ def measure_tracking(drives: Mapping[str, Sequence[TrackedFrame]], params: Track
     """
     return {
         name: _measure(drives, make)
-        for name, make in (("plain AB3DMOT", lambda: peer(PlainAb3dmot())), ("ours", lambda: tracker(params)))
+        for name, make in (
+            ("plain AB3DMOT", lambda: make_peer_step(PlainAb3dmot())),
+            ("ours", lambda: make_tracker_step(params)),
+        )
     }
 
 
-def peer(plain: PlainAb3dmot, operating: float = OPERATING) -> Step:
-    """Track one drive with the peer, which gets detections of score `operating` or more."""
-    return lambda seen: plain(seen.found[seen.found.scores >= operating], seen.pose)
+def make_peer_step(plain: PlainAb3dmot, min_score: float = PEER_MIN_SCORE) -> Step:
+    """Track one drive with the peer, which gets detections of at least min_score."""
+    return lambda frame: plain(frame.found[frame.found.scores >= min_score], frame.pose)
 
 
-def tracker(params: TrackingParams) -> Step:
+def make_tracker_step(params: TrackingParams) -> Step:
     """Track one drive with our tracker."""
-    ours = Tracker(params)
+    our_tracker = Tracker(params)
 
-    def step(seen: TrackedFrame) -> tuple[np.ndarray, Detections]:
-        tracks = ours(seen.found, seen.stamp_ns, seen.pose)
+    def step(frame: TrackedFrame) -> tuple[np.ndarray, Detections]:
+        tracks = our_tracker(frame.found, frame.stamp_ns, frame.pose)
         return tracks.ids, tracks.detections
 
     return step
 
 
-def _measure(drives: Mapping[str, Sequence[TrackedFrame]], make: Callable[[], Step]) -> dict:
+def _measure(drives: Mapping[str, Sequence[TrackedFrame]], make_step: Callable[[], Step]) -> dict:
     report, ms = TrackingReport(), []
     for name, frames in drives.items():
-        step = make()
-        for i, seen in enumerate(frames):
+        step = make_step()
+        for i, frame in enumerate(frames):
             start = perf_counter()
-            ids, found = step(seen)
+            ids, detections = step(frame)
             ms.append((perf_counter() - start) * 1e3)
-            report.update(observe(name, i, seen.truth, to_tracked_labels(ids, found), seen.calibration))
+            report.update(observe(name, i, frame.truth, to_tracked_labels(ids, detections), frame.calibration))
     return {**report.compute(), "ms": float(np.median(ms)) if ms else None}
 
 
 def print_tracking(content: dict) -> None:
     """Print a row per class and tracker."""
     table = Table(title="Tracks by centres, similarity 1 - d / 2 m")
-    for name in ("class", "tracker", *SHOWN):
+    for name in ("class", "tracker", *SHOWN_METRICS):
         table.add_column(name, justify="left" if name in ("class", "tracker") else "right")
-    for kind in next(iter(content.values()))["classes"]:
+    for class_name in next(iter(content.values()))["classes"]:
         table.add_section()
         for tracker, scores in content.items():
-            own = scores["classes"][kind]
-            if own is not None:
+            class_scores = scores["classes"][class_name]
+            if class_scores is not None:
                 table.add_row(
-                    kind,
+                    class_name,
                     tracker,
-                    *(str(own[name]) if isinstance(own[name], int) else f"{100 * own[name]:.1f}" for name in SHOWN),
+                    *(
+                        str(class_scores[name])
+                        if isinstance(class_scores[name], int)
+                        else f"{100 * class_scores[name]:.1f}"
+                        for name in SHOWN_METRICS
+                    ),
                 )
     console.print(table)

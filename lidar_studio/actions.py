@@ -1,8 +1,8 @@
 """Actions of a labelling session: apply(state, action, motion) returns the next state.
 
-An action is a dict like a line of the journal. It contains all computed values, so a journal can be
-replayed without a detector. Its tracks are Track objects; convert_tracks() converts from and to a
-line of the journal.
+An action is a dict with the fields of a line of the journal. It contains all computed values, so a
+journal can be replayed without a detector. Its tracks are Track objects; convert_tracks() converts
+them to and from the journal's form.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ def convert_tracks(action: Action, convert: Callable[[Any], Any]) -> Action:
 
 
 def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
-    """Return the next state and the change. InputError for an invalid action."""
+    """Apply an action. Return the next state and the change; raise InputError for an invalid action."""
     name, motion = action.get("do"), with_scan_poses(state, motion)
     if name == "poses":  # not a manual edit, so it cannot be undone
         poses = tuple(tuple(map(float, row)) for row in action["poses"])
         return replace(state, poses=poses, seq=state.seq + 1), Change(
-            {}, (state.seeds, state.seeds), (state.checked, state.checked), (state.kept, state.kept)
+            {}, (state.seeds, state.seeds), (state.checked, state.checked), (state.preserved, state.preserved)
         )
     if name == "undo" or name == "redo":
         return _undo(state) if name == "undo" else _redo(state)
@@ -47,7 +47,7 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
         {n: (state.tracks.get(n), track) for n, track in tracks.items() if state.tracks.get(n) != track},
         (state.seeds, seeds),
         (state.checked, checked),
-        (state.kept, action.get("kept", state.kept) if name == "import" else state.kept),
+        (state.preserved, action.get("kept", state.preserved) if name == "import" else state.preserved),
     )
     undo_stack: Stack = (change, state.undo_stack)
     redo_stack: Stack = None
@@ -59,7 +59,7 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
 
 
 def with_scan_poses(state: State, motion: Motion) -> Motion:
-    """Return the motion of a drive, with the poses from scan matching if it has no others."""
+    """Return the motion of a drive, with the poses from scan matching if the drive has none."""
     if motion.poses is not None or len(state.poses) != len(motion.times):
         return motion
     return Motion(motion.times, np.array(state.poses, np.float64).reshape(-1, 4, 4))
@@ -68,26 +68,26 @@ def with_scan_poses(state: State, motion: Motion) -> Motion:
 def _undo(state: State) -> tuple[State, Change]:
     if state.undo_stack is None:
         raise InputError("there is nothing to undo")
-    change, below = state.undo_stack
-    back = change.invert()
+    change, rest = state.undo_stack
+    inverse = change.invert()
     return replace(
-        state.with_change(back), seq=state.seq + 1, undo_stack=below, redo_stack=(change, state.redo_stack)
-    ), back
+        state.with_change(inverse), seq=state.seq + 1, undo_stack=rest, redo_stack=(change, state.redo_stack)
+    ), inverse
 
 
 def _redo(state: State) -> tuple[State, Change]:
     if state.redo_stack is None:
         raise InputError("there is nothing to redo")
-    change, below = state.redo_stack
+    change, rest = state.redo_stack
     return replace(
-        state.with_change(change), seq=state.seq + 1, undo_stack=(change, state.undo_stack), redo_stack=below
+        state.with_change(change), seq=state.seq + 1, undo_stack=(change, state.undo_stack), redo_stack=rest
     ), change
 
 
 Outcome = tuple[TrackChanges, Seeds, frozenset[int]]
 
 
-def _replace(state: State, *tracks: Track) -> Outcome:
+def _replace_tracks(state: State, *tracks: Track) -> Outcome:
     return {track.id: track for track in tracks}, state.seeds, state.checked
 
 
@@ -148,21 +148,21 @@ def require_class_name(action: Action) -> str:
     return name
 
 
-def _computed_tracks(state: State, action: Action) -> TrackChanges:
-    found: TrackChanges = {int(n): None for n in action.get("removed", ())}
-    found |= {track.id: track for track in action.get("tracks", ())}
-    return found
+def _get_computed_tracks(state: State, action: Action) -> TrackChanges:
+    changes: TrackChanges = {int(n): None for n in action.get("removed", ())}
+    changes |= {track.id: track for track in action.get("tracks", ())}
+    return changes
 
 
-def _replace_computed(state: State, action: Action, motion: Motion) -> Outcome:
-    return _computed_tracks(state, action), state.seeds, state.checked
+def _replace_with_computed(state: State, action: Action, motion: Motion) -> Outcome:
+    return _get_computed_tracks(state, action), state.seeds, state.checked
 
 
-def _seed(state: State, action: Action, motion: Motion) -> Outcome:
-    frame, own = require_frame(action, motion), action.get("track")
-    if not isinstance(own, int):
+def _add_seed_track(state: State, action: Action, motion: Motion) -> Outcome:
+    frame, track_id = require_frame(action, motion), action.get("track")
+    if not isinstance(track_id, int):
         raise InputError("a seed needs its track, which the server computes")
-    return _computed_tracks(state, action), add_seed(state.seeds, frame, own), state.checked
+    return _get_computed_tracks(state, action), add_seed(state.seeds, frame, track_id), state.checked
 
 
 def add_seed(seeds: Seeds, frame: int, track: int) -> Seeds:
@@ -170,26 +170,28 @@ def add_seed(seeds: Seeds, frame: int, track: int) -> Seeds:
     return seeds if (frame, track) in seeds else (*seeds, (frame, track))
 
 
-def _add(state: State, action: Action, motion: Motion) -> Outcome:
+def _add_track(state: State, action: Action, motion: Motion) -> Outcome:
     frame, box = require_frame(action, motion), Box(require_box_values(action), KEY)
-    return _replace(state, Track(state.next_id, require_class_name(action), ACCEPTED, 1.0, "person", {frame: box}))
+    return _replace_tracks(
+        state, Track(state.next_id, require_class_name(action), ACCEPTED, 1.0, "person", {frame: box})
+    )
 
 
-def _box(state: State, action: Action, motion: Motion) -> Outcome:
+def _set_box(state: State, action: Action, motion: Motion) -> Outcome:
     track, frame = require_track(state, action.get("track")), require_frame(action, motion)
     removed = track.removed_frames - {frame}
     boxes = apply_correction(track.boxes, removed, frame, require_box_values(action), motion)
-    return _replace(state, replace(track, boxes=boxes, removed_frames=removed))
+    return _replace_tracks(state, replace(track, boxes=boxes, removed_frames=removed))
 
 
-def _size(state: State, action: Action, motion: Motion) -> Outcome:
+def _set_size(state: State, action: Action, motion: Motion) -> Outcome:
     track = require_track(state, action.get("track"))
     size = require_positive(require_numbers(action, "size", 3))
     boxes = {}
     for frame, box in track.boxes.items():
         x, y, z, _, _, height, yaw = box.values
         boxes[frame] = Box((x, y, z + (size[2] - height) / 2, *size, yaw), box.kind)
-    return _replace(state, replace(track, boxes=boxes))
+    return _replace_tracks(state, replace(track, boxes=boxes))
 
 
 def _remove_box(state: State, action: Action, motion: Motion) -> Outcome:
@@ -199,62 +201,62 @@ def _remove_box(state: State, action: Action, motion: Motion) -> Outcome:
     if not boxes:
         return {track.id: None}, _drop_seeds(state.seeds, track.id), state.checked
     removed = track.removed_frames | {frame}
-    return _replace(state, replace(track, boxes=boxes, removed_frames=removed))
+    return _replace_tracks(state, replace(track, boxes=boxes, removed_frames=removed))
 
 
-def _interpolate(state: State, action: Action, motion: Motion) -> Outcome:
+def _interpolate_track(state: State, action: Action, motion: Motion) -> Outcome:
     track, frame = require_track(state, action.get("track")), require_frame(action, motion)
     removed = track.removed_frames - {frame}
     boxes = reinterpolate_frame(track.boxes, removed, frame, motion)
     if boxes is None:
         raise InputError(f"track {track.id} has no key box on both sides of frame {frame}")
-    return _replace(state, replace(track, boxes=boxes, removed_frames=removed))
+    return _replace_tracks(state, replace(track, boxes=boxes, removed_frames=removed))
 
 
 def _drop_seeds(seeds: Seeds, track: int) -> Seeds:
     return tuple(seed for seed in seeds if seed[1] != track)
 
 
-def _copy(state: State, action: Action, motion: Motion) -> Outcome:
+def _copy_box(state: State, action: Action, motion: Motion) -> Outcome:
     track = require_track(state, action.get("track"))
-    frm, to = require_frame(action, motion, "from"), require_frame(action, motion, "to")
-    box = motion.to_sensor(motion.to_fixed(require_box(track, frm).values, frm), to)
-    return _box(state, {"track": track.id, "frame": to, "box": box.tolist()}, motion)
+    source, target = require_frame(action, motion, "from"), require_frame(action, motion, "to")
+    box = motion.to_sensor(motion.to_fixed(require_box(track, source).values, source), target)
+    return _set_box(state, {"track": track.id, "frame": target, "box": box.tolist()}, motion)
 
 
-def _class(state: State, action: Action, motion: Motion) -> Outcome:
+def _set_class(state: State, action: Action, motion: Motion) -> Outcome:
     track = require_track(state, action.get("track"))
-    return _replace(
+    return _replace_tracks(
         state, replace(track, class_name=require_class_name(action), edited=track.edited or track.state == PROPOSED)
     )
 
 
 def _reject_rest(state: State, action: Action, motion: Motion) -> Outcome:
-    only = require_class_name(action) if "class" in action else None
-    left = [t for t in state.tracks.values() if t.state == PROPOSED and only in (None, t.class_name)]
-    if not left:
-        raise InputError(f"no track{f' of class {only}' if only else ''} is left to reject")
-    return _replace(state, *(replace(t, state=REJECTED) for t in left))
+    class_name = require_class_name(action) if "class" in action else None
+    undecided = [t for t in state.tracks.values() if t.state == PROPOSED and class_name in (None, t.class_name)]
+    if not undecided:
+        raise InputError(f"no track{f' of class {class_name}' if class_name else ''} is left to reject")
+    return _replace_tracks(state, *(replace(t, state=REJECTED) for t in undecided))
 
 
-def _accept(state: State, action: Action, motion: Motion, to: str = ACCEPTED) -> Outcome:
+def _accept_track(state: State, action: Action, motion: Motion, new_state: str = ACCEPTED) -> Outcome:
     track, seeds = require_track(state, action.get("track")), state.seeds
     if action.get("seed") is not None:  # frame in which the object is nearest
         seeds = add_seed(seeds, require_frame(action, motion, "seed"), track.id)
-    return {track.id: replace(track, state=to)}, seeds, state.checked
+    return {track.id: replace(track, state=new_state)}, seeds, state.checked
 
 
-def _reject(state: State, action: Action, motion: Motion) -> Outcome:
+def _reject_track(state: State, action: Action, motion: Motion) -> Outcome:
     track = require_track(state, action.get("track"))
     seeds = _drop_seeds(state.seeds, track.id)
     return {track.id: replace(track, state=REJECTED)}, seeds, state.checked
 
 
-def _reopen(state: State, action: Action, motion: Motion) -> Outcome:
-    return _accept(state, action, motion, PROPOSED)
+def _reopen_track(state: State, action: Action, motion: Motion) -> Outcome:
+    return _accept_track(state, action, motion, PROPOSED)
 
 
-def _merge(state: State, action: Action, motion: Motion) -> Outcome:
+def _merge_tracks(state: State, action: Action, motion: Motion) -> Outcome:
     pair = action.get("tracks")
     if not isinstance(pair, list | tuple) or len(pair) != 2 or pair[0] == pair[1]:
         raise InputError("merging needs two different tracks; select a second one")
@@ -269,47 +271,51 @@ def _merge(state: State, action: Action, motion: Motion) -> Outcome:
     return {first.id: merged, second.id: None}, seeds, state.checked
 
 
-def _split(state: State, action: Action, motion: Motion) -> Outcome:
+def _split_track(state: State, action: Action, motion: Motion) -> Outcome:
     track, frame = require_track(state, action.get("track")), require_frame(action, motion)
-    early, late = ({f for f in track.boxes if (f >= frame) == after} for after in (False, True))
-    if not early or not late:
+    earlier, later = ({f for f in track.boxes if (f >= frame) == is_after} for is_after in (False, True))
+    if not earlier or not later:
         raise InputError(
             f"track {track.id} has boxes on one side of frame {frame} only; split it between its first and last box"
         )
 
-    def part(frames: set[int], number: int, after: bool) -> Track:
+    def make_part(frames: set[int], number: int, is_after: bool) -> Track:
         return replace(
             track,
             id=number,
             boxes={f: track.boxes[f] for f in sorted(frames)},
-            removed_frames=frozenset(f for f in track.removed_frames if (f >= frame) == after),
-            extra={f: v for f, v in track.extra.items() if (f >= frame) == after},
+            removed_frames=frozenset(f for f in track.removed_frames if (f >= frame) == is_after),
+            extra={f: v for f, v in track.extra.items() if (f >= frame) == is_after},
             edited=True,
             nearby=False,
         )
 
-    new = state.next_id
-    seeds = tuple((f, new if t == track.id and f >= frame else t) for f, t in state.seeds)
-    return ({track.id: part(early, track.id, False), new: part(late, new, True)}, seeds, state.checked)
+    new_id = state.next_id
+    seeds = tuple((f, new_id if t == track.id and f >= frame else t) for f, t in state.seeds)
+    return (
+        {track.id: make_part(earlier, track.id, False), new_id: make_part(later, new_id, True)},
+        seeds,
+        state.checked,
+    )
 
 
-def _trim(state: State, action: Action, motion: Motion) -> Outcome:
+def _trim_track(state: State, action: Action, motion: Motion) -> Outcome:
     track, frame = require_track(state, action.get("track")), require_frame(action, motion)
     side = action.get("side")
     if side not in ("before", "after"):
         raise InputError("side must be 'before' or 'after'")
-    beyond = {f for f in range(len(motion.times)) if (f < frame if side == "before" else f > frame)}
-    cut = beyond & track.boxes.keys()
-    kept = {f: b for f, b in track.boxes.items() if f not in cut}
-    if not cut or not kept:
-        raise InputError(f"track {track.id} has {'no' if kept else 'only'} boxes {side} frame {frame}")
-    seeds = tuple(s for s in state.seeds if s[1] != track.id or s[0] not in cut)
+    outside = {f for f in range(len(motion.times)) if (f < frame if side == "before" else f > frame)}
+    removed_now = outside & track.boxes.keys()
+    remaining = {f: b for f, b in track.boxes.items() if f not in removed_now}
+    if not removed_now or not remaining:
+        raise InputError(f"track {track.id} has {'no' if remaining else 'only'} boxes {side} frame {frame}")
+    seeds = tuple(s for s in state.seeds if s[1] != track.id or s[0] not in removed_now)
     # Tracking may later reach frames that have no box yet.
-    removed = track.removed_frames | (beyond if track.nearby else cut)
-    return ({track.id: replace(track, boxes=kept, removed_frames=removed)}, seeds, state.checked)
+    removed = track.removed_frames | (outside if track.nearby else removed_now)
+    return ({track.id: replace(track, boxes=remaining, removed_frames=removed)}, seeds, state.checked)
 
 
-def _check(state: State, action: Action, motion: Motion) -> Outcome:
+def _set_checked(state: State, action: Action, motion: Motion) -> Outcome:
     frame, checked = require_frame(action, motion), action.get("checked", True)
     if not isinstance(checked, bool):
         raise InputError("checked must be true or false")
@@ -317,25 +323,25 @@ def _check(state: State, action: Action, motion: Motion) -> Outcome:
 
 
 HANDLERS: dict[str, Callable[[State, Action, Motion], Outcome]] = {
-    "seed": _seed,
-    "add": _add,
-    "box": _box,
-    "size": _size,
+    "seed": _add_seed_track,
+    "add": _add_track,
+    "box": _set_box,
+    "size": _set_size,
     "remove_box": _remove_box,
-    "interpolate": _interpolate,
-    "copy": _copy,
-    "class": _class,
-    "accept": _accept,
-    "reject": _reject,
+    "interpolate": _interpolate_track,
+    "copy": _copy_box,
+    "class": _set_class,
+    "accept": _accept_track,
+    "reject": _reject_track,
     "reject_rest": _reject_rest,
-    "reopen": _reopen,
-    "merge": _merge,
-    "split": _split,
-    "trim": _trim,
-    "check": _check,
-    "snap": _box,
-    "propose": _replace_computed,
-    "import": _replace_computed,
+    "reopen": _reopen_track,
+    "merge": _merge_tracks,
+    "split": _split_track,
+    "trim": _trim_track,
+    "check": _set_checked,
+    "snap": _set_box,
+    "propose": _replace_with_computed,
+    "import": _replace_with_computed,
 }
 
 
@@ -356,5 +362,5 @@ def strip_computed(action: Mapping[str, Any]) -> Action:
         "reopen": ("seed",),
         "snap": ("box",),
     }
-    unwanted = ("seq", "time", "by", "joins", "beside", *computed.get(str(action.get("do")), ()))
-    return {k: v for k, v in action.items() if k not in unwanted}
+    removed_fields = ("seq", "time", "by", "joins", "beside", *computed.get(str(action.get("do")), ()))
+    return {k: v for k, v in action.items() if k not in removed_fields}

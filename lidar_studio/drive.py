@@ -76,51 +76,52 @@ class Scan:
 
 
 def make_pipeline_params(frame: Frame) -> PipelineParams:
-    """Return the configuration `best` for all directions and the frame's sensor height."""
+    """Return the parameters of the configuration `best`, for all directions and the sensor height of a
+    frame."""
     return with_values(BEST, {"view.enabled": False, "ground.sensor_pose.height": frame.sensor_height})
 
 
 def segment_frame(frame: Frame) -> Scan:
     """Load the cloud of a frame and segment it. InputError if it cannot be read."""
     cloud = frame.load()
-    found = segment_cloud(cloud, None, make_pipeline_params(frame))
-    return to_scan(cloud, found.ground, found.cluster_ids)
+    segmented = segment_cloud(cloud, None, make_pipeline_params(frame))
+    return to_scan(cloud, segmented.ground, segmented.cluster_ids)
 
 
 def to_scan(cloud: PointCloud, ground: Array, cluster_ids: Array) -> Scan:
     """Make the scan of N points with ground (N,) bool and cluster_ids (N,) int."""
     order = np.random.default_rng(0).permutation(len(cloud))
     intensity = np.zeros(len(cloud)) if cloud.intensity is None else cloud.intensity
-    shown = np.nan_to_num(np.clip(intensity, 0.0, 1.0)) * 255
-    return Scan(cloud.xyz[order], shown[order].astype(np.uint8), ground[order], cluster_ids[order].astype(np.int32))
+    scaled = np.nan_to_num(np.clip(intensity, 0.0, 1.0)) * 255
+    return Scan(cloud.xyz[order], scaled[order].astype(np.uint8), ground[order], cluster_ids[order].astype(np.int32))
 
 
 class ScanCache:
-    """Thread-safe LRU cache of scans, up to `limit` bytes; a scan is never made twice at once."""
+    """Thread-safe LRU cache of scans, up to `limit` bytes. Concurrent requests make a scan only once."""
 
     def __init__(self, make: Callable[[int], Scan], limit: int = MAX_CACHE_BYTES) -> None:
         self._make, self._limit, self._size = make, limit, 0
-        self._kept: OrderedDict[int, Scan] = OrderedDict()
-        self._making: dict[int, threading.Lock] = {}
+        self._scans: OrderedDict[int, Scan] = OrderedDict()
+        self._locks: dict[int, threading.Lock] = {}
         self._lock = threading.Lock()
 
     def __call__(self, i: int) -> Scan:
         """Return the scan of frame i."""
         with self._lock:
-            making = self._making.setdefault(i, threading.Lock())
-        with making:
+            lock = self._locks.setdefault(i, threading.Lock())
+        with lock:
             with self._lock:
-                if (scan := self._kept.get(i)) is not None:
-                    self._kept.move_to_end(i)
+                if (scan := self._scans.get(i)) is not None:
+                    self._scans.move_to_end(i)
                     return scan
             scan = self._make(i)
             with self._lock:
-                self._kept[i] = scan
+                self._scans[i] = scan
                 self._size += scan.nbytes
-                while self._size > self._limit and len(self._kept) > 1:
-                    old, dropped = self._kept.popitem(last=False)
-                    self._making.pop(old, None)
-                    self._size -= dropped.nbytes
+                while self._size > self._limit and len(self._scans) > 1:
+                    index, oldest = self._scans.popitem(last=False)
+                    self._locks.pop(index, None)
+                    self._size -= oldest.nbytes
             return scan
 
 
@@ -179,7 +180,7 @@ class Drive:
 
     @cached_property
     def load_scan(self) -> ScanCache:
-        """Cached function that returns the scan of a frame by its index."""
+        """Function that returns the scan of a frame by its index, with a cache."""
         return ScanCache(lambda i: self.scan(self.frames[i]))
 
 
@@ -192,15 +193,17 @@ def select_drive(recording: Recording, sequence: str | None = None) -> Drive:
     """
     all_frames = recording.frames[:]  # a slice, because iterating over a bag keeps the clouds in memory
     names = list(dict.fromkeys(frame.sequence for frame in all_frames))
-    listed = f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}"
+    names_text = f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}"
     if sequence is None and len(names) > 1:
-        raise InputError(f"{recording.path} has {len(names)} drives; name one with --sequence: {listed}")
+        raise InputError(f"{recording.path} has {len(names)} drives; name one with --sequence: {names_text}")
     if sequence is not None and sequence not in names:
-        raise InputError(f"{recording.path} has no drive {sequence}; it has {listed}" + did_you_mean(sequence, names))
-    chosen = names[0] if sequence is None else sequence
-    frames = [frame for frame in all_frames if frame.sequence == chosen]
+        raise InputError(
+            f"{recording.path} has no drive {sequence}; it has {names_text}" + did_you_mean(sequence, names)
+        )
+    selected = names[0] if sequence is None else sequence
+    frames = [frame for frame in all_frames if frame.sequence == selected]
     path = Path(recording.path).absolute()
-    return Drive("_".join(filter(None, (path.name, chosen))), replace(recording, frames=frames))
+    return Drive("_".join(filter(None, (path.name, selected))), replace(recording, frames=frames))
 
 
 def require_clouds(drive: Drive) -> None:

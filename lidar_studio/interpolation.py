@@ -1,6 +1,6 @@
-"""Boxes of one track over its frames: copying, interpolation, and propagation of corrections.
+"""Boxes of one track over time: interpolation, and propagation of corrections.
 
-Boxes are interpolated over stamps, in a fixed frame if the drive has poses, else in the sensor's.
+Boxes are interpolated by stamps, in a fixed frame if the drive has poses, else in the sensor frame.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Motion:
 
 
 def interpolate_box(first: Array, last: Array, share: float) -> Array:
-    """Interpolate two boxes (7,) linearly, the yaw over the shorter turn."""
+    """Interpolate linearly between two boxes (7,); the yaw takes the shorter turn."""
     box = first + share * (last - first)
     box[6] = wrap_angle(first[6] + share * wrap_angle(last[6] - first[6]))
     return box
@@ -60,30 +60,30 @@ def apply_correction(
 ) -> dict[int, Box]:
     """Set the key box of a frame, and adjust the other boxes of the track.
 
-    Up to the next key box on each side, the correction fades linearly with time, and frames without
-    a box get an interpolated one. If there is no key box on a side, all boxes there take the whole
+    Towards the next key box on each side, the correction fades linearly with time, and frames
+    without a box get an interpolated one. On a side without a key box, all boxes get the full
     correction and the new size. Frames in `removed` stay empty.
     """
-    found = dict(boxes)
-    found[frame] = Box(values, KEY)
-    new = motion.to_fixed(values, frame)
-    old = _estimate_box(boxes, frame, motion)
-    change = np.zeros(7) if old is None else new - old
-    change[6] = wrap_angle(change[6])
+    corrected = dict(boxes)
+    corrected[frame] = Box(values, KEY)
+    new_box = motion.to_fixed(values, frame)
+    old_box = _estimate_box(boxes, frame, motion)
+    correction = np.zeros(7) if old_box is None else new_box - old_box
+    correction[6] = wrap_angle(correction[6])
     for step in (-1, 1):
         side = [f for f in boxes if (f - frame) * step > 0]
         stop = min((f for f in side if boxes[f].kind == KEY), key=lambda f: abs(f - frame), default=None)
         if stop is None:
             for f in side:
-                moved = motion.to_fixed(boxes[f].values, f) + change
-                moved[3:6], moved[6] = new[3:6], wrap_angle(moved[6])
-                found[f] = Box.of(motion.to_sensor(moved, f), boxes[f].kind)
-            if side and (near := min(side, key=lambda f: abs(f - frame))) != frame + step:
-                _fill_gap(found, removed, near, frame, motion)
+                moved = motion.to_fixed(boxes[f].values, f) + correction
+                moved[3:6], moved[6] = new_box[3:6], wrap_angle(moved[6])
+                corrected[f] = Box.of(motion.to_sensor(moved, f), boxes[f].kind)
+            if side and (nearest := min(side, key=lambda f: abs(f - frame))) != frame + step:
+                _fill_gap(corrected, removed, nearest, frame, motion)
         else:
-            _distribute_correction(found, stop, frame, new, change, motion)
-            _fill_gap(found, removed, stop, frame, motion)
-    return found
+            _distribute_correction(corrected, stop, frame, new_box, correction, motion)
+            _fill_gap(corrected, removed, stop, frame, motion)
+    return corrected
 
 
 def _estimate_box(boxes: Mapping[int, Box], frame: int, motion: Motion) -> Array | None:
@@ -105,31 +105,31 @@ def _interpolate_between(boxes: Mapping[int, Box], a: int, b: int, frame: int, m
 
 
 def _distribute_correction(
-    found: dict[int, Box], stop: int, frame: int, new: Array, change: Array, motion: Motion
+    boxes: dict[int, Box], key_frame: int, frame: int, new_box: Array, correction: Array, motion: Motion
 ) -> None:
-    """Move the boxes between the key boxes of `stop` and `frame` by their shares of a change, and
-    flip opposite headings."""
-    fixed = motion.to_fixed(found[stop].values, stop)
-    turn = wrap_line(change[6])
-    for f in [f for f in found if min(stop, frame) < f < max(stop, frame)]:
-        share = float((motion.times[f] - motion.times[stop]) / (motion.times[frame] - motion.times[stop]))
-        straight, moved = interpolate_box(fixed, new, share), motion.to_fixed(found[f].values, f)
-        moved[:3] += share * change[:3]
-        moved[3:6] = straight[3:6]
+    """Move the boxes between the key boxes of `key_frame` and `frame` by a share of the correction
+    that falls linearly to 0 at `key_frame`, and flip opposite headings."""
+    key_box = motion.to_fixed(boxes[key_frame].values, key_frame)
+    turn = wrap_line(correction[6])
+    for f in [f for f in boxes if min(key_frame, frame) < f < max(key_frame, frame)]:
+        share = float((motion.times[f] - motion.times[key_frame]) / (motion.times[frame] - motion.times[key_frame]))
+        interpolated, moved = interpolate_box(key_box, new_box, share), motion.to_fixed(boxes[f].values, f)
+        moved[:3] += share * correction[:3]
+        moved[3:6] = interpolated[3:6]
         moved[6] += share * turn
-        if abs(wrap_angle(moved[6] - straight[6])) > np.pi / 2:
+        if abs(wrap_angle(moved[6] - interpolated[6])) > np.pi / 2:
             moved[6] += np.pi
         moved[6] = wrap_angle(moved[6])
-        found[f] = Box.of(motion.to_sensor(moved, f), INTERPOLATED)
+        boxes[f] = Box.of(motion.to_sensor(moved, f), INTERPOLATED)
 
 
-def _fill_gap(found: dict[int, Box], removed: frozenset[int], a: int, b: int, motion: Motion) -> None:
-    frames = sorted(f for f in found if min(a, b) <= f <= max(a, b))
+def _fill_gap(boxes: dict[int, Box], removed: frozenset[int], start: int, end: int, motion: Motion) -> None:
+    frames = sorted(f for f in boxes if min(start, end) <= f <= max(start, end))
     for first, last in pairwise(frames):
         for f in range(first + 1, last):
             if f not in removed:
-                box = _interpolate_between(found, first, last, f, motion)
-                found[f] = Box.of(motion.to_sensor(box, f), INTERPOLATED)
+                box = _interpolate_between(boxes, first, last, f, motion)
+                boxes[f] = Box.of(motion.to_sensor(box, f), INTERPOLATED)
 
 
 def reinterpolate_frame(
@@ -144,14 +144,14 @@ def reinterpolate_frame(
     after = min((f for f in keys if f > frame), default=None)
     if before is None or after is None:
         return None
-    found = {f: box for f, box in boxes.items() if not before < f < after}
-    _fill_gap(found, removed, before, after, motion)
-    return dict(sorted(found.items()))
+    result = {f: box for f, box in boxes.items() if not before < f < after}
+    _fill_gap(result, removed, before, after, motion)
+    return dict(sorted(result.items()))
 
 
 def fill_gaps(boxes: Mapping[int, Box], motion: Motion) -> dict[int, Box]:
-    """Return proposed boxes, with the gaps between them interpolated."""
-    found = dict(boxes)
-    if found:
-        _fill_gap(found, frozenset(), min(found), max(found), motion)
-    return {f: b if f in boxes else Box(b.values, PROPOSED) for f, b in sorted(found.items())}
+    """Fill the gaps between proposed boxes by interpolation."""
+    filled = dict(boxes)
+    if filled:
+        _fill_gap(filled, frozenset(), min(filled), max(filled), motion)
+    return {f: b if f in boxes else Box(b.values, PROPOSED) for f, b in sorted(filled.items())}

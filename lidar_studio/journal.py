@@ -26,7 +26,7 @@ def make_journal_header(
     """Make the first line of a journal, which identifies the drive by its frames.
 
     Args:
-        drive: name of the drive; ignored when comparing if `clouds` is the same.
+        drive: name of the drive; not compared if `clouds` matches.
         clouds: digest of some of the clouds, "" if unknown.
         posed: True if the drive has sensor poses.
     """
@@ -54,18 +54,18 @@ class Journal:
     message: a warning about the file, or None.
     """
 
-    def __init__(self, folder: Path, head: Mapping[str, Any]) -> None:
+    def __init__(self, folder: Path, header: Mapping[str, Any]) -> None:
         self.path = folder / JOURNAL_NAME
         self.message: str | None = None
-        self._header = dict(head)
+        self._header = dict(header)
         self.lines: list[dict[str, Any]] = []
         try:
             self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
             raise InputError(f"cannot open {self.path}: {error.strerror}") from None
         try:
-            if why := lock_file(self._file, self.path):  # the folder's lock has no effect on NFS
-                self.message = f"{self.path} cannot be locked ({why}): do not label this drive from a second process"
+            if reason := lock_file(self._file, self.path):  # the folder's lock has no effect on NFS
+                self.message = f"{self.path} cannot be locked ({reason}): do not label this drive from a second process"
             self._size = self._read_lines()
             if self._size == 0:
                 self.append(self._header)
@@ -111,28 +111,28 @@ class Journal:
         """
         with open(self.path, "rb") as stream:
             content = stream.read()
-        whole = content.rfind(b"\n") + 1
-        lines = content[:whole].splitlines()
-        found = [self._parse_line(text, number) for number, text in enumerate(lines, 1)]
-        if found:
-            self._check_header(found[0])
+        end = content.rfind(b"\n") + 1
+        lines = content[:end].splitlines()
+        records = [self._parse_line(text, number) for number, text in enumerate(lines, 1)]
+        if records:
+            self._check_header(records[0])
         elif content and not _encode(self._header).startswith(content):
             raise InputError(f"{self.path} is not a journal of labels; move it away")
-        if whole < len(content):
-            os.ftruncate(self._file, whole)
+        if end < len(content):
+            os.ftruncate(self._file, end)
             os.fsync(self._file)
             self.message = (
                 f"the last line of {self.path} was incomplete, so its "
-                f"{len(content) - whole} bytes were cut off; one action may be lost"
+                f"{len(content) - end} bytes were cut off; one action may be lost"
             )
-        self.lines = found[1:]
+        self.lines = records[1:]
         for number, line in enumerate(self.lines, 1):
             if line.get("seq") != number:
                 raise InputError(
                     f"{self.path}:{number + 1} is action {line.get('seq')}, not "
                     f"{number}; the file was changed by something else"
                 )
-        return whole
+        return end
 
     def _parse_line(self, text: bytes, number: int) -> dict[str, Any]:
         try:
@@ -145,22 +145,24 @@ class Journal:
                 f"{self.path}:{number} is not a line of a journal ({error}); restore the file or move it away"
             ) from None
 
-    def _check_header(self, found: Mapping[str, Any]) -> None:
+    def _check_header(self, header: Mapping[str, Any]) -> None:
         expected = dict(self._header)
-        if not found.get("clouds") or not expected["clouds"]:  # the clouds were unreadable
+        if not header.get("clouds") or not expected["clouds"]:  # the clouds were unreadable
             expected.pop("clouds")
-        elif found["clouds"] == expected["clouds"]:
+        elif header["clouds"] == expected["clouds"]:
             expected.pop("drive")
-        posed = expected.pop("posed", None), found.get("posed")
+        posed = expected.pop("posed", None), header.get("posed")
         if set(posed) == {True, False}:
-            now, then = ("with" if value else "without" for value in posed)
+            current, recorded = ("with" if value else "without" for value in posed)
             raise InputError(
-                f"{self.path} was made {then} sensor poses, but the drive is now "
-                f"{now} them, which would change all interpolated boxes; give the "
+                f"{self.path} was made {recorded} sensor poses, but the drive is now "
+                f"{current} them, which would change all interpolated boxes; give the "
                 "drive as it was, or another --out"
             )
-        if different := find_differences({k: found.get(k) for k in expected}, expected):
-            raise InputError(f"{self.path} is the journal of another drive: {'; '.join(different)}; give another --out")
+        if differences := find_differences({k: header.get(k) for k in expected}, expected):
+            raise InputError(
+                f"{self.path} is the journal of another drive: {'; '.join(differences)}; give another --out"
+            )
 
 
 def _sync_folder(folder: Path) -> None:
@@ -173,10 +175,10 @@ def _sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def open_journal(folder: Path, head: Mapping[str, Any]) -> Iterator[Journal]:
+def open_journal(folder: Path, header: Mapping[str, Any]) -> Iterator[Journal]:
     """Open or create the journal of a folder. InputError if another process uses the folder."""
     with lock_folder(folder):
-        journal = Journal(folder, head)
+        journal = Journal(folder, header)
         try:
             yield journal
         finally:

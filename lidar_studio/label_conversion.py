@@ -1,7 +1,7 @@
 """Conversion between tracks and the labels of a drive, for import and export.
 
-Other fields of a file are preserved: those of a box in Track.extra, those of a frame or of the
-drive in State.kept.
+Other fields of an imported file are preserved for export: fields of a box in Track.extra, fields of
+a frame or of the drive in State.preserved.
 """
 
 from __future__ import annotations
@@ -15,51 +15,53 @@ from typing import Any
 from lidar_perception.data.frame import Frame
 from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLabels
 from lidar_perception.labels.formats.files import replace_non_finite
-from lidar_studio.state import ACCEPTED, KEY, Box, Kept, State, Track, track_to_json
+from lidar_studio.state import ACCEPTED, KEY, Box, PreservedFields, State, Track, track_to_json
 
 IMPORTED = "imported"  # source of an imported track
 ID, SCORE, REST = "track_id", "score", "rest"  # keys of Track.extra
 
 
 def to_tracks(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str, Any]]:
-    """Convert labels to accepted tracks of key boxes, with ids from first_id on, and State.kept.
+    """Convert labels to accepted tracks of key boxes, and to the value of State.preserved.
+
+    Track ids start at first_id.
 
     Boxes with the same track id and class form a track; a box without an id is a separate track.
     """
-    found: dict[tuple[Any, ...], tuple[str, dict[int, Box], dict[int, dict[str, Any]]]] = {}
+    tracks_by_key: dict[tuple[Any, ...], tuple[str, dict[int, Box], dict[int, dict[str, Any]]]] = {}
     for f, frame in enumerate(labels.frames):
         for k, name in enumerate(frame.class_names):
-            number, score = int(frame.track_ids[k]), float(frame.scores[k])
+            track_id, score = int(frame.track_ids[k]), float(frame.scores[k])
             fields = {
-                ID: number,
+                ID: track_id,
                 REST: replace_non_finite(frame.extra[k]),
                 **({} if math.isnan(score) else {SCORE: score}),
             }
-            key = (number, name) if number != NO_TRACK else (NO_TRACK, f, k)
-            if key in found and f in found[key][1]:  # the id occurs twice in one frame
+            key = (track_id, name) if track_id != NO_TRACK else (NO_TRACK, f, k)
+            if key in tracks_by_key and f in tracks_by_key[key][1]:  # the id occurs twice in one frame
                 key = NO_TRACK, f, k
-            _, boxes, extra = found.setdefault(key, (name, {}, {}))
+            _, boxes, extra = tracks_by_key.setdefault(key, (name, {}, {}))
             boxes[f], extra[f] = Box.of(frame.boxes[k], KEY), fields
     tracks = [
-        Track(number, name, ACCEPTED, 1.0, IMPORTED, boxes, frozenset(), extra)
-        for number, (name, boxes, extra) in enumerate(found.values(), first_id)
+        Track(track_id, name, ACCEPTED, 1.0, IMPORTED, boxes, frozenset(), extra)
+        for track_id, (name, boxes, extra) in enumerate(tracks_by_key.values(), first_id)
     ]
     notes = {str(f): replace_non_finite(frame.notes) for f, frame in enumerate(labels.frames) if frame.notes}
     return tracks, {"notes": notes, "extra": replace_non_finite(labels.extra)}
 
 
-def compute_digest(tracks: Sequence[Track], kept: Kept) -> str:
+def compute_digest(tracks: Sequence[Track], preserved: PreservedFields) -> str:
     """Compute a digest of the result of to_tracks, independent of the ids."""
     rows = [{**track_to_json(t), "id": 0} for t in tracks]
-    return hashlib.sha256(json.dumps([rows, kept], sort_keys=True).encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps([rows, preserved], sort_keys=True).encode()).hexdigest()[:16]
 
 
-def join_extras(before: Kept, new: Kept) -> dict[str, Any]:
-    """Merge State.kept with that of another import."""
+def join_extras(before: PreservedFields, new: PreservedFields) -> dict[str, Any]:
+    """Merge State.preserved with the preserved fields of another import."""
     notes = {f: list(rows) for f, rows in before.get("notes", {}).items()}
     for f, rows in new["notes"].items():
-        known = notes.setdefault(f, [])
-        known += [row for row in rows if row not in known]
+        merged = notes.setdefault(f, [])
+        merged += [row for row in rows if row not in merged]
     return {"notes": notes, "extra": {**before.get("extra", {}), **new["extra"]}}
 
 
@@ -71,7 +73,7 @@ def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
         track = state.tracks[number]
         for f, box in track.boxes.items():
             rows[f].append((track, box, track.extra.get(f, {})))
-    notes = state.kept.get("notes", {})
+    notes = state.preserved.get("notes", {})
     return DriveLabels(
         [
             FrameLabels.of(
@@ -86,24 +88,24 @@ def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
             )
             for f, frame in enumerate(frames)
         ],
-        dict(state.kept.get("extra", {})),
+        dict(state.preserved.get("extra", {})),
     )
 
 
 def _choose_ids(state: State) -> dict[int, int]:
     """Choose unique ids for the export of the accepted tracks, preferably the imported ones."""
-    chosen = [t for t in state.tracks.values() if t.state == ACCEPTED]
-    found: dict[int, int] = {}
-    used = set[int]()
-    for t in chosen:
-        fields = {extra[ID] for extra in t.extra.values() if ID in extra}
+    accepted = [t for t in state.tracks.values() if t.state == ACCEPTED]
+    ids: dict[int, int] = {}
+    used_ids = set[int]()
+    for t in accepted:
+        imported_ids = {extra[ID] for extra in t.extra.values() if ID in extra}
         if len(t.boxes) > 1:  # a person has merged boxes without an id
-            fields.discard(NO_TRACK)
-        if len(fields) == 1 and (number := fields.pop()) not in used:
-            found[t.id] = number
-            used |= {number} - {NO_TRACK}
-    for t in chosen:
-        if t.id not in found:
-            found[t.id] = t.id if t.id not in used else max(used | set(state.tracks)) + 1
-            used.add(found[t.id])
-    return found
+            imported_ids.discard(NO_TRACK)
+        if len(imported_ids) == 1 and (number := imported_ids.pop()) not in used_ids:
+            ids[t.id] = number
+            used_ids |= {number} - {NO_TRACK}
+    for t in accepted:
+        if t.id not in ids:
+            ids[t.id] = t.id if t.id not in used_ids else max(used_ids | set(state.tracks)) + 1
+            used_ids.add(ids[t.id])
+    return ids

@@ -1,6 +1,6 @@
 """The newest frames of a running graph, for the page: clouds with the boxes of the same stamp.
 
-Independent of ROS: the node in live_view.py adds the messages.
+This module does not depend on ROS; the node in live_view.py adds the messages.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class LiveGraph:
         self._frames: dict[int, LiveFrame] = {}
         self._by_stamp: dict[int, LiveFrame] = {}
         self._next = self._bytes = 0
-        self._holding_pages: set[int] = set()
+        self._paused_pages: set[int] = set()
         self._awaiting_tf: list[tuple[LiveFrame, str, MarkedObjects, Any]] = []
         self._numbers: dict[tuple[str, str], int] = {}  # (kind, topic) -> BoxTopic.number
         self._last_status: dict[str, Any] = {}
@@ -118,13 +118,13 @@ class LiveGraph:
         """One past the number of the newest frame."""
         return self._next
 
-    def set_held(self, page: int, held: bool) -> None:
+    def set_paused(self, page: int, paused: bool) -> None:
         """Pause or resume a page. New clouds are skipped while any page is paused."""
         with self._lock:
-            (self._holding_pages.add if held else self._holding_pages.discard)(page)
+            (self._paused_pages.add if paused else self._paused_pages.discard)(page)
 
     def expect_topic(self, topic: str, kind: str) -> None:
-        """Add a topic with boxes of a kind, for which clouds wait."""
+        """Add a topic with boxes of a kind; clouds wait for its arrays."""
         with self._lock:
             if topic not in self.topics:
                 number = sum(other_kind == kind for other_kind, _ in self._numbers)
@@ -136,10 +136,10 @@ class LiveGraph:
             self.topics.pop(topic, None)
 
     def add_cloud(self, message: Any) -> None:
-        """Add a PointCloud2. Boxes belong to the last cloud of their stamp, as bags may loop."""
+        """Add a PointCloud2. Boxes are matched to the last cloud with their stamp, as bags may loop."""
         with self._lock:
             stamp = to_ns(message.header.stamp)
-            if self._holding_pages:
+            if self._paused_pages:
                 self.skipped_count += 1
                 return
             frame = LiveFrame(self._next, stamp, message, monotonic())
@@ -168,7 +168,7 @@ class LiveGraph:
                 box_topic.early_arrays[objects.stamp_ns] = objects, message
                 while len(box_topic.early_arrays) > MAX_EARLY_ARRAYS:
                     box_topic.early_arrays.popitem(last=False)
-                    box_topic.unmatched_count += not self._holding_pages
+                    box_topic.unmatched_count += not self._paused_pages
                 return
             box_topic.delays.append(1e3 * (monotonic() - frame.received_s))
             self._add_objects(frame, topic, objects, message)
@@ -179,11 +179,11 @@ class LiveGraph:
 
         If TF is late, they are added by a later update().
         """
-        box_topic, own = self.topics[topic], frame.cloud.header.frame_id
+        box_topic, frame_id = self.topics[topic], frame.cloud.header.frame_id
         trails = read_trails(message) if message is not None and box_topic.kind == TRACKS else {}
-        if objects.frame_id.lstrip("/") not in ("", own.lstrip("/")):
+        if objects.frame_id.lstrip("/") not in ("", frame_id.lstrip("/")):
             try:
-                pose = self.tree.lookup(own, objects.frame_id, frame.stamp_ns)
+                pose = self.tree.lookup(frame_id, objects.frame_id, frame.stamp_ns)
             except MissingTransform as error:
                 if error.late and monotonic() - frame.received_s <= MAX_WAIT_S:
                     self._awaiting_tf.append((frame, topic, objects, message))
@@ -205,17 +205,17 @@ class LiveGraph:
         status. Call it periodically."""
         with self._lock:
             now = monotonic()
-            waiting, self._awaiting_tf = self._awaiting_tf, []
-            for frame, topic, objects, message in waiting:
+            awaiting_tf, self._awaiting_tf = self._awaiting_tf, []
+            for frame, topic, objects, message in awaiting_tf:
                 if topic in self.topics:
                     self._add_objects(frame, topic, objects, message)
-            wanted = {
+            expected_topics = {
                 topic for topic, t in self.topics.items() if t.received_count and t.kind != LABELS and not t.tf_problem
             }
             for frame in reversed(self._frames.values()):
                 if frame.is_shown:
                     break
-                if wanted <= frame.objects.keys() or now - frame.received_s > MAX_WAIT_S:
+                if expected_topics <= frame.objects.keys() or now - frame.received_s > MAX_WAIT_S:
                     for older in self._frames.values():
                         if not older.is_shown and older.number <= frame.number:
                             older.is_shown = True
@@ -242,14 +242,14 @@ class LiveGraph:
             ]
             return {
                 "lines": lines,
-                "clouds": {**self.statistics, "passed": self.skipped_count},
+                "clouds": {**self.statistics, "skipped": self.skipped_count},
                 "topics": [
                     {
                         "topic": topic,
                         "kind": t.kind,
-                        "came": t.received_count,
+                        "received": t.received_count,
                         "late": t.late_count,
-                        "alone": t.unmatched_count,
+                        "unmatched": t.unmatched_count,
                         "ms": round(float(np.median(t.delays)), -1) if t.delays else None,
                     }
                     for topic, t in self.topics.items()
@@ -260,7 +260,7 @@ class LiveGraph:
         return {"live": {"first": self.first, **_frame_to_json(frame), "tracks": self._tracks_to_json([frame])}}
 
     def _tracks_to_json(self, frames: list[LiveFrame]) -> list[dict[str, Any]]:
-        made: list[dict[str, Any]] = []
+        tracks: list[dict[str, Any]] = []
         for topic, box_topic in self.topics.items():
             if box_topic.kind != TRACKS:
                 continue
@@ -271,8 +271,8 @@ class LiveGraph:
                     for f in frames
                     if track["id"] in f.trails.get(topic, ())
                 }
-                made.append(track)
-        return made
+                tracks.append(track)
+        return tracks
 
     def list_tracks(self) -> list[dict[str, Any]]:
         """Return the tracks in all shown frames, as JSON objects of the page."""
@@ -280,7 +280,7 @@ class LiveGraph:
             return self._tracks_to_json([f for f in self._frames.values() if f.is_shown])
 
     def list_frames(self) -> list[dict[str, Any]]:
-        """Return the shown frames, as in the answer of /api/drive."""
+        """Return the shown frames, in the form of /api/drive."""
         with self._lock:
             return [_frame_to_json(frame) for frame in self._frames.values() if frame.is_shown]
 
@@ -295,28 +295,27 @@ class LiveGraph:
         return scan_from_message(self._get_frame(i).cloud, scale=self._scale)
 
     def layers(self, i: int, min_score: float) -> dict[str, Any]:
-        """Return the answer of /api/labels: labels, detections, and missed labels at a minimum
-        score.
+        """Return the labels, detections and missed labels of a frame, in the form of /api/labels.
 
-        False detections are not listed, as the labelled area is unknown.
+        False detections are not listed, because the labelled area is unknown.
         """
         with self._lock:
             objects = self._get_frame(i).objects
-            of_kind = {
+            objects_by_kind = {
                 kind: {t: o for t, o in objects.items() if t in self.topics and self.topics[t].kind == kind}
                 for kind in (BOXES, LABELS)
             }
-        found = {name_source(t): detections_with_sources(o) for t, o in of_kind[BOXES].items()}
-        truth = next((to_truth(o) for o in of_kind[LABELS].values()), None)
+        detections = {name_source(t): detections_with_sources(o) for t, o in objects_by_kind[BOXES].items()}
+        truth = next((to_truth(o) for o in objects_by_kind[LABELS].values()), None)
         matches = (
             {}
             if truth is None
             else {
                 name: {**match_detections(truth, d, min_score), "false": None, "ignored": None}
-                for name, d in found.items()
+                for name, d in detections.items()
             }
         )
-        return layers_to_json(truth, found, matches)
+        return layers_to_json(truth, detections, matches)
 
 
 def _keep_valid(objects: MarkedObjects) -> MarkedObjects:

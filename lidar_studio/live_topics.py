@@ -1,4 +1,4 @@
-"""Selection of the topics to show of a running graph: the clouds with the most columns, and their
+"""Selection of the topics of a running graph to show: the clouds with the most columns, and their
 boxes."""
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def parse_namespace(topic: str) -> str:
     slash; "" is the root.
     """
     parts = topic.removesuffix(ARRAY_SUFFIX).strip("/").split("/")
-    own = 3 if parts[-2:-1] == ["output"] else 2 if parts[-2:] == TRUTH.strip("/").split("/") else 1
-    return "/".join(parts[:-own])
+    name_length = 3 if parts[-2:-1] == ["output"] else 2 if parts[-2:] == TRUTH.strip("/").split("/") else 1
+    return "/".join(parts[:-name_length])
 
 
 def is_in_namespace(topic: str, namespace: str) -> bool:
@@ -36,9 +36,9 @@ def is_in_namespace(topic: str, namespace: str) -> bool:
 
     The namespace "" contains all topics, "/" only those in the root.
     """
-    inside = namespace.strip("/")
-    if inside:
-        return topic.startswith(f"/{inside}/")
+    prefix = namespace.strip("/")
+    if prefix:
+        return topic.startswith(f"/{prefix}/")
     return not namespace or not parse_namespace(topic)
 
 
@@ -48,8 +48,8 @@ def resolve_topic(topic: str, namespace: str) -> str:
     return "/" + "/".join(filter(None, (*parts, topic.strip("/"))))
 
 
-def select_cloud_topic(types: Mapping[str, str], namespace: str = "", wanted: str = "") -> str:
-    """Select the cloud topic: `wanted`, else the one with the most columns, else the only one.
+def select_cloud_topic(types: Mapping[str, str], namespace: str = "", requested: str = "") -> str:
+    """Select the cloud topic: `requested`, else the one with the most columns, else the only one.
 
     Args:
         types: types of the published topics, by name.
@@ -59,73 +59,73 @@ def select_cloud_topic(types: Mapping[str, str], namespace: str = "", wanted: st
     """
     clouds = sorted(t for t, kind in types.items() if kind == POINT_CLOUD)
     where = f" in the namespace {namespace}" if namespace else ""
-    if wanted:
-        full = resolve_topic(wanted, namespace)
-        if full not in clouds:
+    if requested:
+        full_name = resolve_topic(requested, namespace)
+        if full_name not in clouds:
             raise InputError(
-                f"nobody publishes clouds on {full}; there are clouds on {', '.join(clouds) or 'no topic'}"
+                f"nobody publishes clouds on {full_name}; there are clouds on {', '.join(clouds) or 'no topic'}"
             )
-        return full
-    inside = [t for t in clouds if is_in_namespace(t, namespace)]
-    if not inside:
+        return full_name
+    candidates = [t for t in clouds if is_in_namespace(t, namespace)]
+    if not candidates:
         raise InputError(
             f"nobody publishes clouds{where}; is the graph running, on this "
             "ROS_DOMAIN_ID?" + (f" There are clouds on {', '.join(clouds)}" if clouds else "")
         )
     for end in CLOUD_ENDINGS:
-        if found := [t for t in inside if t.endswith(f"/{end}") or t.endswith(f"_{end}")]:
-            inside = found
+        if matches := [t for t in candidates if t.endswith(f"/{end}") or t.endswith(f"_{end}")]:
+            candidates = matches
             break
-    if len(inside) > 1:
+    if len(candidates) > 1:
         raise InputError(
-            f"there are clouds on {', '.join(inside)}; name one with --topic"
+            f"there are clouds on {', '.join(candidates)}; name one with --topic"
             + ("" if namespace else ", or a --namespace")
         )
-    return inside[0]
+    return candidates[0]
 
 
 def select_box_topics(
-    types: Mapping[str, str], clouds: str, namespace: str = "", wanted: Iterable[str] = ()
+    types: Mapping[str, str], clouds: str, namespace: str = "", requested: Iterable[str] = ()
 ) -> dict[str, str]:
     """Select the box topics that belong to a cloud topic; leave out copies as Detection3DArray.
 
     Args:
         types: types of the published topics, by name.
-        wanted: topics of detections; empty for all.
+        requested: topics of detections; empty for all.
 
     Returns:
         BOXES, TRACKS or LABELS by topic.
     """
-    found = {}
+    selected = {}
     for topic, kind in types.items():
         if kind not in (MARKERS, ARRAY):
             continue
-        plain = topic.removesuffix(ARRAY_SUFFIX) if kind == ARRAY else topic
-        if kind == ARRAY and types.get(plain) == MARKERS:
+        marker_topic = topic.removesuffix(ARRAY_SUFFIX) if kind == ARRAY else topic
+        if kind == ARRAY and types.get(marker_topic) == MARKERS:
             continue
         for ending, box_kind in KIND_BY_ENDING.items():
-            if plain.endswith(ending):
-                found[topic] = box_kind
-    home = namespace or _infer_namespace(clouds, found)
-    found = {t: k for t, k in found.items() if is_in_namespace(t, home)}
-    requested = [resolve_topic(t, namespace) for t in wanted]
-    if requested:
-        found = {t: k for t, k in found.items() if k != BOXES}
-        found |= {t: BOXES for t in requested if types.get(t) in (MARKERS, ARRAY)}
-    return found
+            if marker_topic.endswith(ending):
+                selected[topic] = box_kind
+    box_namespace = namespace or _infer_namespace(clouds, selected)
+    selected = {t: k for t, k in selected.items() if is_in_namespace(t, box_namespace)}
+    full_names = [resolve_topic(t, namespace) for t in requested]
+    if full_names:
+        selected = {t: k for t, k in selected.items() if k != BOXES}
+        selected |= {t: BOXES for t in full_names if types.get(t) in (MARKERS, ARRAY)}
+    return selected
 
 
-def _infer_namespace(clouds: str, found: Mapping[str, str]) -> str:
+def _infer_namespace(clouds: str, box_topics: Mapping[str, str]) -> str:
     """Infer the namespace of the boxes that belong to a cloud topic, as for is_in_namespace().
 
     Our own nodes publish both in one namespace. The topic of a driver may be named after the
     sensor, such as /ouster/points, so the nearest parent namespace with boxes is used. If there is
     only one robot with boxes, all are shown, except for NS/points, which may be another robot's.
     """
-    own = parse_namespace(clouds)
+    cloud_namespace = parse_namespace(clouds)
     if "/output/" in clouds:
-        return own or "/"
-    homes = {parse_namespace(topic) for topic, kind in found.items() if kind != LABELS}
-    above = [home for home in homes if not home or clouds.startswith(f"/{home}/")]
-    one_robot = len(homes) < 2 and (above or not own or not clouds.endswith(POINTS))
-    return "" if one_robot else max(above, key=len, default=own) or "/"
+        return cloud_namespace or "/"
+    box_namespaces = {parse_namespace(topic) for topic, kind in box_topics.items() if kind != LABELS}
+    parents = [home for home in box_namespaces if not home or clouds.startswith(f"/{home}/")]
+    is_single_robot = len(box_namespaces) < 2 and (parents or not cloud_namespace or not clouds.endswith(POINTS))
+    return "" if is_single_robot else max(parents, key=len, default=cloud_namespace) or "/"

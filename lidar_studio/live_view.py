@@ -49,7 +49,8 @@ class LiveView(ExternalNode):
         boxes: Sequence[str] = (),
     ) -> None:
         super().__init__(domain, f"view_{os.getpid()}")
-        self.live, self.namespace, self.wanted = live, namespace, (clouds, tuple(boxes))
+        self.live, self.namespace = live, namespace
+        self.requested_clouds, self.requested_boxes = clouds, tuple(boxes)
         self.receptions: dict[str, Reception] = {}
         self.decode_errors: dict[str, str] = {}  # topic -> error of its last message
         self.clouds, self.problem, self._last_scan = "", "", -math.inf
@@ -94,18 +95,18 @@ class LiveView(ExternalNode):
         }
         self.problem = ""
         try:
-            chosen = select_cloud_topic(types, self.namespace, self.wanted[0])
+            cloud_topic = select_cloud_topic(types, self.namespace, self.requested_clouds)
         except InputError as error:
-            chosen, self.problem = self.clouds, str(error)
-        if chosen != self.clouds:
+            cloud_topic, self.problem = self.clouds, str(error)
+        if cloud_topic != self.clouds:
             self._forget([self.clouds] if self.clouds else [])
-            self.clouds = chosen
-            self._subscribe(chosen, CLOUD, lambda m: self.live.add_cloud(m))
-        found = select_box_topics(types, chosen, self.namespace, self.wanted[1]) if chosen else {}
-        for topic in found.keys() - self.receptions.keys():
-            self.live.expect_topic(topic, found[topic])
+            self.clouds = cloud_topic
+            self._subscribe(cloud_topic, CLOUD, lambda m: self.live.add_cloud(m))
+        box_topics = select_box_topics(types, cloud_topic, self.namespace, self.requested_boxes) if cloud_topic else {}
+        for topic in box_topics.keys() - self.receptions.keys():
+            self.live.expect_topic(topic, box_topics[topic])
             self._subscribe(topic, types[topic], self._make_box_handler(topic, types[topic]))
-        self._forget(self.receptions.keys() - found.keys() - {self.clouds})
+        self._forget(self.receptions.keys() - box_topics.keys() - {self.clouds})
         for reception in self.receptions.values():
             reception.adapt()
         self._update_status()
@@ -116,30 +117,30 @@ class LiveView(ExternalNode):
             self.decode_errors.pop(topic, None)
             self.live.forget_topic(topic)
 
-    def _subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
-        handle = self._make_handler(topic, kind, take)
+    def _subscribe(self, topic: str, message_type: str, callback: Callable[[Any], None]) -> None:
+        handle = self._make_handler(topic, message_type, callback)
         reception = self.receptions[topic] = Reception(
             self.node,
-            load_message_class(kind),
+            load_message_class(message_type),
             topic,
             lambda data, patient: handle(data),
             lambda: RECEPTION,
-            "cloud" if kind == CLOUD else "array",
+            "cloud" if message_type == CLOUD else "array",
         )
         reception.open()
 
-    def _make_handler(self, topic: str, kind: str, take: Callable[[Any], None]) -> Callable[[bytes], None]:
+    def _make_handler(self, topic: str, message_type: str, callback: Callable[[Any], None]) -> Callable[[bytes], None]:
         def handle(data: bytes) -> None:
             try:
-                take(decode_message(data, kind))
+                callback(decode_message(data, message_type))
                 self.decode_errors.pop(topic, None)
             except Exception as error:  # other nodes may send invalid messages
                 self.decode_errors[topic] = f"{topic}: {shorten_error(error)}"
 
         return handle
 
-    def _make_box_handler(self, topic: str, kind: str) -> Callable[[Any], None]:
-        if kind == MARKERS:
+    def _make_box_handler(self, topic: str, message_type: str) -> Callable[[Any], None]:
+        if message_type == MARKERS:
             return lambda m: self.live.add_boxes(topic, from_marker_array(m), m)
         return lambda m: self.live.add_boxes(topic, from_detection_array(m), None)
 

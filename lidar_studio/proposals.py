@@ -75,13 +75,13 @@ class ProposalRequest:
 def compute_likeness(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> Array:
     """Compute the probability that each cluster is a person, (C,) float64, from its most similar
     seed; 0 without seeds."""
-    best = np.zeros(len(survey.boxes))
+    likeness = np.zeros(len(survey.boxes))
     for seed in seeds if len(survey.boxes) else ():
         similarity = compute_similarity(survey.images, seed.image, BEST.stm)
-        best = np.maximum(
-            best, compute_confidence(survey.features, similarity, survey.features["height_m"] - seed.height)
+        likeness = np.maximum(
+            likeness, compute_confidence(survey.features, similarity, survey.features["height_m"] - seed.height)
         )
-    return best
+    return likeness
 
 
 def compute_size_similarity(shapes: Array, size: Size) -> Array:
@@ -95,15 +95,15 @@ def compute_size_similarity(shapes: Array, size: Size) -> Array:
         size: length, width and height in metres.
     """
     length, width, height = size
-    long, short, tall = (shapes[:, k].astype(np.float64) for k in (3, 4, 5))
-    excess = long / length - 1
+    lengths, widths, heights = (shapes[:, k].astype(np.float64) for k in (3, 4, 5))
+    excess = lengths / length - 1
     deviation = np.hypot(
         np.where(excess > 0, excess / LENGTH_EXCESS, excess / LENGTH_DEFICIT),
-        np.maximum(short / width - 1, 0) / WIDTH_EXCESS,
+        np.maximum(widths / width - 1, 0) / WIDTH_EXCESS,
     )
     if length > LONG_OBJECT_M:
-        deviation = np.minimum(deviation, np.hypot((long / width - 1) / WIDTH_EXCESS, END_VIEW_PENALTY))
-    return np.exp(-0.5 * (deviation**2 + ((tall / height - 1) / HEIGHT_DEVIATION) ** 2))
+        deviation = np.minimum(deviation, np.hypot((lengths / width - 1) / WIDTH_EXCESS, END_VIEW_PENALTY))
+    return np.exp(-0.5 * (deviation**2 + ((heights / height - 1) / HEIGHT_DEVIATION) ** 2))
 
 
 def find_objects(
@@ -126,35 +126,35 @@ def find_objects(
 
 def _find_people(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> tuple[Detections, Array]:
     scores = compute_likeness(survey, seeds)
-    chosen = np.flatnonzero(scores >= MIN_CONFIDENCE)
-    found = survey.detections
-    people = found.boxes[np.isin(found.class_ids, NOT_VEHICLE_IDS)]
+    likely = np.flatnonzero(scores >= MIN_CONFIDENCE)
+    detections = survey.detections
+    people = detections.boxes[np.isin(detections.class_ids, NOT_VEHICLE_IDS)]
     boxes = np.array(
-        [complete_box(b, find_usual_size(CLASSES[PEDESTRIAN])) for b in survey.boxes[chosen].astype(np.float64)]
+        [complete_box(b, find_usual_size(CLASSES[PEDESTRIAN])) for b in survey.boxes[likely].astype(np.float64)]
     ).reshape(-1, 7)
-    new = centre_distances(boxes, people).min(axis=1, initial=np.inf) > SAME_OBJECT_DISTANCE_M
-    objects = found.followed_by(Detections.of(boxes[new], PEDESTRIAN, scores[chosen][new]))
-    return objects, np.arange(len(objects)) >= len(found)
+    is_new = centre_distances(boxes, people).min(axis=1, initial=np.inf) > SAME_OBJECT_DISTANCE_M
+    objects = detections.followed_by(Detections.of(boxes[is_new], PEDESTRIAN, scores[likely][is_new]))
+    return objects, np.arange(len(objects)) >= len(detections)
 
 
 def _add_similar_objects(
-    survey: FrameSurvey, request: ProposalRequest, found: Detections, candidates: Array
+    survey: FrameSurvey, request: ProposalRequest, detections: Detections, candidates: Array
 ) -> tuple[Detections, Array]:
     """Add clusters of about the size of a seed, where there is no object."""
     sizes = request.sizes
     if not sizes or not len(survey.shapes):
-        return found, candidates
+        return detections, candidates
     scores = np.array([compute_size_similarity(survey.shapes, seed.size) for seed in sizes])
     scores *= UNDETECTED_WEIGHT if request.detected else 1.0
-    best = scores.argmax(axis=0)
-    chosen = np.flatnonzero(scores.max(axis=0) >= MIN_CONFIDENCE)
-    shapes = survey.shapes[chosen].astype(np.float64)
-    boxes = np.array([complete_box(b, sizes[best[k]].size) for k, b in zip(chosen, shapes)]).reshape(-1, 7)
+    best_seed = scores.argmax(axis=0)
+    likely = np.flatnonzero(scores.max(axis=0) >= MIN_CONFIDENCE)
+    shapes = survey.shapes[likely].astype(np.float64)
+    boxes = np.array([complete_box(b, sizes[best_seed[k]].size) for k, b in zip(likely, shapes)]).reshape(-1, 7)
     min_distances = np.maximum(SAME_OBJECT_DISTANCE_M, boxes[:, None, 3] / 3)
-    new = (centre_distances(boxes, found.boxes) > min_distances).all(axis=1)
-    classes = np.array([CLASSES.index(sizes[k].class_name) for k in best[chosen]], np.int32)
-    objects = found.followed_by(Detections.of(boxes[new], classes[new], scores.max(axis=0)[chosen][new]))
-    return objects, np.append(candidates, np.ones(int(new.sum()), bool))
+    is_new = (centre_distances(boxes, detections.boxes) > min_distances).all(axis=1)
+    classes = np.array([CLASSES.index(sizes[k].class_name) for k in best_seed[likely]], np.int32)
+    objects = detections.followed_by(Detections.of(boxes[is_new], classes[is_new], scores.max(axis=0)[likely][is_new]))
+    return objects, np.append(candidates, np.ones(int(is_new.sum()), bool))
 
 
 NOT_VEHICLE_IDS = [i for i, kind in enumerate(KIND_OF_CLASS) if kind != KIND_OF_CLASS[0]]
@@ -181,27 +181,27 @@ def propose_tracks(
     for i in frames:
         if not on_progress(i - frames.start):
             return None
-        found, candidates = find_objects(surveys[i], request, request.placed.get(i, ()))
+        objects, candidates = find_objects(surveys[i], request, request.placed.get(i, ()))
         pose = None if motion.poses is None else motion.poses[i]
-        tracks = tracker(found, stamps_ns[i], pose)
-        matches = _match_detections(tracks, found)
+        tracks = tracker(objects, stamps_ns[i], pose)
+        matches = _match_detections(tracks, objects)
         for k in np.flatnonzero(matches != NO_HIT):
             match, box = matches[k], tracks.detections.boxes[k].astype(np.float64)
-            box[:3] = found.boxes[match, :3]
+            box[:3] = objects.boxes[match, :3]
             hits.setdefault(int(tracks.ids[k]), []).append(
-                (i, box, int(tracks.detections.class_ids[k]), float(found.scores[match]), bool(candidates[match]))
+                (i, box, int(tracks.detections.class_ids[k]), float(objects.scores[match]), bool(candidates[match]))
             )
     min_hits = min(MIN_HITS, len(frames))
-    made = [_make_track(rows, motion) for rows in hits.values() if len(rows) >= min_hits]
-    return sorted((t for t in made if t.score >= MIN_SCORE), key=lambda t: -t.score)
+    proposed = [_make_track(rows, motion) for rows in hits.values() if len(rows) >= min_hits]
+    return sorted((t for t in proposed if t.score >= MIN_SCORE), key=lambda t: -t.score)
 
 
-def _match_detections(tracks: Tracks, found: Detections) -> np.ndarray:
+def _match_detections(tracks: Tracks, detections: Detections) -> np.ndarray:
     """Return the detection that updated each track, (K,) int64: the nearest one within
     MAX_HIT_DISTANCE_M, or NO_HIT."""
-    if len(found) == 0:
+    if len(detections) == 0:
         return np.full(len(tracks), NO_HIT)
-    distances = centre_distances(tracks.detections.boxes, found.boxes)
+    distances = centre_distances(tracks.detections.boxes, detections.boxes)
     nearest = distances.argmin(axis=1)
     return np.where(tracks.seen & (distances.min(axis=1) <= MAX_HIT_DISTANCE_M), nearest, NO_HIT)
 
@@ -210,9 +210,9 @@ def _make_track(hits: list[Hit], motion: Motion) -> Track:
     frames, boxes, classes, scores, candidates = zip(*hits)
     name = CLASSES[np.bincount(classes, weights=scores).argmax()]
     size = np.median([b[3:6] for b in boxes], axis=0)
-    fixed = {}
+    boxes_by_frame = {}
     for frame, box in zip(frames, boxes):
         box[3:6] = size
-        fixed[frame] = Box.of(np.round(box, 4), PROPOSED)
+        boxes_by_frame[frame] = Box.of(np.round(box, 4), PROPOSED)
     source = CANDIDATES if np.mean(candidates) > 0.5 else FUSED
-    return Track(0, name, PROPOSED, round(float(np.mean(scores)), 4), source, fill_gaps(fixed, motion))
+    return Track(0, name, PROPOSED, round(float(np.mean(scores)), 4), source, fill_gaps(boxes_by_frame, motion))

@@ -97,8 +97,8 @@ class Proposer:
     def _cache(self, surveys: list[FrameSurvey]) -> None:
         """Write the last file of the cache once its frames are complete."""
         size = survey_cache.FRAMES_PER_FILE
-        complete = len(surveys) % size == 0 or len(surveys) == len(self.drive.frames)
-        if self.folder is None or not complete:
+        is_complete = len(surveys) % size == 0 or len(surveys) == len(self.drive.frames)
+        if self.folder is None or not is_complete:
             return
         first = (len(surveys) - 1) // size * size
         try:
@@ -108,11 +108,11 @@ class Proposer:
 
     def collect_scan_poses(self) -> list[list[float]] | None:
         """Return the poses from scan matching, 16 numbers per frame; None if the drive has its own
-        poses or scan matching gave none."""
+        poses or scan matching failed."""
         if self.drive.motion.poses is not None or not self.surveys:
             return None
-        found = [survey.pose for survey in self.surveys if survey.pose is not None]
-        return [np.round(pose, 6).ravel().tolist() for pose in found] if len(found) == len(self.surveys) else None
+        poses = [survey.pose for survey in self.surveys if survey.pose is not None]
+        return [np.round(pose, 6).ravel().tolist() for pose in poses] if len(poses) == len(self.surveys) else None
 
     def make_proposals(
         self,
@@ -127,13 +127,13 @@ class Proposer:
         """
         seeds = [SilhouetteSeed(seed.silhouette(BEST), seed.height) for seed in self.find_seeds(state)]
         sizes = [SizeSeed(t.class_name, _track_size(t, f)) for f, t in self._find_size_seeds(state)]
-        placed: dict[int, list[tuple[Array, str]]] = {}
+        placed_boxes: dict[int, list[tuple[Array, str]]] = {}
         for t in state.tracks.values():
             for f, b in t.boxes.items() if t.awaits_tracking else ():
                 if b.kind == KEY:
-                    placed.setdefault(f, []).append((np.array(b.values), t.class_name))
+                    placed_boxes.setdefault(f, []).append((np.array(b.values), t.class_name))
         stamps = [frame.stamp_ns for frame in self.drive.frames]
-        request = ProposalRequest(seeds, sizes, placed, self.detector is not None)
+        request = ProposalRequest(seeds, sizes, placed_boxes, self.detector is not None)
         surveys = self.surveys or []
         return propose_tracks(
             surveys, request, stamps, motion, range(len(surveys)) if frames is None else frames, on_progress
@@ -141,17 +141,17 @@ class Proposer:
 
     def _find_size_seeds(self, state: State) -> list[tuple[int, Track]]:
         """Return frame and track of the seeds that are not pedestrians."""
-        found = [(f, state.tracks[t]) for f, t in state.seeds if t in state.tracks]
+        seeds = [(f, state.tracks[t]) for f, t in state.seeds if t in state.tracks]
         return [
-            (f, t) for f, t in found if f in t.boxes and t.class_name in CLASSES and t.class_name != CLASSES[PEDESTRIAN]
+            (f, t) for f, t in seeds if f in t.boxes and t.class_name in CLASSES and t.class_name != CLASSES[PEDESTRIAN]
         ]
 
     def find_seeds(self, state: State) -> list[Seed]:
         """Return the pedestrian seeds of a state that have enough points."""
-        found = [self._seed(state.tracks[t], f) for f, t in state.seeds if t in state.tracks]
-        return [seed for seed in found if seed is not None]
+        seeds = [self._make_seed(state.tracks[t], f) for f, t in state.seeds if t in state.tracks]
+        return [seed for seed in seeds if seed is not None]
 
-    def _seed(self, track: Track, frame: int) -> Seed | None:
+    def _make_seed(self, track: Track, frame: int) -> Seed | None:
         if frame not in track.boxes or track.class_name != CLASSES[PEDESTRIAN]:
             return None
         box = track.boxes[frame].values
@@ -170,7 +170,7 @@ class Proposer:
         """Compare the silhouette of a pedestrian's track in a frame with the most similar seed.
 
         Returns:
-            The answer of /api/silhouettes.
+            The JSON object of /api/silhouettes.
 
         Raises:
             InputError: there is no seed, or the track has too few points in this frame.
@@ -196,16 +196,16 @@ class Proposer:
         return scan.xyz[points_in_box(scan.xyz, box, BOX_MARGIN_M) & ~scan.ground]
 
     def refine_with_detection(self, frame: int, box: Array, class_name: str) -> Array:
-        """Return the box (7,) of a detection of the class at a clicked cluster's box (7,), or the
-        cluster's box if there is no detection."""
+        """Return the box (7,) of the detection of the class nearest to a clicked cluster's box (7,), or
+        the cluster's box if none is near."""
         if self.surveys is None or class_name not in CLASSES:
             return box
-        found = self.surveys[frame].detections
-        found = found[found.class_ids == CLASSES.index(class_name)]
-        distances = centre_distances(found.boxes, box[None])[:, 0]
+        detections = self.surveys[frame].detections
+        detections = detections[detections.class_ids == CLASSES.index(class_name)]
+        distances = centre_distances(detections.boxes, box[None])[:, 0]
         if distances.min(initial=np.inf) > max(SAME_OBJECT_DISTANCE_M, SAME_TRACK_LENGTH_SHARE * box[3]):
             return box
-        return found.boxes[int(distances.argmin())].astype(np.float64)
+        return detections.boxes[int(distances.argmin())].astype(np.float64)
 
 
 def _track_size(track: Track, frame: int) -> Size:
@@ -225,39 +225,41 @@ def merge_proposals(state: State, proposals: Sequence[Track], motion: Motion) ->
     """Merge new proposals with the existing tracks.
 
     Tracks that a person accepted, rejected or edited stay; a matching proposal extends a clicked
-    track. Earlier proposals are replaced by matching new ones, which take their ids, or removed.
+    track. Earlier proposals are removed, or replaced by matching new ones with the same ids.
 
     Returns:
         New and changed tracks, and the ids of removed tracks.
     """
     index = _TrackIndex(state.tracks)
-    waiting = {t.id for t in state.tracks.values() if not t.has_human_edits and t.source in (FUSED, CANDIDATES)}
-    found: list[Track] = []
+    unconfirmed_ids = {t.id for t in state.tracks.values() if not t.has_human_edits and t.source in (FUSED, CANDIDATES)}
+    changed: list[Track] = []
     next_id, used_ids = state.next_id, set[int]()
     for proposal in proposals:
         matches = index.find_matches(proposal)
-        by_person = [t for t in matches if t.id not in waiting]
-        if by_person:
-            clicked = next((t for t in by_person if t.awaits_tracking and t.id not in used_ids), None)
+        human_tracks = [t for t in matches if t.id not in unconfirmed_ids]
+        if human_tracks:
+            clicked = next((t for t in human_tracks if t.awaits_tracking and t.id not in used_ids), None)
             if clicked is not None:
                 used_ids.add(clicked.id)
-                found.append(extend_track(clicked, proposal.boxes, motion))
+                changed.append(extend_track(clicked, proposal.boxes, motion))
             continue
-        number = next((t.id for t in matches if t.id not in used_ids), next_id)
-        next_id += number == next_id
-        used_ids.add(number)
-        found.append(replace(proposal, id=number))
-    found += [extend_track(t, {}, motion) for t in state.tracks.values() if t.awaits_tracking and t.id not in used_ids]
-    return [t for t in found if t != state.tracks.get(t.id)], sorted(waiting - used_ids)
+        track_id = next((t.id for t in matches if t.id not in used_ids), next_id)
+        next_id += track_id == next_id
+        used_ids.add(track_id)
+        changed.append(replace(proposal, id=track_id))
+    changed += [
+        extend_track(t, {}, motion) for t in state.tracks.values() if t.awaits_tracking and t.id not in used_ids
+    ]
+    return [t for t in changed if t != state.tracks.get(t.id)], sorted(unconfirmed_ids - used_ids)
 
 
 def extend_track(clicked: Track, boxes: Mapping[int, Box], motion: Motion) -> Track:
     """Extend a clicked track by the boxes of a proposal, corrected by the track's key boxes."""
-    found: Mapping[int, Box] = {f: b for f, b in boxes.items() if f not in clicked.removed_frames}
+    extended: Mapping[int, Box] = {f: b for f, b in boxes.items() if f not in clicked.removed_frames}
     for frame, box in sorted(clicked.boxes.items()):
         if box.kind == KEY:
-            found = apply_correction(found, clicked.removed_frames, frame, box.values, motion)
-    return replace(clicked, boxes=dict(sorted(found.items())), nearby=False)
+            extended = apply_correction(extended, clicked.removed_frames, frame, box.values, motion)
+    return replace(clicked, boxes=dict(sorted(extended.items())), nearby=False)
 
 
 class _TrackIndex:

@@ -1,6 +1,6 @@
-"""Results to view: labels, detections of each source with missed and false ones, and tracks.
+"""Results to view: labels, tracks, and detections by source, with missed and false ones.
 
-They are read from a bag or from result files, or detected on request.
+Detections are read from a bag or from result files, or a detector computes them on request.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ TRACKER_ID_STEP = 10**10  # offset between the ids of two trackers; larger than 
 class Source:
     """A source of detections.
 
-    find: (i, frame) -> the detections in frame i.
+    find: returns the detections in frame i, from (i, frame).
     classes: names of the classes that the source can detect.
     """
 
@@ -61,20 +61,20 @@ class Results:
     tracks: tuple[dict[str, Any], ...] = ()
 
     def layers(self, i: int, frame: Frame, min_score: float) -> dict[str, Any]:
-        """Return the answer of /api/labels for frame i: labels and detections, with the missed and
-        false ones at a minimum score."""
+        """Return the JSON object of /api/labels for frame i: labels and detections, with the missed
+        and false ones at a minimum score."""
         truth = frame.truth()
         camera = frame.camera() if self.sources and truth is not None else None
-        found = {name: source.find(i, frame) for name, source in self.sources.items()}
+        detections = {name: source.find(i, frame) for name, source in self.sources.items()}
         matches = (
             {}
             if truth is None
             else {
                 name: match_detections(truth, d, min_score, camera, self.sources[name].classes)
-                for name, d in found.items()
+                for name, d in detections.items()
             }
         )
-        return layers_to_json(truth, found, matches)
+        return layers_to_json(truth, detections, matches)
 
     def bind_layers(self, drive: Drive) -> Callable[[int, float], dict[str, Any]]:
         """Return layers() for the frames of a drive, as a function of (i, min_score)."""
@@ -82,11 +82,11 @@ class Results:
 
 
 def layers_to_json(
-    truth: GroundTruth | None, found: Mapping[str, Detections], matches: Mapping[str, Any]
+    truth: GroundTruth | None, detections: Mapping[str, Detections], matches: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Convert labels and detections to rows: box, class, and track id or score.
 
-    found: detections by source; their rows end with the probabilities by the detector's own
+    detections: by source; their rows end with the probabilities by the detector's own
         sources.
     """
     labels = (
@@ -98,18 +98,20 @@ def layers_to_json(
         ]
     )
     rows = {}
-    for name, d in found.items():
-        parts = [{k: round(float(v[i]), 3) for k, v in d.sources.items() if np.isfinite(v[i])} for i in range(len(d))]
+    for name, d in detections.items():
+        source_scores = [
+            {k: round(float(v[i]), 3) for k, v in d.sources.items() if np.isfinite(v[i])} for i in range(len(d))
+        ]
         rows[name] = [
             [*map(float, box), CLASSES[c], float(score), row]
-            for box, c, score, row in zip(d.boxes, d.class_ids, d.scores, parts)
+            for box, c, score, row in zip(d.boxes, d.class_ids, d.scores, source_scores)
         ]
     return {"labels": labels, "detections": rows, "matches": dict(matches)}
 
 
 def match_detections(
     truth: GroundTruth,
-    found: Detections,
+    detections: Detections,
     min_score: float,
     camera: Camera | None = None,
     classes: frozenset[str] = frozenset(DETECTED),
@@ -131,8 +133,8 @@ def match_detections(
     true_names = np.array([SIMILAR_CLASS[CLASSES[c]] for c in truth.class_ids], object)
     for name in classes & DETECTED.keys():
         labels = np.flatnonzero(true_names == name)
-        rows = np.flatnonzero((found.class_ids == CLASSES.index(name)) & (found.scores >= min_score))
-        boxes, label_boxes = found.boxes[rows].astype(np.float64), truth.boxes[labels]
+        rows = np.flatnonzero((detections.class_ids == CLASSES.index(name)) & (detections.scores >= min_score))
+        boxes, label_boxes = detections.boxes[rows].astype(np.float64), truth.boxes[labels]
         overlaps = bev_iou(boxes, label_boxes)
         hit = overlaps >= DETECTED[name].relaxed
         if name == CLASSES[PEDESTRIAN]:
@@ -144,10 +146,10 @@ def match_detections(
         hits += rows[i[own[j]]].tolist()
         wrong = np.delete(rows, i)
         if camera is not None and len(wrong):
-            wrong = wrong[camera.in_view(found.boxes[wrong, :3])]
+            wrong = wrong[camera.in_view(detections.boxes[wrong, :3])]
         false += wrong.tolist()
     wanted = [CLASSES.index(name) for name in classes & DETECTED.keys()]
-    counted = np.flatnonzero(found.scores >= min_score)
+    counted = np.flatnonzero(detections.scores >= min_score)
     return {
         "missed": sorted(missed),
         "false": sorted(false),
@@ -157,7 +159,7 @@ def match_detections(
 
 
 def make_detector_source(detector: Detector) -> Source:
-    """Make a source that runs a detector on request, with a cache."""
+    """Make a source that runs a detector on request and caches its detections."""
 
     @lru_cache(maxsize=MAX_CACHED_FRAMES)
     def detect(i: int, frame: Frame) -> Detections:
@@ -169,7 +171,7 @@ def make_detector_source(detector: Detector) -> Source:
 def make_file_source(folder: Path) -> Source:
     """Make a source of KITTI result files, folder/NAME.txt, or of the folder of a `detect` run.
 
-    A frame without a file has no detections. Reading an invalid file raises InputError.
+    A frame without a file has no detections. Raises InputError for an invalid file.
     """
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder} with result files")
@@ -187,7 +189,7 @@ def make_file_source(folder: Path) -> Source:
 
 
 def choose_points_topic(path: Path) -> str:
-    """Return the cloud topic to show of a bag: one with clusters, else as choose_cloud_topic.
+    """Return the cloud topic of a bag to show: one with clusters, else that of choose_cloud_topic.
 
     Raises InputError if the choice is ambiguous.
     """
@@ -202,22 +204,22 @@ def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
     A topic whose boxes cannot be transformed to the clouds' frame is left out, with a warning.
     """
     bag = poses.handle.bag()
-    wanted = {
+    topics = {
         topic
         for topic, kind in bag.topics.items()
         if kind == MARKERS and topic != TRUTH and topic.endswith((FOUND, TRACKS))
     }
-    found = read_objects_by_stamp(bag, sorted(wanted))
-    numbers = {stamp: i for i, stamp in enumerate(stamps)}
+    objects_by_topic = read_objects_by_stamp(bag, sorted(topics))
+    index_by_stamp = {stamp: i for i, stamp in enumerate(stamps)}
     sources: dict[str, Source] = {}
     tracks: list[dict[str, Any]] = []
-    trackers = [topic for topic in found if topic.endswith(TRACKS)]
-    for topic, marked in found.items():
+    trackers = [topic for topic in objects_by_topic if topic.endswith(TRACKS)]
+    for topic, objects_by_stamp in objects_by_topic.items():
         try:
             frames = {
-                numbers[stamp]: poses.to_cloud_frame(objects, topic)
-                for stamp, objects in marked.items()
-                if stamp in numbers
+                index_by_stamp[stamp]: poses.to_cloud_frame(objects, topic)
+                for stamp, objects in objects_by_stamp.items()
+                if stamp in index_by_stamp
             }
         except InputError as error:
             errors.print(f"left out: {error}", style="yellow")
@@ -233,11 +235,13 @@ def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
 
 def detections_with_sources(objects: MarkedObjects) -> Detections:
     """Convert markers to detections, with the probabilities of sources that their text contains."""
-    parts = [e["sources"] if isinstance(e.get("sources"), dict) else {} for e in objects.extras]
-    names = list(dict.fromkeys(name for row in parts for name in row))[:MAX_SOURCES]
+    probabilities = [e["sources"] if isinstance(e.get("sources"), dict) else {} for e in objects.extras]
+    names = list(dict.fromkeys(name for row in probabilities for name in row))[:MAX_SOURCES]
     return replace(
         to_detections(objects),
-        sources={name: np.array([_to_probability(row.get(name)) for row in parts], np.float32) for name in names},
+        sources={
+            name: np.array([_to_probability(row.get(name)) for row in probabilities], np.float32) for name in names
+        },
     )
 
 
@@ -250,9 +254,9 @@ def name_source(topic: str) -> str:
     return topic.strip("/").removesuffix(FOUND)
 
 
-def _make_source(found: Mapping[int, Detections]) -> Source:
-    classes = {CLASSES[c] for detections in found.values() for c in detections.class_ids}
-    return Source(lambda i, frame: found.get(i, Detections.none()), frozenset(classes))
+def _make_source(detections_by_frame: Mapping[int, Detections]) -> Source:
+    classes = {CLASSES[c] for detections in detections_by_frame.values() for c in detections.class_ids}
+    return Source(lambda i, frame: detections_by_frame.get(i, Detections.none()), frozenset(classes))
 
 
 def read_recorded_scan(frame: Frame) -> Scan:
@@ -266,7 +270,7 @@ def read_recorded_scan(frame: Frame) -> Scan:
 
 
 def scan_from_message(message: Any, intensity_max: float = 0.0, scale: FullScale = infer_full_scale) -> Scan:
-    """Convert a PointCloud2 to a scan; without such columns it has neither ground nor clusters.
+    """Convert a PointCloud2 to a scan, with ground and clusters if the cloud has these columns.
 
     intensity_max, scale: see to_point_cloud. Raises InputError for an invalid message.
     """
@@ -289,11 +293,11 @@ def tracks_to_json(frames: Mapping[int, MarkedObjects], topic: str, tracker: int
 
     tracker: see make_track_id.
     """
-    made: dict[int, dict[str, Any]] = {}
+    tracks: dict[int, dict[str, Any]] = {}
     for i in sorted(frames):
         objects = frames[i]
         for box, label, number, score in zip(objects.boxes, objects.labels, objects.ids.tolist(), objects.scores):
-            track = made.setdefault(
+            track = tracks.setdefault(
                 number,
                 {
                     "id": make_track_id(tracker, number),
@@ -308,4 +312,4 @@ def tracks_to_json(frames: Mapping[int, MarkedObjects], topic: str, tracker: int
             track["class"] = label  # the tracker's latest decision
             track["score"] = max(track["score"], float(score))
             track["boxes"].append([i, *map(float, box), "proposed"])
-    return list(made.values())
+    return list(tracks.values())

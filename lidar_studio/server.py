@@ -1,4 +1,4 @@
-"""HTTP server of the page; it only serves this machine, and requests need a token."""
+"""HTTP server of the page, for this machine only; every request needs a token."""
 
 from __future__ import annotations
 
@@ -50,7 +50,8 @@ class PageContent:
     """A drive with labels or results, or a running graph.
 
     session: None to view results without labelling.
-    layers: (i, min_score) -> the answer of /api/labels; None without labels and detections.
+    layers: returns the JSON object of /api/labels for (i, min_score); None without labels and
+        detections.
     tracks: returns the JSON objects of the tracks to view.
     token: every request must contain it.
     """
@@ -67,7 +68,7 @@ class PageContent:
         return self.drive if isinstance(self.drive, LiveGraph) else None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the answer of /api/drive."""
+        """Return the JSON object of /api/drive."""
         common = {
             "name": self.drive.name,
             "mode": "label" if self.session else "view",
@@ -122,7 +123,7 @@ class Server:
                 web.get("/api/drive", self.drive),
                 web.get("/api/cloud/{i}", self.cloud),
                 web.get("/api/state", self.state),
-                web.post("/api/do", self.do),
+                web.post("/api/do", self.run_action),
                 web.get("/api/events", self.events),
                 web.get("/api/labels/{i}", self.labels),
                 web.get("/api/silhouettes", self.silhouettes),
@@ -185,22 +186,22 @@ class Server:
         i, drive = self.parse_frame(request.match_info["i"]), self.content.drive
         load_scan = drive.load_scan
         body = await self.run_in_thread(lambda: load_scan(i).encode())
-        ahead = 0 if self.content.live else PREFETCH_FRAMES
-        for near in range(max(i - ahead, drive.first), min(i + ahead + 1, drive.end)):
-            if near not in self.prefetching:
-                self.prefetching.add(near)
-                made = asyncio.get_running_loop().run_in_executor(self.cloud_pool, load_scan, near)
-                made.add_done_callback(partial(self._finish_prefetch, near))
+        prefetched = 0 if self.content.live else PREFETCH_FRAMES
+        for neighbour in range(max(i - prefetched, drive.first), min(i + prefetched + 1, drive.end)):
+            if neighbour not in self.prefetching:
+                self.prefetching.add(neighbour)
+                future = asyncio.get_running_loop().run_in_executor(self.cloud_pool, load_scan, neighbour)
+                future.add_done_callback(partial(self._finish_prefetch, neighbour))
         return web.Response(body=body, content_type="application/octet-stream")
 
-    def _finish_prefetch(self, near: int, made: asyncio.Future[Any]) -> None:
-        self.prefetching.discard(near)
-        if not made.cancelled():
-            made.exception()  # marks it as retrieved; a request for the frame reports it
+    def _finish_prefetch(self, frame: int, future: asyncio.Future[Any]) -> None:
+        self.prefetching.discard(frame)
+        if not future.cancelled():
+            future.exception()  # marks it as retrieved; a request for the frame reports it
 
-    async def run_in_thread(self, work: Callable[[], Any]) -> Any:
+    async def run_in_thread(self, function: Callable[[], Any]) -> Any:
         """Run a function outside the event loop and return its result."""
-        return await asyncio.get_running_loop().run_in_executor(self.cloud_pool, work)
+        return await asyncio.get_running_loop().run_in_executor(self.cloud_pool, function)
 
     @property
     def session(self) -> Session:
@@ -215,12 +216,12 @@ class Server:
             return web.json_response({"seq": 0, "tracks": list(self.content.tracks())})
         return web.json_response(self.session.to_json())
 
-    async def do(self, request: web.Request) -> web.StreamResponse:
-        """Do an action."""
+    async def run_action(self, request: web.Request) -> web.StreamResponse:
+        """Execute an action of a page, and send its number."""
         action = await _read_json(request)
-        by = request.headers.get("X-Page", "")[:64]
+        page_id = request.headers.get("X-Page", "")[:64]
         loop = asyncio.get_running_loop()
-        seq = await loop.run_in_executor(self.action_pool, self.session.do, action, by)
+        seq = await loop.run_in_executor(self.action_pool, self.session.do, action, page_id)
         return web.json_response({"seq": seq})
 
     async def events(self, request: web.Request) -> web.StreamResponse:
@@ -238,10 +239,10 @@ class Server:
                 if message.type == WSMsgType.ERROR:
                     break
                 if self.content.live and message.type == WSMsgType.TEXT:
-                    self.content.live.set_held(id(socket), message.data == "hold")
+                    self.content.live.set_paused(id(socket), message.data == "pause")
         finally:
             if self.content.live:
-                self.content.live.set_held(id(socket), False)
+                self.content.live.set_paused(id(socket), False)
             self.pages.discard(queue)
             sender.cancel()
             with suppress(asyncio.CancelledError, ConnectionError):
@@ -282,8 +283,8 @@ class Server:
 
     async def next(self, request: web.Request) -> web.StreamResponse:
         """Send the next uncertain track."""
-        after, only = _parse_number(request.query.get("after", "")), request.query.get("class")
-        track = find_next_uncertain(self.session.state, after, lambda track: only in (None, track.class_name))
+        after, class_name = _parse_number(request.query.get("after", "")), request.query.get("class")
+        track = find_next_uncertain(self.session.state, after, lambda track: class_name in (None, track.class_name))
         return web.json_response({"track": track and track.id, "frame": track.find_nearest_frame() if track else 0})
 
     async def export(self, request: web.Request) -> web.StreamResponse:
@@ -313,12 +314,12 @@ def _error_response(status: int, text: str) -> web.Response:
 
 async def _read_json(request: web.Request) -> Mapping[str, Any]:
     try:
-        found = await request.json()
+        content = await request.json()
     except (ValueError, RecursionError) as error:
         raise InputError(f"the request is not valid JSON: {shorten_error(error)}") from None
-    if not isinstance(found, dict):
+    if not isinstance(content, dict):
         raise InputError("the request is not a JSON object")
-    return found
+    return content
 
 
 async def _send_events(socket: web.WebSocketResponse, queue: Events) -> None:
@@ -332,19 +333,19 @@ def _notify_in_loop(loop: asyncio.AbstractEventLoop, server: Server, event: dict
         loop.call_soon_threadsafe(server.broadcast, event)
 
 
-async def serve(content: PageContent, port: int, started: Callable[[str], None]) -> None:
+async def serve(content: PageContent, port: int, on_start: Callable[[str], None]) -> None:
     """Serve until SIGINT or SIGTERM.
 
     Args:
         port: 0 for any free port.
-        started: called with the address of the page.
+        on_start: called with the address of the page.
 
     Raises:
         InputError: the port is in use.
     """
-    server, loop, end = Server(content), asyncio.get_running_loop(), asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, end.set)
+    server, loop, stop = Server(content), asyncio.get_running_loop(), asyncio.Event()
+    for signal_number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(signal_number, stop.set)
     for source in (content.session, content.live):
         if source is not None:
             source.listeners.append(partial(_notify_in_loop, loop, server))
@@ -359,9 +360,9 @@ async def serve(content: PageContent, port: int, started: Callable[[str], None])
             f"cannot listen on port {port}: {error.strerror or error}; give another --port, or 0 for any"
         ) from None
     address = runner.addresses[0]
-    started(f"http://{HOSTS[0]}:{address[1]}/?token={content.token}")
+    on_start(f"http://{HOSTS[0]}:{address[1]}/?token={content.token}")
     try:
-        await end.wait()
+        await stop.wait()
     finally:
         server.pages.clear()
         await runner.cleanup()

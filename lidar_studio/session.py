@@ -87,22 +87,22 @@ class Session:
         """Times of the frames, and sensor poses if known."""
         return with_scan_poses(self.state, self.drive.motion)
 
-    def do(self, action: Mapping[str, Any], by: str = "") -> int:
-        """Do an action of a page and return its number.
+    def do(self, action: Mapping[str, Any], page_id: str = "") -> int:
+        """Execute an action of a page and return its number.
 
         Raises:
             InputError: the action is invalid or cannot be written; the labels are unchanged.
         """
         if action.get("do") in ("propose", "cancel"):
-            return self.start_proposals(by, True) if action["do"] == "propose" else self.cancel()
+            return self.start_proposals(page_id, True) if action["do"] == "propose" else self.cancel()
         with self._lock:
-            seq = self._record(self._complete(strip_computed(action)), by)
+            seq = self._record(self._complete(strip_computed(action)), page_id)
             name = action.get("do")
-            # Undo restores a track from before its tracking ended, and a rejected click is not
-            # tracked further. These actions may therefore leave a click that has to be tracked.
+            # Undo may restore a track from before its tracking ended, and rejected clicks are not
+            # tracked. So a click may have to be tracked after these actions.
             resumes = name in ("undo", "redo", "accept", "reopen") and not self._task
             if (name == "seed" or resumes) and self._has_waiting_clicks():
-                self._start("following", lambda: self._track_clicks(by, None if resumes else seq))
+                self._start("following", lambda: self._track_clicks(page_id, None if resumes else seq))
         return seq
 
     def cancel(self) -> int:
@@ -111,7 +111,7 @@ class Session:
         self._next_cancelled.set()
         return self.state.seq
 
-    def start_proposals(self, by: str = "", again: bool = False) -> int:
+    def start_proposals(self, page_id: str = "", again: bool = False) -> int:
         """Survey the drive in the background, and propose tracks if there are no proposals yet.
 
         Args:
@@ -126,10 +126,12 @@ class Session:
         with self._lock:
             if self._task == "proposing":
                 raise InputError("proposals are already being made")
-            self._start("proposing", lambda: self.propose(by, again=again or not self.has_proposals, by_person=again))
+            self._start(
+                "proposing", lambda: self.propose(page_id, again=again or not self.has_proposals, by_person=again)
+            )
         return self.state.seq
 
-    def _start(self, task: str, work: Callable[[], None]) -> None:
+    def _start(self, task: str, run_task: Callable[[], None]) -> None:
         """Cancel the previous task and run a new one in a thread."""
         self.cancel()
         previous, cancelled, self._task = self._worker, threading.Event(), task
@@ -141,7 +143,7 @@ class Session:
             self.busy = {"what": task, "done": 0, "of": len(self.drive.frames)}
             self._cancelled = cancelled  # may already be set
             try:
-                work()
+                run_task()
             except Exception as error:  # shown on the page, because nobody joins this thread
                 self.notify(
                     {
@@ -165,11 +167,11 @@ class Session:
         if self._worker is not None:
             self._worker.join()
 
-    def propose(self, by: str = "", again: bool = True, by_person: bool = False) -> None:
+    def propose(self, page_id: str = "", again: bool = True, by_person: bool = False) -> None:
         """Survey the drive if necessary, and record proposals unless cancelled.
 
         Args:
-            again: if False, make proposals only when a click has still to be tracked.
+            again: if False, make proposals only when a click has not been tracked yet.
             by_person: a person requested the proposals and can undo them.
 
         Raises:
@@ -184,9 +186,9 @@ class Session:
                 return
         with self._lock:
             if not self.state.poses and (poses := self.proposer.collect_scan_poses()) is not None:
-                self._record({"do": "poses", "poses": poses}, by)
+                self._record({"do": "poses", "poses": poses}, page_id)
         if again or self._has_waiting_clicks():
-            self._propose_all(by, None, by_person)
+            self._propose_all(page_id, None, by_person)
 
     def _report_problem(self) -> None:
         if self.proposer.problem:
@@ -200,29 +202,29 @@ class Session:
             self.notify({"progress": self.get_progress()})
         return not self._cancelled.is_set()
 
-    def _propose_all(self, by: str, seed: int | None, by_person: bool = False) -> None:
+    def _propose_all(self, page_id: str, seed: int | None, by_person: bool = False) -> None:
         """Make proposals for the whole drive and record them.
 
-        Other actions may be recorded in the meantime. If action number `seed` is still the last
-        one, the proposals become part of it.
+        Other actions may be recorded in the meantime. If the last action is still number `seed`,
+        the proposals become part of it.
         """
         state = self.state
-        found = self.proposer.make_proposals(state, self.motion, None, self._report_progress)
+        proposals = self.proposer.make_proposals(state, self.motion, None, self._report_progress)
         with self._lock:
-            if found is None or self._cancelled.is_set() or (seed is not None and not self._has_waiting_clicks()):
+            if proposals is None or self._cancelled.is_set() or (seed is not None and not self._has_waiting_clicks()):
                 return
-            tracks, removed = merge_proposals(self.state, found, self.motion)
+            tracks, removed = merge_proposals(self.state, proposals, self.motion)
             # Undoing a seed also undoes its proposals, but never the first proposals of a drive.
             joins = seed == self.state.seq and self.has_proposals
             undo = {} if by_person else {"joins": True} if joins else {"beside": True}
-            self._record({"do": "propose", "tracks": tracks, "removed": removed, **undo}, by)
+            self._record({"do": "propose", "tracks": tracks, "removed": removed, **undo}, page_id)
             self.has_proposals = True
 
-    def _track_clicks(self, by: str, seed: int | None) -> None:
+    def _track_clicks(self, page_id: str, seed: int | None) -> None:
         with self._lock:
             waiting = self._has_waiting_clicks()
         if waiting:
-            self._propose_all(by, seed)
+            self._propose_all(page_id, seed)
 
     def _has_waiting_clicks(self) -> bool:
         return any(t.nearby and t.awaits_tracking for t in self.state.tracks.values())
@@ -248,12 +250,12 @@ class Session:
         if not isinstance(path, str) or not isinstance(name, str):
             raise InputError("an import needs the path of a label file or folder, and optionally a format, as text")
         labels = import_labels(Path(path), name or recognise_format(Path(path)), self.drive.frames)
-        tracks, kept = to_tracks(labels, self.state.next_id)
-        before = self.state.kept
-        digest, imports = compute_digest(tracks, kept), before.get("imports", [])
+        tracks, preserved = to_tracks(labels, self.state.next_id)
+        earlier = self.state.preserved
+        digest, imports = compute_digest(tracks, preserved), earlier.get("imports", [])
         if digest in imports:
             raise AlreadyImportedError(f"the labels in {path} were already imported; nothing was done")
-        return {**action, "tracks": tracks, "kept": {**join_extras(before, kept), "imports": [*imports, digest]}}
+        return {**action, "tracks": tracks, "kept": {**join_extras(earlier, preserved), "imports": [*imports, digest]}}
 
     def export(self, format_name: str, out: str, force: bool = False) -> dict[str, Any]:
         """Export the accepted tracks.
@@ -264,7 +266,7 @@ class Session:
             force: replace existing files.
 
         Returns:
-            The answer of /api/export: path, boxes, frames, left_out.
+            The JSON object of /api/export: path, boxes, frames, left_out.
 
         Raises:
             InputError: the labels cannot be written there.
@@ -308,18 +310,18 @@ class Session:
         count = len(self.drive.frames)
         nearby = range(max(frame - NEARBY_FRAMES, 0), min(frame + NEARBY_FRAMES + 1, count))
         is_long = count > 2 * NEARBY_FRAMES
-        found = self.proposer.make_proposals(state, self.motion, nearby if is_long else None)
-        tracks, removed = merge_proposals(state, found or [], self.motion)
+        proposals = self.proposer.make_proposals(state, self.motion, nearby if is_long else None)
+        tracks, removed = merge_proposals(state, proposals or [], self.motion)
         if is_long:  # proposals in nearby frames must not replace tracks of the whole drive
             tracks = [t for t in tracks if t.id == track.id or t.id not in state.tracks]
             removed = []
-        own = next((t for t in tracks if t.id == track.id), track)
-        tracks = [t for t in tracks if t is not own] + [replace(own, nearby=is_long)]
+        clicked = next((t for t in tracks if t.id == track.id), track)
+        tracks = [t for t in tracks if t is not clicked] + [replace(clicked, nearby=is_long)]
         return {**action, "tracks": tracks, "removed": removed}
 
-    def _record(self, action: Action, by: str) -> int:
+    def _record(self, action: Action, page_id: str) -> int:
         """Apply an action, write it to the journal, and notify the listeners."""
-        after, change = apply(self.state, action, self.drive.motion)
+        new_state, change = apply(self.state, action, self.drive.motion)
         encoded: dict[int, dict[str, Any]] = {}
 
         def encode(track: Track) -> dict[str, Any]:
@@ -328,24 +330,36 @@ class Session:
             return encoded[track.id]
 
         self.journal.append(
-            {"seq": after.seq, "time": datetime.now(UTC).isoformat(), "by": by, **convert_tracks(action, encode)}
+            {
+                "seq": new_state.seq,
+                "time": datetime.now(UTC).isoformat(),
+                "by": page_id,
+                **convert_tracks(action, encode),
+            }
         )
-        self.state = after
-        self._notify_change(action, change, by, encode)
-        return after.seq
+        self.state = new_state
+        self._notify_change(action, change, page_id, encode)
+        return new_state.seq
 
     def _notify_change(
-        self, action: Action, change: Change, by: str, encode: Callable[[Track], dict[str, Any]]
+        self, action: Action, change: Change, page_id: str, encode: Callable[[Track], dict[str, Any]]
     ) -> None:
         tracks = [encode(track) for _, track in change.tracks.values() if track]
         removed = [n for n, (_, track) in change.tracks.items() if track is None]
-        shown = {
+        public_action = {
             k: v
             for k, v in action.items()
             if k not in ("tracks", "removed", "poses", "kept") or action["do"] == "merge"
         }
         self.notify(
-            {"seq": self.state.seq, "by": by, "action": shown, "tracks": tracks, "removed": removed, **self.summarize()}
+            {
+                "seq": self.state.seq,
+                "by": page_id,
+                "action": public_action,
+                "tracks": tracks,
+                "removed": removed,
+                **self.summarize(),
+            }
         )
 
     def notify(self, event: dict[str, Any]) -> None:
@@ -369,7 +383,7 @@ class Session:
         }
 
     def to_json(self) -> dict[str, Any]:
-        """Return the answer of /api/state."""
+        """Return the JSON object of /api/state."""
         with self._lock:
             return {
                 "seq": self.state.seq,

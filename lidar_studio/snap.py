@@ -24,8 +24,8 @@ MIN_GROUND_POINTS, MAX_GROUND_DISTANCE_M = 20, 15.0
 MIN_PIECE_SHARE = 0.2  # min size relative to the largest cluster in a box; smaller ones are other objects
 # A cluster is part of a clicked vehicle if this fraction of its points is within this fraction of the
 # usual length from the click.
-MIN_INSIDE_SHARE, PIECE_REACH = 0.8, 0.55
-MIN_REACH_M = 0.1  # minimum reach beyond the cluster point nearest to the click
+MIN_INSIDE_SHARE, PIECE_RADIUS_RATIO = 0.8, 0.55
+MIN_RADIUS_M = 0.1  # minimum reach beyond the cluster point nearest to the click
 MAX_LENGTH_RATIO = 1.5  # max ratio to the usual length; a longer cluster contains other objects
 LONG_OBJECT_M = 2.5  # usual length of objects whose far side is hidden
 MAX_END_RATIO = 1.3  # max ratio to the usual width; a shorter side is the front or the rear
@@ -36,32 +36,32 @@ def fit_clicked_box(scan: Scan, click: Array, class_name: str) -> Array:
     size. InputError if there is no cluster near the point."""
     label = find_clicked_cluster(click, scan.xyz, scan.cluster_ids, SeedParams().click_radius)
     members = scan.cluster_ids == label
-    usual = find_usual_size(class_name)
-    if usual is not None and usual[0] > LONG_OBJECT_M:  # long objects are often split into several clusters
-        near = np.hypot(*(scan.xyz[:, :2] - click[:2]).T) < usual[0] * PIECE_REACH
+    usual_size = find_usual_size(class_name)
+    if usual_size is not None and usual_size[0] > LONG_OBJECT_M:  # long objects are often split into several clusters
+        is_near = np.hypot(*(scan.xyz[:, :2] - click[:2]).T) < usual_size[0] * PIECE_RADIUS_RATIO
         inside, total = (
-            np.bincount(scan.cluster_ids[mask], minlength=scan.cluster_ids.max() + 1) for mask in (near, slice(None))
+            np.bincount(scan.cluster_ids[mask], minlength=scan.cluster_ids.max() + 1) for mask in (is_near, slice(None))
         )
         is_part = (inside > MIN_INSIDE_SHARE * total) & (np.arange(len(total)) > 0)
         members |= is_part[scan.cluster_ids]
     box = _fit_box(scan, members)
-    if usual is not None and box[3] > MAX_LENGTH_RATIO * usual[0]:  # the cluster includes other objects
+    if usual_size is not None and box[3] > MAX_LENGTH_RATIO * usual_size[0]:  # the cluster includes other objects
         distances = np.hypot(*(scan.xyz[:, :2] - click[:2]).T)
-        # A click may miss the cluster by more than the first term.
-        reach = max(usual[0] * PIECE_REACH, distances[members].min() + MIN_REACH_M)
-        box = _fit_box(scan, members & (distances < reach))
-    return complete_box(box, usual)
+        # The click may be further from the cluster than the first term.
+        radius = max(usual_size[0] * PIECE_RADIUS_RATIO, distances[members].min() + MIN_RADIUS_M)
+        box = _fit_box(scan, members & (distances < radius))
+    return complete_box(box, usual_size)
 
 
 def snap_to_cluster(scan: Scan, box: Array) -> Array:
     """Fit an L-shape (7,) to the cluster in a box (7,), keeping the heading within 45 degrees.
     InputError if there is no cluster in the box."""
-    near = points_in_box(scan.xyz, box, BOX_MARGIN_M) & (scan.cluster_ids > 0)
-    counts = np.bincount(scan.cluster_ids[near], minlength=scan.cluster_ids.max(initial=0) + 1)
+    inside = points_in_box(scan.xyz, box, BOX_MARGIN_M) & (scan.cluster_ids > 0)
+    counts = np.bincount(scan.cluster_ids[inside], minlength=scan.cluster_ids.max(initial=0) + 1)
     if not counts.any():
         raise InputError("there is no cluster in the box; move it onto one")
     is_large = counts >= MIN_PIECE_SHARE * counts.max()
-    return align_heading(_fit_box(scan, near & is_large[scan.cluster_ids]), box[6])
+    return align_heading(_fit_box(scan, inside & is_large[scan.cluster_ids]), box[6])
 
 
 def snap_to_ground(scan: Scan, box: Array) -> Array:
@@ -75,10 +75,10 @@ def snap_to_ground(scan: Scan, box: Array) -> Array:
 def _find_ground_height(scan: Scan, box: Array) -> float:
     """Return the z of the ground below a box (7,), NaN without ground points around it."""
     ground = scan.xyz[scan.ground]
-    near = ground[np.hypot(*(ground[:, :2] - box[:2]).T) < MAX_GROUND_DISTANCE_M]
-    if len(near) < MIN_GROUND_POINTS:
+    nearby = ground[np.hypot(*(ground[:, :2] - box[:2]).T) < MAX_GROUND_DISTANCE_M]
+    if len(nearby) < MIN_GROUND_POINTS:
         return np.nan
-    return float(fit_ground_surface(near, float(np.median(near[:, 2]))).at(box[None])[0])
+    return float(fit_ground_surface(nearby, float(np.median(nearby[:, 2]))).at(box[None])[0])
 
 
 def resize_box(box: Array, size: Array) -> Array:
@@ -112,20 +112,20 @@ def find_usual_size(class_name: str) -> Size | None:
     return DETECTED[class_name].mean_size if class_name in DETECTED else None
 
 
-def complete_box(box: Array, usual: Size | None) -> Array:
+def complete_box(box: Array, usual_size: Size | None) -> Array:
     """Enlarge the box (7,) of visible points to the usual size of the class.
 
     Boxes of people grow evenly, those of vehicles away from the sensor. If the length of a vehicle
     is less than MAX_END_RATIO times the usual width, only its front or rear is visible.
     """
-    if usual is None:
+    if usual_size is None:
         return box
-    length, width, height = usual
-    vehicle = length > LONG_OBJECT_M
-    if vehicle and box[3] < MAX_END_RATIO * width:
+    length, width, height = usual_size
+    is_vehicle = length > LONG_OBJECT_M
+    if is_vehicle and box[3] < MAX_END_RATIO * width:
         box = align_heading(box, box[6] + np.pi / 2)
     size = np.array([max(box[3], length), max(box[4], width), box[5] if box[5] > height / 2 else height])
-    if vehicle:
+    if is_vehicle:
         return resize_box(box, size)
     return np.array([*box[:2], box[2] + (size[2] - box[5]) / 2, *size, box[6]])
 

@@ -37,7 +37,7 @@ class Track:
     removed_frames: frames from which a person removed the box.
     extra: by frame, fields of an imported label that are preserved for export.
     edited: a person changed the class, or split or merged the track.
-    nearby: it was clicked, and is so far tracked only through the frames around the click.
+    nearby: a clicked track that so far has boxes only in the frames around the click.
     """
 
     id: int
@@ -73,7 +73,7 @@ class Track:
 
     @property
     def uncertainty(self) -> float:
-        """1 at a score of 0.5, falling to 0 at scores of 0 and 1."""
+        """Uncertainty of the score: 1 at 0.5, falling to 0 at 0 and 1."""
         return 1.0 - 2.0 * abs(self.score - 0.5)
 
     def find_nearest_frame(self) -> int:
@@ -83,12 +83,12 @@ class Track:
 
 class Change(NamedTuple):
     """Values before and after an action: tracks by id (None if absent), seeds, checked frames, and
-    preserved fields of imported files."""
+    the preserved fields of imported files."""
 
     tracks: Mapping[int, tuple[Track | None, Track | None]]
     seeds: tuple[Seeds, Seeds]
     checked: tuple[frozenset[int], frozenset[int]]
-    kept: tuple[Kept, Kept]
+    preserved: tuple[PreservedFields, PreservedFields]
 
     def combine_with(self, later: Change) -> Change:
         """Return this change and a later one as a single change."""
@@ -98,7 +98,10 @@ class Change(NamedTuple):
             for n in (*self.tracks, *later.tracks)
         }
         return Change(
-            tracks, (self.seeds[0], later.seeds[1]), (self.checked[0], later.checked[1]), (self.kept[0], later.kept[1])
+            tracks,
+            (self.seeds[0], later.seeds[1]),
+            (self.checked[0], later.checked[1]),
+            (self.preserved[0], later.preserved[1]),
         )
 
     def invert(self) -> Change:
@@ -107,12 +110,12 @@ class Change(NamedTuple):
             {k: (after, before) for k, (before, after) in self.tracks.items()},
             self.seeds[::-1],
             self.checked[::-1],
-            self.kept[::-1],
+            self.preserved[::-1],
         )
 
 
 Seeds = tuple[tuple[int, int], ...]  # (frame, track id)
-Kept = Mapping[str, Any]  # preserved fields of imported files, see label_conversion.py
+PreservedFields = Mapping[str, Any]  # preserved fields of imported files, see label_conversion.py
 Stack = tuple[Change, Any] | None  # a change, and the stack below it: shared between states
 
 
@@ -122,7 +125,7 @@ class State:
 
     seq: number of that action.
     next_id: id of the next new track.
-    kept: preserved fields of imported files.
+    preserved: preserved fields of imported files.
     poses: (F, 16) sensor poses from scan matching, if the recording has none.
     """
 
@@ -131,7 +134,7 @@ class State:
     checked: frozenset[int] = frozenset()
     seq: int = 0
     next_id: int = 1
-    kept: Kept = field(default_factory=dict)
+    preserved: PreservedFields = field(default_factory=dict)
     poses: tuple[tuple[float, ...], ...] = ()
     undo_stack: Stack = None
     redo_stack: Stack = None
@@ -149,14 +152,14 @@ class State:
             tracks=tracks,
             seeds=change.seeds[1],
             checked=change.checked[1],
-            kept=change.kept[1],
+            preserved=change.preserved[1],
             next_id=max(self.next_id, *(n + 1 for n in change.tracks), 1),
         )
 
 
 def track_to_json(track: Track) -> dict[str, Any]:
     """Convert a track to the JSON object of the page and the journal."""
-    found = {
+    content = {
         "id": track.id,
         "class": track.class_name,
         "state": track.state,
@@ -166,26 +169,26 @@ def track_to_json(track: Track) -> dict[str, Any]:
         "uncertainty": track.uncertainty,
     }
     if track.removed_frames:
-        found["gone"] = sorted(track.removed_frames)
+        content["gone"] = sorted(track.removed_frames)
     if track.extra:
-        found["extra"] = {str(f): track.extra[f] for f in sorted(track.extra)}
-    return found | {name: True for name in ("edited", "nearby") if getattr(track, name)}
+        content["extra"] = {str(f): track.extra[f] for f in sorted(track.extra)}
+    return content | {name: True for name in ("edited", "nearby") if getattr(track, name)}
 
 
-def track_from_json(found: Mapping[str, Any]) -> Track:
+def track_from_json(content: Mapping[str, Any]) -> Track:
     """Make a track from the object of track_to_json."""
-    boxes = {int(f): Box(tuple(map(float, values)), kind) for f, *values, kind in found["boxes"]}
+    boxes = {int(f): Box(tuple(map(float, values)), kind) for f, *values, kind in content["boxes"]}
     return Track(
-        int(found["id"]),
-        str(found["class"]),
-        found["state"],
-        float(found["score"]),
-        str(found["source"]),
+        int(content["id"]),
+        str(content["class"]),
+        content["state"],
+        float(content["score"]),
+        str(content["source"]),
         boxes,
-        frozenset(found.get("gone", ())),
-        {int(f): v for f, v in found.get("extra", {}).items()},
-        found.get("edited", False),
-        found.get("nearby", False),
+        frozenset(content.get("gone", ())),
+        {int(f): v for f, v in content.get("extra", {}).items()},
+        content.get("edited", False),
+        content.get("nearby", False),
     )
 
 
@@ -194,15 +197,15 @@ def find_next_uncertain(
 ) -> Track | None:
     """Return the most uncertain proposed track that meets a condition, or None.
 
-    after: id of such a track; the one after it is returned, and after the last one the first.
+    after: id of a track; the next one in this order is returned, or the first one after the last.
     """
-    waiting = sorted(
+    candidates = sorted(
         (t for t in state.tracks.values() if t.state == PROPOSED and condition(t)), key=lambda t: (-t.uncertainty, t.id)
     )
-    if not waiting:
+    if not candidates:
         return None
-    place = next((i for i, t in enumerate(waiting) if t.id == after), -1)
-    return waiting[(place + 1) % len(waiting)]
+    index = next((i for i, t in enumerate(candidates) if t.id == after), -1)
+    return candidates[(index + 1) % len(candidates)]
 
 
 def count_progress(state: State, frames: int) -> dict[str, int]:

@@ -1,6 +1,6 @@
 """Survey of a drive: detections and candidate clusters of every frame.
 
-It is computed once, so that a new seed needs only a comparison.
+It is computed once per drive; a new seed is then only compared with the clusters.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class FrameSurvey:
     images: (C, 80) uint32, silhouettes of these clusters.
     features: (C,) each, by name; empty for C = 0.
     shapes: (T, 7) L-shapes of clusters of object size, down to the ground.
-    pose: (4, 4) in the first frame, from scan matching; None if the drive has poses.
+    pose: (4, 4) relative to the first frame, from scan matching; None if the drive has poses.
     """
 
     detections: Detections
@@ -68,15 +68,15 @@ def survey_frame(frame: Frame, detector: Detector | None = None, odometry: Odome
         InputError: the frame cannot be read.
     """
     cloud, params = frame.load(), make_pipeline_params(frame)
-    found = segment_cloud(cloud, None, params)
+    segmented = segment_cloud(cloud, None, params)
     detections = Detections.none() if detector is None else detector(cloud).detections
     pose = None if odometry is None else odometry(cloud.xyz)
-    counts = np.bincount(found.cluster_ids, minlength=len(found.boxes) + 1)[1:]
-    people = _find_clusters(found.boxes, counts, PERSON_HEIGHTS_M, MAX_PERSON_WIDTH_M, MIN_PERSON_POINTS)
-    boxes, shapes = found.boxes[people], _fit_objects(found, counts)
+    counts = np.bincount(segmented.cluster_ids, minlength=len(segmented.boxes) + 1)[1:]
+    people = _find_clusters(segmented.boxes, counts, PERSON_HEIGHTS_M, MAX_PERSON_WIDTH_M, MIN_PERSON_POINTS)
+    boxes, shapes = segmented.boxes[people], _fit_objects(segmented, counts)
     if len(people) == 0:
         return FrameSurvey(detections, boxes, np.zeros((0, ROWS), np.uint32), {}, shapes, pose)
-    images, features = _describe_people(found.xyz, found.cluster_ids, boxes, people + 1, params)
+    images, features = _describe_people(segmented.xyz, segmented.cluster_ids, boxes, people + 1, params)
     return FrameSurvey(detections, boxes, images, features, shapes, pose)
 
 
@@ -92,14 +92,14 @@ def _find_clusters(
     )
 
 
-def _fit_objects(found: SegmentedCloud, counts: Array) -> Array:
+def _fit_objects(segmented: SegmentedCloud, counts: Array) -> Array:
     """Fit the L-shapes (T, 7) float32 of clusters of object size."""
-    chosen = _find_clusters(found.boxes, counts, OBJECT_HEIGHTS_M, MAX_OBJECT_LENGTH_M, MIN_OBJECT_POINTS)
-    numbers = np.zeros(len(found.boxes) + 1, np.int32)
-    numbers[chosen + 1] = np.arange(1, len(chosen) + 1)
-    labels = numbers[found.cluster_ids]
-    shapes = fit_boxes(found.xyz[labels > 0], labels[labels > 0], "l_shape")
-    shapes[:, [2, 5]] = found.boxes[chosen][:, [2, 5]]  # extended down to the ground
+    indices = _find_clusters(segmented.boxes, counts, OBJECT_HEIGHTS_M, MAX_OBJECT_LENGTH_M, MIN_OBJECT_POINTS)
+    numbers = np.zeros(len(segmented.boxes) + 1, np.int32)
+    numbers[indices + 1] = np.arange(1, len(indices) + 1)
+    labels = numbers[segmented.cluster_ids]
+    shapes = fit_boxes(segmented.xyz[labels > 0], labels[labels > 0], "l_shape")
+    shapes[:, [2, 5]] = segmented.boxes[indices][:, [2, 5]]  # extended down to the ground
     return shapes
 
 
@@ -117,8 +117,8 @@ def survey_drive(
 ) -> Generator[FrameSurvey | None, None, None]:
     """Yield the surveys of all frames from `first` on, in order.
 
-    The frames are surveyed in a separate process if the recording can be reopened there; it ends
-    with the iterator. Scan matching has to read earlier frames again; None is yielded for these.
+    The frames are surveyed in a separate process if the recording can be reopened there. Scan
+    matching has to read earlier frames again; None is yielded for these.
 
     Raises:
         InputError: a frame or the detector's weights cannot be read.

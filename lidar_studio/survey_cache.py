@@ -1,4 +1,4 @@
-"""Cache of a drive's survey on disk, which a restarted server uses or continues."""
+"""Cache of the survey of a drive on disk, for a restarted server."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ PARTS = "detections", "classes", "scores", "boxes", "images", "features", "thing
 
 
 def make_key(drive: Drive, choice: DetectorChoice | None) -> str:
-    """Return the inputs of a survey as JSON: the drive, the detector's weights and parameters, and
-    the version of the package."""
+    """Return all inputs of a survey as JSON: the drive, the detector's weights and parameters, and the
+    version of the package."""
     weights = "" if choice is None else choice.weights
     file = Path(weights)
     parameters = (
@@ -68,14 +68,14 @@ def write(folder: Path, key: str, first: int, surveys: Sequence[FrameSurvey]) ->
     columns: list[list[Array]] = [[] for _ in PARTS]
     names = sorted({name for survey in surveys for name in survey.features})
     for survey in surveys:
-        found = survey.detections
+        detections = survey.detections
         features = np.array([survey.features.get(n, np.zeros(len(survey.boxes))) for n in names])
         for column, part in zip(
             columns,
             (
-                found.boxes,
-                found.class_ids,
-                found.scores,
+                detections.boxes,
+                detections.class_ids,
+                detections.scores,
                 survey.boxes,
                 survey.images,
                 features.reshape(len(names), -1).T,
@@ -101,17 +101,17 @@ def _file_name(first: int) -> str:
 
 
 def read(folder: Path, key: str) -> tuple[list[FrameSurvey], str]:
-    """Return the cached surveys of the first frames, and why the others were ignored, or ""."""
+    """Return the cached surveys of the first frames, and the reason why later ones were ignored, or ""."""
     surveys: list[FrameSurvey] = []
     first = 0
     while (path := folder / _file_name(first)).is_file():
         try:
             with np.load(path) as file:
-                found = str(file["key"])
-                surveys += _read_file(file) if found == key else []
-            if found != key:
-                other = "; ".join(find_differences(json.loads(found), json.loads(key)))
-                return [], (f"{folder} belongs to another survey ({other}); the drive is surveyed again")
+                stored_key = str(file["key"])
+                surveys += _read_file(file) if stored_key == key else []
+            if stored_key != key:
+                differences = "; ".join(find_differences(json.loads(stored_key), json.loads(key)))
+                return [], (f"{folder} belongs to another survey ({differences}); the drive is surveyed again")
         except (OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, BadZipFile, zlib.error) as error:
             return surveys, (
                 f"{path} is damaged ({shorten_error(error)}); the drive is surveyed again from frame {first} on"

@@ -20,44 +20,44 @@ FLAGS = (
     "--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
     "--disable-background-networking --disable-component-update --disable-sync"
 ).split()
-PICTURES = """async ([count, thinned]) => {
-  const { drawn, fly, limits } = page, took = [];
+DRAWING_SCRIPT = """async ([count, movingPoints]) => {
+  const { drawStats, limits, moveCamera } = page, durations = [];
   await new Promise((r) => setTimeout(r, 1000)); // at rest
-  limits.thinned = thinned;
+  limits.movingPoints = movingPoints;
   for (let k = 0; k < count; k++) {
-    const start = performance.now(), before = drawn.pictures;
-    fly(0, 0, 0.02);
-    while (drawn.pictures === before) await new Promise(requestAnimationFrame);
+    const start = performance.now(), before = drawStats.count;
+    moveCamera(0, 0, 0.02);
+    while (drawStats.count === before) await new Promise(requestAnimationFrame);
     await new Promise(requestAnimationFrame); // once it has been shown
-    took.push(performance.now() - start);
+    durations.push(performance.now() - start);
   }
-  limits.thinned = 30000;
-  return { took, points: drawn.points };
+  limits.movingPoints = 30000;
+  return { durations, points: drawStats.points };
 }"""
-STANDING = """async (count) => {
-  const { drawn, draw } = page, took = [];
+REDRAWING_SCRIPT = """async (count) => {
+  const { draw, drawStats } = page, durations = [];
   await new Promise((r) => setTimeout(r, 1000));
   for (let k = 0; k < count; k++) {
-    const start = performance.now(), before = drawn.pictures;
+    const start = performance.now(), before = drawStats.count;
     draw(); // as after each step of a box that is dragged
-    while (drawn.pictures === before) await new Promise(requestAnimationFrame);
+    while (drawStats.count === before) await new Promise(requestAnimationFrame);
     await new Promise(requestAnimationFrame);
-    took.push(performance.now() - start);
+    durations.push(performance.now() - start);
   }
-  return { took, points: drawn.points };
+  return { durations, points: drawStats.points };
 }"""
-PICKS = """(count) => {
-  const took = [];
+PICKING_SCRIPT = """(count) => {
+  const durations = [];
   for (let k = 0; k < count; k++) {
     const start = performance.now();
-    page.pointAt(300 + 7 * (k % 80), 150 + 5 * (k % 70));
-    took.push(performance.now() - start);
+    page.findPointAt(300 + 7 * (k % 80), 150 + 5 * (k % 70));
+    durations.push(performance.now() - start);
   }
-  return { took, points: page.store.cloud.count };
+  return { durations, points: page.store.cloud.count };
 }"""
-HOVER = """async (count) => {
+HOVER_SCRIPT = """async (count) => {
   const scene = document.getElementById("scene"), area = scene.getBoundingClientRect();
-  const { cloud } = page.store, places = new Map(), took = [];
+  const { cloud } = page.store, places = new Map(), durations = [];
   for (let i = 0; i < cloud.count; i++) { // one point of each cluster in view
     if (!cloud.cluster[i] || places.has(cloud.cluster[i])) continue;
     const at = page.project(...cloud.xyz.subarray(3 * i, 3 * i + 3));
@@ -66,31 +66,31 @@ HOVER = """async (count) => {
     }
   }
   for (const [x, y] of [...places.values()].slice(0, count)) {
-    const start = performance.now(), before = page.drawn.pictures;
+    const start = performance.now(), before = page.drawStats.count;
     scene.dispatchEvent(new PointerEvent("pointermove",
                                          { clientX: area.left + x, clientY: area.top + y }));
-    while (page.drawn.pictures === before && performance.now() < start + 1000) {
+    while (page.drawStats.count === before && performance.now() < start + 1000) {
       await new Promise(requestAnimationFrame);
     }
     await new Promise(requestAnimationFrame);
-    if (page.drawn.pictures !== before) took.push(performance.now() - start);
+    if (page.drawStats.count !== before) durations.push(performance.now() - start);
   }
-  return { took, points: cloud.count };
+  return { durations, points: cloud.count };
 }"""
-NEXT = """async (count) => {
-  const took = [];
+NEXT_FRAME_SCRIPT = """async (count) => {
+  const durations = [];
   for (let k = 0; k < count; k++) {
     const goal = page.store.frame + 1;
     if (goal >= page.store.drive.frames.length) break;
     await new Promise((r) => setTimeout(r, 2500)); // as long as a person looks: the next is fetched
-    const start = performance.now(), before = page.drawn.pictures;
+    const start = performance.now(), before = page.drawStats.count;
     document.getElementById("next").click();
-    while (page.store.frame !== goal || page.drawn.pictures === before) {
+    while (page.store.frame !== goal || page.drawStats.count === before) {
       await new Promise(requestAnimationFrame);
     }
-    took.push(performance.now() - start);
+    durations.push(performance.now() - start);
   }
-  return { took, points: page.store.cloud.count };
+  return { durations, points: page.store.cloud.count };
 }"""
 
 
@@ -133,11 +133,11 @@ class MeasuredPage:
         processes."""
         before = {name: read_cpu_ms(pid) for name, pid in self.pids.items()}
         result = self.page.evaluate(script, arguments)
-        took, count = sorted(result["took"]), len(result["took"])
+        durations, count = sorted(result["durations"]), len(result["durations"])
         cpu = ", ".join(f"{name} {(read_cpu_ms(pid) - before[name]) / count:.1f}" for name, pid in self.pids.items())
         print(
-            f"{title}, {result['points']:,} points: median {statistics.median(took):.1f} ms, "
-            f"slowest of {count} {took[-1]:.1f} ms; mean CPU time in ms: {cpu}",
+            f"{title}, {result['points']:,} points: median {statistics.median(durations):.1f} ms, "
+            f"slowest of {count} {durations[-1]:.1f} ms; mean CPU time in ms: {cpu}",
             flush=True,
         )
 
@@ -168,15 +168,15 @@ def main() -> None:
         page.wait_for_selector("html[data-ready=true]", state="attached")
         page.wait_for_timeout(2000)
         measured = MeasuredPage(page, others)
-        measured.measure("drawing while the camera moves", PICTURES, [40, 30_000])
-        measured.measure("drawing all points", PICTURES, [20, 10**9])
-        measured.measure("drawing while the camera stands still", STANDING, 40)
-        measured.measure("pick", PICKS, 50)
+        measured.measure("drawing while the camera moves", DRAWING_SCRIPT, [40, 30_000])
+        measured.measure("drawing all points", DRAWING_SCRIPT, [20, 10**9])
+        measured.measure("drawing while the camera stands still", REDRAWING_SCRIPT, 40)
+        measured.measure("pick", PICKING_SCRIPT, 50)
         page.locator("#scene").focus()
         page.keyboard.press("s")
-        measured.measure("highlighting the cluster under the pointer", HOVER, 25)
+        measured.measure("highlighting the cluster under the pointer", HOVER_SCRIPT, 25)
         page.keyboard.press("Escape")
-        measured.measure("next frame", NEXT, 12)
+        measured.measure("next frame", NEXT_FRAME_SCRIPT, 12)
         measured.measure_playback()
         browser.close()
 

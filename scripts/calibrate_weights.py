@@ -52,14 +52,14 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
             jobs=jobs,
             limit=limit,
         )
-        found = fit_calibrations(Comparison.of(report.frames)) if report.frames else {}
+        calibrations = fit_calibrations(Comparison.of(report.frames)) if report.frames else {}
         header = read_header(path)
-        if lost := sorted({*header.calibration} - {*found}):
+        if missing := sorted({*header.calibration} - {*calibrations}):
             raise click.ClickException(
-                f"{path} stays unchanged: {scans} has too few correct or wrong detections of {', '.join(lost)}"
+                f"{path} stays unchanged: {scans} has too few correct or wrong detections of {', '.join(missing)}"
             )
-        save_header(path, replace(header, calibration=found))
-        console.print(f"{path.name}: {found}")
+        save_header(path, replace(header, calibration=calibrations))
+        console.print(f"{path.name}: {calibrations}")
 
 
 if __name__ == "__main__":

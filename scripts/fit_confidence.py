@@ -60,10 +60,10 @@ def collect_samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | 
     images = draw_silhouettes(points, start, np.ones((len(boxes), 1)), boxes[:, 2] - boxes[:, 5] / 2, params)
     features["similarity"] = compute_similarity(images, seed.silhouette(params), params.stm)
     features["height_difference_m"] = np.abs(features["height_m"] - seed.height)
-    found, _ = match_centres(boxes, truth)
+    matched, _ = match_centres(boxes, truth)
     return {
         "features": features,
-        "hit": np.isin(np.arange(len(boxes)), found),
+        "hit": np.isin(np.arange(len(boxes)), matched),
         "bins": find_range_bins(boxes),
         "truth": find_range_bins(truth),
     }

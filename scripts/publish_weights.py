@@ -72,10 +72,10 @@ def evaluate_weights(weights: Path, folder: Path) -> dict[str, Any]:
     return {**report.compute(), "intervals": report.compute_intervals(SAMPLES)}
 
 
-def format_card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]]) -> str:
+def format_card(header: checkpoint.Header, title: str, results: dict[str, dict[str, Any]]) -> str:
     """Return the model card as Markdown."""
     lines = [f"# {title}", "", *(f"- {line}" for line in describe_weights(header, title)), ""]
-    for name, content in scored.items():
+    for name, content in results.items():
         lines += format_figures(name, content, header.config.classes)
     lines += [
         "## Known failures",
@@ -140,10 +140,10 @@ def format_figures(name: str, content: dict[str, Any], classes: tuple[str, ...])
     ]
     for row, metric in ROWS:
         cells, overlaps = [], []
-        for kind in classes:
-            part = content["ap"][kind][row]
-            overlaps.append(f"{part['overlap']:g}")
-            value, bounds = part["moderate"], content["intervals"][kind].get(row)
+        for class_name in classes:
+            class_result = content["ap"][class_name][row]
+            overlaps.append(f"{class_result['overlap']:g}")
+            value, bounds = class_result["moderate"], content["intervals"][class_name].get(row)
             interval = f", {bounds[0]:.0f} to {bounds[1]:.0f}" if bounds else ""
             cells.append(f"{value['r40']:.1f}{interval} ({value['objects']})" if value else "-")
         lines.append(f"| {metric} | {' / '.join(overlaps)} | {' | '.join(cells)} |")
@@ -164,13 +164,13 @@ def format_figures(name: str, content: dict[str, Any], classes: tuple[str, ...])
 @click.argument("folders", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option(
     "--mean-with",
-    "before",
+    "second_path",
     type=click.Path(exists=True, path_type=Path),
     help="Store the mean of both, weight by weight (Wortsman et al., CVPR 2022).",
 )
 @click.option("--judge", is_flag=True, help="A PointNet for `fused`, not to be used alone.")
 @click.option("--card", is_flag=True, help="Only score WEIGHTS and write the model card next to them.")
-def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: bool, card: bool) -> None:
+def main(weights: Path, folders: tuple[Path, ...], second_path: Path | None, judge: bool, card: bool) -> None:
     """Score, store and describe one checkpoint."""
     if card:
         content = {folder.name: evaluate_weights(weights, folder) for folder in folders}
@@ -178,10 +178,10 @@ def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: b
         return
     load = load_pointnet if read_network_name(weights) == POINTNET else load_network
     header, network = load(weights)
-    if before is not None:
-        earlier, other = load(before)
-        require_same_config(header.config, earlier.config, str(before))
-        state = other.state_dict()
+    if second_path is not None:
+        second_header, second_network = load(second_path)
+        require_same_config(header.config, second_header.config, str(second_path))
+        state = second_network.state_dict()
         network.load_state_dict(
             {
                 name: (value + state[name]) / 2 if value.is_floating_point() else value
@@ -190,7 +190,10 @@ def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: b
         )
         header = replace(
             header,
-            training={**header.training, "mean_with": [{"steps": earlier.training["steps"], "commit": earlier.commit}]},
+            training={
+                **header.training,
+                "mean_with": [{"steps": second_header.training["steps"], "commit": second_header.commit}],
+            },
         )
     if header.network == POINTNET:
         out = POINTNET_WEIGHTS.with_name(JUDGE) if judge else POINTNET_WEIGHTS
@@ -198,11 +201,11 @@ def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: b
         out = WEIGHTS / f"pointpillars_{header.config.version}_{header.config.size}.safetensors"
     out.parent.mkdir(exist_ok=True)
     save_checkpoint(out, network, header, half=True)
-    scored = {folder.name: evaluate_weights(out, folder) for folder in folders}
-    if before is not None:  # the header has the metrics of the mean on the first folder
-        metrics = select_metrics(scored[folders[0].name], "bev", header.config.classes)
+    results = {folder.name: evaluate_weights(out, folder) for folder in folders}
+    if second_path is not None:  # the header has the metrics of the mean on the first folder
+        metrics = select_metrics(results[folders[0].name], "bev", header.config.classes)
         save_checkpoint(out, network, replace(header, metrics=round_metrics(metrics)), half=True)
-    write_text(out.with_suffix(".md"), format_card(header, out.stem, scored))
+    write_text(out.with_suffix(".md"), format_card(header, out.stem, results))
     console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB")
 
 

@@ -35,10 +35,10 @@ def date_changelog(text: str, version: str, day: str) -> str:
     if match is None:
         raise SystemExit("CHANGELOG.md has no section 'Unreleased'")
     parts = re.split(r"(?m)^(?=### )", match[1])
-    kept = "".join(part.rstrip() + "\n\n" for part in parts if len(part.strip().splitlines()) > 1)
-    if not kept:
+    changes = "".join(part.rstrip() + "\n\n" for part in parts if len(part.strip().splitlines()) > 1)
+    if not changes:
         raise SystemExit("CHANGELOG.md has no unreleased change")
-    return f"{text[: match.start()]}{EMPTY}## {version} - {day}\n\n{kept}{text[match.end() :]}"
+    return f"{text[: match.start()]}{EMPTY}## {version} - {day}\n\n{changes}{text[match.end() :]}"
 
 
 def main(version: str) -> None:

@@ -129,8 +129,8 @@ def run_everything(folder: Path) -> list[str]:
         cwd=ROOT,
         env=environment,
     )
-    covered = subprocess.run([*coverage, "report"], cwd=ROOT, env=environment)
-    return [*failed, *["coverage"] * bool(covered.returncode)]
+    coverage_report = subprocess.run([*coverage, "report"], cwd=ROOT, env=environment)
+    return [*failed, *["coverage"] * bool(coverage_report.returncode)]
 
 
 def _distributed(workers: int) -> tuple[str, ...]:

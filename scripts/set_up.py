@@ -91,9 +91,9 @@ def main(extras: list[str]) -> int:
 
 def read_pip_settings() -> dict[str, str]:
     """Return the settings of `pip install` by name, from its files and environment variables."""
-    listed = subprocess.run([*PIP, "config", "list"], capture_output=True, text=True).stdout
+    output = subprocess.run([*PIP, "config", "list"], capture_output=True, text=True).stdout
     by_section: dict[str, dict[str, str]] = {"global": {}, "install": {}, ":env:": {}}
-    for line in listed.splitlines():
+    for line in output.splitlines():
         key, _, value = line.partition("=")
         section, _, name = key.rpartition(".")
         if section in by_section:
@@ -120,11 +120,11 @@ def find_uv_options(settings: dict[str, str]) -> tuple[list[str], dict[str, str]
 
 def find_uv() -> str | None:
     """Return the path of uv, installed by pip if there is none; None if that fails."""
-    own = Path(sys.executable).with_name("uv")
-    found = shutil.which("uv") or (str(own) if own.exists() else None)
-    if found is None and _run([*PIP, "install", "--quiet", "--disable-pip-version-check", "uv"]):
-        found = str(own)
-    return found
+    installed = Path(sys.executable).with_name("uv")
+    path = shutil.which("uv") or (str(installed) if installed.exists() else None)
+    if path is None and _run([*PIP, "install", "--quiet", "--disable-pip-version-check", "uv"]):
+        path = str(installed)
+    return path
 
 
 def find_torch() -> list[str]:
@@ -138,7 +138,7 @@ def find_torch() -> list[str]:
         return []
     except PackageNotFoundError:
         pass
-    done = subprocess.run(
+    report = subprocess.run(
         [
             *PIP,
             "install",
@@ -156,9 +156,9 @@ def find_torch() -> list[str]:
         text=True,
     )
     try:
-        url = json.loads(done.stdout)["install"][0]["download_info"]["url"]
+        url = json.loads(report.stdout)["install"][0]["download_info"]["url"]
     except (ValueError, LookupError):
-        print(done.stderr, f"set_up.py: pip installs torch, exit code {done.returncode}", flush=True)
+        print(report.stderr, f"set_up.py: pip installs torch, exit code {report.returncode}", flush=True)
         _run([*PIP, "install", "--disable-pip-version-check", "--constraint", str(CONSTRAINTS), "torch"])
         return []
     return [f"torch @ {url}"]

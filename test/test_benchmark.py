@@ -14,7 +14,7 @@ from samples import object_folder, scene, walker_label
 from benchmark import ground, peers, plain_euclidean, startup
 from benchmark.clustering import have_same_clusters, measure_dbscan, measure_dbscans
 from benchmark.detection import measure_detection, measure_engines, print_detection
-from benchmark.plain_pointnet2 import ball, farthest
+from benchmark.plain_pointnet2 import query_ball, sample_farthest
 from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import format_target, format_value, make_row, print_ground, print_measured
 from benchmark.startup import measure_startup
@@ -60,8 +60,8 @@ def test_contenders_run_in_turn_after_untimed_warm_up():
 @pytest.mark.parametrize("place", range(len(peers.DBSCANS)))
 def test_dbscan_peers_give_our_clusters(place):
     peer = peers.DBSCANS[place]
-    if peer.missing():
-        pytest.skip(f"{peer.package} is {peer.missing()}")
+    if peer.find_problem():
+        pytest.skip(f"{peer.package} is {peer.find_problem()}")
     arguments = ([place], [cloud()], 1, "test")
     _, same, differ = run_in_child(measure_dbscans, *arguments) if peer == peers.WHEEL else measure_dbscans(*arguments)
     assert same[peer.name] == 1 and differ[peer.name] == 0
@@ -72,7 +72,7 @@ def test_plain_euclidean_gives_our_clusters(threshold):
     params = EuclideanParams(threshold=threshold)
     ours = cluster_euclidean(cloud(), params)
     assert ours.max() > 0
-    np.testing.assert_array_equal(plain_euclidean.euclidean(cloud(), params), ours)
+    np.testing.assert_array_equal(plain_euclidean.cluster_euclidean(cloud(), params), ours)
 
 
 def test_same_clusters_compares_noise_and_core_partition():
@@ -154,7 +154,7 @@ def test_engines_are_timed_and_compared(one_thread, capsys):
 @pytest.mark.no_cover
 def test_startup_is_measured_with_and_without_torch(monkeypatch, capsys):
     monkeypatch.setattr(
-        startup, "CODE", {"fused": "a = 0", "fused, engine torch": "import numpy", "clustering": "a = 1"}
+        startup, "CODE_BY_NAME", {"fused": "a = 0", "fused, engine torch": "import numpy", "clustering": "a = 1"}
     )
     content = measure_startup(1, cold=("clustering",))
     print_measured(json.loads(json.dumps(content)))
@@ -171,13 +171,13 @@ def test_pointnet_is_timed_against_a_plain_network(one_thread, capsys):
     assert content["clusters"] >= 1 and all(value > 0 for value in content["ms"].values())
     # The plain PointNet++ samples distant points and groups near ones.
     xyz = torch.tensor([[[0.0, 0, 0], [5, 0, 0], [0.1, 0, 0], [0, 0.3, 0]]])
-    assert farthest(xyz, 3).tolist()[0][:2] == [0, 1]
-    assert ball(0.2, 2, xyz, xyz[:, :1]).tolist() == [[[0, 2]]]
+    assert sample_farthest(xyz, 3).tolist()[0][:2] == [0, 1]
+    assert query_ball(0.2, 2, xyz, xyz[:, :1]).tolist() == [[[0, 2]]]
 
 
 def test_command_writes_the_measurements(nothing_installed, monkeypatch, tmp_path):
     pytest.importorskip("cv2")
-    monkeypatch.setattr(peers, "TRIALS", 20)
+    monkeypatch.setattr(peers, "MAX_TRIALS", 20)
     import benchmark.__main__ as benchmark
 
     monkeypatch.setattr(

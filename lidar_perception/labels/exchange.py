@@ -91,16 +91,16 @@ def export_labels(
             f"there are labels of {len(labels)} frames for a drive of {len(frames)}; give labels of the same frames"
         )
     report_format_errors(
-        "a field that the labels keep from the file they were read from",
+        "a preserved field of the file that the labels were read from",
         lambda: FORMATS[format][1](labels, out, frames[:], force),
     )
-    notes = 0 if format in WITH_NOTES else sum(len(each.notes) for each in labels.frames)
-    ids = format == "kitti" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
+    notes = 0 if format in WITH_NOTES else sum(len(frame_labels.notes) for frame_labels in labels.frames)
+    has_ids = format == "kitti" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
     return ExportResult(
         out,
         labels.box_count,
         len(labels),
-        (*((f"{notes} regions without a box",) if notes else ()), *(("track ids",) if ids else ())),
+        (*((f"{notes} regions without a box",) if notes else ()), *(("track ids",) if has_ids else ())),
     )
 
 
@@ -127,9 +127,9 @@ def recognise_format(path: Path) -> str:
         if find_label_folder(path, folder) != path:
             return format
     for file in files:
-        found = _recognise_text(file) if file.suffix == ".txt" else _recognise_json(read_json(file))
-        if found:
-            return found
+        recognised = _recognise_text(file) if file.suffix == ".txt" else _recognise_json(read_json(file))
+        if recognised:
+            return recognised
     raise InputError(f"no labels are recognised in {path}; give their format with --from, one of {', '.join(READERS)}")
 
 

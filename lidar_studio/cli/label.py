@@ -115,7 +115,7 @@ def _serve(drive: Drive, session: Session, port: int, browser: bool, propose: bo
 
     count = session.state.seq
 
-    def started(url: str) -> None:
+    def on_start(url: str) -> None:
         console.print(url)
         state = f"continues after {count} actions" if count else "is new"
         errors.print(f"the journal {session.journal.path.absolute()} {state}; Ctrl-C stops the server", style="dim")
@@ -125,4 +125,4 @@ def _serve(drive: Drive, session: Session, port: int, browser: bool, propose: bo
             webbrowser.open(url)
 
     layers = Results().bind_layers(drive) if show_labels else None
-    asyncio.run(serve(PageContent(drive, session, layers), port, started))
+    asyncio.run(serve(PageContent(drive, session, layers), port, on_start))

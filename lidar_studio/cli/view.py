@@ -100,15 +100,15 @@ def view(
 
     if (data is None) != live:
         raise click.UsageError("give DATA, the path of a recording, or --live")
-    excluded = (
+    incompatible = (
         {"--weights": detectors, "--results": results, "--sequence": sequence}
         if live
         else {"--detections": detections, "--namespace": namespace}
     )
-    if wrong_options := [name for name, value in excluded.items() if value]:
+    if wrong_options := [name for name, value in incompatible.items() if value]:
         raise click.UsageError(f"{', '.join(wrong_options)}: {'not with' if live else 'only with'} --live")
 
-    def started(url: str) -> None:
+    def on_start(url: str) -> None:
         url += f"&frame={frame}&theme={theme}"
         console.print(url)
         if browser:
@@ -116,12 +116,12 @@ def view(
 
     if data is None:
         with _open_live_content(namespace, points or "", detections) as content:
-            asyncio.run(serve(content, port, started))
+            asyncio.run(serve(content, port, on_start))
         return
     content = _open_content(data, detectors, results, points, sequence)
     if frame >= content.drive.end:
         raise InputError(f"{data} has no frame {frame}; it has {content.drive.end}")
-    asyncio.run(serve(content, port, started))
+    asyncio.run(serve(content, port, on_start))
 
 
 @contextmanager
@@ -164,19 +164,21 @@ def _open_content(
     with show_scanning(path):
         drive = select_drive(recording, sequence)
     require_clouds(drive)
-    found = result_sources.Results()
+    shown_results = result_sources.Results()
     if is_bag:
         drive = replace(drive, scan=result_sources.read_recorded_scan)
-        found = result_sources.read_recorded_results(recording.frames.poses, [f.stamp_ns for f in drive.frames])
+        shown_results = result_sources.read_recorded_results(recording.frames.poses, [f.stamp_ns for f in drive.frames])
     height = drive.frames[0].sensor_height
     sources = {
         Path(choice.weights): result_sources.make_detector_source(choice.open(sensor_height=height))
         for choice in detectors
     }
     sources |= {folder.absolute(): result_sources.make_file_source(folder) for folder in results}
-    names = make_short_names(list(sources), found.sources)
-    found = result_sources.Results({**found.sources, **dict(zip(names, sources.values()))}, found.tracks)
-    return PageContent(drive, layers=found.bind_layers(drive), tracks=lambda: found.tracks)
+    names = make_short_names(list(sources), shown_results.sources)
+    shown_results = result_sources.Results(
+        {**shown_results.sources, **dict(zip(names, sources.values()))}, shown_results.tracks
+    )
+    return PageContent(drive, layers=shown_results.bind_layers(drive), tracks=lambda: shown_results.tracks)
 
 
 def make_short_names(paths: list[Path], used_names: Collection[str] = ()) -> list[str]:
@@ -184,15 +186,15 @@ def make_short_names(paths: list[Path], used_names: Collection[str] = ()) -> lis
     and not in `used_names`, else the whole path."""
     parts = [path.with_suffix("").parts if path.suffix in WEIGHTS else path.parts for path in paths]
     names = []
-    for i, own in enumerate(parts):
-        ends = (own[-k:] for k in range(1, len(own) + 1))
+    for i, path_parts in enumerate(parts):
+        suffixes = (path_parts[-k:] for k in range(1, len(path_parts) + 1))
         others = [other for j, other in enumerate(parts) if j != i]
         names.append(
             next(
                 (
-                    "/".join(end)
-                    for end in ends
-                    if "/".join(end) not in used_names and all(other[-len(end) :] != end for other in others)
+                    "/".join(suffix)
+                    for suffix in suffixes
+                    if "/".join(suffix) not in used_names and all(other[-len(suffix) :] != suffix for other in others)
                 ),
                 str(paths[i]),
             )

@@ -6,34 +6,34 @@ function wrap(angle) {
   return angle - 2 * Math.PI * Math.floor((angle + Math.PI) / (2 * Math.PI));
 }
 
-/** The unit vector of a local axis (0 length, 1 width, 2 height) in the sensor's frame. */
-export function axisOf(box, axis) {
+/** Compute the unit vector of a local axis (0 length, 1 width, 2 height) in the sensor frame. */
+export function computeAxis(box, axis) {
   const c = Math.cos(box[6]), s = Math.sin(box[6]);
   return axis === 0 ? [c, s, 0] : axis === 1 ? [-s, c, 0] : [0, 0, 1];
 }
 
 /** Move one face outwards by delta metres; the opposite face stays in place. */
 export function moveFace(box, axis, sign, delta) {
-  const grown = Math.max(MIN_SIZE, box[3 + axis] + delta) - box[3 + axis];
-  const direction = axisOf(box, axis), moved = box.slice();
-  for (let k = 0; k < 3; k++) moved[k] += direction[k] * sign * grown / 2;
-  moved[3 + axis] += grown;
+  const growth = Math.max(MIN_SIZE, box[3 + axis] + delta) - box[3 + axis];
+  const direction = computeAxis(box, axis), moved = box.slice();
+  for (let k = 0; k < 3; k++) moved[k] += direction[k] * sign * growth / 2;
+  moved[3 + axis] += growth;
   return moved;
 }
 
-export function moveBy(box, dx, dy, dz) {
+export function translate(box, dx, dy, dz) {
   const moved = box.slice();
   moved[0] += dx; moved[1] += dy; moved[2] += dz;
   return moved;
 }
 
 /** Move a box along its own axes. */
-export function moveAlong(box, forward, left, up) {
+export function moveAlongAxes(box, forward, left, up) {
   const c = Math.cos(box[6]), s = Math.sin(box[6]);
-  return moveBy(box, c * forward - s * left, s * forward + c * left, up);
+  return translate(box, c * forward - s * left, s * forward + c * left, up);
 }
 
-export function turnBy(box, angle) {
+export function rotate(box, angle) {
   const turned = box.slice();
   turned[6] = wrap(box[6] + angle);
   return turned;
@@ -53,16 +53,17 @@ export function toWorld(box, u, v, w) {
 const SIGNS = [[1, 1, -1], [1, -1, -1], [-1, -1, -1], [-1, 1, -1],
                [1, 1, 1], [1, -1, 1], [-1, -1, 1], [-1, 1, 1]];
 
-/** The eight corners, four of the bottom, then four of the top; the first two of each are the front. */
-export function corners(box) {
+/** Compute the eight corners: four of the bottom, then four of the top; the first two of each are at
+ * the front. */
+export function computeCorners(box) {
   return SIGNS.map(([a, b, c]) => toWorld(box, a * box[3] / 2, b * box[4] / 2, c * box[5] / 2));
 }
 
 export const EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4],
                       [0, 4], [1, 5], [2, 6], [3, 7]];
 
-/** The distance along a ray to a box, or null. */
-export function rayBox(origin, direction, box) {
+/** Intersect a ray with a box. Returns the distance along the ray, or null. */
+export function intersectBox(origin, direction, box) {
   const o = toLocal(box, ...origin), c = Math.cos(box[6]), s = Math.sin(box[6]);
   const d = [c * direction[0] + s * direction[1], -s * direction[0] + c * direction[1],
              direction[2]];
@@ -75,34 +76,35 @@ export function rayBox(origin, direction, box) {
   return near <= far ? near : null;
 }
 
-/** The t of the point p + t a (unit a) that is nearest to a ray; null if they are parallel. */
-export function nearestOnLine(p, a, origin, direction) {
+/** Find the point of the line p + t a (unit vector a) nearest to a ray. Returns t, or null if they are
+ * parallel. */
+export function findNearestOnLine(p, a, origin, direction) {
   const dot = (u, v) => u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
   const w = [p[0] - origin[0], p[1] - origin[1], p[2] - origin[2]];
-  const b = dot(a, direction), c = dot(direction, direction), under = c - b * b;
-  return under < 1e-4 * c ? null : (b * dot(direction, w) - c * dot(a, w)) / under;
+  const b = dot(a, direction), c = dot(direction, direction), denominator = c - b * b;
+  return denominator < 1e-4 * c ? null : (b * dot(direction, w) - c * dot(a, w)) / denominator;
 }
 
-/** The intersection of a ray with the horizontal plane at height z, or null. */
-export function meetLevel(origin, direction, z) {
+/** Intersect a ray with the horizontal plane at height z. Returns the point, or null. */
+export function intersectLevel(origin, direction, z) {
   const t = (z - origin[2]) / direction[2];
   return t > 0 && Number.isFinite(t)
     ? [origin[0] + t * direction[0], origin[1] + t * direction[1], z] : null;
 }
 
-/** Transform a box by a pose (16 numbers, row by row, from frame to fixed frame); roll and pitch are
- * ignored. */
-export function throughPose(box, pose) {
-  const [x, y, z] = box, placed = box.slice();
+/** Transform a box from the sensor frame to the fixed frame, without roll and pitch. `pose` has 16
+ * numbers, row by row. */
+export function toFixedFrame(box, pose) {
+  const [x, y, z] = box, moved = box.slice();
   for (let k = 0; k < 3; k++) {
-    placed[k] = pose[4 * k] * x + pose[4 * k + 1] * y + pose[4 * k + 2] * z + pose[4 * k + 3];
+    moved[k] = pose[4 * k] * x + pose[4 * k + 1] * y + pose[4 * k + 2] * z + pose[4 * k + 3];
   }
-  placed[6] = wrap(box[6] + Math.atan2(pose[4], pose[0]));
-  return placed;
+  moved[6] = wrap(box[6] + Math.atan2(pose[4], pose[0]));
+  return moved;
 }
 
-/** Transform a point (x, y, z) of the fixed frame to the frame of a pose. */
-export function intoPose(point, pose) {
+/** Transform a point (x, y, z) from the fixed frame to the sensor frame at a pose. */
+export function toSensorFrame(point, pose) {
   const d = [point[0] - pose[3], point[1] - pose[7], point[2] - pose[11]];
   return [0, 1, 2].map((k) => pose[k] * d[0] + pose[4 + k] * d[1] + pose[8 + k] * d[2]);
 }

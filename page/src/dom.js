@@ -2,7 +2,7 @@
 
 const SVG = "http://www.w3.org/2000/svg";
 
-function fill(node, attributes, children) {
+function applyAttributes(node, attributes, children) {
   for (const [name, value] of Object.entries(attributes)) {
     if (name.startsWith("on")) node[name] = value;
     else if (name === "style") node.style.cssText = value; // the Content-Security-Policy forbids the attribute
@@ -16,11 +16,11 @@ function fill(node, attributes, children) {
 }
 
 export function element(name, attributes = {}, ...children) {
-  return fill(document.createElement(name), attributes, children);
+  return applyAttributes(document.createElement(name), attributes, children);
 }
 
 export function svg(name, attributes = {}, ...children) {
-  return fill(document.createElementNS(SVG, name), attributes, children);
+  return applyAttributes(document.createElementNS(SVG, name), attributes, children);
 }
 
 // Icon paths, in a 24 by 24 viewBox.
@@ -52,15 +52,15 @@ export function icon(name) {
     svg("path", { d: PATHS[name] }));
 }
 
-/** A function that calls `work` before the next drawing, once however often it is called. */
-export function beforeDrawing(work) {
+/** Return a function that schedules `callback` before the next drawing; repeated calls run it once. */
+export function beforeDrawing(callback) {
   let requested = false;
   return () => {
     if (requested) return;
     requested = true;
     requestAnimationFrame(() => {
       requested = false;
-      work();
+      callback();
     });
   };
 }

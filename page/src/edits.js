@@ -1,190 +1,194 @@
-// Edits of tracks; each becomes one action. A box that is dragged, or moved by a held key, is a draft
-// until it is released.
+// Edits of tracks; each becomes one action. A box that is being dragged, or moved by keys, is a draft
+// until the pointer or key is released.
 
-import { act, nextUncertain } from "./api.js";
-import { moveAlong, turnBy } from "./boxmath.js";
-import { cloudOf, goTo } from "./cloud.js";
-import { say, sayError } from "./messages.js";
-import { boxOf, changed, classOf, on, select, selectedBox, selectedTrack, store } from "./store.js";
+import { sendAction, fetchNextUncertain } from "./api.js";
+import { moveAlongAxes, rotate } from "./boxmath.js";
+import { loadCloud, goTo } from "./cloud.js";
+import { showNote, showError } from "./messages.js";
+import { getBox, notify, findClass, on, select, getSelectedBox, getSelectedTrack, store } from "./store.js";
 
-const STEP = 0.05, TURN = Math.PI / 180; // of one arrow key: metres, radians
+const STEP_M = 0.05, TURN_RAD = Math.PI / 180; // per press of an arrow key
 
-const editable = () => store.mode === "label";
+const isEditable = () => store.mode === "label";
 
-function chosen() {
-  const track = selectedTrack();
-  if (!track) say("Select a track first: click its box, or its row in the list.");
+function requireSelection() {
+  const track = getSelectedTrack();
+  if (!track) showNote("Select a track first: click its box, or its row in the list.");
   return track;
 }
 
 export function setDraft(box) {
-  const track = selectedTrack();
-  if (!track || !editable()) return;
+  const track = getSelectedTrack();
+  if (!track || !isEditable()) return;
   store.draft = { track: track.id, frame: store.frame, box };
-  changed("draft");
+  notify("draft");
 }
 
 export function dropDraft() {
   if (!store.draft) return;
   store.draft = null;
-  changed("draft");
+  notify("draft");
 }
 
 /** Save the draft. If that fails, the box moves back. */
-export async function commit() {
+export async function commitDraft() {
   const { draft } = store;
   if (!draft || draft.sent) return;
   draft.sent = true;
-  await act({ do: "box", track: draft.track, frame: draft.frame, box: draft.box });
+  await sendAction({ do: "box", track: draft.track, frame: draft.frame, box: draft.box });
   if (store.draft === draft) dropDraft();
 }
 
-on("leaving-frame", commit); // the draft belongs to the frame that is left
+on("leaving-frame", commitDraft); // the draft belongs to the frame that is left
 
-/** Move the selected box a step along its own axes, or turn it; commit() on key up. */
+/** Move the selected box a step along its own axes, or turn it; commitDraft() runs on key up. */
 export function nudge({ forward = 0, left = 0, up = 0, turn = 0 }) {
-  const box = selectedBox()?.box;
-  if (box) setDraft(turnBy(moveAlong(box, forward * STEP, left * STEP, up * STEP), turn * TURN));
+  const box = getSelectedBox()?.box;
+  if (!box) return;
+  const moved = moveAlongAxes(box, forward * STEP_M, left * STEP_M, up * STEP_M);
+  setDraft(rotate(moved, turn * TURN_RAD));
 }
 
-async function onTrack(action) {
-  const track = editable() && chosen();
-  return track ? act({ ...action, track: track.id }) : false;
+async function actOnTrack(action) {
+  const track = isEditable() && requireSelection();
+  return track ? sendAction({ ...action, track: track.id }) : false;
 }
 
-/** "accept", "reject" or "reopen" the selected track and go to the next uncertain one, unless the
- * user has disabled that; without a selection, decide on the track under the pointer. */
-export async function decide(verb) {
-  if (!editable()) return;
-  const pointed = selectedTrack() ? null : store.tracks.get(store.hover);
-  const track = pointed ?? chosen();
-  if (!track || !await act({ do: verb, track: track.id })) return;
-  if (!pointed && store.advance && verb !== "reopen") await next();
+/** Apply a verb ("accept", "reject", "reopen") to the selected track, and go to the next uncertain one
+ * unless the user has disabled that. Without a selection, it applies to the track under the pointer. */
+export async function decideTrack(verb) {
+  if (!isEditable()) return;
+  const hovered = getSelectedTrack() ? null : store.tracks.get(store.hover);
+  const track = hovered ?? requireSelection();
+  if (!track || !await sendAction({ do: verb, track: track.id })) return;
+  if (!hovered && store.autoAdvance && verb !== "reopen") await selectNextUncertain();
 }
 
-export async function next() {
+export async function selectNextUncertain() {
   try {
-    const { track, frame } = await nextUncertain(store.selected, store.only);
+    const { track, frame } = await fetchNextUncertain(store.selected, store.classFilter);
     if (track === null) {
-      say("All tracks are decided.");
+      showNote("All tracks are decided.");
       return;
     }
     if (!store.tracks.get(track)?.byFrame.has(store.frame)) await goTo(frame);
     select(track);
-    changed("focus");
-    const then = await nextUncertain(track, store.only); // prefetch
-    if (then.track !== null) cloudOf(then.frame).catch(() => null); // reported when it is shown
+    notify("focus");
+    const following = await fetchNextUncertain(track, store.classFilter); // prefetch
+    if (following.track !== null) loadCloud(following.frame).catch(() => null); // reported when it is shown
   } catch (error) {
-    sayError(error.message);
+    showError(error.message);
   }
 }
 
 /** Set the class of the selected track; with another tool or without a selection, the class of new
  * tracks. */
 export function setClass(name) {
-  if (store.tool === "select" && selectedTrack()) return setTrackClass(name);
+  if (store.tool === "select" && getSelectedTrack()) return setTrackClass(name);
   store.newClass = name;
-  if (store.tool === "select") say(`New boxes and seeds get the class ${name}.`);
-  changed("tool");
+  if (store.tool === "select") showNote(`New boxes and seeds get the class ${name}.`);
+  notify("tool");
   return null;
 }
 
-export const setTrackClass = (name) => onTrack({ do: "class", class: name });
+export const setTrackClass = (name) => actOnTrack({ do: "class", class: name });
 
 /** Reject all undecided tracks of the listed class, or of all classes, as one action. */
 export async function rejectRest() {
-  if (!editable()) return;
-  const { only } = store, count = leftIn(only);
-  if (count === 0) say("There are no undecided tracks.");
-  else if (await act({ do: "reject_rest", ...(only ? { class: only } : {}) })) {
-    say(`${count} tracks rejected. Ctrl+Z undoes it.`);
+  if (!isEditable()) return;
+  const { classFilter } = store, count = countUndecided(classFilter);
+  if (count === 0) showNote("There are no undecided tracks.");
+  else if (await sendAction({ do: "reject_rest", ...(classFilter ? { class: classFilter } : {}) })) {
+    showNote(`${count} tracks rejected. Ctrl+Z undoes it.`);
   }
 }
 
-/** Number of undecided tracks of a class, null for all. */
-export const leftIn = (only) => [...store.tracks.values()].filter((track) =>
-  track.state === "proposed" && (!only || track.class === only)).length;
+/** Count the undecided tracks of a class; null for all classes. */
+export const countUndecided = (className) => [...store.tracks.values()].filter((track) =>
+  track.state === "proposed" && (!className || track.class === className)).length;
 
-export const classToAdd = () => store.newClass
-  ?? (classOf("Pedestrian") ? "Pedestrian" : store.drive.classes[0]?.name ?? "Pedestrian");
+export const getNewClass = () => store.newClass
+  ?? (findClass("Pedestrian") ? "Pedestrian" : store.drive.classes[0]?.name ?? "Pedestrian");
 
-export const snap = (to) => onTrack({ do: "snap", frame: store.frame, to });
-export const removeBox = () => onTrack({ do: "remove_box", frame: store.frame });
+export const snap = (to) => actOnTrack({ do: "snap", frame: store.frame, to });
+export const removeBox = () => actOnTrack({ do: "remove_box", frame: store.frame });
 /** Remove the boxes "before" or "after" this frame. */
-export const trim = (side) => onTrack({ do: "trim", frame: store.frame, side });
-export const split = () => onTrack({ do: "split", frame: store.frame });
+export const trim = (side) => actOnTrack({ do: "trim", frame: store.frame, side });
+export const split = () => actOnTrack({ do: "split", frame: store.frame });
 
 /** Copy this frame's box of the selected track to the next frame, and go there. */
-export async function copyOn() {
-  const track = chosen(), from = store.frame;
+export async function copyToNextFrame() {
+  const track = requireSelection(), from = store.frame;
   if (!track || from + 1 >= store.drive.frames.length) return;
-  if (await act({ do: "copy", track: track.id, from, to: from + 1 })) await goTo(from + 1);
+  if (await sendAction({ do: "copy", track: track.id, from, to: from + 1 })) await goTo(from + 1);
 }
 
 /** Interpolate this frame's box between the key boxes before and after it. */
 export async function interpolate() {
-  const track = chosen();
+  const track = requireSelection();
   if (!track) return;
   const frames = [...track.byFrame].filter(([frame, { kind }]) => kind === "key"
     && frame !== store.frame).map(([frame]) => frame);
   const before = Math.max(...frames.filter((frame) => frame < store.frame));
   const after = Math.min(...frames.filter((frame) => frame > store.frame));
   if (!Number.isFinite(before) || !Number.isFinite(after)) {
-    say("Interpolation needs a box set by hand before this frame and one after it.");
+    showNote("Interpolation needs a box set by hand before this frame and one after it.");
     return;
   }
-  await act({ do: "interpolate", track: track.id, frame: store.frame });
+  await sendAction({ do: "interpolate", track: track.id, frame: store.frame });
 }
 
 export async function merge() {
-  const track = chosen();
+  const track = requireSelection();
   if (!track) return;
-  if (store.also.size === 0) {
-    say("Select a second track with Ctrl+click, then merge.");
+  if (store.alsoSelected.size === 0) {
+    showNote("Select a second track with Ctrl+click, then merge.");
     return;
   }
-  for (const other of [...store.also]) {
-    if (!await act({ do: "merge", tracks: [track.id, other] })) return;
+  for (const other of [...store.alsoSelected]) {
+    if (!await sendAction({ do: "merge", tracks: [track.id, other] })) return;
   }
   select(track.id);
 }
 
 export async function seedAt(xyz) {
   const before = new Set(store.tracks.keys());
-  if (!await act({ do: "seed", frame: store.frame, xyz, class: classToAdd() })) return;
-  selectNew(before);
+  if (!await sendAction({ do: "seed", frame: store.frame, xyz, class: getNewClass() })) return;
+  selectAddedTrack(before);
 }
 
 export async function addAt([x, y]) {
-  const name = classToAdd(), size = classOf(name)?.size ?? [1, 1, 1.7];
+  const name = getNewClass(), size = findClass(name)?.size ?? [1, 1, 1.7];
   const z = store.cloud.floor + size[2] / 2, before = new Set(store.tracks.keys());
   const box = [x, y, z, ...size, 0];
-  if (await act({ do: "add", frame: store.frame, box, class: name })) selectNew(before);
+  if (await sendAction({ do: "add", frame: store.frame, box, class: name })) selectAddedTrack(before);
 }
 
-function selectNew(before) {
+function selectAddedTrack(before) {
   const added = [...store.tracks.values()].filter((track) => !before.has(track.id)
-    && boxOf(track)).sort((a, b) => (b.source === "click") - (a.source === "click") || a.id - b.id);
+    && getBox(track)).sort((a, b) => (b.source === "click") - (a.source === "click") || a.id - b.id);
   if (added.length) select(added[0].id);
 }
 
-export async function checkFrame() {
-  const { frame } = store, now = !store.checked.has(frame);
-  if (!editable() || store.wanted !== frame) return; // another frame is loading: do not toggle twice
-  const done = await act({ do: "check", frame, checked: now });
-  if (done && now && store.wanted === frame) await goTo(frame + 1);
+export async function toggleChecked() {
+  const { frame } = store, checked = !store.checked.has(frame);
+  if (!isEditable() || store.requestedFrame !== frame) return; // another frame is loading
+  const saved = await sendAction({ do: "check", frame, checked });
+  if (saved && checked && store.requestedFrame === frame) await goTo(frame + 1);
 }
 
-export const undo = () => editable() && (store.canUndo ? act({ do: "undo" }) : say("Nothing to undo."));
-export const redo = () => editable() && (store.canRedo ? act({ do: "redo" }) : say("Nothing to redo."));
-export const propose = () => act({ do: "propose" });
+export const undo = () => isEditable()
+  && (store.canUndo ? sendAction({ do: "undo" }) : showNote("Nothing to undo."));
+export const redo = () => isEditable()
+  && (store.canRedo ? sendAction({ do: "redo" }) : showNote("Nothing to redo."));
+export const propose = () => sendAction({ do: "propose" });
 
 /** Go to the next (1) or previous (-1) frame in which the selected track has a key box. */
-export function toKey(step) {
-  const track = selectedTrack();
+export function goToKeyBox(step) {
+  const track = getSelectedTrack();
   if (!track) return;
   const frames = [...track.byFrame].filter(([, { kind }]) => kind === "key").map(([frame]) => frame);
-  const onwards = frames.filter((frame) => (frame - store.frame) * step > 0);
-  if (onwards.length) goTo(step > 0 ? Math.min(...onwards) : Math.max(...onwards));
-  else say(`No box set by hand ${step > 0 ? "after" : "before"} this frame.`);
+  const candidates = frames.filter((frame) => (frame - store.frame) * step > 0);
+  if (candidates.length) goTo(step > 0 ? Math.min(...candidates) : Math.max(...candidates));
+  else showNote(`No box set by hand ${step > 0 ? "after" : "before"} this frame.`);
 }

@@ -1,25 +1,25 @@
 // The selected track: class, numbers, actions, silhouettes.
 
 import { getJson } from "./api.js";
-import { colourOfClass } from "./colours.js";
+import { getClassColour } from "./colours.js";
 import { element } from "./dom.js";
-import { commit, copyOn, decide, interpolate, merge, removeBox, setDraft, setTrackClass, snap, split,
-         trim } from "./edits.js";
-import { on, selectedBox, selectedTrack, store } from "./store.js";
+import { commitDraft, copyToNextFrame, decideTrack, interpolate, merge, removeBox, setDraft,
+         setTrackClass, snap, split, trim } from "./edits.js";
+import { on, getSelectedBox, getSelectedTrack, store } from "./store.js";
 
 const FIELDS = [["x", "m"], ["y", "m"], ["z", "m"], ["length", "m"], ["width", "m"],
                 ["height", "m"], ["yaw", "°"]];
 const KINDS = { key: "set by hand", proposed: "proposed", interpolated: "interpolated" };
 const panel = document.getElementById("inspector");
-const nothing = document.getElementById("nothing-selected");
-const number = (name) => document.getElementById(`field-${name}`);
-let typed = null; // the field with unsaved input
+const emptyHint = document.getElementById("nothing-selected");
+const getField = (name) => document.getElementById(`field-${name}`);
+let editedField = null; // the field with unsaved input
 
 const BUTTONS = [
   ["Snap", [["cluster", "C", "Snap to the L-shape of its cluster", () => snap("cluster")],
             ["ground", "G", "Snap to the ground", () => snap("ground")],
             ["size", "T", "Snap to the size of the track", () => snap("size")]]],
-  ["Box", [["copy", "V", "Copy to the next frame, and go there", copyOn],
+  ["Box", [["copy", "V", "Copy to the next frame, and go there", copyToNextFrame],
            ["interpolate", "I", "Interpolate between the boxes set by hand before and after", interpolate],
            ["remove", "Del", "Remove the box of this frame", removeBox]]],
   ["Track", [["merge", "M", "Merge with the tracks selected by Ctrl+click", merge],
@@ -32,37 +32,37 @@ export function openInspector() {
   const fields = document.getElementById("numbers");
   for (const [k, [name, unit]] of FIELDS.entries()) {
     const input = element("input", { id: `field-${name}`, type: "number", inputmode: "decimal",
-      step: unit === "m" ? 0.05 : 1, oninput: () => { typed = input; },
+      step: unit === "m" ? 0.05 : 1, oninput: () => { editedField = input; },
       onchange: () => saveNumber(k, input),
       onkeydown: ({ key }) => { if (key === "Escape") discardInput(); } });
     fields.append(element("label", {}, element("span", {}, name), input, element("i", {}, unit)));
   }
   // A click may select another track or frame, so save the input first.
   addEventListener("pointerdown", ({ target }) => {
-    const typing = document.activeElement;
-    if (fields.contains(typing) && target !== typing) typing.blur();
+    const focused = document.activeElement;
+    if (fields.contains(focused) && target !== focused) focused.blur();
   }, { capture: true });
   const rows = document.getElementById("actions");
   for (const [title, buttons] of BUTTONS) {
     rows.append(element("div", { class: "buttons", role: "group", "aria-label": title },
       element("span", {}, title),
-      ...buttons.map(([label, key, what, run]) => element("button", { title: `${what} (${key})`,
+      ...buttons.map(([label, key, description, run]) => element("button", { title: `${description} (${key})`,
         onclick: run, "data-do": label }, label, element("kbd", {}, key)))));
   }
   const choice = document.getElementById("class");
   choice.onchange = async () => {
     await setTrackClass(choice.value);
-    fill(); // show the saved class if saving failed
+    update(); // show the saved class if saving failed
   };
-  document.getElementById("accept").onclick = () => decide(pressed("accepted", "accept"));
-  document.getElementById("reject").onclick = () => decide(pressed("rejected", "reject"));
+  document.getElementById("accept").onclick = () => decideTrack(toggleVerb("accepted", "accept"));
+  document.getElementById("reject").onclick = () => decideTrack(toggleVerb("rejected", "reject"));
   on("drive", fillClasses);
-  on("selection tracks draft drive", fill);
+  on("selection tracks draft drive", update);
   on("frame", discardInput); // it belongs to the box of the previous frame
   on("selection tracks frame", loadSilhouettes);
 }
 
-const pressed = (state, verb) => selectedTrack()?.state === state ? "reopen" : verb;
+const toggleVerb = (state, verb) => getSelectedTrack()?.state === state ? "reopen" : verb;
 
 function fillClasses() {
   document.getElementById("class").replaceChildren(...store.drive.classes.map(({ name }, k) =>
@@ -71,119 +71,120 @@ function fillClasses() {
 
 /** Save one number of the box; the others keep the digits that the fields do not show. */
 async function saveNumber(k, input) {
-  typed = null;
-  const box = selectedBox()?.box.slice(), value = input.valueAsNumber; // NaN if empty
+  editedField = null;
+  const box = getSelectedBox()?.box.slice(), value = input.valueAsNumber; // NaN if empty
   if (box && Number.isFinite(value) && (value > 0 || k < 3 || k === 6)) {
     box[k] = k === 6 ? value * Math.PI / 180 : value;
     setDraft(box); // so that the next number is added to this one
-    await commit();
+    await commitDraft();
   }
-  fill();
+  update();
 }
 
 function discardInput() {
-  typed = null;
-  fill();
+  editedField = null;
+  update();
 }
 
-function fill() {
-  const track = selectedTrack(), { found } = store;
-  panel.hidden = !track && !found;
-  if (panel.hidden) typed = null;
-  nothing.hidden = track !== null || store.mode === "view";
-  document.getElementById("facts").replaceChildren(...(store.mode === "view" && (track || found)
-    ? factsOf(track, found) : []).flatMap(([name, value]) =>
+function update() {
+  const track = getSelectedTrack(), { selectedResult } = store;
+  panel.hidden = !track && !selectedResult;
+  if (panel.hidden) editedField = null;
+  emptyHint.hidden = track !== null || store.mode === "view";
+  document.getElementById("facts").replaceChildren(...(store.mode === "view" && (track || selectedResult)
+    ? listFacts(track, selectedResult) : []).flatMap(([name, value]) =>
     [element("dt", {}, name), element("dd", {}, value)]));
-  if (found) fillFound(found);
+  if (selectedResult) showResult(selectedResult);
   if (!track) return;
   document.getElementById("who").textContent = `Track ${track.id}`;
   const badge = document.getElementById("state");
   badge.textContent = store.mode === "view" ? track.class : track.state;
   badge.className = `badge ${track.state}`;
-  document.getElementById("swatch").style.background = colourOfClass(track.class);
+  document.getElementById("swatch").style.background = getClassColour(track.class);
   const choice = document.getElementById("class");
   if (![...choice.options].some(({ value }) => value === track.class)) {
     choice.append(element("option", { value: track.class }, track.class));
   }
   choice.value = track.class;
-  const here = selectedBox();
-  document.getElementById("kind").textContent = here === null ? "no box in this frame"
-    : store.mode === "view" ? "" : KINDS[here.kind];
+  const selectedBox = getSelectedBox();
+  document.getElementById("kind").textContent = selectedBox === null ? "no box in this frame"
+    : store.mode === "view" ? "" : KINDS[selectedBox.kind];
   document.getElementById("accept").setAttribute("aria-pressed", track.state === "accepted");
   document.getElementById("reject").setAttribute("aria-pressed", track.state === "rejected");
-  fillNumbers(here?.box);
+  updateNumbers(selectedBox?.box);
 }
 
-function fillNumbers(box) {
+function updateNumbers(box) {
   for (const [k, [name]] of FIELDS.entries()) {
-    const input = number(name), value = box?.[k];
+    const input = getField(name), value = box?.[k];
     input.disabled = !box || store.mode === "view";
-    if (input === typed) continue;
+    if (input === editedField) continue;
     input.value = value === undefined ? "" : k === 6 ? (value * 180 / Math.PI).toFixed(1) : value.toFixed(2);
   }
 }
 
 /** Show a selected label or detection. */
-function fillFound({ layer, row, wrong, colour }) {
+function showResult({ layer, row, error, colour }) {
   document.getElementById("who").textContent = row[7];
   const badge = document.getElementById("state");
-  badge.textContent = wrong ?? (layer === "labels" ? "label" : "detection");
-  badge.className = `badge ${wrong ? "rejected" : ""}`;
+  badge.textContent = error ?? (layer === "labels" ? "label" : "detection");
+  badge.className = `badge ${error ? "rejected" : ""}`;
   document.getElementById("swatch").style.background = colour;
   document.getElementById("kind").textContent = "";
-  fillNumbers(row);
+  updateNumbers(row);
 }
 
-/** Further facts about a track, label or detection: [name, value]. */
-function factsOf(track, found) {
+/** List further facts about a track, label or detection: [name, value]. */
+function listFacts(track, selectedResult) {
   if (track) {
     return [["source", track.source], ["score", track.score.toFixed(2)],
             ["frames", `${track.byFrame.size}, from ${track.first} to ${track.last}`]];
   }
-  const { layer, row } = found, facts = [];
+  const { layer, row } = selectedResult, facts = [];
   facts.push(["distance", `${Math.hypot(row[0], row[1]).toFixed(1)} m`]);
   if (layer === "labels") {
     if (row[8] !== null && row[8] !== undefined) facts.push(["track", `${row[8]}`]);
     return facts;
   }
   facts.unshift(["source", layer], ["score", row[8].toFixed(3)]);
-  for (const [name, said] of Object.entries(row[9] ?? {})) facts.push([name, said.toFixed(3)]);
-  const id = trackAt(row);
+  for (const [name, value] of Object.entries(row[9] ?? {})) facts.push([name, value.toFixed(3)]);
+  const id = findTrackAt(row);
   if (id !== null) facts.push(["track", `${id}`]);
   return facts;
 }
 
-/** The id of the track of the same class at a detection, or null. */
-function trackAt(row) {
-  let best = null, least = Math.max(1, row[3] / 2);
+/** Find the track of the same class at a detection. Returns its id, or null. */
+function findTrackAt(row) {
+  let nearest = null, minDistance = Math.max(1, row[3] / 2);
   for (const track of store.tracks.values()) {
     const box = track.byFrame.get(store.frame)?.box;
-    const away = box && track.class === row[7] ? Math.hypot(box[0] - row[0], box[1] - row[1]) : Infinity;
-    if (away < least) { least = away; best = track.id; }
+    const distance = box && track.class === row[7] ? Math.hypot(box[0] - row[0], box[1] - row[1]) : Infinity;
+    if (distance < minDistance) { minDistance = distance; nearest = track.id; }
   }
-  return best;
+  return nearest;
 }
 
-let requested = "", waiting = 0;
+let requestedKey = "", timer = 0;
 
 function loadSilhouettes() {
-  const track = selectedTrack(), area = document.getElementById("silhouettes");
-  const key = track && store.seeds.length && selectedBox() && !store.playing ? `${store.frame} ${track.id} ${selectedBox().box}` : "";
-  if (key === requested || store.mode === "view") return;
-  requested = key;
-  clearTimeout(waiting);
+  const track = getSelectedTrack(), area = document.getElementById("silhouettes");
+  const isShown = track && store.seeds.length && getSelectedBox() && !store.playing;
+  const key = isShown ? `${store.frame} ${track.id} ${getSelectedBox().box}` : "";
+  if (key === requestedKey || store.mode === "view") return;
+  requestedKey = key;
+  clearTimeout(timer);
   if (!key) { area.hidden = true; return; }
-  waiting = setTimeout(async () => {
-    let found = null;
+  timer = setTimeout(async () => {
+    let silhouettes = null;
     try {
-      found = await getJson(`/api/silhouettes?frame=${store.frame}&track=${track.id}`);
+      silhouettes = await getJson(`/api/silhouettes?frame=${store.frame}&track=${track.id}`);
     } catch { /* no seed yet, or nothing to compare */ }
-    if (requested !== key) return;
-    area.hidden = found === null;
-    if (found === null) return;
-    drawSilhouette("seed", found.seed);
-    drawSilhouette("candidate", found.candidate);
-    document.getElementById("similarity").textContent = `${Math.round(100 * found.similarity)} %`;
+    if (requestedKey !== key) return;
+    area.hidden = silhouettes === null;
+    if (silhouettes === null) return;
+    drawSilhouette("seed", silhouettes.seed);
+    drawSilhouette("candidate", silhouettes.candidate);
+    document.getElementById("similarity").textContent = `${Math.round(100 * silhouettes.similarity)} %`;
   }, 120);
 }
 
@@ -192,6 +193,8 @@ function drawSilhouette(name, { rows, cols, bits }) {
   canvas.width = cols;
   canvas.height = rows;
   pen.fillStyle = getComputedStyle(canvas).color;
-  for (let k = 0; k < bits.length; k++) if (bits[k] === "1") pen.fillRect(k % cols, Math.floor(k / cols), 1, 1);
+  for (let k = 0; k < bits.length; k++) {
+    if (bits[k] === "1") pen.fillRect(k % cols, Math.floor(k / cols), 1, 1);
+  }
 }
 

@@ -2,21 +2,21 @@
 
 import { listen, loadDrive, loadState } from "./api.js";
 import "./boxes3d.js";
-import { show } from "./cloud.js";
-import { leftIn } from "./edits.js";
+import { showFrame } from "./cloud.js";
+import { countUndecided } from "./edits.js";
 import { openInspector } from "./inspector.js";
-import { listKeys, openKeys } from "./keys.js";
+import { fillHelp, openKeys } from "./keys.js";
 import { openLive } from "./live.js";
-import { sayError } from "./messages.js";
+import { showError } from "./messages.js";
 import { loadResults } from "./results.js";
-import { openResults } from "./resultpanel.js";
-import { draw, drawn, focus, fly, limits, lookAt, openScene } from "./scene.js";
+import { openResultPanel } from "./resultpanel.js";
+import { draw, drawStats, focusSelection, moveCamera, limits, lookAt, openScene } from "./scene.js";
 import { openSideViews } from "./sideviews.js";
-import { changed, on, select, store } from "./store.js";
+import { notify, on, select, store } from "./store.js";
 import { openTimeline } from "./timeline.js";
 import { openTopbar } from "./topbar.js";
 import { openTrackList } from "./tracklist.js";
-import { pointAt, project } from "./picking.js";
+import { findPointAt, project } from "./picking.js";
 
 async function open() {
   openTopbar();
@@ -25,36 +25,36 @@ async function open() {
   openTimeline();
   openTrackList();
   openInspector();
-  openResults();
+  openResultPanel();
   openKeys();
-  on("focus", focus);
+  on("focus", focusSelection);
   try {
     await loadDrive();
     store.mode = store.drive.mode;
     store.minScore = store.drive.min_score;
-    if (store.mode === "view") store.filter = "all";
-    listKeys();
-    changed("drive", "tool", "colour", "playing");
+    if (store.mode === "view") store.stateFilter = "all";
+    fillHelp();
+    notify("drive", "tool", "colour", "playing");
     await loadState();
-    if (store.mode === "label" && store.tracks.size && leftIn(null) === 0) store.filter = "all";
+    if (store.mode === "label" && store.tracks.size && countUndecided(null) === 0) store.stateFilter = "all";
   } catch (error) {
-    sayError(`Cannot open the drive: ${error.message}`);
+    showError(`Cannot open the drive: ${error.message}`);
     return;
   }
   listen();
   const query = new URLSearchParams(location.search);
   const last = store.drive.frames.length - 1;
-  store.wanted = store.drive.live ? last : Math.min(last, Math.max(0, Number(query.get("frame")) || 0));
-  await show(store.wanted);
+  store.requestedFrame = store.drive.live ? last : Math.min(last, Math.max(0, Number(query.get("frame")) || 0));
+  await showFrame(store.requestedFrame);
   openLive();
   if (query.has("track")) select(Number(query.get("track")));
   await loadResults();
-  changed("tracks"); // redraw, now that everything is loaded
+  notify("tracks"); // redraw, now that everything is loaded
   requestAnimationFrame(() => requestAnimationFrame(() => {
     document.documentElement.dataset.ready = "true";
   }));
 }
 
 // For measurements, screenshots and tests; the page itself does not use it.
-globalThis.page = { store, draw, drawn, pointAt, project, fly, limits, lookAt };
+globalThis.page = { store, draw, drawStats, findPointAt, project, moveCamera, limits, lookAt };
 open();

@@ -2,25 +2,25 @@
 
 import { element, icon } from "./dom.js";
 
-const SHOWN_MS = { note: 3500, error: 12000 };
+const DURATION_MS = { note: 3500, error: 12000 };
 const log = [];
 
-export function say(text) { show(text, "note"); }
-export function sayError(text) { show(text, "error"); }
+export function showNote(text) { showToast(text, "note"); }
+export function showError(text) { showToast(text, "error"); }
 
-function show(text, kind) {
+function showToast(text, kind) {
   log.push({ time: new Date(), text, kind });
   if (log.length > 500) log.shift();
   const region = document.getElementById(kind === "error" ? "errors" : "notes");
-  const same = [...region.children].find((toast) => toast.dataset.text === text);
-  same?.remove();
+  const duplicate = [...region.children].find((toast) => toast.dataset.text === text);
+  duplicate?.remove();
   const toast = element("div", { class: `toast ${kind}`, "data-text": text },
     element("span", {}, text),
     element("button", { class: "bare", "aria-label": "Dismiss", onclick: () => toast.remove() },
       icon("close")));
   region.append(toast);
   while (region.children.length > 4) region.firstChild.remove();
-  setTimeout(() => toast.remove(), SHOWN_MS[kind]);
+  setTimeout(() => toast.remove(), DURATION_MS[kind]);
 }
 
 export function showLog() {

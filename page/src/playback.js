@@ -1,8 +1,8 @@
 // Playback at 10 Hz, or slower if frames load slower.
 
-import { cloudOf, goTo } from "./cloud.js";
+import { loadCloud, goTo } from "./cloud.js";
 import { pauseLive } from "./live.js";
-import { changed, store } from "./store.js";
+import { notify, store } from "./store.js";
 
 const PERIOD_MS = 100;
 
@@ -16,13 +16,13 @@ export async function togglePlay() {
     return;
   }
   store.playing = true;
-  changed("playing");
+  notify("playing");
   const last = store.drive.frames.length - 1;
   if (store.frame >= last) await goTo(0);
   while (store.playing && store.frame < last) {
-    const due = performance.now() + PERIOD_MS, next = store.frame + 1;
-    await cloudOf(next).catch(() => null);
-    await new Promise((resolve) => setTimeout(resolve, Math.max(0, due - performance.now())));
+    const deadline = performance.now() + PERIOD_MS, next = store.frame + 1;
+    await loadCloud(next).catch(() => null);
+    await new Promise((resolve) => setTimeout(resolve, Math.max(0, deadline - performance.now())));
     if (!store.playing) return;
     await goTo(next);
     if (store.frame !== next) break;
@@ -36,13 +36,13 @@ function stop() {
     return;
   }
   store.playing = false;
-  changed("playing");
+  notify("playing");
 }
 
 /** Stop playback and go to a frame. */
-export function to(frame) {
+export function stopAndGoTo(frame) {
   stop();
   return goTo(frame);
 }
 
-export const step = (by) => to(store.wanted + by);
+export const stepFrames = (count) => stopAndGoTo(store.requestedFrame + count);

@@ -1,100 +1,99 @@
 // Labels and detections of a frame, with missed and false ones.
 
-import { cached, getJson } from "./api.js";
-import { colourOfClass } from "./colours.js";
-import { sayError } from "./messages.js";
-import { changed, on, store } from "./store.js";
+import { makeCache, getJson } from "./api.js";
+import { getClassColour } from "./colours.js";
+import { showError } from "./messages.js";
+import { notify, on, store } from "./store.js";
 
 export const MISSED = "#ff4d5e", FALSE = "#ffb020";
 const SOURCES = ["#22c1a6", "#a78bfa", "#38bdf8", "#f472b6", "#a3e635", "#fb923c"];
 const LABEL = "#94a3b8";
 
-const MAX_CACHED = 300, NOTHING = { labels: [], detections: {}, matches: {} };
-const cache = cached((frame) => getJson(`/api/labels/${frame}?score=${store.minScore}`), MAX_CACHED);
-export const resultsOf = cache.get;
+const MAX_CACHED = 300, NO_RESULTS = { labels: [], detections: {}, matches: {} };
+const cache = makeCache((frame) => getJson(`/api/labels/${frame}?score=${store.minScore}`), MAX_CACHED);
+export const fetchResults = cache.get;
 
-/** Boxes of labels and detections in the frame shown: {box, colour, strong, text, chosen}, and their
- * origin: {frame, layer, k, row, wrong}. */
-export function resultBoxes() {
-  return store.results.frame === store.frame ? boxesIn(store.results, store.frame) : [];
+/** List the boxes of labels and detections in the frame shown, as listResultBoxes does. */
+export function listShownResults() {
+  return store.results.frame === store.frame ? listResultBoxes(store.results, store.frame) : [];
 }
 
-/** The same for given results of a frame. */
-export function boxesIn({ labels, detections, matches }, frame) {
-  const found = [];
+/** List the boxes of labels and detections of a frame, from its results: {box, colour, emphasized, text,
+ * isSelected}, and their origin: {frame, layer, k, row, error}. */
+export function listResultBoxes({ labels, detections, matches }, frame) {
+  const boxes = [], { selectedResult: selected } = store;
   const add = (entry, layer, k, row) => {
-    const { found: it } = store;
-    found.push({ ...entry, box: row.slice(0, 7), frame, layer, k, row,
-      chosen: it?.frame === frame && it.layer === layer && it.k === k });
+    const isSelected = selected?.frame === frame && selected.layer === layer && selected.k === k;
+    boxes.push({ ...entry, box: row.slice(0, 7), frame, layer, k, row, isSelected });
   };
-  const compared = firstShown();
-  const rowsOf = (rows) => new Set((store.layers.errors && rows) || []);
-  const missed = rowsOf(matches[compared]?.missed), passed = rowsOf(matches[compared]?.ignored_labels);
+  const match = matches[findFirstShown()];
+  const toSet = (rows) => new Set((store.layers.errors && rows) || []);
+  const missed = toSet(match?.missed), ignoredLabels = toSet(match?.ignored_labels);
   if (store.layers.labels) {
     for (const [k, label] of labels.entries()) {
-      const wrong = missed.has(k);
-      add({ strong: wrong, wrong: wrong ? "missed" : null, colour: wrong ? MISSED
-        : store.mode === "view" ? LABEL : colourOfClass(label[7]),
-        text: wrong ? `missed ${label[7]}` : passed.has(k) ? `ignored ${label[7]}` : null },
+      const isMissed = missed.has(k);
+      add({ emphasized: isMissed, error: isMissed ? "missed" : null, colour: isMissed ? MISSED
+        : store.mode === "view" ? LABEL : getClassColour(label[7]),
+        text: isMissed ? `missed ${label[7]}` : ignoredLabels.has(k) ? `ignored ${label[7]}` : null },
       "labels", k, label);
     }
   }
   for (const [source, { shown, colour }] of store.sources) {
     if (!shown) continue;
-    const wrong = rowsOf(matches[source]?.false), ignored = rowsOf(matches[source]?.ignored);
+    const falseRows = toSet(matches[source]?.false), ignored = toSet(matches[source]?.ignored);
     for (const [k, row] of (detections[source] ?? []).entries()) {
       if (row[8] < store.minScore) continue;
-      const bad = wrong.has(k);
-      add({ strong: bad, wrong: bad ? "false" : null, colour: bad ? FALSE : colour,
-        text: `${bad ? "false " : ignored.has(k) ? "ignored " : ""}${row[7]} ${row[8].toFixed(2)}` },
+      const isFalse = falseRows.has(k);
+      add({ emphasized: isFalse, error: isFalse ? "false" : null, colour: isFalse ? FALSE : colour,
+        text: `${isFalse ? "false " : ignored.has(k) ? "ignored " : ""}${row[7]} ${row[8].toFixed(2)}` },
       source, k, row);
     }
   }
-  return found;
+  return boxes;
 }
 
-export const resultNames = () => resultBoxes().filter(({ text }) => text !== null)
-  .map(({ box, colour, strong, text, chosen }) => ({ box, colour, text, chosen, loud: strong,
-    state: "found" }));
+export const listResultNames = () => listShownResults().filter(({ text }) => text !== null)
+  .map(({ box, colour, emphasized, text, isSelected }) => ({ box, colour, text, isSelected,
+    emphasized, state: "found" }));
 
-const firstShown = () => [...store.sources].find(([, { shown }]) => shown)?.[0];
+const findFirstShown = () => [...store.sources].find(([, { shown }]) => shown)?.[0];
 
-/** Counts for the first shown source in the frame shown: labels = hits + missed + ignoredLabels,
- * found = hits + false + ignored. Null if unknown: without labels, for a running graph, and for a new
- * score until the server has answered. */
-export function resultCounts() {
+/** Count the labels and detections in the frame shown, for the first source shown: labels = hits +
+ * missed + ignoredLabels, detected = hits + false + ignored. Counts are null while unknown: without
+ * labels, for a running graph, and for a new score until the server replies. */
+export function countResults() {
   const { labels, detections, matches, score } = store.results;
-  const source = firstShown();
+  const source = findFirstShown();
   const match = score === store.minScore ? matches[source] : undefined;
   const missed = match?.missed.length ?? null, ignoredLabels = match?.ignored_labels.length ?? null;
   return { source, labels: labels.length, missed, ignoredLabels,
            hits: match ? labels.length - missed - ignoredLabels : null,
-           found: (detections[source] ?? []).filter((row) => row[8] >= store.minScore).length,
+           detected: (detections[source] ?? []).filter((row) => row[8] >= store.minScore).length,
            false: match?.false?.length ?? null, ignored: match?.ignored?.length ?? null };
 }
 
-/** Load the results of the frame shown, and never show those of another one. */
+/** Load the results of the frame shown; they are dropped if another frame is shown by then. */
 export async function loadResults() {
   const { frame, minScore: score } = store;
-  let found = NOTHING;
+  let results = NO_RESULTS;
   if (!store.drive.frames[frame]) return;
   try {
-    found = await resultsOf(frame);
+    results = await fetchResults(frame);
   } catch (error) {
-    if (store.frame === frame) sayError(error.message);
+    if (store.frame === frame) showError(error.message);
   }
   if (store.frame !== frame) return;
-  for (const source of Object.keys(found.detections)) {
+  for (const source of Object.keys(results.detections)) {
     if (!store.sources.has(source)) {
       store.sources.set(source, { shown: true, colour: SOURCES[store.sources.size % SOURCES.length] });
-      changed("sources");
+      notify("sources");
     }
   }
-  store.results = { ...found, frame, score };
-  changed("results");
+  store.results = { ...results, frame, score };
+  notify("results");
 }
 
-export function reload() {
+export function reloadResults() {
   cache.clear();
   loadResults();
 }

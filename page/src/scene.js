@@ -2,18 +2,17 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { theme } from "./colours.js";
+import { getTheme } from "./colours.js";
 import { beforeDrawing } from "./dom.js";
-import { markPoints, openPoints, pointCount, render, setPointSize, setPoints, thinTo } from "./points.js";
-import { on, selectedBox, store } from "./store.js";
+import { highlightPoints, openPoints, pointCount, render, setPointSize, setPoints, limitPoints } from "./points.js";
+import { on, getSelectedBox, store } from "./store.js";
 
-// Points drawn while the camera moves; their order is random.
-export const limits = { thinned: 30_000 };
+export const limits = { movingPoints: 30_000 }; // points drawn while the camera moves, in random order
 const REST_MS = 160;
 const BACKGROUND = { dark: 0x11151c, light: 0xf5f7fa };
 const RINGS = [10, 20, 40, 60, 80];
 
-const canvas = document.getElementById("scene"), software = drawsInSoftware();
+const canvas = document.getElementById("scene"), software = isSoftwareRendered();
 export const renderer = new THREE.WebGLRenderer({ canvas, antialias: !software });
 export const scene = new THREE.Scene();
 export const camera = new THREE.PerspectiveCamera(50, 1, 0.3, 600);
@@ -31,42 +30,42 @@ const rings = new THREE.LineSegments(new THREE.BufferGeometry(),
 rings.frustumCulled = false;
 scene.add(rings);
 
-/** True without a GPU; antialiasing would then take two thirds of the drawing time. */
-function drawsInSoftware() {
+/** Return true without a GPU, where antialiasing would take two thirds of the drawing time. */
+function isSoftwareRendered() {
   const gl = document.createElement("canvas").getContext("webgl2");
-  const known = gl?.getExtension("WEBGL_debug_renderer_info");
-  const name = known ? gl.getParameter(known.UNMASKED_RENDERER_WEBGL) : "";
+  const extension = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = extension ? gl.getParameter(extension.UNMASKED_RENDERER_WEBGL) : "";
   gl?.getExtension("WEBGL_lose_context")?.loseContext();
   return /swiftshader|llvmpipe|software/i.test(name);
 }
 
 /** Functions that are called after each drawing, for overlays. */
 export const afterDrawing = [];
-export const drawn = { ms: 0, pictures: 0, points: 0 }; // the last drawing, for measurements
+export const drawStats = { ms: 0, count: 0, points: 0 }; // the last drawing, for measurements
 
-let resting = 0, still = true;
+let restTimer = 0, isCameraStill = true;
 
 export const draw = beforeDrawing(() => {
   const start = performance.now();
-  render(renderer, scene, camera, software && still && !store.playing);
-  for (const then of afterDrawing) then();
-  drawn.ms = performance.now() - start;
-  drawn.pictures += 1;
-  drawn.points = pointCount();
+  render(renderer, scene, camera, software && isCameraStill && !store.playing);
+  for (const callback of afterDrawing) callback();
+  drawStats.ms = performance.now() - start;
+  drawStats.count += 1;
+  drawStats.points = pointCount();
 });
 
-function moving() {
-  if (still) thin(true);
-  clearTimeout(resting);
-  resting = setTimeout(() => thin(false), REST_MS);
+function onCameraMove() {
+  if (isCameraStill) setMoving(true);
+  clearTimeout(restTimer);
+  restTimer = setTimeout(() => setMoving(false), REST_MS);
   draw();
 }
-controls.addEventListener("change", moving);
+controls.addEventListener("change", onCameraMove);
 
-function thin(yes) {
-  still = !yes;
+function setMoving(isMoving) {
+  isCameraStill = !isMoving;
   const all = store.cloud?.count ?? 0;
-  thinTo(yes || store.playing ? Math.min(limits.thinned, all) : all);
+  limitPoints(isMoving || store.playing ? Math.min(limits.movingPoints, all) : all);
   draw();
 }
 
@@ -74,7 +73,7 @@ function setCloud() {
   if (!store.cloud) return;
   setPoints();
   setRings(store.cloud.floor);
-  moving(); // thinned at first, then all points
+  onCameraMove(); // few points at first, then all of them
 }
 
 function repaint() {
@@ -84,30 +83,30 @@ function repaint() {
 }
 
 /** Highlight one cluster of the cloud; 0 for none. */
-export function mark(cluster) {
-  if (store.cloud && markPoints(cluster)) draw();
+export function highlightCluster(cluster) {
+  if (store.cloud && highlightPoints(cluster)) draw();
 }
 
 function setRings(floor) {
-  const at = [];
+  const positions = [];
   for (const radius of RINGS) {
     const steps = 96;
     for (let k = 0; k < steps; k++) {
       for (const end of [k, k + 1]) {
         const angle = end / steps * 2 * Math.PI;
-        at.push(radius * Math.cos(angle), radius * Math.sin(angle), floor);
+        positions.push(radius * Math.cos(angle), radius * Math.sin(angle), floor);
       }
     }
   }
-  at.push(0, 0, floor, 3, 0, floor); // the forward direction
-  rings.geometry.setAttribute("position", new THREE.Float32BufferAttribute(at, 3));
+  positions.push(0, 0, floor, 3, 0, floor); // the forward direction
+  rings.geometry.setAttribute("position", new THREE.Float32BufferAttribute(positions, 3));
 }
 
 function setTheme() {
-  const which = theme();
-  scene.background = new THREE.Color(BACKGROUND[which]);
-  rings.material.color.set(which === "dark" ? 0x6b7a94 : 0x8a97ab);
-  rings.material.opacity = which === "dark" ? 0.35 : 0.5;
+  const themeName = getTheme();
+  scene.background = new THREE.Color(BACKGROUND[themeName]);
+  rings.material.color.set(themeName === "dark" ? 0x6b7a94 : 0x8a97ab);
+  rings.material.opacity = themeName === "dark" ? 0.35 : 0.5;
   repaint();
 }
 
@@ -123,7 +122,7 @@ function resize() {
   draw();
 }
 
-/** The initial view: from behind the sensor, forward. */
+/** Show the initial view: from behind the sensor, looking forward. */
 export function resetView() {
   camera.position.set(-16, 0, 12);
   controls.target.set(8, 0, -1);
@@ -131,9 +130,9 @@ export function resetView() {
   draw();
 }
 
-/** Look at a position from another, both in the sensor's frame. */
-export function lookAt(place, from) {
-  controls.target.fromArray(place);
+/** Look at `target` from the position `from`, both in the sensor frame. */
+export function lookAt(target, from) {
+  controls.target.fromArray(target);
   camera.position.fromArray(from);
   controls.update();
   camera.updateMatrixWorld();
@@ -147,28 +146,28 @@ export function topView() {
 }
 
 /** Zoom in on the selected box, keeping the direction of view. */
-export function focus() {
-  const box = selectedBox()?.box;
+export function focusSelection() {
+  const box = getSelectedBox()?.box;
   if (!box) return;
   const target = new THREE.Vector3(box[0], box[1], box[2]);
-  const away = camera.position.clone().sub(controls.target);
-  away.setLength(Math.max(5, 2.6 * Math.max(box[3], box[4], box[5])));
-  away.z = Math.max(away.z, 0.45 * away.length());
+  const offset = camera.position.clone().sub(controls.target);
+  offset.setLength(Math.max(5, 2.6 * Math.max(box[3], box[4], box[5])));
+  offset.z = Math.max(offset.z, 0.45 * offset.length());
   controls.target.copy(target);
-  camera.position.copy(target.clone().add(away));
+  camera.position.copy(target.clone().add(offset));
   controls.update();
 }
 
 const distance = () => camera.position.distanceTo(controls.target);
 
-/** Move the camera along the ground by shares of its distance, turn it, or scale its distance. */
-export function fly(right, ahead, turn = 0, nearer = 1) {
-  const away = camera.position.clone().sub(controls.target);
-  const level = new THREE.Vector3(-away.x, -away.y, 0).normalize();
-  const side = new THREE.Vector3(level.y, -level.x, 0);
-  controls.target.addScaledVector(level, ahead * distance()).addScaledVector(side, right * distance());
-  away.applyAxisAngle(camera.up, turn).multiplyScalar(nearer);
-  camera.position.copy(controls.target).add(away);
+/** Move the camera along the ground by multiples of its distance, turn it, or scale its distance. */
+export function moveCamera(right, ahead, turn = 0, distanceScale = 1) {
+  const offset = camera.position.clone().sub(controls.target);
+  const forward = new THREE.Vector3(-offset.x, -offset.y, 0).normalize();
+  const side = new THREE.Vector3(forward.y, -forward.x, 0);
+  controls.target.addScaledVector(forward, ahead * distance()).addScaledVector(side, right * distance());
+  offset.applyAxisAngle(camera.up, turn).multiplyScalar(distanceScale);
+  camera.position.copy(controls.target).add(offset);
   controls.update();
 }
 
@@ -179,7 +178,7 @@ export function openScene() {
   on("theme", setTheme);
   on("cloud", setCloud);
   on("colour", repaint);
-  on("playing", () => thin(!still));
+  on("playing", () => setMoving(!isCameraStill));
   on("tracks draft", () => { if (store.colour === "class") repaint(); });
   setTheme();
   resize();

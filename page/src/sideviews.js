@@ -1,12 +1,12 @@
 // Top, side and front view of the selected box, along its own axes, with handles for its faces, its
 // body and its heading. The views do not move during a drag.
 
-import { moveFace, moveAlong, toLocal, turnBy } from "./boxmath.js";
-import { theme } from "./colours.js";
+import { moveFace, moveAlongAxes, toLocal, rotate } from "./boxmath.js";
+import { getTheme } from "./colours.js";
 import { beforeDrawing, element, svg } from "./dom.js";
 import { setDraft } from "./edits.js";
 import { startDrag } from "./overlay.js";
-import { on, selectedBox, store } from "./store.js";
+import { on, getSelectedBox, store } from "./store.js";
 
 // The local axes that point right and up, and the sign of the first: 0 length, 1 width, 2 height.
 const VIEWS = [
@@ -15,12 +15,12 @@ const VIEWS = [
   { name: "front", title: "Front", right: 1, up: 2, flip: -1 }, // seen from the front
 ];
 const NAMES = "xyz";
-const POINTS = { dark: ["#7f8ea8", "#ffffff", "#3b4558"], light: ["#8794a8", "#0b1220", "#c3ccd8"] };
-const MARGIN = 0.6, KNOB = 20; // metres around the box; pixels from the front to the knob
+const POINT_COLOURS = { dark: ["#7f8ea8", "#ffffff", "#3b4558"], light: ["#8794a8", "#0b1220", "#c3ccd8"] };
+const MARGIN_M = 0.6, KNOB_PX = 20; // around the box; from its front to the knob
 
-let anchor = null, near = [], zoom = 1;
+let anchor = null, nearPoints = [], zoom = 1;
 
-function build(view) {
+function buildView(view) {
   view.canvas = element("canvas");
   view.layer = svg("svg", { class: "handles" });
   view.ring = svg("line", { class: "stalk" });
@@ -44,7 +44,7 @@ function build(view) {
   view.size = element("span", { class: "measure" });
   view.panel = element("figure", { class: "sideview", "data-view": view.name }, view.canvas,
                        view.layer, element("figcaption", {}, view.title), view.size);
-  view.layer.addEventListener("pointerdown", (event) => grab(view, event));
+  view.layer.addEventListener("pointerdown", (event) => startViewDrag(view, event));
   view.panel.addEventListener("wheel", (event) => {
     event.preventDefault();
     zoom = Math.min(6, Math.max(0.25, zoom * Math.exp(-event.deltaY / 600)));
@@ -53,51 +53,51 @@ function build(view) {
   return view.panel;
 }
 
-/** Pixels per metre, so that the box with a margin fills the view. */
-function scaleOf(view, width, height) {
-  const along = anchor[3 + view.right] + 2 * MARGIN, across = anchor[3 + view.up] + 2 * MARGIN;
+/** Compute the pixels per metre at which the box with its margin fills the view. */
+function computeScale(view, width, height) {
+  const along = anchor[3 + view.right] + 2 * MARGIN_M, across = anchor[3 + view.up] + 2 * MARGIN_M;
   return zoom * Math.min(width / along, height / across);
 }
 
 /** Collect the points around the anchor, in its axes: [u, v, w, ground] each. */
-function gather() {
-  near = [];
+function collectPoints() {
+  nearPoints = [];
   const { cloud } = store;
   if (!cloud || !anchor) return;
-  const reach = Math.hypot(anchor[3], anchor[4]) / 2 + 6, { xyz } = cloud;
+  const radius = Math.hypot(anchor[3], anchor[4]) / 2 + 6, { xyz } = cloud;
   for (let i = 0; i < cloud.count; i++) {
     const x = xyz[3 * i], y = xyz[3 * i + 1];
-    if (Math.abs(x - anchor[0]) > reach || Math.abs(y - anchor[1]) > reach) continue;
+    if (Math.abs(x - anchor[0]) > radius || Math.abs(y - anchor[1]) > radius) continue;
     const at = toLocal(anchor, x, y, xyz[3 * i + 2]);
-    if (Math.abs(at[2]) < anchor[5] / 2 + 3) near.push([...at, cloud.ground[i]]);
+    if (Math.abs(at[2]) < anchor[5] / 2 + 3) nearPoints.push([...at, cloud.ground[i]]);
   }
 }
 
-function grab(view, event) {
-  const name = event.target.dataset?.handle, start = selectedBox()?.box;
+function startViewDrag(view, event) {
+  const name = event.target.dataset?.handle, start = getSelectedBox()?.box;
   if (!name || !start || !anchor || event.button !== 0 || store.mode !== "label") return;
   event.preventDefault();
-  const area = view.layer.getBoundingClientRect(), scale = scaleOf(view, area.width, area.height);
-  const held = anchor.slice(), first = [event.clientX, event.clientY];
-  const turned = start[6] - held[6];
+  const area = view.layer.getBoundingClientRect(), scale = computeScale(view, area.width, area.height);
+  const startAnchor = anchor.slice(), startPixel = [event.clientX, event.clientY];
+  const rotation = start[6] - startAnchor[6];
   startDrag(event.target, event, (e) => {
-    let across = (e.clientX - first[0]) / scale * view.flip, up = -(e.clientY - first[1]) / scale;
+    let across = (e.clientX - startPixel[0]) / scale * view.flip, up = -(e.clientY - startPixel[1]) / scale;
     if (name === "yaw") {
       const u = (e.clientX - area.left - area.width / 2) / scale;
       const v = -(e.clientY - area.top - area.height / 2) / scale;
-      const centre = toLocal(held, ...start.slice(0, 3));
-      setDraft(turnBy(start, Math.atan2(v - centre[1], u - centre[0]) - turned));
+      const centre = toLocal(startAnchor, ...start.slice(0, 3));
+      setDraft(rotate(start, Math.atan2(v - centre[1], u - centre[0]) - rotation));
       return;
     }
     if (view.turns) { // to the axes of the box, which may be turned in this view
-      const c = Math.cos(turned), s = Math.sin(turned);
+      const c = Math.cos(rotation), s = Math.sin(rotation);
       [across, up] = [c * across + s * up, -s * across + c * up];
     }
     const moved = [0, 0, 0];
     moved[view.right] = across;
     moved[view.up] = up;
     if (name === "move") {
-      setDraft(moveAlong(start, ...moved));
+      setDraft(moveAlongAxes(start, ...moved));
     } else {
       const axis = NAMES.indexOf(name[1]), sign = name[0] === "+" ? 1 : -1;
       setDraft(moveFace(start, axis, sign, moved[axis] * sign));
@@ -105,18 +105,18 @@ function grab(view, event) {
   });
 }
 
-/** For each collected point, whether it is in a box. */
-function within(box) {
+/** Return for each collected point whether it is inside a box. */
+function findInside(box) {
   const c = Math.cos(box[6] - anchor[6]), s = Math.sin(box[6] - anchor[6]);
   const centre = toLocal(anchor, box[0], box[1], box[2]), [l, w, h] = box.slice(3, 6).map((v) => v / 2);
-  return near.map((point) => {
+  return nearPoints.map((point) => {
     const u = point[0] - centre[0], v = point[1] - centre[1];
     return Math.abs(c * u + s * v) <= l && Math.abs(-s * u + c * v) <= w
       && Math.abs(point[2] - centre[2]) <= h;
   });
 }
 
-function drawView(view, box, isIn) {
+function drawView(view, box, inside) {
   const { clientWidth: width, clientHeight: height } = view.panel;
   const ratio = Math.min(devicePixelRatio, 2), { canvas } = view;
   if (canvas.width !== width * ratio || canvas.height !== height * ratio) {
@@ -126,22 +126,22 @@ function drawView(view, box, isIn) {
   const pen = canvas.getContext("2d");
   pen.clearRect(0, 0, canvas.width, canvas.height);
   view.group.style.display = box ? "" : "none";
-  view.size.textContent = box ? sizes(view, box) : "";
+  view.size.textContent = box ? formatSize(view, box) : "";
   if (!box) return;
-  const scale = scaleOf(view, width, height), depth = 3 - view.right - view.up;
-  const colours = POINTS[theme()], dot = (near.length > 3000 ? 1.2 : 1.8) * ratio;
-  const places = [[], [], []]; // x, y, x, y, … of points outside, inside, and on the ground
-  for (const [k, point] of near.entries()) {
+  const scale = computeScale(view, width, height), depth = 3 - view.right - view.up;
+  const colours = POINT_COLOURS[getTheme()], dot = (nearPoints.length > 3000 ? 1.2 : 1.8) * ratio;
+  const positions = [[], [], []]; // x, y, x, y, … of points outside, inside, and on the ground
+  for (const [k, point] of nearPoints.entries()) {
     const x = (width / 2 + point[view.right] * scale * view.flip) * ratio - dot / 2;
     const y = (height / 2 - point[view.up] * scale) * ratio - dot / 2;
     if (x < -dot || y < -dot || x > canvas.width || y > canvas.height) continue;
-    if (depth !== 2 && Math.abs(point[depth]) > anchor[3 + depth] / 2 + 0.3 && !isIn[k]) continue;
-    places[isIn[k] ? 1 : point[3] ? 2 : 0].push(x, y);
+    if (depth !== 2 && Math.abs(point[depth]) > anchor[3 + depth] / 2 + 0.3 && !inside[k]) continue;
+    positions[inside[k] ? 1 : point[3] ? 2 : 0].push(x, y);
   }
   for (const kind of [2, 0, 1]) {
     pen.fillStyle = colours[kind];
-    for (let k = 0; k < places[kind].length; k += 2) {
-      pen.fillRect(places[kind][k], places[kind][k + 1], dot, dot);
+    for (let k = 0; k < positions[kind].length; k += 2) {
+      pen.fillRect(positions[kind][k], positions[kind][k + 1], dot, dot);
     }
   }
   placeHandles(view, box, width, height, scale);
@@ -149,13 +149,13 @@ function drawView(view, box, isIn) {
 
 function placeHandles(view, box, width, height, scale) {
   const centre = toLocal(anchor, box[0], box[1], box[2]);
-  const turned = view.turns ? -(box[6] - anchor[6]) * 180 / Math.PI : 0;
+  const rotation = view.turns ? -(box[6] - anchor[6]) * 180 / Math.PI : 0;
   const x = width / 2 + centre[view.right] * scale * view.flip, y = height / 2 - centre[view.up] * scale;
   const a = box[3 + view.right] * scale / 2, b = box[3 + view.up] * scale / 2;
   const set = (node, values) => {
     for (const [name, value] of Object.entries(values)) node.setAttribute(name, value.toFixed?.(2) ?? value);
   };
-  set(view.group, { transform: `translate(${x} ${y}) rotate(${turned})` });
+  set(view.group, { transform: `translate(${x} ${y}) rotate(${rotation})` });
   set(view.rect, { x: -a, y: -b, width: 2 * a, height: 2 * b });
   set(view.front, view.right === 0 ? { x1: a, x2: a, y1: -b, y2: b } : { x1: 0, x2: 0, y1: 0, y2: 0 });
   for (const { sign, vertical, grip, dot } of view.handles) {
@@ -165,33 +165,33 @@ function placeHandles(view, box, width, height, scale) {
     set(dot, vertical ? { cx: 0, cy: side * b } : { cx: side * a, cy: 0 });
   }
   if (view.knob) {
-    set(view.ring, { x1: a, x2: a + KNOB, y1: 0, y2: 0 });
-    set(view.knob, { cx: a + KNOB, cy: 0 });
+    set(view.ring, { x1: a, x2: a + KNOB_PX, y1: 0, y2: 0 });
+    set(view.knob, { cx: a + KNOB_PX, cy: 0 });
   }
 }
 
-function sizes(view, box) {
+function formatSize(view, box) {
   return `${box[3 + view.right].toFixed(2)} × ${box[3 + view.up].toFixed(2)} m`;
 }
 
 const redraw = beforeDrawing(() => {
-  const box = selectedBox()?.box ?? null;
-  if (box && !store.draft && !same(anchor, box)) {
+  const box = getSelectedBox()?.box ?? null;
+  if (box && !store.draft && !equals(anchor, box)) {
     anchor = box.slice();
-    gather();
+    collectPoints();
   }
-  const shown = anchor ? box : null, isIn = shown ? within(shown) : [];
+  const shown = anchor ? box : null, inside = shown ? findInside(shown) : [];
   for (const view of VIEWS) {
     view.panel.classList.toggle("empty", !box);
-    drawView(view, shown, isIn);
+    drawView(view, shown, inside);
   }
 });
 
-const same = (a, b) => a !== null && a.every((value, k) => value === b[k]);
+const equals = (a, b) => a !== null && a.every((value, k) => value === b[k]);
 
 export function openSideViews() {
   const area = document.getElementById("sideviews");
-  area.append(...VIEWS.map(build));
+  area.append(...VIEWS.map(buildView));
   new ResizeObserver(redraw).observe(area);
   on("cloud", () => { anchor = null; redraw(); });
   on("selection tracks draft theme", redraw);

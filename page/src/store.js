@@ -1,5 +1,5 @@
-// The state of the page, and its events. Modules subscribe to the names of changes; no other module
-// holds a copy of a track.
+// The state of the page, and its events. Modules subscribe to changes by name; no other module holds a
+// copy of a track.
 
 const listeners = new Map();
 const pending = new Set();
@@ -8,16 +8,16 @@ export const store = {
   drive: null, mode: "label",
   seq: 0, tracks: new Map(), checked: new Set(), seeds: [], canUndo: false, canRedo: false,
   progress: null,
-  wanted: 0, // the requested frame
+  requestedFrame: 0, // shown once its cloud is loaded
   frame: 0, // the frame shown; every edit is in this one
   cloud: null, // of the frame shown
-  selected: null, also: new Set(), hover: null, // of tracks, by id
-  found: null, // the selected label or detection: {frame, layer, k, row, wrong}
+  selected: null, alsoSelected: new Set(), hover: null, // ids of tracks
+  selectedResult: null, // the selected label or detection: {frame, layer, k, row, error}
   status: null, // of a running graph
   tool: "select", // "select", "seed", "add"
   draft: null, // {track, frame, box}, only during a drag or while a key is held
-  colour: "height", names: true, online: true, playing: false, advance: true,
-  filter: "left", only: null, shownTracks: [],
+  colour: "height", showNames: true, online: true, playing: false, autoAdvance: true,
+  stateFilter: "left", classFilter: null, shownTracks: [],
   results: { labels: [], detections: {}, matches: {} }, sources: new Map(), minScore: 0,
   layers: { labels: true, errors: true, tracks: true, trails: true },
 };
@@ -36,7 +36,7 @@ export function emit(name, value) {
 }
 
 /** Report changes; each listener is called once per turn of the event loop, without arguments. */
-export function changed(...names) {
+export function notify(...names) {
   if (pending.size === 0) queueMicrotask(flush);
   for (const name of names) pending.add(name);
 }
@@ -55,24 +55,24 @@ function flush() {
   }
 }
 
-function toTrack(sent) {
+function toTrack(update) {
   const byFrame = new Map();
-  for (const row of sent.boxes) byFrame.set(row[0], { box: row.slice(1, 8), kind: row[8] });
+  for (const row of update.boxes) byFrame.set(row[0], { box: row.slice(1, 8), kind: row[8] });
   const frames = [...byFrame.keys()].sort((a, b) => a - b);
-  return { ...sent, byFrame, first: frames[0] ?? 0, last: frames.at(-1) ?? 0 };
+  return { ...update, byFrame, first: frames[0] ?? 0, last: frames.at(-1) ?? 0 };
 }
 
 export function setState(state) {
-  if (state.seq < store.seq) return; // an event has overtaken it
+  if (state.seq < store.seq) return; // older than an event already applied
   store.tracks = new Map(state.tracks.map((track) => [track.id, toTrack(track)]));
   store.seeds = state.seeds ?? [];
-  setCounts(state);
-  forgetMissing();
+  setProgress(state);
+  dropMissingTracks();
   store.draft = null;
-  changed("tracks", "progress", "selection", "draft");
+  notify("tracks", "progress", "selection", "draft");
 }
 
-/** Set the drive or graph; frames of a graph are stored by their numbers. */
+/** Set the drive or graph; the frames of a graph are stored by their numbers. */
 export function setDrive(drive) {
   if (drive.live) {
     const frames = [];
@@ -84,7 +84,7 @@ export function setDrive(drive) {
   store.drive = drive;
 }
 
-/** Take a new frame of a running graph, or an old one with late boxes; then emit "live-frame". */
+/** Add a new frame of a running graph, or late boxes of an old one; then emit "live-frame". */
 export function addLiveFrame({ first, frame, tracks, ...rest }) {
   const { drive } = store;
   drive.frames[frame] = { ...rest, pose: null };
@@ -92,21 +92,21 @@ export function addLiveFrame({ first, frame, tracks, ...rest }) {
   drive.first = first;
   addTracks(tracks, first);
   emit("live-frame", frame);
-  changed("tracks", "wanted");
+  notify("tracks", "requested-frame");
 }
 
 /** Add the tracks of one frame of a running graph, and drop boxes before `first`. */
 function addTracks(tracks, first) {
-  for (const sent of tracks) {
-    const track = store.tracks.get(sent.id);
+  for (const update of tracks) {
+    const track = store.tracks.get(update.id);
     if (!track) {
-      store.tracks.set(sent.id, toTrack(sent));
+      store.tracks.set(update.id, toTrack(update));
       continue;
     }
-    for (const [frame, box] of toTrack(sent).byFrame) track.byFrame.set(frame, box);
-    Object.assign(track.trails, sent.trails);
-    track.class = sent.class;
-    track.score = Math.max(track.score, sent.score);
+    for (const [frame, box] of toTrack(update).byFrame) track.byFrame.set(frame, box);
+    Object.assign(track.trails, update.trails);
+    track.class = update.class;
+    track.score = Math.max(track.score, update.score);
     track.last = Math.max(...track.byFrame.keys());
   }
   for (const [id, track] of store.tracks) {
@@ -116,7 +116,7 @@ function addTracks(tracks, first) {
     track.first = Math.min(...track.byFrame.keys());
     if (track.byFrame.size === 0) store.tracks.delete(id);
   }
-  forgetMissing();
+  dropMissingTracks();
 }
 
 /** Apply the event of an action of any page. */
@@ -124,47 +124,47 @@ export function applyEvent(event) {
   for (const track of event.tracks ?? []) store.tracks.set(track.id, toTrack(track));
   for (const id of event.removed ?? []) store.tracks.delete(id);
   if (event.seeds) store.seeds = event.seeds;
-  setCounts(event);
-  forgetMissing();
-  changed("tracks", "progress", "selection");
+  setProgress(event);
+  dropMissingTracks();
+  notify("tracks", "progress", "selection");
 }
 
-function setCounts(from) {
-  store.seq = from.seq ?? store.seq;
-  store.checked = from.checked ? new Set(from.checked) : store.checked;
-  store.canUndo = from.can_undo ?? store.canUndo;
-  store.canRedo = from.can_redo ?? store.canRedo;
-  store.progress = from.progress ?? store.progress;
+function setProgress(state) {
+  store.seq = state.seq ?? store.seq;
+  store.checked = state.checked ? new Set(state.checked) : store.checked;
+  store.canUndo = state.can_undo ?? store.canUndo;
+  store.canRedo = state.can_redo ?? store.canRedo;
+  store.progress = state.progress ?? store.progress;
 }
 
-function forgetMissing() {
+function dropMissingTracks() {
   if (store.selected !== null && !store.tracks.has(store.selected)) store.selected = null;
-  for (const id of store.also) if (!store.tracks.has(id)) store.also.delete(id);
+  for (const id of store.alsoSelected) if (!store.tracks.has(id)) store.alsoSelected.delete(id);
 }
 
 export function select(id, { more = false } = {}) {
   if (more && store.selected !== null && id !== null && id !== store.selected) {
-    if (!store.also.delete(id)) store.also.add(id);
+    if (!store.alsoSelected.delete(id)) store.alsoSelected.add(id);
   } else {
     store.selected = id;
-    store.also.clear();
+    store.alsoSelected.clear();
   }
-  store.found = null;
-  changed("selection");
+  store.selectedResult = null;
+  notify("selection");
 }
 
 /** Select a label or a detection of the frame shown. */
-export function selectFound(found) {
+export function selectResult(result) {
   select(null);
-  store.found = found;
+  store.selectedResult = result;
 }
 
-export function selectedTrack() {
+export function getSelectedTrack() {
   return store.selected === null ? null : store.tracks.get(store.selected) ?? null;
 }
 
-/** The box of a track in the frame shown, or its draft: {box, kind} or null. */
-export function boxOf(track, frame = store.frame) {
+/** Return the box of a track in a frame, or its draft: {box, kind} or null. */
+export function getBox(track, frame = store.frame) {
   const { draft } = store;
   if (draft && track && draft.track === track.id && draft.frame === frame) {
     return { box: draft.box, kind: "key" };
@@ -172,12 +172,12 @@ export function boxOf(track, frame = store.frame) {
   return track?.byFrame.get(frame) ?? null;
 }
 
-export function selectedBox() {
-  const { found } = store;
-  if (found?.frame === store.frame) return { box: found.row.slice(0, 7), kind: "found" };
-  return boxOf(selectedTrack());
+export function getSelectedBox() {
+  const { selectedResult } = store;
+  if (selectedResult?.frame === store.frame) return { box: selectedResult.row.slice(0, 7), kind: "found" };
+  return getBox(getSelectedTrack());
 }
 
-export function classOf(name) {
+export function findClass(name) {
   return store.drive?.classes.find((entry) => entry.name === name) ?? null;
 }

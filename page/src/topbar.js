@@ -1,21 +1,22 @@
 // The top bar: drive, progress, undo, tools, theme, help; and the dialogs for import and export.
 
-import { act, exportLabels } from "./api.js";
+import { sendAction, exportLabels } from "./api.js";
 import { element, icon } from "./dom.js";
-import { colourOfClass } from "./colours.js";
-import { classToAdd, propose, redo, rejectRest, setClass, undo } from "./edits.js";
-import { COLOURS, setColour, showHelp } from "./keys.js";
-import { say, showLog } from "./messages.js";
-import { step, togglePlay } from "./playback.js";
+import { getClassColour } from "./colours.js";
+import { getNewClass, propose, redo, rejectRest, setClass, undo } from "./edits.js";
+import { COLOUR_SCHEMES, setColourScheme, showHelp } from "./keys.js";
+import { showNote, showLog } from "./messages.js";
+import { stepFrames, togglePlay } from "./playback.js";
 import { setTool } from "./pointer.js";
-import { focus, resetView, topView } from "./scene.js";
-import { changed, on, store } from "./store.js";
+import { focusSelection, resetView, topView } from "./scene.js";
+import { notify, on, store } from "./store.js";
 
-const by = (id) => document.getElementById(id);
-const RUN = {
-  undo, redo, propose, play: togglePlay, previous: () => step(-1), next: () => step(1), focus,
-  "log-open": showLog, "help-open": showHelp, theme: nextTheme, export: () => by("export-dialog").showModal(),
-  import: () => by("import-dialog").showModal(), reset: resetView, above: topView,
+const byId = (id) => document.getElementById(id);
+const COMMANDS = {
+  undo, redo, propose, play: togglePlay, previous: () => stepFrames(-1), next: () => stepFrames(1),
+  focus: focusSelection,
+  "log-open": showLog, "help-open": showHelp, theme: nextTheme, export: () => byId("export-dialog").showModal(),
+  import: () => byId("import-dialog").showModal(), reset: resetView, above: topView,
   "tool-select": () => setTool("select"), "tool-seed": () => setTool("seed"),
   "tool-add": () => setTool("add"), "reject-rest": rejectRest,
 };
@@ -23,35 +24,35 @@ const RUN = {
 const THEMES = ["auto", "light", "dark"];
 
 function nextTheme() {
-  const now = document.documentElement.dataset.theme;
-  setTheme(THEMES[(THEMES.indexOf(now) + 1) % THEMES.length]);
+  const current = document.documentElement.dataset.theme;
+  setTheme(THEMES[(THEMES.indexOf(current) + 1) % THEMES.length]);
 }
 
 export function setTheme(name) {
   document.documentElement.dataset.theme = name;
-  by("theme").title = `Theme: ${name === "auto" ? "as the system" : name}`;
+  byId("theme").title = `Theme: ${name === "auto" ? "as the system" : name}`;
   try { localStorage.setItem("theme", name); } catch { /* not stored, so it only applies to this page */ }
-  changed("theme");
+  notify("theme");
 }
 
 export function openTopbar() {
   for (const button of document.querySelectorAll("[data-icon]")) button.prepend(icon(button.dataset.icon));
-  for (const [id, run] of Object.entries(RUN)) {
-    const button = by(id);
+  for (const [id, run] of Object.entries(COMMANDS)) {
+    const button = byId(id);
     if (button) button.onclick = run;
   }
-  let kept = new URLSearchParams(location.search).get("theme");
-  try { kept ??= localStorage.getItem("theme") ?? "auto"; } catch { /* storage is not allowed */ }
-  setTheme(THEMES.includes(kept) ? kept : "auto");
-  for (const how of COLOURS) by("colour").append(element("option", { value: how }, how));
-  by("colour").onchange = () => setColour(by("colour").value);
-  by("advance").onchange = () => { store.advance = by("advance").checked; };
+  let stored = new URLSearchParams(location.search).get("theme");
+  try { stored ??= localStorage.getItem("theme") ?? "auto"; } catch { /* storage is not allowed */ }
+  setTheme(THEMES.includes(stored) ? stored : "auto");
+  for (const scheme of COLOUR_SCHEMES) byId("colour").append(element("option", { value: scheme }, scheme));
+  byId("colour").onchange = () => setColourScheme(byId("colour").value);
+  byId("advance").onchange = () => { store.autoAdvance = byId("advance").checked; };
   for (const dialog of document.querySelectorAll("dialog")) {
     dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
     for (const close of dialog.querySelectorAll("[data-close]")) close.onclick = () => dialog.close();
   }
-  by("export-form").onsubmit = sendExport;
-  by("import-form").onsubmit = sendImport;
+  byId("export-form").onsubmit = sendExport;
+  byId("import-form").onsubmit = sendImport;
   on("drive", showDrive);
   on("progress drive", showProgress);
   on("tracks drive", () => { // hide the timeline if there can be no tracks
@@ -59,21 +60,21 @@ export function openTopbar() {
       && !store.drive.live && store.tracks.size === 0 ? "none" : "some";
   });
   on("selection drive", () => {
-    document.documentElement.dataset.chosen = String(store.selected !== null || store.found !== null);
+    document.documentElement.dataset.selected = String(store.selected !== null || store.selectedResult !== null);
   });
   on("connection", () => {
-    by("lost").hidden = store.online;
-    by("lost").textContent = store.refused
+    byId("lost").hidden = store.online;
+    byId("lost").textContent = store.refused
       ? "The server was restarted. Open the address that it printed, which has a new token."
       : "Connection lost. Saved labels are safe; reconnecting…";
   });
-  on("colour", () => { by("colour").value = store.colour; });
+  on("colour", () => { byId("colour").value = store.colour; });
   on("tool drive", showTool);
   on("playing", () => {
-    by("play").replaceChildren(icon(store.playing ? "pause" : "play"));
-    const live = store.drive?.live, what = live ? ["Show the newest frames", "Pause"] : ["Play", "Stop"];
-    by("play").setAttribute("aria-label", what[Number(store.playing)]);
-    by("play").title = `${what[Number(store.playing)]} (Space)`;
+    byId("play").replaceChildren(icon(store.playing ? "pause" : "play"));
+    const live = store.drive?.live, titles = live ? ["Show the newest frames", "Pause"] : ["Play", "Stop"];
+    byId("play").setAttribute("aria-label", titles[Number(store.playing)]);
+    byId("play").title = `${titles[Number(store.playing)]} (Space)`;
   });
 }
 
@@ -81,65 +82,65 @@ function showDrive() {
   const { name, path, layout, frames, can_export: formats } = store.drive;
   document.title = `${name} · ${store.mode === "view" ? "view" : "label"}`;
   document.documentElement.dataset.mode = store.mode;
-  by("drive").textContent = name;
-  by("drive").title = path;
-  by("layout").textContent = store.drive.live ? "the running graph" : `${layout} · ${frames.length} frame${frames.length === 1 ? "" : "s"}`;
+  byId("drive").textContent = name;
+  byId("drive").title = path;
+  byId("layout").textContent = store.drive.live ? "the running graph" : `${layout} · ${frames.length} frame${frames.length === 1 ? "" : "s"}`;
   const choices = () => (formats ?? []).map((format) =>
     element("option", { value: format }, format.replaceAll("_", " ")));
-  by("export-format").replaceChildren(...choices());
-  by("import-format").replaceChildren(element("option", { value: "" }, "detect automatically"),
+  byId("export-format").replaceChildren(...choices());
+  byId("import-format").replaceChildren(element("option", { value: "" }, "detect automatically"),
                                       ...choices());
 }
 
 function showProgress() {
   const { progress } = store;
-  by("undo").disabled = !store.canUndo;
-  by("redo").disabled = !store.canRedo;
+  byId("undo").disabled = !store.canUndo;
+  byId("redo").disabled = !store.canRedo;
   if (!progress) return;
   const { tracks, accepted, rejected, left, frames, checked, busy } = progress;
-  by("bar-accepted").style.flexGrow = accepted;
-  by("bar-rejected").style.flexGrow = rejected;
-  by("bar-left").style.flexGrow = tracks ? left : 1;
-  by("progress-text").textContent = `${left} left · ${accepted} accepted · ${rejected} rejected · `
+  byId("bar-accepted").style.flexGrow = accepted;
+  byId("bar-rejected").style.flexGrow = rejected;
+  byId("bar-left").style.flexGrow = tracks ? left : 1;
+  byId("progress-text").textContent = `${left} left · ${accepted} accepted · ${rejected} rejected · `
     + `${checked} of ${frames} frames checked`;
-  if (by("busy").hidden !== !busy) changed("busy");
-  by("busy").hidden = !busy;
+  if (byId("busy").hidden !== !busy) notify("busy");
+  byId("busy").hidden = !busy;
   if (busy) {
-    by("busy").textContent = `${busy.what} ${busy.done} of ${busy.of}`;
-    by("busy").style.setProperty("--done", busy.of ? busy.done / busy.of : 0);
+    byId("busy").textContent = `${busy.what} ${busy.done} of ${busy.of}`;
+    byId("busy").style.setProperty("--done", busy.of ? busy.done / busy.of : 0);
   }
-  by("propose").disabled = Boolean(busy);
+  byId("propose").disabled = Boolean(busy);
 }
 
 function showTool() {
   for (const name of ["select", "seed", "add"]) {
-    by(`tool-${name}`).setAttribute("aria-pressed", String(store.tool === name));
+    byId(`tool-${name}`).setAttribute("aria-pressed", String(store.tool === name));
   }
-  by("tool-hint").hidden = store.tool === "select" || !store.drive;
-  if (by("tool-hint").hidden) return;
-  by("tool-hint").firstElementChild.textContent = store.tool === "add"
+  byId("tool-hint").hidden = store.tool === "select" || !store.drive;
+  if (byId("tool-hint").hidden) return;
+  byId("tool-hint").firstElementChild.textContent = store.tool === "add"
     ? "Click where to place the new box. Esc ends."
     : "Click a point of an object: similar objects are proposed in the whole drive. Esc ends.";
-  by("tool-classes").replaceChildren(...store.drive.classes.slice(0, 9).map(({ name }, k) =>
-    element("button", { class: "chip", "aria-pressed": String(name === classToAdd()),
+  byId("tool-classes").replaceChildren(...store.drive.classes.slice(0, 9).map(({ name }, k) =>
+    element("button", { class: "chip", "aria-pressed": String(name === getNewClass()),
       onclick: () => setClass(name) },
-      element("i", { class: "dot", style: `background:${colourOfClass(name)}` }), name,
+      element("i", { class: "dot", style: `background:${getClassColour(name)}` }), name,
       element("kbd", {}, `${k + 1}`))));
 }
 
 async function sendExport(event) {
   event.preventDefault();
-  const line = by("export-error"), button = event.submitter;
-  line.textContent = "";
+  const errorLine = byId("export-error"), button = event.submitter;
+  errorLine.textContent = "";
   if (button) button.disabled = true;
   try {
-    const found = await exportLabels({ format: by("export-format").value,
-      out: by("export-out").value, force: by("export-force").checked });
-    by("export-dialog").close();
-    const without = found.left_out.length ? `, without ${found.left_out.join(", ")}` : "";
-    say(`Exported ${found.boxes} boxes of ${found.frames} frames to ${found.path}${without}`);
+    const result = await exportLabels({ format: byId("export-format").value,
+      out: byId("export-out").value, force: byId("export-force").checked });
+    byId("export-dialog").close();
+    const exceptions = result.left_out.length ? `, without ${result.left_out.join(", ")}` : "";
+    showNote(`Exported ${result.boxes} boxes of ${result.frames} frames to ${result.path}${exceptions}`);
   } catch (error) {
-    line.textContent = error.message;
+    errorLine.textContent = error.message;
   } finally {
     if (button) button.disabled = false;
   }
@@ -147,8 +148,8 @@ async function sendExport(event) {
 
 async function sendImport(event) {
   event.preventDefault();
-  const line = by("import-error"); // the dialog would hide a message
-  line.textContent = "";
-  if (await act({ do: "import", path: by("import-path").value, format: by("import-format").value },
-    (text) => { line.textContent = text; })) by("import-dialog").close();
+  const errorLine = byId("import-error"); // the dialog would hide a message
+  errorLine.textContent = "";
+  if (await sendAction({ do: "import", path: byId("import-path").value, format: byId("import-format").value },
+    (text) => { errorLine.textContent = text; })) byId("import-dialog").close();
 }

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmark.plain_euclidean import euclidean as plain
+from benchmark.plain_euclidean import cluster_euclidean as plain_euclidean
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import EuclideanParams
 
@@ -70,14 +70,14 @@ def test_degenerate_clouds_equal_the_plain_implementation(xyz, params):
     xyz = np.asarray(xyz, np.float32)
     labels = cluster_euclidean(xyz, params)
     assert labels.dtype == np.int32 and labels.shape == (len(xyz),)
-    np.testing.assert_array_equal(labels, plain(xyz, params))
+    np.testing.assert_array_equal(labels, plain_euclidean(xyz, params))
 
 
 @pytest.mark.parametrize("params", SETTINGS, ids=SETTING_NAMES)
 @pytest.mark.parametrize("seed", range(3))
 def test_scenes_equal_the_plain_implementation(seed, params):
     labels = cluster_euclidean(scene(seed), params)
-    np.testing.assert_array_equal(labels, plain(scene(seed), params))
+    np.testing.assert_array_equal(labels, plain_euclidean(scene(seed), params))
     # The comparison is not trivial.
     assert labels.max() > 3 and ((labels == 0).any() or params.beta == 0)
 
@@ -97,7 +97,7 @@ def test_lattice_clouds_equal_the_plain_implementation(data):
         min_size=data.draw(st.integers(1, 6)),
     )
     xyz = (np.array(rows) * step).astype(np.float32)
-    np.testing.assert_array_equal(cluster_euclidean(xyz, params), plain(xyz, params))
+    np.testing.assert_array_equal(cluster_euclidean(xyz, params), plain_euclidean(xyz, params))
 
 
 @pytest.mark.parametrize("threshold", ["local", "global"])
@@ -112,7 +112,7 @@ def test_a_real_scan_equals_the_plain_implementation(threshold, data):
     ground = segment_ground(frame, GroundParams(method="cloth"))
     xyz = frame.xyz[~ground][::3]
     params = replace(LOCAL, threshold=threshold, gamma=0.0 if threshold == "global" else 0.8)
-    np.testing.assert_array_equal(cluster_euclidean(xyz, params), plain(xyz, params))
+    np.testing.assert_array_equal(cluster_euclidean(xyz, params), plain_euclidean(xyz, params))
 
 
 @pytest.mark.parametrize("params", SETTINGS, ids=SETTING_NAMES)

@@ -12,7 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
-from benchmark.plain_euclidean import euclidean as plain
+from benchmark.plain_euclidean import cluster_euclidean as plain_euclidean
 from lidar_perception.clustering import euclidean
 from lidar_perception.clustering.cells import mean_neighbourhood_size, sample_cells, sort_into_cells
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
@@ -127,7 +127,7 @@ SETTINGS = [
 def test_grid_and_tree_give_the_same_clusters(arrange, params, max_distances):
     """-1 uses the tree only. The plain implementation has no fixed threshold."""
     xyz = make_points(arrange, 700)
-    expected = cluster_euclidean(xyz, params, 10**9) if params.threshold == "fixed" else plain(xyz, params)
+    expected = cluster_euclidean(xyz, params, 10**9) if params.threshold == "fixed" else plain_euclidean(xyz, params)
     np.testing.assert_array_equal(cluster_euclidean(xyz, params, max_distances), expected)
 
 

@@ -35,8 +35,8 @@ def test_scan_cache_is_bounded_and_makes_a_scan_once():
     assert made == [3]
     for i in range(1000):
         clouds(i)
-        assert sum(s.nbytes for s in clouds._kept.values()) == clouds._size <= 5 * make(0).nbytes
-    assert len(clouds._making) <= 6
+        assert sum(s.nbytes for s in clouds._scans.values()) == clouds._size <= 5 * make(0).nbytes
+    assert len(clouds._locks) <= 6
 
 
 def test_recording_of_several_drives_needs_a_sequence():

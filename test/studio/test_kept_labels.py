@@ -177,9 +177,9 @@ def test_nan_is_null_in_the_journal():
             )
         ]
     )
-    tracks, kept = to_tracks(labels, 1)
-    json.dumps([track_to_json(tracks[0]), kept], allow_nan=False)
-    back = to_labels(replace(State(), tracks={1: tracks[0]}, kept=kept), frames()[:1])
+    tracks, preserved = to_tracks(labels, 1)
+    json.dumps([track_to_json(tracks[0]), preserved], allow_nan=False)
+    back = to_labels(replace(State(), tracks={1: tracks[0]}, preserved=preserved), frames()[:1])
     assert back.frames[0].extra[0] == {"velocity": [None, 1.0]}
     assert back.frames[0].notes == [("area", {"x": None})]
 

@@ -87,7 +87,7 @@ def test_early_boxes_wait_and_unmatched_ones_are_counted(live):
     for stamp in range(1000, 1000 + live_graph.MAX_EARLY_ARRAYS + 3):
         live.add_boxes(FOUND, boxes(stamp), None)
     (topic,) = live.get_status()["topics"]
-    assert (topic["alone"], topic["late"]) == (3, 0)
+    assert (topic["unmatched"], topic["late"]) == (3, 0)
 
 
 @given(st.lists(st.integers(1, 2000), min_size=1, max_size=60), st.integers(1, 12), st.integers(1, 40_000))
@@ -109,13 +109,13 @@ def test_memory_is_bounded_and_the_newest_frame_is_stored(sizes, most, max_bytes
 def test_frames_stay_and_new_ones_are_counted_while_paused(live):
     for stamp in range(4):
         live.add_cloud(cloud(stamp))
-    live.set_held(1, True)
-    live.set_held(2, True)
-    live.set_held(1, False)
+    live.set_paused(1, True)
+    live.set_paused(2, True)
+    live.set_paused(1, False)
     for stamp in range(4, 20):
         live.add_cloud(cloud(stamp))
-    assert (live.first, live.end) == (0, 4) and live.get_status()["clouds"]["passed"] == 16
-    live.set_held(2, False)
+    assert (live.first, live.end) == (0, 4) and live.get_status()["clouds"]["skipped"] == 16
+    live.set_paused(2, False)
     live.add_cloud(cloud(20))
     assert live.end == 5
 
@@ -134,7 +134,7 @@ def test_early_labels_are_matched_when_a_bag_loops(live):
         live.add_boxes("/ground_truth/detections", boxes(stamp), None)
         live.add_cloud(cloud(stamp))
     assert all(len(live.layers(i, 0.0)["labels"]) == 1 for i in range(4))
-    assert live.get_status()["topics"][1]["alone"] == 0
+    assert live.get_status()["topics"][1]["unmatched"] == 0
 
 
 def test_missing_tf_is_reported_and_invalid_boxes_left_out(live):
@@ -226,7 +226,7 @@ def test_cloud_with_most_columns_and_its_boxes_are_selected():
         "/ground_truth/detections": LABELS,
     }
     assert select_box_topics({FOUND + "_3d": ARRAY}, "/points") == {FOUND + "_3d": BOXES}
-    assert select_box_topics(one, "/points", wanted=["clustering/output/boxes"]) == {
+    assert select_box_topics(one, "/points", requested=["clustering/output/boxes"]) == {
         "/clustering/output/boxes": BOXES,
         TRACKED: TRACKS,
         "/ground_truth/detections": LABELS,
@@ -239,9 +239,9 @@ def test_cloud_with_most_columns_and_its_boxes_are_selected():
     assert all(topic.startswith("/rear/") for topic in select_box_topics(two, chosen))
     assert select_cloud_topic(two, "front", "points") == "/front/points"
     assert select_cloud_topic({"/velodyne_points": CLOUD, "/x": MARKERS}) == "/velodyne_points"
-    for types, wanted in (({}, ""), (one, "/no"), ({"/a": CLOUD, "/b": CLOUD}, "")):
+    for types, requested in (({}, ""), (one, "/no"), ({"/a": CLOUD, "/b": CLOUD}, "")):
         with pytest.raises(InputError) as error_info:
-            select_cloud_topic(types, wanted=wanted)
+            select_cloud_topic(types, requested=requested)
         assert "\n" not in str(error_info.value)
 
 

@@ -345,21 +345,21 @@ def test_view_selects_labels_and_keys_step_through_missed_ones(browser, drive_ba
         for k in [*missed, None]:
             page.keyboard.press("n")
             page.wait_for_function(
-                "([n, seen]) => page.store.found?.wrong === 'missed' && "
-                "page.store.found.frame * 1000 + page.store.found.k !== seen",
+                "([n, seen]) => page.store.selectedResult?.error === 'missed' && "
+                "page.store.selectedResult.frame * 1000 + page.store.selectedResult.k !== seen",
                 arg=[k, seen[-1] if seen else -1],
             )
-            seen.append(page.evaluate("page.store.found.frame * 1000 + page.store.found.k"))
+            seen.append(page.evaluate("page.store.selectedResult.frame * 1000 + page.store.selectedResult.k"))
         assert seen[:-1] == missed and seen[-1] >= 1000  # then the next frame
         assert page.inner_text("#state") == "missed" and page.is_visible("#facts")
         page.keyboard.press("[")
-        page.wait_for_function("k => page.store.frame === 0 && page.store.found?.k === k", arg=missed[-1])
-        row = page.evaluate("page.store.found.row")
+        page.wait_for_function("k => page.store.frame === 0 && page.store.selectedResult?.k === k", arg=missed[-1])
+        row = page.evaluate("page.store.selectedResult.row")
         page.keyboard.press("Escape")
-        page.wait_for_function("() => page.store.found === null")
+        page.wait_for_function("() => page.store.selectedResult === null")
         page.evaluate("b => page.lookAt(b.slice(0, 3), [b[0] - 4, b[1] - 1, b[2] + 3])", row)
         area = page.locator("#scene").bounding_box()
         at = page.evaluate("b => page.project(...b.slice(0, 3))", row)
         page.mouse.click(area["x"] + at[0], area["y"] + at[1])
-        page.wait_for_function("k => page.store.found?.k === k", arg=missed[-1])
+        page.wait_for_function("k => page.store.selectedResult?.k === k", arg=missed[-1])
         assert page.inner_text("#who") == row[7]

@@ -64,7 +64,7 @@ def test_each_frame_is_checked_once_at_any_key_speed(browser, page, labels):
             other.keyboard.press(".")
         other.wait_for_function("() => page.store.frame === 3")
         other.keyboard.press("k")
-        other.wait_for_function("() => page.store.wanted === 4")
+        other.wait_for_function("() => page.store.requestedFrame === 4")
         other.keyboard.press("k")  # frame 4 is not shown yet
         while not held:
             other.wait_for_timeout(10)

@@ -82,10 +82,10 @@ def test_only_recordings_with_track_ids_are_tracked(monkeypatch):
 
 
 def test_intervals_of_drives_are_paired():
-    from benchmark.drives import _interval, resample
+    from benchmark.drives import _compute_interval, resample
 
     values = [1.0, 2.0, 4.0]
     means = resample(values, lambda chosen: sum(chosen) / 3)
     np.testing.assert_array_equal(means, resample(values, lambda chosen: sum(chosen) / 3))
-    low, high = _interval(means)
+    low, high = _compute_interval(means)
     assert 1.0 <= low < np.mean(values) < high <= 4.0

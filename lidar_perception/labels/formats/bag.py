@@ -39,24 +39,28 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
             raise InputError(
                 f"{path}: {topic} is {bag.topics[topic]}, but labels are {MARKERS} or {DETECTIONS}; give another topic"
             )
-        markers = bag.topics[topic] == MARKERS
-        found: dict[int, MarkedObjects] = {}
+        are_markers = bag.topics[topic] == MARKERS
+        objects_by_stamp: dict[int, MarkedObjects] = {}
         poses = BagPoses(BagHandle(path), read_frame_id(frames))
         for _, time, msg in bag.messages({topic}):
-            objects = from_marker_array(msg) if markers else from_detection_array(msg)
+            objects = from_marker_array(msg) if are_markers else from_detection_array(msg)
             stamp_ns = objects.stamp_ns or (0 if 0 in stamps else time)
-            found[stamp_ns] = poses.to_cloud_frame(objects, topic)
-    if unknown := sorted(found.keys() - stamps):
+            objects_by_stamp[stamp_ns] = poses.to_cloud_frame(objects, topic)
+    if unknown := sorted(objects_by_stamp.keys() - stamps):
         raise InputError(
             f"{path}: {topic} has labels at {unknown[0]} ns ({len(unknown)} of "
-            f"{len(found)} such stamps), where the drive has no frame; give the drive "
+            f"{len(objects_by_stamp)} such stamps), where the drive has no frame; give the drive "
             "that was labelled"
         )
-    has_ids = markers or any(sorted(o.ids.tolist()) != list(range(len(o))) for o in found.values())
+    has_ids = are_markers or any(sorted(o.ids.tolist()) != list(range(len(o))) for o in objects_by_stamp.values())
     return DriveLabels(
         [
             _make_frame_labels(
-                frame, found.get(frame.stamp_ns), markers, has_ids, f"{path}, {topic} at {frame.stamp_ns} ns"
+                frame,
+                objects_by_stamp.get(frame.stamp_ns),
+                are_markers,
+                has_ids,
+                f"{path}, {topic} at {frame.stamp_ns} ns",
             )
             for frame in frames
         ]
@@ -64,18 +68,18 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
 
 
 def _make_frame_labels(
-    frame: Frame, objects: MarkedObjects | None, markers: bool, has_ids: bool, where: str
+    frame: Frame, objects: MarkedObjects | None, are_markers: bool, has_ids: bool, where: str
 ) -> FrameLabels:
     if objects is None:
         return FrameLabels.of(frame.name, frame.stamp_ns)
     extra = [dict(e) for e in objects.extras]
     ids = [NO_TRACK] * len(objects)
     for k, fields in enumerate(extra):
-        if markers:
+        if are_markers:
             ids[k] = fields.pop("track_id", fields.pop("id", NO_TRACK) if "velocity" in fields else NO_TRACK)
         elif has_ids:
             ids[k] = int(objects.ids[k])
-    scores = [e.pop("score", np.nan) for e in extra] if markers else objects.scores
+    scores = [e.pop("score", np.nan) for e in extra] if are_markers else objects.scores
     names = [e.pop("class_name", label) for e, label in zip(extra, objects.labels)]
     return FrameLabels.of(frame.name, frame.stamp_ns, objects.boxes, names, ids, scores, extra, objects.notes, where)
 
@@ -84,7 +88,10 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
     """Write a bag with the labels, poses, camera and, optionally, clouds of the frames to `out`."""
     write_bag(
         out,
-        (replace(frame, truth=partial(to_ground_truth, each)) for frame, each in zip(frames, labels.frames)),
+        (
+            replace(frame, truth=partial(to_ground_truth, frame_labels))
+            for frame, frame_labels in zip(frames, labels.frames)
+        ),
         force=force,
         clouds=clouds,
         detections_3d=True,

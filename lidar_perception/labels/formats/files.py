@@ -1,4 +1,4 @@
-"""Files of labels: their assignment to frames and drives, track names, and JSON."""
+"""Label files: their assignment to frames and drives, track names, and JSON."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from lidar_perception.labels.drive_labels import NO_TRACK, FrameLabels
 from lidar_perception.runs.files import check_unused, read_text, write_folder, write_text
 from lidar_perception.types import InputError
 
-MAX_BYTES = 2**30  # maximum size of a label file
-KEPT = "kept"
+MAX_BYTES = 2**30  # of a file of labels
+CONFLICTING = "kept"  # field with the fields whose names the format uses itself
 
 
 def group_by_sequence(frames: Sequence[Frame]) -> dict[str, list[int]]:
     """Return the positions of frames by the sequence that they belong to, in order."""
-    found: dict[str, list[int]] = {}
+    positions: dict[str, list[int]] = {}
     for i, frame in enumerate(frames):
-        found.setdefault(frame.sequence, []).append(i)
-    return found
+        positions.setdefault(frame.sequence, []).append(i)
+    return positions
 
 
 def list_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[str, Path]:
@@ -45,7 +45,7 @@ def list_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[s
 def find_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[str, Path]:
     """Return the existing files of list_drive_files, and `path` if it is a file.
 
-    For InputError see check_label_files.
+    Raises InputError as check_label_files does.
     """
     files = list_drive_files(path, frames, suffix)
     if path not in files.values():
@@ -72,21 +72,21 @@ def write_drives(
 
 
 def list_frame_files(folder: Path, frames: Sequence[Frame], suffix: str) -> list[Path]:
-    """Return the label file of each frame, FRAME.suffix, in a folder per drive if several."""
-    several = len(group_by_sequence(frames)) > 1
-    return [folder / f"{frame.name if several else frame.name.rpartition('/')[2]}{suffix}" for frame in frames]
+    """Return the label file of each frame, FRAME.suffix, in a folder per drive if there are several."""
+    has_drives = len(group_by_sequence(frames)) > 1
+    return [folder / f"{frame.name if has_drives else frame.name.rpartition('/')[2]}{suffix}" for frame in frames]
 
 
-def check_label_files(folder: Path, known: Sequence[Path], suffix: str, ignored: Sequence[str] = ()) -> None:
-    """Raise InputError if a folder has no label files, or one that is not in `known`.
+def check_label_files(folder: Path, expected: Sequence[Path], suffix: str, ignored: Sequence[str] = ()) -> None:
+    """Raise InputError if a folder has no label files, or one that is not in `expected`.
 
     Args:
-        known: label files of the frames.
+        expected: label files of the frames.
         ignored: names of other files that are allowed.
     """
     if not folder.is_dir():
         raise InputError(f"the folder {folder} does not exist; give the folder of the label files")
-    names = {str(path.relative_to(folder)) for path in known}
+    names = {str(path.relative_to(folder)) for path in expected}
     existing = {
         str(path.relative_to(folder))
         for path in folder.rglob(f"*{suffix}")
@@ -106,20 +106,20 @@ def check_label_files(folder: Path, known: Sequence[Path], suffix: str, ignored:
 def merge_extra(extra: dict[str, Any], own_names: Collection[str]) -> dict[str, Any]:
     """Return the extra fields of a box as fields of a format.
 
-    Fields whose names the format uses itself are stored under KEPT.
+    Fields whose names the format uses itself are stored under CONFLICTING.
     """
-    conflicting = {key: value for key, value in extra.items() if key in own_names or key == KEPT}
+    conflicting = {key: value for key, value in extra.items() if key in own_names or key == CONFLICTING}
     return {
         **{key: value for key, value in extra.items() if key not in conflicting},
-        **({KEPT: conflicting} if conflicting else {}),
+        **({CONFLICTING: conflicting} if conflicting else {}),
     }
 
 
 def extract_extra(item: dict[str, Any], own_names: Collection[str]) -> dict[str, Any]:
     """Return the extra fields of a box, the inverse of merge_extra."""
-    kept = item.get(KEPT)
-    rest = {key: value for key, value in item.items() if key not in own_names}
-    return {**rest, **rest.pop(KEPT)} if isinstance(kept, dict) else rest
+    conflicting = item.get(CONFLICTING)
+    extra = {key: value for key, value in item.items() if key not in own_names}
+    return {**extra, **extra.pop(CONFLICTING)} if isinstance(conflicting, dict) else extra
 
 
 def assign_track_ids(names: Iterable[str]) -> dict[str, int]:
@@ -181,7 +181,7 @@ def replace_non_finite(value: Any) -> Any:
 
 
 def report_format_errors(where: str, read: Callable[[], Any]) -> Any:
-    """Return read(), and convert its errors to InputErrors that name `where`.
+    """Call read(), and convert its errors to InputErrors that name `where`.
 
     For parsers of files whose values may be of any type.
     """

@@ -2,8 +2,8 @@
 
 The development kits' readme files define the columns: location is the centre of the bottom face in
 the rectified camera's frame (x right, y down, z forward), and rotation_y is the rotation about its
-y axis, 0 where the length points to the right. A box that was read and not changed keeps all its
-columns.
+y axis, 0 where the length points to the right. A box that was read and not changed is written with
+all its original columns.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str
             "truncated": float(outside[k]),
             "occluded": level if isinstance(level := extra.get("occluded"), int) else int(occlusion[k]),
         }
-        if _is_as_read(box, extra, to_lidar):
+        if _is_unchanged_line(box, extra, to_lidar):
             line |= {column: extra[column] for column in COLUMNS}
             if not levels and _is_level(extra["truncated"], labels.track_ids[k]):
                 line["truncated"] = float(outside[k])
@@ -112,20 +112,20 @@ def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str
 
 def _make_note_line(name: str, extra: dict[str, Any]) -> dict[str, Any]:
     """Return the line of an object without a 3D box: as read, or with the columns of DontCare."""
-    kinds = {"bbox": (4,), "dimensions": (3,), "location": (3,)}
+    shapes = {"bbox": (4,), "dimensions": (3,), "location": (3,)}
     with suppress(KeyError, TypeError, ValueError):
-        if all(np.array(extra[c], np.float64).shape == kinds.get(c, ()) for c in COLUMNS):
+        if all(np.array(extra[c], np.float64).shape == shapes.get(c, ()) for c in COLUMNS):
             return {"class": name, **extra}
     return {"class": "_".join(name.split()) or "Misc", **DONT_CARE, "bbox": [0.0] * 4}
 
 
-def _is_as_read(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndarray) -> bool:
+def _is_unchanged_line(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndarray) -> bool:
     """Return True if extra has all columns of the unchanged box."""
     try:
-        kept = to_lidar_box(extra, to_lidar)
+        original = to_lidar_box(extra, to_lidar)
         return (
-            kept is not None
-            and is_unchanged(box, kept)
+            original is not None
+            and is_unchanged(box, original)
             and np.shape([extra[c] for c in ("truncated", "occluded", "alpha")]) == (3,)
             and np.shape(extra["bbox"]) == (4,)
         )
@@ -154,8 +154,8 @@ def compute_occlusion_levels(pixels: np.ndarray, depths: np.ndarray) -> np.ndarr
         # Sample a grid of 32 x 32 points in the box, so that overlapping boxes count once.
         u = left + (np.arange(32) + 0.5) / 32 * (right - left)
         v = top + (np.arange(32) + 0.5) / 32 * (bottom - top)
-        across = (u >= nearer[:, :1]) & (u < nearer[:, 2:3])
-        down = (v >= nearer[:, 1:2]) & (v < nearer[:, 3:])
-        share = (across[:, None, :] & down[:, :, None]).any(axis=0).mean()
-        levels[k] = int(share >= MIN_PARTLY) + int(share >= MIN_LARGELY)
+        inside_columns = (u >= nearer[:, :1]) & (u < nearer[:, 2:3])
+        inside_rows = (v >= nearer[:, 1:2]) & (v < nearer[:, 3:])
+        hidden_share = (inside_columns[:, None, :] & inside_rows[:, :, None]).any(axis=0).mean()
+        levels[k] = int(hidden_share >= MIN_PARTLY) + int(hidden_share >= MIN_LARGELY)
     return levels

@@ -30,18 +30,18 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
             "a folder, or choose a drive with --split"
         )
     labels: list[FrameLabels] = []
-    found = False
+    has_file = False
     for drive, positions in drives.items():
         files = (path, path / TRACKLETS) if len(drives) == 1 else ()
         file = next((file for file in (*files, path / drive / TRACKLETS) if file.is_file()), None)
-        found = found or file is not None
+        has_file = has_file or file is not None
         drive_frames = [frames[i] for i in positions]
         labels += (
             [make_frame_labels(frame, ()) for frame in drive_frames]
             if file is None
             else _read_drive(file, drive_frames)
         )
-    if not found:
+    if not has_file:
         raise InputError(f"{path} has no {TRACKLETS}; give the folder that contains it")
     return DriveLabels(labels)
 

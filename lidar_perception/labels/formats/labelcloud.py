@@ -43,45 +43,45 @@ from msg_utils.markers import COLORS, OTHER_COLOR
 ROOT, CLASSES_FILE, SUFFIX = "labelcloud", "_classes.json", ".json"
 DECIMALS = 8
 CORNERS = [2, 1, 0, 3, 6, 5, 4, 7]  # order of geometry.box_corners in labelCloud
-ABSOLUTE, RELATIVE, VERTICES = KINDS = "centroid_abs", "centroid_rel", "vertices"
+ABSOLUTE, RELATIVE, VERTICES = NOTATIONS = "centroid_abs", "centroid_rel", "vertices"
 TILTED = "labelcloud_tilted"
-OWN = {"name", "centroid", "dimensions", "rotations", "vertices", "track_id", "score"}
+OWN_FIELDS = {"name", "centroid", "dimensions", "rotations", "vertices", "track_id", "score"}
 
 
-def _read(kind: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
+def _read(notation: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
     """Read a folder with FRAME.json. A frame without a file has no labels."""
     files = list_frame_files(path, frames, SUFFIX)
     check_label_files(path, files, SUFFIX, ignored=(CLASSES_FILE,))
     classes = path / CLASSES_FILE
     if classes.exists():  # this file states the format
         content = read_json(classes)
-        stated = content.get("format") if isinstance(content, dict) else None
-        kind = stated if stated in KINDS else kind
-    labels, heads = [], {}
+        stated_notation = content.get("format") if isinstance(content, dict) else None
+        notation = stated_notation if stated_notation in NOTATIONS else notation
+    labels, headers = [], {}
     for frame, file in zip(frames, files):
         content = read_json(file) if file.exists() else {"objects": []}
-        rows = report_format_errors(str(file), partial(_parse_objects, content, kind))
+        rows = report_format_errors(str(file), partial(_parse_objects, content, notation))
         labels.append(make_frame_labels(frame, rows, where=file))
         if file.exists():
-            heads[frame.name] = {k: v for k, v in content.items() if k != "objects"}
-    return DriveLabels(labels, {ROOT: heads})
+            headers[frame.name] = {k: v for k, v in content.items() if k != "objects"}
+    return DriveLabels(labels, {ROOT: headers})
 
 
-def _parse_objects(content: dict[str, Any], kind: str) -> list[Row]:
+def _parse_objects(content: dict[str, Any], notation: str) -> list[Row]:
     rows: list[Row] = []
     for item in content["objects"]:
-        extra = extract_extra(item, OWN)
+        extra = extract_extra(item, OWN_FIELDS)
         shape = {key: item[key] for key in ("rotations", "vertices") if key in item}
-        box, tilted = _parse_box(item, kind)
+        box, tilted = _parse_box(item, notation)
         if tilted:
-            extra[TILTED] = {**shape, "unit": kind, "box": box}
+            extra[TILTED] = {**shape, "unit": notation, "box": box}
         rows.append(
             (box, str(item["name"]), int(item.get("track_id", NO_TRACK)), float(item.get("score", math.nan)), extra)
         )
     return rows
 
 
-def _parse_box(item: dict[str, Any], kind: str) -> tuple[list[float], bool]:
+def _parse_box(item: dict[str, Any], notation: str) -> tuple[list[float], bool]:
     """Return [x y z l w h yaw], and True if the box is tilted."""
     if "vertices" in item:
         corners = np.array(item["vertices"], float).reshape(8, 3)
@@ -98,7 +98,7 @@ def _parse_box(item: dict[str, Any], kind: str) -> tuple[list[float], bool]:
             bool(np.abs([*edges[:2, 2], *edges[2, :2]]).max() > 1e-6),
         )
     angles = [item["rotations"][axis] for axis in "xyz"]
-    x, y, z = angles if kind == RELATIVE else np.radians(angles).tolist()
+    x, y, z = angles if notation == RELATIVE else np.radians(angles).tolist()
     yaw = z if math.cos(y) > 0 else z + math.pi
     return (
         [item["centroid"][axis] for axis in "xyz"]
@@ -108,22 +108,22 @@ def _parse_box(item: dict[str, Any], kind: str) -> tuple[list[float], bool]:
     )
 
 
-def _write(kind: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
+def _write(notation: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
     """Write FRAME.json of each frame and _classes.json to the folder `out`."""
-    names = sorted({name for each in labels.frames for name in each.class_names})
-    heads = labels.extra.get(ROOT, {})
+    names = sorted({name for frame_labels in labels.frames for name in frame_labels.class_names})
+    headers = labels.extra.get(ROOT, {})
     with write_folder(out, force) as folder:
         files = list_frame_files(folder, frames, SUFFIX)
         for frame_labels, frame, file in zip(labels.frames, frames, files):
             cloud = frame.points or Path(f"{file.stem}.pcd")
-            objects = [_make_object(frame_labels, k, kind) for k in range(len(frame_labels))]
+            objects = [_make_object(frame_labels, k, notation) for k in range(len(frame_labels))]
             write_json(
                 file,
                 {
                     "folder": cloud.parent.name,
                     "filename": cloud.name,
                     "path": str(cloud),
-                    **heads.get(frame.name, {}),
+                    **headers.get(frame.name, {}),
                     "objects": objects,
                 },
                 1,
@@ -134,37 +134,39 @@ def _write(kind: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], f
                 "classes": [{"name": name, "id": i, "color": _to_hex_color(name)} for i, name in enumerate(names)],
                 "default": 0,
                 "type": "object_detection",
-                "format": kind,
+                "format": notation,
                 "created_with": {"name": "lidar_perception", "version": ""},
             },
             1,
         )
 
 
-def _make_object(labels: FrameLabels, k: int, kind: str) -> dict[str, Any]:
+def _make_object(labels: FrameLabels, k: int, notation: str) -> dict[str, Any]:
     box, extra = labels.boxes[k], dict(labels.extra[k])
     x, y, z, length, width, height, _ = box.round(DECIMALS).tolist()
-    kept = extra.pop(TILTED, None)
+    original = extra.pop(TILTED, None)
     shape: dict[str, Any]
-    if kept and kept["unit"] == kind and is_unchanged(box, kept["box"]):
-        shape = {key: kept[key] for key in ("rotations", "vertices") if key in kept}
-    elif kind == VERTICES:
+    if original and original["unit"] == notation and is_unchanged(box, original["box"]):
+        shape = {key: original[key] for key in ("rotations", "vertices") if key in original}
+    elif notation == VERTICES:
         shape = {"vertices": box_corners(box[None])[0][CORNERS].round(DECIMALS).tolist()}
     else:
-        yaw = math.degrees(box[6]) % 360 if kind == ABSOLUTE else math.remainder(box[6], math.tau)
+        yaw = math.degrees(box[6]) % 360 if notation == ABSOLUTE else math.remainder(box[6], math.tau)
         yaw = round(yaw, DECIMALS)
-        shape = {"rotations": {"x": 0, "y": 0, "z": yaw % 360 if kind == ABSOLUTE else yaw}}
-    if kind != VERTICES:
+        shape = {"rotations": {"x": 0, "y": 0, "z": yaw % 360 if notation == ABSOLUTE else yaw}}
+    if notation != VERTICES:
         shape = {
             "centroid": {"x": x, "y": y, "z": z},
             "dimensions": {"length": length, "width": width, "height": height},
             **shape,
         }
-    return {**merge_extra(extra, OWN), "name": labels.class_names[k], **shape, **get_id_and_score(labels, k)}
+    return {**merge_extra(extra, OWN_FIELDS), "name": labels.class_names[k], **shape, **get_id_and_score(labels, k)}
 
 
 def _to_hex_color(name: str) -> str:
     return "#" + "".join(f"{round(255 * part):02x}" for part in COLORS.get(name, OTHER_COLOR))
 
 
-absolute_format, relative_format, vertices_format = ((partial(_read, kind), partial(_write, kind)) for kind in KINDS)
+absolute_format, relative_format, vertices_format = (
+    (partial(_read, notation), partial(_write, notation)) for notation in NOTATIONS
+)

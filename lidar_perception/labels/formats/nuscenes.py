@@ -55,7 +55,7 @@ SIMILAR_NAMES = {row.name: NUSCENES_NAMES[row.looks_like] for row in TABLE if ro
 WRITTEN_NAMES = {**NUSCENES_NAMES, **SIMILAR_NAMES}
 # nuScenes classes that correspond to ours only with a rider.
 RIDDEN_CLASSES, NOT_RIDDEN = OUR_NAMES.keys() - CLASS_BY_NAME.keys(), "cycle.without_rider"
-OWN = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id", "attribute_name"}
+OWN_FIELDS = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id", "attribute_name"}
 
 
 def _get_token(frame: Frame) -> str:
@@ -98,8 +98,8 @@ def _parse_boxes(task: str, frame: Frame, boxes: list[dict[str, Any]], ids: dict
     rows: list[Row] = []
     pose = _require_pose(frame) if boxes else np.eye(4)  # without boxes, no pose is needed
     for row in boxes:
-        kind, attribute = str(row[f"{task}_name"]), row.get("attribute_name", "")
-        extra = extract_extra(row, OWN | {f"{task}_name", f"{task}_score"})
+        class_name, attribute = str(row[f"{task}_name"]), row.get("attribute_name", "")
+        extra = extract_extra(row, OWN_FIELDS | {f"{task}_name", f"{task}_score"})
         if attribute:
             extra["attribute"] = attribute
         if (velocity := _parse_velocity(row.get("velocity"))) is not None:
@@ -111,10 +111,10 @@ def _parse_boxes(task: str, frame: Frame, boxes: list[dict[str, Any]], ids: dict
         if track and track != str(ids[track]):
             extra["tracking_id"] = track
         score = float(row.get(f"{task}_score", NO_SCORE))
-        if SIMILAR_NAMES.get(extra.get("class_name", "")) == kind:
-            kind = extra.pop("class_name")
-        kind = kind if attribute == NOT_RIDDEN else OUR_NAMES.get(kind, kind)
-        rows.append((box, kind, ids.get(track, NO_TRACK), np.nan if score < 0 else score, extra))
+        if SIMILAR_NAMES.get(extra.get("class_name", "")) == class_name:
+            class_name = extra.pop("class_name")
+        class_name = class_name if attribute == NOT_RIDDEN else OUR_NAMES.get(class_name, class_name)
+        rows.append((box, class_name, ids.get(track, NO_TRACK), np.nan if score < 0 else score, extra))
     return rows
 
 
@@ -169,22 +169,22 @@ def _make_columns(
     task: str, labels: FrameLabels, k: int, pose: np.ndarray, velocity: list[float], names: dict[int, str]
 ) -> dict[str, Any]:
     """Return the fields of a box except its position and size, see _write."""
-    kind, track = labels.class_names[k], int(labels.track_ids[k])
+    class_name, track = labels.class_names[k], int(labels.track_ids[k])
     extra = dict(labels.extra[k])
     attribute = extra.pop("attribute", None) or ""
-    if kind in RIDDEN_CLASSES:
+    if class_name in RIDDEN_CLASSES:
         attribute = NOT_RIDDEN
-    elif NUSCENES_NAMES.get(kind) in RIDDEN_CLASSES and attribute == NOT_RIDDEN:
+    elif NUSCENES_NAMES.get(class_name) in RIDDEN_CLASSES and attribute == NOT_RIDDEN:
         attribute = ""  # no longer valid, because a person changed the class
     extra.pop("tracking_id", None)
-    if kind in SIMILAR_NAMES:
-        extra["class_name"] = kind
-    if isinstance(kept := extra.pop("velocity", None), list) and len(kept) == 2:
-        velocity = _parse_velocity(kept) or velocity
+    if class_name in SIMILAR_NAMES:
+        extra["class_name"] = class_name
+    if isinstance(read_velocity := extra.pop("velocity", None), list) and len(read_velocity) == 2:
+        velocity = _parse_velocity(read_velocity) or velocity
     columns = {
         "velocity": velocity,
         "attribute_name": attribute,
-        f"{task}_name": WRITTEN_NAMES.get(kind, kind),
+        f"{task}_name": WRITTEN_NAMES.get(class_name, class_name),
         f"{task}_score": (float(labels.scores[k]) if np.isfinite(labels.scores[k]) else NO_SCORE),
     }
     if task == "tracking" or track != NO_TRACK:
@@ -192,7 +192,7 @@ def _make_columns(
     if rotation := find_read_rotation(labels, k, pose):
         columns["rotation"] = rotation
     extra.pop("rotation", None)
-    return {**merge_extra(extra, OWN | columns.keys()), **columns}
+    return {**merge_extra(extra, OWN_FIELDS | columns.keys()), **columns}
 
 
 def _compute_velocities(
@@ -203,8 +203,8 @@ def _compute_velocities(
     poses: poses of the frames with boxes. Returns velocities by frame and box.
     """
     tracks: dict[tuple[str, int], list[tuple[int, int]]] = {}
-    for i, (each, frame) in enumerate(zip(labels.frames, frames)):
-        for k, track in enumerate(each.track_ids.tolist()):
+    for i, (frame_labels, frame) in enumerate(zip(labels.frames, frames)):
+        for k, track in enumerate(frame_labels.track_ids.tolist()):
             if track != NO_TRACK:
                 tracks.setdefault((frame.sequence, track), []).append((i, k))
     velocities = {}

@@ -3,7 +3,7 @@
 A cuboid is [x y z qx qy qz qw sx sy sz]: centre, orientation in its coordinate system, and sizes
 along its axes. We write x along the length to the front, y to the left and z up, as in ISO 8855, in
 the LiDAR's coordinate system. Frame numbers are those of the drive. All other content of a file is
-preserved, that of a cuboid in FrameLabels.extra, that of the drive in DriveLabels.extra.
+preserved: fields of a cuboid in FrameLabels.extra, those of the drive in DriveLabels.extra.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ UID, OTHER, OBJECT = "uid", "openlabel_attributes", "openlabel_data"
 REGION = "openlabel_region"  # data of an object whose 2D boxes became notes with KITTI's columns
 REGION_CLASS = "DontCare"
 PROPERTIES = "frame_properties"
-KEPT, DATA, CUBOIDS = "openlabel_cuboid", "object_data", "cuboid"
+ORIGINAL, DATA, CUBOIDS = "openlabel_cuboid", "object_data", "cuboid"
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
@@ -92,28 +92,30 @@ def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[Frame
         notes: list[tuple[str, dict[str, Any]]] = []
         for uid, element in frame_content.get("objects", {}).items():
             data = dict(element.get(DATA, {}))
-            kind = class_name(str(objects.get(uid, {}).get("type", "")))
+            object_class = class_name(str(objects.get(uid, {}).get("type", "")))
             uid_field = {} if str(numbers[uid]) == uid else {UID: uid}
-            cuboids = [cuboid for cuboid in data.get(CUBOIDS, ()) if kind != REGION_CLASS and parts.has_size(cuboid)]
+            cuboids = [
+                cuboid for cuboid in data.get(CUBOIDS, ()) if object_class != REGION_CLASS and parts.has_size(cuboid)
+            ]
             if not cuboids:
-                notes += _make_region_notes(kind, uid, data)
+                notes += _make_region_notes(object_class, uid, data)
                 continue
             data[CUBOIDS] = [cuboid for cuboid in data[CUBOIDS] if cuboid not in cuboids]
             data = {key: items for key, items in data.items() if items}
             for k, cuboid in enumerate(cuboids):
                 system = cuboid.get("coordinate_system", "")
-                box, upright = parts.cuboid_to_box(
+                box, is_upright = parts.cuboid_to_box(
                     cuboid["val"], parts.find_transform_to_lidar(system, systems, frame_content, frame, where)
                 )
                 rows.append(
                     (
                         box,
-                        *_parse_track(cuboid, kind, numbers[uid]),
+                        *_parse_track(cuboid, object_class, numbers[uid]),
                         {
                             **uid_field,
                             **({OBJECT: data} if data and k == 0 else {}),
                             **_parse_extra(
-                                cuboid, box, upright and system in ("", parts.find_lidar_system(systems, where))
+                                cuboid, box, is_upright and system in ("", parts.find_lidar_system(systems, where))
                             ),
                         },
                     )
@@ -143,90 +145,98 @@ def _make_region_notes(kind: str, uid: str, data: dict[str, Any]) -> list[tuple[
     return notes or [(kind, {**values, **({OBJECT: rest} if rest else {}), **({} if values else {UID: uid})})]
 
 
-def _parse_track(cuboid: dict[str, Any], kind: str, number: int) -> tuple[str, int, float]:
+def _parse_track(cuboid: dict[str, Any], object_class: str, number: int) -> tuple[str, int, float]:
     """Return class, track id and score of a cuboid."""
     values, _ = parts.parse_named_values(cuboid.get("attributes", {}))
     return (
-        class_name(values.get(TYPE, kind)),
+        class_name(values.get(TYPE, object_class)),
         number if values.get(TRACKED, True) else NO_TRACK,
         values.get(SCORE, np.nan),
     )
 
 
-def _parse_extra(cuboid: dict[str, Any], box: list[float], plain: bool) -> dict[str, Any]:
-    """Return the extra fields of a cuboid; `plain` means that its box describes it completely."""
-    values, rest = parts.parse_named_values(cuboid.get("attributes", {}))
+def _parse_extra(cuboid: dict[str, Any], box: list[float], is_plain: bool) -> dict[str, Any]:
+    """Return the extra fields of a cuboid; `is_plain` means that its box describes it completely."""
+    values, other_items = parts.parse_named_values(cuboid.get("attributes", {}))
     extra = {name: v for name, v in values.items() if name not in (SCORE, TRACKED, TYPE)}
-    extra |= {OTHER: rest} if rest else {}
-    if not plain or set(cuboid) - {"val", "attributes", "name", "coordinate_system"}:
-        extra[KEPT] = {**{k: v for k, v in cuboid.items() if k != "attributes"}, "box": box}
+    extra |= {OTHER: other_items} if other_items else {}
+    if not is_plain or set(cuboid) - {"val", "attributes", "name", "coordinate_system"}:
+        extra[ORIGINAL] = {**{k: v for k, v in cuboid.items() if k != "attributes"}, "box": box}
     return extra
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
     """Write FILE.json, or a folder with a file per drive. Numbers are exact."""
-    kept = labels.extra.get(ROOT, {})
+    original = labels.extra.get(ROOT, {})
 
     def write_drive(file: Path, drive: str, positions: list[int]) -> None:
-        write_json(file, _make_content(labels, frames, positions, kept.get(drive, {})))
+        write_json(file, _make_content(labels, frames, positions, original.get(drive, {})))
 
     write_drives(out, frames, SUFFIX, force, write_drive)
 
 
 def _make_content(
-    labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[int], kept: dict[str, Any]
+    labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[int], original: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the content of the file of a drive. kept: that of the file which was read, without
-    cuboids."""
-    own = [(frames[i], labels.frames[i]) for i in positions]
-    named_tracks = collect_track_names((frame_labels for _, frame_labels in own), UID)
-    note_uids = {str(note[UID]) for _, frame_labels in own for _, note in frame_labels.notes if UID in note}
-    used = (
-        {str(i) for _, frame_labels in own for i in frame_labels.track_ids.tolist()}
+    """Return the content of the file of a drive. original: content of the file that
+    was read, without cuboids."""
+    drive = [(frames[i], labels.frames[i]) for i in positions]
+    named_tracks = collect_track_names((frame_labels for _, frame_labels in drive), UID)
+    note_uids = {str(note[UID]) for _, frame_labels in drive for _, note in frame_labels.notes if UID in note}
+    used_uids = (
+        {str(i) for _, frame_labels in drive for i in frame_labels.track_ids.tolist()}
         | {*named_tracks.values()}
         | note_uids
     )
     objects = {
-        uid: dict(o) for uid, o in kept.get("objects", {}).items() if uid in used or not o.get("frame_intervals")
+        uid: dict(o)
+        for uid, o in original.get("objects", {}).items()
+        if uid in used_uids or not o.get("frame_intervals")
     }  # objects that are still used, or not bound to frames
-    systems = kept if kept.get("coordinate_systems") else parts.make_coordinate_systems([frame for frame, _ in own])
+    systems = (
+        original if original.get("coordinate_systems") else parts.make_coordinate_systems([frame for frame, _ in drive])
+    )
     lidar = parts.find_lidar_system(systems["coordinate_systems"], "the file that was read")
-    numbers = [int(uid) for uid in (*used, *objects) if is_track_number(uid)]
+    numbers = [int(uid) for uid in (*used_uids, *objects) if is_track_number(uid)]
     new_numbers = itertools.count(max([0, *numbers]) + 1)
     frame_contents: dict[str, Any] = {}
     frames_by_object: dict[str, list[int]] = {}
 
-    def get_object_data(uid: str, kind: str, index: int) -> dict[str, Any]:
+    def get_object_data(uid: str, object_class: str, index: int) -> dict[str, Any]:
         """Return the data of an object in a frame."""
         if uid not in frames_by_object:
-            known = objects.get(uid, {})
-            same_class = class_name(str(known.get("type", ""))) == kind  # compared in any spelling
-            objects[uid] = {"name": f"{kind} {uid}", **known, "type": known["type"] if same_class else kind}
+            known_object = objects.get(uid, {})
+            same_class = class_name(str(known_object.get("type", ""))) == object_class  # compared in any spelling
+            objects[uid] = {
+                "name": f"{object_class} {uid}",
+                **known_object,
+                "type": known_object["type"] if same_class else object_class,
+            }
         frames_by_object.setdefault(uid, []).append(index)
         frame_objects = frame_contents[str(index)].setdefault("objects", {})
         data: dict[str, Any] = frame_objects.setdefault(uid, {DATA: {}})[DATA]
         return data
 
-    for frame, frame_labels in own:
-        kept_content = kept.get("frames", {}).get(str(frame.index), {})
+    for frame, frame_labels in drive:
+        original_content = original.get("frames", {}).get(str(frame.index), {})
         frame_contents[str(frame.index)] = {
-            **kept_content,
+            **original_content,
             PROPERTIES: {
-                **({} if systems is kept else parts.make_transforms(frame)),
-                **kept_content.get(PROPERTIES, {}),
+                **({} if systems is original else parts.make_transforms(frame)),
+                **original_content.get(PROPERTIES, {}),
                 "name": frame.name,
                 "timestamp": f"{frame.stamp_ns / 1e9:.9f}",
             },
         }
-        for k, (kind, extra) in enumerate(zip(frame_labels.class_names, frame_labels.extra)):
+        for k, (object_class, extra) in enumerate(zip(frame_labels.class_names, frame_labels.extra)):
             track = int(frame_labels.track_ids[k])
             uid = named_tracks.get(track, str(next(new_numbers) if track == NO_TRACK else track))
-            data = get_object_data(uid, kind, frame.index)
+            data = get_object_data(uid, object_class, frame.index)
             data |= {key: value for key, value in extra.get(OBJECT, {}).items() if key not in data}
             data.setdefault(CUBOIDS, []).append(_make_cuboid(frame_labels, k, objects[uid]["type"], lidar))
-        for kind, note in frame_labels.notes:
+        for object_class, note in frame_labels.notes:
             values = {key: value for key, value in note.items() if key not in (UID, OBJECT)}
-            get_object_data(str(note.get(UID, next(new_numbers))), kind, frame.index).update(
+            get_object_data(str(note.get(UID, next(new_numbers))), object_class, frame.index).update(
                 note[REGION] if REGION in note else {**parts.to_named_values(values), **note.get(OBJECT, {})}
             )
     for uid, indices in frames_by_object.items():
@@ -234,16 +244,16 @@ def _make_content(
     return {
         ROOT: {
             "metadata": {"schema_version": "1.0.0"},
-            **kept,
+            **original,
             **systems,
             "frames": frame_contents,
             "objects": objects,
-            "frame_intervals": parts.find_intervals([frame.index for frame, _ in own]),
+            "frame_intervals": parts.find_intervals([frame.index for frame, _ in drive]),
         }
     }
 
 
-def _make_cuboid(labels: FrameLabels, k: int, kind: str, lidar: str) -> dict[str, Any]:
+def _make_cuboid(labels: FrameLabels, k: int, object_class: str, lidar: str) -> dict[str, Any]:
     box, extra = labels.boxes[k], labels.extra[k]
     x, y, z, length, width, height, yaw = box.tolist()
     cuboid = {
@@ -251,12 +261,12 @@ def _make_cuboid(labels: FrameLabels, k: int, kind: str, lidar: str) -> dict[str
         "coordinate_system": lidar,
         "val": [x, y, z, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2), length, width, height],
     }
-    if KEPT in extra and is_unchanged(box, extra[KEPT]["box"]):
-        cuboid = {key: value for key, value in extra[KEPT].items() if key != "box"}
-    values = {name: v for name, v in extra.items() if name not in (UID, OTHER, OBJECT, KEPT)}
+    if ORIGINAL in extra and is_unchanged(box, extra[ORIGINAL]["box"]):
+        cuboid = {key: value for key, value in extra[ORIGINAL].items() if key != "box"}
+    values = {name: v for name, v in extra.items() if name not in (UID, OTHER, OBJECT, ORIGINAL)}
     values |= {SCORE: float(labels.scores[k])} if np.isfinite(labels.scores[k]) else {}
     values |= {TRACKED: False} if labels.track_ids[k] == NO_TRACK else {}
-    values |= {TYPE: labels.class_names[k]} if labels.class_names[k] != class_name(kind) else {}
+    values |= {TYPE: labels.class_names[k]} if labels.class_names[k] != class_name(object_class) else {}
     attributes = parts.to_named_values(values)
     for name, items in extra.get(OTHER, {}).items():
         attributes.setdefault(name, []).extend(items)

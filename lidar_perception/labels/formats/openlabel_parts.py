@@ -1,7 +1,7 @@
 """Parts of OpenLABEL files: coordinate systems, cuboids in them, and named values.
 
 A coordinate system has a pose in its parent (pose_wrt_parent), or a frame has a transform between
-the two. A value is {"name": ..., "val": ...} in a list of its kind: num, text, boolean, vec.
+the two. A value is {"name": ..., "val": ...} in the list of its type: num, text, boolean, vec.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ def cuboid_to_box(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[floa
         raise ValueError(f"a cuboid has {len(val)} numbers instead of 10 or 9")
     axes = to_lidar[:3, :3] @ (quaternion_to_matrix(val[3:7]) if len(val) == 10 else _euler_to_matrix(*val[3:6]))
     x, y, z = (to_lidar[:3, :3] @ np.array(val[:3], float) + to_lidar[:3, 3]).tolist()
-    up = 2 - int(np.abs(axes[2, ::-1]).argmax())
-    ahead, across = (axis for axis in range(3) if axis != up)
-    same = np.array_equal(to_lidar, np.eye(4))
+    up_axis = 2 - int(np.abs(axes[2, ::-1]).argmax())
+    length_axis, width_axis = (axis for axis in range(3) if axis != up_axis)
+    is_identity = np.array_equal(to_lidar, np.eye(4))
     yaw = (
         2 * math.atan2(val[5], val[6])
-        if same and len(val) == 10 and val[3] == val[4] == 0
-        else math.atan2(axes[1, ahead], axes[0, ahead])
+        if is_identity and len(val) == 10 and val[3] == val[4] == 0
+        else math.atan2(axes[1, length_axis], axes[0, length_axis])
     )
     yaw = (yaw + math.pi) % (2 * math.pi) - math.pi if abs(yaw) > math.pi else yaw
     sizes = [float(size) for size in val[-3:]]
-    return ([x, y, z, sizes[ahead], sizes[across], sizes[up], yaw], bool(axes[2, 2] > 1 - MAX_TILT))
+    return ([x, y, z, sizes[length_axis], sizes[width_axis], sizes[up_axis], yaw], bool(axes[2, 2] > 1 - MAX_TILT))
 
 
 def has_size(cuboid: dict[str, Any]) -> bool:
@@ -85,7 +85,7 @@ def _euler_to_matrix(x: float, y: float, z: float) -> np.ndarray:
 
 
 def find_transform_to_lidar(
-    name: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame, where: str
+    name: str, systems: dict[str, Any], frame: dict[str, Any], recorded_frame: Frame, where: str
 ) -> np.ndarray:
     """Return the transform (4, 4) from a coordinate system ("" for the LiDAR's) to the LiDAR's.
 
@@ -96,7 +96,7 @@ def find_transform_to_lidar(
     lidar = find_lidar_system(systems, where)
     if name in ("", lidar):
         return np.eye(4)
-    calibration = own.calibration() if _is_camera(name) and lidar not in systems else None
+    calibration = recorded_frame.calibration() if _is_camera(name) and lidar not in systems else None
     if calibration is not None:
         return np.linalg.inv(calibration.lidar_to_camera)
     roots = []
@@ -109,7 +109,7 @@ def find_transform_to_lidar(
                 )
             if not (parent := systems[system].get("parent")):
                 break
-            pose = _find_pose(system, parent, systems, frame, own, where)
+            pose = _find_pose(system, parent, systems, frame, recorded_frame, where)
             transform, system = pose @ transform, parent
         roots.append((system, transform))
     if roots[0][0] != roots[1][0]:
@@ -136,17 +136,18 @@ def _is_camera(name: str) -> bool:
 
 
 def _find_pose(
-    name: str, parent: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame, where: str
+    name: str, parent: str, systems: dict[str, Any], frame: dict[str, Any], recorded_frame: Frame, where: str
 ) -> np.ndarray:
     for transform in frame.get("frame_properties", {}).get("transforms", {}).values():
         if transform["src"] == name and transform["dst"] == parent:
             return _parse_transform(transform["transform_src_to_dst"])
     if "pose_wrt_parent" in systems[name]:
         return _parse_transform(systems[name]["pose_wrt_parent"])
-    pose = own.pose()
+    pose = recorded_frame.pose()
     if pose is None:
         raise InputError(
-            f"{where}: the pose of {name!r} in {parent!r} is missing in frame {own.index}; write the file again"
+            f"{where}: the pose of {name!r} in {parent!r} is missing in frame {recorded_frame.index}; "
+            "write the file again"
         )
     return pose
 
@@ -211,29 +212,29 @@ def make_transforms(frame: Frame) -> dict[str, Any]:
 
 
 def to_named_values(values: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Convert a JSON object to named values by kind; other values become a text NAME.json."""
-    values_by_kind: dict[str, list[dict[str, Any]]] = {}
+    """Convert a JSON object to named values by type; other values become a text NAME.json."""
+    values_by_type: dict[str, list[dict[str, Any]]] = {}
     for name, value in values.items():
-        kind = next((kind for kind, fits in KINDS.items() if fits(value)), "")
-        values_by_kind.setdefault(kind or "text", []).append(
-            {"name": name if kind else f"{name}.json", "val": value if kind else json.dumps(value)}
+        value_type = next((value_type for value_type, is_type in TYPES.items() if is_type(value)), "")
+        values_by_type.setdefault(value_type or "text", []).append(
+            {"name": name if value_type else f"{name}.json", "val": value if value_type else json.dumps(value)}
         )
-    return values_by_kind
+    return values_by_type
 
 
 def parse_named_values(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[Any]]]:
-    """Invert to_named_values; also return the items that are not plain values, by kind."""
+    """Invert to_named_values; also return the items that are not plain values, by type."""
     values: dict[str, Any] = {}
-    rest: dict[str, list[Any]] = {}
-    for kind, items in lists.items():
+    other_items: dict[str, list[Any]] = {}
+    for value_type, items in lists.items():
         for item in items:
-            if kind not in KINDS or set(item) != {"name", "val"}:
-                rest.setdefault(kind, []).append(item)
-            elif kind == "text" and item["name"].endswith(".json"):
+            if value_type not in TYPES or set(item) != {"name", "val"}:
+                other_items.setdefault(value_type, []).append(item)
+            elif value_type == "text" and item["name"].endswith(".json"):
                 values[item["name"].removesuffix(".json")] = json.loads(item["val"])
             else:
                 values[item["name"]] = item["val"]
-    return values, rest
+    return values, other_items
 
 
 def _is_number(value: Any) -> bool:
@@ -241,7 +242,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
-KINDS = {
+TYPES = {
     "boolean": lambda v: isinstance(v, bool),
     "num": _is_number,
     "text": lambda v: isinstance(v, str),

@@ -38,7 +38,7 @@ from lidar_perception.runs.files import write_folder
 
 SUFFIX = ".json"
 TILTED = "sustech_tilted"
-OWN = {"psr", "obj_type", "obj_id", "score"}
+OWN_FIELDS = {"psr", "obj_type", "obj_id", "score"}
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
@@ -69,17 +69,17 @@ def _parse_boxes(content: list[dict[str, Any]], ids: dict[str, int]) -> list[Row
             [float(item["psr"][part][axis]) for axis in "xyz"] for part in ("position", "scale", "rotation")
         )
         x, y, z = angles
-        upright = x == y == 0
+        is_upright = x == y == 0
         yaw = (
             z
-            if upright
+            if is_upright
             else math.atan2(
                 math.cos(x) * math.sin(z) + math.sin(x) * math.sin(y) * math.cos(z), math.cos(y) * math.cos(z)
             )
         )
         box = [*position, *scale, math.remainder(yaw, math.tau)]
-        extra = extract_extra(item, OWN)
-        if not upright:
+        extra = extract_extra(item, OWN_FIELDS)
+        if not is_upright:
             extra[TILTED] = {"rotation": item["psr"]["rotation"], "box": box}
         name = str(item.get("obj_id", ""))
         track = ids.get(name, NO_TRACK)
@@ -112,7 +112,7 @@ def _make_object(labels: FrameLabels, k: int, names: dict[int, str]) -> dict[str
         "rotation": rotation,
     }
     return {
-        **merge_extra(extra, OWN),
+        **merge_extra(extra, OWN_FIELDS),
         "psr": psr,
         "obj_type": labels.class_names[k],
         "obj_id": names.get(track, str(track)),
