@@ -145,13 +145,9 @@ class Session:
             try:
                 run_task()
             except Exception as error:  # shown on the page, because nobody joins this thread
-                self.notify(
-                    {
-                        "error": str(error)
-                        if isinstance(error, InputError)
-                        else f"no proposals: {type(error).__name__}: {shorten_error(error)}"
-                    }
-                )
+                is_known = isinstance(error, InputError)
+                reason = f"no proposals: {type(error).__name__}: {shorten_error(error)}"
+                self.notify({"error": str(error) if is_known else reason})
             finally:
                 self.busy = None
                 with self._lock:
@@ -329,14 +325,8 @@ class Session:
                 encoded[track.id] = track_to_json(track)
             return encoded[track.id]
 
-        self.journal.append(
-            {
-                "seq": new_state.seq,
-                "time": datetime.now(UTC).isoformat(),
-                "by": page_id,
-                **convert_tracks(action, encode),
-            }
-        )
+        line = {"seq": new_state.seq, "time": datetime.now(UTC).isoformat(), "by": page_id}
+        self.journal.append({**line, **convert_tracks(action, encode)})
         self.state = new_state
         self._notify_change(action, change, page_id, encode)
         return new_state.seq
@@ -346,21 +336,10 @@ class Session:
     ) -> None:
         tracks = [encode(track) for _, track in change.tracks.values() if track]
         removed = [n for n, (_, track) in change.tracks.items() if track is None]
-        public_action = {
-            k: v
-            for k, v in action.items()
-            if k not in ("tracks", "removed", "poses", "kept") or action["do"] == "merge"
-        }
-        self.notify(
-            {
-                "seq": self.state.seq,
-                "by": page_id,
-                "action": public_action,
-                "tracks": tracks,
-                "removed": removed,
-                **self.summarize(),
-            }
-        )
+        hidden = () if action["do"] == "merge" else ("tracks", "removed", "poses", "kept")
+        public_action = {k: v for k, v in action.items() if k not in hidden}
+        event = {"seq": self.state.seq, "by": page_id, "action": public_action, "tracks": tracks, "removed": removed}
+        self.notify({**event, **self.summarize()})
 
     def notify(self, event: dict[str, Any]) -> None:
         """Send an event to all listeners."""
