@@ -14,7 +14,7 @@ from lidar_perception.labels.drive_labels import NO_TRACK, FrameLabels
 from lidar_perception.runs.files import check_unused, read_text, write_folder, write_text
 from lidar_perception.types import InputError
 
-MAX_BYTES = 2**30  # of a file of labels
+MAX_BYTES = 2**30  # maximum size of a label file
 CONFLICTING = "kept"  # field with the fields whose names the format uses itself
 
 
