@@ -1,24 +1,24 @@
-"""Detections of the trained networks in one frame (paper C, Section 3.2)."""
+"""Detections of all networks in one frame (paper C, Section 3.2)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
 
-from experiments.clusters.networks import COMPARED, name_model
+from experiments.clusters.networks import Source, list_compared, list_sources
 from experiments.framework.precision import to_record
 from experiments.framework.trained_models import TrainedModel
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.data.frame import Frame
-from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.open import POINTNET, open_detector, resolve_weights
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.ground.params import GroundParams
@@ -48,14 +48,14 @@ CHANGES = {
 
 
 def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[str, Any]:
-    """Detect the objects of a frame with every network, and with some in changed clouds.
+    """Detect the objects of a frame with every detector, and with some in changed clouds.
 
     Returns:
         - truth: the labels, see framework.precision.to_record
-        - found: name of a model -> detections
-        - changed: change -> name of a model -> detections
-        - detector_ms: name of a model -> duration of ground, clusters and network
-        - changed_ms: change -> name of a model -> the same duration
+        - found: name of a detector -> detections
+        - changed: change -> name of a detector -> detections
+        - detector_ms: name of a detector -> duration of ground, clusters and network
+        - changed_ms: change -> name of a detector -> the same duration
 
     Raises:
         InputError: the frame has no labels.
@@ -64,9 +64,8 @@ def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[
     if truth is None:
         raise InputError(f"{frame.points or frame.name} has no labels; put them beside the scans")
 
-    def detect(change: Change, names: list[str]) -> tuple[dict[str, Any], dict[str, float]]:
-        cloud = change_cloud(frame.load(), change, frame.name)
-        found = detect_with_all(cloud, {n: models[n].weights for n in names}, frame.sensor_height)
+    def detect(change: Change, sources: Mapping[str, Source]) -> tuple[dict[str, Any], dict[str, float]]:
+        found = detect_with_all(change_cloud(frame.load(), change, frame.name), sources, frame.sensor_height)
         return (
             {
                 name: to_record(to_camera_objects(to_scored_labels(boxes), calibration))
@@ -75,9 +74,8 @@ def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[
             {name: round(ms, 3) for name, (_, ms) in found.items()},
         )
 
-    compared = [name_model(name, 0) for name in COMPARED if name_model(name, 0) in models]
-    found, times = detect(Change(), [*models])
-    changed = {name: detect(change, compared) for name, change in CHANGES.items()}
+    found, times = detect(Change(), list_sources(models))
+    changed = {name: detect(change, list_compared(models)) for name, change in CHANGES.items()}
     return {
         "truth": to_record(to_camera_objects(truth, calibration)),
         "found": found,
@@ -88,22 +86,27 @@ def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[
 
 
 def detect_with_all(
-    cloud: PointCloud, weights: Mapping[str, Path], height: float
+    cloud: PointCloud, sources: Mapping[str, Source], height: float, range: str = "auto"
 ) -> dict[str, tuple[Detections, float]]:
-    """Run networks on a cloud, whose ground and clusters are computed once for equal parameters.
+    """Run detectors on a cloud, whose ground and clusters are computed once for equal parameters.
 
     Args:
-        weights: Checkpoint of each network, by name.
+        sources: The detectors by name.
         height: Height of the sensor, metres.
+        range: Range of PointPillars, see open_detector; PointNet covers all directions.
 
     Returns:
-        Detections of each network, and the milliseconds of ground, clusters and network.
+        Detections of each detector, and the milliseconds of ground, clusters and network.
     """
-    detectors = {name: open_network(path, height) for name, path in weights.items()}
     ground: dict[GroundParams, tuple[np.ndarray, float]] = {}
     clusters: dict[tuple[GroundParams, ClusteringParams], tuple[np.ndarray, float]] = {}
     found = {}
-    for name, detector in detectors.items():
+    for name, source in sources.items():
+        detector = open_network(source, height, range)
+        if not isinstance(detector, PointNetDetector):
+            result = detector(cloud)
+            found[name] = result.detections, sum(result.timings.values())
+            continue
         params = detector.params
         if params.ground not in ground:
             ground[params.ground] = _time(segment_ground, cloud, params.ground)
@@ -118,12 +121,21 @@ def detect_with_all(
 
 
 @lru_cache(maxsize=64)
-def open_network(weights: Path, height: float) -> PointNetDetector:
-    """Open a network that returns detections of any score, as average precision needs."""
+def open_network(source: Source, height: float, range: str = "auto") -> NetworkDetector:
+    """Open a detector that returns detections of any score, as average precision needs."""
+    kind, _ = resolve_weights(source.weights)
+    settings: dict[str, Any] = {f"{kind}.warm_up": False}
+    if source.gamma is not None:
+        settings["clustering.euclidean.gamma"] = source.gamma
     detector = open_detector(
-        weights, "cpu", sensor_height=height, min_score=MIN_SCORE, settings={"pointnet.warm_up": False}
+        source.weights,
+        "cpu",
+        sensor_height=height,
+        min_score=MIN_SCORE,
+        range="auto" if kind == POINTNET else range,
+        settings=settings,
     )
-    assert isinstance(detector, PointNetDetector)
+    assert isinstance(detector, NetworkDetector)
     return detector
 
 

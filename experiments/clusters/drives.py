@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.clusters import paper
 from experiments.clusters.detection import detect_with_all
-from experiments.clusters.networks import COMPARED, OURS, name_model
+from experiments.clusters.networks import COMPARED, OURS, list_compared, name_model
 from experiments.framework.experiment import Row, Section, Table
 from experiments.framework.statistics import estimate, make_cells
 from experiments.framework.trained_models import TrainedModel
@@ -52,14 +52,13 @@ def measure_drive(
         For each key frame truth, and found: network -> boxes with velocities, as of to_columns();
         None for a frame that begins no drive.
     """
-    compared = {name: models[name_model(name, 0)].weights for name in COMPARED if name_model(name, 0) in models}
-    drive = list_drive(frames, number)
-    if not drive or not compared:
+    compared, drive = list_compared(models), list_drive(frames, number)
+    if not drive:
         return None
     trackers, rows = {name: Tracker() for name in compared}, []
     for frame in drive:
         pose, truth, found = frame.native.pose, GlobalBoxes.none(), {}
-        for name, (boxes, _) in detect_with_all(frame.load(), compared, frame.sensor_height).items():
+        for name, (boxes, _) in detect_with_all(frame.load(), compared, frame.sensor_height, "around").items():
             tracks = trackers[name](boxes, frame.stamp_ns, pose)
             result = select_boxes(frame, add_velocities(to_results(boxes, frame), tracks, pose))
             if result.truth is None or result.counted is None:
@@ -171,8 +170,8 @@ def make_drive_section(records: list[dict[str, Any]], data: str) -> Section:
     truth = [from_columns(row["truth"]) for row in key_frames]
     samples = [np.arange(len(truth)), *draw_samples([np.array([i]) for i in range(len(truth))], REPLICATES)]
     rows: list[Row] = []
-    for network in (name for name in COMPARED if all(name in r["found"] for r in key_frames)):
-        found = [from_columns(row["found"][network]) for row in key_frames]
+    for network in (n for n in COMPARED if all(name_model(n, 0) in row["found"] for row in key_frames)):
+        found = [from_columns(row["found"][name_model(network, 0)]) for row in key_frames]
         unknown = [replace(b, velocities=np.full((len(b), 2), np.nan)) for b in found]
         for title, boxes in (("without velocities", unknown), ("velocities of the tracker", found)):
             draws = np.stack(

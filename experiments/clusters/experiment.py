@@ -1,4 +1,4 @@
-"""The experiments of paper C: its segmentation alone, and all of its tables."""
+"""The experiments of paper C: its segmentation alone, the shipped detectors alone, and all tables."""
 
 from __future__ import annotations
 
@@ -28,6 +28,11 @@ SETTINGS = {
     "study": asdict(STUDY),
     "range image": asdict(RangeImageParams()),
 }
+DETECTION_SETTINGS = {
+    "changes": {name: list(change) for name, change in CHANGES.items()},
+    "drives": [SIMULATED_DRIVES, SCANS],
+}
+NO_MODELS: Mapping[str, TrainedModel] = {}
 EPOCHS = 120  # for recorded frames; Table 1 of the paper, with the settings, is missing in its text
 
 
@@ -43,37 +48,45 @@ def make_segmentation_report(records: list[dict[str, Any]]) -> list[Section]:
     return make_segmentation_sections(records, records[0]["data"] if records else "KITTI")
 
 
-def measure_frame(frames: Sequence[Frame], number: int, *, models: Mapping[str, TrainedModel]) -> dict[str, Any]:
-    """Measure frame `number` and return its record.
-
-    It has the content of measure_detection(); `drive`, see measure_drive(); and `segmentation`, see
-    measure_segmentation(), or None for a frame whose objects have too few points.
-    """
+def measure_detected_frame(
+    frames: Sequence[Frame], number: int, *, models: Mapping[str, TrainedModel] = NO_MODELS
+) -> dict[str, Any]:
+    """Measure the detectors on frame `number`: see measure_detection(), and measure_drive() for `drive`."""
     frame = frames[number]
-    record = {
+    return {
         "frame": frame.name,
         "data": _name_data(frame),
         **measure_detection(frame, models),
         "drive": measure_drive(frames, number, models),
-        "segmentation": None,
     }
+
+
+def make_detection_report(
+    records: list[dict[str, Any]], *, models: Mapping[str, TrainedModel] = NO_MODELS
+) -> list[Section]:
+    """Return the report of measure_detected_frame(); skipped frames are left out."""
+    records = [record for record in records if "skipped" not in record]
+    data = records[0]["data"] if records else "KITTI"
+    return [*make_detection_sections(records, data, models), make_drive_section(records, data)]
+
+
+def measure_frame(frames: Sequence[Frame], number: int, *, models: Mapping[str, TrainedModel]) -> dict[str, Any]:
+    """Measure frame `number` and return its record.
+
+    It has the content of measure_detected_frame() and `segmentation`, see measure_segmentation(), or
+    None for a frame whose objects have too few points.
+    """
     try:
-        record["segmentation"] = measure_segmentation(frame)
+        segmentation = measure_segmentation(frames[number])
     except InputError:  # objects with points are detected nevertheless
-        pass
-    return record
+        segmentation = None
+    return {**measure_detected_frame(frames, number, models=models), "segmentation": segmentation}
 
 
 def make_sections(records: list[dict[str, Any]], *, models: Mapping[str, TrainedModel]) -> list[Section]:
     """Return the report of the records of measure_frame(); skipped frames are left out."""
-    records = [record for record in records if "skipped" not in record]
-    data = records[0]["data"] if records else "KITTI"
-    segmented = [r["segmentation"] for r in records if r["segmentation"]]
-    return [
-        *make_segmentation_sections(segmented, data),
-        *make_detection_sections(records, data, models),
-        make_drive_section(records, data),
-    ]
+    segmented = [{**r, **r["segmentation"]} for r in records if r.get("segmentation")]
+    return [*make_segmentation_report(segmented), *make_detection_report(records, models=models)]
 
 
 def _name_data(frame: Frame) -> str:
@@ -89,17 +102,21 @@ SEGMENTATION = Experiment(
     make_segmentation_report,
     SETTINGS,
 )
+SHIPPED = Experiment(
+    "clusters-shipped",
+    "PointNet and PointPillars with the shipped weights: the tables of detection of paper C",
+    QUESTION,
+    measure_detected_frame,
+    make_detection_report,
+    DETECTION_SETTINGS,
+)
 CLUSTERS = Experiment(
     "clusters",
     "Adaptive clustering and improved PointNet: the tables of the paper",
     QUESTION,
     measure_frame,
     make_sections,
-    {
-        **SETTINGS,
-        "changes": {name: list(change) for name, change in CHANGES.items()},
-        "drives": [SIMULATED_DRIVES, SCANS],
-    },
+    {**SETTINGS, **DETECTION_SETTINGS},
     training=PointNetTraining(),
     protocol={"epochs": EPOCHS},
     models=choose_networks,

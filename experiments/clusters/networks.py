@@ -1,17 +1,37 @@
-"""The networks of paper C's experiment, all trained on the same scenes with the same steps."""
+"""The networks of paper C's experiment: those that it trains, on the same scenes with the same steps,
+and detectors with the weights of the package."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
-from experiments.framework.trained_models import Model
+from experiments.framework.trained_models import Model, TrainedModel
 from lidar_perception.detectors.pointnet.config import ABLATIONS
+from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.pointnet.weights_file import weights_file as pointnet_file
+from lidar_perception.detectors.pointpillars.params import PointPillarsParams
+from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
 from lidar_perception.param_fields import with_values
 from lidar_perception.training.params import PointNetTraining
 
+
+class Source(NamedTuple):
+    """A detector: its weights, and the gamma of its clustering (Eq. 9); None: as it was trained."""
+
+    weights: Path
+    gamma: float | None = None
+
+
 OURS = "improved"
 BASELINES = ("pointnet", "pointnet2")
-COMPARED = (OURS, *BASELINES)  # networks compared by difficulty, on modified clouds and on drives
+SHIPPED = {
+    "PointNet, shipped": Source(pointnet_file(PointNetParams())),
+    "PointNet, shipped, gamma 0.8": Source(pointnet_file(PointNetParams()), 0.8),
+    "PointPillars V0, shipped": Source(pointpillars_file(PointPillarsParams(version="v0"))),
+}
+COMPARED = (OURS, *BASELINES, *SHIPPED)  # compared by difficulty, on modified clouds and on drives
 RADII = {
     "radii-halved": "0.05, 0.1, 0.2",
     OURS: "0.1, 0.2, 0.4",
@@ -37,5 +57,16 @@ def choose_networks(params: PointNetTraining, seed: int) -> Sequence[Model]:
 
 
 def name_model(network: str, seed: int) -> str:
-    """Return the name of a trained network."""
-    return f"{network}, seed {seed}"
+    """Return the name of a detector in the records: of a seed, if it is trained here."""
+    return network if network in SHIPPED else f"{network}, seed {seed}"
+
+
+def list_sources(models: Mapping[str, TrainedModel]) -> dict[str, Source]:
+    """Return all detectors by their names in the records."""
+    return {**{name: Source(model.weights) for name, model in models.items()}, **SHIPPED}
+
+
+def list_compared(models: Mapping[str, TrainedModel]) -> dict[str, Source]:
+    """Return the detectors of COMPARED, of the first seed, by their names in the records."""
+    sources = list_sources(models)
+    return {name: sources[name] for name in (name_model(n, 0) for n in COMPARED) if name in sources}

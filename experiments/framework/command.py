@@ -24,6 +24,7 @@ from lidar_perception.types import InputError
 if TYPE_CHECKING:
     from experiments.framework.experiment import Experiment
     from experiments.framework.trained_models import ModelRequest
+    from lidar_perception.data.frame import Recording
 
 SIM = "sim"
 EXPERIMENTS = {  # name -> "module:attribute" of an Experiment; the first is the default
@@ -33,6 +34,7 @@ EXPERIMENTS = {  # name -> "module:attribute" of an Experiment; the first is the
     "eg-pointpillars-shipped": "experiments.eg_pointpillars.experiment:SHIPPED",
     "clusters": "experiments.clusters.experiment:CLUSTERS",
     "clusters-segmentation": "experiments.clusters.experiment:SEGMENTATION",
+    "clusters-shipped": "experiments.clusters.experiment:SHIPPED",
 }
 
 
@@ -45,7 +47,7 @@ def _list_parameters(given: Mapping[str, Any]) -> list[Runs]:
 
 @click.command(cls=Command)
 @click.argument("words", nargs=-1, metavar="[EXPERIMENT] DATA|sim")
-@a_path("--data", f"Same as DATA. {WHAT} `sim`: simulated scans, for experiments that train.", "DATA|sim")
+@a_path("--data", f"Same as DATA. {WHAT} `sim`: simulated scans.", "DATA|sim")
 @a_path(
     "--split",
     "Measure only the frames or sequences named in this file, one per line. "
@@ -94,8 +96,9 @@ def reproduce(
     EXPERIMENT is stm-cpa (default: every table of the STM-CPA paper), stm-cpa-configurations
     (the configurations `paper` and `best`, with and without a labelled seed), eg-pointpillars
     (the versions of EG-PointPillars, trained first), eg-pointpillars-shipped (the versions with the
-    shipped weights, without training), clusters (adaptive clustering and improved
-    PointNet: every table) or clusters-segmentation (its tables without a network).
+    shipped weights, without training), clusters (adaptive clustering and improved PointNet: every
+    table), clusters-segmentation (its tables without a network) or clusters-shipped (its tables of
+    detection with the shipped weights).
 
     FOLDER gets report.html, report.md, report.json, the tables as CSV and the figures as PNG, and
     frames.jsonl with the record of every frame. Trained networks are in models/. Workers of --dask
@@ -114,7 +117,6 @@ def reproduce(
         raise click.UsageError("--jobs is for this machine, --dask for others: give one of them")
     from experiments.framework.report import group_skipped_frames, print_report, write_report
     from experiments.framework.runner import run_experiment, run_with_models
-    from lidar_perception.data.frame import BOXES
     from lidar_perception.runs.terminal import console
 
     experiment = load_experiment(name)
@@ -125,8 +127,7 @@ def reproduce(
             ("budget", "seeds", "device", "config", "given"),
             f"is for experiments that train networks; {name} trains none",
         )
-        recording = open_and_describe(data, split=split)
-        recording.require(BOXES, "reproduce")
+        recording = _open_recording(data, split, out)
         records = run_experiment(experiment, recording, out, jobs=workers, dask=dask, force=force, limit=limit)
     else:
         request = _make_request(experiment, data, split, out, budget, seeds, device, workers, limit, settings)
@@ -150,6 +151,20 @@ def reproduce(
         raise InputError(f"{data}: no frame could be measured ({records[0]['skipped']})")
     print_report(sections, group_skipped_frames(records), console)
     console.print(f"report: {page}")
+
+
+def _open_recording(data: Path, split: Path | None, out: Path) -> Recording:
+    """Open the frames that an experiment without training measures."""
+    from lidar_perception.data.frame import BOXES
+
+    if str(data) != SIM:
+        recording = open_and_describe(data, split=split)
+        recording.require(BOXES, "reproduce")
+        return recording
+    from experiments.framework.scenes import ExperimentScenes
+    from lidar_perception.training.params import PointNetTraining
+
+    return ExperimentScenes.split(SIM, split).open_test_recording(PointNetTraining(), out / "scans")
 
 
 def _make_request(

@@ -23,6 +23,7 @@ from lidar_perception.training.frames import LabelledFrames, open_labelled_frame
 from lidar_perception.training.params import PAPER_SHARE
 from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.training.sources import SIM
+from lidar_perception.types import InputError
 
 FIRST_TEST_SCENE = 40_000_000  # first seed; no training uses seeds near it
 TEST_SCANS = 120
@@ -55,9 +56,12 @@ class ExperimentScenes:
                 on. KITTI's own test frames have no public labels.
 
         Raises:
-            InputError: There are fewer than three labelled frames, or a name is unknown.
+            InputError: There are fewer than three labelled frames, a name is unknown, or simulated
+                scenes are to be split.
         """
         if data == SIM:
+            if test is not None:
+                raise InputError("--split is for recordings; simulated scenes have no names")
             return ExperimentScenes(SIM)
         path = Path(data)
         frames = open_labelled_frames(path)

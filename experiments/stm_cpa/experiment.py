@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from experiments.framework.experiment import Experiment
-from experiments.stm_cpa.frames import load_labelled_frame, make_nearest_seed
-from experiments.stm_cpa.params import StmCpaParams
+from experiments.stm_cpa.frames import LabelledFrame, load_labelled_frame, make_nearest_seed
+from experiments.stm_cpa.params import READINGS, StmCpaParams
 from experiments.stm_cpa.tables import make_sections
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
@@ -19,10 +20,14 @@ from lidar_perception.candidates.segmented_cloud import SegmentedCloud, fit_grou
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import fit_boxes
 from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.contract import Detector
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointpillars.params import PointPillarsParams
+from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.geometry import bev_and_3d_iou
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, count_by_range, find_range_bins, match_centres
-from lidar_perception.types import InputError
+from lidar_perception.types import PEDESTRIAN, InputError
 
 NUMBERS = StmCpaParams()
 
@@ -35,6 +40,8 @@ def measure_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:
       are misses.
     - stages: stage -> see count_stage()
     - cpa: the same for each number of CPA steps
+    - readings: name in READINGS -> see count_stage(), of the last stage
+    - pointpillars: see count_stage(), of our PointPillars V0 at its default threshold
     - overlap: stage -> see measure_overlaps()
     - search: [true positives, false positives] for each eps and each min_samples
     - clusters: number of clusters before and after the height filter
@@ -46,11 +53,13 @@ def measure_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:
     segmented = labelled.segment(PAPER)
     seed, no_seed, found, unfiltered = None, None, Candidates.none(), Candidates.none()
     sweep = [found.final.boxes] * (NUMBERS.cpa_steps + 1)
+    readings = dict.fromkeys(READINGS, found.final.boxes)
     try:
         seed = make_nearest_seed(segmented, labelled)
         found = _refine(segmented, seed, PAPER)
         unfiltered = _refine(segmented, seed, drop_height_filter())
         sweep = [_refine(segmented, seed, extend_cpa(steps)).final.boxes for steps in range(NUMBERS.cpa_steps + 1)]
+        readings = {name: _refine(segmented, seed, params).final.boxes for name, params in READINGS.items()}
     except InputError as error:
         no_seed = str(error)
     boxes = {stage: getattr(found, stage).boxes for stage in STAGES}
@@ -60,11 +69,28 @@ def measure_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:
         "no_seed": no_seed,
         "stages": {stage: count_stage(boxes[stage], truth, boxes["stage1"]) for stage in STAGES},
         "cpa": [count_stage(accepted, truth, boxes["stage1"]) for accepted in sweep],
+        "readings": {name: count_stage(accepted, truth, boxes["stage1"]) for name, accepted in readings.items()},
+        "pointpillars": count_stage(detect_pedestrians(labelled), truth, boxes["stage1"]),
         "overlap": {stage: measure_overlaps(boxes[stage], truth) for stage in STAGES},
         "search": search_clustering(segmented, seed, truth),
         "clusters": [len(unfiltered.stage1), len(found.stage1)],
         "ms": None if no_seed else {**segmented.ms, **found.ms, "stm_all": unfiltered.ms["stm"]},
     }
+
+
+def detect_pedestrians(labelled: LabelledFrame) -> np.ndarray:
+    """Return the pedestrians (K, 7) that PointPillars V0 finds in the camera's view (Table 7)."""
+    seen = labelled.camera.in_view(labelled.cloud.xyz)
+    cloud = labelled.cloud.take(np.flatnonzero(seen))
+    found = open_pointpillars(labelled.height)(cloud).detections
+    return found.boxes[found.class_ids == PEDESTRIAN]
+
+
+@cache
+def open_pointpillars(height: float) -> Detector:
+    """Open PointPillars V0 with the shipped weights for a sensor `height` metres above the ground."""
+    weights = weights_file(PointPillarsParams(version="v0"))
+    return open_detector(weights, "cpu", sensor_height=height, settings={"pointpillars.warm_up": False})
 
 
 def drop_height_filter() -> PipelineParams:
@@ -157,5 +183,9 @@ STM_CPA = Experiment(
     "Does a plain reading of the paper's method give the paper's values?",
     measure_frame,
     make_sections,
-    {"protocol": flatten(PAPER), "numbers": flatten(NUMBERS)},
+    {
+        "protocol": flatten(PAPER),
+        "numbers": flatten(NUMBERS),
+        "readings": {name: flatten(params) for name, params in READINGS.items()},
+    },
 )

@@ -50,6 +50,14 @@ FIGURE_8: dict[str, dict[int, Scores]] = {
     "45-60": {0: (0.8, 4.3, 1.4)},
 }
 
+# Table 7: recall, precision, F1, centre error of detectors, from another study of KITTI.
+TABLE_7: dict[str, Scores] = {
+    "PointPillars": (43.0, 66.0, 52.0, None, 0.11),
+    "AVOD": (43.0, 57.0, 48.0, None, 0.14),
+    "PointCNN": (55.0, 28.0, 37.0, None, 0.12),
+    "F-PointNet": (62.0, 22.0, 33.0, None, 0.16),
+}
+
 # Table 8: fraction of matches with a 3D IoU of at least 0.10 and 0.25, the same in BEV, and the mean IoU
 # in 3D and in BEV.
 TABLE_8 = {

@@ -4,6 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.param_fields import with_values
+
+# Readings of Table 2 and Section 3.5 that the text allows, see experiments/departures.py.
+READINGS = {
+    "window stretched, yaw": PAPER,
+    "window metric, yaw": with_values(PAPER, {"stm.window": "metric"}),
+    "window stretched, PCA": with_values(PAPER, {"stm.axis": "pca"}),
+    "window metric, PCA": with_values(PAPER, {"stm.window": "metric", "stm.axis": "pca"}),
+}
+
 
 @dataclass(frozen=True)
 class StmCpaParams:

@@ -12,7 +12,7 @@ from pointnet_samples import lively, small
 
 from experiments.__main__ import cli
 from experiments.clusters import detection_tables, drives, networks
-from experiments.clusters.detection import Change, change_cloud
+from experiments.clusters.detection import Change, change_cloud, open_network
 from experiments.clusters.drives import (
     add_velocities,
     compute_scores,
@@ -22,7 +22,8 @@ from experiments.clusters.drives import (
     to_columns,
 )
 from experiments.clusters.experiment import CLUSTERS
-from experiments.clusters.networks import COMPARED, NETWORKS, choose_networks
+from experiments.clusters.experiment import SHIPPED as SHIPPED_EXPERIMENT
+from experiments.clusters.networks import COMPARED, NETWORKS, SHIPPED, choose_networks
 from experiments.framework.trained_models import Model, TrainedModel
 from lidar_perception.classes import CAR
 from lidar_perception.data.frame import Frame
@@ -75,8 +76,8 @@ def test_report_is_complete_with_and_without_records(coarse, models, frames):
     experiment = CLUSTERS.with_models(models)
     records = [experiment.measure(frames, i) for i in range(2)]
     assert json.loads(json.dumps(records, allow_nan=False)) == records
-    assert [*records[0]["found"]] == [*models]
-    assert [*records[0]["changed"]["10 %"]] == ["improved, seed 0"]
+    assert [*records[0]["found"]] == [*models, *SHIPPED]
+    assert [*records[0]["changed"]["10 %"]] == ["improved, seed 0", *SHIPPED]
     assert len(records[0]["drive"]) == 3 and records[1]["drive"] is None
     for some in ([], [{"frame": "x", "skipped": "why"}], records):
         tables = {table.name: table for section in experiment.make_sections(some) for table in section.tables}
@@ -96,8 +97,37 @@ def test_report_is_complete_with_and_without_records(coarse, models, frames):
     names = [row[0] for row in tables["table_5"].rows]
     assert names == ["base", "improved"] and tables["table_5"].rows[1][-1] == "2"
     assert [row[0] for row in tables["table_4"].rows] == ["0.1, 0.2, 0.4 m"]
-    without, tracked = tables["table_7"].rows
+    without, tracked = tables["table_7"].rows[:2]
     assert without[6].value == 1.0 != tracked[6].value and tracked[2].paper is not None
+
+
+def test_shipped_detectors_need_no_training(coarse, frames):
+    records = [SHIPPED_EXPERIMENT.measure(frames, i) for i in range(2)]
+    assert [*records[0]["found"]] == [*records[0]["changed"]["10 %"]] == [*SHIPPED]
+    sections = SHIPPED_EXPERIMENT.make_sections(records)
+    tables = {table.name: table for section in sections for table in section.tables}
+    assert {*tables} == {"table_6", "figure_10", "table_7", "table_8"}
+    assert {row[0] for row in tables["table_8"].rows} == {*SHIPPED}
+    assert all(row[5].value > 0 for row in tables["table_8"].rows)  # milliseconds
+
+
+def test_experiment_without_training_runs_on_simulated_scans(tmp_path, coarse):
+    command = ["reproduce", "clusters-shipped", "sim", "--limit", "1", "--jobs", "1", "--out"]
+    result = CliRunner().invoke(cli, [*command, str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    assert report["measured"] == 1 and report["about"]["data"].startswith("simulated scans")
+    (tmp_path / "names.txt").write_text("scene 1")
+    result = CliRunner().invoke(cli, [*command, str(tmp_path / "other"), "--split", str(tmp_path / "names.txt")])
+    assert "--split is for recordings" in str(result.exception)
+
+
+def test_sources_differ_in_gamma_and_range():
+    plain, merged, pillars = (open_network(source, 1.5, "around") for source in SHIPPED.values())
+    assert plain.params.clustering.euclidean.gamma == 0.0 and merged.params.clustering.euclidean.gamma == 0.8
+    assert {d.params.ground.sensor_pose.height for d in (plain, merged, pillars)} == {1.5}
+    assert {d.range for d in (plain, merged, pillars)} == {"around"}
+    assert open_network(SHIPPED["PointPillars V0, shipped"], 1.5).range == "ahead"
 
 
 def test_every_network_of_the_tables_can_be_trained():
@@ -105,7 +135,7 @@ def test_every_network_of_the_tables_can_be_trained():
     assert len({model.name for model in models}) == len(models) == len(NETWORKS) == 16
     assert {model.params.network for model in models} <= set(config_module.NETWORKS)
     assert {model.params.seed for model in models} == {3}
-    assert {*COMPARED} <= {model.params.network for model in models if model.required}
+    assert {*COMPARED} - {*SHIPPED} <= {model.params.network for model in models if model.required}
 
 
 def test_tiny_budget_runs_end_to_end(tmp_path, coarse, monkeypatch):

@@ -24,6 +24,7 @@ from experiments.stm_cpa.experiment import (
     search_clustering,
 )
 from experiments.stm_cpa.frames import load_labelled_frame, make_nearest_seed
+from experiments.stm_cpa.params import READINGS
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import StmParams
 from lidar_perception.candidates.pipeline import segment_cloud
@@ -175,6 +176,20 @@ def test_two_cpa_steps_equal_final_stage_at_15_to_30_m(refined):
         np.testing.assert_array_equal(*inside)
         compared += len(inside[0])
     assert compared > 3
+
+
+def test_readings_and_detector_are_measured_on_the_same_pedestrians(measured):
+    for record in measured:
+        assert record["readings"]["window stretched, yaw"] == record["stages"]["final"]
+        for counts in (*record["readings"].values(), record["pointpillars"]):
+            assert np.add(counts["tp"], counts["fn"]).tolist() == record["pedestrians"]
+    totals = [add_up(measured, "readings", name, "fp").sum() for name in READINGS]
+    assert len(set(totals)) > 1  # the readings differ
+    tables = {t.name: t for s in STM_CPA.make_sections(measured) for t in s.tables}
+    assert [row[0] for row in tables["readings"].rows] == [*READINGS]
+    ours = next(row for row in tables["table_7"].rows if row[0] == "PointPillars V0, ours")
+    tp, fp, fn = (add_up(measured, "pointpillars", k).sum() for k in ("tp", "fp", "fn"))
+    assert ours[-3:] == (str(tp), str(fp), str(fn)) and ours[3].paper == 52.0
 
 
 def test_search_at_paper_setting_equals_stage_1(refined, measured):
