@@ -52,7 +52,7 @@ def measure_frame(frames: Sequence[Frame], number: int, models: Mapping[str, Tra
         result = detector(scan)
         taken = {"total": 1e3 * (perf_counter() - begun), "cpu": 1e3 * (process_time() - cpu)}
         found[name] = to_record(to_camera_objects(to_scored_labels(result.detections), calibration))
-        ms[name] = {step: round(value, 2) for step, value in (taken | result.timings).items()}
+        ms[name] = {step: round(value, 2) for step, value in {**taken, **result.timings}.items()}
     return {
         "frame": frame.name,
         "true": to_record(to_camera_objects(truth, calibration)),

@@ -1,4 +1,4 @@
-"""pytest plugin for stacks that use this package: bags, running nodes, waiting, and assertions.
+"""pytest plugin to test stacks that use this package, with bags, running nodes and assertions.
 
     pytest_plugins = ["lidar_perception.testing"]           # in conftest.py
 

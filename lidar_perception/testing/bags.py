@@ -1,4 +1,4 @@
-"""Bags for tests, made of arrays or simulated frames and written by the rosbags library."""
+"""Bags for tests, made from arrays or simulated frames and written with the rosbags library."""
 
 from __future__ import annotations
 
@@ -30,15 +30,18 @@ def make_frames(
     hz: float = 10.0,
     start_ns: int = START_NS,
 ) -> list[Frame]:
-    """Make frames of clouds.
+    """Make frames from clouds.
 
     Args:
-        clouds: arrays (N, 3) [x y z] in metres, or (N, 4) with intensity 0..1, in the sensor frame.
-        labels: for each cloud GroundTruth, pairs (class name, [x y z l w h yaw]), or None for an
-            unlabelled cloud.
+        clouds: Arrays (N, 3) [x y z] in metres, or (N, 4) with intensity 0..1, in the sensor frame.
+        labels: Labels of each cloud: GroundTruth, pairs (class name, [x y z l w h yaw]), or None
+            for an unlabelled cloud.
+        frame_id: Frame of the clouds.
+        hz: Number of clouds per second.
+        start_ns: Stamp of the first cloud.
 
     Raises:
-        InputError: for arrays of another shape, or if the numbers of clouds and labels differ.
+        InputError: An array has another shape, or the numbers of clouds and labels differ.
     """
     clouds = [np.asarray(cloud, np.float32) for cloud in clouds]
     truths = [None] * len(clouds) if labels is None else [*map(_to_truth, labels)]
@@ -59,10 +62,10 @@ def make_frames(
     return frames
 
 
-def _to_truth(given: Any) -> GroundTruth | None:
-    if given is None or isinstance(given, GroundTruth):
-        return given
-    objects = to_objects(given)
+def _to_truth(labels: Any) -> GroundTruth | None:
+    if labels is None or isinstance(labels, GroundTruth):
+        return labels
+    objects = to_objects(labels)
     if unknown := [name for name in objects.labels if name not in CLASSES]:
         raise InputError(f"labels: '{unknown[0]}' is none of {', '.join(CLASSES)}")
     if np.isnan(objects.boxes).any():
@@ -73,14 +76,16 @@ def _to_truth(given: Any) -> GroundTruth | None:
 def write_rosbags_bag(
     path: Path, frames: Iterable[Frame], storage: str = "mcap", names: Mapping[str, str] = {}
 ) -> Path:
-    """Write frames as a bag by rosbags; return its path.
+    """Write frames to a bag with rosbags and return its path.
 
     Args:
-        storage: mcap or sqlite3.
-        names: topic of lidar_perception.wire.topics -> another name.
+        path: Folder of the bag.
+        frames: Frames to write.
+        storage: "mcap" or "sqlite3".
+        names: New names for topics of lidar_perception.wire.topics.
 
     Raises:
-        InputError: for an unknown storage.
+        InputError: The storage is unknown.
     """
     with tempfile.TemporaryDirectory() as folder:
         write_bag(Path(folder) / "bag", frames)
@@ -88,33 +93,33 @@ def write_rosbags_bag(
 
 
 def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = {}) -> Path:
-    """Copy a bag by rosbags; arguments and errors are those of write_rosbags_bag."""
+    """Copy a bag with rosbags; for arguments and errors see write_rosbags_bag."""
     if storage not in STORAGES:
         raise InputError(f"storage '{storage}' is none of {', '.join(STORAGES)}")
-    with Bag(source) as recorded, Writer(path, version=9, storage_plugin=STORAGES[storage]) as bag:
-        copies = {
+    with Bag(source) as source_bag, Writer(path, version=9, storage_plugin=STORAGES[storage]) as bag:
+        connections = {
             topic: bag.add_connection(
-                names.get(topic, topic), kind, typestore=load_typestore(), offered_qos_profiles=recorded.qos(topic)
+                names.get(topic, topic), kind, typestore=load_typestore(), offered_qos_profiles=source_bag.qos(topic)
             )
-            for topic, kind in recorded.topics.items()
+            for topic, kind in source_bag.topics.items()
         }
-        for topic, stamp, data in recorded.raw_messages():
-            bag.write(copies[topic], stamp, data)
+        for topic, stamp, data in source_bag.raw_messages():
+            bag.write(connections[topic], stamp, data)
     return path
 
 
-def to_frames(given: Sequence[Any] | Iterable[Frame], labels: Any = None, **options: Any) -> list[Frame]:
-    """Return frames as they are, or make_frames() of clouds.
+def to_frames(frames: Sequence[Any] | Iterable[Frame], labels: Any = None, **options: Any) -> list[Frame]:
+    """Return frames unchanged, or convert clouds with make_frames().
 
     Raises:
-        InputError: for labels or options together with frames, which would be ignored.
+        InputError: There are labels or options together with frames; they would be ignored.
     """
-    given = list(given)
-    if not given or not isinstance(given[0], Frame):
-        return make_frames(given, labels, **options)
-    if refused := [*(() if labels is None else ("labels",)), *options]:
+    frames = list(frames)
+    if not frames or not isinstance(frames[0], Frame):
+        return make_frames(frames, labels, **options)
+    if rejected := [*(() if labels is None else ("labels",)), *options]:
         raise InputError(
             f"frames already have labels, times and a frame_id, so they take no "
-            f"{' and no '.join(refused)}; give arrays instead"
+            f"{' and no '.join(rejected)}; give arrays instead"
         )
-    return given
+    return frames

@@ -1,4 +1,4 @@
-"""Clouds as PointCloud2 messages."""
+"""Point cloud messages for tests."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ def make_cloud_message(points: Any, stamp_ns: int = 1, frame_id: str = "lidar", 
 
     Args:
         points: (N, 3) [x y z] in metres, or (N, 4) with intensity; written as float32.
-        columns: further fields (N, ...) in their own types, such as ground or ring.
+        stamp_ns: Stamp of the cloud.
+        frame_id: Frame of the cloud.
+        columns: Additional fields (N, ...) such as ground or ring, written with their own dtypes.
 
     Raises:
-        InputError: for points of another shape.
+        InputError: `points` has another shape.
     """
     points = np.asarray(points, np.float32)
     if points.ndim != 2 or points.shape[1] not in (3, 4):

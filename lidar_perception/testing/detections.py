@@ -1,4 +1,4 @@
-"""Comparison of detections of any type with expected objects."""
+"""Comparison of detections with expected objects."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ MAX_LISTED = 20  # maximum number of missing and of extra objects to list
 
 
 class Objects(NamedTuple):
-    """Objects of any source.
+    """K detected or expected objects.
 
-    boxes (K, 7) float64 [x y z l w h yaw], with NaN where only a centre is given; labels are K
-    class names; scores (K,) float64 are 1 where there are none.
+    Attributes:
+        boxes: (K, 7) float64 [x y z l w h yaw]; NaN after the centre if only the centre is given.
+        labels: K class names.
+        scores: (K,) float64, 1 for objects without a score.
     """
 
     boxes: np.ndarray
@@ -30,28 +32,28 @@ class Objects(NamedTuple):
     scores: np.ndarray
 
 
-def to_objects(given: Any) -> Objects:
+def to_objects(source: Any) -> Objects:
     """Convert detections or labels to Objects.
 
     Args:
-        given: a MarkerArray or Detection3DArray of rclpy or rosbags, Detections, GroundTruth, or
+        source: A MarkerArray or Detection3DArray (rclpy or rosbags), Detections, GroundTruth, or
             pairs (class name, box), where a box is [x y z l w h yaw] or only [x y z].
 
     Raises:
-        InputError: for other types.
+        InputError: The type is not supported.
     """
-    if hasattr(given, "markers"):
-        given = from_marker_array(given)
-    elif hasattr(given, "detections"):
-        given = from_detection_array(given)
-    if hasattr(given, "class_ids"):
-        labels = [CLASSES[i] for i in given.class_ids]
-    elif hasattr(given, "labels"):
-        labels = list(given.labels)
+    if hasattr(source, "markers"):
+        source = from_marker_array(source)
+    elif hasattr(source, "detections"):
+        source = from_detection_array(source)
+    if hasattr(source, "class_ids"):
+        labels = [CLASSES[i] for i in source.class_ids]
+    elif hasattr(source, "labels"):
+        labels = list(source.labels)
     else:
-        return _from_pairs(given)
-    boxes = np.asarray(given.boxes, np.float64).reshape(-1, 7)
-    return Objects(boxes, labels, np.asarray(getattr(given, "scores", np.ones(len(boxes))), float))
+        return _from_pairs(source)
+    boxes = np.asarray(source.boxes, np.float64).reshape(-1, 7)
+    return Objects(boxes, labels, np.asarray(getattr(source, "scores", np.ones(len(boxes))), float))
 
 
 def _from_pairs(pairs: Any) -> Objects:
@@ -81,46 +83,51 @@ def assert_detections(
     max_missing: int = 0,
     max_extra: int | None = 0,
 ) -> list[tuple[int, int]]:
-    """Assert that the detections match the expected objects, both as to_objects() takes them.
+    """Assert that detections match the expected objects.
 
-    Detections and objects are paired one to one: as many pairs as possible, then the closest.
+    Detections and objects are matched one to one: as many pairs as possible, then the closest ones.
 
     Args:
-        max_distance: largest distance of the centres of a pair in metres.
-        min_iou: smallest 3D IoU of a pair, in place of max_distance.
-        same_class: pairs must have the same class.
-        max_missing, max_extra: how many objects may be missed, and how many detections may have no
-            object; None for any number.
+        found: Detections of any type that to_objects() accepts.
+        expected: Expected objects of any type that to_objects() accepts.
+        max_distance: Maximum distance between the centres of a pair, metres.
+        min_iou: Minimum 3D IoU of a pair; if given, it replaces max_distance.
+        same_class: True if the classes of a pair must be equal.
+        max_missing: Maximum number of expected objects without a detection.
+        max_extra: Maximum number of detections without an object, None for any number.
 
     Returns:
-        (row of found, row of expected) of each pair.
+        (index into found, index into expected) of each pair.
 
     Raises:
-        AssertionError: listing the missing and the extra objects.
+        AssertionError: Too many objects are missing or extra; the message lists them.
     """
-    a, b = to_objects(found), to_objects(expected)
-    if min_iou is not None and not np.isfinite(b.boxes).all():
+    detected, wanted = to_objects(found), to_objects(expected)
+    if min_iou is not None and not np.isfinite(wanted.boxes).all():
         raise InputError("min_iou needs complete boxes; some expected objects have only a centre")
-    distance = np.linalg.norm(a.boxes[:, None, :3] - b.boxes[None, :, :3], axis=2)
+    distance = np.linalg.norm(detected.boxes[:, None, :3] - wanted.boxes[None, :, :3], axis=2)
     if min_iou is None:
-        cost, close = distance, distance <= max_distance
+        cost, can_match = distance, distance <= max_distance
     else:
-        overlap = iou_3d(a.boxes, b.boxes)
-        cost, close = 1 - overlap, (overlap >= min_iou) & (overlap > 0)
+        overlap = iou_3d(detected.boxes, wanted.boxes)
+        cost, can_match = 1 - overlap, (overlap >= min_iou) & (overlap > 0)
     if same_class:
-        close &= np.array([[x == y for y in b.labels] for x in a.labels], bool).reshape(close.shape)
-    rows, columns = assign_pairs(cost, close)
-    missing = sorted(set(range(len(b.boxes))) - set(columns.tolist()))
-    extra = sorted(set(range(len(a.boxes))) - set(rows.tolist()))
+        can_match &= np.array(
+            [[detected_label == wanted_label for wanted_label in wanted.labels] for detected_label in detected.labels],
+            bool,
+        ).reshape(can_match.shape)
+    rows, columns = assign_pairs(cost, can_match)
+    missing = sorted(set(range(len(wanted.boxes))) - set(columns.tolist()))
+    extra = sorted(set(range(len(detected.boxes))) - set(rows.tolist()))
     if len(missing) > max_missing or (max_extra is not None and len(extra) > max_extra):
         rule = f"centres at most {max_distance:g} m apart" if min_iou is None else f"3D IoU at least {min_iou:g}"
         raise AssertionError(
             "\n".join(
                 [
-                    f"{len(rows)} of {len(b.boxes)} expected objects were found, {len(extra)} more were "
+                    f"{len(rows)} of {len(wanted.boxes)} expected objects were found, {len(extra)} more were "
                     f"found ({rule}{', of the same class' if same_class else ''})",
-                    *_list_objects("missing", b, missing, a, distance.T),
-                    *_list_objects("extra", a, extra, b, distance),
+                    *_list_objects("missing", wanted, missing, detected, distance.T),
+                    *_list_objects("extra", detected, extra, wanted, distance),
                 ]
             )
         )
@@ -128,7 +135,7 @@ def assert_detections(
 
 
 def _list_objects(word: str, objects: Objects, rows: Sequence[int], others: Objects, distance: np.ndarray) -> list[str]:
-    """Return a line for each of the rows, with the nearest of the others."""
+    """Return one line for each of the rows, with the nearest object of `others`."""
     lines = []
     for i in rows[:MAX_LISTED]:
         box = objects.boxes[i]

@@ -1,4 +1,4 @@
-"""pytest fixtures, and a hook that adds the logs of nodes to the report of a failed test."""
+"""pytest fixtures, and a hook that adds the logs of the nodes to the report of a failed test."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FRAMES = 8  # number of frames of drive_bag
 
 @pytest.fixture(scope="session")
 def domain() -> Iterator[int]:
-    """A private ROS domain, limited to this machine.
+    """Private ROS domain, limited to this machine.
 
     It is set in the environment, so that programs started by the tests use it too.
     """
@@ -49,33 +49,34 @@ def _peer(domain: int, processes: Any) -> Iterator[Any]:
 
 @pytest.fixture
 def processes(domain, tmp_path) -> Iterator[Any]:
-    """Starts nodes and programs, and stops them at the end of the test (testing/processes.py)."""
+    """NodesUnderTest: starts nodes and programs, and stops them at the end of the test."""
     yield from _processes(domain, tmp_path / "logs")
 
 
 @pytest.fixture
 def peer(domain, processes) -> Iterator[Any]:
-    """A node that subscribes, publishes and waits (testing/peer.py)."""
+    """Peer: a node that subscribes, publishes and waits."""
     yield from _peer(domain, processes)
 
 
 @pytest.fixture(scope="module")
 def shared_processes(domain, tmp_path_factory) -> Iterator[Any]:
-    """`processes` for all tests of a module, because starting takes longer than testing."""
+    """`processes` shared by all tests of a module, because starting nodes takes long."""
     yield from _processes(domain, tmp_path_factory.mktemp("logs"))
 
 
 @pytest.fixture(scope="module")
 def shared_peer(domain, shared_processes) -> Iterator[Any]:
-    """`peer` for all tests of a module."""
+    """`peer` shared by all tests of a module."""
     yield from _peer(domain, shared_processes)
 
 
 @pytest.fixture(scope="session")
 def make_bag(tmp_path_factory) -> Callable[..., Path]:
-    """make_bag(clouds, labels=None, storage="mcap", points="/points", ...) writes a bag by rosbags.
+    """Function that writes a bag: make_bag(clouds, labels=None, storage="mcap", points="/points").
 
-    clouds and labels are those of bags.make_frames, or clouds are frames, such as simulated ones.
+    For clouds, labels and other options see bags.make_frames. Instead of clouds, frames can be
+    given, such as simulated ones.
     """
 
     def make(
@@ -93,7 +94,7 @@ def make_bag(tmp_path_factory) -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def drive_bag(make_bag) -> Path:
-    """A simulated drive among people: eight clouds of 64 beams, with labels and a camera."""
+    """Bag of a simulated drive among people: eight clouds of 64 beams, labels and a camera."""
     from lidar_perception.simulation.recording import simulate_frames
     from lidar_perception.simulation.scene import CROWDED_ZONES
 

@@ -1,4 +1,4 @@
-"""Nodes forked from a process with preloaded modules, because importing them takes most time."""
+"""Nodes forked from a process with preloaded modules, because imports take most of the start."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CONTEXT.set_forkserver_preload(["lidar_perception.testing.preload"])
 
 
 class ForkedNode:
-    """A node in a forked process, with the interface of subprocess.Popen."""
+    """Node in a forked process, with the interface of subprocess.Popen."""
 
     def __init__(self, arguments: Sequence[str], environment: Mapping[str, str], log: Path):
         self.args = list(arguments)
@@ -28,11 +28,15 @@ class ForkedNode:
         return self.process.exitcode
 
     def poll(self) -> int | None:
-        """Return the exit code, None while the process runs."""
+        """Return the exit code, or None while the process is running."""
         return self.process.exitcode
 
     def wait(self, timeout: float | None = None) -> int:
-        """Return the exit code; raise TimeoutExpired if the process runs longer."""
+        """Wait for the process to end and return its exit code.
+
+        Raises:
+            TimeoutExpired: The process is still running after `timeout` seconds.
+        """
         self.process.join(timeout)
         if self.returncode is None:
             raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
@@ -47,7 +51,7 @@ class ForkedNode:
 
 
 def _run_node(arguments: list[str], environment: dict[str, str], log: Path) -> None:
-    """Run a node; called in the new process."""
+    """Run a node in the forked process."""
     os.environ.clear()
     os.environ.update(environment)
     file = os.open(log, os.O_WRONLY | os.O_APPEND)

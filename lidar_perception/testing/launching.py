@@ -1,6 +1,6 @@
-"""launch_testing: launch files of this package and nodes under test on a private domain.
+"""Support for launch_testing: launch files of this package on a private ROS domain.
 
-Needs launch_testing and launch_ros of ROS 2. In the tests, Peer() waits and asserts.
+Needs launch_testing and launch_ros of ROS 2. Use Peer in the tests to wait for messages.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from lidar_perception.types import InputError
 
 
 def include_launch_file(name: str = "detectors", **arguments: Any) -> Any:
-    """Return the action that includes launch/NAME.launch.py of this package.
+    """Return the launch action that includes launch/NAME.launch.py of this package.
 
     Example: include_launch_file(detectors="pointpillars", points="/front/points").
 
     Raises:
-        InputError: if launch is not installed, if ROS does not find the package, or if there is no
-            such file.
+        InputError: launch is not installed, ROS does not find the package, or there is no such
+            file.
     """
     try:
         from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
@@ -39,8 +39,8 @@ def include_launch_file(name: str = "detectors", **arguments: Any) -> Any:
         ) from None
     path = share / "launch" / f"{name}.launch.py"
     if not path.is_file():
-        have = ", ".join(sorted(p.name.split(".")[0] for p in path.parent.glob("*.launch.py")))
-        raise InputError(f"there is no launch file '{name}'; there are {have}")
+        available = ", ".join(sorted(p.name.split(".")[0] for p in path.parent.glob("*.launch.py")))
+        raise InputError(f"there is no launch file '{name}'; there are {available}")
     return IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(path)),
         launch_arguments=[
@@ -50,13 +50,13 @@ def include_launch_file(name: str = "detectors", **arguments: Any) -> Any:
 
 
 def make_description(*actions: Any) -> Any:
-    """Return the result of generate_test_description(): the actions, then ReadyToTest.
+    """Make the return value of generate_test_description(): the actions, then ReadyToTest.
 
-    This process and the programs that it starts move to a private ROS domain limited to this
-    machine, so that a test never talks to a robot.
+    Also moves this process and the programs that it starts to a private ROS domain, limited to this
+    machine, so that a test never communicates with a robot.
 
     Raises:
-        InputError: if launch_testing is not installed.
+        InputError: launch_testing is not installed.
     """
     try:
         from launch.launch_description import LaunchDescription

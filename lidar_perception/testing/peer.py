@@ -1,4 +1,4 @@
-"""A node in the test process that talks to the nodes under test and waits for them."""
+"""Node in the test process that communicates with the nodes under test and waits for them."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ LEVELS = {0: "OK", 1: "WARN", 2: "ERROR", 3: "STALE"}
 
 
 class Peer(ExternalNode):
-    """Talks over DDS on a domain, by default that of the environment. A context manager.
+    """Context manager with a node on a ROS domain, by default that of the environment.
 
-    A wait that fails raises an AssertionError that describes the messages received: after the
-    timeout, or at once if one of `processes` has ended with an error.
+    If a wait fails, it raises an AssertionError that describes the received messages. It fails
+    after the timeout, or at once if one of `processes` has ended with an error.
 
-    Types of messages are names such as "std_msgs/msg/Bool", or classes. Received messages are of
-    rosbags' classes, with NumPy arrays, if rosbags knows the type; else of rclpy's classes.
+    Message types are names such as "std_msgs/msg/Bool", or classes. Received messages are of a
+    rosbags class, with NumPy arrays, if rosbags knows the type; otherwise of an rclpy class.
     """
 
     def __init__(self, domain: int | None = None, processes: NodesUnderTest | None = None):
@@ -38,13 +38,13 @@ class Peer(ExternalNode):
         self.received: list[tuple[str, list]] = []  # topic and messages of each subscription
 
     def listen(self, topic: str, kind: str | type, qos: QoSProfile = RELIABLE) -> list:
-        """Subscribe to a topic; return a list that grows with its messages."""
+        """Subscribe to a topic; return a list to which its messages are appended."""
         name, cls = _resolve_type(kind)
-        known = name in load_typestore().fielddefs
-        return self._listen(topic, cls, (lambda data: decode(data, name)) if known else None, qos)
+        is_known = name in load_typestore().fielddefs
+        return self._listen(topic, cls, (lambda data: decode(data, name)) if is_known else None, qos)
 
     def listen_raw(self, topic: str, kind: str | type, qos: QoSProfile = RELIABLE) -> list[bytes]:
-        """Subscribe to a topic; return a list that grows with the serialized messages."""
+        """Subscribe to a topic; return a list to which its serialized messages are appended."""
         return self._listen(topic, _resolve_type(kind)[1], bytes, qos)
 
     def _listen(self, topic: str, cls: type, read: Callable[[bytes], Any] | None, qos: QoSProfile) -> list:
@@ -60,14 +60,20 @@ class Peer(ExternalNode):
         return received
 
     def advertise(self, topic: str, kind: str | type, qos: QoSProfile = RELIABLE) -> Any:
-        """Return a publisher for send()."""
+        """Create a publisher for send()."""
         return self.node.create_publisher(_resolve_type(kind)[1], topic, qos)
 
     def send(self, publisher: Any, message: Any, until: Callable[[], Any], what: str) -> None:
-        """Publish a message of rosbags' or rclpy's classes until a condition holds.
+        """Publish a message every half second until a condition is true.
 
-        It is published every half second, because a best-effort subscriber may not have discovered
-        the publisher when the publisher has discovered it. `what` describes the condition.
+        The message is repeated because a best-effort subscriber may not have discovered the
+        publisher yet when the publisher discovers it.
+
+        Args:
+            publisher: Result of advertise().
+            message: Message of a rosbags or rclpy class.
+            until: Function that returns the condition.
+            what: Description of the condition for the error message.
         """
         data = encode(message) if hasattr(message, "__msgtype__") else message
         next_time = 0.0
@@ -83,25 +89,30 @@ class Peer(ExternalNode):
         self.wait(condition, what)
 
     def wait(self, condition: Callable[[], Any], what: str | Callable[[], str], timeout: float = TIMEOUT_S) -> None:
-        """Spin until condition() holds; `what` describes it.
+        """Spin until condition() is true.
+
+        Args:
+            condition: Function that returns the condition.
+            what: Description of the condition for the error message.
+            timeout: Maximum duration in seconds.
 
         Raises:
-            AssertionError: after the timeout, or if a process ended with an error.
+            AssertionError: The timeout has expired, or a process has ended with an error.
         """
-        fulfilled = False
+        is_fulfilled = False
 
         def is_over() -> bool:
-            nonlocal fulfilled
-            fulfilled = bool(condition())
-            return fulfilled or bool(self._find_failed())
+            nonlocal is_fulfilled
+            is_fulfilled = bool(condition())
+            return is_fulfilled or bool(self._find_failed())
 
         self.spin_until(is_over, timeout)
         # The condition may be that the process ends.
-        if fulfilled or (self._find_failed() and condition()):
+        if is_fulfilled or (self._find_failed() and condition()):
             return
         what = what if isinstance(what, str) else what()
-        if ended := ", ".join(f"{k} ended with code {v}" for k, v in self._find_failed().items()):
-            raise AssertionError(f"while the test waited for {what}, {ended}; {self.describe()}")
+        if failures := ", ".join(f"{k} ended with code {v}" for k, v in self._find_failed().items()):
+            raise AssertionError(f"while the test waited for {what}, {failures}; {self.describe()}")
         raise AssertionError(f"waited {timeout:g} s in vain for {what}; {self.describe()}")
 
     def _find_failed(self) -> dict[str, int]:
@@ -119,7 +130,7 @@ class Peer(ExternalNode):
     def wait_for_messages(
         self, topic: str, kind: str | type, count: int = 1, qos: QoSProfile = RELIABLE, timeout: float = TIMEOUT_S
     ) -> list:
-        """Subscribe to a topic and wait for `count` messages; the list continues to grow."""
+        """Subscribe to a topic, wait for `count` messages, and return the list; see listen()."""
         received = self.listen(topic, kind, qos)
         self.wait(lambda: len(received) >= count, f"{count} messages on {topic}", timeout)
         return received
@@ -127,40 +138,44 @@ class Peer(ExternalNode):
     def wait_for_diagnostics(
         self, node: str, words: str = "", level: int | None = None, timeout: float = TIMEOUT_S
     ) -> Any:
-        """Wait until the node's diagnostic has these words and this level; return the status.
+        """Wait for a diagnostic status of a node and return it.
 
-        level: 0 OK, 1 WARN, 2 ERROR, 3 STALE; None for any.
+        Args:
+            node: Name of the node.
+            words: Words that the message must contain.
+            level: 0 OK, 1 WARN, 2 ERROR, 3 STALE; None for any level.
+            timeout: Maximum duration in seconds.
         """
 
         def matches() -> bool:
             status = self.diagnostics.get(node)
             return status is not None and words in status.message and level in (None, ord(status.level))
 
-        wanted = ("" if level is None else f" of level {LEVELS[level]}") + (f" with '{words}'" if words else "")
-        self.wait(matches, f"a diagnostic of {node}{wanted}", timeout)
+        description = ("" if level is None else f" of level {LEVELS[level]}") + (f" with '{words}'" if words else "")
+        self.wait(matches, f"a diagnostic of {node}{description}", timeout)
         return self.diagnostics[node]
 
     def wait_for_graph(self, graph: Graph, timeout: float = TIMEOUT_S) -> None:
-        """Wait until all nodes of a graph, as start_graph() returns it, are connected."""
+        """Wait until all nodes of a graph of start_graph() are connected."""
         outputs = find_connected_outputs(graph)
         self.wait(lambda: self.is_connected(outputs), f"{', '.join(graph)} to find each other", timeout)
 
     def wait_for_subscribers(self, node: str, topic: str, others: int = 0, timeout: float = TIMEOUT_S) -> None:
         """Wait until a node of this package has discovered all subscribers of its topic.
 
-        These are the peer's own subscribers and `others`, by the node's diagnostics. They miss
-        messages that are published earlier.
+        Subscribers miss messages that are published earlier. The count comes from the diagnostics
+        of the node; expected are the subscribers of this peer plus `others`.
         """
         name = self.node.resolve_topic_name(topic)
-        wanted = others + sum(name == subscribed for subscribed, _ in self.received)
+        expected_count = others + sum(name == subscribed for subscribed, _ in self.received)
         self.wait(
-            lambda: int(self.get_value(node, f"subscribers of {name}") or 0) >= wanted,
-            f"{wanted} subscribers of {name}",
+            lambda: int(self.get_value(node, f"subscribers of {name}") or 0) >= expected_count,
+            f"{expected_count} subscribers of {name}",
             timeout,
         )
 
     def describe(self) -> str:
-        """Describe the diagnostics of the nodes and the messages received so far."""
+        """Return a description of the nodes' diagnostics and of the messages received so far."""
         diagnostics = "; ".join(
             f"{name} {LEVELS[ord(status.level)]} '{status.message}'"
             for name, status in sorted(self.diagnostics.items())
@@ -174,7 +189,7 @@ class Peer(ExternalNode):
         return f"diagnostics: {diagnostics or 'none'}" + (f"; received: {received}" if received else "")
 
     def call(self, service: str, kind: type, request: Any) -> Any:
-        """Call a service and return its answer."""
+        """Call a service and return its response."""
         client = self.node.create_client(kind, service)
         self.wait(client.service_is_ready, f"service {service}")
         future = client.call_async(request)
@@ -183,31 +198,35 @@ class Peer(ExternalNode):
         return future.result()
 
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> list[str]:
-        """Set parameters of a node one by one; return its reasons for those that it refuses."""
+        """Set parameters of a node one by one; return the reason for each one that it rejects."""
         request = SetParameters.Request(
             parameters=[parameter.to_parameter_msg() for parameter in to_parameters(values)]
         )
         results = self.call(f"{node}/set_parameters", SetParameters, request).results
-        return [r.reason or "no reason is given" for r in results if not r.successful]
+        return [result.reason or "no reason is given" for result in results if not result.successful]
 
     def set_parameter(self, node: str, name: str, value: Any) -> None:
-        """Set a parameter of a node; raise AssertionError with the node's reason if it refuses."""
-        assert not (refused := self.set_parameters(node, {name: value})), refused
+        """Set a parameter of a node.
+
+        Raises:
+            AssertionError: The node rejects the value; the message has its reason.
+        """
+        assert not (reasons := self.set_parameters(node, {name: value})), reasons
 
     @contextmanager
     def parameters(self, node: str, values: Mapping[str, Any]) -> Iterator[None]:
-        """Set parameters of a node within a block; the previous values are restored at its end."""
+        """Set parameters of a node within a block and restore the previous values at its end."""
         request = GetParameters.Request(names=list(values))
-        before = to_values(self.call(f"{node}/get_parameters", GetParameters, request).values)
-        assert not (refused := self.set_parameters(node, values)), refused
+        previous_values = to_values(self.call(f"{node}/get_parameters", GetParameters, request).values)
+        assert not (reasons := self.set_parameters(node, values)), reasons
         try:
             yield
         finally:
-            assert not self.set_parameters(node, dict(zip(values, before)))
+            assert not self.set_parameters(node, dict(zip(values, previous_values)))
 
 
 def _resolve_type(kind: str | type) -> tuple[str, type]:
-    """Return the name and the class of a message type."""
+    """Return the name and the class of a message type, given either of them."""
     if isinstance(kind, str):
         return kind, load_message_class(kind)
     package, group, *_ = kind.__module__.split(".")

@@ -1,4 +1,4 @@
-"""Imports the modules that nodes need, for processes forked from the one that imports this."""
+"""Preloading of the modules that nodes need, in the process from which nodes are forked."""
 
 from contextlib import suppress
 from importlib import import_module

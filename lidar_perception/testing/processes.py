@@ -1,4 +1,4 @@
-"""Nodes and other programs as child processes of a test, on one ROS domain."""
+"""Child processes of a test: nodes and other programs on one ROS domain."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ MAX_LOG_LINES = 60  # maximum lines of each log in the report of a failed test
 
 
 class NodesUnderTest(Processes):
-    """Processes whose logs are shown if a test fails while they run.
+    """Processes whose logs are shown if a test fails while they are running.
 
-    Nodes of this package are forked from a process that has imported their code, unless `fresh` is
-    True: then each is a new interpreter, as in production, and takes seconds to start.
+    Nodes of this package are forked from a process that has imported their code. If `fresh` is
+    True, each node is instead started in a new interpreter, as in production, which takes seconds.
     """
 
     active: list[NodesUnderTest] = []  # nodes of all tests that are running
@@ -53,13 +53,15 @@ class NodesUnderTest(Processes):
         """Start the nodes of one or several detectors, as the launch files do.
 
         Args:
-            detectors: any of candidates, pointpillars and pointnet.
-            params: a dataclass of parameters, or name -> value, for all nodes with such parameters.
-            single: one process per detector; else ground and clusters are computed once for all.
-            points: topic of the clouds, in the namespace unless it starts with /.
+            detectors: Any of candidates, pointpillars and pointnet.
+            params: Dataclass or mapping with parameter values; each node gets those that it has.
+            single: Run each detector in one process. If False, ground and clusters are computed
+                once for all detectors.
+            points: Topic of the clouds, relative to the namespace unless it starts with /.
+            namespace: Namespace of the nodes.
 
         Returns:
-            node -> remappings.
+            Remappings of each node.
         """
         values = {} if params is None else (params if isinstance(params, Mapping) else flatten(params))
         graph = {
@@ -74,9 +76,10 @@ class NodesUnderTest(Processes):
         """Start bag_player, which waits up to two minutes for a subscriber of the clouds.
 
         Args:
-            follow: topics of detections. The next cloud is sent when the previous ones have their
-                answer there, so that a slow machine loses none.
-            params: other parameters of bag_player.
+            bag: The bag to play.
+            follow: Topics of detections. The next cloud is sent after the detections of the
+                previous ones have arrived there, so that no cloud is lost on a slow machine.
+            params: Other parameters of bag_player.
         """
         if "bag_player" in self.running:
             self.end("bag_player")
@@ -87,7 +90,7 @@ class NodesUnderTest(Processes):
         )
 
     def end(self, name: str, timeout: float = 15.0) -> int:
-        """End a process by SIGINT if it still runs; return its exit code."""
+        """End a process with SIGINT if it is still running; return its exit code."""
         process = self.running[name]
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
@@ -98,12 +101,12 @@ class NodesUnderTest(Processes):
         return (self.logs / f"{name}.log").read_text(errors="replace")
 
     def find_failed(self) -> dict[str, int]:
-        """Return the exit codes of the processes that ended with a code other than 0."""
+        """Return the exit codes of the processes that have failed, by name."""
         return {name: code for name, process in self.running.items() if (code := process.poll())}
 
 
 def collect_logs() -> list[tuple[str, str]]:
-    """Return title and last lines of the log of each process that runs in any test."""
+    """Return the title and last lines of the log of each process of the running tests."""
     logs = []
     for processes in NodesUnderTest.active:
         for name, process in processes.running.items():
