@@ -1,4 +1,4 @@
-"""Conversion of recordings to data sets; content that a layout cannot store is reported."""
+"""Conversion of recordings to data sets. Content that a layout cannot store is reported."""
 
 from __future__ import annotations
 
@@ -31,14 +31,12 @@ ASSUMED_CAMERA = replace(
 
 @dataclass(frozen=True)
 class DatasetFrame:
-    """Frame with its labels and its position in the data set.
+    """A frame, its labels, and its numbers in the data set.
 
     Attributes:
-        frame: The frame.
-        labels: Its labels.
-        drive: Number of the drive.
-        index: Number of the frame in the drive.
-        number: Number of the frame in the data set.
+        drive: number of the drive.
+        index: number of the frame in its drive.
+        number: number of the frame in the data set.
     """
 
     frame: Frame
@@ -50,10 +48,10 @@ class DatasetFrame:
 
 @dataclass
 class Summary:
-    """Counts of frames, boxes and drives of a data set.
+    """Counts of a data set that was written.
 
     Attributes:
-        remarks: Number of frames for each omission or assumption.
+        remarks: omissions and assumptions, with the number of frames of each.
     """
 
     frames: int = 0
@@ -61,8 +59,8 @@ class Summary:
     drives: int = 0
     remarks: dict[str, int] = field(default_factory=dict)
 
-    def remark(self, text: str) -> None:
-        """Add one frame to the count of a remark."""
+    def add_remark(self, text: str) -> None:
+        """Count a remark for one more frame."""
         self.remarks[text] = self.remarks.get(text, 0) + 1
 
 
@@ -71,30 +69,25 @@ def write_dataset(
 ) -> Summary:
     """Write the frames of a recording as a data set in one of LAYOUTS.
 
-    Frames are numbered from 0; in KITTI's tracking layout the number is the time in units of 0.1 s.
-    A new drive starts at a new sequence of the recording, after a gap of 5 s, and when the
-    calibration changes. A sensor height that differs from KITTI's is stored, see
-    data.open.write_height.
+    Frames are numbered from 0, in KITTI's tracking layout by their time at 10 Hz. A new drive
+    starts where the recording has one, after a gap of 5 s, and where the calibration changes. A
+    sensor height other than KITTI's is stored, see data.open.write_height.
 
     Args:
-        layout: Name of the layout.
-        frames: Frames of the recording.
-        out: Folder of the data set.
-        labels: Labels to write instead of those of the recording.
-        force: Replace existing files.
+        labels: labels to write instead of those of the recording.
 
     Raises:
-        InputError: A frame cannot be read or written; `out` is then unchanged.
+        InputError: something cannot be read or written; `out` is then unchanged.
     """
     layout = resolve_format(layout, LAYOUTS)
     summary = Summary()
     with write_folder(out, force) as folder:
-        for dataset_frame in LAYOUTS[layout](folder, _number_frames(frames, labels), summary):
-            if dataset_frame.number == 0 and dataset_frame.frame.sensor_height != SENSOR_HEIGHT:
-                write_height(folder, dataset_frame.frame.sensor_height)
+        for item in LAYOUTS[layout](folder, _number_frames(frames, labels), summary):
+            if item.number == 0 and item.frame.sensor_height != SENSOR_HEIGHT:
+                write_height(folder, item.frame.sensor_height)
             summary.frames += 1
-            summary.boxes += len(dataset_frame.labels)
-            summary.drives = dataset_frame.drive + 1
+            summary.boxes += len(item.labels)
+            summary.drives = item.drive + 1
         if summary.frames == 0:
             raise InputError("there are no frames to write; give a recording with clouds")
     return summary
@@ -114,10 +107,8 @@ def _number_frames(frames: Iterable[Frame], labels: DriveLabels | None) -> Itera
 
 
 def _continues_drive(previous: Frame, frame: Frame) -> bool:
-    last_calibration, calibration = previous.calibration(), frame.calibration()
-    same_calibration = last_calibration is calibration or (
-        last_calibration is not None and last_calibration.equals(calibration)
-    )
+    before, after = previous.calibration(), frame.calibration()
+    same_calibration = before is after or (before is not None and before.equals(after))
     return (
         previous.sequence == frame.sequence
         and same_calibration
@@ -126,7 +117,7 @@ def _continues_drive(previous: Frame, frame: Frame) -> bool:
 
 
 def _ensure_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
-    """Return the frame and its calibration; if it has none, both use ASSUMED_CAMERA."""
+    """Return the frame and its calibration, which is ASSUMED_CAMERA if it has none."""
     calibration = frame.calibration()
     if calibration is None:
         summary.add_remark("assumed: a camera at the LiDAR facing ahead, which KITTI's labels need")
@@ -141,74 +132,67 @@ def _load_cloud(frame: Frame, summary: Summary) -> np.ndarray:
     return scan.points()
 
 
-def _remark_losses(summary: Summary, dataset_frame: DatasetFrame, stored_content: str) -> None:
-    """Add a remark for each kind of content of the frame that the layout cannot store.
-
-    stored_content lists the kinds that the layout can store.
-    """
-    labels = dataset_frame.labels
+def _remark_losses(summary: Summary, item: DatasetFrame, storable: str) -> None:
+    """Add a remark for each content of the frame that is not in `storable`."""
+    labels = item.labels
     for content, exists in (
-        ("poses", dataset_frame.frame.pose() is not None),
-        ("point labels", dataset_frame.frame.point_truth() is not None),
+        ("poses", item.frame.pose() is not None),
+        ("point labels", item.frame.point_truth() is not None),
         ("boxes", len(labels) > 0),
         ("track ids", bool((labels.track_ids != NO_TRACK).any())),
     ):
-        if exists and content not in stored_content:
-            summary.remark(f"left out: {content}, which the layout cannot store")
+        if exists and content not in storable:
+            summary.add_remark(f"left out: {content}, which the layout cannot store")
 
 
 def _write_kitti_object(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
-    for dataset_frame in frames:
-        frame, calibration = _ensure_camera(dataset_frame.frame, summary)
+    for item in frames:
+        frame, calibration = _ensure_camera(item.frame, summary)
         write_object_text(
-            folder,
-            dataset_frame.number,
-            _load_cloud(frame, summary),
-            kitti_object.format_frame(dataset_frame.labels, frame),
-            calibration,
+            folder, item.number, _load_cloud(frame, summary), kitti_object.format_frame(item.labels, frame), calibration
         )
-        _remark_losses(summary, dataset_frame, "boxes")
-        yield dataset_frame
+        _remark_losses(summary, item, "boxes")
+        yield item
 
 
 def _write_kitti_tracking(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
     root = folder / "training"
     texts: dict[str, list[str]] = {}
-    for dataset_frame in frames:
-        frame, calibration = _ensure_camera(dataset_frame.frame, summary)
-        name = f"{dataset_frame.drive:04}"
-        write_velodyne(root / f"velodyne/{name}/{dataset_frame.index:06}.bin", _load_cloud(frame, summary))
+    for item in frames:
+        frame, calibration = _ensure_camera(item.frame, summary)
+        name = f"{item.drive:04}"
+        write_velodyne(root / f"velodyne/{name}/{item.index:06}.bin", _load_cloud(frame, summary))
         if name not in texts:
             write_bytes(root / f"calib/{name}.txt", format_calibration(calibration).encode())
-        texts.setdefault(name, []).append(kitti_tracking.format_frame(dataset_frame.labels, frame, dataset_frame.index))
-        _remark_losses(summary, dataset_frame, "boxes, track ids")
-        if (dataset_frame.labels.track_ids == NO_TRACK).any():
-            summary.remark("without a track id: boxes, written with the id -1")
-        yield dataset_frame
+        texts.setdefault(name, []).append(kitti_tracking.format_frame(item.labels, frame, item.index))
+        _remark_losses(summary, item, "boxes, track ids")
+        if (item.labels.track_ids == NO_TRACK).any():
+            summary.add_remark("without a track id: boxes, written with the id -1")
+        yield item
     for name, parts in texts.items():
         write_bytes(root / f"label_02/{name}.txt", "".join(parts).encode())
 
 
 def _write_semantickitti(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
     drives: dict[int, list[tuple[int, Calibration, np.ndarray | None]]] = {}
-    for dataset_frame in frames:
-        frame, points = dataset_frame.frame, dataset_frame.frame.point_truth()
+    for item in frames:
+        frame, points = item.frame, item.frame.point_truth()
         if points is None:
             raise InputError(
                 f"frame {frame.name} has no point labels, which SemanticKITTI needs; "
                 "use kitti, kitti-tracking or nuscenes for boxes"
             )
-        drive_scans = drives.setdefault(dataset_frame.drive, [])
+        scans = drives.setdefault(item.drive, [])
         semantickitti.write_scan(
-            folder / f"sequences/{dataset_frame.drive:02}",
-            len(drive_scans),
+            folder / f"sequences/{item.drive:02}",
+            len(scans),
             _load_cloud(frame, summary),
             points.classes,
             points.instances,
         )
-        _remark_losses(summary, dataset_frame, "point labels, poses")
-        drive_scans.append((frame.stamp_ns, frame.calibration() or ASSUMED_CAMERA, frame.pose()))
-        yield dataset_frame
+        _remark_losses(summary, item, "point labels, poses")
+        scans.append((frame.stamp_ns, frame.calibration() or ASSUMED_CAMERA, frame.pose()))
+        yield item
     for drive, rows in drives.items():
         (start, calibration, _), root = rows[0], folder / f"sequences/{drive:02}"
         times = "".join(f"{(stamp - start) / 1e9:.6e}\n" for stamp, _, _ in rows)
@@ -227,15 +211,15 @@ def _write_semantickitti(folder: Path, frames: Iterator[DatasetFrame], summary: 
 
 def _write_nuscenes(folder: Path, frames: Iterator[DatasetFrame], summary: Summary) -> Iterator[DatasetFrame]:
     tables = NuscenesTables(folder)
-    for dataset_frame in frames:
-        frame, labels = dataset_frame.frame, dataset_frame.labels
+    for item in frames:
+        frame, labels = item.frame, item.labels
         if frame.pose() is None:
             summary.add_remark("assumed: a vehicle that does not move, as there are no poses")
         for name in sorted(set(labels.class_names) & SIMILAR_NAMES.keys()):
-            summary.remark(f"written as another class: {name} as {SIMILAR_NAMES[name]}")
-        tables.add(frame, labels, dataset_frame.drive, _load_cloud(frame, summary))
-        _remark_losses(summary, dataset_frame, "boxes, poses, track ids")
-        yield dataset_frame
+            summary.add_remark(f"written as another class: {name} as {SIMILAR_NAMES[name]}")
+        tables.add(frame, labels, item.drive, _load_cloud(frame, summary))
+        _remark_losses(summary, item, "boxes, poses, track ids")
+        yield item
     tables.write()
 
 

@@ -1,8 +1,8 @@
-"""Writer of tables and sweeps in nuScenes' layout, readable by nuscenes-devkit.
+"""Writer of nuScenes' tables and sweeps, which nuscenes-devkit can read.
 
-The tables are defined by Caesar et al., CVPR 2020, and docs/schema_nuscenes.md of nuscenes-devkit.
-A scene is a drive, and each scan is a key frame. The only sensor is LIDAR_TOP, with x to the right
-and y forward; there are no cameras, maps or radars.
+Caesar et al., CVPR 2020, and nuscenes-devkit's docs/schema_nuscenes.md define the tables. A scene
+is a drive, and each scan is a key frame. The only sensor is LIDAR_TOP, with x to the right and y
+ahead; there are no cameras, maps or radars.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ MAP = "maps/none.png"  # required by nuscenes-devkit
 
 
 def make_token(*parts: object) -> str:
-    """Return a token of 32 hexadecimal digits that depends only on the arguments."""
+    """Return a token of 32 hexadecimal digits, the same for the same arguments."""
     return hashlib.sha256("/".join(map(str, parts)).encode()).hexdigest()[:32]
 
 
 class NuscenesTables:
-    """Tables of a data set; add() adds one frame, write() writes the files."""
+    """Tables that grow frame by frame; write() writes them."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -83,11 +83,7 @@ class NuscenesTables:
         self.last_rows: dict[str, dict[str, Any]] = {}  # of each chain, see _add_linked
 
     def add(self, frame: Frame, labels: FrameLabels, drive: int, cloud: np.ndarray) -> None:
-        """Add a scan (N, 4) [x y z intensity] with its labels and write its sweep.
-
-        Raises:
-            InputError: The sweep cannot be written, or the frame cannot be read.
-        """
+        """Add a scan (N, 4) [x y z intensity] with its labels. InputError if that fails."""
         scene = f"scene-{drive + 1:04}"
         sample = make_token(scene, len(self.rows["sample"]))
         file = f"samples/{CHANNEL}/{scene}__{CHANNEL}__{frame.stamp_ns // 1000}.pcd.bin"
@@ -97,33 +93,33 @@ class NuscenesTables:
         pose = frame.pose()
         pose = np.eye(4) if pose is None else pose
         ego = pose[:3, 3] - pose[:3, :3] @ [0, 0, frame.sensor_height]
-        mount_token = make_token("mount", frame.sensor_height)
-        if not any(row["token"] == mount_token for row in self.rows["calibrated_sensor"]):
+        mount = make_token("mount", frame.sensor_height)
+        if not any(row["token"] == mount for row in self.rows["calibrated_sensor"]):
             self._add(
                 "calibrated_sensor",
-                mount_token,
+                mount,
                 sensor_token=make_token(CHANNEL),
                 translation=[0.0, 0.0, frame.sensor_height],
                 rotation=_to_quaternion(TO_SENSOR.T),
                 camera_intrinsic=[],
             )
-        timestamp_field = {"timestamp": frame.stamp_ns // 1000}
+        timestamp = {"timestamp": frame.stamp_ns // 1000}
         self._add(
             "ego_pose",
             make_token(sample, "ego"),
-            **timestamp_field,
+            **timestamp,
             translation=ego.tolist(),
             rotation=_to_quaternion(pose[:3, :3]),
         )
-        self._add_linked("sample", scene, sample, **timestamp_field, scene_token=make_token(scene))
+        self._add_linked("sample", scene, sample, **timestamp, scene_token=make_token(scene))
         self._add_linked(
             "sample_data",
             scene,
             make_token(sample, "data"),
-            **timestamp_field,
+            **timestamp,
             sample_token=sample,
             ego_pose_token=make_token(sample, "ego"),
-            calibrated_sensor_token=mount_token,
+            calibrated_sensor_token=mount,
             fileformat="pcd",
             is_key_frame=True,
             height=0,
@@ -154,11 +150,11 @@ class NuscenesTables:
         write_bytes(path, sweep.tobytes())
 
     def _add_boxes(self, scene: str, sample: str, labels: FrameLabels, pose: np.ndarray, cloud: np.ndarray) -> None:
-        point_counts = np.diff(points_in_boxes(cloud, labels.boxes)[1]) if len(labels) else ()
+        inside = np.diff(points_in_boxes(cloud, labels.boxes)[1]) if len(labels) else ()
         placements = format_boxes(sample, *to_global_boxes(labels.boxes, pose))
         for k, placement in enumerate(placements):
             track, name, extra = labels.track_ids[k], labels.class_names[k], labels.extra[k]
-            lidar, radar = int(point_counts[k]), 0
+            lidar, radar = int(inside[k]), 0
             if rotation := find_read_rotation(labels, k, pose):  # the box is unchanged
                 placement["rotation"] = rotation
                 lidar = extra.get("lidar_points", lidar)
@@ -208,19 +204,15 @@ class NuscenesTables:
         self.rows[table].append({"token": token, **values})
 
     def _add_linked(self, table: str, chain: str, token: str, /, **values: Any) -> None:
-        """Add a row and link it with the previous row of its chain."""
-        previous = self.last.get(f"{table}/{chain}")
+        """Add a row, and link it with the previous row of its chain."""
+        previous = self.last_rows.get(f"{table}/{chain}")
         self._add(table, token, **values, prev=previous["token"] if previous else "", next="")
         if previous is not None:
             previous["next"] = token
-        self.last[f"{table}/{chain}"] = self.rows[table][-1]
+        self.last_rows[f"{table}/{chain}"] = self.rows[table][-1]
 
     def write(self) -> None:
-        """Write the tables.
-
-        Raises:
-            InputError: A file cannot be written.
-        """
+        """Write the tables. Raises InputError if they cannot be written."""
         write_bytes(self.folder / MAP, _make_png())
         for name, rows in self.rows.items():
             write_text(self.folder / VERSION / f"{name}.json", json.dumps(rows, indent=0))
@@ -231,10 +223,10 @@ def _to_quaternion(rotation: np.ndarray) -> list[float]:
 
 
 def _make_png() -> bytes:
-    """Return a PNG image with one black pixel."""
+    """Return a PNG image of one black pixel."""
 
-    def make_chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", crc32(kind + data))
+    def make_chunk(chunk_type: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + chunk_type + data + struct.pack(">I", crc32(chunk_type + data))
 
     return (
         b"\x89PNG\r\n\x1a\n"

@@ -1,4 +1,4 @@
-"""Labels of a drive and of its frames, independent of the file format."""
+"""Labels of a drive, frame by frame, independent of their format."""
 
 from __future__ import annotations
 
@@ -20,18 +20,16 @@ MAX_DIFFERENCE = 1e-4  # tolerance in metres and radians between a box and the o
 
 @dataclass(frozen=True, eq=False)
 class FrameLabels:
-    """K labelled boxes of one frame, in its LiDAR frame; K may be 0.
+    """K labelled boxes of one frame, in its LiDAR frame. No labels is K = 0.
 
     Attributes:
-        name: Name of the frame.
-        stamp_ns: Stamp of the frame.
+        name, stamp_ns: those of the frame.
         boxes: (K, 7) float64 [x y z l w h yaw], metres and radians.
-        class_names: K class names, which may be any text.
-        track_ids: (K,) int64, -1 for none.
-        scores: (K,) float64, NaN for none.
-        extra: K JSON objects with additional fields of the format.
-        notes: (class, JSON object) of each object without a 3D box, such as KITTI's DontCare
-            regions.
+        class_names: K strings, any text.
+        track_ids: (K,) int64, -1 = none.
+        scores: (K,) float64, NaN = none.
+        extra: K JSON objects with further fields of the format.
+        notes: (class, JSON object) of objects without a 3D box, such as KITTI's DontCare regions.
     """
 
     name: str
@@ -55,12 +53,10 @@ class FrameLabels:
         notes: Iterable[tuple[str, dict[str, Any]]] = (),
         where: object = None,
     ) -> FrameLabels:
-        """Make labels and convert dtypes and shapes.
+        """Make labels, with conversion of dtypes and shapes.
 
-        Raises:
-            InputError: A box is not finite, is beyond MAX_RANGE or has a side that is not positive;
-                a track id is not an integer; or the columns differ in length. The message starts
-                with `where`.
+        Raises InputError that names `where` if a box is not finite, is beyond MAX_RANGE or has a
+        side that is not positive, if a track id is not an integer, or if columns differ in length.
         """
         where = where or f"the labels of frame {name}"
         try:
@@ -88,12 +84,12 @@ class FrameLabels:
                 f"{where}: {count} boxes, {len(labels.class_names)} classes and "
                 f"{len(labels.extra)} extras; each box needs one of each"
             )
-        is_invalid = ~(
+        invalid = ~(
             (np.abs(boxes[:, :6]) <= MAX_RANGE).all(axis=1) & np.isfinite(boxes[:, 6]) & (boxes[:, 3:6] > 0).all(axis=1)
         )
-        if is_invalid.any():
+        if invalid.any():
             raise InputError(
-                f"{where}, box {np.flatnonzero(is_invalid)[0] + 1} of {count}: its "
+                f"{where}, box {np.flatnonzero(invalid)[0] + 1} of {count}: its "
                 f"numbers must be finite and within {MAX_RANGE:g} m, its sides above "
                 "0; correct or remove it"
             )
@@ -110,8 +106,8 @@ class DriveLabels:
     """Labels of a drive.
 
     Attributes:
-        frames: Labels of each frame, in the order of the frames.
-        extra: JSON object with the content of a file that belongs to the drive, by format.
+        frames: FrameLabels of each frame, in the order of the frames.
+        extra: content of a format for the whole drive, as JSON object, by format.
     """
 
     frames: list[FrameLabels]
@@ -121,7 +117,7 @@ class DriveLabels:
         return len(self.frames)
 
     def take_first(self, count: int) -> DriveLabels:
-        """Return the labels of the first `count` frames."""
+        """Return the labels of the first frames."""
         return DriveLabels(self.frames[:count], self.extra)
 
     @property
@@ -143,20 +139,20 @@ def make_frame_labels(
 
 
 def read_frame_labels(frame: Frame) -> FrameLabels:
-    """Read the labels of a frame from its recording, with their original class names."""
+    """Read the labels of a frame in a recording, with their original class names."""
     truth = frame.truth()
     if truth is None:
         return FrameLabels.of(frame.name, frame.stamp_ns)
-    extra = [dict(fields) for fields in truth.extras]
-    ids = [fields.pop("track_id", NO_TRACK) for fields in extra]
-    scores = [fields.pop("score", np.nan) for fields in extra]
+    extra = [dict(e) for e in truth.extras]
+    ids = [e.pop("track_id", NO_TRACK) for e in extra]
+    scores = [e.pop("score", np.nan) for e in extra]
     classes = [
         str(
-            fields.pop("class_name", None)
-            or (label == OTHER_CLASS and (fields.get("detection_name") or fields.get("category")))
+            e.pop("class_name", None)
+            or (label == OTHER_CLASS and (e.get("detection_name") or e.get("category")))
             or label
         )
-        for fields, label in zip(extra, truth.labels)
+        for e, label in zip(extra, truth.labels)
     ]
     return FrameLabels.of(frame.name, frame.stamp_ns, truth.boxes, classes, ids, scores, extra, truth.notes)
 
@@ -170,7 +166,7 @@ def _to_integers(ids: np.ndarray) -> np.ndarray:
 
 
 def to_ground_truth(labels: FrameLabels) -> GroundTruth:
-    """Convert labels to GroundTruth; unknown classes become Misc and keep their name in extras."""
+    """Convert labels to GroundTruth; unknown classes become Misc, with their name in extras."""
     extras = []
     for k, (name, extra) in enumerate(zip(labels.class_names, labels.extra)):
         class_name = {} if name in CLASSES else {"class_name": name}
@@ -179,7 +175,7 @@ def to_ground_truth(labels: FrameLabels) -> GroundTruth:
 
 
 def get_id_and_score(labels: FrameLabels, k: int) -> dict[str, Any]:
-    """Return the track_id and score of box k as a dict that omits missing values."""
+    """Return the track_id and score of box k, without missing ones."""
     fields: dict[str, Any] = {}
     if labels.track_ids[k] != NO_TRACK:
         fields["track_id"] = int(labels.track_ids[k])
@@ -189,7 +185,7 @@ def get_id_and_score(labels: FrameLabels, k: int) -> dict[str, Any]:
 
 
 def is_unchanged(box: Sequence[float] | np.ndarray, original: Sequence[float] | np.ndarray) -> bool:
-    """Return True if a box (7,) equals the original one, so that its other fields remain valid."""
+    """Return True if a box (7,) equals the original that was read, so that its other fields are valid."""
     difference = np.subtract(box, original)
     difference[6] = wrap_angle(difference[6])
     return bool(np.abs(difference).max() < MAX_DIFFERENCE)

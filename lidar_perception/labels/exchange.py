@@ -1,4 +1,4 @@
-"""Import and export of labels: table of the formats, and recognition of the format of a file."""
+"""Import and export of labels: recognition of the format, and one reader and writer per format."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ WITH_NOTES = {"kitti", "kitti-tracking", "openlabel", "mcap", "mcap-labels"}
 
 @dataclass(frozen=True)
 class ExportResult:
-    """Number of exported boxes and frames, and descriptions of content that was left out."""
+    """Number of exported boxes and frames, and content that the format cannot store, as text."""
 
     path: Path
     boxes: int
@@ -71,8 +71,7 @@ class ExportResult:
 def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabels:
     """Read the labels at a path for each frame of a drive.
 
-    Raises:
-        InputError: The labels cannot be read, or belong to frames that are not in the drive.
+    Raises InputError if they cannot be read, or belong to frames that the drive does not have.
     """
     with np.errstate(all="ignore"):  # FrameLabels.of rejects numbers that overflow
         read = READERS[resolve_format(format, READERS)]
@@ -82,10 +81,9 @@ def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabe
 def export_labels(
     labels: DriveLabels, format: str, out: Path, frames: Sequence[Frame], force: bool = False
 ) -> ExportResult:
-    """Write the labels of a drive; existing files are replaced only with `force`.
+    """Write the labels of the frames of a drive; replace existing files only with `force`.
 
-    Raises:
-        InputError: The labels cannot be written; nothing is left behind.
+    Raises InputError, without partial output, if they cannot be written.
     """
     format = resolve_format(format, FORMATS)
     if len(labels) != len(frames):
@@ -97,23 +95,17 @@ def export_labels(
         lambda: FORMATS[format][1](labels, out, frames[:], force),
     )
     notes = 0 if format in WITH_NOTES else sum(len(frame_labels.notes) for frame_labels in labels.frames)
-    has_unstored_ids = format == "kitti" and any(
-        (frame_labels.track_ids != NO_TRACK).any() for frame_labels in labels.frames
-    )
+    has_ids = format == "kitti" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
     return ExportResult(
         out,
         labels.box_count,
         len(labels),
-        (*((f"{notes} regions without a box",) if notes else ()), *(("track ids",) if has_unstored_ids else ())),
+        (*((f"{notes} regions without a box",) if notes else ()), *(("track ids",) if has_ids else ())),
     )
 
 
 def recognise_format(path: Path) -> str:
-    """Recognise the format of the labels at a path.
-
-    Raises:
-        InputError: The format is not recognised.
-    """
+    """Return the format of the labels at a path. Raises InputError if it cannot be recognised."""
     files = (
         [path]
         if path.is_file()
@@ -135,32 +127,29 @@ def recognise_format(path: Path) -> str:
         if find_label_folder(path, folder) != path:
             return format
     for file in files:
-        file_format = _recognise_text(file) if file.suffix == ".txt" else _recognise_json(read_json(file))
-        if file_format:
-            return file_format
+        recognised = _recognise_text(file) if file.suffix == ".txt" else _recognise_json(read_json(file))
+        if recognised:
+            return recognised
     raise InputError(f"no labels are recognised in {path}; give their format with --from, one of {', '.join(READERS)}")
 
 
 def _recognise_text(file: Path) -> str:
-    """Recognise a text format by the number of columns before the class name in the first line.
-
-    Returns "" for other text files.
-    """
+    """Recognise the format by the number of columns before the class in the first line."""
     words = read_text(file, MAX_BYTES).lstrip().partition("\n")[0].split()
     if words and words[0].endswith(":"):
         return ""  # the file is a calibration
-    number_count = 0
+    numbers = 0
     with suppress(ValueError):
         for word in words:
             float(word)
-            number_count += 1
-    if number_count == 0:
+            numbers += 1
+    if numbers == 0:
         return "kitti" if len(words) > 3 else ""
-    return "kitti-tracking" if number_count == 2 else "openpcdet" if number_count == 7 else ""
+    return "kitti-tracking" if numbers == 2 else "openpcdet" if numbers == 7 else ""
 
 
 def _recognise_json(content: Any) -> str:
-    """Recognise a JSON format by its keys; return "" for files without boxes and other JSON files."""
+    """Recognise the format by the keys; "" for files without boxes, and for other JSON files."""
     with suppress(TypeError, LookupError, AttributeError):  # values may be of any type
         if isinstance(content, list) or "objs" in content:
             boxes = content if isinstance(content, list) else content["objs"]

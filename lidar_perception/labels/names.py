@@ -1,4 +1,4 @@
-"""Names of label formats and their aliases."""
+"""Names of formats and their aliases."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ ALIASES = {"kitti-object": "kitti", "bag": "mcap", "bag-labels": "mcap-labels"}
 
 
 def resolve_format(name: str, names: Iterable[str]) -> str:
-    """Return the name of a format as it is spelt in `names`.
-
-    Case does not matter, nor does the choice between hyphens and underscores.
+    """Return the name of a format as spelt in `known`; case, hyphens and underscores do not matter.
 
     Raises:
-        InputError: `names` has no such format.
+        InputError: `known` has no such name.
     """
-    format_name = name.strip().lower().replace("_", "-")
-    format_name, names = ALIASES.get(format_name, format_name), list(names)
-    if format_name not in names:
+    normalised = name.strip().lower().replace("_", "-")
+    normalised, names = ALIASES.get(normalised, normalised), list(names)
+    if normalised not in names:
         raise unknown_name("format", name, names)
-    return format_name
+    return normalised

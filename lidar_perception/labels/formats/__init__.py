@@ -1,1 +1,1 @@
-"""Label formats, one module each, with read(path, frames) and write(labels, out, frames)."""
+"""One module per label format, with read(path, frames) and write(labels, out, frames)."""

@@ -1,7 +1,7 @@
 """Labels in a rosbag2 bag, as MarkerArray and Detection3DArray, with or without clouds.
 
-A message belongs to the frame with its header.stamp. Numbers are stored without rounding.
-Detection3DArray has one class, score and id per box; other fields are in the text of the markers.
+A message belongs to the frame of its header.stamp. Numbers are exact. Detection3DArray has one
+class, score and id per box; other fields are in the text of the markers.
 """
 
 from __future__ import annotations
@@ -27,11 +27,10 @@ MARKERS, DETECTIONS = "visualization_msgs/msg/MarkerArray", "vision_msgs/msg/Det
 
 
 def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels:
-    """Read the boxes from a MarkerArray or Detection3DArray topic of any node.
+    """Read the boxes on a topic of any node, MarkerArray or Detection3DArray.
 
-    Track ids are read from `track_id` in the text of label markers and from `id` in the text of
-    track markers. The ids of a Detection3DArray are track ids unless they only number the boxes of
-    each message.
+    Track ids are `track_id` in the text of label markers, and `id` in that of track markers. The
+    ids of a Detection3DArray are track ids unless they only number the boxes of each message.
     """
     stamps = {frame.stamp_ns for frame in frames}
     with Bag(path) as bag:
@@ -40,12 +39,12 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
             raise InputError(
                 f"{path}: {topic} is {bag.topics[topic]}, but labels are {MARKERS} or {DETECTIONS}; give another topic"
             )
-        is_marker_topic = bag.topics[topic] == MARKERS
+        are_markers = bag.topics[topic] == MARKERS
         objects_by_stamp: dict[int, MarkedObjects] = {}
         poses = BagPoses(BagHandle(path), read_frame_id(frames))
-        for _, message_time_ns, msg in bag.messages({topic}):
-            objects = from_marker_array(msg) if is_marker_topic else from_detection_array(msg)
-            stamp_ns = objects.stamp_ns or (0 if 0 in stamps else message_time_ns)
+        for _, time, msg in bag.messages({topic}):
+            objects = from_marker_array(msg) if are_markers else from_detection_array(msg)
+            stamp_ns = objects.stamp_ns or (0 if 0 in stamps else time)
             objects_by_stamp[stamp_ns] = poses.to_cloud_frame(objects, topic)
     if unknown := sorted(objects_by_stamp.keys() - stamps):
         raise InputError(
@@ -53,15 +52,13 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
             f"{len(objects_by_stamp)} such stamps), where the drive has no frame; give the drive "
             "that was labelled"
         )
-    has_ids = is_marker_topic or any(
-        sorted(objects.ids.tolist()) != list(range(len(objects))) for objects in objects_by_stamp.values()
-    )
+    has_ids = are_markers or any(sorted(o.ids.tolist()) != list(range(len(o))) for o in objects_by_stamp.values())
     return DriveLabels(
         [
             _make_frame_labels(
                 frame,
                 objects_by_stamp.get(frame.stamp_ns),
-                is_marker_topic,
+                are_markers,
                 has_ids,
                 f"{path}, {topic} at {frame.stamp_ns} ns",
             )
@@ -71,24 +68,24 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
 
 
 def _make_frame_labels(
-    frame: Frame, objects: MarkedObjects | None, from_markers: bool, has_ids: bool, where: str
+    frame: Frame, objects: MarkedObjects | None, are_markers: bool, has_ids: bool, where: str
 ) -> FrameLabels:
     if objects is None:
         return FrameLabels.of(frame.name, frame.stamp_ns)
-    extra = [dict(fields) for fields in objects.extras]
+    extra = [dict(e) for e in objects.extras]
     ids = [NO_TRACK] * len(objects)
     for k, fields in enumerate(extra):
-        if from_markers:
+        if are_markers:
             ids[k] = fields.pop("track_id", fields.pop("id", NO_TRACK) if "velocity" in fields else NO_TRACK)
         elif has_ids:
             ids[k] = int(objects.ids[k])
-    scores = [fields.pop("score", np.nan) for fields in extra] if from_markers else objects.scores
-    names = [fields.pop("class_name", label) for fields, label in zip(extra, objects.labels)]
+    scores = [e.pop("score", np.nan) for e in extra] if are_markers else objects.scores
+    names = [e.pop("class_name", label) for e, label in zip(extra, objects.labels)]
     return FrameLabels.of(frame.name, frame.stamp_ns, objects.boxes, names, ids, scores, extra, objects.notes, where)
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False, clouds: bool = True) -> None:
-    """Write a bag with the labels, poses, calibration and, optionally, clouds of the frames."""
+    """Write a bag with the labels, poses, camera and, optionally, clouds of the frames to `out`."""
     write_bag(
         out,
         (

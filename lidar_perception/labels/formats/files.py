@@ -1,4 +1,4 @@
-"""Functions for label files: assignment to frames and drives, track names, and JSON."""
+"""Label files: their assignment to frames and drives, track names, and JSON."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CONFLICTING = "kept"  # field with the fields whose names the format uses itself
 
 
 def group_by_sequence(frames: Sequence[Frame]) -> dict[str, list[int]]:
-    """Return the positions of the frames of each sequence, in order."""
+    """Return the positions of frames by the sequence that they belong to, in order."""
     positions: dict[str, list[int]] = {}
     for i, frame in enumerate(frames):
         positions.setdefault(frame.sequence, []).append(i)
@@ -27,13 +27,9 @@ def group_by_sequence(frames: Sequence[Frame]) -> dict[str, list[int]]:
 
 
 def list_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[str, Path]:
-    """Return the label file of each drive.
+    """Return the label file of each drive: `path` if it has the suffix, else path/DRIVE.suffix.
 
-    It is `path` if it has the suffix, otherwise path/DRIVE.suffix. A drive without a name is called
-    0000.
-
-    Raises:
-        InputError: `path` is a single file, but there are several drives.
+    A drive without a name is 0000. Raises InputError for one file and several drives.
     """
     names = list(group_by_sequence(frames))
     if path.suffix == suffix:
@@ -47,12 +43,9 @@ def list_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[s
 
 
 def find_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[str, Path]:
-    """Return the label file of each drive that has one; see list_drive_files.
+    """Return the existing files of list_drive_files, and `path` if it is a file.
 
-    A `path` with the suffix is returned even if it does not exist.
-
-    Raises:
-        InputError: See list_drive_files and check_label_files.
+    Raises InputError as check_label_files does.
     """
     files = list_drive_files(path, frames, suffix)
     if path not in files.values():
@@ -63,15 +56,9 @@ def find_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[s
 def write_drives(
     out: Path, frames: Sequence[Frame], suffix: str, force: bool, write: Callable[[Path, str, list[int]], None]
 ) -> None:
-    """Call write(file, drive, positions) for each drive, with the positions of its frames.
+    """Call write(file, drive, positions of its frames) for each drive.
 
-    Args:
-        out: File of the only drive if it has the suffix, otherwise a folder. The folder appears
-            when it is complete.
-        frames: Frames of all drives.
-        suffix: Suffix of a label file.
-        force: Replace existing files.
-        write: Function that writes the file of one drive.
+    out: file of the only drive if it has the suffix, else a folder, which appears when complete.
     """
     drives = group_by_sequence(frames)
     if out.suffix == suffix:
@@ -85,37 +72,25 @@ def write_drives(
 
 
 def list_frame_files(folder: Path, frames: Sequence[Frame], suffix: str) -> list[Path]:
-    """Return the label file FRAME.suffix of each frame.
-
-    If there are several drives, each has its own folder.
-    """
-    has_several_drives = len(group_by_sequence(frames)) > 1
-    return [
-        folder / f"{frame.name if has_several_drives else frame.name.rpartition('/')[2]}{suffix}" for frame in frames
-    ]
+    """Return the label file of each frame, FRAME.suffix, in a folder per drive if there are several."""
+    has_drives = len(group_by_sequence(frames)) > 1
+    return [folder / f"{frame.name if has_drives else frame.name.rpartition('/')[2]}{suffix}" for frame in frames]
 
 
-def check_label_files(
-    folder: Path, label_files: Sequence[Path], suffix: str, ignored_names: Sequence[str] = ()
-) -> None:
-    """Check that a folder has label files, and only those of the given frames.
+def check_label_files(folder: Path, expected: Sequence[Path], suffix: str, ignored: Sequence[str] = ()) -> None:
+    """Raise InputError if a folder has no label files, or one that is not in `expected`.
 
     Args:
-        folder: The folder.
-        label_files: Label files of the frames.
-        suffix: Suffix of a label file.
-        ignored_names: Names of other files that are allowed.
-
-    Raises:
-        InputError: The folder does not exist, has no label file, or has one of another frame.
+        expected: label files of the frames.
+        ignored: names of other files that are allowed.
     """
     if not folder.is_dir():
         raise InputError(f"the folder {folder} does not exist; give the folder of the label files")
-    names = {str(path.relative_to(folder)) for path in label_files}
+    names = {str(path.relative_to(folder)) for path in expected}
     existing = {
         str(path.relative_to(folder))
         for path in folder.rglob(f"*{suffix}")
-        if path.name not in ignored_names and not path.name.startswith(".")
+        if path.name not in ignored and not path.name.startswith(".")
     }
     example = min(names, default="none")
     if unknown := sorted(existing - names):
@@ -131,7 +106,7 @@ def check_label_files(
 def merge_extra(extra: dict[str, Any], own_names: Collection[str]) -> dict[str, Any]:
     """Return the extra fields of a box as fields of a format.
 
-    Fields whose names are also names of the format are stored under KEPT.
+    Fields whose names the format uses itself are stored under CONFLICTING.
     """
     conflicting = {key: value for key, value in extra.items() if key in own_names or key == CONFLICTING}
     return {
@@ -142,13 +117,13 @@ def merge_extra(extra: dict[str, Any], own_names: Collection[str]) -> dict[str, 
 
 def extract_extra(item: dict[str, Any], own_names: Collection[str]) -> dict[str, Any]:
     """Return the extra fields of a box, the inverse of merge_extra."""
-    conflicting = item.get(KEPT)
-    fields = {key: value for key, value in item.items() if key not in own_names}
-    return {**fields, **fields.pop(KEPT)} if isinstance(conflicting, dict) else fields
+    conflicting = item.get(CONFLICTING)
+    extra = {key: value for key, value in item.items() if key not in own_names}
+    return {**extra, **extra.pop(CONFLICTING)} if isinstance(conflicting, dict) else extra
 
 
 def assign_track_ids(names: Iterable[str]) -> dict[str, int]:
-    """Return a track id for each name: its number if the name is a number, otherwise a new one."""
+    """Return a track id for each name: the name if it is a number, else a new number."""
     unique_names = sorted(set(names))
     ids = {name: int(name) for name in unique_names if is_track_number(name)}
     new_ids = itertools.count(max([0, *ids.values()]) + 1)
@@ -156,9 +131,9 @@ def assign_track_ids(names: Iterable[str]) -> dict[str, int]:
 
 
 def collect_track_names(frames: Iterable[FrameLabels], key: str) -> dict[int, str]:
-    """Return the original name of each track, stored in extra[key] when the file was read.
+    """Return the names of tracks in the file that was read, from extra[key].
 
-    Each name is used for one track only, so that the parts of a split track have different names.
+    Each name is used for one track only, so that parts of a split track have different names.
     """
     names: dict[int, str] = {}
     used_names = set()
@@ -172,16 +147,12 @@ def collect_track_names(frames: Iterable[FrameLabels], key: str) -> dict[int, st
 
 
 def is_track_number(name: str) -> bool:
-    """Return True if the name of a track is an integer in its usual spelling."""
+    """Return True if a track id is a number in its usual spelling."""
     return name.isascii() and name.isdigit() and len(name) < 19 and name == str(int(name))
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        InputError: The file cannot be read or is not valid JSON; the message has the line.
-    """
+    """Read a JSON file. InputError with the line of a syntax error."""
     text = read_text(path, MAX_BYTES)
     try:
         return json.loads(text)
@@ -194,12 +165,12 @@ def read_json(path: Path) -> Any:
 
 
 def write_json(path: Path, content: Any, indent: int | None = None) -> None:
-    """Write a standard JSON file; numbers that are not finite become null."""
+    """Write a standard JSON file: null instead of numbers that are not finite."""
     write_text(path, json.dumps(replace_non_finite(content), indent=indent, allow_nan=False))
 
 
 def replace_non_finite(value: Any) -> Any:
-    """Return a JSON value in which numbers that are not finite are replaced by null."""
+    """Return a JSON value with null instead of numbers that are not finite."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -210,9 +181,9 @@ def replace_non_finite(value: Any) -> Any:
 
 
 def report_format_errors(where: str, read: Callable[[], Any]) -> Any:
-    """Call read() and convert its errors to InputError with the prefix `where`.
+    """Call read(), and convert its errors to InputErrors that name `where`.
 
-    Use it for parsers of files whose values can have any type.
+    For parsers of files whose values may be of any type.
     """
     try:
         return read()

@@ -35,11 +35,7 @@ LEVELS = (-1, 0, 1, 2)  # levels of truncation in the tracking layout
 
 
 def require_calibration(frame: Frame) -> Calibration:
-    """Return the calibration of a frame.
-
-    Raises:
-        InputError: The frame has no calibration.
-    """
+    """Return the calibration of a frame; raise InputError if it has none."""
     calibration = frame.calibration()
     if calibration is None:
         raise InputError(
@@ -51,10 +47,7 @@ def require_calibration(frame: Frame) -> Calibration:
 
 
 def find_label_folder(path: Path, name: str) -> Path:
-    """Find the folder `name` (label_2 or label_02) in a folder of KITTI's layout.
-
-    Returns `path` itself if there is no such folder.
-    """
+    """Return the folder `name` (label_2 or label_02) in a folder of KITTI's layout, else `path`."""
     for inner in (f"training/{name}", name):
         path = path / inner if (path / inner).is_dir() else path
     return path
@@ -67,75 +60,72 @@ def parse_frame_labels(frame: Frame, lines: Sequence[dict[str, Any]], where: obj
     to_lidar = np.linalg.inv(require_calibration(frame).lidar_to_camera)
     rows: list[Row] = []
     notes: list[tuple[str, dict[str, Any]]] = []
-    for columns in lines:
-        box = to_lidar_box(columns, to_lidar)
-        extra = {key: value for key, value in columns.items() if key != "class"}
+    for line in lines:
+        box = to_lidar_box(line, to_lidar)
+        extra = {key: value for key, value in line.items() if key != "class"}
         if box is None:
-            notes.append((columns["class"], extra))
+            notes.append((line["class"], extra))
         else:
-            rows.append((box, columns["class"], extra.pop("track_id", NO_TRACK), extra.pop("score", np.nan), extra))
+            rows.append((box, line["class"], extra.pop("track_id", NO_TRACK), extra.pop("score", np.nan), extra))
     return make_frame_labels(frame, rows, notes, where)
 
 
 def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str, Any]]:
-    """Convert labels to the columns for data.kitti.labels.format_label: boxes first, then notes.
+    """Convert labels to lines for data.kitti.labels.format_label: one per box, then the notes.
 
-    For new and changed boxes, alpha, the 2D box (zero outside the image), the truncation and, if
-    missing, the level of occlusion by other boxes are computed.
+    Of new and changed boxes, alpha, the 2D box (zero outside the image), the truncation and, unless
+    given, the level of occlusion by other boxes are computed.
 
     Args:
-        labels: Labels of the frame.
-        frame: The frame.
-        levels: True to write truncation as a level, as in the tracking layout; False to write it as
-            a fraction.
+        levels: truncation is a level, as in the tracking layout, instead of a share.
 
     Raises:
-        InputError: There are boxes but no calibration.
+        InputError: there are boxes, but no calibration.
     """
     notes = [_make_note_line(name, extra) for name, extra in labels.notes]
     if len(labels):
         calibration = require_calibration(frame)
         to_lidar = np.linalg.inv(calibration.lidar_to_camera)
-        pixels, outside_fractions = project_boxes(labels.boxes, calibration)
+        pixels, outside = project_boxes(labels.boxes, calibration)
         to_camera = calibration.lidar_to_camera
         depths = labels.boxes[:, :3] @ to_camera[2, :3] + to_camera[2, 3]
         occlusion = compute_occlusion_levels(pixels, depths)
     lines = []
     for k, (box, name, extra) in enumerate(zip(labels.boxes, labels.class_names, labels.extra)):
-        columns = {
+        line = {
             "class": "_".join(name.split()) or "Misc",
             **to_camera_box(box, calibration.lidar_to_camera),
             "bbox": np.nan_to_num(pixels[k]).tolist(),
-            "truncated": float(outside_fractions[k]),
+            "truncated": float(outside[k]),
             "occluded": level if isinstance(level := extra.get("occluded"), int) else int(occlusion[k]),
         }
-        if _is_as_read(box, extra, to_lidar):
-            columns |= {column: extra[column] for column in COLUMNS}
+        if _is_unchanged_line(box, extra, to_lidar):
+            line |= {column: extra[column] for column in COLUMNS}
             if not levels and _is_level(extra["truncated"], labels.track_ids[k]):
-                columns["truncated"] = float(outside_fractions[k])
-        lines.append({**columns, **get_id_and_score(labels, k)})
-    for columns, track in zip(lines + notes, [*labels.track_ids, *[0] * len(notes)]) if levels else ():
-        value = columns["truncated"]
-        columns["truncated"] = str(int(value) if _is_level(value, track) else max(-1, round(2 * value)))
+                line["truncated"] = float(outside[k])
+        lines.append({**line, **get_id_and_score(labels, k)})
+    for line, track in zip(lines + notes, [*labels.track_ids, *[0] * len(notes)]) if levels else ():
+        value = line["truncated"]
+        line["truncated"] = str(int(value) if _is_level(value, track) else max(-1, round(2 * value)))
     return lines + notes
 
 
 def _make_note_line(name: str, extra: dict[str, Any]) -> dict[str, Any]:
-    """Return the columns of an object without a 3D box: as read, or those of DontCare."""
-    kinds = {"bbox": (4,), "dimensions": (3,), "location": (3,)}
+    """Return the line of an object without a 3D box: as read, or with the columns of DontCare."""
+    shapes = {"bbox": (4,), "dimensions": (3,), "location": (3,)}
     with suppress(KeyError, TypeError, ValueError):
         if all(np.array(extra[c], np.float64).shape == shapes.get(c, ()) for c in COLUMNS):
             return {"class": name, **extra}
     return {"class": "_".join(name.split()) or "Misc", **DONT_CARE, "bbox": [0.0] * 4}
 
 
-def _is_as_read(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndarray) -> bool:
-    """Return True if `extra` has all columns of the box and the box has not changed."""
+def _is_unchanged_line(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndarray) -> bool:
+    """Return True if extra has all columns of the unchanged box."""
     try:
-        original_box = to_lidar_box(extra, to_lidar)
+        original = to_lidar_box(extra, to_lidar)
         return (
-            original_box is not None
-            and is_unchanged(box, original_box)
+            original is not None
+            and is_unchanged(box, original)
             and np.shape([extra[c] for c in ("truncated", "occluded", "alpha")]) == (3,)
             and np.shape(extra["bbox"]) == (4,)
         )
@@ -144,32 +134,28 @@ def _is_as_read(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndarray) ->
 
 
 def _is_level(truncated: float, track: int) -> bool:
-    """Return True if a truncation is a level, as in the tracking layout, not a fraction."""
+    """Return True if a truncation is a level, as in the tracking layout, instead of a share."""
     return isinstance(truncated, int) or (track != NO_TRACK and truncated in LEVELS)
 
 
 def compute_occlusion_levels(pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Compute the level of occlusion of 2D boxes by nearer boxes.
+    """Compute the level of occlusion of 2D boxes (K, 4) by nearer ones, given their depths (K,).
 
-    Unlabelled objects are not considered.
-
-    Args:
-        pixels: (K, 4) boxes [left top right bottom].
-        depths: (K,) depth of each box.
+    Unlabelled occluders are not considered.
 
     Returns:
-        (K,) int: 0 visible, 1 partly occluded, 2 largely occluded.
+        (K,) int: 0 visible, 1 partly, 2 largely occluded.
     """
     levels = np.zeros(len(pixels), int)
     for k, (left, top, right, bottom) in enumerate(pixels):
-        nearer_boxes = pixels[(depths < depths[k]) & np.isfinite(pixels[:, 0])]
-        if not np.isfinite(left) or len(nearer_boxes) == 0:
+        nearer = pixels[(depths < depths[k]) & np.isfinite(pixels[:, 0])]
+        if not np.isfinite(left) or len(nearer) == 0:
             continue
         # Sample a grid of 32 x 32 points in the box, so that overlapping boxes count once.
         u = left + (np.arange(32) + 0.5) / 32 * (right - left)
         v = top + (np.arange(32) + 0.5) / 32 * (bottom - top)
-        in_columns = (u >= nearer_boxes[:, :1]) & (u < nearer_boxes[:, 2:3])
-        in_rows = (v >= nearer_boxes[:, 1:2]) & (v < nearer_boxes[:, 3:])
-        hidden_fraction = (in_columns[:, None, :] & in_rows[:, :, None]).any(axis=0).mean()
-        levels[k] = int(hidden_fraction >= MIN_PARTLY) + int(hidden_fraction >= MIN_LARGELY)
+        inside_columns = (u >= nearer[:, :1]) & (u < nearer[:, 2:3])
+        inside_rows = (v >= nearer[:, 1:2]) & (v < nearer[:, 3:])
+        hidden_share = (inside_columns[:, None, :] & inside_rows[:, :, None]).any(axis=0).mean()
+        levels[k] = int(hidden_share >= MIN_PARTLY) + int(hidden_share >= MIN_LARGELY)
     return levels

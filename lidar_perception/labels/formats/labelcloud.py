@@ -1,11 +1,10 @@
 """labelCloud's JSON files, one per frame: a centroid and rotations, or eight vertices.
 
-Rotations are about z, then the rotated y, then the rotated x, in degrees from 0 to 360
-(centroid_abs) or in radians from -pi to pi (centroid_rel). The length is along the rotated x axis.
-Vertices start at the rear right corner of the bottom face and continue with the rear left one; the
-top face follows in the same order (seen along y as in labelCloud's manual). Numbers have eight
-decimals, as in labelCloud. labelCloud reads the classes and the format from _classes.json in the
-same folder, and drops unknown fields when it saves.
+Rotations are about z, then the rotated y, then the rotated x: in degrees, 0 to 360 (centroid_abs),
+or in radians, -pi to pi (centroid_rel). The length is along the rotated x axis. Vertices go around
+the bottom from the rear right corner over the rear left one, then around the top, seen along y as
+in labelCloud's manual. Numbers have eight decimals, as in labelCloud. It reads classes and format
+from _classes.json in the same folder, and drops unknown fields when it saves.
 """
 
 from __future__ import annotations
@@ -52,38 +51,38 @@ OWN_FIELDS = {"name", "centroid", "dimensions", "rotations", "vertices", "track_
 def _read(notation: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
     """Read a folder with FRAME.json. A frame without a file has no labels."""
     files = list_frame_files(path, frames, SUFFIX)
-    check_label_files(path, files, SUFFIX, ignored_names=(CLASSES_FILE,))
+    check_label_files(path, files, SUFFIX, ignored=(CLASSES_FILE,))
     classes = path / CLASSES_FILE
     if classes.exists():  # this file states the format
         content = read_json(classes)
-        declared_format = content.get("format") if isinstance(content, dict) else None
-        kind = declared_format if declared_format in KINDS else kind
-    labels, file_fields = [], {}
+        stated_notation = content.get("format") if isinstance(content, dict) else None
+        notation = stated_notation if stated_notation in NOTATIONS else notation
+    labels, headers = [], {}
     for frame, file in zip(frames, files):
         content = read_json(file) if file.exists() else {"objects": []}
         rows = report_format_errors(str(file), partial(_parse_objects, content, notation))
         labels.append(make_frame_labels(frame, rows, where=file))
         if file.exists():
-            file_fields[frame.name] = {k: v for k, v in content.items() if k != "objects"}
-    return DriveLabels(labels, {ROOT: file_fields})
+            headers[frame.name] = {k: v for k, v in content.items() if k != "objects"}
+    return DriveLabels(labels, {ROOT: headers})
 
 
 def _parse_objects(content: dict[str, Any], notation: str) -> list[Row]:
     rows: list[Row] = []
     for item in content["objects"]:
-        extra = extract_extra(item, OWN)
-        orientation = {key: item[key] for key in ("rotations", "vertices") if key in item}
-        box, is_tilted = _parse_box(item, kind)
-        if is_tilted:
-            extra[TILTED] = {**orientation, "unit": kind, "box": box}
+        extra = extract_extra(item, OWN_FIELDS)
+        shape = {key: item[key] for key in ("rotations", "vertices") if key in item}
+        box, tilted = _parse_box(item, notation)
+        if tilted:
+            extra[TILTED] = {**shape, "unit": notation, "box": box}
         rows.append(
             (box, str(item["name"]), int(item.get("track_id", NO_TRACK)), float(item.get("score", math.nan)), extra)
         )
     return rows
 
 
-def _parse_box(item: dict[str, Any], kind: str) -> tuple[list[float], bool]:
-    """Return a box [x y z l w h yaw], and True if the original box is tilted."""
+def _parse_box(item: dict[str, Any], notation: str) -> tuple[list[float], bool]:
+    """Return [x y z l w h yaw], and True if the box is tilted."""
     if "vertices" in item:
         corners = np.array(item["vertices"], float).reshape(8, 3)
         edges = np.array(
@@ -109,10 +108,10 @@ def _parse_box(item: dict[str, Any], kind: str) -> tuple[list[float], bool]:
     )
 
 
-def _write(kind: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
-    """Write FRAME.json for each frame, and _classes.json, to the folder `out`."""
+def _write(notation: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
+    """Write FRAME.json of each frame and _classes.json to the folder `out`."""
     names = sorted({name for frame_labels in labels.frames for name in frame_labels.class_names})
-    file_fields = labels.extra.get(ROOT, {})
+    headers = labels.extra.get(ROOT, {})
     with write_folder(out, force) as folder:
         files = list_frame_files(folder, frames, SUFFIX)
         for frame_labels, frame, file in zip(labels.frames, frames, files):
@@ -124,7 +123,7 @@ def _write(kind: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], f
                     "folder": cloud.parent.name,
                     "filename": cloud.name,
                     "path": str(cloud),
-                    **file_fields.get(frame.name, {}),
+                    **headers.get(frame.name, {}),
                     "objects": objects,
                 },
                 1,
@@ -147,9 +146,9 @@ def _make_object(labels: FrameLabels, k: int, notation: str) -> dict[str, Any]:
     x, y, z, length, width, height, _ = box.round(DECIMALS).tolist()
     original = extra.pop(TILTED, None)
     shape: dict[str, Any]
-    if original and original["unit"] == kind and is_unchanged(box, original["box"]):
+    if original and original["unit"] == notation and is_unchanged(box, original["box"]):
         shape = {key: original[key] for key in ("rotations", "vertices") if key in original}
-    elif kind == VERTICES:
+    elif notation == VERTICES:
         shape = {"vertices": box_corners(box[None])[0][CORNERS].round(DECIMALS).tolist()}
     else:
         yaw = math.degrees(box[6]) % 360 if notation == ABSOLUTE else math.remainder(box[6], math.tau)

@@ -73,7 +73,7 @@ def _require_pose(frame: Frame) -> np.ndarray:
 
 
 def _read(task: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a result file; boxes of other drives in it are ignored."""
+    """Read a file, which may also have boxes of other drives."""
     content = read_json(path)
     results = report_format_errors(str(path), lambda: dict(content["results"]))
     if not results.keys() & {_get_token(frame) for frame in frames}:
@@ -97,37 +97,34 @@ def _read(task: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
 def _parse_boxes(task: str, frame: Frame, boxes: list[dict[str, Any]], ids: dict[str, int]) -> list[Row]:
     rows: list[Row] = []
     pose = _require_pose(frame) if boxes else np.eye(4)  # without boxes, no pose is needed
-    for fields in boxes:
-        kind, attribute = str(fields[f"{task}_name"]), fields.get("attribute_name", "")
-        extra = extract_extra(fields, OWN | {f"{task}_name", f"{task}_score"})
+    for row in boxes:
+        class_name, attribute = str(row[f"{task}_name"]), row.get("attribute_name", "")
+        extra = extract_extra(row, OWN_FIELDS | {f"{task}_name", f"{task}_score"})
         if attribute:
             extra["attribute"] = attribute
-        if (velocity := _parse_velocity(fields.get("velocity"))) is not None:
+        if (velocity := _parse_velocity(row.get("velocity"))) is not None:
             extra["velocity"] = velocity
-        box, is_tilted = _to_local_box(fields, pose)
-        if is_tilted:
-            extra["rotation"] = fields["rotation"]
-        track = str(fields.get("tracking_id", ""))
+        box, tilted = _to_local_box(row, pose)
+        if tilted:
+            extra["rotation"] = row["rotation"]
+        track = str(row.get("tracking_id", ""))
         if track and track != str(ids[track]):
             extra["tracking_id"] = track
-        score = float(fields.get(f"{task}_score", NO_SCORE))
-        if SIMILAR_NAMES.get(extra.get("class_name", "")) == kind:
-            kind = extra.pop("class_name")
-        kind = kind if attribute == NOT_RIDDEN else OUR_NAMES.get(kind, kind)
-        rows.append((box, kind, ids.get(track, NO_TRACK), np.nan if score < 0 else score, extra))
+        score = float(row.get(f"{task}_score", NO_SCORE))
+        if SIMILAR_NAMES.get(extra.get("class_name", "")) == class_name:
+            class_name = extra.pop("class_name")
+        class_name = class_name if attribute == NOT_RIDDEN else OUR_NAMES.get(class_name, class_name)
+        rows.append((box, class_name, ids.get(track, NO_TRACK), np.nan if score < 0 else score, extra))
     return rows
 
 
 def _parse_velocity(velocity: Any) -> list[float] | None:
-    is_valid = velocity is not None and None not in velocity and np.isfinite(velocity).all()
-    return [float(v) for v in velocity] if is_valid else None
+    valid = velocity is not None and None not in velocity and np.isfinite(velocity).all()
+    return [float(v) for v in velocity] if valid else None
 
 
 def _to_local_box(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], bool]:
-    """Transform a global box to the frame with this pose.
-
-    Returns the box, and True if it is tilted in that frame.
-    """
+    """Return the box in the frame with this pose, and True if it is tilted there."""
     width, length, height = row["size"]
     box = GlobalBoxes.of([row["translation"]], [[length, width, height]], [row["rotation"]], 0)
     if not are_valid_rotations(box.rotations).all():
@@ -136,7 +133,7 @@ def _to_local_box(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], b
 
 
 def find_read_rotation(labels: FrameLabels, k: int, pose: np.ndarray) -> list[float] | None:
-    """Return the original rotation [w x y z] of a tilted box; None if the box has changed."""
+    """Return the rotation [w x y z] with which a tilted box was read; None if it was changed."""
     rotation, box = labels.extra[k].get("rotation"), labels.boxes[k]
     if not isinstance(rotation, list) or len(rotation) != 4:
         return None
@@ -150,8 +147,7 @@ def find_read_rotation(labels: FrameLabels, k: int, pose: np.ndarray) -> list[fl
 def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
     """Write one JSON file.
 
-    Missing velocities are computed from the tracks. Without a track they are NaN, which
-    nuscenes-devkit can read.
+    Missing velocities are computed from the tracks, else NaN, which nuscenes-devkit can read.
     """
     check_unused(out, force)
     poses = {i: _require_pose(frame) for i, frame in enumerate(frames) if len(labels.frames[i])}
@@ -172,8 +168,8 @@ def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], f
 def _make_columns(
     task: str, labels: FrameLabels, k: int, pose: np.ndarray, velocity: list[float], names: dict[int, str]
 ) -> dict[str, Any]:
-    """Return the fields of a box other than its position and size."""
-    kind, track = labels.class_names[k], int(labels.track_ids[k])
+    """Return the fields of a box except its position and size, see _write."""
+    class_name, track = labels.class_names[k], int(labels.track_ids[k])
     extra = dict(labels.extra[k])
     attribute = extra.pop("attribute", None) or ""
     if class_name in RIDDEN_CLASSES:
@@ -181,10 +177,10 @@ def _make_columns(
     elif NUSCENES_NAMES.get(class_name) in RIDDEN_CLASSES and attribute == NOT_RIDDEN:
         attribute = ""  # no longer valid, because a person changed the class
     extra.pop("tracking_id", None)
-    if kind in SIMILAR_NAMES:
-        extra["class_name"] = kind
-    if isinstance(stored_velocity := extra.pop("velocity", None), list) and len(stored_velocity) == 2:
-        velocity = _parse_velocity(stored_velocity) or velocity
+    if class_name in SIMILAR_NAMES:
+        extra["class_name"] = class_name
+    if isinstance(read_velocity := extra.pop("velocity", None), list) and len(read_velocity) == 2:
+        velocity = _parse_velocity(read_velocity) or velocity
     columns = {
         "velocity": velocity,
         "attribute_name": attribute,
@@ -202,15 +198,9 @@ def _make_columns(
 def _compute_velocities(
     labels: DriveLabels, frames: Sequence[Frame], poses: dict[int, np.ndarray]
 ) -> dict[tuple[int, int], list[float]]:
-    """Compute velocities in the fixed frame, m/s, from the previous and next box of each track.
+    """Compute velocities in m/s in the fixed frame from the previous to the next box of a track.
 
-    Args:
-        labels: Labels of the frames.
-        frames: The frames.
-        poses: Pose of each frame with boxes.
-
-    Returns:
-        Velocity [x y] by (frame, box).
+    poses: poses of the frames with boxes. Returns velocities by frame and box.
     """
     tracks: dict[tuple[str, int], list[tuple[int, int]]] = {}
     for i, (frame_labels, frame) in enumerate(zip(labels.frames, frames)):
@@ -221,10 +211,10 @@ def _compute_velocities(
     for boxes in tracks.values():
         positions = np.array([(poses[i] @ [*labels.frames[i].boxes[k, :3], 1.0])[:2] for i, k in boxes])
         stamps = np.array([frames[i].stamp_ns for i, _ in boxes], np.int64)
-        for position, box in enumerate(boxes):
-            previous, following = max(position - 1, 0), min(position + 1, len(boxes) - 1)
-            if (seconds := (stamps[following] - stamps[previous]) * 1e-9) > 0:
-                velocities[box] = ((positions[following] - positions[previous]) / seconds).tolist()
+        for n, box in enumerate(boxes):
+            first, last = max(n - 1, 0), min(n + 1, len(boxes) - 1)
+            if (seconds := (stamps[last] - stamps[first]) * 1e-9) > 0:
+                velocities[box] = ((positions[last] - positions[first]) / seconds).tolist()
     return velocities
 
 

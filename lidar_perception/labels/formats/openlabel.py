@@ -1,9 +1,9 @@
 """ASAM OpenLABEL 1.0: one JSON file per drive, with cuboids that have a quaternion.
 
 A cuboid is [x y z qx qy qz qw sx sy sz]: centre, orientation in its coordinate system, and sizes
-along its axes. We write cuboids in the LiDAR's coordinate system, with x forward, y to the left and
-z up, as in ISO 8855. Frame numbers are those of the drive. All other content of a file is
-preserved: that of a cuboid in FrameLabels.extra, that of the drive in DriveLabels.extra.
+along its axes. We write x along the length to the front, y to the left and z up, as in ISO 8855, in
+the LiDAR's coordinate system. Frame numbers are those of the drive. All other content of a file is
+preserved: fields of a cuboid in FrameLabels.extra, those of the drive in DriveLabels.extra.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
 
 
 def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[FrameLabels], dict[str, Any]]:
-    """Read the file of a drive; return the labels of each frame, and its other content."""
+    """Return the labels of each frame, and the other content of the file."""
     content = dict(read_json(path)[ROOT])
     objects, systems = content.get("objects", {}), content.get("coordinate_systems", {})
     frame_contents = content.get("frames", {})
@@ -134,11 +134,8 @@ def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[Frame
 
 
 def _make_region_notes(kind: str, uid: str, data: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    """Return the notes of an object without a cuboid.
-
-    Each 2D box becomes a note with KITTI's columns; the first note also has the object's data. An
-    object without 2D boxes becomes one note with its data.
-    """
+    """Return notes of an object without a cuboid: one with KITTI's columns per 2D box, of which the
+    first has the data, or without 2D boxes, one of the data."""
     values, rest = parts.parse_named_values(data)
     columns = {name: DONT_CARE[name] for name in COLUMNS if name in DONT_CARE}
     notes = [
@@ -148,8 +145,8 @@ def _make_region_notes(kind: str, uid: str, data: dict[str, Any]) -> list[tuple[
     return notes or [(kind, {**values, **({OBJECT: rest} if rest else {}), **({} if values else {UID: uid})})]
 
 
-def _parse_track(cuboid: dict[str, Any], kind: str, number: int) -> tuple[str, int, float]:
-    """Return the class, track id and score of a cuboid."""
+def _parse_track(cuboid: dict[str, Any], object_class: str, number: int) -> tuple[str, int, float]:
+    """Return class, track id and score of a cuboid."""
     values, _ = parts.parse_named_values(cuboid.get("attributes", {}))
     return (
         class_name(values.get(TYPE, object_class)),
@@ -158,22 +155,18 @@ def _parse_track(cuboid: dict[str, Any], kind: str, number: int) -> tuple[str, i
     )
 
 
-def _parse_extra(cuboid: dict[str, Any], box: list[float], is_complete: bool) -> dict[str, Any]:
-    """Return the extra fields of a cuboid.
-
-    `is_complete` is True if the box describes the cuboid completely; otherwise the original cuboid
-    is kept.
-    """
-    values, rest = parts.parse_named_values(cuboid.get("attributes", {}))
+def _parse_extra(cuboid: dict[str, Any], box: list[float], is_plain: bool) -> dict[str, Any]:
+    """Return the extra fields of a cuboid; `is_plain` means that its box describes it completely."""
+    values, other_items = parts.parse_named_values(cuboid.get("attributes", {}))
     extra = {name: v for name, v in values.items() if name not in (SCORE, TRACKED, TYPE)}
-    extra |= {OTHER: rest} if rest else {}
-    if not is_complete or set(cuboid) - {"val", "attributes", "name", "coordinate_system"}:
-        extra[KEPT] = {**{k: v for k, v in cuboid.items() if k != "attributes"}, "box": box}
+    extra |= {OTHER: other_items} if other_items else {}
+    if not is_plain or set(cuboid) - {"val", "attributes", "name", "coordinate_system"}:
+        extra[ORIGINAL] = {**{k: v for k, v in cuboid.items() if k != "attributes"}, "box": box}
     return extra
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
-    """Write FILE.json, or a folder with one file per drive; numbers are stored without rounding."""
+    """Write FILE.json, or a folder with a file per drive. Numbers are exact."""
     original = labels.extra.get(ROOT, {})
 
     def write_drive(file: Path, drive: str, positions: list[int]) -> None:
@@ -185,23 +178,15 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
 def _make_content(
     labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[int], original: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the content of the file of a drive.
-
-    Args:
-        labels: Labels of all frames.
-        frames: All frames.
-        positions: Positions of the drive's frames in `frames`.
-        original: Content of the file that was read, without cuboids; {} for none.
-    """
-    drive_frames = [(frames[i], labels.frames[i]) for i in positions]
-    named_tracks = collect_track_names((frame_labels for _, frame_labels in drive_frames), UID)
-    uids_of_notes = {
-        str(note[UID]) for _, frame_labels in drive_frames for _, note in frame_labels.notes if UID in note
-    }
+    """Return the content of the file of a drive. original: content of the file that
+    was read, without cuboids."""
+    drive = [(frames[i], labels.frames[i]) for i in positions]
+    named_tracks = collect_track_names((frame_labels for _, frame_labels in drive), UID)
+    note_uids = {str(note[UID]) for _, frame_labels in drive for _, note in frame_labels.notes if UID in note}
     used_uids = (
-        {str(i) for _, frame_labels in drive_frames for i in frame_labels.track_ids.tolist()}
+        {str(i) for _, frame_labels in drive for i in frame_labels.track_ids.tolist()}
         | {*named_tracks.values()}
-        | uids_of_notes
+        | note_uids
     )
     objects = {
         uid: dict(o)
@@ -209,9 +194,7 @@ def _make_content(
         if uid in used_uids or not o.get("frame_intervals")
     }  # objects that are still used, or not bound to frames
     systems = (
-        original
-        if original.get("coordinate_systems")
-        else parts.make_coordinate_systems([frame for frame, _ in drive_frames])
+        original if original.get("coordinate_systems") else parts.make_coordinate_systems([frame for frame, _ in drive])
     )
     lidar = parts.find_lidar_system(systems["coordinate_systems"], "the file that was read")
     numbers = [int(uid) for uid in (*used_uids, *objects) if is_track_number(uid)]
@@ -219,28 +202,28 @@ def _make_content(
     frame_contents: dict[str, Any] = {}
     frames_by_object: dict[str, list[int]] = {}
 
-    def get_object_data(uid: str, kind: str, index: int) -> dict[str, Any]:
-        """Return the data of an object in a frame; add the object if it is new."""
+    def get_object_data(uid: str, object_class: str, index: int) -> dict[str, Any]:
+        """Return the data of an object in a frame."""
         if uid not in frames_by_object:
-            original_object = objects.get(uid, {})
-            same_class = class_name(str(original_object.get("type", ""))) == kind  # compared in any spelling
+            known_object = objects.get(uid, {})
+            same_class = class_name(str(known_object.get("type", ""))) == object_class  # compared in any spelling
             objects[uid] = {
-                "name": f"{kind} {uid}",
-                **original_object,
-                "type": original_object["type"] if same_class else kind,
+                "name": f"{object_class} {uid}",
+                **known_object,
+                "type": known_object["type"] if same_class else object_class,
             }
         frames_by_object.setdefault(uid, []).append(index)
         frame_objects = frame_contents[str(index)].setdefault("objects", {})
         data: dict[str, Any] = frame_objects.setdefault(uid, {DATA: {}})[DATA]
         return data
 
-    for frame, frame_labels in drive_frames:
-        original_frame = original.get("frames", {}).get(str(frame.index), {})
+    for frame, frame_labels in drive:
+        original_content = original.get("frames", {}).get(str(frame.index), {})
         frame_contents[str(frame.index)] = {
-            **original_frame,
+            **original_content,
             PROPERTIES: {
                 **({} if systems is original else parts.make_transforms(frame)),
-                **original_frame.get(PROPERTIES, {}),
+                **original_content.get(PROPERTIES, {}),
                 "name": frame.name,
                 "timestamp": f"{frame.stamp_ns / 1e9:.9f}",
             },
@@ -265,7 +248,7 @@ def _make_content(
             **systems,
             "frames": frame_contents,
             "objects": objects,
-            "frame_intervals": parts.find_intervals([frame.index for frame, _ in drive_frames]),
+            "frame_intervals": parts.find_intervals([frame.index for frame, _ in drive]),
         }
     }
 

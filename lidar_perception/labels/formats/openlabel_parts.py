@@ -25,45 +25,41 @@ MAX_TILT = 1e-9  # 1 - cosine of the angle between the z axis of a box and the v
 def cuboid_to_box(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[float], bool]:
     """Convert a cuboid to a box.
 
-    The height is the size along the axis that is closest to the vertical, which is y in a camera's
-    system (x right, y down, z forward). The length is the size along the first of the other two
-    axes, as in KITTI and ISO 8855.
+    The height is the size along the axis that is closest to the vertical: y in a camera's system (x
+    right, y down, z ahead). The first of the other two is the length, as in KITTI and ISO 8855.
 
     Args:
-        val: 10 numbers [x y z qx qy qz qw sx sy sz], or 9 numbers with three angles instead of the
-            quaternion; the rotations are about x, then y, then z.
-        to_lidar: (4, 4) transform from the cuboid's coordinate system to the LiDAR's.
+        val: 10 numbers [x y z qx qy qz qw sx sy sz], or 9 with angles about x, y and z, applied in
+            this order, instead of the quaternion.
+        to_lidar: transform (4, 4) from the cuboid's coordinate system to the LiDAR's.
 
     Returns:
-        The box [x y z l w h yaw] in the LiDAR's system, and True if the cuboid's z axis points up.
+        [x y z l w h yaw] in the LiDAR's system, and True if the cuboid's z axis is up there.
     """
     if len(val) not in (9, 10):
         raise ValueError(f"a cuboid has {len(val)} numbers instead of 10 or 9")
     axes = to_lidar[:3, :3] @ (quaternion_to_matrix(val[3:7]) if len(val) == 10 else _euler_to_matrix(*val[3:6]))
     x, y, z = (to_lidar[:3, :3] @ np.array(val[:3], float) + to_lidar[:3, 3]).tolist()
-    vertical_axis = 2 - int(np.abs(axes[2, ::-1]).argmax())
-    length_axis, width_axis = (axis for axis in range(3) if axis != vertical_axis)
-    is_lidar_system = np.array_equal(to_lidar, np.eye(4))
+    up_axis = 2 - int(np.abs(axes[2, ::-1]).argmax())
+    length_axis, width_axis = (axis for axis in range(3) if axis != up_axis)
+    is_identity = np.array_equal(to_lidar, np.eye(4))
     yaw = (
         2 * math.atan2(val[5], val[6])
-        if is_lidar_system and len(val) == 10 and val[3] == val[4] == 0
+        if is_identity and len(val) == 10 and val[3] == val[4] == 0
         else math.atan2(axes[1, length_axis], axes[0, length_axis])
     )
     yaw = (yaw + math.pi) % (2 * math.pi) - math.pi if abs(yaw) > math.pi else yaw
     sizes = [float(size) for size in val[-3:]]
-    return (
-        [x, y, z, sizes[length_axis], sizes[width_axis], sizes[vertical_axis], yaw],
-        bool(axes[2, 2] > 1 - MAX_TILT),
-    )
+    return ([x, y, z, sizes[length_axis], sizes[width_axis], sizes[up_axis], yaw], bool(axes[2, 2] > 1 - MAX_TILT))
 
 
 def has_size(cuboid: dict[str, Any]) -> bool:
-    """Return True if a cuboid has a positive size; KITTI's DontCare regions have none."""
+    """Return False for a cuboid without a positive size, such as KITTI's DontCare regions."""
     return not all(size <= 0 for size in cuboid["val"][-3:])
 
 
 def find_regions(data: dict[str, Any]) -> list[list[float]]:
-    """Return the 2D boxes [left top right bottom] of an object in the image of its first camera."""
+    """Return the 2D boxes [left top right bottom] of an object in pixels of its first camera."""
     boxes = [box for box in data.get("bbox", ()) if len(box["val"]) == 4]
     cameras = [box.get("coordinate_system") for box in boxes]
     return [
@@ -75,12 +71,12 @@ def find_regions(data: dict[str, Any]) -> list[list[float]]:
 
 
 def quaternion_to_matrix(quaternion: Sequence[float]) -> np.ndarray:
-    """Convert a quaternion [qx qy qz qw] to a rotation matrix (3, 3)."""
+    """Return the rotation matrix (3, 3) of [qx qy qz qw]."""
     return to_matrices(np.roll(np.array(quaternion, float).reshape(1, 4), 1))[0]
 
 
 def _euler_to_matrix(x: float, y: float, z: float) -> np.ndarray:
-    """Return the rotation matrix (3, 3) for rotations about x, then y, then z, in radians."""
+    """Return the rotation matrix (3, 3) of a rotation about x, then about y, then about z."""
     a, b, c = (
         quaternion_to_matrix([*(math.sin(angle / 2) * np.eye(3)[i]), math.cos(angle / 2)])
         for i, angle in enumerate((x, y, z))
@@ -89,27 +85,18 @@ def _euler_to_matrix(x: float, y: float, z: float) -> np.ndarray:
 
 
 def find_transform_to_lidar(
-    name: str, systems: dict[str, Any], frame: dict[str, Any], recording_frame: Frame, where: str
+    name: str, systems: dict[str, Any], frame: dict[str, Any], recorded_frame: Frame, where: str
 ) -> np.ndarray:
-    """Return the transform (4, 4) from a coordinate system to that of the LiDAR.
+    """Return the transform (4, 4) from a coordinate system ("" for the LiDAR's) to the LiDAR's.
 
-    It is computed from the poses in the file, and from the pose of the recording if one is missing.
-    For a camera in a file without a LiDAR, it is the calibration of the recording.
-
-    Args:
-        name: Name of the coordinate system, "" for the LiDAR's.
-        systems: Coordinate systems of the file.
-        frame: Content of the frame in the file.
-        recording_frame: The same frame of the recording.
-        where: Name of the file, for error messages.
-
-    Raises:
-        InputError: The systems are not connected.
+    It is computed from the poses of the systems and of the frame, else from the recording's pose;
+    for a camera in a file without a LiDAR, from the recording's calibration. Raises InputError if
+    the systems are not connected.
     """
     lidar = find_lidar_system(systems, where)
     if name in ("", lidar):
         return np.eye(4)
-    calibration = recording_frame.calibration() if _is_camera(name) and lidar not in systems else None
+    calibration = recorded_frame.calibration() if _is_camera(name) and lidar not in systems else None
     if calibration is not None:
         return np.linalg.inv(calibration.lidar_to_camera)
     roots = []
@@ -122,7 +109,7 @@ def find_transform_to_lidar(
                 )
             if not (parent := systems[system].get("parent")):
                 break
-            pose = _find_pose(system, parent, systems, frame, recording_frame, where)
+            pose = _find_pose(system, parent, systems, frame, recorded_frame, where)
             transform, system = pose @ transform, parent
         roots.append((system, transform))
     if roots[0][0] != roots[1][0]:
@@ -133,11 +120,7 @@ def find_transform_to_lidar(
 
 
 def find_lidar_system(systems: dict[str, Any], where: str) -> str:
-    """Return the name of the LiDAR's coordinate system.
-
-    Raises:
-        InputError: Several systems may be that of the LiDAR.
-    """
+    """Return the name of the LiDAR's coordinate system. Raises InputError if it is ambiguous."""
     sensors = [name for name, s in systems.items() if s.get("type") == "sensor_cs" and not _is_camera(name)]
     lidars = [name for name in sensors if any(word in name.lower() for word in ("lidar", "velo", "laser"))] or sensors
     if len(lidars) > 1:
@@ -153,17 +136,17 @@ def _is_camera(name: str) -> bool:
 
 
 def _find_pose(
-    name: str, parent: str, systems: dict[str, Any], frame: dict[str, Any], recording_frame: Frame, where: str
+    name: str, parent: str, systems: dict[str, Any], frame: dict[str, Any], recorded_frame: Frame, where: str
 ) -> np.ndarray:
     for transform in frame.get("frame_properties", {}).get("transforms", {}).values():
         if transform["src"] == name and transform["dst"] == parent:
             return _parse_transform(transform["transform_src_to_dst"])
     if "pose_wrt_parent" in systems[name]:
         return _parse_transform(systems[name]["pose_wrt_parent"])
-    pose = recording_frame.pose()
+    pose = recorded_frame.pose()
     if pose is None:
         raise InputError(
-            f"{where}: the pose of {name!r} in {parent!r} is missing in frame {recording_frame.index}; "
+            f"{where}: the pose of {name!r} in {parent!r} is missing in frame {recorded_frame.index}; "
             "write the file again"
         )
     return pose
@@ -179,11 +162,8 @@ def _parse_transform(data: dict[str, Any]) -> np.ndarray:
 
 
 def make_coordinate_systems(frames: Sequence[Frame]) -> dict[str, Any]:
-    """Make coordinate_systems and streams of a drive.
-
-    They contain the LiDAR and, if the recording has poses or a calibration, a fixed system and the
-    camera.
-    """
+    """Return coordinate_systems and streams of a drive: the LiDAR, and if the recording has them, a
+    fixed system and the camera."""
     calibration = frames[0].calibration() if frames else None
     has_poses = bool(frames) and frames[0].pose() is not None
     lidar: dict[str, Any] = {"type": "sensor_cs", "parent": FIXED if has_poses else "", "children": []}
@@ -214,7 +194,7 @@ def make_coordinate_systems(frames: Sequence[Frame]) -> dict[str, Any]:
 
 
 def make_transforms(frame: Frame) -> dict[str, Any]:
-    """Make frame_properties with the pose of the LiDAR in a fixed frame; {} without a pose."""
+    """Return frame_properties with the pose of the LiDAR in a fixed frame; empty without a pose."""
     pose = frame.pose()
     return (
         {}
@@ -232,11 +212,8 @@ def make_transforms(frame: Frame) -> dict[str, Any]:
 
 
 def to_named_values(values: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Convert a JSON object to lists of named values, by kind.
-
-    A value that fits no kind becomes the text NAME.json.
-    """
-    values_by_kind: dict[str, list[dict[str, Any]]] = {}
+    """Convert a JSON object to named values by type; other values become a text NAME.json."""
+    values_by_type: dict[str, list[dict[str, Any]]] = {}
     for name, value in values.items():
         value_type = next((value_type for value_type, is_type in TYPES.items() if is_type(value)), "")
         values_by_type.setdefault(value_type or "text", []).append(
@@ -246,14 +223,14 @@ def to_named_values(values: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
 
 
 def parse_named_values(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[Any]]]:
-    """Invert to_named_values; return the values, and other items by kind."""
+    """Invert to_named_values; also return the items that are not plain values, by type."""
     values: dict[str, Any] = {}
     other_items: dict[str, list[Any]] = {}
-    for kind, items in lists.items():
+    for value_type, items in lists.items():
         for item in items:
-            if kind not in KINDS or set(item) != {"name", "val"}:
-                other_items.setdefault(kind, []).append(item)
-            elif kind == "text" and item["name"].endswith(".json"):
+            if value_type not in TYPES or set(item) != {"name", "val"}:
+                other_items.setdefault(value_type, []).append(item)
+            elif value_type == "text" and item["name"].endswith(".json"):
                 values[item["name"].removesuffix(".json")] = json.loads(item["val"])
             else:
                 values[item["name"]] = item["val"]
@@ -261,7 +238,7 @@ def parse_named_values(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str,
 
 
 def _is_number(value: Any) -> bool:
-    """Return True for a number in the range of float64, which other readers require."""
+    """Return True for numbers within the range of float64, as other readers require."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
@@ -274,7 +251,7 @@ TYPES = {
 
 
 def find_intervals(numbers: list[int]) -> list[dict[str, int]]:
-    """Group numbers into intervals of consecutive frames."""
+    """Return the runs of consecutive numbers."""
     runs: list[dict[str, int]] = []
     for number in sorted(set(numbers)):
         if runs and runs[-1]["frame_end"] == number - 1:
