@@ -165,7 +165,7 @@ class ActorSet:
         trajectory: Trajectory | None = None,
         radius: float = 0.0,
     ):
-        """Start without actors.
+        """Create a set without actors.
 
         Args:
             seconds: Duration of the drive.

@@ -168,20 +168,20 @@ def _build_entrance(rng, side: Side) -> Iterator[Actor]:
     """Yield glass halls, some with stairs, and squares between them."""
     along, line = rng.uniform(0, 8), side.walk + 2.5
     while along < side.length - 8:
-        long = min(rng.uniform(12, 35), side.length - along)
+        length = min(rng.uniform(12, 35), side.length - along)
         if rng.random() < 0.75:
-            yield side.place(make_glass_hall(rng, long, rng.uniform(8, 15)), along + long / 2, line)
+            yield side.place(make_glass_hall(rng, length, rng.uniform(8, 15)), along + length / 2, line)
             if rng.random() < 0.6:
-                wide = rng.uniform(3.0, 0.7 * long)
-                yield side.place(furniture.make_stairs(rng, wide), along + long / 2, line - 2.4)
+                width = rng.uniform(3.0, 0.7 * length)
+                yield side.place(furniture.make_stairs(rng, width), along + length / 2, line - 2.4)
         else:
             yield from FRONTS["square"](
                 rng,
                 side._replace(
-                    x=side.x + np.cos(side.heading) * along, y=side.y + np.sin(side.heading) * along, length=long
+                    x=side.x + np.cos(side.heading) * along, y=side.y + np.sin(side.heading) * along, length=length
                 ),
             )
-        along += long + rng.uniform(0.5, 6)
+        along += length + rng.uniform(0.5, 6)
 
 
 def _build_hedge(rng, side: Side) -> Iterator[Actor]:
@@ -189,9 +189,9 @@ def _build_hedge(rng, side: Side) -> Iterator[Actor]:
     along, line = 0.0, side.walk + rng.uniform(1.0, 2.5)
     make = (vegetation.make_hedge, vegetation.make_hedge, furniture.make_wall)[rng.integers(3)]
     while along < side.length - 4:
-        long = min(rng.uniform(4, 18), side.length - along)
-        yield side.place(make(rng, long), along + long / 2, line)
-        along += long + rng.uniform(1.5, 8)
+        length = min(rng.uniform(4, 18), side.length - along)
+        yield side.place(make(rng, length), along + length / 2, line)
+        along += length + rng.uniform(1.5, 8)
     yield from FRONTS["verge"](rng, side._replace(walk=line + 2.0))
 
 

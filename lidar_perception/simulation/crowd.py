@@ -27,12 +27,12 @@ def make_person(rng, speed: float = 0.0) -> SceneObject:
 def place_standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
     """Yield standing people, and groups of people who face each other."""
     for along in scatter(rng, side.length, rate):
-        out, many = rng.uniform(0.4, max(side.walk - 0.4, 1.0)), rng.choice([1, 2, 3, 4], p=STANDING_PROBABILITIES)
-        first, wide = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 0.7) * (many > 1)
-        angles = first + 2 * np.pi / many * np.arange(many)
+        out, count = rng.uniform(0.4, max(side.walk - 0.4, 1.0)), rng.choice([1, 2, 3, 4], p=STANDING_PROBABILITIES)
+        first, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 0.7) * (count > 1)
+        angles = first + 2 * np.pi / count * np.arange(count)
         yield [
             side.place(
-                make_person(rng), along + wide * np.cos(a), out + wide * np.sin(a), a + np.pi + rng.normal(0, 0.15)
+                make_person(rng), along + radius * np.cos(a), out + radius * np.sin(a), a + np.pi + rng.normal(0, 0.15)
             )
             for a in angles
         ]
@@ -55,10 +55,10 @@ def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Act
             low, turn = -3.0, turn + rng.normal(0, 0.6) * (rng.random() < 0.5)
         out = rng.uniform(low, max(side.walk - 0.5, low + 0.5))
         moves = _draw_moves(rng, speed, 0.2)
-        many = rng.choice([1, 2, 3], p=WALKING_PROBABILITIES)
+        count = rng.choice([1, 2, 3], p=WALKING_PROBABILITIES)
         yield [
             side.place(make_person(rng, speed), along + rng.uniform(-0.2, 0.2), out + 0.85 * i, turn, **moves)
-            for i in range(many)
+            for i in range(count)
         ]
 
 
@@ -73,10 +73,10 @@ def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
     for x, y in court.draw_positions(rng, rate):
         speed, turn = _draw_speed(rng), rng.uniform(-np.pi, np.pi)
         moves = _draw_moves(rng, speed, 0.5)
-        many = rng.choice([1, 2, 3], p=WALKING_PROBABILITIES)
+        count = rng.choice([1, 2, 3], p=WALKING_PROBABILITIES)
         yield [
             Actor(make_person(rng, speed), x - 0.85 * i * np.sin(turn), y + 0.85 * i * np.cos(turn), turn, **moves)
-            for i in range(many)
+            for i in range(count)
         ]
 
 

@@ -194,13 +194,13 @@ def _line_up_tables(rng, court: Court, height: float, people: float) -> Iterator
 
 def _set_table(rng, x: float, y: float, turn: float, people: float) -> list[Actor]:
     """Return a table, and the chairs and people at its long sides."""
-    long, wide = rng.uniform((0.7, 0.65), (2.0, 0.9))
-    table = Actor(make_prop(interiors.make_table(rng, long, wide)), x, y, turn)
+    length, width = rng.uniform((0.7, 0.65), (2.0, 0.9))
+    table = Actor(make_prop(interiors.make_table(rng, length, width)), x, y, turn)
     line, around = Side(x, y, turn, 0.0, 0.0, ""), []
-    count = int(long / SEAT_WIDTH_M)
+    count = int(length / SEAT_WIDTH_M)
     for along in (np.arange(count) + 0.5) * SEAT_WIDTH_M - count * SEAT_WIDTH_M / 2:
         for side in (-1, 1):
-            out, pick = side * (wide / 2 + rng.uniform(0.2, 0.4)), rng.random()
+            out, pick = side * (width / 2 + rng.uniform(0.2, 0.4)), rng.random()
             if pick < min(0.35 * people, 0.8):
                 around.append(line.place(make_sitting_person(rng), along, out, -side * np.pi / 2))
             elif pick < 0.85:
@@ -214,9 +214,9 @@ def _place_shelves(rng, court: Court, height: float, people: float) -> Iterator[
     while y < court.y1 - 0.4:
         x = court.x0 + rng.uniform(1.0, 2.5)
         while x < court.x1 - 1.5:
-            long = rng.uniform(1.0, 2.4)
-            yield [Actor(make_prop(interiors.make_shelf(rng, long)), x + long / 2, y)]
-            x += long + (0.4 if rng.random() < 0.8 else rng.uniform(1.5, 2.5))
+            length = rng.uniform(1.0, 2.4)
+            yield [Actor(make_prop(interiors.make_shelf(rng, length)), x + length / 2, y)]
+            x += length + (0.4 if rng.random() < 0.8 else rng.uniform(1.5, 2.5))
         y += 0.7 + aisle
 
 

@@ -95,10 +95,10 @@ def _build_garden(rng, side: Side) -> Iterator[Actor]:
 
 def _build_verge(rng, side: Side) -> Iterator[Actor]:
     """Yield rows of trees and bushes on grass, with buildings or hedges behind."""
-    deep = rng.uniform(4, 14)
+    strip_depth = rng.uniform(4, 14)
     for along in space_evenly(rng, side.length, rng.uniform(7, 14)):
         yield side.place(_make_tree(rng), along, side.walk + rng.uniform(1.2, 1.8))
-    shrubs, depth = (150, 0.35 * deep) if rng.random() < 0.7 else (rng.uniform(2, 50), deep)
+    shrubs, depth = (150, 0.35 * strip_depth) if rng.random() < 0.7 else (rng.uniform(2, 50), strip_depth)
     for along in scatter(rng, side.length, shrubs):
         yield side.place(
             vegetation.make_bush(rng), along, side.walk + rng.uniform(1.0, 1.0 + depth), rng.uniform(-3, 3)
@@ -111,23 +111,23 @@ def _build_verge(rng, side: Side) -> Iterator[Actor]:
             yield side.place(
                 make_building(rng, length, rng.uniform(10, 20), rng.integers(1, 6)),
                 along + length / 2,
-                side.walk + deep + rng.uniform(0, 4),
+                side.walk + strip_depth + rng.uniform(0, 4),
             )
         elif pick < 0.8:
             border = BORDERS[rng.integers(len(BORDERS))]
-            yield side.place(border(rng, length), along + length / 2, side.walk + deep)
+            yield side.place(border(rng, length), along + length / 2, side.walk + strip_depth)
         along += length + rng.uniform(0.3, 12)
-    yield from _build_yard(rng, side, side.walk + deep + 2)
+    yield from _build_yard(rng, side, side.walk + strip_depth + 2)
 
 
 def _build_wild(rng, side: Side) -> Iterator[Actor]:
     """Yield a forest edge, a hedgerow or fields behind grass."""
     near = side.walk + rng.uniform(1.5, 4.0)
-    bushes, trees, deep = WILD_FRONTS[rng.choice(len(WILD_FRONTS), p=(0.4, 0.4, 0.2))]
+    bushes, trees, strip_depth = WILD_FRONTS[rng.choice(len(WILD_FRONTS), p=(0.4, 0.4, 0.2))]
     for along in scatter(rng, side.length, bushes):
-        yield side.place(vegetation.make_bush(rng), along, near + rng.exponential(deep), rng.uniform(-3, 3))
+        yield side.place(vegetation.make_bush(rng), along, near + rng.exponential(strip_depth), rng.uniform(-3, 3))
     for along in scatter(rng, side.length, trees):
-        yield side.place(_make_tree(rng), along, near + 1 + rng.gamma(1.5, deep))
+        yield side.place(_make_tree(rng), along, near + 1 + rng.gamma(1.5, strip_depth))
     if rng.random() < 0.3:
         for along in np.arange(0, side.length - 12, 12.0):
             yield side.place(furniture.make_fence(rng, 11.7), along + 6, near - 0.3)
@@ -141,12 +141,12 @@ def _build_wild(rng, side: Side) -> Iterator[Actor]:
 
 def _build_square(rng, side: Side) -> Iterator[Actor]:
     """Yield facades behind a square with trees, planters and bollards."""
-    deep = rng.uniform(5, 14)
-    yield from _build_facade(rng, side._replace(walk=side.walk + deep))
+    strip_depth = rng.uniform(5, 14)
+    yield from _build_facade(rng, side._replace(walk=side.walk + strip_depth))
     for along in space_evenly(rng, side.length, rng.uniform(6, 10)):
-        yield side.place(_make_tree(rng), along, side.walk + deep * 0.5)
+        yield side.place(_make_tree(rng), along, side.walk + strip_depth * 0.5)
     for along in scatter(rng, side.length, 8):
-        yield side.place(make_clutter(rng), along, side.walk + rng.uniform(0, deep), rng.uniform(-3, 3))
+        yield side.place(make_clutter(rng), along, side.walk + rng.uniform(0, strip_depth), rng.uniform(-3, 3))
 
 
 FRONTS = {
@@ -172,11 +172,11 @@ def _place_furniture(rng, side: Side, kind: StreetKind) -> Iterator[Actor]:
     for along in scatter(rng, side.length, 2.2 * kind.clutter):
         parts = make_clutter(rng, rural)
         low, high = compute_extents(parts)
-        wide = np.abs([low[:, :2], high[:, :2]]).max()  # half width that stays off the road at any rotation
+        half_width = np.abs([low[:, :2], high[:, :2]]).max()  # half width that stays off the road at any rotation
         at_wall = not rural and rng.random() < 0.35
-        out = side.walk - wide if at_wall else edge + wide + rng.uniform(0, 0.15)
+        out = side.walk - half_width if at_wall else edge + half_width + rng.uniform(0, 0.15)
         turn = rng.choice([0.0, np.pi / 2, np.pi, -np.pi / 2]) + rng.normal(0, 0.1)
-        yield side.place(parts, along, max(out, 0.2 + wide), turn)
+        yield side.place(parts, along, max(out, 0.2 + half_width), turn)
 
 
 def _place_islands(rng, street: Street) -> Iterator[Actor]:

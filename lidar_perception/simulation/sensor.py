@@ -56,25 +56,25 @@ class Sensor:
 
     def __post_init__(self) -> None:
         up = np.asarray(self.elevations, np.float64)
-        for wrong, what in (
-            (not len(up), "elevations must name one beam at least"),
-            (len(up) > MAX_BEAMS, f"elevations must name {MAX_BEAMS} beams at most"),
+        for is_invalid, message in (
+            (not len(up), "elevations must contain at least one beam"),
+            (len(up) > MAX_BEAMS, f"elevations must contain at most {MAX_BEAMS} beams"),
             (
                 not (np.abs(up) < np.pi / 2).all() or not (np.diff(up) < 0).all(),
                 "elevations must descend, within 90 degrees of level",
             ),
             *(
                 (
-                    len(each) not in (0, len(up)) or not np.isfinite(each).all(),
+                    len(values) not in (0, len(up)) or not np.isfinite(values).all(),
                     f"{name} must be empty or finite, one for each beam",
                 )
-                for name, each in (("lifts", self.lifts), ("offsets", self.offsets), ("biases", self.biases))
+                for name, values in (("lifts", self.lifts), ("offsets", self.offsets), ("biases", self.biases))
             ),
             (not np.isfinite([*self.fade, *np.ravel(self.blocked)]).all(), "fade and blocked must be finite"),
             (not 0 < self.azimuth_step <= np.pi / 2, "azimuth_step must be above 0, at most 90 degrees"),
             (
                 len(up) * 2 * np.pi > MAX_RAYS * self.azimuth_step,
-                f"a turn must have at most {MAX_RAYS} rays; give a larger step or fewer beams",
+                f"a revolution must have at most {MAX_RAYS} rays; give a larger step or fewer beams",
             ),
             (not 0 < self.height < np.inf, "height must be positive"),
             (
@@ -87,11 +87,11 @@ class Sensor:
                 not all(0 <= x <= 1 for x in (self.dropout, self.silent, self.floor)),
                 "dropout, silent and floor must be in 0 .. 1",
             ),
-            (self.dropout == 1, "with dropout 1 nothing would come back"),
+            (self.dropout == 1, "dropout must be below 1, else no return is left"),
             (self.divergence > np.pi / 2, "divergence must be at most 90 degrees"),
             (
                 not all(0 <= row[0] < max(1, len(up)) for row in self.blocked),
-                "blocked must begin with a beam, 0 or more",
+                "blocked must begin with the number of a beam, 0 or more",
             ),
             (
                 not all(0 <= x < np.inf for x in (self.range_noise, self.divergence, self.pulse)),
@@ -100,11 +100,11 @@ class Sensor:
             (self.range_noise > MAX_NOISE, f"range_noise must be up to {MAX_NOISE:g} m"),
             (
                 len(up) and not (0 <= self.wander < np.pi / 2 + up.min()),
-                "wander must not be negative, nor take beams beyond straight down",
+                "wander must not be negative, and beams must not point beyond straight down",
             ),
         ):
-            if wrong:
-                raise InputError(f"impossible sensor: {what}")
+            if is_invalid:
+                raise InputError(f"impossible sensor: {message}")
 
     @property
     def columns(self) -> int:
@@ -226,7 +226,7 @@ def make_generic_sensor(
         InputError: A value is impossible.
     """
     if beams > MAX_BEAMS:  # checked before the list is created
-        raise InputError(f"impossible sensor: {beams} beams must be {MAX_BEAMS} at most")
+        raise InputError(f"impossible sensor: beams = {beams} must be at most {MAX_BEAMS}")
     if beams > 1 and not lowest < highest:
         raise InputError(f"impossible sensor: lowest {lowest} must be below highest {highest}")
     return Sensor(

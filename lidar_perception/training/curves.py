@@ -39,8 +39,8 @@ def fit_curves(
         The model as JSON data: "bias", and "curves" by feature.
     """
     columns, bounds, parts = [], [], []
-    for name, own in knots.items():
-        steps, unknown = compute_ramps(features[name], own), np.isnan(features[name])[:, None]
+    for name, own_knots in knots.items():
+        steps, unknown = compute_ramps(features[name], own_knots), np.isnan(features[name])[:, None]
         direction = rising.get(name, 0)
         columns.append(np.column_stack([steps, unknown]) if unknown.any() else steps)
         bounds += [{1: (0, None), -1: (None, 0), 0: (None, None)}[direction]] * steps.shape[1]
@@ -65,9 +65,9 @@ def fit_curves(
         options={"maxiter": 5000, "maxfun": 10000},
     ).x
     curves: dict[str, dict] = {}
-    for (name, own), steps in zip(knots.items(), np.split(x[1:], np.cumsum(parts)[:-1])):
-        rises = steps[: len(own) - 1]
-        curves[name] = {"knots": own, "values": [0.0, *np.round(np.cumsum(rises), 3).tolist()]}
+    for (name, own_knots), steps in zip(knots.items(), np.split(x[1:], np.cumsum(parts)[:-1])):
+        rises = steps[: len(own_knots) - 1]
+        curves[name] = {"knots": own_knots, "values": [0.0, *np.round(np.cumsum(rises), 3).tolist()]}
         if len(steps) > len(rises):
             curves[name]["unknown"] = round(float(steps[-1]), 3)
     return {"bias": round(float(x[0]), 4), "curves": curves}

@@ -87,17 +87,17 @@ def cut_objects(scene: TrainingScene, classes: tuple[str, ...], min_points: int,
     isolated = overlap.sum(axis=1) <= 1
     boxes, class_ids, points = [np.zeros((0, 7))], [], [np.zeros((0, 4), np.float32)]
     for i in np.flatnonzero(scene.detectable & isolated & np.isin(scene.class_ids, chosen)):
-        own = scene.points[find_points_in_box(scene.points, scene.boxes[i], 0.0)]
-        if len(own) >= min_points:
+        object_points = scene.points[find_points_in_box(scene.points, scene.boxes[i], 0.0)]
+        if len(object_points) >= min_points:
             boxes.append(scene.boxes[i : i + 1])
             class_ids.append(scene.class_ids[i])
-            points.append(own)
+            points.append(object_points)
     if PEDESTRIAN in chosen:
         background_boxes, background_points = find_background_objects(scene, min_points, np.random.default_rng(seed))
         boxes.append(background_boxes)
         class_ids.extend([BACKGROUND_ID] * len(background_boxes))
         points.extend(background_points)
-    sizes = [len(own) for own in points[1:]]
+    sizes = [len(object_points) for object_points in points[1:]]
     return Database(
         np.concatenate(boxes),
         np.array(class_ids, np.int32),

@@ -100,10 +100,10 @@ def paste_objects(
         for i in rng.permutation(candidates)[: max(MAX_TRIES * missing, 0)]:
             if missing == 0:
                 break
-            box, own = database.boxes[i], database.get_points(i)
+            box, object_points = database.boxes[i], database.get_points(i)
             if class_id == BACKGROUND_ID:
-                box, own = vary_background_box(box, own, params, rng)
-            pasted = _paste(box, own, points, boxes, free, low, high, rng)
+                box, object_points = vary_background_box(box, object_points, params, rng)
+            pasted = _paste(box, object_points, points, boxes, free, low, high, rng)
             if pasted is not None:
                 points, boxes = pasted
                 class_ids.append(class_id)
@@ -131,20 +131,22 @@ def vary_background_box(
     return box, points
 
 
-def _paste(box, own, points, boxes, free, low, high, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray] | None:
+def _paste(
+    box, object_points, points, boxes, free, low, high, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the points and boxes of the scene with the object, or None if it does not fit."""
     turn = _draw_turn(box, free, low, high, rng)
     if turn is None:
         return None
-    box, own = _turn_about_sensor(box, own, turn)
+    box, object_points = _turn_about_sensor(box, object_points, turn)
     if bev_iou(enlarge_boxes(box[None]), enlarge_boxes(boxes)).any():
         return None
     step = estimate_floor(points, box, FLOOR_HALF_SIZE_M, FLOOR_QUANTILE) - (box[2] - box[5] / 2)
     if not abs(step) <= MAX_STEP_M:  # NaN: no ground
         return None
     box[2] += step
-    own[:, 2] += np.float32(step)
-    points = paste_object(points, own, box, BOX_MARGIN_M, MAX_HIDDEN_SHARE * len(own))
+    object_points[:, 2] += np.float32(step)
+    points = paste_object(points, object_points, box, BOX_MARGIN_M, MAX_HIDDEN_SHARE * len(object_points))
     return (points, np.concatenate([boxes, box[None]])) if len(points) else None
 
 

@@ -118,10 +118,10 @@ def fit_fusion(
     Raises:
         InputError: An input cannot be used; raised before any scan is simulated.
     """
-    own = FusedParams(
+    fused = FusedParams(
         weights=str(weights or ""), classifier=str(classifier or ""), range=params.range, threads=1, warm_up=False
     )
-    detector = load_fused_detector("", "cpu", FusedDetectorParams(fused=own))
+    detector = load_fused_detector("", "cpu", FusedDetectorParams(fused=fused))
     header, other = detector.proposer.header, detector.classifier.header
     params = fill_from_header(params, header)
     sensor = find_sensor(params.sensor, params.mount_height or _find_trained_height(header))
@@ -136,7 +136,7 @@ def fit_fusion(
         if warning := network.find_height_mismatch(sensor.height):
             errors.print(f"{NETWORKS[network.network][0]}: {warning}")
     source = SimulatedScenes(FIRST_FIT_SEED, params.scans, sensor, scenes, around=around)
-    models, fits = fit_classes(simulate_samples(FusedDetectorParams(fused=own), source, jobs), load_shipped_models())
+    models, fits = fit_classes(simulate_samples(FusedDetectorParams(fused=fused), source, jobs), load_shipped_models())
     write_fusion(
         out,
         (weights, classifier),
@@ -196,13 +196,13 @@ def collect_samples(frame: Frame, proposals: Proposals, scan: int) -> Samples:
     in_view = np.ones(len(detections), bool) if camera is None else camera.in_view(centres)
     selected, correct = [], []
     for class_id in np.unique(detections.class_ids):
-        own = np.flatnonzero((detections.class_ids == class_id) & in_view)
-        own = own[np.argsort(-detections.scores[own], kind="stable")]
-        name, boxes = CLASSES[class_id], detections.boxes[own]
+        order = np.flatnonzero((detections.class_ids == class_id) & in_view)
+        order = order[np.argsort(-detections.scores[order], kind="stable")]
+        name, boxes = CLASSES[class_id], detections.boxes[order]
         hits = _match_boxes(boxes, truth.of_class(class_id), name)
         similar = truth.of_class(CLASSES.index(NEIGHBOURS.get(name, name)))
         is_matched = np.zeros(hits.shape[1], bool)
-        for i, hit, similar_hit in zip(own, hits, _match_boxes(boxes, similar, name)):
+        for i, hit, similar_hit in zip(order, hits, _match_boxes(boxes, similar, name)):
             unmatched = np.flatnonzero(hit & ~is_matched)
             if not len(unmatched) and (hit.any() or similar_hit.any()):
                 continue
@@ -255,50 +255,50 @@ def fit_classes(samples: Samples, before: Models) -> tuple[Models, dict[str, Cla
     """
     models, fits = dict(before), {}
     for name in DETECTED:
-        own = samples.take(samples.class_ids == CLASSES.index(name))
+        class_samples = samples.take(samples.class_ids == CLASSES.index(name))
         after = None
-        if has_enough_samples(own):
-            models[name] = fit_class(name, own)
-            after = _cross_validate(name, own)
+        if has_enough_samples(class_samples):
+            models[name] = fit_class(name, class_samples)
+            after = _cross_validate(name, class_samples)
         fits[name] = ClassFit(
-            len(own.correct),
-            int(own.correct.sum()),
-            _score(own, compute_probabilities(before, own.class_ids, own.evidence)),
+            len(class_samples.correct),
+            int(class_samples.correct.sum()),
+            _score(class_samples, compute_probabilities(before, class_samples.class_ids, class_samples.evidence)),
             after,
         )
     return models, fits
 
 
-def has_enough_samples(own: Samples) -> bool:
+def has_enough_samples(samples: Samples) -> bool:
     """Return True if both halves of the scans have enough correct and wrong proposals."""
-    halves = [own.correct[own.scans % 2 == half] for half in range(2)]
+    halves = [samples.correct[samples.scans % 2 == half] for half in range(2)]
     return all(min(right.sum(), (~right).sum()) >= MIN_SAMPLES / 2 for right in halves)
 
 
-def fit_class(name: str, own: Samples) -> dict:
+def fit_class(name: str, samples: Samples) -> dict:
     """Fit the curves of a class to its proposals, see curves.fit_curves."""
     knots = {source: k for source, k in KNOTS.items() if (source, name) != ("silhouette", CLASSES[CAR])}
-    features = {source: own.evidence[source] for source in knots}
-    return fit_curves(features, own.correct, np.ones(len(own.correct)), knots, dict.fromkeys(knots, 1))
+    features = {source: samples.evidence[source] for source in knots}
+    return fit_curves(features, samples.correct, np.ones(len(samples.correct)), knots, dict.fromkeys(knots, 1))
 
 
-def _cross_validate(name: str, own: Samples) -> CurveScore:
-    scores = np.zeros(len(own.correct), np.float32)
+def _cross_validate(name: str, samples: Samples) -> CurveScore:
+    scores = np.zeros(len(samples.correct), np.float32)
     for half in range(2):
-        in_half = own.scans % 2 == half
-        model = {name: fit_class(name, own.take(~in_half))}
-        left_out = own.take(in_half)
+        in_half = samples.scans % 2 == half
+        model = {name: fit_class(name, samples.take(~in_half))}
+        left_out = samples.take(in_half)
         scores[in_half] = compute_probabilities(model, left_out.class_ids, left_out.evidence)
-    return _score(own, scores)
+    return _score(samples, scores)
 
 
-def _score(own: Samples, scores: np.ndarray) -> CurveScore:
+def _score(samples: Samples, scores: np.ndarray) -> CurveScore:
     if not len(scores):
         return CurveScore(0.0, 0, 0)
-    likelihood = np.where(own.correct, scores, 1 - scores)
-    passed = scores >= ScoreParams().get(CLASSES[own.class_ids[0]])
+    likelihood = np.where(samples.correct, scores, 1 - scores)
+    passed = scores >= ScoreParams().get(CLASSES[samples.class_ids[0]])
     return CurveScore(
         float(-np.log(np.maximum(likelihood, MIN_PROBABILITY)).mean()),
-        int((passed & own.correct).sum()),
-        int((passed & ~own.correct).sum()),
+        int((passed & samples.correct).sum()),
+        int((passed & ~samples.correct).sum()),
     )

@@ -40,29 +40,33 @@ def _is_in_box(point, box, half, cos, sin):
 
 
 @njit(cache=True, nogil=True)
-def paste_object(points: np.ndarray, own: np.ndarray, box: np.ndarray, margin: float, max_hidden: float) -> np.ndarray:
+def paste_object(
+    points: np.ndarray, object_points: np.ndarray, box: np.ndarray, margin: float, max_hidden: float
+) -> np.ndarray:
     """Add the points of an object to a scene, and drop the points that it replaces or hides.
 
     Args:
         points: (N, 4) float32 points of the scene.
-        own: (K, 4) points of the object.
+        object_points: (K, 4) points of the object.
         box: (7,) float64 box of the object. Scene points in it are dropped.
         margin: Margin of the box in metres.
         max_hidden: Largest allowed number of scene points in front of the object.
 
     Returns:
-        The remaining scene points followed by own; (0, 4) if the object would be hidden.
+        The remaining scene points followed by object_points; (0, 4) if the object would be hidden.
     """
     bearing = np.arctan2(box[1], box[0])
     cos, sin = np.cos(bearing), np.sin(bearing)
     # Bounds of depth, horizontal slope and vertical slope of the object.
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for i in range(len(own)):
-        depth = max(cos * own[i, 0] + sin * own[i, 1], MIN_RANGE_M)
-        for k, value in enumerate((depth, (cos * own[i, 1] - sin * own[i, 0]) / depth, own[i, 2] / depth)):
+    for i in range(len(object_points)):
+        depth = max(cos * object_points[i, 0] + sin * object_points[i, 1], MIN_RANGE_M)
+        for k, value in enumerate(
+            (depth, (cos * object_points[i, 1] - sin * object_points[i, 0]) / depth, object_points[i, 2] / depth)
+        ):
             low[k], high[k] = min(low[k], value), max(high[k], value)
     half, yaw_cos, yaw_sin = box[3:6] / 2 + margin, np.cos(box[6]), np.sin(box[6])
-    out = np.empty((len(points) + len(own), 4), np.float32)
+    out = np.empty((len(points) + len(object_points), 4), np.float32)
     count, in_front = 0, 0
     for i in range(len(points)):
         depth = cos * points[i, 0] + sin * points[i, 1]
@@ -78,8 +82,8 @@ def paste_object(points: np.ndarray, own: np.ndarray, box: np.ndarray, margin: f
             count += 1
     if in_front > max_hidden:
         return out[:0]
-    out[count : count + len(own)] = own
-    return out[: count + len(own)]
+    out[count : count + len(object_points)] = object_points
+    return out[: count + len(object_points)]
 
 
 @njit(cache=True, nogil=True)

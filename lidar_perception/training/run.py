@@ -77,7 +77,7 @@ class Progress:
 
 
 class Run:
-    """State of a training run that changes with every step."""
+    """State of a training run: network, optimizer, weight average and progress."""
 
     def __init__(self, task: Task, params: LoopParams, device: torch.device):
         self.task, self.params, self.device = task, params, device

@@ -1,5 +1,4 @@
-"""The command simulate: interruptions and the number of processes change no byte, and existing
-files are not touched."""
+"""The command simulate: files do not depend on processes and interruptions; existing files are kept."""
 
 import contextlib
 import errno

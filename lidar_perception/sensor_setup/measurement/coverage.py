@@ -38,7 +38,7 @@ class Coverage(NamedTuple):
 
     Attributes:
         rows: (R,) elevations in degrees of the beams, or of rows without beams, descending.
-        seen: (R, 360) share of the scans with a return.
+        return_share: (R, 360) share of the scans with a return.
         body: (R, 360) bool, returns of the robot itself.
         box: (6,) box around the body's points, lower then upper corner, m; empty without any.
         foreign_share: Share of the points in the box that are not the body's.
@@ -51,7 +51,7 @@ class Coverage(NamedTuple):
     """
 
     rows: np.ndarray
-    seen: np.ndarray
+    return_share: np.ndarray
     body: np.ndarray
     box: np.ndarray
     foreign_share: float
@@ -105,7 +105,7 @@ def measure_coverage(
         stationary: The robot stands still; None if unknown.
     """
     rows, labels, ranges = nearest
-    seen = np.isfinite(ranges).mean(axis=0)
+    return_share = np.isfinite(ranges).mean(axis=0)
     body, middle = _find_body(ranges, rows, mount, stationary)
     own, box = _select_body(scans, labels, body, middle)
     total = sum(len(scan.xyz) for scan in scans)
@@ -118,17 +118,17 @@ def measure_coverage(
         own, box = _select_body(scans, labels, body, middle)
     # A cell without returns is blind only if it points to the ground; others may point to the sky.
     sees_ground = (
-        np.zeros(seen.shape, bool)
+        np.zeros(return_share.shape, bool)
         if mount is None
         else (_cell_directions(rows) @ mount.normal * MAX_GROUND_RANGE_M < -mount.height)
     )
     sees_ground |= not sees_ground.any()  # no cell reaches the ground, for example on a tall vehicle
-    open_ = (seen > 0).any(axis=0) | ~sees_ground.any(axis=0)
+    open_ = (return_share > 0).any(axis=0) | ~sees_ground.any(axis=0)
     inside = [~select_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
     foreign = float(sum((i & ~m).sum() for i, m in zip(inside, own)) / max(1, sum(i.sum() for i in inside)))
     coverage = Coverage(
         rows,
-        seen,
+        return_share,
         body,
         box,
         foreign,
@@ -140,7 +140,9 @@ def measure_coverage(
     )
     # If the robot stands still, the constant returns may be a person next to it.
     hiding = body & (coverage.can_crop and stationary is False)
-    return coverage._replace(blocked=_find_blocked(((seen == 0) & sees_ground) | hiding, open_, seen, hiding))
+    return coverage._replace(
+        blocked=_find_blocked(((return_share == 0) & sees_ground) | hiding, open_, return_share, hiding)
+    )
 
 
 def _select_body(
@@ -232,7 +234,7 @@ def _cell_directions(rows: np.ndarray) -> np.ndarray:
 
 
 def _find_blocked(
-    blind: np.ndarray, open_: np.ndarray, seen: np.ndarray, body: np.ndarray
+    blind: np.ndarray, open_: np.ndarray, return_share: np.ndarray, body: np.ndarray
 ) -> list[tuple[int, float, float]]:
     """Find sectors in which a beam and all lower beams are blind; outside open_ (360,), all beams are.
 
@@ -241,7 +243,11 @@ def _find_blocked(
     Returns:
         (first row, from, to) of each sector, in degrees.
     """
-    informative = (seen[:, open_] > 0).mean(axis=1) >= MIN_SEEN_SHARE if open_.any() else np.zeros(len(seen), bool)
+    informative = (
+        (return_share[:, open_] > 0).mean(axis=1) >= MIN_SEEN_SHARE
+        if open_.any()
+        else np.zeros(len(return_share), bool)
+    )
     if not informative.any():
         return []
     # The lowest informative beam with a return in each sector.

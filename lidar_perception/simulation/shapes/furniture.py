@@ -45,14 +45,16 @@ def make_lamp(rng: np.random.Generator) -> np.ndarray:
 
 def make_traffic_light(rng: np.random.Generator) -> np.ndarray:
     """Make a mast with lights at 2.2 m, a push button, and up to two signs."""
-    height, own = rng.uniform(3.0, 3.5), rng.spawn(1)[0]
+    height, child_rng = rng.uniform(3.0, 3.5), rng.spawn(1)[0]
     rows = [
         _post(height, 0.07),
         block((0.08, -0.15, height - 0.95), (0.3, 0.15, height), 0.05),
         block((0.06, -0.28, height - 1.0), (0.08, 0.28, height + 0.05), 0.1),
         block((-0.16, -0.06, 1.0), (-0.06, 0.06, 1.25), 0.4),
     ]
-    return make_parts(rows + [_plate(0.1, *own.uniform((0.5, 0.2), (1.6, 0.35))) for _ in range(own.integers(3))], POLE)
+    return make_parts(
+        rows + [_plate(0.1, *child_rng.uniform((0.5, 0.2), (1.6, 0.35))) for _ in range(child_rng.integers(3))], POLE
+    )
 
 
 def make_sign(rng: np.random.Generator) -> np.ndarray:
@@ -62,10 +64,10 @@ def make_sign(rng: np.random.Generator) -> np.ndarray:
     partly retroreflective, most of them low.
     """
     low = rng.uniform(1.7, 2.2) if rng.random() < 0.6 else rng.uniform(0.4, 1.0)
-    size, own = rng.uniform(0.25, 0.4), rng.spawn(1)[0]
+    size, child_rng = rng.uniform(0.25, 0.4), rng.spawn(1)[0]
     plates = [(low, size)] + ([(low + 2 * size + 0.05, 0.2)] if rng.random() < 0.4 else [])
-    mast = low < 1.0 and own.random() < 0.5
-    rows = [_post(own.uniform(2.5, 4.0), 0.07) if mast else _post(low + 2 * size, 0.035)]
+    mast = low < 1.0 and child_rng.random() < 0.5
+    rows = [_post(child_rng.uniform(2.5, 4.0), 0.07) if mast else _post(low + 2 * size, 0.035)]
     return make_parts(rows + [_plate(0.08 if mast else 0.04, z, half) for z, half in plates], POLE)
 
 

@@ -24,8 +24,10 @@ def make_wall(rng: np.random.Generator, length: float, height: float) -> np.ndar
     if pick < 0.15:
         rows.append(block((-x, -0.08, 0.85), (x, -0.03, 0.95), 0.3))
     elif pick < 0.45 and length > 1.5:
-        wide, low = rng.uniform(0.3, 0.45) * length, rng.uniform(0.9, 1.3)
-        rows.append(block((-wide, -0.04, low), (wide, 0.0, low + rng.uniform(0.4, 0.9)), rng.uniform(0.1, 0.8)))
+        half_width, low = rng.uniform(0.3, 0.45) * length, rng.uniform(0.9, 1.3)
+        rows.append(
+            block((-half_width, -0.04, low), (half_width, 0.0, low + rng.uniform(0.4, 0.9)), rng.uniform(0.1, 0.8))
+        )
     return make_parts(rows, BUILDING)
 
 
@@ -91,13 +93,13 @@ def _opening_parts(rng, x: float, half: float, top: float, height: float) -> lis
 def _room_parts(rng, x: float, height: float) -> list[tuple]:
     """Return the walls of a room behind an opening, with one piece of furniture."""
     far, tone = rng.uniform(2.5, 6.0), rng.uniform(0.4, 0.7)
-    wide, deep, high = rng.uniform((0.3, 0.2, 0.7), (0.7, 0.5, 2.0))
+    half_width, half_depth, high = rng.uniform((0.3, 0.2, 0.7), (0.7, 0.5, 2.0))
     at = rng.uniform(-0.4, 0.4) * x
     return [
         block((-x, far, FOOT_M), (x, far + WALL_THICKNESS_M, height), tone),
         *(block((s * x, WALL_THICKNESS_M, FOOT_M), (s * (x - 0.1), far, height), tone) for s in (-1, 1)),
         block((-x, WALL_THICKNESS_M, height), (x, far, height + WALL_THICKNESS_M), tone),
-        block((at - wide, far - 2 * deep, 0.0), (at + wide, far, high), 0.3),
+        block((at - half_width, far - 2 * half_depth, 0.0), (at + half_width, far, high), 0.3),
     ]
 
 
@@ -118,11 +120,11 @@ def make_ceiling(rng: np.random.Generator, length: float, width: float, height: 
     """Make a ceiling centred at the origin, some with lamps or joists."""
     x, y = length / 2, width / 2
     rows = [block((-x, -y, height), (x, y, height + 0.3), rng.uniform(0.4, 0.75))]
-    count, deep = int(length / rng.uniform(3.0, 6.0)), rng.uniform(0.05, 0.4)
-    deep = min(deep, height - 2.35)
+    count, lamp_height = int(length / rng.uniform(3.0, 6.0)), rng.uniform(0.05, 0.4)
+    lamp_height = min(lamp_height, height - 2.35)
     if rng.random() < 0.7:
         rows += [
-            block((at - 0.15, -0.9 * y, height - deep), (at + 0.15, 0.9 * y, height), 0.5)
+            block((at - 0.15, -0.9 * y, height - lamp_height), (at + 0.15, 0.9 * y, height), 0.5)
             for at in np.linspace(-x, x, count)
         ]
     return make_parts(rows, BUILDING)
@@ -141,11 +143,11 @@ def make_shelf(rng: np.random.Generator, length: float) -> np.ndarray:
     x, y, high = length / 2, rng.uniform(0.2, 0.35), rng.uniform(1.2, 2.2)
     levels = np.arange(0.1, high, rng.uniform(0.35, 0.5))
     rows = [block((s * x, -y, 0.0), (s * (x - 0.04), y, high), METAL) for s in (-1, 1)]
-    for z, left, right, tall, deep, tone in zip(levels, *rng.random((5, len(levels)))):
+    for z, left, right, tall, depth, tone in zip(levels, *rng.random((5, len(levels)))):
         rows.append(block((-x, -y, z), (x, y, z + 0.03), 0.4))
         rows.append(
             block(
-                (-x + 0.6 * left * x, -(0.5 + 0.4 * deep) * y, z + 0.03),
+                (-x + 0.6 * left * x, -(0.5 + 0.4 * depth) * y, z + 0.03),
                 (x - 0.6 * right * x, 0.9 * y, z + 0.1 + 0.2 * tall),
                 0.1 + 0.5 * tone,
             )
@@ -242,12 +244,12 @@ def make_boxes(rng: np.random.Generator) -> np.ndarray:
 
 def make_coat_stand(rng: np.random.Generator) -> np.ndarray:
     """Make a coat stand with coats."""
-    high, wide, low = rng.uniform((1.6, 0.12, 0.5), (1.85, 0.25, 1.1))
+    high, radius, low = rng.uniform((1.6, 0.12, 0.5), (1.85, 0.25, 1.1))
     return make_parts(
         [
             rod((0, 0, 0), (0, 0, high), 0.025, METAL),
             cylinder((0, 0, 0.02), (0.22, 0.22, 0.02), METAL),
-            cylinder((0, 0, (low + high) / 2 - 0.1), (wide, 0.8 * wide, (high - low) / 2), rng.uniform(0.1, 0.5)),
+            cylinder((0, 0, (low + high) / 2 - 0.1), (radius, 0.8 * radius, (high - low) / 2), rng.uniform(0.1, 0.5)),
         ],
         OTHER,
     )
