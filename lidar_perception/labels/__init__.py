@@ -1,1 +1,1 @@
-"""Labels of drives, and their conversion from and to the formats of other tools and data sets."""
+"""Labels of drives, and their import and export in the formats of other tools and data sets."""

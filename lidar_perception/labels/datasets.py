@@ -1,4 +1,4 @@
-"""Conversion of recordings to data sets. Content that a layout cannot store is reported."""
+"""Conversion of recordings to data sets; content that a layout cannot store is reported."""
 
 from __future__ import annotations
 
@@ -31,12 +31,14 @@ ASSUMED_CAMERA = replace(
 
 @dataclass(frozen=True)
 class DatasetFrame:
-    """A frame, its labels, and its numbers in the data set.
+    """Frame with its labels and its position in the data set.
 
     Attributes:
-        drive: number of the drive.
-        index: number of the frame in its drive.
-        number: number of the frame in the data set.
+        frame: The frame.
+        labels: Its labels.
+        drive: Number of the drive.
+        index: Number of the frame in the drive.
+        number: Number of the frame in the data set.
     """
 
     frame: Frame
@@ -48,10 +50,10 @@ class DatasetFrame:
 
 @dataclass
 class Summary:
-    """Counts of a data set that was written.
+    """Counts of frames, boxes and drives of a data set.
 
     Attributes:
-        remarks: omissions and assumptions, with the number of frames of each.
+        remarks: Number of frames for each omission or assumption.
     """
 
     frames: int = 0
@@ -60,7 +62,7 @@ class Summary:
     remarks: dict[str, int] = field(default_factory=dict)
 
     def add_remark(self, text: str) -> None:
-        """Count a remark for one more frame."""
+        """Add one frame to the count of a remark."""
         self.remarks[text] = self.remarks.get(text, 0) + 1
 
 
@@ -69,15 +71,20 @@ def write_dataset(
 ) -> Summary:
     """Write the frames of a recording as a data set in one of LAYOUTS.
 
-    Frames are numbered from 0, in KITTI's tracking layout by their time at 10 Hz. A new drive
-    starts where the recording has one, after a gap of 5 s, and where the calibration changes. A
-    sensor height other than KITTI's is stored, see data.open.write_height.
+    Frames are numbered from 0; in KITTI's tracking layout the number is the time in units of 0.1 s.
+    A new drive starts at a new sequence of the recording, after a gap of 5 s, and when the
+    calibration changes. A sensor height that differs from KITTI's is stored, see
+    data.open.write_height.
 
     Args:
-        labels: labels to write instead of those of the recording.
+        layout: Name of the layout.
+        frames: Frames of the recording.
+        out: Folder of the data set.
+        labels: Labels to write instead of those of the recording.
+        force: Replace existing files.
 
     Raises:
-        InputError: something cannot be read or written; `out` is then unchanged.
+        InputError: A frame cannot be read or written; `out` is then unchanged.
     """
     layout = resolve_format(layout, LAYOUTS)
     summary = Summary()
@@ -117,7 +124,7 @@ def _continues_drive(previous: Frame, frame: Frame) -> bool:
 
 
 def _ensure_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
-    """Return the frame and its calibration, which is ASSUMED_CAMERA if it has none."""
+    """Return the frame and its calibration; if it has none, both use ASSUMED_CAMERA."""
     calibration = frame.calibration()
     if calibration is None:
         summary.add_remark("assumed: a camera at the LiDAR facing ahead, which KITTI's labels need")
@@ -133,7 +140,7 @@ def _load_cloud(frame: Frame, summary: Summary) -> np.ndarray:
 
 
 def _remark_losses(summary: Summary, item: DatasetFrame, storable: str) -> None:
-    """Add a remark for each content of the frame that is not in `storable`."""
+    """Add a remark for each kind of content of the frame that is not in `storable`."""
     labels = item.labels
     for content, exists in (
         ("poses", item.frame.pose() is not None),

@@ -1,8 +1,8 @@
-"""Writer of nuScenes' tables and sweeps, which nuscenes-devkit can read.
+"""Writer of tables and sweeps in nuScenes' layout, readable by nuscenes-devkit.
 
-Caesar et al., CVPR 2020, and nuscenes-devkit's docs/schema_nuscenes.md define the tables. A scene
-is a drive, and each scan is a key frame. The only sensor is LIDAR_TOP, with x to the right and y
-ahead; there are no cameras, maps or radars.
+The tables are defined by Caesar et al., CVPR 2020, and docs/schema_nuscenes.md of nuscenes-devkit.
+A scene is a drive, and each scan is a key frame. The only sensor is LIDAR_TOP, with x to the right
+and y forward; there are no cameras, maps or radars.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ MAP = "maps/none.png"  # required by nuscenes-devkit
 
 
 def make_token(*parts: object) -> str:
-    """Return a token of 32 hexadecimal digits, the same for the same arguments."""
+    """Return a token of 32 hexadecimal digits that depends only on the arguments."""
     return hashlib.sha256("/".join(map(str, parts)).encode()).hexdigest()[:32]
 
 
 class NuscenesTables:
-    """Tables that grow frame by frame; write() writes them."""
+    """Tables of a data set; add() adds one frame, write() writes the files."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -83,7 +83,11 @@ class NuscenesTables:
         self.last_rows: dict[str, dict[str, Any]] = {}  # of each chain, see _add_linked
 
     def add(self, frame: Frame, labels: FrameLabels, drive: int, cloud: np.ndarray) -> None:
-        """Add a scan (N, 4) [x y z intensity] with its labels. InputError if that fails."""
+        """Add a scan (N, 4) [x y z intensity] with its labels and write its sweep.
+
+        Raises:
+            InputError: The sweep cannot be written, or the frame cannot be read.
+        """
         scene = f"scene-{drive + 1:04}"
         sample = make_token(scene, len(self.rows["sample"]))
         file = f"samples/{CHANNEL}/{scene}__{CHANNEL}__{frame.stamp_ns // 1000}.pcd.bin"
@@ -212,7 +216,11 @@ class NuscenesTables:
         self.last_rows[f"{table}/{chain}"] = self.rows[table][-1]
 
     def write(self) -> None:
-        """Write the tables. Raises InputError if they cannot be written."""
+        """Write the tables.
+
+        Raises:
+            InputError: A file cannot be written.
+        """
         write_bytes(self.folder / MAP, _make_png())
         for name, rows in self.rows.items():
             write_text(self.folder / VERSION / f"{name}.json", json.dumps(rows, indent=0))
@@ -223,7 +231,7 @@ def _to_quaternion(rotation: np.ndarray) -> list[float]:
 
 
 def _make_png() -> bytes:
-    """Return a PNG image of one black pixel."""
+    """Return a PNG image with one black pixel."""
 
     def make_chunk(chunk_type: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + chunk_type + data + struct.pack(">I", crc32(chunk_type + data))

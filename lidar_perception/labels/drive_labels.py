@@ -1,4 +1,4 @@
-"""Labels of a drive, frame by frame, independent of their format."""
+"""Labels of a drive and of its frames, independent of the file format."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ MAX_DIFFERENCE = 1e-4  # tolerance in metres and radians between a box and the o
 
 @dataclass(frozen=True, eq=False)
 class FrameLabels:
-    """K labelled boxes of one frame, in its LiDAR frame. No labels is K = 0.
+    """K labelled boxes of one frame, in its LiDAR frame; K may be 0.
 
     Attributes:
-        name, stamp_ns: those of the frame.
+        name: Name of the frame.
+        stamp_ns: Stamp of the frame.
         boxes: (K, 7) float64 [x y z l w h yaw], metres and radians.
-        class_names: K strings, any text.
-        track_ids: (K,) int64, -1 = none.
-        scores: (K,) float64, NaN = none.
-        extra: K JSON objects with further fields of the format.
-        notes: (class, JSON object) of objects without a 3D box, such as KITTI's DontCare regions.
+        class_names: K class names, which may be any text.
+        track_ids: (K,) int64, -1 for none.
+        scores: (K,) float64, NaN for none.
+        extra: K JSON objects with additional fields of the format.
+        notes: (class, JSON object) of each object without a 3D box, such as KITTI's DontCare
+            regions.
     """
 
     name: str
@@ -53,10 +55,12 @@ class FrameLabels:
         notes: Iterable[tuple[str, dict[str, Any]]] = (),
         where: object = None,
     ) -> FrameLabels:
-        """Make labels, with conversion of dtypes and shapes.
+        """Make labels and convert dtypes and shapes.
 
-        Raises InputError that names `where` if a box is not finite, is beyond MAX_RANGE or has a
-        side that is not positive, if a track id is not an integer, or if columns differ in length.
+        Raises:
+            InputError: A box is not finite, is beyond MAX_RANGE or has a side that is not positive;
+                a track id is not an integer; or the columns differ in length. The message starts
+                with `where`.
         """
         where = where or f"the labels of frame {name}"
         try:
@@ -106,8 +110,8 @@ class DriveLabels:
     """Labels of a drive.
 
     Attributes:
-        frames: FrameLabels of each frame, in the order of the frames.
-        extra: content of a format for the whole drive, as JSON object, by format.
+        frames: Labels of each frame, in the order of the frames.
+        extra: JSON object with the content of a file that belongs to the drive, by format.
     """
 
     frames: list[FrameLabels]
@@ -117,7 +121,7 @@ class DriveLabels:
         return len(self.frames)
 
     def take_first(self, count: int) -> DriveLabels:
-        """Return the labels of the first frames."""
+        """Return the labels of the first `count` frames."""
         return DriveLabels(self.frames[:count], self.extra)
 
     @property
@@ -166,7 +170,7 @@ def _to_integers(ids: np.ndarray) -> np.ndarray:
 
 
 def to_ground_truth(labels: FrameLabels) -> GroundTruth:
-    """Convert labels to GroundTruth; unknown classes become Misc, with their name in extras."""
+    """Convert labels to GroundTruth; unknown classes become Misc and keep their name in extras."""
     extras = []
     for k, (name, extra) in enumerate(zip(labels.class_names, labels.extra)):
         class_name = {} if name in CLASSES else {"class_name": name}
@@ -175,7 +179,7 @@ def to_ground_truth(labels: FrameLabels) -> GroundTruth:
 
 
 def get_id_and_score(labels: FrameLabels, k: int) -> dict[str, Any]:
-    """Return the track_id and score of box k, without missing ones."""
+    """Return the track_id and score of box k as a dict that omits missing values."""
     fields: dict[str, Any] = {}
     if labels.track_ids[k] != NO_TRACK:
         fields["track_id"] = int(labels.track_ids[k])

@@ -1,4 +1,4 @@
-"""Import and export of labels: recognition of the format, and one reader and writer per format."""
+"""Import and export of labels: table of the formats, and recognition of the format of a file."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ WITH_NOTES = {"kitti", "kitti-tracking", "openlabel", "mcap", "mcap-labels"}
 
 @dataclass(frozen=True)
 class ExportResult:
-    """Number of exported boxes and frames, and content that the format cannot store, as text."""
+    """Number of exported boxes and frames, and descriptions of content that was left out."""
 
     path: Path
     boxes: int
@@ -71,7 +71,8 @@ class ExportResult:
 def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabels:
     """Read the labels at a path for each frame of a drive.
 
-    Raises InputError if they cannot be read, or belong to frames that the drive does not have.
+    Raises:
+        InputError: The labels cannot be read, or belong to frames that are not in the drive.
     """
     with np.errstate(all="ignore"):  # FrameLabels.of rejects numbers that overflow
         read = READERS[resolve_format(format, READERS)]
@@ -81,9 +82,10 @@ def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabe
 def export_labels(
     labels: DriveLabels, format: str, out: Path, frames: Sequence[Frame], force: bool = False
 ) -> ExportResult:
-    """Write the labels of the frames of a drive; replace existing files only with `force`.
+    """Write the labels of a drive; existing files are replaced only with `force`.
 
-    Raises InputError, without partial output, if they cannot be written.
+    Raises:
+        InputError: The labels cannot be written; nothing is left behind.
     """
     format = resolve_format(format, FORMATS)
     if len(labels) != len(frames):
@@ -105,7 +107,11 @@ def export_labels(
 
 
 def recognise_format(path: Path) -> str:
-    """Return the format of the labels at a path. Raises InputError if it cannot be recognised."""
+    """Recognise the format of the labels at a path.
+
+    Raises:
+        InputError: The format is not recognised.
+    """
     files = (
         [path]
         if path.is_file()
@@ -134,7 +140,10 @@ def recognise_format(path: Path) -> str:
 
 
 def _recognise_text(file: Path) -> str:
-    """Recognise the format by the number of columns before the class in the first line."""
+    """Recognise a text format by the number of columns before the class name in the first line.
+
+    Returns "" for other text files.
+    """
     words = read_text(file, MAX_BYTES).lstrip().partition("\n")[0].split()
     if words and words[0].endswith(":"):
         return ""  # the file is a calibration
@@ -149,7 +158,7 @@ def _recognise_text(file: Path) -> str:
 
 
 def _recognise_json(content: Any) -> str:
-    """Recognise the format by the keys; "" for files without boxes, and for other JSON files."""
+    """Recognise a JSON format by its keys; return "" for files without boxes and other JSON files."""
     with suppress(TypeError, LookupError, AttributeError):  # values may be of any type
         if isinstance(content, list) or "objs" in content:
             boxes = content if isinstance(content, list) else content["objs"]

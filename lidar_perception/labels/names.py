@@ -1,4 +1,4 @@
-"""Names of formats and their aliases."""
+"""Names of label formats and their aliases."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ ALIASES = {"kitti-object": "kitti", "bag": "mcap", "bag-labels": "mcap-labels"}
 
 
 def resolve_format(name: str, names: Iterable[str]) -> str:
-    """Return the name of a format as spelt in `known`; case, hyphens and underscores do not matter.
+    """Return the name of a format as it is spelt in `names`.
+
+    Case does not matter, nor does the choice between hyphens and underscores.
 
     Raises:
-        InputError: `known` has no such name.
+        InputError: `names` has no such format.
     """
     normalised = name.strip().lower().replace("_", "-")
     normalised, names = ALIASES.get(normalised, normalised), list(names)

@@ -1,1 +1,1 @@
-"""One module per label format, with read(path, frames) and write(labels, out, frames)."""
+"""Label formats, one module each, with read(path, frames) and write(labels, out, frames)."""

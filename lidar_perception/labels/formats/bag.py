@@ -1,7 +1,7 @@
 """Labels in a rosbag2 bag, as MarkerArray and Detection3DArray, with or without clouds.
 
-A message belongs to the frame of its header.stamp. Numbers are exact. Detection3DArray has one
-class, score and id per box; other fields are in the text of the markers.
+A message belongs to the frame with its header.stamp. Numbers are stored without rounding.
+Detection3DArray has one class, score and id per box; other fields are in the text of the markers.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ MARKERS, DETECTIONS = "visualization_msgs/msg/MarkerArray", "vision_msgs/msg/Det
 
 
 def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels:
-    """Read the boxes on a topic of any node, MarkerArray or Detection3DArray.
+    """Read the boxes from a MarkerArray or Detection3DArray topic of any node.
 
-    Track ids are `track_id` in the text of label markers, and `id` in that of track markers. The
-    ids of a Detection3DArray are track ids unless they only number the boxes of each message.
+    Track ids are read from `track_id` in the text of label markers and from `id` in the text of
+    track markers. The ids of a Detection3DArray are track ids unless they only number the boxes of
+    each message.
     """
     stamps = {frame.stamp_ns for frame in frames}
     with Bag(path) as bag:
@@ -85,7 +86,7 @@ def _make_frame_labels(
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False, clouds: bool = True) -> None:
-    """Write a bag with the labels, poses, camera and, optionally, clouds of the frames to `out`."""
+    """Write a bag with the labels, poses, calibration and, optionally, clouds of the frames."""
     write_bag(
         out,
         (

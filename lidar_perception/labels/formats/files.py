@@ -19,7 +19,7 @@ CONFLICTING = "kept"  # field with the fields whose names the format uses itself
 
 
 def group_by_sequence(frames: Sequence[Frame]) -> dict[str, list[int]]:
-    """Return the positions of frames by the sequence that they belong to, in order."""
+    """Return the positions of the frames of each sequence, in order."""
     positions: dict[str, list[int]] = {}
     for i, frame in enumerate(frames):
         positions.setdefault(frame.sequence, []).append(i)
@@ -27,9 +27,13 @@ def group_by_sequence(frames: Sequence[Frame]) -> dict[str, list[int]]:
 
 
 def list_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[str, Path]:
-    """Return the label file of each drive: `path` if it has the suffix, else path/DRIVE.suffix.
+    """Return the label file of each drive.
 
-    A drive without a name is 0000. Raises InputError for one file and several drives.
+    It is `path` if it has the suffix, otherwise path/DRIVE.suffix. A drive without a name is called
+    0000.
+
+    Raises:
+        InputError: `path` is a single file, but there are several drives.
     """
     names = list(group_by_sequence(frames))
     if path.suffix == suffix:
@@ -56,9 +60,15 @@ def find_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[s
 def write_drives(
     out: Path, frames: Sequence[Frame], suffix: str, force: bool, write: Callable[[Path, str, list[int]], None]
 ) -> None:
-    """Call write(file, drive, positions of its frames) for each drive.
+    """Call write(file, drive, positions) for each drive, with the positions of its frames.
 
-    out: file of the only drive if it has the suffix, else a folder, which appears when complete.
+    Args:
+        out: File of the only drive if it has the suffix, otherwise a folder. The folder appears
+            when it is complete.
+        frames: Frames of all drives.
+        suffix: Suffix of a label file.
+        force: Replace existing files.
+        write: Function that writes the file of one drive.
     """
     drives = group_by_sequence(frames)
     if out.suffix == suffix:
@@ -72,17 +82,25 @@ def write_drives(
 
 
 def list_frame_files(folder: Path, frames: Sequence[Frame], suffix: str) -> list[Path]:
-    """Return the label file of each frame, FRAME.suffix, in a folder per drive if there are several."""
+    """Return the label file FRAME.suffix of each frame.
+
+    If there are several drives, each has its own folder.
+    """
     has_drives = len(group_by_sequence(frames)) > 1
     return [folder / f"{frame.name if has_drives else frame.name.rpartition('/')[2]}{suffix}" for frame in frames]
 
 
 def check_label_files(folder: Path, expected: Sequence[Path], suffix: str, ignored: Sequence[str] = ()) -> None:
-    """Raise InputError if a folder has no label files, or one that is not in `expected`.
+    """Check that a folder has label files, and only those of the given frames.
 
     Args:
-        expected: label files of the frames.
-        ignored: names of other files that are allowed.
+        folder: The folder.
+        expected: Label files of the frames.
+        suffix: Suffix of a label file.
+        ignored: Names of other files that are allowed.
+
+    Raises:
+        InputError: The folder does not exist, has no label file, or has one of another frame.
     """
     if not folder.is_dir():
         raise InputError(f"the folder {folder} does not exist; give the folder of the label files")
@@ -123,7 +141,7 @@ def extract_extra(item: dict[str, Any], own_names: Collection[str]) -> dict[str,
 
 
 def assign_track_ids(names: Iterable[str]) -> dict[str, int]:
-    """Return a track id for each name: the name if it is a number, else a new number."""
+    """Return a track id for each name: its number if the name is a number, otherwise a new one."""
     unique_names = sorted(set(names))
     ids = {name: int(name) for name in unique_names if is_track_number(name)}
     new_ids = itertools.count(max([0, *ids.values()]) + 1)
@@ -131,9 +149,9 @@ def assign_track_ids(names: Iterable[str]) -> dict[str, int]:
 
 
 def collect_track_names(frames: Iterable[FrameLabels], key: str) -> dict[int, str]:
-    """Return the names of tracks in the file that was read, from extra[key].
+    """Return the original name of each track, stored in extra[key] when the file was read.
 
-    Each name is used for one track only, so that parts of a split track have different names.
+    Each name is used for one track only, so that the parts of a split track have different names.
     """
     names: dict[int, str] = {}
     used_names = set()
@@ -147,12 +165,16 @@ def collect_track_names(frames: Iterable[FrameLabels], key: str) -> dict[int, st
 
 
 def is_track_number(name: str) -> bool:
-    """Return True if a track id is a number in its usual spelling."""
+    """Return True if the name of a track is an integer in its usual spelling."""
     return name.isascii() and name.isdigit() and len(name) < 19 and name == str(int(name))
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file. InputError with the line of a syntax error."""
+    """Read a JSON file.
+
+    Raises:
+        InputError: The file cannot be read or is not valid JSON; the message has the line.
+    """
     text = read_text(path, MAX_BYTES)
     try:
         return json.loads(text)
@@ -165,12 +187,12 @@ def read_json(path: Path) -> Any:
 
 
 def write_json(path: Path, content: Any, indent: int | None = None) -> None:
-    """Write a standard JSON file: null instead of numbers that are not finite."""
+    """Write a standard JSON file; numbers that are not finite become null."""
     write_text(path, json.dumps(replace_non_finite(content), indent=indent, allow_nan=False))
 
 
 def replace_non_finite(value: Any) -> Any:
-    """Return a JSON value with null instead of numbers that are not finite."""
+    """Return a JSON value in which numbers that are not finite are replaced by null."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):

@@ -35,7 +35,11 @@ LEVELS = (-1, 0, 1, 2)  # levels of truncation in the tracking layout
 
 
 def require_calibration(frame: Frame) -> Calibration:
-    """Return the calibration of a frame; raise InputError if it has none."""
+    """Return the calibration of a frame.
+
+    Raises:
+        InputError: The frame has no calibration.
+    """
     calibration = frame.calibration()
     if calibration is None:
         raise InputError(
@@ -47,7 +51,10 @@ def require_calibration(frame: Frame) -> Calibration:
 
 
 def find_label_folder(path: Path, name: str) -> Path:
-    """Return the folder `name` (label_2 or label_02) in a folder of KITTI's layout, else `path`."""
+    """Find the folder `name` (label_2 or label_02) in a folder of KITTI's layout.
+
+    Returns `path` itself if there is no such folder.
+    """
     for inner in (f"training/{name}", name):
         path = path / inner if (path / inner).is_dir() else path
     return path
@@ -71,16 +78,19 @@ def parse_frame_labels(frame: Frame, lines: Sequence[dict[str, Any]], where: obj
 
 
 def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str, Any]]:
-    """Convert labels to lines for data.kitti.labels.format_label: one per box, then the notes.
+    """Convert labels to the columns for data.kitti.labels.format_label: boxes first, then notes.
 
-    Of new and changed boxes, alpha, the 2D box (zero outside the image), the truncation and, unless
-    given, the level of occlusion by other boxes are computed.
+    For new and changed boxes, alpha, the 2D box (zero outside the image), the truncation and, if
+    missing, the level of occlusion by other boxes are computed.
 
     Args:
-        levels: truncation is a level, as in the tracking layout, instead of a share.
+        labels: Labels of the frame.
+        frame: The frame.
+        levels: True to write truncation as a level, as in the tracking layout; False to write it as
+            a fraction.
 
     Raises:
-        InputError: there are boxes, but no calibration.
+        InputError: There are boxes but no calibration.
     """
     notes = [_make_note_line(name, extra) for name, extra in labels.notes]
     if len(labels):
@@ -111,7 +121,7 @@ def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str
 
 
 def _make_note_line(name: str, extra: dict[str, Any]) -> dict[str, Any]:
-    """Return the line of an object without a 3D box: as read, or with the columns of DontCare."""
+    """Return the columns of an object without a 3D box: as read, or those of DontCare."""
     shapes = {"bbox": (4,), "dimensions": (3,), "location": (3,)}
     with suppress(KeyError, TypeError, ValueError):
         if all(np.array(extra[c], np.float64).shape == shapes.get(c, ()) for c in COLUMNS):
@@ -120,7 +130,7 @@ def _make_note_line(name: str, extra: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_unchanged_line(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndarray) -> bool:
-    """Return True if extra has all columns of the unchanged box."""
+    """Return True if `extra` has all columns of the box and the box has not changed."""
     try:
         original = to_lidar_box(extra, to_lidar)
         return (
@@ -134,17 +144,21 @@ def _is_unchanged_line(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndar
 
 
 def _is_level(truncated: float, track: int) -> bool:
-    """Return True if a truncation is a level, as in the tracking layout, instead of a share."""
+    """Return True if a truncation is a level, as in the tracking layout, not a fraction."""
     return isinstance(truncated, int) or (track != NO_TRACK and truncated in LEVELS)
 
 
 def compute_occlusion_levels(pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Compute the level of occlusion of 2D boxes (K, 4) by nearer ones, given their depths (K,).
+    """Compute the level of occlusion of 2D boxes by nearer boxes.
 
-    Unlabelled occluders are not considered.
+    Unlabelled objects are not considered.
+
+    Args:
+        pixels: (K, 4) boxes [left top right bottom].
+        depths: (K,) depth of each box.
 
     Returns:
-        (K,) int: 0 visible, 1 partly, 2 largely occluded.
+        (K,) int: 0 visible, 1 partly occluded, 2 largely occluded.
     """
     levels = np.zeros(len(pixels), int)
     for k, (left, top, right, bottom) in enumerate(pixels):

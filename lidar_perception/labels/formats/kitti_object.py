@@ -18,7 +18,10 @@ ZEROS = re.compile(r"(\.\d\d\d*?)0+(?=\s|$)")
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a folder with FRAME.txt, or of the object layout. Frames may have no file."""
+    """Read a folder with FRAME.txt, or a folder of the object layout.
+
+    Frames without a file have no labels.
+    """
     path = find_label_folder(path, "label_2")
     files = list_frame_files(path, frames, ".txt")
     check_label_files(path, files, ".txt")
@@ -31,7 +34,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
-    """Write a file per frame to the folder `out`."""
+    """Write one file per frame to the folder `out`."""
     with write_folder(out, force) as folder:
         files = list_frame_files(folder, frames, ".txt")
         for frame_labels, frame, file in zip(labels.frames, frames, files):
@@ -39,5 +42,5 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
 
 
 def format_frame(labels: FrameLabels, frame: Frame) -> str:
-    """Return the lines of a frame."""
+    """Format the labels of a frame as the lines of its file."""
     return "".join(ZEROS.sub(r"\1", format_label(line, 6)) + "\n" for line in make_lines(labels, frame, levels=False))

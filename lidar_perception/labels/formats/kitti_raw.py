@@ -21,7 +21,7 @@ from lidar_perception.types import InputError
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     """Read FILE.xml, or a folder with tracklet_labels.xml or DRIVE/tracklet_labels.xml.
 
-    A drive without a file has no labels.
+    Drives without a file have no labels.
     """
     drives = group_by_sequence(frames)
     if path.is_file() and len(drives) > 1:

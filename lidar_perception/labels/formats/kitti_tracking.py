@@ -40,7 +40,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
-    """Write DRIVE.txt, or a folder with a file per drive; numbers have six decimals."""
+    """Write DRIVE.txt, or a folder with one file per drive; numbers have six decimals."""
 
     def write_drive(file: Path, drive: str, positions: list[int]) -> None:
         write_bytes(
@@ -51,7 +51,7 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
 
 
 def format_frame(labels: FrameLabels, frame: Frame, number: int) -> str:
-    """Return the lines of a frame with this number."""
+    """Format the labels of a frame as lines that start with its number."""
     return "".join(
         format_tracking_line(number, line.get("track_id", NO_TRACK), line)
         for line in make_lines(labels, frame, levels=True)

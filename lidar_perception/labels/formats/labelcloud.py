@@ -1,10 +1,11 @@
 """labelCloud's JSON files, one per frame: a centroid and rotations, or eight vertices.
 
-Rotations are about z, then the rotated y, then the rotated x: in degrees, 0 to 360 (centroid_abs),
-or in radians, -pi to pi (centroid_rel). The length is along the rotated x axis. Vertices go around
-the bottom from the rear right corner over the rear left one, then around the top, seen along y as
-in labelCloud's manual. Numbers have eight decimals, as in labelCloud. It reads classes and format
-from _classes.json in the same folder, and drops unknown fields when it saves.
+Rotations are about z, then the rotated y, then the rotated x, in degrees from 0 to 360
+(centroid_abs) or in radians from -pi to pi (centroid_rel). The length is along the rotated x axis.
+Vertices start at the rear right corner of the bottom face and continue with the rear left one; the
+top face follows in the same order (seen along y as in labelCloud's manual). Numbers have eight
+decimals, as in labelCloud. labelCloud reads the classes and the format from _classes.json in the
+same folder, and drops unknown fields when it saves.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def _parse_objects(content: dict[str, Any], notation: str) -> list[Row]:
 
 
 def _parse_box(item: dict[str, Any], notation: str) -> tuple[list[float], bool]:
-    """Return [x y z l w h yaw], and True if the box is tilted."""
+    """Return a box [x y z l w h yaw], and True if the original box is tilted."""
     if "vertices" in item:
         corners = np.array(item["vertices"], float).reshape(8, 3)
         edges = np.array(
@@ -109,7 +110,7 @@ def _parse_box(item: dict[str, Any], notation: str) -> tuple[list[float], bool]:
 
 
 def _write(notation: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
-    """Write FRAME.json of each frame and _classes.json to the folder `out`."""
+    """Write FRAME.json for each frame, and _classes.json, to the folder `out`."""
     names = sorted({name for frame_labels in labels.frames for name in frame_labels.class_names})
     headers = labels.extra.get(ROOT, {})
     with write_folder(out, force) as folder:

@@ -73,7 +73,7 @@ def _require_pose(frame: Frame) -> np.ndarray:
 
 
 def _read(task: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a file, which may also have boxes of other drives."""
+    """Read a result file; boxes of other drives in it are ignored."""
     content = read_json(path)
     results = report_format_errors(str(path), lambda: dict(content["results"]))
     if not results.keys() & {_get_token(frame) for frame in frames}:
@@ -124,7 +124,10 @@ def _parse_velocity(velocity: Any) -> list[float] | None:
 
 
 def _to_local_box(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], bool]:
-    """Return the box in the frame with this pose, and True if it is tilted there."""
+    """Transform a global box to the frame with this pose.
+
+    Returns the box, and True if it is tilted in that frame.
+    """
     width, length, height = row["size"]
     box = GlobalBoxes.of([row["translation"]], [[length, width, height]], [row["rotation"]], 0)
     if not are_valid_rotations(box.rotations).all():
@@ -133,7 +136,7 @@ def _to_local_box(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], b
 
 
 def find_read_rotation(labels: FrameLabels, k: int, pose: np.ndarray) -> list[float] | None:
-    """Return the rotation [w x y z] with which a tilted box was read; None if it was changed."""
+    """Return the original rotation [w x y z] of a tilted box; None if the box has changed."""
     rotation, box = labels.extra[k].get("rotation"), labels.boxes[k]
     if not isinstance(rotation, list) or len(rotation) != 4:
         return None
@@ -147,7 +150,8 @@ def find_read_rotation(labels: FrameLabels, k: int, pose: np.ndarray) -> list[fl
 def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
     """Write one JSON file.
 
-    Missing velocities are computed from the tracks, else NaN, which nuscenes-devkit can read.
+    Missing velocities are computed from the tracks. Without a track they are NaN, which
+    nuscenes-devkit can read.
     """
     check_unused(out, force)
     poses = {i: _require_pose(frame) for i, frame in enumerate(frames) if len(labels.frames[i])}
@@ -168,7 +172,7 @@ def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame], f
 def _make_columns(
     task: str, labels: FrameLabels, k: int, pose: np.ndarray, velocity: list[float], names: dict[int, str]
 ) -> dict[str, Any]:
-    """Return the fields of a box except its position and size, see _write."""
+    """Return the fields of a box other than its position and size."""
     class_name, track = labels.class_names[k], int(labels.track_ids[k])
     extra = dict(labels.extra[k])
     attribute = extra.pop("attribute", None) or ""
@@ -198,9 +202,15 @@ def _make_columns(
 def _compute_velocities(
     labels: DriveLabels, frames: Sequence[Frame], poses: dict[int, np.ndarray]
 ) -> dict[tuple[int, int], list[float]]:
-    """Compute velocities in m/s in the fixed frame from the previous to the next box of a track.
+    """Compute velocities in the fixed frame, m/s, from the previous and next box of each track.
 
-    poses: poses of the frames with boxes. Returns velocities by frame and box.
+    Args:
+        labels: Labels of the frames.
+        frames: The frames.
+        poses: Pose of each frame with boxes.
+
+    Returns:
+        Velocity [x y] by (frame, box).
     """
     tracks: dict[tuple[str, int], list[tuple[int, int]]] = {}
     for i, (frame_labels, frame) in enumerate(zip(labels.frames, frames)):

@@ -72,7 +72,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
 
 
 def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[FrameLabels], dict[str, Any]]:
-    """Return the labels of each frame, and the other content of the file."""
+    """Read the file of a drive; return the labels of each frame, and its other content."""
     content = dict(read_json(path)[ROOT])
     objects, systems = content.get("objects", {}), content.get("coordinate_systems", {})
     frame_contents = content.get("frames", {})
@@ -134,8 +134,11 @@ def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[Frame
 
 
 def _make_region_notes(kind: str, uid: str, data: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
-    """Return notes of an object without a cuboid: one with KITTI's columns per 2D box, of which the
-    first has the data, or without 2D boxes, one of the data."""
+    """Return the notes of an object without a cuboid.
+
+    Each 2D box becomes a note with KITTI's columns; the first note also has the object's data. An
+    object without 2D boxes becomes one note with its data.
+    """
     values, rest = parts.parse_named_values(data)
     columns = {name: DONT_CARE[name] for name in COLUMNS if name in DONT_CARE}
     notes = [
@@ -146,7 +149,7 @@ def _make_region_notes(kind: str, uid: str, data: dict[str, Any]) -> list[tuple[
 
 
 def _parse_track(cuboid: dict[str, Any], object_class: str, number: int) -> tuple[str, int, float]:
-    """Return class, track id and score of a cuboid."""
+    """Return the class, track id and score of a cuboid."""
     values, _ = parts.parse_named_values(cuboid.get("attributes", {}))
     return (
         class_name(values.get(TYPE, object_class)),
@@ -156,7 +159,11 @@ def _parse_track(cuboid: dict[str, Any], object_class: str, number: int) -> tupl
 
 
 def _parse_extra(cuboid: dict[str, Any], box: list[float], is_plain: bool) -> dict[str, Any]:
-    """Return the extra fields of a cuboid; `is_plain` means that its box describes it completely."""
+    """Return the extra fields of a cuboid.
+
+    `is_plain` is True if the box describes the cuboid completely; otherwise the original cuboid is
+    kept.
+    """
     values, other_items = parts.parse_named_values(cuboid.get("attributes", {}))
     extra = {name: v for name, v in values.items() if name not in (SCORE, TRACKED, TYPE)}
     extra |= {OTHER: other_items} if other_items else {}
@@ -166,7 +173,7 @@ def _parse_extra(cuboid: dict[str, Any], box: list[float], is_plain: bool) -> di
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
-    """Write FILE.json, or a folder with a file per drive. Numbers are exact."""
+    """Write FILE.json, or a folder with one file per drive; numbers are stored without rounding."""
     original = labels.extra.get(ROOT, {})
 
     def write_drive(file: Path, drive: str, positions: list[int]) -> None:
@@ -178,8 +185,14 @@ def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool =
 def _make_content(
     labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[int], original: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the content of the file of a drive. original: content of the file that
-    was read, without cuboids."""
+    """Return the content of the file of a drive.
+
+    Args:
+        labels: Labels of all frames.
+        frames: All frames.
+        positions: Positions of the drive's frames in `frames`.
+        original: Content of the file that was read, without cuboids; {} for none.
+    """
     drive = [(frames[i], labels.frames[i]) for i in positions]
     named_tracks = collect_track_names((frame_labels for _, frame_labels in drive), UID)
     note_uids = {str(note[UID]) for _, frame_labels in drive for _, note in frame_labels.notes if UID in note}
@@ -203,7 +216,7 @@ def _make_content(
     frames_by_object: dict[str, list[int]] = {}
 
     def get_object_data(uid: str, object_class: str, index: int) -> dict[str, Any]:
-        """Return the data of an object in a frame."""
+        """Return the data of an object in a frame; add the object if it is new."""
         if uid not in frames_by_object:
             known_object = objects.get(uid, {})
             same_class = class_name(str(known_object.get("type", ""))) == object_class  # compared in any spelling

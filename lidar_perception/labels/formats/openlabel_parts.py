@@ -25,16 +25,17 @@ MAX_TILT = 1e-9  # 1 - cosine of the angle between the z axis of a box and the v
 def cuboid_to_box(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[float], bool]:
     """Convert a cuboid to a box.
 
-    The height is the size along the axis that is closest to the vertical: y in a camera's system (x
-    right, y down, z ahead). The first of the other two is the length, as in KITTI and ISO 8855.
+    The height is the size along the axis that is closest to the vertical, which is y in a camera's
+    system (x right, y down, z forward). The length is the size along the first of the other two
+    axes, as in KITTI and ISO 8855.
 
     Args:
-        val: 10 numbers [x y z qx qy qz qw sx sy sz], or 9 with angles about x, y and z, applied in
-            this order, instead of the quaternion.
-        to_lidar: transform (4, 4) from the cuboid's coordinate system to the LiDAR's.
+        val: 10 numbers [x y z qx qy qz qw sx sy sz], or 9 numbers with three angles instead of the
+            quaternion; the rotations are about x, then y, then z.
+        to_lidar: (4, 4) transform from the cuboid's coordinate system to the LiDAR's.
 
     Returns:
-        [x y z l w h yaw] in the LiDAR's system, and True if the cuboid's z axis is up there.
+        The box [x y z l w h yaw] in the LiDAR's system, and True if the cuboid's z axis points up.
     """
     if len(val) not in (9, 10):
         raise ValueError(f"a cuboid has {len(val)} numbers instead of 10 or 9")
@@ -54,12 +55,12 @@ def cuboid_to_box(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[floa
 
 
 def has_size(cuboid: dict[str, Any]) -> bool:
-    """Return False for a cuboid without a positive size, such as KITTI's DontCare regions."""
+    """Return True if a cuboid has a positive size; KITTI's DontCare regions have none."""
     return not all(size <= 0 for size in cuboid["val"][-3:])
 
 
 def find_regions(data: dict[str, Any]) -> list[list[float]]:
-    """Return the 2D boxes [left top right bottom] of an object in pixels of its first camera."""
+    """Return the 2D boxes [left top right bottom] of an object in the image of its first camera."""
     boxes = [box for box in data.get("bbox", ()) if len(box["val"]) == 4]
     cameras = [box.get("coordinate_system") for box in boxes]
     return [
@@ -71,12 +72,12 @@ def find_regions(data: dict[str, Any]) -> list[list[float]]:
 
 
 def quaternion_to_matrix(quaternion: Sequence[float]) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of [qx qy qz qw]."""
+    """Convert a quaternion [qx qy qz qw] to a rotation matrix (3, 3)."""
     return to_matrices(np.roll(np.array(quaternion, float).reshape(1, 4), 1))[0]
 
 
 def _euler_to_matrix(x: float, y: float, z: float) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of a rotation about x, then about y, then about z."""
+    """Return the rotation matrix (3, 3) for rotations about x, then y, then z, in radians."""
     a, b, c = (
         quaternion_to_matrix([*(math.sin(angle / 2) * np.eye(3)[i]), math.cos(angle / 2)])
         for i, angle in enumerate((x, y, z))
@@ -87,11 +88,20 @@ def _euler_to_matrix(x: float, y: float, z: float) -> np.ndarray:
 def find_transform_to_lidar(
     name: str, systems: dict[str, Any], frame: dict[str, Any], recorded_frame: Frame, where: str
 ) -> np.ndarray:
-    """Return the transform (4, 4) from a coordinate system ("" for the LiDAR's) to the LiDAR's.
+    """Return the transform (4, 4) from a coordinate system to that of the LiDAR.
 
-    It is computed from the poses of the systems and of the frame, else from the recording's pose;
-    for a camera in a file without a LiDAR, from the recording's calibration. Raises InputError if
-    the systems are not connected.
+    It is computed from the poses in the file, and from the pose of the recording if one is missing.
+    For a camera in a file without a LiDAR, it is the calibration of the recording.
+
+    Args:
+        name: Name of the coordinate system, "" for the LiDAR's.
+        systems: Coordinate systems of the file.
+        frame: Content of the frame in the file.
+        recorded_frame: The same frame of the recording.
+        where: Name of the file, for error messages.
+
+    Raises:
+        InputError: The systems are not connected.
     """
     lidar = find_lidar_system(systems, where)
     if name in ("", lidar):
@@ -120,7 +130,11 @@ def find_transform_to_lidar(
 
 
 def find_lidar_system(systems: dict[str, Any], where: str) -> str:
-    """Return the name of the LiDAR's coordinate system. Raises InputError if it is ambiguous."""
+    """Return the name of the LiDAR's coordinate system.
+
+    Raises:
+        InputError: Several systems may be that of the LiDAR.
+    """
     sensors = [name for name, s in systems.items() if s.get("type") == "sensor_cs" and not _is_camera(name)]
     lidars = [name for name in sensors if any(word in name.lower() for word in ("lidar", "velo", "laser"))] or sensors
     if len(lidars) > 1:
@@ -162,8 +176,11 @@ def _parse_transform(data: dict[str, Any]) -> np.ndarray:
 
 
 def make_coordinate_systems(frames: Sequence[Frame]) -> dict[str, Any]:
-    """Return coordinate_systems and streams of a drive: the LiDAR, and if the recording has them, a
-    fixed system and the camera."""
+    """Make coordinate_systems and streams of a drive.
+
+    They contain the LiDAR and, if the recording has poses or a calibration, a fixed system and the
+    camera.
+    """
     calibration = frames[0].calibration() if frames else None
     has_poses = bool(frames) and frames[0].pose() is not None
     lidar: dict[str, Any] = {"type": "sensor_cs", "parent": FIXED if has_poses else "", "children": []}
@@ -194,7 +211,7 @@ def make_coordinate_systems(frames: Sequence[Frame]) -> dict[str, Any]:
 
 
 def make_transforms(frame: Frame) -> dict[str, Any]:
-    """Return frame_properties with the pose of the LiDAR in a fixed frame; empty without a pose."""
+    """Make frame_properties with the pose of the LiDAR in a fixed frame; {} without a pose."""
     pose = frame.pose()
     return (
         {}
@@ -238,7 +255,7 @@ def parse_named_values(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str,
 
 
 def _is_number(value: Any) -> bool:
-    """Return True for numbers within the range of float64, as other readers require."""
+    """Return True for a number in the range of float64, which other readers require."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
@@ -251,7 +268,7 @@ TYPES = {
 
 
 def find_intervals(numbers: list[int]) -> list[dict[str, int]]:
-    """Return the runs of consecutive numbers."""
+    """Group numbers into intervals of consecutive frames."""
     runs: list[dict[str, int]] = []
     for number in sorted(set(numbers)):
         if runs and runs[-1]["frame_end"] == number - 1:

@@ -14,7 +14,10 @@ from lidar_perception.labels.formats.files import check_label_files, list_frame_
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a folder with FRAME.txt or labels/FRAME.txt. A frame without a file has no labels."""
+    """Read a folder with FRAME.txt or labels/FRAME.txt.
+
+    Frames without a file have no labels.
+    """
     path = path / "labels" if (path / "labels").is_dir() else path
     files = list_frame_files(path, frames, ".txt")
     check_label_files(path, files, ".txt")

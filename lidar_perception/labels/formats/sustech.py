@@ -1,8 +1,8 @@
 """SUSTechPOINTS' JSON files, one per frame: position, scale and rotation of each box.
 
-scale.x is along the length, which points to the front at rotation 0. Rotations are in radians,
-about x, then the rotated y, then the rotated z, in the LiDAR's frame. Ids are text. Numbers are
-exact. SUSTechPOINTS drops unknown fields when it saves.
+scale.x is the length of the box; at rotation 0 it points forward. Rotations are in radians, about
+x, then the rotated y, then the rotated z, in the LiDAR frame. Ids are text. Numbers are stored
+without rounding. SUSTechPOINTS drops unknown fields when it saves.
 """
 
 from __future__ import annotations
@@ -42,7 +42,10 @@ OWN_FIELDS = {"psr", "obj_type", "obj_id", "score"}
 
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
-    """Read a folder with FRAME.json or label/FRAME.json. A frame without a file has no labels."""
+    """Read a folder with FRAME.json or label/FRAME.json.
+
+    Frames without a file have no labels.
+    """
     path = path / "label" if (path / "label").is_dir() else path
     files = list_frame_files(path, frames, SUFFIX)
     check_label_files(path, files, SUFFIX)
@@ -90,7 +93,7 @@ def _parse_boxes(content: list[dict[str, Any]], ids: dict[str, int]) -> list[Row
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
-    """Write FRAME.json of each frame to the folder `out`."""
+    """Write FRAME.json for each frame to the folder `out`."""
     names = collect_track_names(labels.frames, "obj_id")
     with write_folder(out, force) as folder:
         files = list_frame_files(folder, frames, SUFFIX)
