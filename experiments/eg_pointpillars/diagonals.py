@@ -80,14 +80,15 @@ def count_classes(pairs: list[list[float]]) -> list[list[int]]:
 
 def _draw_histograms(records: list[dict[str, Any]]) -> Figure:
     panels = []
+    middles = (BINS[:-1] + np.diff(BINS) / 2).tolist()
     for key, title in (("boxes", "labelled boxes"), ("clusters", "clusters")):
         values = np.array([pair for record in records for pair in record[key]]).reshape(-1, 2)
+        counts = np.stack([np.histogram(values[_find_class(values[:, 0]) == i, 1], BINS)[0] for i in range(len(NAMES))])
+        shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
         lines = []
-        for i, name in enumerate(NAMES):
-            counts, _ = np.histogram(values[_find_class(values[:, 0]) == i, 1], BINS)
-            share = 100 * counts / max(counts.sum(), 1)
-            lines.append(Line(name, (BINS[:-1] + np.diff(BINS) / 2).tolist(), share.tolist()))
+        for name, share in zip(NAMES, shares):
             low = paper.TABLE_2[name][0]
-            lines.append(Line(f"{name}, limit", (low, low), (0.0, 100.0), dashed=True))
-        panels.append(Panel(title, "diagonal in x-y [m]", "% of the class", tuple(lines)))
+            lines.append(Line(name, middles, share.tolist()))
+            lines.append(Line(f"{name}, limit", (low, low), (0.0, float(shares.max())), dashed=True))
+        panels.append(Panel(title, "diagonal in x-y [m]", "fraction of the class", tuple(lines)))
     return Figure("figure_13", "Figure 13: diagonals by class, and the lower limits of Table 2", tuple(panels))

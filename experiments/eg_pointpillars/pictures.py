@@ -25,7 +25,7 @@ from lidar_perception.scoring.kitti.protocol import (
 from lidar_perception.types import CLASSES, InputError
 
 SHOWN_SCORE = 0.3
-SIZE = (960, 540)  # size of each half of the picture, in pixels
+SIZE = (1280, 540)  # size of each half of the picture, in pixels
 BETTER, WORSE = 2, 1  # number of frames to show in which V4 makes fewer errors, and more errors
 
 
@@ -58,8 +58,8 @@ def make_picture_sections(
         pictures.append(
             Picture(
                 f"figure_20_{len(pictures) + 1}",
-                f"{frame.name}: {first} (left, errors: {counts[0]}) and {last} (right, errors: {counts[1]})",
-                np.concatenate([_draw(frame, models[name], name) for name in (first, last)], axis=1),
+                f"{frame.name}: {first} (above, errors: {counts[0]}) and {last} (below, errors: {counts[1]})",
+                np.concatenate([_draw(frame, models[name], name) for name in (first, last)], axis=0),
             )
         )
     text = (
@@ -68,7 +68,7 @@ def make_picture_sections(
         "the second are shown, those with the largest difference; the paper shows three of the first kind. An "
         "error is a missed object or a wrong box, in BEV at the overlaps 0.5 (Car) and 0.25."
     )
-    return [Section("Side by side (Figure 20)", text, figures=tuple(pictures))]
+    return [Section("V0 and V4 on the same frames (Figure 20)", text, figures=tuple(pictures))]
 
 
 def count_errors(frame: ComparedFrame) -> int:

@@ -311,7 +311,10 @@ def _draw_legend(canvas: Canvas, stage: Stage, boxes: Boxes, labels: np.ndarray,
         x += 50 + 8.2 * len(text)
     if not with_scale:
         return items
-    scale_right, scale_top = stage.views[0].width - 80, int(y) - 4
+    scale_right = stage.views[0].width - 80
+    if x > scale_right - SCALE_WIDTH - 80:  # not enough width for one row
+        y -= 24
+    scale_top = int(y) - 4
     low, high, unit = (0, 1, "") if stage.color == "intensity" else (0, 4, " m")
     values = np.linspace(low, high, SCALE_WIDTH)
     bar = color_by_intensity(values) if stage.color == "intensity" else color_by_height(values)

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidar_perception.rendering.colors import LABEL, color_by_cluster, color_by_height, get_class_color
-from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
+from lidar_perception.rendering.canvas import Canvas
+from lidar_perception.rendering.colors import BACKGROUND, LABEL, color_by_cluster, color_by_height, get_class_color
+from lidar_perception.rendering.picture import Boxes, Stage, _draw_legend, draw_frame
 from lidar_perception.types import CLASSES, PointCloud
 
 CAR, PEDESTRIAN = CLASSES.index("Car"), CLASSES.index("Pedestrian")
@@ -104,3 +105,13 @@ def test_stage_covers_range_of_first_cloud(far, reach):
     assert stage.reach == pytest.approx(reach, rel=1e-3) and stage.ground == -1.0
     assert 3 <= len(stage.rings) <= 12
     assert Stage.of(EMPTY, 1.0, False).reach == 6.0
+
+
+@pytest.mark.parametrize("width", [480, 800, 1280])
+def test_color_scale_does_not_cover_the_classes(width):
+    stage = Stage(30.0, True, -1.73, width=width, height=270)
+    found = Boxes(np.repeat(BOX, 3, axis=0), np.array([CAR, PEDESTRIAN, CLASSES.index("Cyclist")]))
+    *classes, scale, _ = _draw_legend(Canvas(width, 270, BACKGROUND), stage, found, BOX, True)
+    last = classes[-1]
+    end, start = last.at[0] + 9 * len(last.text), scale.at[0] - 8 * len(scale.text)
+    assert len(classes) == 4 and (end < start or scale.at[1] < last.at[1] - 12)
