@@ -48,7 +48,7 @@ def make_diagonal_section(records: list[dict[str, Any]]) -> Section:
             "number",
             *(f"{p} % [m]" for p in PERCENTILES),
             "limits of Table 2 [m]",
-            *(f"taken for {name} [%]" for name in (*NAMES, "none")),
+            *(f"assigned to {name} [%]" for name in (*NAMES, "none")),
         )
         tables.append(Table(f"table_2_{key}", title, header, tuple(rows)))
     text = (
