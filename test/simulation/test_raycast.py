@@ -21,31 +21,31 @@ NO_GROUND = np.array([0.0, 0.0, 1e4])
 DRIVE = Motion((12.0, -1.0, 0.2), 0.8, stamp=0.3)
 
 
-def reference(made, sensor, motion=NO_MOTION):
+def reference(objects, sensor, motion=NO_MOTION):
     """Return range, solid (columns, rings) and reached by testing every solid with every ray."""
     turn = make_rays(sensor, motion)
     nearest = np.full(turn.direction.shape[:2], np.inf)
     solid, reached = np.full(nearest.shape, -1), {}
-    for i in range(len(made)):
-        centre = made.centre[i] + made.velocity[i] * turn.since[:, None, None]
-        o = (turn.origin - centre) @ made.axes[i] / made.half[i]
-        d = turn.direction @ made.axes[i] / made.half[i]
+    for i in range(len(objects)):
+        centre = objects.centre[i] + objects.velocity[i] * turn.since[:, None, None]
+        o = (turn.origin - centre) @ objects.axes[i] / objects.half[i]
+        d = turn.direction @ objects.axes[i] / objects.half[i]
         o = np.broadcast_to(o, d.shape)
         with np.errstate(all="ignore"):
             slab = np.sort(np.stack([(-1 - o) / d, (1 - o) / d]), axis=0)
-            flat = slice(0, 2) if made.kind[i] == CYLINDER else slice(0, 3)
+            flat = slice(0, 2) if objects.kind[i] == CYLINDER else slice(0, 3)
             a, b = (d[..., flat] ** 2).sum(-1), (o * d)[..., flat].sum(-1)
             root = np.sqrt(b * b - a * ((o[..., flat] ** 2).sum(-1) - 1))
             quadric = (-b - root) / a, (-b + root) / a
-            if made.kind[i] == BOX:
+            if objects.kind[i] == BOX:
                 enter, leave = slab[0].max(-1), slab[1].min(-1)
-            elif made.kind[i] == ELLIPSOID:
+            elif objects.kind[i] == ELLIPSOID:
                 enter, leave = quadric
             else:
                 enter = np.maximum(quadric[0], slab[0][..., 2])
                 leave = np.minimum(quadric[1], slab[1][..., 2])
         t = np.where((enter <= leave) & (enter > 0) & (enter <= sensor.max_range), enter, np.inf)
-        own = int(made.owner[i])
+        own = int(objects.owner[i])
         reached[own] = reached.get(own, False) | (t < np.inf)
         solid = np.where(t < nearest, i, solid)
         nearest = np.minimum(nearest, t)
@@ -59,21 +59,23 @@ def same(one, other):
 @pytest.mark.parametrize("motion", [NO_MOTION, DRIVE])
 @pytest.mark.parametrize("seed", range(4))
 def test_hits_equal_slow_reference(seed, motion):
-    made = crowd(seed)
+    objects = crowd(seed)
     for sensor in (SENSOR, replace(SENSOR, lifts=(), elevations=tuple(np.linspace(1.4, -1.4, 9)))):
-        hits = cast_rays(made, Ground(), NO_GROUND, sensor, motion)
-        nearest, solid, reached = reference(made, sensor, motion)
+        hits = cast_rays(objects, Ground(), NO_GROUND, sensor, motion)
+        nearest, solid, reached = reference(objects, sensor, motion)
         assert (nearest < np.inf).sum() > 50
         assert np.allclose(hits.range, nearest, rtol=1e-9)
         assert np.array_equal(hits.solid, solid)
-        assert np.array_equal(hits.owner, np.where(solid < 0, 0, made.owner[solid]))
+        assert np.array_equal(hits.owner, np.where(solid < 0, 0, objects.owner[solid]))
         assert {k: n for k, n in enumerate(hits.reached) if n} == {k: n for k, n in reached.items() if n}
 
 
 def leafy(seed):
-    made, rng = crowd(seed), np.random.default_rng(seed)
+    objects, rng = crowd(seed), np.random.default_rng(seed)
     return replace(
-        made, density=np.where(rng.random(60) < 0.4, 1.0, np.inf), transmission=np.where(rng.random(60) < 0.3, 0.5, 0.0)
+        objects,
+        density=np.where(rng.random(60) < 0.4, 1.0, np.inf),
+        transmission=np.where(rng.random(60) < 0.3, 0.5, 0.0),
     )
 
 
@@ -91,21 +93,21 @@ def test_nearest_of_single_casts_equals_joint_cast(motion):
     """Overlapping solids in high grass, most without an owner: neither order nor skipping changes a
     byte."""
     count, rng = 160, np.random.default_rng(0)
-    made = crowd(5, count)
-    far = np.linalg.norm(made.centre[:, :2], axis=1)[:, None]
-    made = replace(
-        made,
-        centre=made.centre * (5 + 0.3 * far) / far - [0, 0, 1],
-        half=0.6 * made.half,
+    objects = crowd(5, count)
+    far = np.linalg.norm(objects.centre[:, :2], axis=1)[:, None]
+    objects = replace(
+        objects,
+        centre=objects.centre * (5 + 0.3 * far) / far - [0, 0, 1],
+        half=0.6 * objects.half,
         density=np.where(rng.random(count) < 0.3, 1.0, np.inf),
-        owner=np.where(rng.random(count) < 0.7, 0, made.owner).astype(np.int32),
+        owner=np.where(rng.random(count) < 0.7, 0, objects.owner).astype(np.int32),
     )
     ground = FULL._replace(rough=0.8, litter=0.6, camber=0.03, curb_left=3.0, curb_right=-2.0)
-    hits = cast_rays(made, ground, OVER_ROAD, SENSOR, motion)
-    nearest = cast_rays(made.take(np.arange(0)), ground, OVER_ROAD, SENSOR, motion)._asdict()
+    hits = cast_rays(objects, ground, OVER_ROAD, SENSOR, motion)
+    nearest = cast_rays(objects.take(np.arange(0)), ground, OVER_ROAD, SENSOR, motion)._asdict()
     for i in range(count):
         # The others are out of reach, so that solid i keeps its place among them.
-        alone = replace(made, centre=np.where(np.arange(count)[:, None] == i, made.centre, 1e4))
+        alone = replace(objects, centre=np.where(np.arange(count)[:, None] == i, objects.centre, 1e4))
         met = cast_rays(alone, Ground(), NO_GROUND, SENSOR, motion)
         nearer = met.range < nearest["range"]
         assert (met.solid[nearer] == i).all()
@@ -149,9 +151,9 @@ def test_leaf_clumps_are_constant_during_drive():
         assert len(xyz) > 2000
     both = filled[0] & filled[1]
     assert len(both) > 0.6 * min(map(len, filled))
-    front = {c for c in filled[0] | filled[1] if c[0] == -6}  # the first layer, 12 by 5 cells seen
-    seen = {(-6, y, z) for y in range(-5, 5) for z in range(-2, 2)}
-    assert 0.08 < len(front & seen) / len(seen) < 0.5
+    front = {c for c in filled[0] | filled[1] if c[0] == -6}  # the first layer, 12 by 5 visible cells
+    visible = {(-6, y, z) for y in range(-5, 5) for z in range(-2, 2)}
+    assert 0.08 < len(front & visible) / len(visible) < 0.5
 
 
 @pytest.mark.parametrize("kind", [BOX, ELLIPSOID, CYLINDER])
@@ -196,17 +198,17 @@ def test_glass_passes_its_share_of_rays():
 def test_nearest_solid_wins_and_reached_counts_hidden_rays():
     both = solids([BOX, BOX], [(9, 0, 0), (5, 0, 0)], (0.5, 0.5, 1.0), [2, 1])
     hits = cast_rays(both, Ground(), OVER_ROAD, SENSOR)
-    seen = np.bincount(hits.owner.ravel(), minlength=3)
+    hit_counts = np.bincount(hits.owner.ravel(), minlength=3)
     assert (hits.range[0][hits.owner[0] == 1] < 5.0).all()
-    assert seen[1] == hits.reached[1] and seen[2] < 0.4 * hits.reached[2]
+    assert hit_counts[1] == hits.reached[1] and hit_counts[2] < 0.4 * hits.reached[2]
 
 
 def test_edge_beams_return_from_between_or_one_side():
     near, far = (BOX, (5, 0, 0), (0.2, 1, 1)), (BOX, (5.7, 0, 0), (0.2, 9, 4))
-    made = solids(*zip(near, far), [1, 2])
+    objects = solids(*zip(near, far), [1, 2])
     fine = make_generic_sensor(64, -10.0, 10.0, 0.2, 10.0, divergence=3e-3)
-    exact = cast_rays(made, Ground(), NO_GROUND, replace(fine, divergence=0.0))
-    beams = cast_rays(made, Ground(), NO_GROUND, fine)
+    exact = cast_rays(objects, Ground(), NO_GROUND, replace(fine, divergence=0.0))
+    beams = cast_rays(objects, Ground(), NO_GROUND, fine)
     mixed = beams.owner == 0
     mixed &= np.isfinite(beams.range)
     low, high = exact.range[exact.owner > 0].min(), exact.range[exact.owner > 0].max()
@@ -215,14 +217,14 @@ def test_edge_beams_return_from_between_or_one_side():
     assert 0.9 < unchanged[exact.owner > 0].mean() < 1
     x = (fine.directions() * np.where(np.isfinite(beams.range), beams.range, 0)[..., None])[..., 0]
     assert (np.abs(x[beams.owner == 1] - 4.8) < 0.01).all()  # an owner's points are on it
-    apart = cast_rays(replace(made, centre=made.centre + [[0, 0, 0], [3, 0, 0]]), Ground(), NO_GROUND, fine)
+    apart = cast_rays(replace(objects, centre=objects.centre + [[0, 0, 0], [3, 0, 0]]), Ground(), NO_GROUND, fine)
     assert (apart.owner[np.isfinite(apart.range)] > 0).all()  # too far apart to mix
     assert np.array_equal(beams.reached, exact.reached)
 
 
 def test_beam_on_one_surface_equals_ray():
-    made = solids(BOX, (8, 0, 0), (1, 200, 200))
-    one, other = (cast_rays(made, Ground(), NO_GROUND, s) for s in (SENSOR, WIDE))
+    objects = solids(BOX, (8, 0, 0), (1, 200, 200))
+    one, other = (cast_rays(objects, Ground(), NO_GROUND, s) for s in (SENSOR, WIDE))
     inner = np.isfinite(np.roll(one.range, 1, 0)) & np.isfinite(np.roll(one.range, -1, 0))
     assert np.array_equal(one.range[inner], other.range[inner])
 

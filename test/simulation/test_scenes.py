@@ -73,40 +73,40 @@ def test_trajectory_derivatives_are_exact():
 
 @pytest.mark.parametrize("scene, kind", ROBOTS)
 def test_actors_never_touch_robot_or_each_other(scene, kind):
-    made = make_cached_scene(scene, kind)
-    props = [a for a in made.actors if not a.obj.label]
+    simulated = make_cached_scene(scene, kind)
+    props = [a for a in simulated.actors if not a.obj.label]
     fixed = make_flat_boxes(np.array([a.footprint for a in props]), 0.0)
-    for t in np.linspace(0.0, made.seconds, 9):
-        moment, pose = made.at(t, 0.6), made.sensor_pose(t, 0.6)
+    for t in np.linspace(0.0, simulated.seconds, 9):
+        moment, pose = simulated.at(t, 0.6), simulated.sensor_pose(t, 0.6)
         robot = np.array([[0.0, 0, 0, 1.4 * ROBOT_RADIUS_M, 1.4 * ROBOT_RADIUS_M, 1, 0]])
         boxes = np.concatenate([robot, moment.boxes * [1, 1, 0, 1, 1, 1, 1]])
         assert not {0} & set(find_overlaps(boxes, 1)[:, 0].tolist())
         for i, j in find_overlaps(boxes, len(boxes)):
             assert {moment.class_ids[i - 1], moment.class_ids[j - 1]} == {SITTING}
-        there = fixed - [*pose[:2, 3], 0, 0, 0, 0, 0]
-        assert not len(find_overlaps(np.concatenate([robot, there]), 1))
-    assert any(a.obj.label in ("Pedestrian", "Person_sitting") for a in made.actors)
+        footprints = fixed - [*pose[:2, 3], 0, 0, 0, 0, 0]
+        assert not len(find_overlaps(np.concatenate([robot, footprints]), 1))
+    assert any(a.obj.label in ("Pedestrian", "Person_sitting") for a in simulated.actors)
 
 
 @pytest.mark.parametrize("scene, kind", ROBOTS)
 def test_points_and_boxes_agree_with_world(scene, kind):
     """At any heading and yaw rate the ground agrees with the world, and points of labelled objects
     are in their boxes."""
-    made = make_cached_scene(scene, kind)
-    made = replace(made, ground=made.ground._replace(rough=0.0, litter=0.0))
+    simulated = make_cached_scene(scene, kind)
+    simulated = replace(simulated, ground=simulated.ground._replace(rough=0.0, litter=0.0))
     for t in (0.0, 7.3):
-        moment, pose = made.at(t, 0.6), made.sensor_pose(t, 0.6)
-        hits = cast_rays(moment.solids, made.ground, moment.position, EXACT, moment.motion, 1, moment.heading)
+        moment, pose = simulated.at(t, 0.6), simulated.sensor_pose(t, 0.6)
+        hits = cast_rays(moment.solids, simulated.ground, moment.position, EXACT, moment.motion, 1, moment.heading)
         got = make_returns(hits, EXACT, moment.motion, np.random.default_rng(0))
         world = transform_points(got.xyz.astype(float), pose)
         ground = np.isin(got.semantic, GROUND) & (got.owner == 0)
-        off = world[ground, 2] - surface_height(made.ground, *world[ground, :2].T)
+        off = world[ground, 2] - surface_height(simulated.ground, *world[ground, :2].T)
         # On the edge of a kerb, height is that of either side.
         assert ground.sum() > 100 and (np.abs(off) < 2e-3).mean() > 0.97
-        assert np.abs(off).max() <= made.ground.curb_height + 2e-3
+        assert np.abs(off).max() <= simulated.ground.curb_height + 2e-3
         boxes = moment.boxes.copy()
         boxes[:, :3] = transform_points(boxes[:, :3], pose)
-        feet = surface_height(made.ground, *boxes[:, :2].T)
+        feet = surface_height(simulated.ground, *boxes[:, :2].T)
         assert np.allclose(boxes[:, 2] - boxes[:, 5] / 2, feet)
         for box, track, speed in zip(moment.boxes, moment.track_ids, moment.speeds):
             own = got.xyz[(got.owner == track) & (got.semantic != 99)]
@@ -216,9 +216,9 @@ def test_unknown_scenes_are_named(scenes, message):
 
 
 def test_wandering_beams_differ_between_scenes():
-    sensor, seen = replace(EXACT, wander=np.radians(2.0)), []
+    sensor, elevations = replace(EXACT, wander=np.radians(2.0)), []
     for seed in range(3):
         scan = simulate_scan(seed, 0, sensor, Scenes(scene="campus"))
         lowest = scan.frame.xyz[scan.ring == sensor.rings - 1]
-        seen.append(np.degrees(np.median(np.arctan2(lowest[:, 2], np.hypot(*lowest[:, :2].T)))))
-    assert np.diff(np.sort(seen)).min() > 0.3 and np.ptp(seen) < 2.0
+        elevations.append(np.degrees(np.median(np.arctan2(lowest[:, 2], np.hypot(*lowest[:, :2].T)))))
+    assert np.diff(np.sort(elevations)).min() > 0.3 and np.ptp(elevations) < 2.0

@@ -189,10 +189,10 @@ def test_returns_have_documented_properties():
     sensor = replace(HDL64E, azimuth_step=np.radians(1.0))
     rng = np.random.default_rng(0)
     shape = sensor.columns, sensor.rings
-    found = measured(sensor, rng.uniform(0, 130, shape), rng.uniform(0, 1, shape))
-    n = len(found.xyz)
+    returns = measured(sensor, rng.uniform(0, 130, shape), rng.uniform(0, 1, shape))
+    n = len(returns.xyz)
     assert n > 1000
-    assert [(f.shape, f.dtype) for f in found] == [
+    assert [(f.shape, f.dtype) for f in returns] == [
         ((n, 3), np.float32),
         ((n,), np.float32),
         ((n,), np.int32),
@@ -200,34 +200,34 @@ def test_returns_have_documented_properties():
         ((n,), np.uint16),
         ((n,), np.float32),
     ]
-    reach = np.linalg.norm(found.xyz - [0, 0, 0.16], axis=1)
-    assert reach.min() > sensor.min_range - 0.06 and reach.max() < sensor.max_range + 0.06
-    assert found.intensity.min() >= 0 and found.intensity.max() <= 1
-    hundredths = found.intensity * 100
+    ranges = np.linalg.norm(returns.xyz - [0, 0, 0.16], axis=1)
+    assert ranges.min() > sensor.min_range - 0.06 and ranges.max() < sensor.max_range + 0.06
+    assert returns.intensity.min() >= 0 and returns.intensity.max() <= 1
+    hundredths = returns.intensity * 100
     assert np.abs(hundredths - np.round(hundredths)).max() < 1e-4
-    assert (np.diff(found.ring.astype(int)) >= 0).all()  # beam by beam
-    bearing = np.arctan2(found.xyz[:, 1], found.xyz[:, 0]) % (2 * np.pi)
-    assert (np.diff(bearing)[np.diff(found.ring) == 0] > -1e-5).all()
+    assert (np.diff(returns.ring.astype(int)) >= 0).all()  # beam by beam
+    bearing = np.arctan2(returns.xyz[:, 1], returns.xyz[:, 0]) % (2 * np.pi)
+    assert (np.diff(bearing)[np.diff(returns.ring) == 0] > -1e-5).all()
 
 
 def test_ring_gives_elevation_and_time_gives_azimuth():
-    found = measured(SMALL, 30.0)
-    rise = found.xyz[:, 2] / np.linalg.norm(found.xyz, axis=1)
-    assert np.allclose(np.arcsin(rise), np.array(SMALL.elevations)[found.ring], atol=1e-5)
-    column = np.round(np.arctan2(found.xyz[:, 1], found.xyz[:, 0]) / (2 * np.pi) * SMALL.columns)
-    assert np.allclose(found.time, make_rays(SMALL).since[column.astype(int) % SMALL.columns])
+    returns = measured(SMALL, 30.0)
+    rise = returns.xyz[:, 2] / np.linalg.norm(returns.xyz, axis=1)
+    assert np.allclose(np.arcsin(rise), np.array(SMALL.elevations)[returns.ring], atol=1e-5)
+    column = np.round(np.arctan2(returns.xyz[:, 1], returns.xyz[:, 0]) / (2 * np.pi) * SMALL.columns)
+    assert np.allclose(returns.time, make_rays(SMALL).since[column.astype(int) % SMALL.columns])
 
 
 def test_range_noise_has_given_deviation():
-    found = measured(replace(SMALL, range_noise=0.05), 20.0)
-    assert abs((np.linalg.norm(found.xyz, axis=1) - 20).std() - 0.05) < 0.003
+    returns = measured(replace(SMALL, range_noise=0.05), 20.0)
+    assert abs((np.linalg.norm(returns.xyz, axis=1) - 20).std() - 0.05) < 0.003
 
 
 def test_offsets_shift_ranges_per_beam():
     offsets = tuple(np.linspace(-0.05, 0.05, 8))
-    found = measured(replace(SMALL, offsets=offsets), 20.0)
+    returns = measured(replace(SMALL, offsets=offsets), 20.0)
     for ring, offset in enumerate(offsets):
-        ranges = np.linalg.norm(found.xyz[found.ring == ring], axis=1)
+        ranges = np.linalg.norm(returns.xyz[returns.ring == ring], axis=1)
         assert abs(ranges.mean() - 20 - offset) < 0.01
     assert 0.01 < np.std(HDL64E.offsets[:39]) < 0.03
 
@@ -256,8 +256,8 @@ def test_infinite_reach_loses_only_rays_without_hit():
     distance = np.where(np.arange(sensor.columns) % 2, np.inf, 100.0)[:, None]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = measured(sensor, distance, np.where(np.isinf(distance), 0.0, 1e-6))
-    assert len(found.xyz) == sensor.columns * sensor.rings / 2
+        returns = measured(sensor, distance, np.where(np.isinf(distance), 0.0, 1e-6))
+    assert len(returns.xyz) == sensor.columns * sensor.rings / 2
 
 
 def test_intensity_is_brightness_with_bias_and_fade():
@@ -290,13 +290,13 @@ def test_retroreflectors_do_not_fade():
 
 def test_vehicle_blocks_its_sectors():
     sensor = replace(SMALL, blocked=((4, 350, 10), (6, 90, 120)), dropout=0.0)
-    found = measured(sensor, 10.0)
-    bearing = np.degrees(np.arctan2(found.xyz[:, 1], found.xyz[:, 0]))
-    low, lower = found.ring >= 4, found.ring >= 6
+    returns = measured(sensor, 10.0)
+    bearing = np.degrees(np.arctan2(returns.xyz[:, 1], returns.xyz[:, 0]))
+    low, lower = returns.ring >= 4, returns.ring >= 6
     assert not (low & (np.abs(bearing) < 9.9)).any() and (~low & (np.abs(bearing) < 9.9)).any()
     side = (bearing > 90.1) & (bearing < 119.9)
     assert not (lower & side).any() and (~lower & side).any()
-    assert isinstance(sensor, Sensor) and len(found.xyz) == sensor.open_rays().sum()
+    assert isinstance(sensor, Sensor) and len(returns.xyz) == sensor.open_rays().sum()
 
 
 @pytest.mark.parametrize(

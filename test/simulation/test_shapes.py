@@ -199,8 +199,8 @@ def test_vehicles_are_symmetric(style):
     parts = vehicles.make_body((4.2, 1.7, 1.6), getattr(vehicles, style), 0.3, 0.8, driver=False)
     low, high = compute_extents(parts)
     mirrored = np.stack([low[:, 0], -high[:, 1], low[:, 2], high[:, 0], -low[:, 1], high[:, 2]], 1)
-    there = np.hstack([low, high])
-    far = np.abs(mirrored[:, None] - there).max(axis=2).min(axis=1)
+    hulls = np.hstack([low, high])
+    far = np.abs(mirrored[:, None] - hulls).max(axis=2).min(axis=1)
     assert far.max() < 1e-9
 
 

@@ -69,12 +69,12 @@ def test_object_layout_reads_back(made):
 
 def test_hidden_objects_become_dont_care():
     scan = simulate_scan(33, 0, SENSORS["hdl64e"], CROWDED_ZONES)
-    seen = write_kitti.keep_visible_objects(scan.truth, FORWARD_CAMERA)
+    visible = write_kitti.keep_visible_objects(scan.truth, FORWARD_CAMERA)
     labels = make_kitti_labels(scan.truth)
-    assert 0 < len(labels) < len(seen) == len(labels) + len(labels.notes)
+    assert 0 < len(labels) < len(visible) == len(labels) + len(labels.notes)
     assert all(e["num_points"] >= 5 and e["visible"] >= 0.15 for e in labels.extras)
-    kept = {e["track_id"] for e in labels.extras}
-    left_out = [e for e in seen.extras if e["track_id"] not in kept]
+    labelled = {e["track_id"] for e in labels.extras}
+    left_out = [e for e in visible.extras if e["track_id"] not in labelled]
     assert all(e["num_points"] < 5 or e["visible"] < 0.15 for e in left_out)
     assert [e["bbox"] for e in left_out] == [note["bbox"] for _, note in labels.notes]
 
@@ -90,16 +90,16 @@ def test_tracking_layout_reads_back(made):
         assert [e["track_id"] for e in truth.extras] == [e["track_id"] for e in expected.extras]
 
 
-def assert_same_objects(found, expected, accuracy, truncation=None):
+def assert_same_objects(actual, expected, accuracy, truncation=None):
     """Assert that labels agree to the digits of the text."""
-    assert found.labels == expected.labels
-    assert [name for name, _ in found.notes] == [name for name, _ in expected.notes]
-    for (_, a), (_, b) in zip(found.notes, expected.notes):
+    assert actual.labels == expected.labels
+    assert [name for name, _ in actual.notes] == [name for name, _ in expected.notes]
+    for (_, a), (_, b) in zip(actual.notes, expected.notes):
         assert a["bbox"] == pytest.approx(b["bbox"], abs=accuracy)
-    assert np.abs(found.boxes - expected.boxes)[:, :6].max(initial=0) <= 1.6 * accuracy
-    turned = wrap_angle(found.boxes[:, 6] - expected.boxes[:, 6])
+    assert np.abs(actual.boxes - expected.boxes)[:, :6].max(initial=0) <= 1.6 * accuracy
+    turned = wrap_angle(actual.boxes[:, 6] - expected.boxes[:, 6])
     assert np.abs(turned).max(initial=0) <= accuracy
-    for a, b in zip(found.extras, expected.extras):
+    for a, b in zip(actual.extras, expected.extras):
         scale = 2 if truncation else 1  # a level in the tracking layout
         assert abs(a["truncated"] / scale - b["truncated"]) <= (truncation or accuracy)
         assert a["occluded"] == b["occluded"]
@@ -173,19 +173,21 @@ def test_2d_boxes_contain_projected_corners():
             rng.uniform(-4, 4, 300),
         ]
     )
-    found, outside = write_kitti.project_boxes(boxes, FORWARD_CAMERA)
-    seen = np.isfinite(found[:, 0])
-    assert 30 < seen.sum() < 250 and ((outside >= 0) & (outside <= 1)).all()
-    assert (found[seen] >= 0).all() and (found[seen] <= [1241, 374, 1241, 374]).all()
+    rectangles, outside = write_kitti.project_boxes(boxes, FORWARD_CAMERA)
+    in_image = np.isfinite(rectangles[:, 0])
+    assert 30 < in_image.sum() < 250 and ((outside >= 0) & (outside <= 1)).all()
+    assert (rectangles[in_image] >= 0).all() and (rectangles[in_image] <= [1241, 374, 1241, 374]).all()
     projection = FORWARD_CAMERA.camera().projection
     corners = box_corners(boxes) @ projection[:, :3].T + projection[:, 3]
     whole = (corners[..., 2] > write_kitti.MIN_DEPTH_M).all(axis=1)
     pixels = corners[..., :2] / corners[..., 2:]
-    inside = whole & ((pixels >= 0) & (pixels <= [1241, 374])).all(axis=(1, 2)) & seen
+    inside = whole & ((pixels >= 0) & (pixels <= [1241, 374])).all(axis=(1, 2)) & in_image
     assert inside.sum() > 10 and np.abs(outside[inside]).max() < 1e-9
-    assert np.allclose(found[inside], np.concatenate([pixels[inside].min(axis=1), pixels[inside].max(axis=1)], axis=1))
+    assert np.allclose(
+        rectangles[inside], np.concatenate([pixels[inside].min(axis=1), pixels[inside].max(axis=1)], axis=1)
+    )
     # Many points of a box that reaches behind the camera: none in the image is outside its 2D box.
-    for box, limits in zip(boxes[~whole & seen], found[~whole & seen]):
+    for box, limits in zip(boxes[~whole & in_image], rectangles[~whole & in_image]):
         inner = rng.uniform(-0.5, 0.5, (4000, 3)) * box[3:6]
         cos, sin = np.cos(box[6]), np.sin(box[6])
         points = inner @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) + box[:3]

@@ -53,18 +53,18 @@ def test_same_seed_same_bytes():
 
 def test_frames_have_documented_properties():
     for i, scan in enumerate(simulate_drive(0, 3, COARSE)):
-        frame, found = scan.frame, scan.truth
+        frame, truth = scan.frame, scan.truth
         assert frame.xyz.dtype == frame.intensity.dtype == np.float32
         assert frame.xyz.shape == (len(frame.intensity), 3) and frame.xyz.flags.c_contiguous
         assert frame.frame_id == "velodyne"
         assert frame.stamp_ns == 1_700_000_000 * 10**9 + i * 10**8
-        reach = np.linalg.norm(frame.xyz.astype(float), axis=1)
-        assert reach.min() >= COARSE.min_range - 0.2 and reach.max() <= COARSE.max_range + 0.2
+        distance = np.linalg.norm(frame.xyz.astype(float), axis=1)
+        assert distance.min() >= COARSE.min_range - 0.2 and distance.max() <= COARSE.max_range + 0.2
         assert frame.intensity.min() >= 0.0 and frame.intensity.max() <= 1.0
-        assert np.hypot(*found.boxes[:, :2].T).max() <= 80.0
-        assert all(e["num_points"] > 0 and e["occluded"] in (0, 1, 2) and e["truncated"] == 0.0 for e in found.extras)
-        assert all(0.0 <= e["visible"] <= 1.0 for e in found.extras)
-        tracks = [e["track_id"] for e in found.extras]
+        assert np.hypot(*truth.boxes[:, :2].T).max() <= 80.0
+        assert all(e["num_points"] > 0 and e["occluded"] in (0, 1, 2) and e["truncated"] == 0.0 for e in truth.extras)
+        assert all(0.0 <= e["visible"] <= 1.0 for e in truth.extras)
+        tracks = [e["track_id"] for e in truth.extras]
         assert len(set(tracks)) == len(tracks) and min(tracks) > 0
 
 
@@ -83,8 +83,8 @@ def test_points_of_object_are_in_its_box(seed, t):
         outside = ~points_in_box(xyz[own], box, margin=beam + 0.05)
         assert speed > 2 or outside.sum() <= 0.4 * own.sum()
     assert set(np.unique(owner)) <= {0, *moment.track_ids}
-    found = label_scan(moment, hits, owner)
-    assert [e["num_points"] for e in found.extras] == [(owner == e["track_id"]).sum() for e in found.extras]
+    truth = label_scan(moment, hits, owner)
+    assert [e["num_points"] for e in truth.extras] == [(owner == e["track_id"]).sum() for e in truth.extras]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -105,8 +105,8 @@ def test_boxes_stand_on_the_ground_and_apart(seed):
 def test_pedestrians_walk_in_view_all_the_time():
     for scan in simulate_drive(33, 11, replace(COARSE, rate=2.5), CROWDED_ZONES):
         boxes = scan.truth.of_class(PEDESTRIAN)
-        reach, bearing = np.hypot(boxes[:, 0], boxes[:, 1]), np.arctan2(boxes[:, 1], boxes[:, 0])
-        seen = (np.abs(bearing) < np.radians(40)) & (reach > 6) & (reach < 35)
+        distance, bearing = np.hypot(boxes[:, 0], boxes[:, 1]), np.arctan2(boxes[:, 1], boxes[:, 0])
+        seen = (np.abs(bearing) < np.radians(40)) & (distance > 6) & (distance < 35)
         assert seen.sum() >= 2
 
 
@@ -116,13 +116,13 @@ def test_scans_resemble_those_of_real_sensor():
     density, labels = [], set()
     for seed in (0, 33):
         scan = next(simulate_drive(seed, 1, scenes=CROWDED_ZONES))
-        frame, found = scan.frame, scan.truth
+        frame, truth = scan.frame, scan.truth
         assert 95_000 < len(frame) < 135_000
         assert 0.15 < frame.intensity.mean() < 0.4
-        labels |= set(found.labels)
+        labels |= set(truth.labels)
         density += [
             e["num_points"] * (box[0] ** 2 + box[1] ** 2)
-            for box, label, e in zip(found.boxes, found.labels, found.extras)
+            for box, label, e in zip(truth.boxes, truth.labels, truth.extras)
             if label == "Pedestrian" and e["occluded"] == 0
         ]
     assert 12_000 < np.median(density) < 45_000

@@ -37,8 +37,8 @@ def test_actors_never_overlap(kind, seed):
     for t in np.linspace(0.0, scene.seconds, 5):
         moment = scene.at(t, HEIGHT)
         ego = np.array([[0.0, 0, 0, 4.6, 1.9, 1, 0]])
-        there = fixed - [*moment.position[:2], 0, 0, 0, 0, 0]
-        boxes = np.concatenate([ego, moment.boxes * [1, 1, 0, 1, 1, 1, 1], there])
+        footprints = fixed - [*moment.position[:2], 0, 0, 0, 0, 0]
+        boxes = np.concatenate([ego, moment.boxes * [1, 1, 0, 1, 1, 1, 1], footprints])
         for i, j in find_overlaps(boxes, len(moment.boxes) + 1):
             sits = i > 0 and moment.class_ids[i - 1] == SITTING
             assert sits and j > len(moment.boxes), (t, boxes[i], boxes[j])
@@ -110,7 +110,7 @@ def test_solids_have_velocity_and_class_of_owner():
 
 
 def test_islands_are_at_crossings_and_off_lanes():
-    found = 0
+    count = 0
     for kind, seed in EVERY:
         scene = make_cached_scene(kind, seed)
         middle = [
@@ -120,10 +120,10 @@ def test_islands_are_at_crossings_and_off_lanes():
         ]
         edges = np.ravel(scene.ground.crossings)
         for actor in middle:
-            found += 1
+            count += 1
             assert np.abs(edges - actor.x).min() <= 15.0
             assert abs(actor.footprint[1]) - actor.footprint[WIDTH] > 1.0  # our lane's cars
-    assert found > 10
+    assert count > 10
 
 
 def test_streets_have_objects_that_kitti_labels():
@@ -132,7 +132,7 @@ def test_streets_have_objects_that_kitti_labels():
     cyclists), so the bands are wide."""
     seeds = range(4)  # cyclists are rare
     share = np.array([k.share for k in STREET_KINDS.values()])
-    found = np.zeros((len(STREET_KINDS), len(CLASSES)))
+    counts = np.zeros((len(STREET_KINDS), len(CLASSES)))
     for i, kind in enumerate(STREET_KINDS):
         for seed in seeds:
             for t in TIMES:
@@ -140,13 +140,13 @@ def test_streets_have_objects_that_kitti_labels():
                 seen = (np.abs(np.arctan2(m.boxes[:, 1], m.boxes[:, 0])) < np.radians(40)) & (
                     np.hypot(*m.boxes[:, :2].T) < 30
                 )
-                found[i] += np.bincount(m.class_ids[seen], minlength=len(CLASSES))
-    mean = share @ found / (len(TIMES) * len(seeds))
+                counts[i] += np.bincount(m.class_ids[seen], minlength=len(CLASSES))
+    mean = share @ counts / (len(TIMES) * len(seeds))
     assert share.sum() == pytest.approx(1.0)
     assert 1.0 < mean[CAR] < 4.5
     assert 0.2 < mean[PEDESTRIAN] < 1.5
     assert 0.05 < mean[CYCLIST] < 0.6
-    assert (found.sum(axis=0)[: len(CLASSES) - 1] > 0).sum() >= 6
+    assert (counts.sum(axis=0)[: len(CLASSES) - 1] > 0).sum() >= 6
 
 
 def test_people_option_scales_number_of_people():

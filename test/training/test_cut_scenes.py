@@ -166,9 +166,9 @@ def test_augmented_clusters_stay_in_boxes_and_thin_with_range(rng):
     assert np.allclose(same.points, clusters.points, atol=1e-6) and np.allclose(boxes, BOXES)
     for seed in range(5):
         params = ClusterAugmentParams(beam_noise=0, range_noise=0, intensity=0)
-        made, boxes = augment_clusters(clusters, BOXES, no, params, np.random.default_rng(seed))
+        augmented, boxes = augment_clusters(clusters, BOXES, no, params, np.random.default_rng(seed))
         for k in range(4):
-            own = made.points[made.first[k] : made.first[k + 1], :3]
+            own = augmented.points[augmented.first[k] : augmented.first[k + 1], :3]
             assert len(own) >= MIN_POINTS_LEFT and points_in_box(own, boxes[k], 1e-3).all()
         # objects that are moved away stay in their direction and have fewer points
         ratio = np.hypot(*boxes[:, :2].T) / np.hypot(*BOXES[:, :2].T)
@@ -176,7 +176,7 @@ def test_augmented_clusters_stay_in_boxes_and_thin_with_range(rng):
             np.abs(np.arctan2(boxes[:, 1], boxes[:, 0])), np.abs(np.arctan2(BOXES[:, 1], BOXES[:, 0])), atol=0.03
         )
         far = ratio > 1.3
-        assert (made.sizes[far] < 400 / ratio[far] ** 2 + 60).all()
+        assert (augmented.sizes[far] < 400 / ratio[far] ** 2 + 60).all()
     flip = ClusterAugmentParams(**{**vars(STILL), "flip": 1.0})
     twice = augment_clusters(*augment_clusters(clusters, BOXES, no, flip, rng), no, flip, rng)
     assert np.allclose(twice[0].points, clusters.points, atol=1e-6)
@@ -185,8 +185,8 @@ def test_augmented_clusters_stay_in_boxes_and_thin_with_range(rng):
 
 def test_box_crops_are_near_boxes_and_never_empty(rng):
     clusters = fill_boxes(rng, BOXES * [1, 1, 1, 1.4, 1.4, 1.4, 1], 300)
-    made, boxes = augment_clusters(clusters, BOXES, np.ones(4, bool), STILL, rng)
-    assert np.allclose(boxes, BOXES) and (made.sizes < 300).all() and (made.sizes > 80).all()
+    augmented, boxes = augment_clusters(clusters, BOXES, np.ones(4, bool), STILL, rng)
+    assert np.allclose(boxes, BOXES) and (augmented.sizes < 300).all() and (augmented.sizes > 80).all()
     tiny = fill_boxes(rng, BOXES, 3)
     hard = ClusterAugmentParams(dropout=0.99, box_shift=2.0)
     assert (augment_clusters(tiny, BOXES, np.ones(4, bool), hard, rng)[0].sizes == 3).all()
@@ -218,11 +218,11 @@ class RepeatedScene:
 
 def test_scene_is_cut_by_clustering_and_around_objects(rng, tmp_path):
     scene = a_scene(rng)
-    made = cut_clusters(scene, CONFIG, 5)
-    assert set(made.labels[~made.is_box_crop]) == {0, 1, UNKNOWN}  # the cyclist is not detectable
-    assert made.labels[made.is_box_crop].tolist() == [0, 1]
-    assert np.array_equal(made.boxes[made.is_box_crop], BOXES[:2])
-    assert not made.boxes[made.labels == UNKNOWN].any() and made.boxes[made.labels == 1].any()
+    cut = cut_clusters(scene, CONFIG, 5)
+    assert set(cut.labels[~cut.is_box_crop]) == {0, 1, UNKNOWN}  # the cyclist is not detectable
+    assert cut.labels[cut.is_box_crop].tolist() == [0, 1]
+    assert np.array_equal(cut.boxes[cut.is_box_crop], BOXES[:2])
+    assert not cut.boxes[cut.labels == UNKNOWN].any() and cut.boxes[cut.labels == 1].any()
     source = CutScenes(RepeatedScene(scene), CONFIG, 5, tmp_path)
     first, again = source.scene(0), source.scene(0)  # the second from the cache
     assert len(list(tmp_path.iterdir())) == 1
@@ -253,8 +253,8 @@ def test_clusters_equal_those_of_detector_at_scene_height(rng):
         ),
     )
     detector(PointCloud(scene.points[:, :3].copy(), scene.points[:, 3].copy()))
-    made = cut_clusters(scene, CONFIG, 5)
-    assert sum(read) == (~made.is_box_crop).sum() > 3
+    cut = cut_clusters(scene, CONFIG, 5)
+    assert sum(read) == (~cut.is_box_crop).sum() > 3
 
 
 def test_share_of_scenes_is_sparse_and_always_the_same(rng, tmp_path):
@@ -289,12 +289,12 @@ def test_wrong_proposals_become_decoys_unless_they_touch_label(rng, tmp_path, mo
     monkeypatch.setattr(
         cut_scenes, "_load_proposer", lambda path: SimpleNamespace(propose=lambda frame: DetectionResult(found))
     )
-    plain, made = (cut_clusters(scene, CONFIG, 5, path) for path in (None, tmp_path))
+    plain, cut = (cut_clusters(scene, CONFIG, 5, path) for path in (None, tmp_path))
     none = len(CONFIG.classes)
-    boxes = made.boxes[made.is_box_crop & (made.labels == none)]
+    boxes = cut.boxes[cut.is_box_crop & (cut.labels == none)]
     assert [np.isclose(boxes, box, atol=1e-5).all(axis=1).sum() for box in (empty, near)] == [1, 0]
-    assert np.array_equal(made.labels[~made.is_box_crop], plain.labels[~plain.is_box_crop])
-    assert (made.labels[made.is_box_crop] < none).sum() == 1
+    assert np.array_equal(cut.labels[~cut.is_box_crop], plain.labels[~plain.is_box_crop])
+    assert (cut.labels[cut.is_box_crop] < none).sum() == 1
 
 
 def test_half_of_background_is_decoys(rng):

@@ -52,25 +52,25 @@ data = st.one_of(
 @given(speeds, data, st.floats(0.3, 100), st.integers(1, 64))
 def test_plan_fits_budget_or_error_names_sufficient_budget(speed, data, hours, cores):
     try:
-        made = fit_plan(hours, cores, speed, data)
+        plan = fit_plan(hours, cores, speed, data)
     except InputError as error:
         enough = float(re.search(r"--budget (\S+) or", str(error))[1])
         assert enough > 0.9 * hours
         if enough < 300:
-            made = fit_plan(1.1 * enough, cores, speed, data)
-            assert made.steps >= MIN_STEPS
+            plan = fit_plan(1.1 * enough, cores, speed, data)
+            assert plan.steps >= MIN_STEPS
         return
-    seconds = preparation_duration(made, cores, speed) + sum(training_durations(made, speed, data))
+    seconds = preparation_duration(plan, cores, speed) + sum(training_durations(plan, speed, data))
     assert seconds <= 3600 * hours
-    assert made.steps >= MIN_STEPS and 1 <= made.validate_steps <= made.steps
-    assert made.scans == 0 or SCANS_RANGE[0] <= made.scans <= SCANS_RANGE[1]
-    assert (made.scans > 0) == data.simulated and (made.val_scans > 0) == data.val_simulated
+    assert plan.steps >= MIN_STEPS and 1 <= plan.validate_steps <= plan.steps
+    assert plan.scans == 0 or SCANS_RANGE[0] <= plan.scans <= SCANS_RANGE[1]
+    assert (plan.scans > 0) == data.simulated and (plan.val_scans > 0) == data.val_simulated
 
 
 def test_plan_for_two_cores_and_two_hours():
-    made = fit_plan(2.0, 2, SPEED, SIM)
-    assert 1000 < made.scans <= 3000 and made.part
-    assert 3 * made.scans <= 4 * made.steps <= 10 * made.scans  # each scene is seen several times
+    plan = fit_plan(2.0, 2, SPEED, SIM)
+    assert 1000 < plan.scans <= 3000 and plan.part
+    assert 3 * plan.scans <= 4 * plan.steps <= 10 * plan.scans  # each scene is seen several times
     assert fit_plan(50.0, 2, SPEED, SIM).part is False  # with much time, the whole range
 
 
@@ -81,8 +81,8 @@ def test_more_time_or_cores_give_larger_plan():
 
 
 def test_fixed_numbers_are_kept():
-    made = fit_plan(1.0, 2, SPEED, SIM, Plan(scans=30, val_scans=7, steps=5000, validate_steps=11, part=False))
-    assert made == Plan(30, 7, 30, 5000, 11, False)  # it takes longer than the budget
+    plan = fit_plan(1.0, 2, SPEED, SIM, Plan(scans=30, val_scans=7, steps=5000, validate_steps=11, part=False))
+    assert plan == Plan(30, 7, 30, 5000, 11, False)  # it takes longer than the budget
     assert fit_plan(1.0, 2, SPEED, SIM, Plan(scans=100), epochs=3).steps == 75
     assert fit_plan(1.0, 2, SPEED, SIM, Plan(steps=10)).scans <= 40  # not more than the steps use
 

@@ -103,8 +103,8 @@ def test_run_killed_twice_equals_unbroken_run(tmp_path, one_thread):
     assert {path: path.stat().st_mtime_ns for path in before} == before  # not made again
     assert CliRunner().invoke(cli, small_training(broken, "--resume")).exit_code == 0
     assert tensors(broken) == tensors(whole)
-    kept = {path.relative_to(broken): path.read_bytes() for path in broken.rglob("*.npz")}
-    assert kept == {path.relative_to(whole): path.read_bytes() for path in whole.rglob("*.npz")}
+    cached = {path.relative_to(broken): path.read_bytes() for path in broken.rglob("*.npz")}
+    assert cached == {path.relative_to(whole): path.read_bytes() for path in whole.rglob("*.npz")}
 
 
 def refuse(tmp_path: Path, *more: str) -> str:
@@ -131,12 +131,12 @@ def test_foreign_weights_in_out_are_not_replaced(tmp_path, more):
 
 
 def test_only_temporary_files_of_killed_run_are_removed(tmp_path):
-    ours = [".last.pt.7-1.tmp", "scans/.ab.npz.7-1.tmp", "scans/clusters/.ab.npz.7-2.tmp"]
-    theirs = ["notes/.draft.tmp", ".draft.tmp", ".draft.7-1.tmp", "notes/.last.pt.7-1.tmp"]
-    for name in (*ours, *theirs):
+    own_files = [".last.pt.7-1.tmp", "scans/.ab.npz.7-1.tmp", "scans/clusters/.ab.npz.7-2.tmp"]
+    other_files = ["notes/.draft.tmp", ".draft.tmp", ".draft.7-1.tmp", "notes/.last.pt.7-1.tmp"]
+    for name in (*own_files, *other_files):
         write(tmp_path / name, "half")
     with RunDirectory(tmp_path).lock():
-        assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.tmp")} == {*theirs}
+        assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.tmp")} == {*other_files}
 
 
 @pytest.mark.parametrize("hours", ["0", "-1", "nan", "inf"])

@@ -176,18 +176,18 @@ def test_settings_without_effect_may_differ_when_resuming():
 # steps that are not finite
 
 
-def spoil_batch(toy: Toy, what: str):
+def spoil_batch(toy: Toy, part: str):
     step, inputs, target = next(toy.batches(0))
-    if what == "input":
+    if part == "input":
         inputs = inputs.clone()
         inputs[0, 0] = torch.nan
-    elif what == "gradient":  # the loss itself is finite
+    elif part == "gradient":  # the loss itself is finite
         toy.loss = lambda module, batch: ((module(inputs).sum() * 0).abs().sqrt() + 1, {})
-    return step, inputs, target * (torch.inf if what == "loss" else 1)
+    return step, inputs, target * (torch.inf if part == "loss" else 1)
 
 
-@pytest.mark.parametrize("what", ["input", "loss", "gradient"])
-def test_nonfinite_step_changes_only_counters(what):
+@pytest.mark.parametrize("part", ["input", "loss", "gradient"])
+def test_nonfinite_step_changes_only_counters(part):
     toy = Toy()
     run = Run(toy.task(), PARAMS, CPU)
     good = next(toy.batches(1))
@@ -197,7 +197,7 @@ def test_nonfinite_step_changes_only_counters(what):
         **{f"a{k}": v.clone() for k, v in run.average.module.state_dict().items()},
         **{f"o{i}{k}": v.clone() for i, s in run.optimizer.state_dict()["state"].items() for k, v in s.items()},
     }
-    loss, batch = toy.loss, spoil_batch(toy, what)
+    loss, batch = toy.loss, spoil_batch(toy, part)
     run = _with_loss(run, toy.loss)
     assert run.step(batch) is None
     after = {
