@@ -119,7 +119,7 @@ DEPARTURES = (
     Departure(
         "C Eq. 9",
         "gamma 0.8",
-        "the detector uses 0, as 0.8 joins cars that stand side by side",
+        "the detector uses 0, as 0.8 joins cars that stand side by side and halves mAP on KITTI",
         "`clustering.euclidean.gamma: 0.8`",
     ),
     Departure(
