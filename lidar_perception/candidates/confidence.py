@@ -49,20 +49,23 @@ def compute_shape_features(
     """Compute the features of SHAPE_KNOTS of K clusters.
 
     Args:
-        xyz, start: (N, 3) points and (K + 1,) first row of each cluster, as in silhouette.py.
-        boxes: (K, 7), standing on the ground.
+        xyz: (N, 3) points, sorted by cluster.
+        start: (K + 1,) first row of each cluster, as in silhouette.py.
+        boxes: (K, 7) boxes of the clusters, extended down to the ground.
+        params: Parameters of the pipeline.
 
     Returns:
         Arrays (K,) float64 by name:
-        range_m: horizontal range of the centroid.
-        height_m: height of the top above the ground plus half a beam step, because the true top is
+        range_m: Horizontal range of the centroid.
+        height_m: Height of the top above the ground plus half a beam step, because the true top is
             between two beams.
-        length_m, width_m: extent along and across the widest direction in x-y.
-        area_m2: number of points times the surface area per point.
-        hidden_below_m: height of the lowest point above the ground, minus a beam step.
-        upright: standard deviation of z divided by the height.
-        fill: drawn share of the rectangle height x length.
-        lopsided: distance of the median from the middle of the extent, divided by the length.
+        length_m, width_m: Extents along and across the widest direction in x-y.
+        area_m2: Number of points times the surface area per point.
+        hidden_below_m: Height of the lowest point above the ground, minus a beam step.
+        upright: Vertical spread: standard deviation of z divided by the height.
+        fill: Area of the silhouette divided by height x length.
+        lopsided: Skew of the points: distance of the median from the middle of the extent, divided
+            by the length.
     """
     stm = replace(params.stm, window="metric", spread=True, dilations=0, axis="yaw")
     floors = boxes[:, 2].astype(float) - boxes[:, 5] / 2
@@ -152,16 +155,16 @@ def _compute_moments(xyz, start):
             zz += (p[2] - z) ** 2
         angle = 0.5 * np.arctan2(2 * xy, xx - yy)
         ax, ay = np.cos(angle), np.sin(angle)
-        along = points[:, 0] * ax + points[:, 1] * ay
-        across = points[:, 1] * ax - points[:, 0] * ay
-        middle = (along.max() + along.min()) / 2
+        main_coordinates = points[:, 0] * ax + points[:, 1] * ay
+        cross_coordinates = points[:, 1] * ax - points[:, 0] * ay
+        middle = (main_coordinates.max() + main_coordinates.min()) / 2
         moments[k] = (
             np.hypot(x, y),
             points[:, 2].min(),
             points[:, 2].max(),
             np.sqrt(zz / n),
-            along.max() - along.min(),
-            across.max() - across.min(),
-            abs(quantile(along.copy(), 0.5) - middle),
+            main_coordinates.max() - main_coordinates.min(),
+            cross_coordinates.max() - cross_coordinates.min(),
+            abs(quantile(main_coordinates.copy(), 0.5) - middle),
         )
     return moments

@@ -1,4 +1,4 @@
-"""Parameters of paper A's candidates, and of the whole candidate pipeline."""
+"""Parameters of the pedestrian candidates of paper A and of the complete pipeline."""
 
 from __future__ import annotations
 

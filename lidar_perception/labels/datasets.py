@@ -114,8 +114,10 @@ def _number_frames(frames: Iterable[Frame], labels: DriveLabels | None) -> Itera
 
 
 def _continues_drive(previous: Frame, frame: Frame) -> bool:
-    before, after = previous.calibration(), frame.calibration()
-    same_calibration = before is after or (before is not None and before.equals(after))
+    previous_calibration, calibration = previous.calibration(), frame.calibration()
+    same_calibration = previous_calibration is calibration or (
+        previous_calibration is not None and previous_calibration.equals(calibration)
+    )
     return (
         previous.sequence == frame.sequence
         and same_calibration

@@ -154,11 +154,11 @@ class NuscenesTables:
         write_bytes(path, sweep.tobytes())
 
     def _add_boxes(self, scene: str, sample: str, labels: FrameLabels, pose: np.ndarray, cloud: np.ndarray) -> None:
-        inside = np.diff(points_in_boxes(cloud, labels.boxes)[1]) if len(labels) else ()
+        point_counts = np.diff(points_in_boxes(cloud, labels.boxes)[1]) if len(labels) else ()
         placements = format_boxes(sample, *to_global_boxes(labels.boxes, pose))
         for k, placement in enumerate(placements):
             track, name, extra = labels.track_ids[k], labels.class_names[k], labels.extra[k]
-            lidar, radar = int(inside[k]), 0
+            lidar, radar = int(point_counts[k]), 0
             if rotation := find_read_rotation(labels, k, pose):  # the box is unchanged
                 placement["rotation"] = rotation
                 lidar = extra.get("lidar_points", lidar)

@@ -88,12 +88,12 @@ class FrameLabels:
                 f"{where}: {count} boxes, {len(labels.class_names)} classes and "
                 f"{len(labels.extra)} extras; each box needs one of each"
             )
-        invalid = ~(
+        is_invalid = ~(
             (np.abs(boxes[:, :6]) <= MAX_RANGE).all(axis=1) & np.isfinite(boxes[:, 6]) & (boxes[:, 3:6] > 0).all(axis=1)
         )
-        if invalid.any():
+        if is_invalid.any():
             raise InputError(
-                f"{where}, box {np.flatnonzero(invalid)[0] + 1} of {count}: its "
+                f"{where}, box {np.flatnonzero(is_invalid)[0] + 1} of {count}: its "
                 f"numbers must be finite and within {MAX_RANGE:g} m, its sides above "
                 "0; correct or remove it"
             )

@@ -17,8 +17,8 @@ def resolve_format(name: str, names: Iterable[str]) -> str:
     Raises:
         InputError: `names` has no such format.
     """
-    normalised = name.strip().lower().replace("_", "-")
-    normalised, names = ALIASES.get(normalised, normalised), list(names)
-    if normalised not in names:
+    format_name = name.strip().lower().replace("_", "-")
+    format_name, names = ALIASES.get(format_name, format_name), list(names)
+    if format_name not in names:
         raise unknown_name("format", name, names)
-    return normalised
+    return format_name

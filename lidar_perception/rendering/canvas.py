@@ -76,7 +76,7 @@ class Canvas:
         stride = self.width + 2 * margin
         image = np.zeros((self.height + 2 * margin, stride, 4), np.uint8)
         image[margin:-margin, margin:-margin, :3] = self.pixels
-        flat = image.view(np.uint32).ravel()
+        flat_pixels = image.view(np.uint32).ravel()
         packed = np.zeros((len(order), 4), np.uint8)
         packed[:, :3] = colors[order]
         values = packed.view(np.uint32).ravel()
@@ -87,7 +87,7 @@ class Canvas:
             shift = np.arange(side) - side // 2
             offsets = (shift[:, None] * stride + shift).ravel()
             covered_pixels = first_pixel[has_side, None] + offsets
-            flat[np.clip(covered_pixels, 0, len(flat) - 1)] = values[has_side, None]
+            flat_pixels[np.clip(covered_pixels, 0, len(flat_pixels) - 1)] = values[has_side, None]
         self.pixels = np.ascontiguousarray(image[margin:-margin, margin:-margin, :3])
 
     def draw_lines(
@@ -156,9 +156,11 @@ class Canvas:
         last_entry = np.full(self.width * self.height, -1, np.int64)
         last_entry[index] = np.arange(len(index))  # the last of equal indices wins
         winners = last_entry[last_entry >= 0]
-        flat = self.pixels.reshape(-1, 3)
+        flat_pixels = self.pixels.reshape(-1, 3)
         pixel_index, opacity = index[winners], opacities[winners, None]
-        flat[pixel_index] = np.round(flat[pixel_index] * (1 - opacity) + colors[color_index[winners]] * opacity)
+        flat_pixels[pixel_index] = np.round(
+            flat_pixels[pixel_index] * (1 - opacity) + colors[color_index[winners]] * opacity
+        )
 
     def _clip(self, segments: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Clip segments to the image (Liang and Barsky, 1984).

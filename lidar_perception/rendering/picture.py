@@ -257,7 +257,7 @@ def _draw_edges(
 
 
 def _draw_arrows(canvas: Canvas, view: View, boxes: Boxes, box_colors: np.ndarray) -> None:
-    """Draw arrows from moving boxes to their positions after ARROW_S."""
+    """Draw an arrow from each moving box to its position after ARROW_S."""
     speeds = np.hypot(*np.reshape(boxes.velocities, (-1, 2)).T)
     moving_indices = np.flatnonzero(speeds >= MIN_SPEED)
     start, speed = boxes.boxes[moving_indices, :3].astype(float), speeds[moving_indices, None]

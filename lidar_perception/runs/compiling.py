@@ -79,10 +79,10 @@ def report_compilation(report: Callable[[str], object] | None = None, whole_dete
         whole_detector: True if the block runs a complete detector. If nothing is cached yet, the
             compilation is then reported at the start of the block, before torch is loaded.
     """
-    outer = _Compilation.current
-    if outer is not None:
+    outer_compilation = _Compilation.current
+    if outer_compilation is not None:
         if whole_detector and not _is_cached():
-            outer.announce()
+            outer_compilation.announce()
         yield
         return
     from numba.core import event

@@ -50,10 +50,10 @@ class Journal:
 
     def sort(self, names: list[str]) -> None:
         """Rewrite the file with the records in the order of names; other frames come last."""
-        ordered = [self.lines[name] for name in names if name in self.lines]
+        ordered_lines = [self.lines[name] for name in names if name in self.lines]
         known_names = set(names)
-        others = [line for name, line in self.lines.items() if name not in known_names]
-        write_text(self.path, "\n".join([_format_head(self.plan), *ordered, *others]))
+        other_lines = [line for name, line in self.lines.items() if name not in known_names]
+        write_text(self.path, "\n".join([_format_head(self.plan), *ordered_lines, *other_lines]))
 
 
 @contextmanager
@@ -114,7 +114,7 @@ def _read_records(folder: Path, plan: dict[str, Any]) -> dict[str, str]:
     """Read the records of an earlier run with the same plan; {} if there is no such run."""
     path = folder / JOURNAL_NAME
     if not path.exists():
-        if any(not old.name.startswith(f".{JOURNAL_NAME}.") for old in folder.iterdir()):
+        if any(not path_in_folder.name.startswith(f".{JOURNAL_NAME}.") for path_in_folder in folder.iterdir()):
             raise InputError(
                 f"{folder} exists already and has no run of this command; give "
                 "another name, or --force to write into it"

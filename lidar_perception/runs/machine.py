@@ -1,4 +1,4 @@
-"""Properties of this machine."""
+"""Processor properties of this machine."""
 
 from __future__ import annotations
 

@@ -56,16 +56,18 @@ def run_in_processes(
             yield from map(start(), items)
         return
     context = _make_context(start)
-    running: dict[Connection, ForkServerProcess] = {}
+    process_by_pipe: dict[Connection, ForkServerProcess] = {}
     try:
         for j in range(jobs):
             receiver, sender = context.Pipe(duplex=False)
-            running[receiver] = _start_process(context, _run_items, start, deal_items(items, jobs, j), jobs > 1, sender)
-        while running:
-            for receiver in cast(list[Connection], wait(list(running))):
-                yield from _receive_result(receiver, running, work_done)
+            process_by_pipe[receiver] = _start_process(
+                context, _run_items, start, deal_items(items, jobs, j), jobs > 1, sender
+            )
+        while process_by_pipe:
+            for receiver in cast(list[Connection], wait(list(process_by_pipe))):
+                yield from _receive_result(receiver, process_by_pipe, work_done)
     finally:
-        _end_processes(running)
+        _end_processes(process_by_pipe)
 
 
 def deal_items(items: Sequence, jobs: int, job: int) -> list:
@@ -95,20 +97,20 @@ def run_in_order(
     remaining = iter(items)
     first_items = list(islice(remaining, jobs * max_ahead))
     context = _make_context(start)
-    running: dict[Connection, ForkServerProcess] = {}
+    process_by_pipe: dict[Connection, ForkServerProcess] = {}
     try:
         for _ in first_items[:jobs]:
             parent_end, worker_end = context.Pipe()
-            running[parent_end] = _start_process(context, _serve_items, start, worker_end)
-        pipes = list(running)
+            process_by_pipe[parent_end] = _start_process(context, _serve_items, start, worker_end)
+        pipes = list(process_by_pipe)
         pending = deque(_send_item(pipes[k % len(pipes)], item) for k, item in enumerate(first_items))
         while pending:
             pipe = pending.popleft()
-            for result in _receive_result(pipe, running, work_done):
+            for result in _receive_result(pipe, process_by_pipe, work_done):
                 pending += [_send_item(pipe, item) for item in islice(remaining, 1)]
                 yield result
     finally:
-        _end_processes(running)
+        _end_processes(process_by_pipe)
 
 
 def _make_context(start: Callable) -> ForkServerContext:
@@ -117,26 +119,26 @@ def _make_context(start: Callable) -> ForkServerContext:
     return context
 
 
-def _start_process(context: ForkServerContext, work: Callable, *args: Any) -> ForkServerProcess:
+def _start_process(context: ForkServerContext, target: Callable, *args: Any) -> ForkServerProcess:
     """Start a process that runs work(*args). The last argument is the end of its pipe.
 
     No other process keeps this end open, so the pipe closes when the process ends, even if the
     process is killed while it sends a result.
     """
-    process = context.Process(target=work, args=args, daemon=True)
+    process = context.Process(target=target, args=args, daemon=True)
     with _block_interrupts():
         process.start()
     args[-1].close()
     return process
 
 
-def _end_processes(running: dict[Connection, ForkServerProcess]) -> None:
-    for process in running.values():
+def _end_processes(process_by_pipe: dict[Connection, ForkServerProcess]) -> None:
+    for process in process_by_pipe.values():
         process.terminate()
-    for pipe in running:
+    for pipe in process_by_pipe:
         pipe.close()
     deadline = monotonic() + EXIT_TIMEOUT_S
-    for process in running.values():
+    for process in process_by_pipe.values():
         process.join(max(0.0, deadline - monotonic()))
         process.kill()  # if it has not ended, for example because it was interrupted holding a lock
         process.join()
@@ -153,7 +155,9 @@ def _find_modules(work: Any) -> set[str]:
     return {getattr(work, "__module__", "builtins"), *later_imports}
 
 
-def _receive_result(receiver: Connection, running: dict[Connection, ForkServerProcess], work_done: str) -> Iterator:
+def _receive_result(
+    receiver: Connection, process_by_pipe: dict[Connection, ForkServerProcess], work_done: str
+) -> Iterator:
     """Yield the next result, or nothing if the process has ended normally.
 
     Raises:
@@ -162,7 +166,7 @@ def _receive_result(receiver: Connection, running: dict[Connection, ForkServerPr
     try:
         result, error = receiver.recv()
     except (EOFError, OSError):  # OSError if the result is cut off
-        process = running.pop(receiver)
+        process = process_by_pipe.pop(receiver)
         process.join()
         if process.exitcode:
             raise InputError(
@@ -181,11 +185,11 @@ def _run_items(start: Callable, items: Sequence, shared: bool, sender: Connectio
     parent = multiprocessing.parent_process()
     with suppress(BrokenPipeError):  # the reader has ended
         try:
-            work = start()
+            process_item = start()
             for item in items:
                 if parent is not None and not parent.is_alive():
                     return
-                sender.send((work(item), None))
+                sender.send((process_item(item), None))
         except InputError as error:
             sender.send((None, str(error)))
 
@@ -202,14 +206,14 @@ def _serve_items(start: Callable, pipe: Connection) -> None:
     signal.signal(signal.SIGTERM, _exit_once)
     results: SimpleQueue[Any] = SimpleQueue()
     Thread(target=_send_results, args=(results, pipe), daemon=True).start()
-    work = start()
+    process_item = start()
     while True:
         try:
             item = pipe.recv()
         except (EOFError, OSError):
             return  # the parent has ended
         try:
-            results.put(ForkingPickler.dumps((work(item), None)))
+            results.put(ForkingPickler.dumps((process_item(item), None)))
         except InputError as error:
             results.put(ForkingPickler.dumps((None, str(error))))
 

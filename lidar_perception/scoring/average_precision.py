@@ -1,13 +1,13 @@
 """Average precision at 11 and at 40 recall points, sampled as in KITTI's benchmark.
 
-The mean over recall points of the highest precision at that recall or above: 11 points 0, 0.1 .. 1
-(Everingham et al., IJCV 2010), or 40 points 1/40 .. 1 (Simonelli et al., ICCV 2019).
+It is the mean over recall points of the highest precision at that recall or above. The points are
+0, 0.1 .. 1 (Everingham et al., IJCV 2010) or 1/40, 2/40 .. 1 (Simonelli et al., ICCV 2019).
 
-KITTI's program samples 41 points from the scores of the true positives, each at most once. With
-fewer objects than points it leaves points empty: n objects that are all detected score (n - 1) / 40
-instead of 1. For fewer than 41 objects the points are therefore sampled from the whole curve here,
-by the definition above; for 41 or more the result equals that of KITTI's program. Its result is
-also available (official=True).
+KITTI's own program samples 41 points from the scores of the true positives, each score at most
+once. With fewer objects than points some points remain empty: if all n objects are detected, the
+result is (n - 1) / 40 instead of 1. For fewer than 41 objects, the points are therefore sampled
+from the complete curve here, according to the definition above. For 41 or more objects the result
+is the same as from KITTI's program. official=True always gives the result of KITTI's program.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ def choose_thresholds(scores: np.ndarray, objects: int) -> np.ndarray:
         scores: (N,) scores of the true positives.
         objects: Number of labelled objects, at least N.
     """
-    descending = np.sort(scores)[::-1]
-    if objects < MIN_OBJECTS or len(descending) == 0:
-        return descending
+    sorted_scores = np.sort(scores)[::-1]
+    if objects < MIN_OBJECTS or len(sorted_scores) == 0:
+        return sorted_scores
     indices, target_recall = [], 0.0
-    for i in range(len(descending)):
+    for i in range(len(sorted_scores)):
         recall, next_recall = (i + 1) / objects, (i + 2) / objects
-        if i + 1 == len(descending) or next_recall - target_recall >= target_recall - recall:
+        if i + 1 == len(sorted_scores) or next_recall - target_recall >= target_recall - recall:
             indices.append(i)
             target_recall += 1 / STEPS
-    return descending[indices[:MIN_OBJECTS]]
+    return sorted_scores[indices[:MIN_OBJECTS]]
 
 
 def sample_curve(values: np.ndarray, objects: int, official: bool = False) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Matplotlib figures as files."""
+"""Writing of Matplotlib figures to files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ if TYPE_CHECKING:
 
 
 def save_picture(path: str | Path, figure: Figure, **options) -> None:
-    """Write a figure as PNG and close it. Raise InputError if it cannot be written."""
+    """Write a figure as PNG and close it.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
     import matplotlib.pyplot as plt
 
     path = Path(path)

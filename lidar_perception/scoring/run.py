@@ -134,8 +134,8 @@ def measure_frames(
     if dask is not None:
         return sort_results(_measure_on_dask(dask, recording, start, numbers), numbers)
     if jobs > 1 and len(numbers) > 1:
-        work = functools.partial(_make_worker, _require_reopen(recording), start)
-        return sort_results(run_in_processes(work, numbers, jobs, "measured frames"), numbers)
+        make_worker = functools.partial(_make_worker, _require_reopen(recording), start)
+        return sort_results(run_in_processes(make_worker, numbers, jobs, "measured frames"), numbers)
     return _measure_in_process(recording, start, numbers)
 
 
@@ -189,7 +189,7 @@ _get_worker = functools.lru_cache(maxsize=1)(lambda run, reopen, start: _make_wo
 
 
 def _measure_on_cluster(run: str, reopen: Callable[[], Recording], start: StartMeasurement, i: int) -> tuple[int, Any]:
-    """Measure a frame in a process that other runs may share."""
+    """Measure a frame in a worker process that may also be used by other runs."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by libraries that are loaded later
     with threadpool_limits(1):
         return _get_worker(run, reopen, start)(i)
@@ -206,7 +206,7 @@ def _measure_on_dask(
         raise InputError(
             "--dask needs the package distributed; run pip install 'lidar_perception[distributed]'"
         ) from None
-    work = functools.partial(_measure_on_cluster, uuid4().hex, _require_reopen(recording), start)
+    measure_on_worker = functools.partial(_measure_on_cluster, uuid4().hex, _require_reopen(recording), start)
     try:
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
         client.wait_for_workers(1, timeout=CONNECT_S)
@@ -218,13 +218,13 @@ def _measure_on_dask(
         max_submitted = TASKS_PER_THREAD * sum(client.nthreads().values())
         not_submitted = iter(numbers)
         submitted = distributed.as_completed(
-            client.map(work, [*islice(not_submitted, max_submitted)], pure=False), loop=client.loop
+            client.map(measure_on_worker, [*islice(not_submitted, max_submitted)], pure=False), loop=client.loop
         )
         try:
             for future in submitted:
                 yield future.result()
                 for number in islice(not_submitted, 1):
-                    submitted.add(client.submit(work, number, pure=False))
+                    submitted.add(client.submit(measure_on_worker, number, pure=False))
         except (distributed.KilledWorker, CommClosedError, CancelledError) as error:
             raise InputError(
                 f"the Dask cluster at {address} failed: {error}; finished frames are kept, and the same command resumes"

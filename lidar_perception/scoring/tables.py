@@ -1,4 +1,4 @@
-"""Tables and messages of scores on the terminal."""
+"""Terminal output of scores: tables, formatted numbers and messages."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def print_time(ms: float | None, console: Console) -> None:
 
 
 def print_skipped(lines: list[str], console: Console) -> None:
-    """Print the first reasons why frames were skipped."""
+    """Print the reasons for skipped frames, at most MAX_SHOWN of them."""
     for line in lines[:MAX_SHOWN]:
         console.print(Text("skipped", "yellow") + f": {line}")
     if len(lines) > MAX_SHOWN:

@@ -66,8 +66,8 @@ def _to_truth(labels: Any) -> GroundTruth | None:
     if labels is None or isinstance(labels, GroundTruth):
         return labels
     objects = to_objects(labels)
-    if unknown := [name for name in objects.labels if name not in CLASSES]:
-        raise InputError(f"labels: '{unknown[0]}' is none of {', '.join(CLASSES)}")
+    if unknown_classes := [name for name in objects.labels if name not in CLASSES]:
+        raise InputError(f"labels: '{unknown_classes[0]}' is none of {', '.join(CLASSES)}")
     if np.isnan(objects.boxes).any():
         raise InputError("labels need complete boxes [x y z l w h yaw]")
     return GroundTruth.of(objects.boxes, [CLASSES.index(name) for name in objects.labels])

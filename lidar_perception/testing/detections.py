@@ -102,32 +102,35 @@ def assert_detections(
     Raises:
         AssertionError: Too many objects are missing or extra; the message lists them.
     """
-    detected, wanted = to_objects(found), to_objects(expected)
-    if min_iou is not None and not np.isfinite(wanted.boxes).all():
+    detected, expected_objects = to_objects(found), to_objects(expected)
+    if min_iou is not None and not np.isfinite(expected_objects.boxes).all():
         raise InputError("min_iou needs complete boxes; some expected objects have only a centre")
-    distance = np.linalg.norm(detected.boxes[:, None, :3] - wanted.boxes[None, :, :3], axis=2)
+    distance = np.linalg.norm(detected.boxes[:, None, :3] - expected_objects.boxes[None, :, :3], axis=2)
     if min_iou is None:
         cost, can_match = distance, distance <= max_distance
     else:
-        overlap = iou_3d(detected.boxes, wanted.boxes)
+        overlap = iou_3d(detected.boxes, expected_objects.boxes)
         cost, can_match = 1 - overlap, (overlap >= min_iou) & (overlap > 0)
     if same_class:
         can_match &= np.array(
-            [[detected_label == wanted_label for wanted_label in wanted.labels] for detected_label in detected.labels],
+            [
+                [detected_label == wanted_label for wanted_label in expected_objects.labels]
+                for detected_label in detected.labels
+            ],
             bool,
         ).reshape(can_match.shape)
     rows, columns = assign_pairs(cost, can_match)
-    missing = sorted(set(range(len(wanted.boxes))) - set(columns.tolist()))
-    extra = sorted(set(range(len(detected.boxes))) - set(rows.tolist()))
-    if len(missing) > max_missing or (max_extra is not None and len(extra) > max_extra):
+    missing_rows = sorted(set(range(len(expected_objects.boxes))) - set(columns.tolist()))
+    extra_rows = sorted(set(range(len(detected.boxes))) - set(rows.tolist()))
+    if len(missing_rows) > max_missing or (max_extra is not None and len(extra_rows) > max_extra):
         rule = f"centres at most {max_distance:g} m apart" if min_iou is None else f"3D IoU at least {min_iou:g}"
         raise AssertionError(
             "\n".join(
                 [
-                    f"{len(rows)} of {len(wanted.boxes)} expected objects were found, {len(extra)} more were "
-                    f"found ({rule}{', of the same class' if same_class else ''})",
-                    *_list_objects("missing", wanted, missing, detected, distance.T),
-                    *_list_objects("extra", detected, extra, wanted, distance),
+                    f"{len(rows)} of {len(expected_objects.boxes)} expected objects were found, "
+                    f"{len(extra_rows)} more were found ({rule}{', of the same class' if same_class else ''})",
+                    *_list_objects("missing", expected_objects, missing_rows, detected, distance.T),
+                    *_list_objects("extra", detected, extra_rows, expected_objects, distance),
                 ]
             )
         )

@@ -36,8 +36,8 @@ def _processes(domain: int, folder: Path) -> Iterator[Any]:
     pytest.importorskip("rclpy", reason=NEEDS_ROS)
     from lidar_perception.testing.processes import NodesUnderTest
 
-    with NodesUnderTest(folder, domain) as running:
-        yield running
+    with NodesUnderTest(folder, domain) as nodes:
+        yield nodes
 
 
 def _peer(domain: int, processes: Any) -> Iterator[Any]:
@@ -104,7 +104,7 @@ def drive_bag(make_bag) -> Path:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: Any, call: Any) -> Any:
     report = yield
-    running = sys.modules.get("lidar_perception.testing.processes")
-    if running is not None and report.failed:
-        report.sections += [(f"log of {title}", log) for title, log in running.collect_logs()]
+    processes_module = sys.modules.get("lidar_perception.testing.processes")
+    if processes_module is not None and report.failed:
+        report.sections += [(f"log of {title}", log) for title, log in processes_module.collect_logs()]
     return report

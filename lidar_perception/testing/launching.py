@@ -31,13 +31,13 @@ def include_launch_file(name: str = "detectors", **arguments: Any) -> Any:
     except ModuleNotFoundError as error:
         raise _missing_package_error(error) from None
     try:
-        share = Path(get_package_share_directory("lidar_perception"))
+        share_folder = Path(get_package_share_directory("lidar_perception"))
     except PackageNotFoundError:
         raise InputError(
             "ROS does not find the package lidar_perception; source the workspace it "
             "was built in, or add where pip installed it to AMENT_PREFIX_PATH"
         ) from None
-    path = share / "launch" / f"{name}.launch.py"
+    path = share_folder / "launch" / f"{name}.launch.py"
     if not path.is_file():
         available = ", ".join(sorted(p.name.split(".")[0] for p in path.parent.glob("*.launch.py")))
         raise InputError(f"there is no launch file '{name}'; there are {available}")

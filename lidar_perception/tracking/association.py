@@ -82,7 +82,7 @@ def _find_pairs_in_gates(tracks, gate, boxes, order, with_iou):
     """
     x = boxes[order, 0]
     reach, box_reach = footprint_radii(tracks), footprint_radii(boxes)
-    work = np.empty((4, MAX_CORNERS))
+    buffer = np.empty((4, MAX_CORNERS))
     i, j, distances, ious = [0], [0], [0.0], [0.0]  # the first item gives the types
     for track in range(len(tracks)):
         a = tracks[track]
@@ -97,7 +97,7 @@ def _find_pairs_in_gates(tracks, gate, boxes, order, with_iou):
             if distance <= gate[track]:
                 shared = 0.0
                 if with_iou:
-                    shared = overlap_area(a, b, reach[track] + box_reach[order[position]], work)
+                    shared = overlap_area(a, b, reach[track] + box_reach[order[position]], buffer)
                 i.append(track)
                 j.append(order[position])
                 distances.append(distance)
@@ -134,8 +134,8 @@ def _label_components(tracks, boxes):
         for pair in range(len(nodes)):
             if first[nodes[pair]] < 0:
                 first[nodes[pair]] = pair
-            root, other = _root(parent, first[nodes[pair]]), _root(parent, pair)
-            parent[max(root, other)] = min(root, other)
+            root, other_root = _root(parent, first[nodes[pair]]), _root(parent, pair)
+            parent[max(root, other_root)] = min(root, other_root)
     for pair in range(len(tracks)):
         parent[pair] = _root(parent, pair)
     return parent

@@ -1,9 +1,9 @@
 """Probability that a track is a real object of its class, and that it is still present.
 
-Both are sums of evidence in log odds. A post that looks like a person does so in every frame and
-from every side: observations of one object are correlated, so n of them count as
-n / (1 + (n - 1) correlation), the design effect of cluster sampling (Kish, Survey Sampling, 1965).
-Presence follows from hits and misses, with the hit rate of the track itself.
+Both are sums of evidence in log odds. Observations of one object are correlated: a post that looks
+like a person does so in every frame. n observations are therefore equivalent to
+n / (1 + (n - 1) correlation) independent ones, the design effect of cluster sampling (Kish, Survey
+Sampling, 1965). Presence is computed from hits and misses, given the track's own hit rate.
 """
 
 from __future__ import annotations

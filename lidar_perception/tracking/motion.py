@@ -1,9 +1,9 @@
 """Batched extended Kalman filters of N objects on the ground.
 
-The state is [x y vx vy heading turn] in metres, seconds and radians in a fixed frame, with a
-velocity that turns at a constant rate (coordinated turn with Cartesian velocity; Li and Jilkov,
-IEEE TAES 2003, Section V.B). With zero turn rate and turn variance it is the constant velocity
-filter. means are (N, 6), covariances (N, 6, 6), both float64; N may be 0.
+The state is [x y vx vy heading turn] in metres, seconds and radians in a fixed frame. The motion
+model is a coordinated turn with Cartesian velocity (Li and Jilkov, IEEE TAES 2003, Section V.B);
+with zero turn rate and turn variance it is the constant velocity model. means are (N, 6),
+covariances (N, 6, 6), both float64; N may be 0.
 """
 
 from __future__ import annotations
@@ -36,32 +36,32 @@ def predict(
     is_straight = np.abs(angle) < MIN_TURN_RAD
     divisor = np.where(is_straight, 1.0, turn)
     sin, cos = np.sin(angle), np.cos(angle)
-    along = np.where(is_straight, t, sin / divisor)
-    across = np.where(is_straight, angle * t / 2, (1.0 - cos) / divisor)
+    forward_factor = np.where(is_straight, t, sin / divisor)
+    lateral_factor = np.where(is_straight, angle * t / 2, (1.0 - cos) / divisor)
     predicted_means = means.copy()
-    predicted_means[:, X] += along * vx - across * vy
-    predicted_means[:, Y] += across * vx + along * vy
+    predicted_means[:, X] += forward_factor * vx - lateral_factor * vy
+    predicted_means[:, Y] += lateral_factor * vx + forward_factor * vy
     predicted_means[:, VX], predicted_means[:, VY] = cos * vx - sin * vy, sin * vx + cos * vy
     predicted_means[:, HEADING] = wrap_angle(means[:, HEADING] + angle)
 
-    along_by_turn = np.where(is_straight, -angle * t * t / 3, (t * cos - along) / divisor)
-    across_by_turn = np.where(is_straight, t * t / 2, (t * sin - across) / divisor)
+    forward_derivative = np.where(is_straight, -angle * t * t / 3, (t * cos - forward_factor) / divisor)
+    lateral_derivative = np.where(is_straight, t * t / 2, (t * sin - lateral_factor) / divisor)
     f = np.tile(np.eye(6), (count, 1, 1))
-    f[:, X, VX] = f[:, Y, VY] = along
-    f[:, X, VY], f[:, Y, VX] = -across, across
+    f[:, X, VX] = f[:, Y, VY] = forward_factor
+    f[:, X, VY], f[:, Y, VX] = -lateral_factor, lateral_factor
     f[:, VX, VX] = f[:, VY, VY] = cos
     f[:, VX, VY], f[:, VY, VX] = -sin, sin
-    f[:, X, TURN] = along_by_turn * vx - across_by_turn * vy
-    f[:, Y, TURN] = across_by_turn * vx + along_by_turn * vy
+    f[:, X, TURN] = forward_derivative * vx - lateral_derivative * vy
+    f[:, Y, TURN] = lateral_derivative * vx + forward_derivative * vy
     f[:, VX, TURN], f[:, VY, TURN] = -t * predicted_means[:, VY], t * predicted_means[:, VX]
     f[:, HEADING, TURN] = t
     predicted_covariances = f @ covariances @ f.transpose(0, 2, 1)
     for value, rate, density in ((X, VX, acceleration), (Y, VY, acceleration), (HEADING, TURN, turning)):
-        square = density * density
-        predicted_covariances[:, value, value] += square * t**3 / 3
-        predicted_covariances[:, value, rate] += square * t * t / 2
-        predicted_covariances[:, rate, value] += square * t * t / 2
-        predicted_covariances[:, rate, rate] += square * t
+        variance_density = density * density
+        predicted_covariances[:, value, value] += variance_density * t**3 / 3
+        predicted_covariances[:, value, rate] += variance_density * t * t / 2
+        predicted_covariances[:, rate, value] += variance_density * t * t / 2
+        predicted_covariances[:, rate, rate] += variance_density * t
     predicted_covariances[:, HEADING, HEADING] += wandering * wandering * t
     return predicted_means, predicted_covariances
 
@@ -120,8 +120,8 @@ def flip_reversed_headings(
     Returns:
         The new means and agreements.
     """
-    forward = np.cos(means[:, HEADING]) * means[:, VX] + np.sin(means[:, HEADING]) * means[:, VY]
-    is_reversed = (forward < -backwards) | (agreement < -MIN_OPPOSING_SCORE) & (forward <= backwards)
+    forward_speed = np.cos(means[:, HEADING]) * means[:, VX] + np.sin(means[:, HEADING]) * means[:, VY]
+    is_reversed = (forward_speed < -backwards) | (agreement < -MIN_OPPOSING_SCORE) & (forward_speed <= backwards)
     flipped = means.copy()
     flipped[:, HEADING] = wrap_angle(means[:, HEADING] + np.pi * is_reversed)
     return flipped, np.where(is_reversed, -agreement, agreement)

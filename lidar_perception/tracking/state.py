@@ -66,7 +66,7 @@ class States:
         return States(*(getattr(self, f.name).copy() for f in fields(self)))
 
     def append(self, others: States) -> States:
-        """Return these tracks followed by the others."""
+        """Return these tracks followed by `others`."""
         return States(*(np.concatenate([getattr(self, f.name), getattr(others, f.name)]) for f in fields(self)))
 
     @staticmethod

@@ -187,7 +187,7 @@ def start_tracks(
 
 
 def prune(states: States, params: TrackingParams, fixed: bool) -> States:
-    """Remove tracks that are probably gone, and the less probable of overlapping tracks."""
+    """Remove tracks that are probably gone; of overlapping tracks, keep the most probable one."""
     states = states.take(np.flatnonzero(existence.to_probability(states.present) >= params.existence.end))
     probabilities = compute_probabilities(states, params, fixed)
     kept_indices = rotated_nms(states.to_boxes(), probabilities, states.class_ids, params.overlap, across_classes=True)

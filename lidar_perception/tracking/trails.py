@@ -12,7 +12,7 @@ TRAIL_POINTS = 20  # number of trail points per track
 
 
 class Trails:
-    """The recent positions of each track."""
+    """Recorder of the recent positions of each track."""
 
     def __init__(self) -> None:
         self._trails: dict[int, deque[tuple[int, np.ndarray]]] = {}

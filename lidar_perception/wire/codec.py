@@ -1,4 +1,4 @@
-"""CDR serialization of ROS messages without ROS, with the message classes of rosbags."""
+"""Serialization of ROS messages to CDR without ROS, with the message classes of rosbags."""
 
 from __future__ import annotations
 

@@ -53,10 +53,10 @@ def to_point_cloud(
             indices = np.flatnonzero(_read_scalar_field(points, "in_view"))
             points = points.take(indices)
         coordinates = read_xyz(points)
-        raw = None if intensity_max is None else _read_raw_intensity(points)
+        raw_intensity = None if intensity_max is None else _read_raw_intensity(points)
     except CloudError as error:
         raise InputError(str(error)) from None
-    intensity = None if raw is None else to_unit(raw[0], intensity_max or scale(*raw))
+    intensity = None if raw_intensity is None else to_unit(raw_intensity[0], intensity_max or scale(*raw_intensity))
     is_usable = usable_returns(coordinates)
     if not is_usable.all():
         usable_indices = np.flatnonzero(is_usable)

@@ -47,9 +47,9 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
             objects = from_marker_array(msg) if are_markers else from_detection_array(msg)
             stamp_ns = objects.stamp_ns or (0 if 0 in stamps else time)
             objects_by_stamp[stamp_ns] = poses.to_cloud_frame(objects, topic)
-    if unknown := sorted(objects_by_stamp.keys() - stamps):
+    if unknown_stamps := sorted(objects_by_stamp.keys() - stamps):
         raise InputError(
-            f"{path}: {topic} has labels at {unknown[0]} ns ({len(unknown)} of "
+            f"{path}: {topic} has labels at {unknown_stamps[0]} ns ({len(unknown_stamps)} of "
             f"{len(objects_by_stamp)} such stamps), where the drive has no frame; give the drive "
             "that was labelled"
         )

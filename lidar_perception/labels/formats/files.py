@@ -111,10 +111,10 @@ def check_label_files(folder: Path, expected: Sequence[Path], suffix: str, ignor
         if path.name not in ignored and not path.name.startswith(".")
     }
     example = min(names, default="none")
-    if unknown := sorted(existing - names):
+    if unknown_names := sorted(existing - names):
         raise InputError(
-            f"{folder / unknown[0]} belongs to no frame of the drive "
-            f"({len(unknown)} such files; those of the drive are named like "
+            f"{folder / unknown_names[0]} belongs to no frame of the drive "
+            f"({len(unknown_names)} such files; those of the drive are named like "
             f"{example}); give the drive that was labelled, or move these files away"
         )
     if not existing:

@@ -55,8 +55,8 @@ def find_label_folder(path: Path, name: str) -> Path:
 
     Returns `path` itself if there is no such folder.
     """
-    for inner in (f"training/{name}", name):
-        path = path / inner if (path / inner).is_dir() else path
+    for subfolder in (f"training/{name}", name):
+        path = path / subfolder if (path / subfolder).is_dir() else path
     return path
 
 
@@ -96,7 +96,7 @@ def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str
     if len(labels):
         calibration = require_calibration(frame)
         to_lidar = np.linalg.inv(calibration.lidar_to_camera)
-        pixels, outside = project_boxes(labels.boxes, calibration)
+        pixels, outside_fractions = project_boxes(labels.boxes, calibration)
         to_camera = calibration.lidar_to_camera
         depths = labels.boxes[:, :3] @ to_camera[2, :3] + to_camera[2, 3]
         occlusion = compute_occlusion_levels(pixels, depths)
@@ -106,13 +106,13 @@ def make_lines(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str
             "class": "_".join(name.split()) or "Misc",
             **to_camera_box(box, calibration.lidar_to_camera),
             "bbox": np.nan_to_num(pixels[k]).tolist(),
-            "truncated": float(outside[k]),
+            "truncated": float(outside_fractions[k]),
             "occluded": level if isinstance(level := extra.get("occluded"), int) else int(occlusion[k]),
         }
         if _is_unchanged_line(box, extra, to_lidar):
             line |= {column: extra[column] for column in COLUMNS}
             if not levels and _is_level(extra["truncated"], labels.track_ids[k]):
-                line["truncated"] = float(outside[k])
+                line["truncated"] = float(outside_fractions[k])
         lines.append({**line, **get_id_and_score(labels, k)})
     for line, track in zip(lines + notes, [*labels.track_ids, *[0] * len(notes)]) if levels else ():
         value = line["truncated"]

@@ -52,9 +52,9 @@ def _read_drive(path: Path, frames: Sequence[Frame]) -> list[FrameLabels]:
     numbers = [numbers_by_name.get(frame.name.rpartition("/")[2], frame.index) for frame in frames]
     truth = read_tracklets(path)
     # Tracks continue over missing scans, so numbers within the drive are allowed.
-    if unknown := sorted(n for n in truth if not min(numbers) <= n <= max(numbers)):
+    if unknown_numbers := sorted(n for n in truth if not min(numbers) <= n <= max(numbers)):
         raise InputError(
-            f"{path} has the frame {unknown[0]} ({len(unknown)} unknown frames), but "
+            f"{path} has the frame {unknown_numbers[0]} ({len(unknown_numbers)} unknown frames), but "
             f"the drive has {min(numbers)} to {max(numbers)}; give the drive that was "
             "labelled"
         )

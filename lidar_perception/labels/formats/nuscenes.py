@@ -1,8 +1,8 @@
 """Result files of nuScenes' detection and tracking tasks: JSON files with boxes by sample.
 
-Boxes are in the global frame, so the recording needs poses. size is [width length height], rotation
-is [w x y z], with x to the front. The token of a frame of another recording is its name.
-nuscenes-devkit ignores additional fields and rejects unknown classes, which are written, too.
+Boxes are in the global frame, so the recording needs poses. size is [width length height] and
+rotation is [w x y z], with x forward. The token of a frame that is not from nuScenes is its name.
+nuscenes-devkit ignores additional fields and rejects unknown classes; both are written.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def _parse_boxes(task: str, frame: Frame, boxes: list[dict[str, Any]], ids: dict
 
 
 def _parse_velocity(velocity: Any) -> list[float] | None:
-    valid = velocity is not None and None not in velocity and np.isfinite(velocity).all()
-    return [float(v) for v in velocity] if valid else None
+    is_valid = velocity is not None and None not in velocity and np.isfinite(velocity).all()
+    return [float(v) for v in velocity] if is_valid else None
 
 
 def _to_local_box(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], bool]:
@@ -222,9 +222,9 @@ def _compute_velocities(
         positions = np.array([(poses[i] @ [*labels.frames[i].boxes[k, :3], 1.0])[:2] for i, k in boxes])
         stamps = np.array([frames[i].stamp_ns for i, _ in boxes], np.int64)
         for n, box in enumerate(boxes):
-            first, last = max(n - 1, 0), min(n + 1, len(boxes) - 1)
-            if (seconds := (stamps[last] - stamps[first]) * 1e-9) > 0:
-                velocities[box] = ((positions[last] - positions[first]) / seconds).tolist()
+            previous, following = max(n - 1, 0), min(n + 1, len(boxes) - 1)
+            if (seconds := (stamps[following] - stamps[previous]) * 1e-9) > 0:
+                velocities[box] = ((positions[following] - positions[previous]) / seconds).tolist()
     return velocities
 
 

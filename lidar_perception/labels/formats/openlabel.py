@@ -76,9 +76,9 @@ def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[Frame
     content = dict(read_json(path)[ROOT])
     objects, systems = content.get("objects", {}), content.get("coordinate_systems", {})
     frame_contents = content.get("frames", {})
-    if unknown := sorted(set(frame_contents) - {str(frame.index) for frame in frames}):
+    if unknown_numbers := sorted(set(frame_contents) - {str(frame.index) for frame in frames}):
         raise InputError(
-            f"{where} has the frame {unknown[0]!r} ({len(unknown)} unknown frames), "
+            f"{where} has the frame {unknown_numbers[0]!r} ({len(unknown_numbers)} unknown frames), "
             f"but the drive has {frames[0].index} to {frames[-1].index}; give the "
             "drive that was labelled"
         )
@@ -139,13 +139,15 @@ def _make_region_notes(kind: str, uid: str, data: dict[str, Any]) -> list[tuple[
     Each 2D box becomes a note with KITTI's columns; the first note also has the object's data. An
     object without 2D boxes becomes one note with its data.
     """
-    values, rest = parts.parse_named_values(data)
+    values, other_items = parts.parse_named_values(data)
     columns = {name: DONT_CARE[name] for name in COLUMNS if name in DONT_CARE}
     notes = [
         (kind, {**columns, **values, "bbox": box, UID: uid, REGION: {} if k else data})
         for k, box in enumerate(parts.find_regions(data))
     ]
-    return notes or [(kind, {**values, **({OBJECT: rest} if rest else {}), **({} if values else {UID: uid})})]
+    return notes or [
+        (kind, {**values, **({OBJECT: other_items} if other_items else {}), **({} if values else {UID: uid})})
+    ]
 
 
 def _parse_track(cuboid: dict[str, Any], object_class: str, number: int) -> tuple[str, int, float]:

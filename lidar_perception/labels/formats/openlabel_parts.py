@@ -240,7 +240,7 @@ def to_named_values(values: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
 
 
 def parse_named_values(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[Any]]]:
-    """Invert to_named_values; also return the items that are not plain values, by type."""
+    """Invert to_named_values; return the plain values, and all other items by type."""
     values: dict[str, Any] = {}
     other_items: dict[str, list[Any]] = {}
     for value_type, items in lists.items():

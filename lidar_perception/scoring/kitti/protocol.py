@@ -1,12 +1,17 @@
 """KITTI's object benchmark: matching of detections and labels, and average precision.
 
-Geiger, Lenz, Urtasun, CVPR 2012, and the benchmark's own program. For a class and a difficulty a
-label is counted (must be detected), ignored (may be detected: too small in the image, too occluded
-or truncated for the difficulty, or of a neighbour class) or other (has no effect). A detection is
-counted, ignored if it is lower than the minimum height (of any class), or other. Detections
-are matched twice: by score, to find the thresholds at which recall rises, and by overlap at each
-threshold, to count. A detection inside a DontCare region is not a false positive in the image; in
-BEV and 3D such regions have no extent.
+The rules follow Geiger, Lenz, Urtasun, CVPR 2012, and the benchmark's own program.
+
+For a class and a difficulty, a label is
+- counted: it must be detected;
+- ignored: it may be detected, because it is too small in the image, too occluded or truncated for
+  the difficulty, or of a neighbour class;
+- other: it has no effect.
+
+A detection is ignored if its 2D box is lower than the minimum height (in any class), counted if it
+is of the class, and otherwise other. Detections are matched twice: by score, to find the thresholds
+at which recall rises, and by overlap at each threshold, to count. A detection inside a DontCare
+region is not a false positive in the image; in BEV and 3D such regions have no extent.
 """
 
 from __future__ import annotations
@@ -54,14 +59,14 @@ class ComparedFrame:
     excused: np.ndarray
 
 
-def compare_objects(true: CameraObjects, found: CameraObjects) -> ComparedFrame:
+def compare_objects(labels: CameraObjects, detections: CameraObjects) -> ComparedFrame:
     """Compute the overlaps of the labels and detections of a frame; detections in any order."""
-    found = found.take(np.lexsort([*found.boxes.T, *found.image_boxes.T, -found.scores]))
+    detections = detections.take(np.lexsort([*detections.boxes.T, *detections.image_boxes.T, -detections.scores]))
     overlaps = np.stack(
-        [compute_image_iou(found.image_boxes, true.image_boxes), *bev_and_3d_iou(found.boxes, true.boxes)]
+        [compute_image_iou(detections.image_boxes, labels.image_boxes), *bev_and_3d_iou(detections.boxes, labels.boxes)]
     )
-    excused = compute_image_iou(found.image_boxes, true.regions, over_first=True)
-    return ComparedFrame(true, found, overlaps, excused.max(axis=1, initial=0.0))
+    excused = compute_image_iou(detections.image_boxes, labels.regions, over_first=True)
+    return ComparedFrame(labels, detections, overlaps, excused.max(axis=1, initial=0.0))
 
 
 def compute_image_iou(boxes: np.ndarray, others: np.ndarray, over_first: bool = False) -> np.ndarray:
@@ -104,14 +109,14 @@ class Comparison:
     @staticmethod
     def of(frames: list[ComparedFrame]) -> Comparison:
         """Concatenate one or more frames."""
-        true, found = [f.true for f in frames], [f.found for f in frames]
+        labels, detections = [f.true for f in frames], [f.found for f in frames]
         return Comparison(
-            CameraObjects.concatenate(true),
-            CameraObjects.concatenate(found),
+            CameraObjects.concatenate(labels),
+            CameraObjects.concatenate(detections),
             np.concatenate([f.overlaps.reshape(len(METRICS), -1) for f in frames], axis=1),
             np.concatenate([f.excused for f in frames]),
-            _find_starts(map(len, true)),
-            _find_starts(map(len, found)),
+            _find_starts(map(len, labels)),
+            _find_starts(map(len, detections)),
             _find_starts(f.overlaps[0].size for f in frames),
         )
 

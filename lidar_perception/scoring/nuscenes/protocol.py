@@ -1,10 +1,11 @@
-"""The detection task of nuScenes: average precision by centre distance, and errors of the hits.
+"""Scores of nuScenes' detection task: average precision by centre distance, and errors of the hits.
 
-Caesar et al., CVPR 2020, Section 3.1, with the configuration detection_cvpr_2019 of
-nuscenes-devkit. Detections of a class take, best score first, the nearest unmatched object of their
-frame if it is near enough in the ground plane. Average precision is the area under the curve above
-a recall and a precision of 0.1, averaged over four distances. The errors are those of hits at 2 m:
-at each recall the mean over all hits of at least that score, averaged over recalls above 0.1.
+The rules follow Caesar et al., CVPR 2020, Section 3.1, and the configuration detection_cvpr_2019 of
+nuscenes-devkit. In descending order of score, each detection is matched with the nearest free
+object of its class and frame, if their distance in the ground plane is small enough. Average
+precision is the area under the precision-recall curve above a recall and a precision of 0.1,
+averaged over four distances. Errors are computed for hits within 2 m: at each recall, take the mean
+over all hits up to this recall, then average over recalls above 0.1.
 """
 
 from __future__ import annotations
@@ -108,8 +109,8 @@ def score_class(
     for distance in DISTANCES:
         indices = _match(detections.centres, detection_frames, truth.centres, first, distance)
         precision, confidence = _interpolate_curves(indices >= 0, detections.scores, len(truth))
-        above = np.maximum(precision[FIRST_RECALL_INDEX:] - MIN_PRECISION, 0)
-        ap[distance] = float(above.mean()) / (1 - MIN_PRECISION)
+        precision_gain = np.maximum(precision[FIRST_RECALL_INDEX:] - MIN_PRECISION, 0)
+        ap[distance] = float(precision_gain.mean()) / (1 - MIN_PRECISION)
         if distance == ERROR_DISTANCE:
             hits = detections[indices >= 0]
             errors = {
@@ -161,13 +162,13 @@ def _average_error(values: np.ndarray, scores: np.ndarray, confidence: np.ndarra
     NaN values are ignored; the result is 1 if all values are NaN.
     """
     reached_indices = np.flatnonzero(confidence)
-    last = reached_indices[-1] if len(reached_indices) else 0
-    if last < FIRST_RECALL_INDEX or np.isnan(values).all():
+    last_index = reached_indices[-1] if len(reached_indices) else 0
+    if last_index < FIRST_RECALL_INDEX or np.isnan(values).all():
         return 1.0
     known_counts = np.cumsum(~np.isnan(values))
     running_means = np.nancumsum(values) / np.maximum(known_counts, 1)
     curve = np.interp(confidence[::-1], scores[::-1], running_means[::-1])[::-1]
-    return float(curve[FIRST_RECALL_INDEX : last + 1].mean())
+    return float(curve[FIRST_RECALL_INDEX : last_index + 1].mean())
 
 
 def compute_errors(truth: GlobalBoxes, detections: GlobalBoxes, symmetric: bool) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Scores of detections against the labels of nuScenes."""
+"""Report of nuScenes detection scores, from a detector or a result file."""
 
 from __future__ import annotations
 

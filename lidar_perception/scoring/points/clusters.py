@@ -245,5 +245,5 @@ def _compute_scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, 
     }
 
 
-def _to_percent(part: int, whole: int) -> float | None:
-    return 100.0 * float(part) / float(whole) if whole else None
+def _to_percent(numerator: int, denominator: int) -> float | None:
+    return 100.0 * float(numerator) / float(denominator) if denominator else None

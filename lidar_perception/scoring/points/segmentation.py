@@ -253,7 +253,7 @@ class ClusterReport:
     def compute(self) -> dict:
         """Return the content of the JSON file; precision is the fraction of judged clusters that hit."""
         classes = np.array([c for names, _, _ in self.frames for c in names], str)
-        ranges = _concatenate(each for _, each, _ in self.frames)
+        ranges = _concatenate(frame_ranges for _, frame_ranges, _ in self.frames)
         bins = np.searchsorted(RANGE_LIMITS, ranges, "right")
         columns = [
             _concatenate(getattr(score, name) for _, _, score in self.frames) for name in ("iou", "pieces", "shared")
@@ -309,5 +309,5 @@ def _compute_median(values: list[float]) -> float | None:
     return float(np.median(values)) if values else None
 
 
-def _divide(part: float, whole: float) -> float:
-    return part / whole if whole else 0.0
+def _divide(numerator: float, denominator: float) -> float:
+    return numerator / denominator if denominator else 0.0

@@ -1,9 +1,9 @@
 """AB3DMOT's sAMOTA, AMOTA and AMOTP (Weng et al., IROS 2020): 3D CLEAR MOT averaged over recall.
 
-Counting follows the paper's own script for KITTI with 3D IoU. Tracks are ranked by their mean
-score, and 40 thresholds select them. Unlike CLEAR MOT, the script counts hits on ignored labels as
-true positives, counts an id switch only between consecutive frames, and does not prefer the pair of
-the previous frame.
+The counts follow the paper's own script for KITTI with 3D IoU: each of 40 thresholds selects the
+tracks with at least this mean score. Unlike CLEAR MOT, the script counts matches of ignored labels
+as true positives, counts an id switch only between consecutive frames, and does not prefer the
+match of the previous frame.
 """
 
 from __future__ import annotations
@@ -90,15 +90,15 @@ def _average_scores(frames: list[Pairs]) -> dict[int, float]:
 
 def _choose_thresholds(scores: np.ndarray, objects: int) -> list[tuple[float, float]]:
     """Return the score thresholds with the recall nearest to 1/40, 2/40, .., as (score, recall)."""
-    descending, chosen, target_recall = np.sort(scores)[::-1], [], 0.0
-    for i, score in enumerate(descending.tolist()):
+    sorted_scores, thresholds, target_recall = np.sort(scores)[::-1], [], 0.0
+    for i, score in enumerate(sorted_scores.tolist()):
         recall = (i + 1) / objects
-        next_recall = (i + 2) / objects if i + 1 < len(descending) else recall
-        if next_recall - target_recall < target_recall - recall and i + 1 < len(descending):
+        next_recall = (i + 2) / objects if i + 1 < len(sorted_scores) else recall
+        if next_recall - target_recall < target_recall - recall and i + 1 < len(sorted_scores):
             continue
-        chosen.append((score, target_recall))
+        thresholds.append((score, target_recall))
         target_recall += 1 / STEPS
-    return chosen[1:]
+    return thresholds[1:]
 
 
 def _count_at_threshold(

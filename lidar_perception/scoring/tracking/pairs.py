@@ -1,8 +1,8 @@
 """Labels and tracks of one frame for the tracking scores, and their similarity.
 
-What counts follows KITTI's tracking benchmark as run by TrackEval: labels of neighbour classes,
-truncated or hardly visible labels, DontCare regions and small boxes are ignored. Labels outside the
-image, which KITTI does not have, are ignored too.
+As in KITTI's tracking benchmark (TrackEval), labels of neighbour classes, truncated or hardly
+visible labels, DontCare regions and small boxes are ignored. Labels outside the image, which KITTI
+does not have, are also ignored.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def drop_ignored(pairs: Pairs) -> Pairs:
     is_dropped = pairs.excused.copy()
     is_dropped[columns] = pairs.ignored[rows]
     labels, tracks = np.flatnonzero(~pairs.ignored), np.flatnonzero(~is_dropped)
-    both = np.ix_(labels, tracks)
+    kept_pairs = np.ix_(labels, tracks)
     return replace(
         pairs,
         true_ids=pairs.true_ids[labels],
@@ -172,8 +172,8 @@ def drop_ignored(pairs: Pairs) -> Pairs:
         track_ids=pairs.track_ids[tracks],
         scores=pairs.scores[tracks],
         excused=pairs.excused[tracks],
-        similarity=pairs.similarity[both],
-        overlap=pairs.overlap[both],
+        similarity=pairs.similarity[kept_pairs],
+        overlap=pairs.overlap[kept_pairs],
     )
 
 
