@@ -113,8 +113,8 @@ def _describe_training(params: Any) -> str:
     if params is None:
         return ""
     sentences = [
-        f"All networks have the size {params.size}, batches of {params.batch} scenes, the same scenes and the same "
-        "number of steps, and begin with random weights. The weights with the best validation score are measured."
+        f"All networks have the size {params.size}, a batch size of {params.batch} and the same number of "
+        "steps, and begin with random weights. Networks with all labels are trained on the same scenes. The weights with the best validation score are measured."
     ]
     if params.data.scans:
         sentences.append(
@@ -160,7 +160,7 @@ def make_table_5(draws: Draws, true: list[dict[str, Any]]) -> Section:
         "are paired. The paper does not say which recall points it uses."
     )
     if few := [name for name, count in counts.items() if count < MIN_LABELS]:
-        text += f" There are too few labels to compare versions by their AP of {' and '.join(few)}, and by the mean."
+        text += f" There are too few labels to compare versions by the AP of {', '.join(few)} or by the mean."
     best = max((values[0, RELAXED, MEAN] for values in draws.values()), default=np.nan)
     if not best >= MIN_AP:  # also true for NaN
         text = (
