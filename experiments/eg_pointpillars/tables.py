@@ -114,7 +114,8 @@ def _describe_training(params: Any) -> str:
         return ""
     sentences = [
         f"All networks have the size {params.size}, a batch size of {params.batch} and the same number of "
-        "steps, and begin with random weights. Networks with all labels are trained on the same scenes. The weights with the best validation score are measured."
+        "steps, and begin with random weights. Networks with all labels are trained on the same "
+        "scenes. The weights with the best validation score are measured."
     ]
     if params.data.scans:
         sentences.append(
