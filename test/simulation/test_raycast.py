@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from raycast_samples import FULL, OVER_ROAD, SENSOR, crowd, solids
+from raycast_samples import FULL, OVER_ROAD, SENSOR, make_crowd, make_solids
 
 from lidar_perception.simulation import foliage
 from lidar_perception.simulation.hashing import hash_uniform
@@ -21,7 +21,7 @@ NO_GROUND = np.array([0.0, 0.0, 1e4])
 DRIVE = Motion((12.0, -1.0, 0.2), 0.8, stamp=0.3)
 
 
-def reference(objects, sensor, motion=NO_MOTION):
+def cast_by_brute_force(objects, sensor, motion=NO_MOTION):
     """Return range, solid (columns, rings) and reached by testing every solid with every ray."""
     turn = make_rays(sensor, motion)
     nearest = np.full(turn.direction.shape[:2], np.inf)
@@ -52,17 +52,17 @@ def reference(objects, sensor, motion=NO_MOTION):
     return nearest, solid, {k: v.sum() for k, v in reached.items() if k}
 
 
-def same(one, other):
+def are_equal(one, other):
     return all(np.array_equal(a, b) for a, b in zip(one, other))
 
 
 @pytest.mark.parametrize("motion", [NO_MOTION, DRIVE])
 @pytest.mark.parametrize("seed", range(4))
 def test_hits_equal_slow_reference(seed, motion):
-    objects = crowd(seed)
+    objects = make_crowd(seed)
     for sensor in (SENSOR, replace(SENSOR, lifts=(), elevations=tuple(np.linspace(1.4, -1.4, 9)))):
         hits = cast_rays(objects, Ground(), NO_GROUND, sensor, motion)
-        nearest, solid, reached = reference(objects, sensor, motion)
+        nearest, solid, reached = cast_by_brute_force(objects, sensor, motion)
         assert (nearest < np.inf).sum() > 50
         assert np.allclose(hits.range, nearest, rtol=1e-9)
         assert np.array_equal(hits.solid, solid)
@@ -70,8 +70,8 @@ def test_hits_equal_slow_reference(seed, motion):
         assert {k: n for k, n in enumerate(hits.reached) if n} == {k: n for k, n in reached.items() if n}
 
 
-def leafy(seed):
-    objects, rng = crowd(seed), np.random.default_rng(seed)
+def make_foliage(seed):
+    objects, rng = make_crowd(seed), np.random.default_rng(seed)
     return replace(
         objects,
         density=np.where(rng.random(60) < 0.4, 1.0, np.inf),
@@ -81,9 +81,9 @@ def leafy(seed):
 
 def test_hits_depend_on_seed_only():
     for seed, motion in ((0, NO_MOTION), (1, DRIVE)):
-        scene = leafy(seed), FULL._replace(rough=0.05), OVER_ROAD, WIDE, motion
+        scene = make_foliage(seed), FULL._replace(rough=0.05), OVER_ROAD, WIDE, motion
         one = cast_rays(*scene, seed)
-        assert same(one, cast_rays(*scene, seed))
+        assert are_equal(one, cast_rays(*scene, seed))
         for other in (9, -1, (1 << 90) + 5):
             assert not np.array_equal(cast_rays(*scene, other).range, one.range)
 
@@ -93,7 +93,7 @@ def test_nearest_of_single_casts_equals_joint_cast(motion):
     """Overlapping solids in high grass, most without an owner: neither order nor skipping changes a
     byte."""
     count, rng = 160, np.random.default_rng(0)
-    objects = crowd(5, count)
+    objects = make_crowd(5, count)
     far = np.linalg.norm(objects.centre[:, :2], axis=1)[:, None]
     objects = replace(
         objects,
@@ -119,7 +119,7 @@ def test_nearest_of_single_casts_equals_joint_cast(motion):
 
 
 def test_wall_is_flat_only_after_compensation():
-    wall = solids(BOX, (10, 0, 0), (1, 40, 8))
+    wall = make_solids(BOX, (10, 0, 0), (1, 40, 8))
     exact = replace(SENSOR, range_noise=0.0, dropout=0.0)
     hits = cast_rays(wall, Ground(), NO_GROUND, exact, DRIVE)
     flat, raw = (
@@ -141,7 +141,7 @@ def even_leaves(monkeypatch):
 def test_leaf_clumps_are_constant_during_drive():
     """Two casts with other random numbers hit leaves in the same cells, a share of LEAF_SHARE."""
     fine = make_generic_sensor(64, -8.0, 8.0, 0.1, 10.0, divergence=0.0)
-    plant = solids(BOX, (12, 0, 0), (3, 3, 3), density=2.0)
+    plant = make_solids(BOX, (12, 0, 0), (3, 3, 3), density=2.0)
     filled = []
     for seed in (1, 2):
         hits = cast_rays(plant, Ground(), NO_GROUND, fine, seed=seed)
@@ -160,7 +160,7 @@ def test_leaf_clumps_are_constant_during_drive():
 def test_foliage_stops_rays_after_mean_free_path(kind, even_leaves):
     fine = make_generic_sensor(32, -8.0, 8.0, 0.2, 10.0, divergence=0.0)
     thin, thick = (
-        cast_rays(solids(kind, (12, 0, 0), (3, 3, 3), density=density), Ground(), NO_GROUND, fine, seed=5)
+        cast_rays(make_solids(kind, (12, 0, 0), (3, 3, 3), density=density), Ground(), NO_GROUND, fine, seed=5)
         for density in (np.inf, 0.7)
     )
     shell = np.isfinite(thin.range)
@@ -176,7 +176,7 @@ def test_foliage_stops_rays_after_mean_free_path(kind, even_leaves):
 
 def test_rays_from_inside_are_stopped_only_by_foliage(even_leaves):
     inside = [
-        cast_rays(solids(ELLIPSOID, (0.5, 0, 0), (4, 4, 4), density=density), Ground(), NO_GROUND, SENSOR).range
+        cast_rays(make_solids(ELLIPSOID, (0.5, 0, 0), (4, 4, 4), density=density), Ground(), NO_GROUND, SENSOR).range
         for density in (np.inf, 1.0)
     ]
     assert not np.isfinite(inside[0]).any()
@@ -184,7 +184,7 @@ def test_rays_from_inside_are_stopped_only_by_foliage(even_leaves):
 
 
 def test_glass_passes_its_share_of_rays():
-    panes = solids([BOX, BOX], [(8, 0, 0), (12, 0, 0)], (0.01, 3, 2), [1, 2], transmission=0.7)
+    panes = make_solids([BOX, BOX], [(8, 0, 0), (12, 0, 0)], (0.01, 3, 2), [1, 2], transmission=0.7)
     panes = replace(panes, transmission=np.array([0.7, 0.0]))
     fine = make_generic_sensor(32, -5.0, 5.0, 0.1, 10.0, divergence=0.0)
     hits = cast_rays(panes, Ground(), NO_GROUND, fine)
@@ -196,7 +196,7 @@ def test_glass_passes_its_share_of_rays():
 
 
 def test_nearest_solid_wins_and_reached_counts_hidden_rays():
-    both = solids([BOX, BOX], [(9, 0, 0), (5, 0, 0)], (0.5, 0.5, 1.0), [2, 1])
+    both = make_solids([BOX, BOX], [(9, 0, 0), (5, 0, 0)], (0.5, 0.5, 1.0), [2, 1])
     hits = cast_rays(both, Ground(), OVER_ROAD, SENSOR)
     hit_counts = np.bincount(hits.owner.ravel(), minlength=3)
     assert (hits.range[0][hits.owner[0] == 1] < 5.0).all()
@@ -205,7 +205,7 @@ def test_nearest_solid_wins_and_reached_counts_hidden_rays():
 
 def test_edge_beams_return_from_between_or_one_side():
     near, far = (BOX, (5, 0, 0), (0.2, 1, 1)), (BOX, (5.7, 0, 0), (0.2, 9, 4))
-    objects = solids(*zip(near, far), [1, 2])
+    objects = make_solids(*zip(near, far), [1, 2])
     fine = make_generic_sensor(64, -10.0, 10.0, 0.2, 10.0, divergence=3e-3)
     exact = cast_rays(objects, Ground(), NO_GROUND, replace(fine, divergence=0.0))
     beams = cast_rays(objects, Ground(), NO_GROUND, fine)
@@ -223,7 +223,7 @@ def test_edge_beams_return_from_between_or_one_side():
 
 
 def test_beam_on_one_surface_equals_ray():
-    objects = solids(BOX, (8, 0, 0), (1, 200, 200))
+    objects = make_solids(BOX, (8, 0, 0), (1, 200, 200))
     one, other = (cast_rays(objects, Ground(), NO_GROUND, s) for s in (SENSOR, WIDE))
     inner = np.isfinite(np.roll(one.range, 1, 0)) & np.isfinite(np.roll(one.range, -1, 0))
     assert np.array_equal(one.range[inner], other.range[inner])

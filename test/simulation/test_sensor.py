@@ -26,8 +26,8 @@ from lidar_perception.types import InputError
 SMALL = make_generic_sensor(8, -10.0, 4.0, 0.5, 10.0)
 
 
-def hits(sensor, distance, brightness=0.3, cosine=1.0):
-    """Return hits of every ray at a distance and brightness; arrays or numbers."""
+def make_hits(sensor, distance, brightness=0.3, cosine=1.0):
+    """Return the hits of all rays at a distance and brightness, numbers or arrays (columns, rings)."""
     shape = sensor.columns, sensor.rings
     return Hits(
         np.broadcast_to(np.asarray(distance, float), shape),
@@ -40,9 +40,9 @@ def hits(sensor, distance, brightness=0.3, cosine=1.0):
     )
 
 
-def measured(sensor, distance, brightness=0.3, motion=NO_MOTION, seed=0, cosine=1.0, **flags):
+def make_measurement(sensor, distance, brightness=0.3, motion=NO_MOTION, seed=0, cosine=1.0, **flags):
     return make_returns(
-        hits(sensor, distance, brightness, cosine), sensor, motion, np.random.default_rng(seed), **flags
+        make_hits(sensor, distance, brightness, cosine), sensor, motion, np.random.default_rng(seed), **flags
     )
 
 
@@ -189,7 +189,7 @@ def test_returns_have_documented_properties():
     sensor = replace(HDL64E, azimuth_step=np.radians(1.0))
     rng = np.random.default_rng(0)
     shape = sensor.columns, sensor.rings
-    returns = measured(sensor, rng.uniform(0, 130, shape), rng.uniform(0, 1, shape))
+    returns = make_measurement(sensor, rng.uniform(0, 130, shape), rng.uniform(0, 1, shape))
     n = len(returns.xyz)
     assert n > 1000
     assert [(f.shape, f.dtype) for f in returns] == [
@@ -211,7 +211,7 @@ def test_returns_have_documented_properties():
 
 
 def test_ring_gives_elevation_and_time_gives_azimuth():
-    returns = measured(SMALL, 30.0)
+    returns = make_measurement(SMALL, 30.0)
     rise = returns.xyz[:, 2] / np.linalg.norm(returns.xyz, axis=1)
     assert np.allclose(np.arcsin(rise), np.array(SMALL.elevations)[returns.ring], atol=1e-5)
     column = np.round(np.arctan2(returns.xyz[:, 1], returns.xyz[:, 0]) / (2 * np.pi) * SMALL.columns)
@@ -219,13 +219,13 @@ def test_ring_gives_elevation_and_time_gives_azimuth():
 
 
 def test_range_noise_has_given_deviation():
-    returns = measured(replace(SMALL, range_noise=0.05), 20.0)
+    returns = make_measurement(replace(SMALL, range_noise=0.05), 20.0)
     assert abs((np.linalg.norm(returns.xyz, axis=1) - 20).std() - 0.05) < 0.003
 
 
 def test_offsets_shift_ranges_per_beam():
     offsets = tuple(np.linspace(-0.05, 0.05, 8))
-    returns = measured(replace(SMALL, offsets=offsets), 20.0)
+    returns = make_measurement(replace(SMALL, offsets=offsets), 20.0)
     for ring, offset in enumerate(offsets):
         ranges = np.linalg.norm(returns.xyz[returns.ring == ring], axis=1)
         assert abs(ranges.mean() - 20 - offset) < 0.01
@@ -235,7 +235,7 @@ def test_offsets_shift_ranges_per_beam():
 def test_far_and_dark_returns_are_lost():
     open_sensor = replace(SMALL, dropout=0.0)
     share = {
-        (r, b): len(measured(open_sensor, r, b).xyz) / SMALL.columns / SMALL.rings
+        (r, b): len(make_measurement(open_sensor, r, b).xyz) / SMALL.columns / SMALL.rings
         for r in (5, 25, 50, 100)
         for b in (0.03, 0.1, 0.4, 0.9)
     }
@@ -245,9 +245,9 @@ def test_far_and_dark_returns_are_lost():
         assert share[r, 0.03] <= share[r, 0.1] <= share[r, 0.4] <= share[r, 0.9]
     assert share[5, 0.1] == 1 and abs(share[50, 0.1] - 0.5) < 0.1
     assert abs(share[100, 0.4] - 0.5) < 0.1  # power goes with brightness over range squared
-    assert len(measured(open_sensor, 5.0, 0.0).xyz) == 0 and not len(measured(SMALL, np.inf).xyz)
-    assert len(measured(SMALL, 50.0, cosine=0.05).xyz) < len(measured(SMALL, 50.0).xyz)
-    lost = 1 - len(measured(replace(SMALL, dropout=0.2), 5.0).xyz) / SMALL.columns / SMALL.rings
+    assert len(make_measurement(open_sensor, 5.0, 0.0).xyz) == 0 and not len(make_measurement(SMALL, np.inf).xyz)
+    assert len(make_measurement(SMALL, 50.0, cosine=0.05).xyz) < len(make_measurement(SMALL, 50.0).xyz)
+    lost = 1 - len(make_measurement(replace(SMALL, dropout=0.2), 5.0).xyz) / SMALL.columns / SMALL.rings
     assert abs(lost - 0.2) < 0.03
 
 
@@ -256,41 +256,41 @@ def test_infinite_reach_loses_only_rays_without_hit():
     distance = np.where(np.arange(sensor.columns) % 2, np.inf, 100.0)[:, None]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        returns = measured(sensor, distance, np.where(np.isinf(distance), 0.0, 1e-6))
+        returns = make_measurement(sensor, distance, np.where(np.isinf(distance), 0.0, 1e-6))
     assert len(returns.xyz) == sensor.columns * sensor.rings / 2
 
 
 def test_intensity_is_brightness_with_bias_and_fade():
-    plain = measured(SMALL, 10.0, 0.4)
+    plain = make_measurement(SMALL, 10.0, 0.4)
     assert abs(plain.intensity.mean() - 0.4) < 0.005
-    faded = measured(replace(SMALL, fade=(18.0, 0.01)), 28.0, 0.4)
+    faded = make_measurement(replace(SMALL, fade=(18.0, 0.01)), 28.0, 0.4)
     assert abs(faded.intensity.mean() - 0.3) < 0.005
     biases = tuple(np.linspace(-0.1, 0.1, 8))
-    biased = measured(replace(SMALL, biases=biases), 10.0, 0.4)
+    biased = make_measurement(replace(SMALL, biases=biases), 10.0, 0.4)
     for ring, bias in enumerate(biases):
         assert abs(biased.intensity[biased.ring == ring].mean() - 0.4 - bias) < 0.01
 
 
 def test_only_weak_returns_have_intensity_0():
     sensor = replace(SMALL, floor=0.2, biases=(0.1,) * 8)
-    assert (measured(sensor, 10.0, 0.05).intensity == 0).all()
-    assert (measured(sensor, 10.0, 0.4).intensity > 0.2).all()
-    on_the_verge = measured(sensor, 10.0, 0.2).intensity
+    assert (make_measurement(sensor, 10.0, 0.05).intensity == 0).all()
+    assert (make_measurement(sensor, 10.0, 0.4).intensity > 0.2).all()
+    on_the_verge = make_measurement(sensor, 10.0, 0.2).intensity
     assert 0.4 < (on_the_verge == 0).mean() < 0.6
     assert on_the_verge[on_the_verge > 0].min() >= 0.3  # nothing between 0 and the floor
 
 
 def test_retroreflectors_do_not_fade():
     sensor = replace(SMALL, fade=(10.0, 0.01))
-    assert measured(sensor, 60.0, RETROREFLECTOR).intensity.mean() > 0.95
-    assert measured(sensor, 60.0, 0.9).intensity.mean() < 0.45
+    assert make_measurement(sensor, 60.0, RETROREFLECTOR).intensity.mean() > 0.95
+    assert make_measurement(sensor, 60.0, 0.9).intensity.mean() < 0.45
     assert compute_brightness(RETROREFLECTOR, 0.1) == RETROREFLECTOR
     assert RETROREFLECTOR > 1.2 * compute_brightness(0.99, 0.1)
 
 
 def test_vehicle_blocks_its_sectors():
     sensor = replace(SMALL, blocked=((4, 350, 10), (6, 90, 120)), dropout=0.0)
-    returns = measured(sensor, 10.0)
+    returns = make_measurement(sensor, 10.0)
     bearing = np.degrees(np.arctan2(returns.xyz[:, 1], returns.xyz[:, 0]))
     low, lower = returns.ring >= 4, returns.ring >= 6
     assert not (low & (np.abs(bearing) < 9.9)).any() and (~low & (np.abs(bearing) < 9.9)).any()

@@ -286,7 +286,7 @@ def test_sizes_have_spread_of_table(label):
 
 
 def test_size_table_agrees_with_labels(data):
-    """The table agrees with the labels of the sample to its digits."""
+    """The table agrees with the labels of the sample, up to rounding."""
     rows = {}
     for path in (data / "kitti_object/training/label_2").glob("*.txt"):
         for line in path.read_text().splitlines():

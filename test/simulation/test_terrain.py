@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numba import njit
-from raycast_samples import FULL, OVER_ROAD, SENSOR, crowd
+from raycast_samples import FULL, OVER_ROAD, SENSOR, make_crowd
 
 from experiments.realism.roughness import compute_roughness
 from lidar_perception.simulation.raycast import cast_rays
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.no_cover  # others run these lines
 
 def test_flat_ground_range_is_height_over_sine():
     plain = replace(SENSOR, lifts=())
-    hits = cast_rays(crowd(0, 0), Ground(), OVER_ROAD, plain)
+    hits = cast_rays(make_crowd(0, 0), Ground(), OVER_ROAD, plain)
     sine = -np.sin(np.array(plain.elevations))
     expected = np.where(sine > 0, plain.height / np.where(sine > 0, sine, 1), np.inf)
     expected[expected > plain.max_range] = np.inf
@@ -28,7 +28,7 @@ def test_flat_ground_range_is_height_over_sine():
 def cast_on_ground(ground, position=(3.0, 0.4), sensor=None):
     sensor = sensor or replace(SENSOR, azimuth_step=np.radians(0.5))
     position = np.array([*position, surface_height(ground, *position) + sensor.height])
-    hits = cast_rays(crowd(0, 0), ground, position, sensor)
+    hits = cast_rays(make_crowd(0, 0), ground, position, sensor)
     met = np.isfinite(hits.range)
     turn = make_rays(sensor)
     at = position + turn.origin + turn.direction * np.where(met, hits.range, 0.0)[..., None]
@@ -130,5 +130,5 @@ def test_no_hit_behind_low_sensor(height, least):
     """Next to a meadow whose tufts are higher than the sensor, and among bumps of the road."""
     meadow = Ground(curb_left=1.0, curb_right=-1.0, walk=0.0, rough=0.8)
     low = replace(SENSOR, height=height, lifts=())
-    hits = cast_rays(crowd(0, 0), meadow, np.array([0.0, 0.0, height]), low)
+    hits = cast_rays(make_crowd(0, 0), meadow, np.array([0.0, 0.0, height]), low)
     assert np.isfinite(hits.range).any() and hits.range.min() > least

@@ -15,7 +15,7 @@ OVER_ROAD = np.array([0.0, 0.0, SENSOR.height])
 FULL = Ground(0.01, -0.02, 0.05, 20.0, 0.02, 6.0, -4.0, 0.13, 2.0, ((8.0, 15.0), (-30.0, -22.0)), 1.5)
 
 
-def solids(kind, centre, half, owner=1, axes=None, density=np.inf, transmission=0.0, velocity=(0.0, 0.0, 0.0)):
+def make_solids(kind, centre, half, owner=1, axes=None, density=np.inf, transmission=0.0, velocity=(0.0, 0.0, 0.0)):
     """Return solids of P kinds, centres and half sizes; other values for each or for all."""
     kind, centre = np.atleast_1d(np.array(kind, np.int8)), np.atleast_2d(np.array(centre, float))
     n = len(kind)
@@ -34,13 +34,13 @@ def solids(kind, centre, half, owner=1, axes=None, density=np.inf, transmission=
     )
 
 
-def crowd(seed, count=60, moving=True):
+def make_crowd(seed, count=60, moving=True):
     """Return random solids of all kinds around the sensor, some far away."""
     rng = np.random.default_rng(seed)
     axes = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
     bearing, far = rng.uniform(-np.pi, np.pi, count), rng.uniform(4, 70, count)
     centre = np.stack([far * np.cos(bearing), far * np.sin(bearing), rng.uniform(-3, 2, count)], 1)
-    made = solids(
+    made = make_solids(
         rng.integers(0, 3, count),
         centre,
         rng.uniform(0.05, 2.0, (count, 3)),

@@ -73,7 +73,7 @@ def rng():
     return np.random.default_rng(8)
 
 
-def ids(*names):
+def to_class_ids(*names):
     return np.array([CLASSES.index(name) for name in names])
 
 
@@ -100,7 +100,7 @@ BOXES = np.array(
 
 
 def test_cluster_gets_label_of_most_of_its_points(rng):
-    names = ids("Car", "Pedestrian", "Cyclist", "Van")
+    names = to_class_ids("Car", "Pedestrian", "Cyclist", "Van")
     clusters = fill_boxes(rng, np.concatenate([BOXES, BOXES[:1] + [40, 0, 0, 0, 0, 0, 0]]))
     labels, owners = label_clusters(clusters, BOXES, names, CONFIG.classes)
     assert labels.tolist() == [0, 1, 2, UNKNOWN, 3] and owners.tolist() == [0, 1, 2, -1, -1]
@@ -110,7 +110,7 @@ def test_cluster_gets_label_of_most_of_its_points(rng):
         points[int(60 * share) :, 2] += 5
         one = Clusters(points, np.array([0, 60]), np.array([1]))
         assert label_clusters(one, BOXES, names, CONFIG.classes)[0].tolist() == [expected]
-    none = label_clusters(clusters, np.zeros((0, 7)), ids(), CONFIG.classes)
+    none = label_clusters(clusters, np.zeros((0, 7)), to_class_ids(), CONFIG.classes)
     assert none[0].tolist() == [3] * 5 and none[1].tolist() == [-1] * 5
     points = label_points(clusters.points[:, :3], BOXES, names, CONFIG.classes)
     assert points.reshape(5, 60).tolist() == [[k] * 60 for k in (0, 1, 2, UNKNOWN, 3)]
@@ -192,11 +192,11 @@ def test_box_crops_are_near_boxes_and_never_empty(rng):
     assert (augment_clusters(tiny, BOXES, np.ones(4, bool), hard, rng)[0].sizes == 3).all()
 
 
-def a_scene(rng):
+def make_scene(rng):
     """Return a car, a pedestrian and an unwanted cyclist on flat ground."""
     flat = np.column_stack([rng.uniform(-20, 30, (12_000, 2)), rng.normal(-1.73, 0.01, 12_000), rng.random(12_000)])
     points = np.concatenate([flat, fill_boxes(rng, BOXES[:3], 500).points]).astype(np.float32)
-    return TrainingScene(points, BOXES[:3], ids("Car", "Pedestrian", "Cyclist"), np.array([True, True, False]))
+    return TrainingScene(points, BOXES[:3], to_class_ids("Car", "Pedestrian", "Cyclist"), np.array([True, True, False]))
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ class RepeatedScene:
 
 
 def test_scene_is_cut_by_clustering_and_around_objects(rng, tmp_path):
-    scene = a_scene(rng)
+    scene = make_scene(rng)
     cut = cut_clusters(scene, CONFIG, 5)
     assert set(cut.labels[~cut.is_box_crop]) == {0, 1, UNKNOWN}  # the cyclist is not detectable
     assert cut.labels[cut.is_box_crop].tolist() == [0, 1]
@@ -237,7 +237,7 @@ def test_scene_is_cut_by_clustering_and_around_objects(rng, tmp_path):
 
 
 def test_clusters_equal_those_of_detector_at_scene_height(rng):
-    seen = a_scene(rng)
+    seen = make_scene(rng)
     small_boxes = BOXES[:3] * [1, -1, 1, 0.1, 0.3, 0.3, 0]  # some of them too small
     things = fill_boxes(rng, small_boxes, 6).points
     points = np.concatenate([seen.points, things])
@@ -258,7 +258,7 @@ def test_clusters_equal_those_of_detector_at_scene_height(rng):
 
 
 def test_share_of_scenes_is_sparse_and_always_the_same(rng, tmp_path):
-    scene, count = a_scene(rng), 40
+    scene, count = make_scene(rng), 40
     none, half, all_ = (
         CutScenes(RepeatedScene(scene, count), CONFIG, 5, tmp_path, sparse=sparse) for sparse in (0.0, 0.5, 1.0)
     )
@@ -283,9 +283,9 @@ def test_wrong_proposals_become_decoys_unless_they_touch_label(rng, tmp_path, mo
     flat = np.column_stack([rng.uniform(-20, 30, (12_000, 2)), rng.normal(-1.73, 0.01, 12_000), rng.random(12_000)])
     empty = BOXES[0] + [8, 8, 0, 0, 0, 0, 0]
     points = np.concatenate([flat, fill_boxes(rng, np.array([BOXES[0], empty]), 500).points])
-    scene = TrainingScene(points.astype(np.float32), BOXES[:1], ids("Car"), np.array([True]))
+    scene = TrainingScene(points.astype(np.float32), BOXES[:1], to_class_ids("Car"), np.array([True]))
     near = BOXES[0] + [1, 0.5, 0, 0, 0, 0, 0.2]
-    found = Detections.of(np.array([near, empty]), ids("Car", "Pedestrian"), np.array([0.9, 0.5]))
+    found = Detections.of(np.array([near, empty]), to_class_ids("Car", "Pedestrian"), np.array([0.9, 0.5]))
     monkeypatch.setattr(
         cut_scenes, "_load_proposer", lambda path: SimpleNamespace(propose=lambda frame: DetectionResult(found))
     )
@@ -362,7 +362,9 @@ def test_network_learns_to_classify_clusters(rng):
 
 def test_validation_calibrates_and_names_broken_scenes(rng):
     scene = sample_scene(rng, 4)
-    truth = GroundTruth.of(BOXES[:3], ids("Car", "Pedestrian", "Cyclist"), [{"truncated": 0.0, "occluded": 0}] * 3)
+    truth = GroundTruth.of(
+        BOXES[:3], to_class_ids("Car", "Pedestrian", "Cyclist"), [{"truncated": 0.0, "occluded": 0}] * 3
+    )
 
     class Source:
         def __len__(self):

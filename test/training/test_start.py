@@ -79,7 +79,7 @@ def kill_when(condition, *arguments: str) -> None:
     process.join()
 
 
-def tensors(out: Path) -> bytes:
+def read_tensors(out: Path) -> bytes:
     """Return the tensors without the header, which contains durations."""
     content = (out / "last.safetensors").read_bytes()
     return content[8 + int.from_bytes(content[:8], "little") :]
@@ -102,7 +102,7 @@ def test_run_killed_twice_equals_unbroken_run(tmp_path, one_thread):
     kill_when((broken / STATE).exists, *small_training(broken, "--resume"))
     assert {path: path.stat().st_mtime_ns for path in before} == before  # not made again
     assert CliRunner().invoke(cli, small_training(broken, "--resume")).exit_code == 0
-    assert tensors(broken) == tensors(whole)
+    assert read_tensors(broken) == read_tensors(whole)
     cached = {path.relative_to(broken): path.read_bytes() for path in broken.rglob("*.npz")}
     assert cached == {path.relative_to(whole): path.read_bytes() for path in whole.rglob("*.npz")}
 

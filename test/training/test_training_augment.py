@@ -38,7 +38,7 @@ seeds = st.integers(0, 2**32 - 1)
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
 
 
-def random_scene(seed: int, around: bool = False) -> TrainingScene:
+def make_random_scene(seed: int, around: bool = False) -> TrainingScene:
     """Return ground with up to twelve boxes of points that do not touch."""
     rng = np.random.default_rng(seed)
     boxes, ids = np.zeros((0, 7)), []
@@ -58,7 +58,7 @@ def random_scene(seed: int, around: bool = False) -> TrainingScene:
     return TrainingScene(points, boxes, np.array(ids, int), np.ones(len(ids), bool), around)
 
 
-def members(scene: TrainingScene, margin: float = 0.0) -> np.ndarray:
+def find_points_of_boxes(scene: TrainingScene, margin: float = 0.0) -> np.ndarray:
     """Return (M, N) bool: which points are in which box."""
     return np.array([points_in_box(scene.points[:, :3], box, margin) for box in scene.boxes], bool).reshape(
         len(scene.boxes), len(scene.points)
@@ -71,7 +71,7 @@ def any_touch(boxes: np.ndarray) -> bool:
 
 @given(seeds, st.floats(0, 0.5))
 def test_find_points_in_box_agrees_with_points_in_box(seed, margin):
-    scene = random_scene(seed)
+    scene = make_random_scene(seed)
     for box in scene.boxes:
         plain = points_in_box(scene.points[:, :3], box, margin)
         assert np.array_equal(find_points_in_box(scene.points, box, margin), np.flatnonzero(plain))
@@ -82,8 +82,8 @@ def test_find_points_in_box_agrees_with_points_in_box(seed, margin):
 
 @given(seeds)
 def test_points_stay_in_their_boxes(seed):
-    scene, rng = random_scene(seed), np.random.default_rng(seed)
-    before = members(scene)
+    scene, rng = make_random_scene(seed), np.random.default_rng(seed)
+    before = find_points_of_boxes(scene)
     for changed in (
         flip_scene(scene),
         turn_scene(scene, rng.uniform(-4, 4)),
@@ -93,7 +93,7 @@ def test_points_stay_in_their_boxes(seed):
         move_objects(scene, 0.5, 0.5, rng),
     ):
         assert changed.points.dtype == np.float32 and changed.points.shape == scene.points.shape
-        assert not (before & ~members(changed, margin=2e-4)).any()
+        assert not (before & ~find_points_of_boxes(changed, margin=2e-4)).any()
         np.testing.assert_allclose(
             changed.boxes[:, 3:6] / scene.boxes[:, 3:6], (changed.boxes[:1, 3:4] / scene.boxes[:1, 3:4]).sum() or 1
         )
@@ -102,7 +102,7 @@ def test_points_stay_in_their_boxes(seed):
 
 @given(seeds, st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
 def test_slope_keeps_heights_above_ground(seed, ahead, aside):
-    scene = random_scene(seed)
+    scene = make_random_scene(seed)
     tilted = raise_scene(scene, 0.3, (ahead, aside))
     for before, after in ((scene.points, tilted.points), (scene.boxes, tilted.boxes)):
         np.testing.assert_allclose(after[:, 2] - 0.3 - after[:, :2] @ [ahead, aside], before[:, 2], atol=1e-5)
@@ -111,7 +111,7 @@ def test_slope_keeps_heights_above_ground(seed, ahead, aside):
 
 @given(seeds, st.floats(-7, 7))
 def test_inverse_changes_restore_scene(seed, angle):
-    scene = random_scene(seed)
+    scene = make_random_scene(seed)
     for back in (
         flip_scene(flip_scene(scene)),
         turn_scene(turn_scene(scene, angle), -angle),
@@ -134,7 +134,7 @@ def test_turn_is_counter_clockwise():
 
 @given(seeds, st.floats(0, 0.99))
 def test_drop_points_keeps_share_and_order(seed, share):
-    scene = random_scene(seed)
+    scene = make_random_scene(seed)
     left = drop_points(scene, share, np.random.default_rng(seed))
     assert (len(left.points) == len(scene.points)) or share > 0
     assert abs(len(left.points) - (1 - share) * len(scene.points)) < 6 * len(scene.points) ** 0.5
@@ -144,7 +144,7 @@ def test_drop_points_keeps_share_and_order(seed, share):
 
 @given(seeds)
 def test_intensity_stays_within_0_and_1_and_0_stays_0(seed):
-    scene = random_scene(seed)
+    scene = make_random_scene(seed)
     changed = change_intensity(scene, 1.4, 0.2)
     assert changed.points[:, 3].min() >= 0 and changed.points[:, 3].max() <= 1
     assert np.array_equal(changed.points[:, :3], scene.points[:, :3])
@@ -169,7 +169,7 @@ def test_intensity_of_whole_scans_is_removed_or_distorted():
 
 @given(seeds, st.booleans())
 def test_augmentation_is_deterministic_and_zeros_do_nothing(seed, around):
-    scene = random_scene(seed, around)
+    scene = make_random_scene(seed, around)
     kept = scene.points.copy(), scene.boxes.copy()
     once, twice = (augment_scene(scene, AugmentParams(), np.random.default_rng(seed)) for _ in "ab")
     assert np.array_equal(once.points, twice.points) and np.array_equal(once.boxes, twice.boxes)
@@ -185,9 +185,9 @@ def test_augmentation_is_deterministic_and_zeros_do_nothing(seed, around):
 @given(seeds)
 def test_pasted_objects_touch_nothing_and_keep_points(seed):
     database = join_databases(
-        [cut_objects(random_scene(seed + k), ("Car", "Pedestrian", "Cyclist"), 5) for k in range(1, 6)]
+        [cut_objects(make_random_scene(seed + k), ("Car", "Pedestrian", "Cyclist"), 5) for k in range(1, 6)]
     )
-    scene, rng = random_scene(seed), np.random.default_rng(seed)
+    scene, rng = make_random_scene(seed), np.random.default_rng(seed)
     params = AugmentParams(cars=4, pedestrians=4, cyclists=0)
     fuller = paste_objects(scene, database, params, *AREA, rng)
     old, count = len(scene.boxes), len(fuller.boxes)
@@ -197,8 +197,8 @@ def test_pasted_objects_touch_nothing_and_keep_points(seed):
     for kind, most in ((CAR, 4), (PEDESTRIAN, 4), (CYCLIST, 0)):
         present = (fuller.class_ids == kind).sum()
         assert present <= max(most, (scene.class_ids == kind).sum())
-    within = members(fuller, 1e-3).sum(axis=1)
-    assert (within[:old] <= members(scene, 1e-3).sum(axis=1)).all()  # some may be in a shadow
+    within = find_points_of_boxes(fuller, 1e-3).sum(axis=1)
+    assert (within[:old] <= find_points_of_boxes(scene, 1e-3).sum(axis=1)).all()  # some may be in a shadow
     sizes = np.diff(database.first)
     ranges = np.hypot(database.boxes[:, 0], database.boxes[:, 1])
     for box, number in zip(fuller.boxes[old:], within[old:]):
@@ -210,7 +210,7 @@ def test_pasted_objects_touch_nothing_and_keep_points(seed):
     assert np.array_equal(again.points, fuller.points)
 
 
-def wall(x: float, y: tuple[float, float], z: tuple[float, float], apart: float = 0.02) -> np.ndarray:
+def make_wall(x: float, y: tuple[float, float], z: tuple[float, float], apart: float = 0.02) -> np.ndarray:
     """Return the points (N, 4) of a wall across the x axis."""
     sides, heights = np.meshgrid(np.arange(*y, apart), np.arange(*z, apart))
     return np.column_stack([np.full(sides.size, x), sides.ravel(), heights.ravel(), np.zeros(sides.size)]).astype(
@@ -218,16 +218,16 @@ def wall(x: float, y: tuple[float, float], z: tuple[float, float], apart: float 
     )
 
 
-def one_walker(x: float) -> Database:
+def make_walker(x: float) -> Database:
     """Return a pedestrian x metres ahead, a flat grid of points."""
-    own = wall(x, (-0.25, 0.25), (-1.7, 0))
+    own = make_wall(x, (-0.25, 0.25), (-1.7, 0))
     return Database(
         np.array([[x, 0, -0.86, 0.8, 0.7, 1.74, 0]]), np.array([PEDESTRIAN], np.int32), own, np.array([0, len(own)])
     )
 
 
-def street_with(*walls: np.ndarray) -> TrainingScene:
-    ground = wall(-1.73, (-15, 15), (0, 15), 0.1)[:, [2, 1, 0, 3]]
+def make_street(*walls: np.ndarray) -> TrainingScene:
+    ground = make_wall(-1.73, (-15, 15), (0, 15), 0.1)[:, [2, 1, 0, 3]]
     return TrainingScene(np.concatenate([ground, *walls]), np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool))
 
 
@@ -235,13 +235,13 @@ def street_with(*walls: np.ndarray) -> TrainingScene:
 @pytest.mark.no_cover
 def test_pasted_object_casts_shadow_and_is_not_hidden(seed):
     params, rng = AugmentParams(cars=0, pedestrians=1, cyclists=0), np.random.default_rng(seed)
-    behind = wall(12.0, (-14, 14), (-1.7, 1.0), 0.06)
-    scene = street_with(behind)
-    fuller = paste_objects(scene, one_walker(8.0), params, *AREA, rng)
+    behind = make_wall(12.0, (-14, 14), (-1.7, 1.0), 0.06)
+    scene = make_street(behind)
+    fuller = paste_objects(scene, make_walker(8.0), params, *AREA, rng)
     assert len(fuller.boxes) == 1
     box = fuller.boxes[0]
     assert np.hypot(box[0], box[1]) == pytest.approx(8.0)
-    count = len(one_walker(8.0).points)
+    count = len(make_walker(8.0).points)
     rest, own = fuller.points[:-count], fuller.points[-count:]
     assert points_in_box(own, box, 1e-4).all()
     seen = rest[(rest[:, 0] == 12) & (rest[:, 2] > -1.72)]
@@ -251,15 +251,15 @@ def test_pasted_object_casts_shadow_and_is_not_hidden(seed):
     assert len(seen) > 0.8 * len(behind)
     if abs(np.arctan2(box[1], box[0])) < 0.6:
         assert len(seen) < len(behind)
-    hidden = paste_objects(scene, one_walker(14.0), params, *AREA, rng)
+    hidden = paste_objects(scene, make_walker(14.0), params, *AREA, rng)
     assert len(hidden.boxes) == 0 or abs(np.arctan2(*hidden.boxes[0, 1::-1])) > 0.45
-    assert len(paste_objects(street_with(), one_walker(14.0), params, *AREA, rng).boxes) == 1
+    assert len(paste_objects(make_street(), make_walker(14.0), params, *AREA, rng).boxes) == 1
 
 
 def test_posts_are_pasted_without_boxes():
-    post = wall(8.0, (2.9, 3.1), (-1.73, 0.6))
-    walker = one_walker(9.0)
-    scene = street_with(post, walker.points, wall(11.0, (-8, -5), (-1.73, 0.5)))
+    post = make_wall(8.0, (2.9, 3.1), (-1.73, 0.6))
+    walker = make_walker(9.0)
+    scene = make_street(post, walker.points, make_wall(11.0, (-8, -5), (-1.73, 0.5)))
     scene = replace(scene, boxes=walker.boxes, class_ids=walker.class_ids, detectable=np.ones(1, bool))
     database = cut_objects(scene, ("Pedestrian",), 5)
     assert database.class_ids.tolist() == [PEDESTRIAN, BACKGROUND_ID]
@@ -268,7 +268,7 @@ def test_posts_are_pasted_without_boxes():
     assert (own[:, 0] == 8).all() and len(own) > 0.8 * len(post)
     assert box[:2] == pytest.approx([8, 3], abs=0.05) and box[5] == pytest.approx(2.33, abs=0.1)
     params = replace(STILL, things=1, things_stretch=0, things_intensity=0, things_shine=0)
-    fuller = paste_objects(street_with(), database, params, *AREA, np.random.default_rng(0))
+    fuller = paste_objects(make_street(), database, params, *AREA, np.random.default_rng(0))
     assert len(fuller.boxes) == len(fuller.class_ids) == len(fuller.detectable) == 0
     added = fuller.points[-len(own) :]
     np.testing.assert_allclose(np.hypot(added[:, 0], added[:, 1]), np.hypot(own[:, 0], own[:, 1]), atol=1e-4)
@@ -278,7 +278,7 @@ def test_posts_are_pasted_without_boxes():
 @given(seeds)
 def test_range_noise_is_along_rays_and_shared_by_beams(seed):
     rng = np.random.default_rng(seed)
-    points = np.concatenate([random_scene(seed).points, np.zeros((1, 4), np.float32)])
+    points = np.concatenate([make_random_scene(seed).points, np.zeros((1, 4), np.float32)])
     assert np.array_equal(blur_ranges(points, 0, 0, rng), points)
     before = np.linalg.norm(points[:-1, :3], axis=1)
     for beam, point in ((0.05, 0.0), (0.0, 0.05)):
@@ -298,7 +298,7 @@ STILL_THINGS = AugmentParams(things_stretch=0, things_intensity=0, things_shine=
 
 @given(seeds)
 def test_reflector_spans_range_of_heights(seed):
-    scene, rng = random_scene(seed), np.random.default_rng(seed)
+    scene, rng = make_random_scene(seed), np.random.default_rng(seed)
     for box in scene.boxes:
         own = scene.points[find_points_in_box(scene.points, box, 0.0)]
         own[:, 3] = 0.3
@@ -312,7 +312,7 @@ def test_reflector_spans_range_of_heights(seed):
 
 @given(seeds)
 def test_stretched_background_keeps_its_foot(seed):
-    scene, rng = random_scene(seed), np.random.default_rng(seed)
+    scene, rng = make_random_scene(seed), np.random.default_rng(seed)
     changes = replace(STILL_THINGS, things_stretch=0.5, things_intensity=0.4)
     for box in scene.boxes:
         own = scene.points[find_points_in_box(scene.points, box, 0.0)]
@@ -328,7 +328,7 @@ def test_stretched_background_keeps_its_foot(seed):
 
 @given(seeds, st.sampled_from([-1, 1]), st.sampled_from([-1, 1]))
 def test_early_crop_keeps_everything_that_may_move_into_range(seed, larger, higher):
-    scene, params = random_scene(seed), AugmentParams(turn=0, scale=0.1, height=0.3, tilt=0.1)
+    scene, params = make_random_scene(seed), AugmentParams(turn=0, scale=0.1, height=0.3, tilt=0.1)
     low, high = np.array([0, -10, -1.8]), np.array([10.0, 10, 0.5])
 
     def changed(scene: TrainingScene) -> TrainingScene:
@@ -364,7 +364,7 @@ def test_scenes_labelled_all_around_turn_by_any_angle():
 
 
 def test_database_file_round_trip_and_broken_file_is_named(tmp_path):
-    database = join_databases([cut_objects(random_scene(k), ("Car", "Pedestrian"), 5) for k in range(4)])
+    database = join_databases([cut_objects(make_random_scene(k), ("Car", "Pedestrian"), 5) for k in range(4)])
     assert len(database) > 0 and set(database.class_ids) <= {CAR, PEDESTRIAN}
     database.save(tmp_path / "objects.npz")
     back = Database.load(tmp_path / "objects.npz")
@@ -376,6 +376,6 @@ def test_database_file_round_trip_and_broken_file_is_named(tmp_path):
 
 
 def test_nothing_is_pasted_without_ground():
-    database = join_databases([cut_objects(random_scene(k), ("Car",), 5) for k in range(4)])
+    database = join_databases([cut_objects(make_random_scene(k), ("Car",), 5) for k in range(4)])
     empty = TrainingScene(np.zeros((0, 4), np.float32), np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool))
     assert len(paste_objects(empty, database, AugmentParams(), *AREA, np.random.default_rng(0)).boxes) == 0

@@ -37,7 +37,7 @@ def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("cache")
 
 
-def sim(cache, out, **changes):
+def train_on_simulation(cache, out, **changes):
     given = {
         "--data": "sim",
         "--sensor": SENSOR,
@@ -58,7 +58,7 @@ def sim(cache, out, **changes):
 
 def test_trained_network_opens_as_detector(tmp_path, cache, tiny_size):
     out = tmp_path / "run"
-    result = train(*sim(cache, out), "--version", "v4", "--seed", 5)
+    result = train(*train_on_simulation(cache, out), "--version", "v4", "--seed", 5)
     assert result.exit_code == 0, result.output
     assert len((out / "log.csv").read_text().splitlines()) == 5
     assert len((out / "validation.csv").read_text().splitlines()) == 3
@@ -74,17 +74,21 @@ def test_trained_network_opens_as_detector(tmp_path, cache, tiny_size):
     detector(simulate_scan(3, 0, find_sensor(SENSOR)).frame)
     # a finished run does not change
     before = (out / "last.safetensors").read_bytes()
-    again = train(*sim(cache, out), "--version", "v4", "--seed", 5)
+    again = train(*train_on_simulation(cache, out), "--version", "v4", "--seed", 5)
     assert again.exit_code == 1 and "--resume" in str(again.exception)
-    assert train(*sim(cache, out), "--version", "v4", "--seed", 5, "--resume").exit_code == 0
+    assert train(*train_on_simulation(cache, out), "--version", "v4", "--seed", 5, "--resume").exit_code == 0
     assert (out / "last.safetensors").read_bytes() == before
     # another run can start from its weights
     init = train(
-        *sim(cache, tmp_path / "next", **{"--steps": 1}), "--version", "v4", "--init", out / "last.safetensors"
+        *train_on_simulation(cache, tmp_path / "next", **{"--steps": 1}),
+        "--version",
+        "v4",
+        "--init",
+        out / "last.safetensors",
     )
     assert init.exit_code == 0, init.output
     other = train(
-        *sim(cache, tmp_path / "other", **{"--steps": 1}),
+        *train_on_simulation(cache, tmp_path / "other", **{"--steps": 1}),
         "--version",
         "v0",
         "--init",
@@ -103,7 +107,7 @@ def test_kitti_and_simulated_scenes_mix_and_broken_ones_count(tmp_path, cache, t
     root = object_folder(tmp_path / "kitti", walker_label() + "\n", 6)
     write(root / "training/label_2/000002.txt", "Pedestrian 0 0 x\n")
     result = train(
-        *sim(cache, tmp_path / "run"),
+        *train_on_simulation(cache, tmp_path / "run"),
         "--data",
         root,
         "--version",
@@ -120,7 +124,7 @@ def test_kitti_and_simulated_scenes_mix_and_broken_ones_count(tmp_path, cache, t
     assert header.metrics["Pedestrian_3d"] is not None
 
 
-def counts(*arguments) -> tuple[list, list]:
+def count_frames(*arguments) -> tuple[list, list]:
     train_on, judge_on = open_sources(*arguments)
     return [len(x) for x in train_on], [len(x) for x in judge_on]
 
@@ -131,9 +135,9 @@ def test_held_out_frames_are_not_trained_on(tmp_path):
     folder = str(root)
     (train_on, *_), (held, *_) = open_sources((folder,), (), None, None, params, 0)
     assert (len(train_on), len(held)) == (3, 2) and not {*train_on.names} & {*held.names}
-    assert counts((folder, "sim"), (), None, None, params, 0) == ([3, 7], [2, 2])
-    assert counts((folder,), ("sim",), None, None, params, 0) == ([5], [2])
-    assert counts(("sim",), (folder,), None, None, params, 0) == ([7], [5])
+    assert count_frames((folder, "sim"), (), None, None, params, 0) == ([3, 7], [2, 2])
+    assert count_frames((folder,), ("sim",), None, None, params, 0) == ([5], [2])
+    assert count_frames(("sim",), (folder,), None, None, params, 0) == ([7], [5])
     (streets,) = open_sources(("sim",), (), None, None, params, 0)[0]
     (others,) = open_sources(("sim",), (), None, None, params, 0)[1]
     assert streets.first + streets.count <= others.first

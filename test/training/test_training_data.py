@@ -122,7 +122,7 @@ def test_stream_depends_only_on_seed():
 # PointPillars' samples
 
 
-def scene_of_two(**changes) -> TrainingScene:
+def make_scene(**changes) -> TrainingScene:
     boxes = BOXES.numpy().astype(np.float64)
     return TrainingScene(
         **{
@@ -134,14 +134,14 @@ def scene_of_two(**changes) -> TrainingScene:
     )
 
 
-def labels_of(sample: Sample, anchors: torch.Tensor) -> torch.Tensor:
+def to_labels(sample: Sample, anchors: torch.Tensor) -> torch.Tensor:
     return to_dense([sample.targets], len(anchors), torch.device("cpu")).labels[0]
 
 
 @pytest.mark.parametrize("version", ["v0", "v2", "v4"])
 def test_samples_have_inputs_of_version(version):
     config = tiny(version)
-    sample = ScenePreparation(config, STILL)(scene_of_two(), np.random.default_rng(0))
+    sample = ScenePreparation(config, STILL)(make_scene(), np.random.default_rng(0))
     assert sample.points.shape[1] == config.point_columns
     assert (sample.cluster_map is not None) == config.pseudo_map
     assert sample.labels.tolist() == [0, 1] and sample.is_target.all()
@@ -154,8 +154,8 @@ def test_samples_have_inputs_of_version(version):
 
 
 def test_share_of_scenes_gets_pasted_objects(tmp_path):
-    cut_objects(scene_of_two(), tiny().classes, 1).save(tmp_path / "objects.npz")
-    rng, scene = np.random.default_rng(0), scene_of_two()
+    cut_objects(make_scene(), tiny().classes, 1).save(tmp_path / "objects.npz")
+    rng, scene = np.random.default_rng(0), make_scene()
     scene = replace(scene, boxes=scene.boxes[:1], class_ids=scene.class_ids[:1], detectable=scene.detectable[:1])
 
     def numbers(crowded: float) -> list[int]:
@@ -172,32 +172,32 @@ def test_anchors_on_hidden_objects_are_ignored():
     config = tiny()
     anchors, kinds = anchor_tensors(config)
     rng = np.random.default_rng(0)
-    whole = ScenePreparation(config, STILL)(scene_of_two(), rng)
-    found = labels_of(whole, anchors)
+    whole = ScenePreparation(config, STILL)(make_scene(), rng)
+    found = to_labels(whole, anchors)
     for scene, prepare in (
-        (scene_of_two(detectable=np.array([False, True])), ScenePreparation(config, STILL)),
-        (scene_of_two(class_ids=np.array([VAN, PEDESTRIAN])), ScenePreparation(config, STILL)),
+        (make_scene(detectable=np.array([False, True])), ScenePreparation(config, STILL)),
+        (make_scene(class_ids=np.array([VAN, PEDESTRIAN])), ScenePreparation(config, STILL)),
     ):
         sample = prepare(scene, rng)
         assert sample.is_target.tolist() == [False, True]
-        labels = labels_of(sample, anchors)
+        labels = to_labels(sample, anchors)
         assert (labels != 0).all() and torch.equal(labels[kinds == 1], found[kinds == 1])
         near = (labels == IGNORED) & (kinds == 0)
         assert near.any() and (near | (labels == BACKGROUND) | (kinds != 0)).all()
         assert (found[near] != BACKGROUND).all()
-    few_points = ScenePreparation(config, STILL, min_points=10**4)(scene_of_two(), rng)
+    few_points = ScenePreparation(config, STILL, min_points=10**4)(make_scene(), rng)
     assert not few_points.is_target.any()
 
 
 def test_scene_without_points_in_range_is_refused():
-    behind = scene_of_two(points=two_objects() * np.array([-1, 1, 1, 1], np.float32))
+    behind = make_scene(points=two_objects() * np.array([-1, 1, 1, 1], np.float32))
     with pytest.raises(InputError, match="no point"):
         ScenePreparation(tiny(), STILL)(behind, np.random.default_rng(0))
     far = ScenePreparation(tiny(), STILL)(
-        scene_of_two(boxes=BOXES.numpy() + [90, 0, 0, 0, 0, 0, 0]), np.random.default_rng(0)
+        make_scene(boxes=BOXES.numpy() + [90, 0, 0, 0, 0, 0, 0]), np.random.default_rng(0)
     )
     assert len(far.boxes) == 0 and len(far.labels) == 0
-    assert (labels_of(far, anchor_tensors(tiny())[0]) == BACKGROUND).all()
+    assert (to_labels(far, anchor_tensors(tiny())[0]) == BACKGROUND).all()
 
 
 def test_validation_scores_perfect_and_blind_detectors(tmp_path):
@@ -281,7 +281,7 @@ def test_killed_worker_ends_training_with_reason(jobs):
 
 
 def test_samples_do_not_depend_on_sensor_height():
-    scene = scene_of_two()
+    scene = make_scene()
     for config in tiny(), tiny("v4"):
         usual = ScenePreparation(config, STILL)(scene, np.random.default_rng(0))
         for height in 0.6, 2.4:

@@ -77,7 +77,7 @@ def _label_by_ring(scans: Sequence[Scan]) -> list[np.ndarray] | None:
 
 
 def _label_by_order(scans: Sequence[Scan]) -> list[np.ndarray] | None:
-    """Label points by their order, if the cloud contains the turn of one beam after the other, like KITTI's."""
+    """Label points by their order, if the cloud is sorted beam by beam, as in KITTI."""
     labels = []
     for scan in scans:
         best: tuple[float, np.ndarray] | None = None
