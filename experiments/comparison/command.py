@@ -11,19 +11,19 @@ import click
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import (
     ScoringOptions,
-    a_path,
     intervals_option,
     no_labels_error,
     out_file,
+    path_option,
     scoring_options,
 )
 from lidar_perception.cli.options import (
     Runs,
     Settings,
-    candidates_run,
     device_option,
+    make_candidate_runs,
+    make_runs,
     range_option,
-    runs_of,
     settings_options,
 )
 from lidar_perception.detectors.open import PARAMS
@@ -32,12 +32,12 @@ from lidar_perception.runs.terminal import console, errors
 
 def _list_runs() -> list[Runs]:
     """List the detectors that have parameters."""
-    return [candidates_run(), *map(runs_of, PARAMS)]
+    return [make_candidate_runs(), *map(make_runs, PARAMS)]
 
 
 @click.command(cls=Command)
 @scoring_options()
-@a_path(
+@path_option(
     "--weights",
     "One more detector: weights of PointPillars or PointNet, or a class of your own, module:Class; may be repeated.",
     multiple=True,

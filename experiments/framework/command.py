@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lidar_perception import __version__
-from lidar_perception.cli.command import Choice, Command, refuse_given
-from lidar_perception.cli.data import WHAT, a_path, dask_option, limit_option, open_and_describe, out_folder
+from lidar_perception.cli.command import Choice, Command, refuse_options
+from lidar_perception.cli.data import WHAT, dask_option, limit_option, open_and_describe, out_folder, path_option
 from lidar_perception.cli.options import Runs, Settings, checked, device_option, settings_options
 from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.machine import count_cores, read_cpu_name
@@ -47,8 +47,8 @@ def _list_parameters(given: Mapping[str, Any]) -> list[Runs]:
 
 @click.command(cls=Command)
 @click.argument("words", nargs=-1, metavar="[EXPERIMENT] DATA|sim")
-@a_path("--data", f"Same as DATA. {WHAT} `sim`: simulated scans.", "DATA|sim")
-@a_path(
+@path_option("--data", f"Same as DATA. {WHAT} `sim`: simulated scans.", "DATA|sim")
+@path_option(
     "--split",
     "Measure only the frames or sequences named in this file, one per line. "
     "Experiments that train use the others for training.",
@@ -123,7 +123,7 @@ def reproduce(
     started, before = datetime.now().astimezone(), perf_counter()
     workers = jobs or count_cores()
     if experiment.training is None:
-        refuse_given(
+        refuse_options(
             ("budget", "seeds", "device", "config", "given"),
             f"is for experiments that train networks; {name} trains none",
         )

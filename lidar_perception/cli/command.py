@@ -23,10 +23,10 @@ class Choice(click.ParamType):
         self.choices, self.aliases = choices, aliases
 
     def convert(self, value: Any, param: Any, ctx: Any) -> str:
-        known = {_plain(alias): name for alias, name in self.aliases.items()}
-        known |= {_plain(name): name for name in self.choices}
-        if (found := known.get(_plain(str(value)))) is not None:
-            return found
+        names_by_spelling = {_plain(alias): name for alias, name in self.aliases.items()}
+        names_by_spelling |= {_plain(name): name for name in self.choices}
+        if (match := names_by_spelling.get(_plain(str(value)))) is not None:
+            return match
         self.fail(f"{value!r} is unknown{valid_names(str(value), self.choices)}", param, ctx)
 
     def get_metavar(self, param: Any, ctx: Any = None) -> str:
@@ -42,7 +42,7 @@ def _plain(name: str) -> str:
     return name.strip().lower().replace("_", "-")
 
 
-def refuse_given(names: Iterable[str], reason: str) -> None:
+def refuse_options(names: Iterable[str], reason: str) -> None:
     """Raise UsageError if one of these parameters of the command that runs was given.
 
     reason: the end of the message, such as "is for a simulated drive".
@@ -99,7 +99,7 @@ class HelpfulOption(click.Option):
             for flag in self.opts
         )
 
-    def listing(self, given: Mapping[str, Any]) -> str:
+    def listing(self, options: Mapping[str, Any]) -> str:
         """Return the listing, with the options that were given."""
         raise NotImplementedError
 
@@ -116,6 +116,6 @@ class Group(click.Group):
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
         name = args[0]
         if self.get_command(ctx, name) is None and not name.startswith("-"):
-            known = self.list_commands(ctx)
-            ctx.fail(f"there is no command {name!r}{valid_names(name, known)}")
+            commands = self.list_commands(ctx)
+            ctx.fail(f"there is no command {name!r}{valid_names(name, commands)}")
         return super().resolve_command(ctx, args)

@@ -13,7 +13,7 @@ import click
 from rich.text import Text
 
 from lidar_perception.cli.command import Choice, Command
-from lidar_perception.cli.data import a_path, limit_option, open_and_describe, split_option
+from lidar_perception.cli.data import limit_option, open_and_describe, path_option, split_option
 from lidar_perception.labels.datasets import LAYOUTS
 from lidar_perception.labels.exchange import FORMATS, READERS
 from lidar_perception.labels.names import ALIASES
@@ -36,9 +36,11 @@ DATASETS, LABELS = tuple(LAYOUTS), tuple(FORMATS)
     help="Format to write.",
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Bag, folder or file to make.")
-@a_path("--data", "Same as DATA. With both, DATA is the path of labels of this drive, which are converted.", "DRIVE")
+@path_option(
+    "--data", "Same as DATA. With both, DATA is the path of labels of this drive, which are converted.", "DRIVE"
+)
 @click.option(
-    "--from", "given", type=Choice(READERS, ALIASES), help="Format of the labels at DATA. Default: recognised."
+    "--from", "labels_format", type=Choice(READERS, ALIASES), help="Format of the labels at DATA. Default: recognised."
 )
 @click.option(
     "--detections",
@@ -46,7 +48,7 @@ DATASETS, LABELS = tuple(LAYOUTS), tuple(FORMATS)
     help="Take the boxes on this topic of the bag at DATA (MarkerArray or Detection3DArray), instead of its labels.",
 )
 @click.option("--points", default="", metavar="TOPIC", help="Clouds of a bag.  [default: /points, else the only ones]")
-@a_path(
+@path_option(
     "--robot",
     "robot.param.yaml that `setup` wrote, for a recording with a tilted or turned "
     "sensor: level its clouds, x ahead, without the robot's own returns, as nodes see them.",
@@ -66,7 +68,7 @@ def convert(
     format: str,
     out: Path,
     data: Path | None,
-    given: str | None,
+    labels_format: str | None,
     detections: str | None,
     points: str,
     robot: Path | None,
@@ -100,26 +102,26 @@ def convert(
     if source is None:
         raise click.UsageError("DATA is missing: give the path of a recording")
     given_labels = data is not None or (format in LABELS and format not in (MCAP, *DATASETS))
-    for wrong, what in (
+    for is_wrong, message in (
         (images and (given_labels or format != MCAP), "--images is for --to mcap"),
         (
             (robot is not None or deskew) and (given_labels or detections is not None),
             "--robot and --deskew are for a recording with its clouds",
         ),
-        (given is not None and data is None, "--from is for labels at DATA; give their drive with --data"),
-        (given is not None and detections is not None, "--detections is for a bag, --from for other labels"),
+        (labels_format is not None and data is None, "--from is for labels at DATA; give their drive with --data"),
+        (labels_format is not None and detections is not None, "--detections is for a bag, --from for other labels"),
         (data is not None and format == "nuscenes", "labels are written as nuscenes-detection or nuscenes-tracking"),
     ):
-        if wrong:
-            raise click.UsageError(what)
+        if is_wrong:
+            raise click.UsageError(message)
     recording = open_and_describe(source if data is None else data, level=robot is None, split=split, points=points)
-    seen = _make_frame_transform(recording, robot, deskew)
+    transform = _make_frame_transform(recording, robot, deskew)
     if given_labels:
-        _labels(source, recording, format, out, given, data is not None, detections, limit, force)
+        _convert_labels(source, recording, format, out, labels_format, data is not None, detections, limit, force)
     elif format == MCAP and detections is None:
-        _bag(source, recording, seen, out, images, limit, force)
+        _convert_to_bag(source, recording, transform, out, images, limit, force)
     else:
-        _dataset(source, recording, seen, format, out, detections, limit, force)
+        _convert_to_dataset(source, recording, transform, format, out, detections, limit, force)
 
 
 def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], Any]:
@@ -138,12 +140,12 @@ def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Ca
         )
     from lidar_perception.data.levelling import SensorMount, level_frame
 
-    robot = SensorMount()
+    mount = SensorMount()
     if file is not None:
-        robot, asked = _read_mount(file)
-        deskew = deskew or asked
+        mount, requested = _read_mount(file)
+        deskew = deskew or requested
     if not deskew:
-        return partial(level_frame, mount=robot)
+        return partial(level_frame, mount=mount)
     from lidar_perception.data.bag import BagHandle
     from lidar_perception.data.bag_poses import BagPoses
 
@@ -151,8 +153,8 @@ def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Ca
         raise InputError(f"{recording.path} is not a bag, so it has no odometry or TF, which --deskew needs")
     first = recording.frames[len(recording) // 2]
     poses = BagPoses(BagHandle(recording.path), first.load().frame_id).lookup
-    level_frame(first, robot, poses).load()  # fails early if a topic or a column is missing
-    return partial(level_frame, mount=robot, poses=poses)
+    level_frame(first, mount, poses).load()  # fails early if a topic or a column is missing
+    return partial(level_frame, mount=mount, poses=poses)
 
 
 def _read_mount(file: Path) -> tuple[Any, bool]:
@@ -164,7 +166,9 @@ def _read_mount(file: Path) -> tuple[Any, bool]:
     from lidar_perception.params import CloudNodeParams
 
     try:
-        params, node = (with_values(known, read_config(file, known)) for known in (PipelineParams(), CloudNodeParams()))
+        params, node = (
+            with_values(defaults, read_config(file, defaults)) for defaults in (PipelineParams(), CloudNodeParams())
+        )
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
     if params == PipelineParams() and node == CloudNodeParams():
@@ -181,14 +185,20 @@ def _read_mount(file: Path) -> tuple[Any, bool]:
     ), node.input.deskew != "off"
 
 
-def _bag(
-    source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, images: bool, limit: int | None, force: bool
+def _convert_to_bag(
+    source: Path,
+    recording: Any,
+    transform: Callable[[Any], Any],
+    out: Path,
+    images: bool,
+    limit: int | None,
+    force: bool,
 ) -> None:
     from lidar_perception.data.to_bag import write_bag
 
     count = min(len(recording), limit or len(recording))
     skipped: list[str] = []
-    frames = show_progress(map(seen, islice(recording, count)), f"converting {source}", count)
+    frames = show_progress(map(transform, islice(recording, count)), f"converting {source}", count)
     written = write_bag(out, frames, images=images, force=force, skipped=skipped)
     console.print(f"{out}: {written} scans of {count}")
     for line in skipped:
@@ -196,7 +206,7 @@ def _bag(
     raise SystemExit(1 if skipped else 0)
 
 
-def _on_topic(source: Path, recording: Any, topic: str) -> Any:
+def _read_topic_boxes(source: Path, recording: Any, topic: str) -> Any:
     """Return the boxes on a topic of a bag as DriveLabels."""
     from lidar_perception.data.open import split_topic
     from lidar_perception.labels.formats import bag
@@ -204,10 +214,10 @@ def _on_topic(source: Path, recording: Any, topic: str) -> Any:
     return bag.read(split_topic(source)[0], recording.frames[:], topic)
 
 
-def _dataset(
+def _convert_to_dataset(
     source: Path,
     recording: Any,
-    seen: Callable[[Any], Any],
+    transform: Callable[[Any], Any],
     format: str,
     out: Path,
     detections: str | None,
@@ -217,27 +227,27 @@ def _dataset(
     from lidar_perception.labels.datasets import write_dataset
     from lidar_perception.labels.exchange import export_labels
 
-    labels = None if detections is None else _on_topic(source, recording, detections)
+    labels = None if detections is None else _read_topic_boxes(source, recording, detections)
     count = min(len(recording), limit or len(recording))
     if labels is not None and format == MCAP:
         export_labels(labels.take_first(count), format, out, recording.frames[:count], force)
         console.print(f"{out}: {count} scans")
         return
-    frames = show_progress(map(seen, islice(recording, count)), f"converting {source}", count)
+    frames = show_progress(map(transform, islice(recording, count)), f"converting {source}", count)
     summary = write_dataset(format, frames, out, labels, force)
     drives = f"{summary.drives} drive{'' if summary.drives == 1 else 's'}"
     console.print(f"{out}: {summary.frames} scans of {drives}, {summary.boxes} boxes")
-    for remark, frames_of in summary.remarks.items():
-        console.print(Text(remark, "yellow") + f" ({frames_of} scans)")
+    for remark, frame_count in summary.remarks.items():
+        console.print(Text(remark, "yellow") + f" ({frame_count} scans)")
 
 
-def _labels(
+def _convert_labels(
     source: Path,
     recording: Any,
     format: str,
     out: Path,
-    given: str | None,
-    elsewhere: bool,
+    labels_format: str | None,
+    is_label_path: bool,
     detections: str | None,
     limit: int | None,
     force: bool,
@@ -247,12 +257,12 @@ def _labels(
 
     count = min(len(recording), limit or len(recording))
     if detections is not None:
-        labels = _on_topic(source, recording, detections)
-    elif elsewhere:
-        labels = import_labels(source, given or recognise_format(source), recording.frames)
+        labels = _read_topic_boxes(source, recording, detections)
+    elif is_label_path:
+        labels = import_labels(source, labels_format or recognise_format(source), recording.frames)
     else:
         labels = DriveLabels(list(map(read_frame_labels, recording.frames[:])))
     written = export_labels(labels.take_first(count), format, out, recording.frames[:count], force)
     console.print(f"{out}: {written.boxes} boxes of {written.frames} frames, as {format}")
-    for what in written.left_out:
-        console.print(f"left out: {what}, for which the format has no place", style="yellow")
+    for content in written.left_out:
+        console.print(f"left out: {content}, for which the format has no place", style="yellow")

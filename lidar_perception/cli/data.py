@@ -26,7 +26,7 @@ WHAT = (
 MAX_DEFAULT_JOBS = 16  # maximum default number of processes, enough to feed a GPU
 
 
-def a_path(name: str, what: str, metavar: str = "FILE", **more: Any) -> Callable:
+def path_option(name: str, what: str, metavar: str = "FILE", **more: Any) -> Callable:
     """Return an option that takes a path."""
     return click.option(name, type=click.Path(path_type=Path), metavar=metavar, help=what, **more)
 
@@ -61,7 +61,7 @@ def out_folder(what: str, name: str = "--out", **more: Any) -> Callable:
     return click.option(name, type=OutFolder(path_type=Path), metavar="FOLDER", help=what, **more)
 
 
-def jobs_for_all_cores(what: str, least: int = 0) -> Callable:
+def make_jobs_option(what: str, least: int = 0) -> Callable:
     """Return the option --jobs, by default one process for each core; `what` starts its help."""
     return click.option(
         "--jobs",
@@ -108,7 +108,7 @@ def data_argument(
     return decorate
 
 
-split_option = a_path("--split", "Use only the frames or sequences named in this file, one per line.")
+split_option = path_option("--split", "Use only the frames or sequences named in this file, one per line.")
 limit_option = click.option("--limit", type=click.IntRange(1), metavar="N", help="Only the first N frames.")
 jobs_option = click.option(
     "--jobs", type=click.IntRange(1), default=1, show_default=True, metavar="N", help="Number of processes."
@@ -227,8 +227,8 @@ def open_and_describe(data: Path, *, level: bool = True, **how: Any) -> Any:
         height = next(iter(measured)).sensor_height
         errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds", style="dim")
     if level and clouds:
-        if (full := recording.frames[0].intensity_max()) > 1:
-            errors.print(f"its intensity is 0 .. {full:g}, read as 0 .. 1", style="dim")
+        if (full_scale := recording.frames[0].intensity_max()) > 1:
+            errors.print(f"its intensity is 0 .. {full_scale:g}, read as 0 .. 1", style="dim")
         for problem in filter(
             None,
             (
@@ -242,8 +242,8 @@ def open_and_describe(data: Path, *, level: bool = True, **how: Any) -> Any:
 
 def describe_missing_scans(recording: Any) -> list[str]:
     """Return a line with the number of labels whose scan is missing; no line if there are none."""
-    lost = [reason for _, reason in recording.missing_scans]
-    return [f"labels without a scan: {len(lost)}, such as {lost[0]}"] if lost else []
+    reasons = [reason for _, reason in recording.missing_scans]
+    return [f"labels without a scan: {len(reasons)}, such as {reasons[0]}"] if reasons else []
 
 
 def with_recorded_height(recording: Any, params: Any) -> Any:

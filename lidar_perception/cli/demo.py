@@ -15,19 +15,19 @@ from rich.text import Text
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.classes import DETECTED
-from lidar_perception.cli.command import Choice, Command, refuse_given
+from lidar_perception.cli.command import Choice, Command, refuse_options
 from lidar_perception.cli.data import WHAT, data_argument, open_and_describe, out_folder
 from lidar_perception.cli.evaluate.candidates import with_recorded_setup
 from lidar_perception.cli.options import (
     CANDIDATES,
     Runs,
     Settings,
-    candidates_run,
     checked,
-    chosen_detector,
     device_option,
+    make_candidate_runs,
+    make_detector_choice,
+    make_runs,
     range_option,
-    runs_of,
     settings_options,
 )
 from lidar_perception.data.bag import Bag
@@ -60,9 +60,9 @@ BEHIND_M = 2.0  # a detection farther behind the sensor than this requires an al
 REPLACED = ("drive", "result", "logs")  # subfolders that the next demo replaces
 
 
-def _runs(detector: str) -> Runs:
+def _make_runs(detector: str) -> Runs:
     """Return the detector that the nodes run, with its parameters."""
-    return candidates_run(on_messages=True) if detector == CANDIDATES else runs_of(detector, on_messages=True)
+    return make_candidate_runs(on_messages=True) if detector == CANDIDATES else make_runs(detector, on_messages=True)
 
 
 @click.command(cls=Command)
@@ -98,7 +98,7 @@ def _runs(detector: str) -> Runs:
 )
 @range_option
 @device_option
-@settings_options(lambda given: [_runs(given.get("detector") or FUSED)], candidates=True)
+@settings_options(lambda given: [_make_runs(given.get("detector") or FUSED)], candidates=True)
 def demo(
     data: Path | None,
     detector: str,
@@ -131,39 +131,52 @@ def demo(
       lidar-perception demo --detector candidates --config best
     """
     if data is not None:
-        refuse_given(("frames", "drive_seed"), "is for a simulated drive, which DATA replaces")
-    (values,) = settings.values(_runs(detector))
+        refuse_options(("frames", "drive_seed"), "is for a simulated drive, which DATA replaces")
+    (values,) = settings.values(_make_runs(detector))
     if detector == CANDIDATES and (range != "auto" or device != "auto"):
         raise click.UsageError("--range and --device are for a detector with a network")
-    chosen = chosen_detector(detector, range, device, values, PAPER if detector == CANDIDATES else None)
+    choice = make_detector_choice(detector, range, device, values, PAPER if detector == CANDIDATES else None)
     require_rclpy()  # checked before the drive is simulated
     recording = None if data is None else open_and_describe(data)
     if recording is not None:
         recording.require(BOXES, "demo")
-    _make_room(out, data, detector)
+    _remove_old_results(out, data, detector)
     make_folder(out / "logs")
-    with compile_in_background(_code_that_compiles(chosen), out / "logs" / "compile.log", errors.print):
-        drive = _bag(out / "drive", recording, frames, drive_seed)
-    played = _as_replayed(drive, recording)
-    clouds = len(played)
+    with compile_in_background(_write_compile_code(choice), out / "logs" / "compile.log", errors.print):
+        drive = _make_drive_bag(out / "drive", recording, frames, drive_seed)
+    replayed = _open_replayed(drive, recording)
+    clouds = len(replayed)
     from lidar_perception.nodes.replay.graph_replay import TRACKS, replay
 
     with errors.status("loading compiled code (the first time: compiling, half a minute or more)"):
-        own = _params_of(chosen, played)
+        node_params = _load_node_params(choice, replayed)
     content = replay(
-        drive, clouds, out, own, detector=detector, rate=rate, single=single, real_time=real_time, processes=processes
+        drive,
+        clouds,
+        out,
+        node_params,
+        detector=detector,
+        rate=rate,
+        single=single,
+        real_time=real_time,
+        processes=processes,
     )
     final = list_result_topics(single, detector)[FINAL]
-    found, tracks = read_results(out / "result", final, TRACKS)
-    calibration = next(iter(played)).calibration()
+    detections, tracks = read_results(out / "result", final, TRACKS)
+    calibration = next(iter(replayed)).calibration()
     if detector == CANDIDATES:
         print_candidate_report(content, console)
     else:
-        content["detections"] = _print_detections(found, calibration)
+        content["detections"] = _print_detections(detections, calibration)
     _print_pace(content, rate, clouds)
     content["tracks"] = _print_tracks(tracks, calibration, content["poses"])
     write_text(out / "scores.json", json.dumps(content, indent=1))
-    picture = _draw_best(out, cloud_topic(single, detector), _drawn(found, detector), next(iter(played)).sensor_height)
+    picture = _draw_best(
+        out,
+        cloud_topic(single, detector),
+        _select_drawn_objects(detections, detector),
+        next(iter(replayed)).sensor_height,
+    )
     console.print(f"results in {out}: result (bag), scores.json, logs" + (", birdseye.png" if picture else ""))
     console.print(f"look at it: lidar-perception view {out / 'result'}")
     if missing := clouds - content["results"]:
@@ -175,7 +188,7 @@ def demo(
             raise SystemExit(1)
 
 
-def _make_room(out: Path, data: Path | None, detector: str) -> None:
+def _remove_old_results(out: Path, data: Path | None, detector: str) -> None:
     """Remove the results of an earlier demo in `out`.
 
     Raises:
@@ -194,33 +207,33 @@ def _make_room(out: Path, data: Path | None, detector: str) -> None:
     write_text(out / RECORD, json.dumps({"data": data and str(data), "detector": detector}))
 
 
-def _as_replayed(drive: Path, recording: Recording | None) -> Recording:
+def _open_replayed(drive: Path, recording: Recording | None) -> Recording:
     """Open the bag to replay, with the sensor height of the recording that it was made from."""
     return open_recording(drive, sensor_height=None if recording is None else recording.frames[0].sensor_height)
 
 
-def _params_of(chosen: DetectorChoice, played: Recording) -> Any:
+def _load_node_params(choice: DetectorChoice, replayed: Recording) -> Any:
     """Return the parameters of the nodes, and compile their shared code once for all of them."""
-    if chosen.weights == CANDIDATES:
+    if choice.weights == CANDIDATES:
         warm_up()
-        return with_recorded_setup(played, checked(PAPER, chosen.settings))
-    return chosen.open(sensor_height=played.frames[0].sensor_height).params
+        return with_recorded_setup(replayed, checked(PAPER, choice.settings))
+    return choice.open(sensor_height=replayed.frames[0].sensor_height).params
 
 
-def _code_that_compiles(chosen: DetectorChoice) -> str:
+def _write_compile_code(choice: DetectorChoice) -> str:
     """Return Python code that compiles what the tracker, the detector and its inputs run."""
     lines = [f"from {tracker.__name__} import warm_up", "warm_up()"]
-    if chosen.weights == CANDIDATES:
+    if choice.weights == CANDIDATES:
         lines += [f"from {warm_up.__module__} import warm_up", "warm_up()"]
     else:
         lines += [
             f"from {open_detector.__module__} import open_detector",
-            f"open_detector({chosen.weights!r}, {chosen.device!r}, range={chosen.range!r})",
+            f"open_detector({choice.weights!r}, {choice.device!r}, range={choice.range!r})",
         ]
     return "; ".join(lines)
 
 
-def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
+def _make_drive_bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     """Return the bag to replay: as given, or made from a recording or a simulated drive."""
     if (
         recording is not None
@@ -229,13 +242,15 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     ):
         return recording.path
     if recording is not None:
-        found = show_progress(recording, f"converting {recording.path}", len(recording))
+        frames_to_write = show_progress(recording, f"converting {recording.path}", len(recording))
     else:
         from lidar_perception.simulation.recording import simulate_frames
         from lidar_perception.simulation.scene import CROWDED_ZONES
 
-        found = show_progress(simulate_frames(drive_seed, frames, scenes=CROWDED_ZONES), "simulating a drive", frames)
-    write_bag(path, found, force=True)
+        frames_to_write = show_progress(
+            simulate_frames(drive_seed, frames, scenes=CROWDED_ZONES), "simulating a drive", frames
+        )
+    write_bag(path, frames_to_write, force=True)
     return path
 
 
@@ -297,10 +312,10 @@ def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str
     return {"found": count, "scores": result}
 
 
-def _drawn(frames: Sequence[RecordedResult], detector: str) -> dict[int, tuple[np.ndarray, Any]]:
+def _select_drawn_objects(frames: Sequence[RecordedResult], detector: str) -> dict[int, tuple[np.ndarray, Any]]:
     """Return {stamp: (boxes of labels, detected objects)} of the classes that are detected."""
-    wanted = {CLASSES[PEDESTRIAN]} if detector == CANDIDATES else {*DETECTED}
-    return {f.stamp_ns: (f.truth.boxes[[label in wanted for label in f.truth.labels]], f.published) for f in frames}
+    names = {CLASSES[PEDESTRIAN]} if detector == CANDIDATES else {*DETECTED}
+    return {f.stamp_ns: (f.truth.boxes[[label in names for label in f.truth.labels]], f.published) for f in frames}
 
 
 def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]], height: float) -> bool:
@@ -311,21 +326,21 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
     from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
 
     hits = {
-        stamp: (len(match_centres(found.boxes, truth)[0]), len(truth))
-        for stamp, (truth, found) in frames.items()
+        stamp: (len(match_centres(detections.boxes, truth)[0]), len(truth))
+        for stamp, (truth, detections) in frames.items()
         if len(truth)
     }
     if not hits:
         return False
     best = max(hits, key=lambda s: (hits[s], s))  # the last such frame, because its trails are the longest
-    truth, found = frames[best]
+    truth, detections = frames[best]
     trails: dict[int, np.ndarray] = {}
     drawing = None
     with Bag(out / "result") as bag:
         for topic, _, msg in bag.messages({cloud, TRACKS} & set(bag.topics)):
             if topic == TRACKS:
                 if msg.markers and to_ns(msg.markers[0].header.stamp) == best:
-                    found, trails = from_marker_array(msg), read_trails(msg)
+                    detections, trails = from_marker_array(msg), read_trails(msg)
             elif to_ns(msg.header.stamp) == best:
                 drawing = msg
     if drawing is None:
@@ -336,12 +351,12 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
     none = np.zeros(len(frame), int)
     colors = None if ground is None else color_by_cluster(ground > 0, none if ids is None else renumber_ids(ids)[0])
     boxes = Boxes(
-        found.boxes,
-        np.array(class_ids(found.labels), int),
-        [str(i) if trails else "" for i in found.ids],
-        [trails.get(int(i), found.boxes[k : k + 1, :3]) for k, i in enumerate(found.ids)],
+        detections.boxes,
+        np.array(class_ids(detections.labels), int),
+        [str(i) if trails else "" for i in detections.ids],
+        [trails.get(int(i), detections.boxes[k : k + 1, :3]) for k, i in enumerate(detections.ids)],
     )
-    stage = Stage.of(frame, height, not (found.boxes[:, 0] < -BEHIND_M).any())
+    stage = Stage.of(frame, height, not (detections.boxes[:, 0] < -BEHIND_M).any())
     write_png(
         out / "birdseye.png",
         draw_frame(

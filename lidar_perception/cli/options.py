@@ -191,7 +191,7 @@ def settings_options(
     return decorate
 
 
-def candidates_run(on_messages: bool = False) -> Runs:
+def make_candidate_runs(on_messages: bool = False) -> Runs:
     """Return the candidate pipeline with its parameters; on_messages: it runs in nodes."""
     return Runs(CANDIDATES, _read_here(collect_fields(PAPER), on_messages), CANDIDATE_NODES)
 
@@ -234,7 +234,7 @@ def weights_of(given: Mapping[str, Any]) -> list[str]:
     return [*map(str, weights)] if isinstance(weights, tuple) else [str(weights)]
 
 
-def runs_of(weights: str | Path, on_messages: bool = False) -> Runs:
+def make_runs(weights: str | Path, on_messages: bool = False) -> Runs:
     """Return the detector of a value of --weights with its parameters.
 
     Args:
@@ -290,7 +290,7 @@ def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> 
     others = [TRACKER] if tracking else []
 
     def runs(given: Mapping[str, Any]) -> list[Runs]:
-        return [*map(runs_of, weights_of(given) or [FUSED]), *others]
+        return [*map(make_runs, weights_of(given) or [FUSED]), *others]
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
@@ -309,10 +309,10 @@ def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> 
                 raise click.UsageError("--config and --set are for a detector that runs; give --weights")
             values: list[dict[str, Any]] = [{}, {}]
             if name is not None:
-                values = settings.values(runs_of(name), *others) if settings else values
+                values = settings.values(make_runs(name), *others) if settings else values
             if tracking:
                 kwargs["tracking"] = checked(Tracked(), values[1]).tracking
-            chosen = None if name is None else chosen_detector(name, range, device, values[0])
+            chosen = None if name is None else make_detector_choice(name, range, device, values[0])
             return function(*args, detector=chosen, **kwargs)
 
         wrapper = settings_options(runs)(wrapper)
@@ -336,17 +336,17 @@ def detectors_options(function: Callable) -> Callable:
     ) -> Any:
         if settings and not weights:
             raise click.UsageError("--config and --set are for a detector that runs; give --weights")
-        values = settings.values(*map(runs_of, weights)) if settings else [{} for _ in weights]
-        chosen = tuple(chosen_detector(name, range, device, own) for name, own in zip(weights, values))
+        values = settings.values(*map(make_runs, weights)) if settings else [{} for _ in weights]
+        chosen = tuple(make_detector_choice(name, range, device, own) for name, own in zip(weights, values))
         return function(*args, detectors=chosen, **kwargs)
 
-    wrapper = settings_options(lambda given: [*map(runs_of, weights_of(given) or [FUSED])])(wrapper)
+    wrapper = settings_options(lambda given: [*map(make_runs, weights_of(given) or [FUSED])])(wrapper)
     for option in device_option, range_option, weights_option(multiple=True):
         wrapper = option(wrapper)
     return wrapper
 
 
-def chosen_detector(
+def make_detector_choice(
     weights: str | Path, range: str, device: str, values: Mapping[str, Any], params: Any = None
 ) -> DetectorChoice:
     """Return a detector to open later, with parameters that are checked now.

@@ -40,13 +40,13 @@ def read_parameters(
         InputError: the file cannot be read, or a name in it is on the wrong level.
     """
     if str(path) in CONFIGURATIONS:
-        named = CONFIGURATIONS[str(path)]
-        if others := sorted(named.keys() - known.keys()):
+        configuration = CONFIGURATIONS[str(path)]
+        if others := sorted(configuration.keys() - known.keys()):
             raise InputError(
                 f"the configuration {path} is for candidates; there is no {others[0]} here, give a parameter file"
             )
-        return dict(named), []
-    content = _load(path)
+        return dict(configuration), []
+    content = _load_file(path)
     visited = count()
     values: dict[str, Any] = {}
     lines: list[str] = []
@@ -54,24 +54,24 @@ def read_parameters(
     for node, section in content.items():
         if not (isinstance(section, dict) and isinstance(section.get("ros__parameters", ()), dict | None)):
             raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for the form")
-        if nodes is not None and not _applies(str(node), nodes):
+        if nodes is not None and not _is_for_nodes(str(node), nodes):
             name = str(node).rpartition("/")[2]
-            if name not in NODES and (guess := did_you_mean(name, nodes)):
-                lines.append(f"there is no node {name[:80]!r}{guess}")
+            if name not in NODES and (suggestion := did_you_mean(name, nodes)):
+                lines.append(f"there is no node {name[:80]!r}{suggestion}")
             continue
-        for name, value in _dotted(path, section.get("ros__parameters") or {}, visited):
+        for name, value in _iterate_dotted(path, section.get("ros__parameters") or {}, visited):
             if not isinstance(name, str):
                 raise InputError(f"{path}: {name!r} is no name of a parameter; put it into quotes")
             if name in known:
                 values[name] = value
             elif any(k.startswith(f"{name}.") or name.startswith(f"{k}.") for k in known):
-                raise InputError(f"{path}: '{name}' is {_wrong_level(name, known)}")
+                raise InputError(f"{path}: '{name}' is {_describe_wrong_level(name, known)}")
             else:
                 unknown.append(name)
     return values, [*lines, *describe_misspelt_parameters(unknown)]
 
 
-def _load(path: Path) -> dict[Any, Any]:
+def _load_file(path: Path) -> dict[Any, Any]:
     if not path.exists():
         raise InputError(
             f"cannot read the parameter file {path}: there is no such file" + valid_names(str(path), CONFIGURATIONS)
@@ -85,17 +85,17 @@ def _load(path: Path) -> dict[Any, Any]:
     return content or {}
 
 
-def _applies(section: str, nodes: Collection[str]) -> bool:
+def _is_for_nodes(section: str, nodes: Collection[str]) -> bool:
     """Return True for a section for one of these nodes, or for all nodes."""
     return section.rpartition("/")[2] in ("*", "**", *nodes)
 
 
-def _wrong_level(name: str, known: Iterable[str]) -> str:
+def _describe_wrong_level(name: str, known: Iterable[str]) -> str:
     inner = [k for k in known if k.startswith(f"{name}.")]
     return f"a group, not a value; it holds {', '.join(inner)}" if inner else "below a parameter that holds no others"
 
 
-def _dotted(
+def _iterate_dotted(
     path: Path, section: dict, visited: Iterator[int], prefix: str = "", depth: int = 0
 ) -> Iterator[tuple[Any, Any]]:
     """Yield (dotted name, value), with the name unchanged if it is not text.
@@ -108,6 +108,6 @@ def _dotted(
         if not isinstance(key, str):
             yield key, value
         elif isinstance(value, dict):
-            yield from _dotted(path, value, visited, f"{prefix}{key}.", depth + 1)
+            yield from _iterate_dotted(path, value, visited, f"{prefix}{key}.", depth + 1)
         else:
             yield f"{prefix}{key}", value

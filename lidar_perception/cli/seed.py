@@ -56,7 +56,7 @@ def seed(
     """
     recording = open_and_describe(data)
     params = with_recorded_height(recording, params)
-    frame = _pick(recording, number, params.view, at is None)
+    frame = _choose_frame(recording, number, params.view, at is None)
     camera = frame.camera()
     if camera is None:
         params = replace(params, view=ViewParams(enabled=False))
@@ -73,12 +73,12 @@ def seed(
     console.print(f"{out}: frame {frame.name}, height {template.height:.2f} m")
 
 
-def _pick(recording: Recording, number: int | None, view: ViewParams, labelled: bool) -> Frame:
+def _choose_frame(recording: Recording, number: int | None, view: ViewParams, needs_label: bool) -> Frame:
     for i, frame in enumerate(recording):
         if i == number:
             return frame
         with suppress(InputError):
-            if number is None and (not labelled or len(load_pedestrians(frame, view.enabled))):
+            if number is None and (not needs_label or len(load_pedestrians(frame, view.enabled))):
                 return frame
     raise InputError(
         f"{recording.path} has no frame {number}; it has {len(recording)}"

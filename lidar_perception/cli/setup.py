@@ -71,34 +71,36 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
         raise InputError(f"--topic {topic} is for a bag, and {data} is {clouds.layout}")
     count = f"{clouds.count} cloud{'s' * (clouds.count != 1)}"
     errors.print(f"{data}: {clouds.layout}, {count}", style="dim")
-    numbers, found, skipped = [], [], []
-    chosen = choose_clouds(clouds.count, scans)
+    numbers, scans_read, skipped = [], [], []
+    indices = choose_clouds(clouds.count, scans)
     with make_progress() as bar:
-        task = bar.add_task("reading", total=len(chosen) + 1)
-        for i in chosen:
+        task = bar.add_task("reading", total=len(indices) + 1)
+        for i in indices:
             try:
-                found.append(read_scan(clouds.load(i), f"cloud {i} of {data}"))
+                scans_read.append(read_scan(clouds.load(i), f"cloud {i} of {data}"))
                 numbers.append(i)
             except InputError as error:
                 skipped.append(str(error))
             bar.advance(task)
-        if not found:
+        if not scans_read:
             raise InputError(skipped[0])
         bar.update(task, description="measuring")
-        recorded = read_recorded_poses(clouds.poses, numbers, clouds.stamps_ns)
-        m = measure_sensor(found, numbers, str(data), clouds.count, clouds.stamps_ns, recorded, height_hint)
+        recorded_poses = read_recorded_poses(clouds.poses, numbers, clouds.stamps_ns)
+        measurement = measure_sensor(
+            scans_read, numbers, str(data), clouds.count, clouds.stamps_ns, recorded_poses, height_hint
+        )
     files = {
-        "sensor.yaml": format_sensor(m),
-        "robot.param.yaml": format_params(m),
-        **_layouts(clouds.topic or "/points", m.source.scans[0].frame_id),
+        "sensor.yaml": format_sensor(measurement),
+        "robot.param.yaml": format_params(measurement),
+        **_make_layouts(clouds.topic or "/points", measurement.source.scans[0].frame_id),
     }
     make_folder(out)
     for name, text in files.items():
         write_text(out / name, text)
-    _print_values(list_values(m))
+    _print_values(list_values(measurement))
     for line in skipped:
         console.print(Text("left out", "yellow") + f": {line}")
-    for line in find_warnings(m):
+    for line in find_warnings(measurement):
         console.print(Text("warning", "yellow") + f": {line}")
     console.print(f"{out}: {', '.join(files)}")
 
@@ -112,16 +114,16 @@ def _print_values(rows: list[Any]) -> None:
     console.print(table)
 
 
-def _layouts(topic: str, frame: str) -> dict[str, str]:
+def _make_layouts(topic: str, frame: str) -> dict[str, str]:
     """Return the package's layouts for RViz and Foxglove with this topic and frame.
 
     Empty if the layouts are not installed.
     """
-    places = (
+    folders = (
         Path(__file__).parents[2] / "config",  # folder of a checkout; otherwise the installed folder is used
         *(p / "share/lidar_perception/config" for p in Path(__file__).parents),
     )
-    folder = next((p for p in places if (p / FILES[-1]).is_file()), None)
+    folder = next((p for p in folders if (p / FILES[-1]).is_file()), None)
     if folder is None:
         return {}
     rviz = (folder / FILES[-2]).read_text(encoding="utf-8")

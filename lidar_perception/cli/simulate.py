@@ -133,22 +133,22 @@ def simulate(
                 "a bag is one file and cannot be resumed; make kitti-tracking, "
                 "which can, and turn it into a bag with 'convert'"
             )
-        _bag(out, plan, force)
+        _write_bag(out, plan, force)
     else:
-        _data_set(out, plan, sensor_name, mount_height, jobs or count_cores(), resume, force)
+        _write_dataset(out, plan, sensor_name, mount_height, jobs or count_cores(), resume, force)
 
 
-def _bag(out: Path, plan: DatasetPlan, force: bool) -> None:
+def _write_bag(out: Path, plan: DatasetPlan, force: bool) -> None:
     scans = simulate_frames(plan.seed, plan.frames, plan.sensor, plan.frames_per_drive, plan.scenes)
     count = write_bag(out, show_progress(scans, "simulating", plan.frames), force=force)
     console.print(f"{out}: {count} scans")
 
 
-def _data_set(
+def _write_dataset(
     out: Path, plan: DatasetPlan, sensor_name: str, mount_height: float, jobs: int, resume: bool, force: bool
 ) -> None:
     scenes = plan.scenes
-    asked = {
+    settings = {
         "format": plan.layout,
         "sensor": sensor_name,
         "height": plan.sensor.height,
@@ -172,26 +172,26 @@ def _data_set(
         "streets-of": plan.frames_per_drive,
         "street": scenes.kind,
     }
-    asked["command"] = shlex.join(
+    settings["command"] = shlex.join(
         [
             "lidar-perception",
             "simulate",
             *(word for name, value in options.items() if value is not None for word in (f"--{name}", str(value))),
         ]
     )
-    complete, begun = resume and is_finished(out), False
+    was_complete, has_begun = resume and is_finished(out), False
     try:
-        with make_resumable_folder(out, asked, FOLDERS, resume=resume, force=force) as missing:
-            begun = True
+        with make_resumable_folder(out, settings, FOLDERS, resume=resume, force=force) as missing:
+            has_begun = True
             with closing(write_frames(out, plan, missing, jobs)) as written:
                 for _ in show_progress(written, "simulating", len(missing)):
                     pass
     except InputError as error:
-        if not begun:
+        if not has_begun:
             raise
         raise InputError(f"{error}; finished frames are kept, resume with --resume") from None
     console.print(
         f"{out} is complete: there is nothing to do"
-        if complete
+        if was_complete
         else f"{out}: {plan.frames} scans" + (f", {plan.frames - len(missing)} of them from before" if resume else "")
     )

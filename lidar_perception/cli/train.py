@@ -14,7 +14,7 @@ import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.command import Choice, Group
-from lidar_perception.cli.data import a_path, data_argument, jobs_for_all_cores, out_file, out_folder
+from lidar_perception.cli.data import data_argument, make_jobs_option, out_file, out_folder, path_option
 from lidar_perception.cli.options import checked, device_option, parameter_options
 from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.terminal import console
@@ -34,15 +34,15 @@ OPTIONS = (
         metavar="PATH|sim",
         help="Validation data. Default: frames held out of --data, and other simulated streets.",
     ),
-    a_path("--split", "Train on the frames of --data, or whole sequences, listed in this file, one per line."),
-    a_path("--val-split", "Validate on the frames or sequences listed in this file."),
+    path_option("--split", "Train on the frames of --data, or whole sequences, listed in this file, one per line."),
+    path_option("--val-split", "Validate on the frames or sequences listed in this file."),
     out_folder("Folder for best.safetensors, last.safetensors, logs and the state.", required=True),
     click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one."),
-    a_path(
+    path_option(
         "--init", "Start from the matching weights of this checkpoint; `package`: the shipped weights.", "FILE|package"
     ),
     device_option,
-    jobs_for_all_cores("Processes that prepare scenes; 0: only this one."),
+    make_jobs_option("Processes that prepare scenes; 0: only this one."),
     click.option(
         "--budget",
         type=float,
@@ -157,11 +157,11 @@ def pointnet(request: TrainingRequest, params: PointNetTraining) -> None:
 
 
 @train.command()
-@a_path("--weights", "Checkpoint or exported network (.onnx) of PointPillars. Default: the shipped one.")
-@a_path("--classifier", "Checkpoint of PointNet. Default: the shipped one.")
+@path_option("--weights", "Checkpoint or exported network (.onnx) of PointPillars. Default: the shipped one.")
+@path_option("--classifier", "Checkpoint of PointNet. Default: the shipped one.")
 @out_file("--out", "File to write (.json), for --weights and `fused.weights`.", required=True)
 @click.option("--force", is_flag=True, help="Replace --out.")
-@jobs_for_all_cores("Processes that evaluate scans.", 1)
+@make_jobs_option("Processes that evaluate scans.", 1)
 @training_options(FusedTraining())
 def fused(
     weights: Path | None, classifier: Path | None, out: Path, force: bool, jobs: int, params: FusedTraining
@@ -210,23 +210,23 @@ def print_fused(fits: Any) -> None:
     table = make_table(
         "Curves, on scans that they were not fitted to", "", "proposals", "right", ">= 0.4", "right", "log loss"
     )
-    few = []
-    for name, own in fits.items():
-        rows = [("package", own.before)]
-        rows += [("fitted", own.after)] if own.after else []
-        few += [] if own.after else [name]
-        for k, (which, score) in enumerate(rows):
+    unfitted = []
+    for name, fit in fits.items():
+        rows = [("package", fit.before)]
+        rows += [("fitted", fit.after)] if fit.after else []
+        unfitted += [] if fit.after else [name]
+        for k, (source, score) in enumerate(rows):
             table.add_row(
-                f"{name}, {which}",
-                *((str(own.proposals), str(own.correct)) if k == 0 else ("", "")),
+                f"{name}, {source}",
+                *((str(fit.proposals), str(fit.correct)) if k == 0 else ("", "")),
                 str(score.correct + score.wrong),
                 str(score.correct),
                 f"{score.loss:.3f}",
             )
     console.print(table)
-    if few:
+    if unfitted:
         console.print(
-            f"{', '.join(few)}: too few to fit curves to; those of the package stay. "
+            f"{', '.join(unfitted)}: too few to fit curves to; those of the package stay. "
             "More --scans, or another --scene, have more"
         )
 

@@ -251,17 +251,17 @@ class Bag:
             with several types, of which the most frequent one is read.
         """
         recorded, problems = Counter[str](), []
-        kinds: dict[str, Counter[str]] = {}
+        counts_by_topic: dict[str, Counter[str]] = {}
         for _, file in self.files:
             for topic in file.topics:
                 recorded[topic.name] += topic.messages
                 if topic.encoding == "cdr":
-                    kinds.setdefault(topic.name, Counter())[topic.type] += topic.messages
+                    counts_by_topic.setdefault(topic.name, Counter())[topic.type] += topic.messages
                 else:
                     self.unreadable[topic.name] = topic
-        for name, found in kinds.items():
+        for name, counts_by_type in counts_by_topic.items():
             self.unreadable.pop(name, None)
-            (self.topics[name], self.counts[name]), *others = found.most_common()
+            (self.topics[name], self.counts[name]), *others = counts_by_type.most_common()
             if left_out := [f"{count} of {kind}" for kind, count in others if count]:
                 problems.append(
                     f"{self.path}: {name} has messages of several types; only "

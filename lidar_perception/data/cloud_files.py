@@ -73,12 +73,12 @@ def to_message(file: Path, stamp_ns: int = 0, frame_id: str = "") -> Any:
     """Read a file as a PointCloud2 of rosbags' class with all its columns."""
     points = read_points(file)
     # PointCloud2 has no 64-bit integers; as float64, times keep their microseconds.
-    kinds = [
+    fields = [
         (name, points.dtype[name].base.str.replace("i8", "f8").replace("u8", "f8"), points.dtype[name].shape)
         for name in points.dtype.names or ()
     ]
     try:
-        return from_array(points.astype(kinds), make_header(stamp_ns, frame_id, bag_message), bag_message)
+        return from_array(points.astype(fields), make_header(stamp_ns, frame_id, bag_message), bag_message)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
 

@@ -45,11 +45,11 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
         names = [file.name for file in files]
     times = parse_times(files)
     stamps = times or [START_NS + i * PERIOD_NS for i in range(len(files))]
-    kinds = " and ".join(sorted({file.suffix.lower() for file in files}))
+    suffixes = " and ".join(sorted({file.suffix.lower() for file in files}))
     scale = make_cloud_scale_reader(files)
     return Recording(
         path,
-        f"{kinds} clouds, {'times' if times else 'no times'} in file names",
+        f"{suffixes} clouds, {'times' if times else 'no times'} in file names",
         [
             Frame(
                 name,
@@ -79,7 +79,7 @@ def _parse_stamps(files: list[Path]) -> list[int]:
     if len(parts) < len(files):
         return []
     fractions = [fraction for _, fraction in parts]
-    as_decimals = [whole + int(f"{fraction:0<9}"[:9]) for whole, fraction in parts]
+    as_decimals = [seconds_ns + int(f"{fraction:0<9}"[:9]) for seconds_ns, fraction in parts]
     # Until perception_pcl 2.6.2, pointcloud_to_pcd wrote SECONDS.NANOSECONDS without leading zeros:
     # https://github.com/ros-perception/perception_pcl/pull/481
     shorter = [f for f in fractions if len(f) < NANOSECOND_DIGITS]
@@ -89,7 +89,7 @@ def _parse_stamps(files: list[Path]) -> list[int]:
         or any((f.startswith("0") and f != "0") or len(f) > NANOSECOND_DIGITS for f in fractions)
     ):
         return as_decimals
-    as_nanoseconds = [whole + int(fraction or 0) for whole, fraction in parts]
+    as_nanoseconds = [seconds_ns + int(fraction or 0) for seconds_ns, fraction in parts]
     spreads = [np.ptp(np.diff(sorted(stamps))) for stamps in (as_decimals, as_nanoseconds)]
     if any(f.endswith("0") for f in shorter) or spreads[1] < spreads[0]:
         return as_nanoseconds
@@ -101,12 +101,12 @@ def _split_name(file: Path) -> tuple[int, str] | None:
 
     None if it is not a time; frames of KITTI's raw drives also have ten digits, but start with 0.
     """
-    whole, _, fraction = file.name.removesuffix(file.suffix).partition(".")
+    seconds, _, fraction = file.name.removesuffix(file.suffix).partition(".")
     if (
-        not whole.isdecimal()
-        or whole[0] == "0"
-        or len(whole) not in UNIT_NS_BY_DIGITS
-        or (fraction and (len(whole) != 10 or not fraction.isdecimal()))
+        not seconds.isdecimal()
+        or seconds[0] == "0"
+        or len(seconds) not in UNIT_NS_BY_DIGITS
+        or (fraction and (len(seconds) != 10 or not fraction.isdecimal()))
     ):
         return None
-    return int(whole) * UNIT_NS_BY_DIGITS[len(whole)], fraction
+    return int(seconds) * UNIT_NS_BY_DIGITS[len(seconds)], fraction

@@ -91,35 +91,35 @@ class McapFile:
     def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
         """Yield (channel id, log time, data) of channels with start <= time < stop, in order of
         time."""
-        wanted = {*ids}
+        channels = {*ids}
         sources: list[tuple[int, Callable[[], Stream]]] = [
-            (chunk.start, partial(self._messages_in_chunk, chunk, wanted, start, stop))
+            (chunk.start, partial(self._messages_in_chunk, chunk, channels, start, stop))
             for chunk in self.chunks
-            if chunk.start < stop and start <= chunk.end and not wanted.isdisjoint(chunk.counts)
+            if chunk.start < stop and start <= chunk.end and not channels.isdisjoint(chunk.counts)
         ]
         if len(self.locations):
             sources.append(
-                (int(self.locations["time"][0]), partial(self._messages_outside_chunks, wanted, start, stop))
+                (int(self.locations["time"][0]), partial(self._messages_outside_chunks, channels, start, stop))
             )
         return merge_streams(sources)
 
-    def _messages_in_chunk(self, chunk: Chunk, wanted: set[int], start: int, stop: int) -> Stream:
-        data, found = self._read_chunk(chunk), []
+    def _messages_in_chunk(self, chunk: Chunk, channels: set[int], start: int, stop: int) -> Stream:
+        data, messages = self._read_chunk(chunk), []
         for kind, at, length in _iterate_records(partial(_slice, data), 0, len(data)):
             if kind == MESSAGE:
                 channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, at)
                 if not chunk.start <= time <= chunk.end:
                     raise ValueError("a chunk has messages outside its time range")
-                if channel in wanted and start <= time < stop:
-                    found.append((time, channel, at + MESSAGE_HEAD.size, at + length))
-        found.sort(key=itemgetter(0))
-        for time, channel, begin, end in found:
+                if channel in channels and start <= time < stop:
+                    messages.append((time, channel, at + MESSAGE_HEAD.size, at + length))
+        messages.sort(key=itemgetter(0))
+        for time, channel, begin, end in messages:
             yield channel, time, data[begin:end]
 
-    def _messages_outside_chunks(self, wanted: set[int], start: int, stop: int) -> Stream:
+    def _messages_outside_chunks(self, channels: set[int], start: int, stop: int) -> Stream:
         begin, end = np.searchsorted(self.locations["time"], (start, stop))
         for time, channel, at, size in self.locations[begin:end].tolist():
-            if channel in wanted:
+            if channel in channels:
                 yield channel, time, self._read(at, size)
 
     def _read(self, at: int, size: int) -> bytes:
@@ -153,9 +153,9 @@ class McapFile:
         Returns:
             The messages outside of chunks, (M,) LOCATION with ascending times.
         """
-        locations, last = [], len(MAGIC)
+        locations, end_of_last = [], len(MAGIC)
         for kind, at, length in _iterate_records(self._read, len(MAGIC), end):
-            last = at + length
+            end_of_last = at + length
             if kind == HEADER:
                 self.profile = _parse_string(self._read(at, length), 0)[0].decode(errors="replace")
             elif kind == MESSAGE:
@@ -171,10 +171,10 @@ class McapFile:
                 self._add_definition(kind, self._read(at, length))
             elif kind == DATA_END:
                 break
-        if last != end:
+        if end_of_last != end:
             raise ValueError("the data section does not end where the index begins")
-        found = np.array(locations, LOCATION)
-        return found[np.argsort(found["time"], kind="stable")]
+        messages = np.array(locations, LOCATION)
+        return messages[np.argsort(messages["time"], kind="stable")]
 
     def _check_summary(self, summary: bytes) -> None:
         indexed = []
@@ -199,18 +199,18 @@ class McapFile:
     def _complete_definitions(self) -> None:
         """Decompress the chunks without a message index, and first chunks until all channels with
         messages are defined."""
-        before = iter(self.chunks)
+        earlier_chunks = iter(self.chunks)
         for chunk in self.chunks:
             if not chunk.counts:
                 self._scan_chunk(chunk)
             while not self._has_definitions(chunk.counts):
-                self._scan_chunk(next(before))
+                self._scan_chunk(next(earlier_chunks))
         if not self._has_definitions(np.unique(self.locations["channel"]).tolist()):
             raise ValueError("the definition of a channel with messages is missing")
 
     def _has_definitions(self, ids: Collection[int]) -> bool:
-        known = self.channels
-        return all(i in known and known[i].schema_id in (0, *self.schemas) for i in ids)
+        channels = self.channels
+        return all(i in channels and channels[i].schema_id in (0, *self.schemas) for i in ids)
 
     def _scan_chunk(self, chunk: Chunk) -> None:
         data, counts = self._read_chunk(chunk), dict[int, int]()
@@ -230,8 +230,8 @@ class McapFile:
         return data
 
     def _make_topics(self) -> list[Topic]:
-        numbers, found = np.unique(self.locations["channel"], return_counts=True)
-        counts = dict(zip(numbers.tolist(), found.tolist()))
+        numbers, message_counts = np.unique(self.locations["channel"], return_counts=True)
+        counts = dict(zip(numbers.tolist(), message_counts.tolist()))
         for chunk in self.chunks:
             for channel, count in chunk.counts.items():
                 counts[channel] = counts.get(channel, 0) + count

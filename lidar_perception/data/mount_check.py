@@ -114,14 +114,14 @@ def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.nd
 def _find_lowest_points(xyz: np.ndarray) -> np.ndarray:
     """Return the lowest points (K, 3) of the cells around the sensor."""
     square = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
-    near = xyz.compress((square >= MIN_RANGE_M**2) & (square <= MAX_RANGE_M**2), axis=0)
+    nearby = xyz.compress((square >= MIN_RANGE_M**2) & (square <= MAX_RANGE_M**2), axis=0)
     side = 2 * round(MAX_RANGE_M / CELL_M) + 1
-    column, row = np.floor((near[:, :2] + MAX_RANGE_M) / CELL_M).astype(np.int64).T
+    column, row = np.floor((nearby[:, :2] + MAX_RANGE_M) / CELL_M).astype(np.int64).T
     cell = row * side + column
-    low = np.full(side * side, np.inf, near.dtype)
-    np.minimum.at(low, cell, near[:, 2])
-    lowest = np.flatnonzero(near[:, 2] == low[cell])
-    return near[lowest[np.unique(cell[lowest], return_index=True)[1]]]
+    low = np.full(side * side, np.inf, nearby.dtype)
+    np.minimum.at(low, cell, nearby[:, 2])
+    lowest = np.flatnonzero(nearby[:, 2] == low[cell])
+    return nearby[lowest[np.unique(cell[lowest], return_index=True)[1]]]
 
 
 def _find_floors(clouds: Sequence[PointCloud], params: ThresholdParams = FLOOR_PLANE) -> np.ndarray:

@@ -157,18 +157,18 @@ def _select_split(recording: Recording, split: Path) -> Recording:
     first = next(iter(frames), "none")
     if not names:
         raise InputError(f"{split} is empty; it needs one frame per line, such as {first}")
-    chosen: dict[str, None] = {}
+    selected: dict[str, None] = {}
     unknown: list[str] = []
     for name in names:
-        found: Sequence[str] = [name] if name in frames else sequences.get(name, ())
-        chosen.update(dict.fromkeys(found))
-        unknown += [] if found else [name]
+        matches: Sequence[str] = [name] if name in frames else sequences.get(name, ())
+        selected.update(dict.fromkeys(matches))
+        unknown += [] if matches else [name]
     if unknown:
         raise InputError(
             f"{split} names {unknown[0]} ({len(unknown)} unknown), which is not in "
             f"{recording.path}; its first frame is {first}"
         )
-    return recording.select(list(chosen))
+    return recording.select(list(selected))
 
 
 def write_height(folder: Path, height: float) -> None:

@@ -56,26 +56,28 @@ def find_files(path: Path, metadata: Metadata) -> list[Path]:
         )
     for file in path.iterdir():
         check_regular(file)
-    found = list_storage_files(path)
+    existing = list_storage_files(path)
     if not (path / NAME).exists():
-        if len(found) == 1 or (found and _are_parts_of_one_bag(found)):
-            return found
+        if len(existing) == 1 or (existing and _are_parts_of_one_bag(existing)):
+            return existing
         raise InputError(
-            f"{path} is not a rosbag2 bag: it has no metadata.yaml and {len(found)} "
+            f"{path} is not a rosbag2 bag: it has no metadata.yaml and {len(existing)} "
             "storage files; run 'ros2 bag reindex' or give one .mcap file"
         )
     missing = [name for name in metadata.files if not (path / name).is_file()]
     if not missing and metadata.files:
         return [path / name for name in metadata.files]
-    if not found:
+    if not existing:
         raise InputError(
             f"the bag {path} is truncated or damaged: its metadata.yaml names "
             f"{', '.join(missing) or 'no file'}, and there is no storage file; copy "
             "the whole folder again"
         )
     if missing:
-        metadata.problems.append(f"it names {', '.join(missing)} instead of {', '.join(file.name for file in found)}")
-    return found
+        metadata.problems.append(
+            f"it names {', '.join(missing)} instead of {', '.join(file.name for file in existing)}"
+        )
+    return existing
 
 
 def open_file(path: Path, stack: ExitStack) -> StorageFile:

@@ -200,8 +200,8 @@ def _write_image(bag: BagWriter, image: Path, stamp_ns: int) -> None:
 def _write_pose(bag: BagWriter, pose: np.ndarray, stamp_ns: int, frame_id: str) -> None:
     if ODOMETRY not in bag.channels:
         bag.add_topic(ODOMETRY, "nav_msgs/msg/Odometry")
-    fixed = make_header(stamp_ns, ODOMETRY_FRAME, bag_message)
-    bag.write(ODOMETRY, stamp_ns, make_odometry(pose, fixed, frame_id, bag_message))
+    header = make_header(stamp_ns, ODOMETRY_FRAME, bag_message)
+    bag.write(ODOMETRY, stamp_ns, make_odometry(pose, header, frame_id, bag_message))
 
 
 def _write_calibration(bag: BagWriter, calibration: Calibration, stamp_ns: int, header) -> None:

@@ -84,33 +84,33 @@ class Stage:
     ) -> Stage:
         """Choose the settings for a video, given its first scan."""
         typical_range = np.percentile(horizontal_range(scan.xyz), FAR_PERCENTILE) if len(scan) else MIN_RANGE
-        reach = float(np.clip(typical_range, MIN_RANGE, MAX_RANGE_AHEAD if ahead else MAX_RANGE_AROUND))
-        return Stage(reach, ahead, -sensor_height, color, *size)
+        extent = float(np.clip(typical_range, MIN_RANGE, MAX_RANGE_AHEAD if ahead else MAX_RANGE_AROUND))
+        return Stage(extent, ahead, -sensor_height, color, *size)
 
     @property
     def views(self) -> tuple[Perspective, BirdsEye]:
         """Perspective view from behind the sensor, and bird's-eye view."""
-        reach, right_width = self.reach, round(self.width * BEV_SHARE)
+        extent, right_width = self.reach, round(self.width * BEV_SHARE)
         left_width = self.width - right_width
         if self.ahead:
             perspective = Perspective(
-                (-0.2 * reach, -0.045 * reach, 0.12 * reach),
-                (0.24 * reach, 0.01 * reach, self.ground),
+                (-0.2 * extent, -0.045 * extent, 0.12 * extent),
+                (0.24 * extent, 0.01 * extent, self.ground),
                 FOV,
                 left_width,
                 self.height,
-                POINT_SHARE * reach,
+                POINT_SHARE * extent,
             )
-            return perspective, BirdsEye((0.44 * reach, 0.0), self.height / (1.14 * reach), right_width, self.height)
+            return perspective, BirdsEye((0.44 * extent, 0.0), self.height / (1.14 * extent), right_width, self.height)
         perspective = Perspective(
-            (-0.5 * reach, -0.1 * reach, 0.4 * reach),
-            (0.02 * reach, 0.0, self.ground),
+            (-0.5 * extent, -0.1 * extent, 0.4 * extent),
+            (0.02 * extent, 0.0, self.ground),
             FOV,
             left_width,
             self.height,
-            POINT_SHARE * reach,
+            POINT_SHARE * extent,
         )
-        return perspective, BirdsEye((0.0, 0.0), self.height / (2.1 * reach), right_width, self.height)
+        return perspective, BirdsEye((0.0, 0.0), self.height / (2.1 * extent), right_width, self.height)
 
     @property
     def rings(self) -> np.ndarray:

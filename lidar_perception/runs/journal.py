@@ -121,8 +121,8 @@ def _read_records(folder: Path, plan: dict[str, Any]) -> dict[str, str]:
             )
         return {}
     try:
-        head, *record_lines = path.read_text(errors="replace").split("\n")
-        recorded_plan = json.loads(head)["plan"]
+        header, *record_lines = path.read_text(errors="replace").split("\n")
+        recorded_plan = json.loads(header)["plan"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"cannot read {path}: {error!r}; --force starts again") from None
     if differences := find_differences(recorded_plan, json.loads(json.dumps(plan))):

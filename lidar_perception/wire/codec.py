@@ -73,8 +73,8 @@ def decode(data: bytes, type_name: str) -> Any:
         raise InputError(f"{len(data)} bytes are not a valid {type_name} ({error})") from None
 
 
-def _make_zero(kind: tuple[Any, Any]) -> Any:
-    node, detail = kind
+def _make_zero(type_name: tuple[Any, Any]) -> Any:
+    node, detail = type_name
     if node == Nodetype.BASE:
         name = detail[0]
         return {"string": "", "bool": False}.get(name, 0.0 if name.startswith("float") else 0)

@@ -62,10 +62,10 @@ def candidates(options: ScoringOptions, png: Path | None, params: PipelineParams
     print_candidate_report(content, console)
     options.write(content)
     if png is not None:
-        _draw(png, recording, report, params)
+        _draw_most_crowded(png, recording, report, params)
 
 
-def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> None:
+def _draw_most_crowded(png: Path, recording: Any, report: Any, params: PipelineParams) -> None:
     """Draw the frame with most pedestrians among those with candidates."""
     from lidar_perception.candidates.pipeline import find_candidates
     from lidar_perception.candidates.seeds import load_seeds
@@ -75,21 +75,21 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
     from lidar_perception.scoring.centres.report import load_pedestrians, make_seed_source
     from lidar_perception.types import PointCloud
 
-    _, best = report.most_crowded
-    if best is None:
+    _, frame_name = report.most_crowded
+    if frame_name is None:
         return
     templates = None if params.seed.source == "ground_truth" else load_seeds(params.seed.file)
-    frame = next(frame for frame in recording if frame.name == best)
+    frame = next(frame for frame in recording if frame.name == frame_name)
     truth = load_pedestrians(frame, params.view.enabled)
     scan = frame.load()
-    segmented, found = find_candidates(scan, make_seed_source(truth, templates, params), frame.camera(), params)
+    segmented, candidates = find_candidates(scan, make_seed_source(truth, templates, params), frame.camera(), params)
     stage = Stage.of(scan, params.ground.sensor_pose.height, params.view.enabled)
     write_png(
         png,
         draw_frame(
             stage,
             PointCloud(segmented.xyz),
-            Boxes(found.final.boxes, found.final.class_ids),
+            Boxes(candidates.final.boxes, candidates.final.class_ids),
             truth,
             f"frame {frame.name}",
             colors=color_by_cluster(segmented.ground, segmented.cluster_ids),

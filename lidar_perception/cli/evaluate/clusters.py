@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import ScoringOptions, a_path, no_labels_error, scoring_options
+from lidar_perception.cli.data import ScoringOptions, no_labels_error, path_option, scoring_options
 from lidar_perception.cli.options import Runs, Settings, checked, settings_options
 from lidar_perception.detectors.open import POINTNET, default_params, resolve_weights
 from lidar_perception.detectors.pointnet.weights_file import WEIGHTS
@@ -17,17 +17,17 @@ from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
 
 
-def _file(weights: Path | None) -> Path:
+def _find_checkpoint(weights: Path | None) -> Path:
     """Return the checkpoint of --weights; InputError if it is not one of PointNet."""
-    kind, path = (POINTNET, None) if weights is None else resolve_weights(weights)
-    if kind != POINTNET:
-        raise InputError(f"{weights} is a detector {kind}; give a checkpoint of {POINTNET}")
+    network, path = (POINTNET, None) if weights is None else resolve_weights(weights)
+    if network != POINTNET:
+        raise InputError(f"{weights} is a detector {network}; give a checkpoint of {POINTNET}")
     return path or WEIGHTS
 
 
-def _runs(weights: Path | None) -> Runs:
+def _make_runs(weights: Path | None) -> Runs:
     """Return ground and clustering with the parameters that the network was trained with."""
-    fields = collect_fields(default_params(_file(weights)))
+    fields = collect_fields(default_params(_find_checkpoint(weights)))
     return Runs(
         "ground and clustering",
         {name: f for name, f in fields.items() if name.startswith(("ground.", "clustering."))},
@@ -37,8 +37,8 @@ def _runs(weights: Path | None) -> Runs:
 
 @click.command(cls=Command)
 @scoring_options()
-@a_path("--weights", "Checkpoint of PointNet. Default: the shipped one.")
-@settings_options(lambda given: [_runs(given.get("weights"))], "clustering.density=0")
+@path_option("--weights", "Checkpoint of PointNet. Default: the shipped one.")
+@settings_options(lambda given: [_make_runs(given.get("weights"))], "clustering.density=0")
 def clusters(options: ScoringOptions, weights: Path | None, settings: Settings) -> None:
     """Score the classes that PointNet assigns to clusters and points.
 
@@ -58,8 +58,8 @@ def clusters(options: ScoringOptions, weights: Path | None, settings: Settings) 
     from lidar_perception.scoring.points.cluster_tables import print_cluster_scores
     from lidar_perception.scoring.points.clusters import ClusterScores, measure_network
 
-    file = _file(weights)
-    (values,) = settings.values(_runs(weights)) if settings else [{}]
+    file = _find_checkpoint(weights)
+    (values,) = settings.values(_make_runs(weights)) if settings else [{}]
     checked(default_params(file), values)
     scores = ClusterScores(read_header(file, PointNetConfig).config.classes)
     recording = options.open_recording(BOXES)

@@ -9,13 +9,13 @@ from typing import Any
 
 import click
 
-from lidar_perception.cli.command import Command, refuse_given
+from lidar_perception.cli.command import Command, refuse_options
 from lidar_perception.cli.data import (
     ScoringOptions,
-    a_path,
     intervals_option,
     no_labels_error,
     out_folder,
+    path_option,
     scoring_options,
 )
 from lidar_perception.cli.options import detector_options
@@ -50,9 +50,9 @@ class DetectionRequest:
     def check(self) -> None:
         """Raise a UsageError or InputError for options that do not go together."""
         if not self.errors:
-            refuse_given(("errors_from",), "goes with --errors")
+            refuse_options(("errors_from",), "goes with --errors")
         if self.detector is None:
-            refuse_given(("min_score", "device"), "is for a detector that runs; --results DIR has its boxes already")
+            refuse_options(("min_score", "device"), "is for a detector that runs; --results DIR has its boxes already")
             if self.write_results is not None:
                 raise click.UsageError(
                     "--write-results writes the detections of a detector; --results DIR has its files already"
@@ -114,7 +114,7 @@ class DetectionRequest:
         return content
 
 
-def _print(content: dict[str, Any]) -> None:
+def _print_scores(content: dict[str, Any]) -> None:
     """Print the tables of the scores in `content`."""
     from lidar_perception.scoring.kitti.box_errors import print_box_errors
     from lidar_perception.scoring.kitti.reliability import print_reliability
@@ -130,7 +130,7 @@ def _print(content: dict[str, Any]) -> None:
 
 @click.command(cls=Command)
 @scoring_options()
-@a_path(
+@path_option(
     "--results",
     "Result files of any detector, in KITTI's format: DIR/000000.txt ...; "
     "or the folder that `detect --format kitti` wrote.",
@@ -206,5 +206,5 @@ def detection(options: ScoringOptions, **choices: Any) -> None:
         raise no_labels_error(recording, report.skipped)
     content = request.compute(report)
     if report.frames:
-        _print(content)
+        _print_scores(content)
     options.write(content)

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import ScoringOptions, a_path, no_labels_error, out_file, scoring_options
+from lidar_perception.cli.data import ScoringOptions, no_labels_error, out_file, path_option, scoring_options
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.detectors.params import MIN_SCORE
@@ -66,7 +66,7 @@ class NuscenesRequest:
 
 @click.command(cls=Command)
 @scoring_options()
-@a_path("--results", "Result file of any detector, in the format of nuScenes' detection task.", "JSON")
+@path_option("--results", "Result file of any detector, in the format of nuScenes' detection task.", "JSON")
 @detector_options(default=None)
 @out_file("--write-results", "Write the detections of --weights as a result file, also for frames without labels.")
 def nuscenes(options: ScoringOptions, **choices: Any) -> None:

@@ -82,14 +82,14 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
     return values
 
 
-def get_matrix(values: dict, path: Path, name: str, shape: tuple[int, ...], other: str = "") -> np.ndarray:
+def get_matrix(values: dict, path: Path, name: str, shape: tuple[int, ...], alternative: str = "") -> np.ndarray:
     """Return the matrix called `name`, else `other`. InputError if it is missing."""
-    found = values.get(name, values.get(other))
-    if found is None or found.size != np.prod(shape) or not np.isfinite(found).all():
+    matrix = values.get(name, values.get(alternative))
+    if matrix is None or matrix.size != np.prod(shape) or not np.isfinite(matrix).all():
         raise InputError(
             f"{path} has no {name} of {int(np.prod(shape))} finite numbers; download KITTI's calibration again"
         )
-    return found.reshape(shape)
+    return matrix.reshape(shape)
 
 
 def _make_pose(path: Path, rectify: np.ndarray, velodyne: np.ndarray) -> np.ndarray:
@@ -111,9 +111,9 @@ def check_pose(pose: np.ndarray, path: Path) -> np.ndarray:
 
 def to_homogeneous(matrix: np.ndarray) -> np.ndarray:
     """Extend a matrix (3, 3) or (3, 4) to (4, 4)."""
-    full = np.eye(4)
-    full[:3, : matrix.shape[1]] = matrix
-    return full
+    extended = np.eye(4)
+    extended[:3, : matrix.shape[1]] = matrix
+    return extended
 
 
 def _read_png_size(image: Path | None) -> tuple[int, int] | None:
@@ -125,5 +125,5 @@ def _read_png_size(image: Path | None) -> tuple[int, int] | None:
 
 
 def _guess_image_size(intrinsics: np.ndarray) -> tuple[int, int]:
-    focal = min(IMAGE_SIZES, key=lambda known: abs(known - intrinsics[0, 0]))
+    focal = min(IMAGE_SIZES, key=lambda length: abs(length - intrinsics[0, 0]))
     return IMAGE_SIZES[focal] if abs(focal - intrinsics[0, 0]) < 0.01 else (1242, 375)

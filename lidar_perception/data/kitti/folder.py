@@ -93,7 +93,7 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
 
 
 def _find_missing_tracking_scans(folder: Path, frames: list[Frame]) -> list[tuple[str, str]]:
-    known = {(frame.sequence, frame.index) for frame in frames}
+    scan_keys = {(frame.sequence, frame.index) for frame in frames}
     missing = []
     for label in sorted(folder.glob("label_02/*.txt")):
         numbers = {
@@ -104,7 +104,7 @@ def _find_missing_tracking_scans(folder: Path, frames: list[Frame]) -> list[tupl
         missing += [
             (f"{label.stem}/{number:06}", f"frame {number} of {label}")
             for number in sorted(numbers)
-            if (label.stem, number) not in known
+            if (label.stem, number) not in scan_keys
         ]
     return missing
 

@@ -32,12 +32,12 @@ def to_results(detections: Detections, frame: Frame) -> GlobalBoxes:
         )
     class_id_by_ours = np.array([NAMES.index(NAME_BY_CLASS[name]) if name in NAME_BY_CLASS else -1 for name in CLASSES])
     class_ids = class_id_by_ours[detections.class_ids]
-    chosen = np.flatnonzero(class_ids >= 0)
-    chosen = chosen[np.argsort(-detections.scores[chosen], kind="stable")][:MAX_BOXES]
+    selected = np.flatnonzero(class_ids >= 0)
+    selected = selected[np.argsort(-detections.scores[selected], kind="stable")][:MAX_BOXES]
     return GlobalBoxes.of(
-        *to_global_boxes(detections.boxes[chosen], frame.native.pose),
-        class_ids[chosen],
-        scores=detections.scores[chosen],
+        *to_global_boxes(detections.boxes[selected], frame.native.pose),
+        class_ids[selected],
+        scores=detections.scores[selected],
     )
 
 
