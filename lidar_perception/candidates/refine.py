@@ -81,14 +81,17 @@ def refine_clusters(
     t2 = perf_counter()
     ranges = np.hypot(boxes[:, 0], boxes[:, 1])
     scales = compute_cpa_scales(ranges, params.cpa)
-    augmented = np.flatnonzero((scales < 1.0).any(axis=1))
+    augmented_indices = np.flatnonzero((scales < 1.0).any(axis=1))
     cpa_scores = stm_scores.copy()
-    if len(augmented):
+    if len(augmented_indices):
         images = draw_silhouettes(
-            *group_points(xyz, labels, kept_indices[augmented] + 1), scales[augmented], floors[augmented], params
+            *group_points(xyz, labels, kept_indices[augmented_indices] + 1),
+            scales[augmented_indices],
+            floors[augmented_indices],
+            params,
         )
         for scores, template in zip(cpa_scores, templates):
-            scores[augmented] = compute_similarity(images, template, params.stm)
+            scores[augmented_indices] = compute_similarity(images, template, params.stm)
     t3 = perf_counter()
     threshold = params.stm.threshold
     if params.confidence.enabled:

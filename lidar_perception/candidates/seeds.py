@@ -65,8 +65,8 @@ def find_seed_cluster(seed: Seed, xyz: np.ndarray, start: np.ndarray) -> np.ndar
         np.ascontiguousarray(xyz, np.float32).view(row_type).ravel(),
         np.ascontiguousarray(seed.xyz, np.float32).view(row_type).ravel(),
     )
-    shared = np.diff(np.concatenate([[0], np.cumsum(is_seed_point)])[start])
-    return 2 * shared >= len(seed.xyz)
+    shared_counts = np.diff(np.concatenate([[0], np.cumsum(is_seed_point)])[start])
+    return 2 * shared_counts >= len(seed.xyz)
 
 
 def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray) -> Seed:
@@ -156,10 +156,10 @@ def load_seed(path: str | Path = "") -> Seed:
     Raises:
         InputError: The file is not a valid template; the message names the file and the error.
     """
-    packaged = files("lidar_perception.candidates") / "pedestrian.json"
-    source = path or packaged
+    shipped_file = files("lidar_perception.candidates") / "pedestrian.json"
+    source = path or shipped_file
     try:
-        content = json.loads(read_text(path, MAX_TEMPLATE_BYTES) if path else packaged.read_text())
+        content = json.loads(read_text(path, MAX_TEMPLATE_BYTES) if path else shipped_file.read_text())
         with np.errstate(over="ignore"):  # values beyond float32 become inf
             xyz = np.array(content["points_m"], np.float32)
         floor, height = float(content["floor_m"]), float(content["height_m"])

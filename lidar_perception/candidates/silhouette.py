@@ -92,8 +92,8 @@ def compute_similarity(images: np.ndarray, template: np.ndarray, params: StmPara
     norm = np.sqrt(count_pixels(images) * count_pixels(templates).astype(float))
     shared = count_pixels(images & templates)
     for columns in range(1, params.shifts + 1):
-        for shifted in (images << np.uint32(columns), images >> np.uint32(columns)):
-            shared = np.maximum(shared, count_pixels(shifted & templates))
+        for shifted_images in (images << np.uint32(columns), images >> np.uint32(columns)):
+            shared = np.maximum(shared, count_pixels(shifted_images & templates))
     return np.divide(shared, norm, out=np.zeros(len(images)), where=norm > 0)
 
 
@@ -212,18 +212,18 @@ def _find_principal_axes(points, centre):
 @njit(cache=True)
 def _dilate(rows):
     """Dilate with 3 x 3; pixels outside the window are treated as not set."""
-    widened = (rows | (rows << ONE) | (rows >> ONE)) & FULL_ROW
-    dilated = widened.copy()
-    dilated[1:] |= widened[:-1]
-    dilated[:-1] |= widened[1:]
-    return dilated
+    widened_rows = (rows | (rows << ONE) | (rows >> ONE)) & FULL_ROW
+    result = widened_rows.copy()
+    result[1:] |= widened_rows[:-1]
+    result[:-1] |= widened_rows[1:]
+    return result
 
 
 @njit(cache=True)
 def _erode(rows):
     """Erode with 3 x 3; pixels outside the window are treated as set, so the border is kept."""
-    narrowed = rows & ((rows << ONE) | ONE) & ((rows >> ONE) | (ONE << LAST_COLUMN))
-    eroded = narrowed.copy()
-    eroded[1:] &= narrowed[:-1]
-    eroded[:-1] &= narrowed[1:]
-    return eroded
+    narrowed_rows = rows & ((rows << ONE) | ONE) & ((rows >> ONE) | (ONE << LAST_COLUMN))
+    result = narrowed_rows.copy()
+    result[1:] &= narrowed_rows[:-1]
+    result[:-1] &= narrowed_rows[1:]
+    return result

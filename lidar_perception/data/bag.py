@@ -139,7 +139,7 @@ class BagWriter:
         )
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Append a message: an object of bag_message, or CDR bytes."""
+        """Append a message: an object of make_bag_message, or CDR bytes."""
         channel = self.channels[topic]
         raw = message if isinstance(message, bytes) else encode(message)
         with self._name_write_error():

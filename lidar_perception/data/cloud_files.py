@@ -16,7 +16,7 @@ from lidar_perception.data.recorded_scale import make_scale_reader
 from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import check_regular, shorten_error
 from lidar_perception.types import MAX_RANGE, InputError, PointCloud
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import read_raw_intensity, to_point_cloud
 from msg_utils.point_cloud2 import from_array, read_xyz
 from msg_utils.stamps import make_header
@@ -78,7 +78,7 @@ def to_message(file: Path, stamp_ns: int = 0, frame_id: str = "") -> Any:
         for name in points.dtype.names or ()
     ]
     try:
-        return from_array(points.astype(fields), make_header(stamp_ns, frame_id, bag_message), bag_message)
+        return from_array(points.astype(fields), make_header(stamp_ns, frame_id, make_bag_message), make_bag_message)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
 

@@ -18,7 +18,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import find_layout, open_recording, split_topic
 from lidar_perception.data.to_bag import to_point_array
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.topics import LIDAR_FRAME
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
@@ -98,8 +98,8 @@ def _open_files(path: Path, files: list[Path]) -> RawClouds:
 
 def _to_message(frame: Frame) -> Any:
     scan = frame.load()
-    header = make_header(scan.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
-    return from_array(to_point_array(scan), header, bag_message)
+    header = make_header(scan.stamp_ns, scan.frame_id or LIDAR_FRAME, make_bag_message)
+    return from_array(to_point_array(scan), header, make_bag_message)
 
 
 def choose_clouds(count: int, wanted: int) -> list[int]:

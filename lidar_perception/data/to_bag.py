@@ -12,7 +12,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import LATCHED_QOS, BagWriter
 from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.types import GroundTruth, InputError, PointCloud
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_camera_info, make_extrinsics, make_odometry, make_truth_markers
 from lidar_perception.wire.topics import (
     CAMERA_FRAME,
@@ -125,7 +125,7 @@ class FrameWriter:
             raise InputError(
                 f"{frame.name}: another labelled scan has the same stamp, so labels could not be assigned to scans"
             )
-        header = make_header(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
+        header = make_header(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, make_bag_message)
         image = frame.image if self.images and frame.image and frame.image.exists() else None
         return FrameContent(
             header,
@@ -147,7 +147,7 @@ class FrameWriter:
             _write_pose(bag, pose, stamp_ns, header.frame_id)
         if truth is not None:
             self._labelled_stamps.add(stamp_ns)
-            markers = make_truth_markers(truth, header, bag_message, self._marker_keys)
+            markers = make_truth_markers(truth, header, make_bag_message, self._marker_keys)
             self._marker_keys = list_marker_keys(markers)
             bag.write(TRUTH, stamp_ns, markers)
             if self.detections_3d:
@@ -155,7 +155,7 @@ class FrameWriter:
         if image is not None:
             _write_image(bag, image, stamp_ns)
         if points is not None:
-            bag.write(POINTS, stamp_ns, from_array(points, header, bag_message))
+            bag.write(POINTS, stamp_ns, from_array(points, header, make_bag_message))
 
 
 def to_point_array(scan: PointCloud, labels: PointTruth | None = None) -> np.ndarray:
@@ -181,7 +181,7 @@ def _make_detections(markers: Any, header: Any) -> Any:
         objects.labels,
         objects.scores.tolist(),
         header=header,
-        make=bag_message,
+        make=make_bag_message,
         ids=tracks if numbered else None,
     )
 
@@ -189,24 +189,26 @@ def _make_detections(markers: Any, header: Any) -> Any:
 def _write_image(bag: BagWriter, image: Path, stamp_ns: int) -> None:
     if IMAGE not in bag.channels:
         bag.add_topic(IMAGE, "sensor_msgs/msg/CompressedImage")
-    header = make_header(stamp_ns, CAMERA_FRAME, bag_message)
+    header = make_header(stamp_ns, CAMERA_FRAME, make_bag_message)
     bag.write(
         IMAGE,
         stamp_ns,
-        bag_message("sensor_msgs/msg/CompressedImage", header=header, format="png", data=np.fromfile(image, np.uint8)),
+        make_bag_message(
+            "sensor_msgs/msg/CompressedImage", header=header, format="png", data=np.fromfile(image, np.uint8)
+        ),
     )
 
 
 def _write_pose(bag: BagWriter, pose: np.ndarray, stamp_ns: int, frame_id: str) -> None:
     if ODOMETRY not in bag.channels:
         bag.add_topic(ODOMETRY, "nav_msgs/msg/Odometry")
-    header = make_header(stamp_ns, ODOMETRY_FRAME, bag_message)
-    bag.write(ODOMETRY, stamp_ns, make_odometry(pose, header, frame_id, bag_message))
+    header = make_header(stamp_ns, ODOMETRY_FRAME, make_bag_message)
+    bag.write(ODOMETRY, stamp_ns, make_odometry(pose, header, frame_id, make_bag_message))
 
 
 def _write_calibration(bag: BagWriter, calibration: Calibration, stamp_ns: int, header) -> None:
-    camera_header = make_header(stamp_ns, CAMERA_FRAME, bag_message)
-    transform = make_extrinsics(calibration, header, bag_message)
-    bag.write(CAMERA_INFO, stamp_ns, make_camera_info(calibration, camera_header, bag_message))
+    camera_header = make_header(stamp_ns, CAMERA_FRAME, make_bag_message)
+    transform = make_extrinsics(calibration, header, make_bag_message)
+    bag.write(CAMERA_INFO, stamp_ns, make_camera_info(calibration, camera_header, make_bag_message))
     bag.write(EXTRINSICS, stamp_ns, transform)
-    bag.write(TF_STATIC, stamp_ns, bag_message("tf2_msgs/msg/TFMessage", transforms=[transform]))
+    bag.write(TF_STATIC, stamp_ns, make_bag_message("tf2_msgs/msg/TFMessage", transforms=[transform]))

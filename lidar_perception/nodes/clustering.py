@@ -14,7 +14,7 @@ from lidar_perception.nodes.outputs import ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.params import BoxNodeParams, ClusteringNodeParams
 from lidar_perception.runs.compiling import lock_compilation
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import OUT_OF_RANGE, read_column, scatter_values, to_point_cloud
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
@@ -47,7 +47,7 @@ class Clustering(ManagedNode):
             column = read_column(msg, "ground", indices)
             ground = np.zeros(len(frame), bool) if column is None else column > 0
             ids = cluster_obstacles(frame.xyz, ground, self.params.clustering)
-            self.points.publish(add_columns(msg, bag_message, cluster_id=scatter_values(ids, indices, msg, "u4")))
+            self.points.publish(add_columns(msg, make_bag_message, cluster_id=scatter_values(ids, indices, msg, "u4")))
         self.boxes.publish(msg.header, lambda: fit_grounded_boxes(frame.xyz, ground, ids, self.params.boxes))
         self.counts["clusters"] = int(ids.max(initial=0))
         if column is None:

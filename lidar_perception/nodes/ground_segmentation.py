@@ -20,7 +20,7 @@ from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import GroundExtraParams, GroundNodeParams
 from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.types import PointCloud
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import IN_VIEW, OUT_OF_RANGE, scatter_values
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
 from msg_utils.stamps import to_ns
@@ -64,7 +64,7 @@ class GroundSegmentation(ManagedNode):
             in_view = scatter_values(OUT_OF_RANGE, visible, msg, "u1")
             in_view[indices] = IN_VIEW
             self.points.publish(
-                add_columns(msg, bag_message, ground=scatter_values(ground, indices, msg, "u1"), in_view=in_view)
+                add_columns(msg, make_bag_message, ground=scatter_values(ground, indices, msg, "u1"), in_view=in_view)
             )
         self._publish_parts(msg, visible_frame, visible, params, ground if self.node_params.range == "all" else None)
         plane = fit_plane(segmented.xyz.compress(ground, axis=0))
@@ -96,5 +96,5 @@ class GroundSegmentation(ManagedNode):
             ground = segment_ground(frame, params.ground)
         for publisher, chosen in ((self.ground, ground), (self.nonground, ~ground)):
             if publisher.get_subscription_count():
-                publisher.publish(from_array(to_array(msg).take(indices[chosen]), msg.header, bag_message))
+                publisher.publish(from_array(to_array(msg).take(indices[chosen]), msg.header, make_bag_message))
         self.obstacles.publish(msg, frame.xyz, ground, indices)

@@ -17,7 +17,7 @@ from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, fi
 from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.array_codec import encode_detection_array
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_detection_rows, make_xyz_cloud
 from msg_utils.markers import MarkerRows, list_marker_keys, make_marker_rows
 from msg_utils.messages import load_message_class
@@ -32,7 +32,7 @@ def to_output_frame(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[An
     """
     placement = node.transforms.find_placement(header)
     if placement.frame_id != header.frame_id:
-        header = make_header(to_ns(header.stamp), placement.frame_id, bag_message)
+        header = make_header(to_ns(header.stamp), placement.frame_id, make_bag_message)
     return header, boxes if placement.out is None else transform_boxes(boxes, placement.out)
 
 
@@ -88,7 +88,10 @@ class Obstacles:
             chosen = find_obstacles(xyz, ground, self.node.node_params.obstacles, params.ground.sensor_pose)
             self.publisher.publish(
                 make_xyz_cloud(
-                    msg, placement.to_cloud_frame(xyz.compress(chosen, axis=0)), indices.compress(chosen), bag_message
+                    msg,
+                    placement.to_cloud_frame(xyz.compress(chosen, axis=0)),
+                    indices.compress(chosen),
+                    make_bag_message,
                 )
             )
 

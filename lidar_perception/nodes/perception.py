@@ -16,7 +16,7 @@ from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import PerceptionExtraParams
 from lidar_perception.runs.compiling import lock_compilation
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import scatter_values
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
@@ -54,7 +54,7 @@ class Perception(ManagedNode):
             self.points.publish(
                 add_columns(
                     msg,
-                    bag_message,
+                    make_bag_message,
                     ground=scatter_values(segmented.ground, indices, msg, "u1"),
                     in_view=scatter_values(1, indices, msg, "u1"),
                     cluster_id=scatter_values(segmented.cluster_ids, indices, msg, "u4"),

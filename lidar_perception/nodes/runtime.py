@@ -31,7 +31,7 @@ from lidar_perception.nodes.rclpy_compat import UnknownParameterError, parameter
 from lidar_perception.nodes.reception import Problem, Reception
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.types import InputError, closest_name
-from lidar_perception.wire.codec import bag_message, decode, encode, load_typestore
+from lidar_perception.wire.codec import decode, encode, load_typestore, make_bag_message
 from msg_utils.messages import load_message_class
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -388,4 +388,4 @@ def _mask_numbers(message: str) -> str:
 def _warm_up_type(type_name: str) -> None:
     """Let rosbags generate its code for a type before the first message arrives."""
     if type_name in load_typestore().fielddefs:
-        decode(encode(bag_message(type_name)), type_name)
+        decode(encode(make_bag_message(type_name)), type_name)

@@ -23,7 +23,7 @@ from lidar_perception.robot.placement import Placement, find_level_transform, ma
 from lidar_perception.robot.poses import invert_pose
 from lidar_perception.robot.transform_tree import MissingTransform, TransformTree
 from lidar_perception.types import InputError, PointCloud
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.point_times import deskew_points, read_point_times, replace_points
 from lidar_perception.wire.topics import TF, TF_STATIC
@@ -376,7 +376,7 @@ class Transforms:
         if result is None:
             return msg
         timed, moved, times = result
-        return replace_points(msg, bag_message, indices.take(timed), moved, times)
+        return replace_points(msg, make_bag_message, indices.take(timed), moved, times)
 
     # Diagnostics
 

@@ -65,9 +65,9 @@ class Perspective:
 
     def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         axes = self.axes
-        projected = xyz @ axes.astype(xyz.dtype) - (self.eye @ axes).astype(xyz.dtype)
-        depth = projected[..., 2]
-        pixels = projected[..., :2] / np.maximum(depth, NEAR)[..., None]
+        camera_points = xyz @ axes.astype(xyz.dtype) - (self.eye @ axes).astype(xyz.dtype)
+        depth = camera_points[..., 2]
+        pixels = camera_points[..., :2] / np.maximum(depth, NEAR)[..., None]
         pixels += np.array([self.width / 2, self.height / 2], xyz.dtype)
         return pixels, depth
 

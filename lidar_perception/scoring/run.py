@@ -217,14 +217,14 @@ def _measure_on_dask(
     with client:
         max_submitted = TASKS_PER_THREAD * sum(client.nthreads().values())
         not_submitted = iter(numbers)
-        submitted = distributed.as_completed(
+        futures = distributed.as_completed(
             client.map(measure_on_worker, [*islice(not_submitted, max_submitted)], pure=False), loop=client.loop
         )
         try:
-            for future in submitted:
+            for future in futures:
                 yield future.result()
                 for number in islice(not_submitted, 1):
-                    submitted.add(client.submit(measure_on_worker, number, pure=False))
+                    futures.add(client.submit(measure_on_worker, number, pure=False))
         except (distributed.KilledWorker, CommClosedError, CancelledError) as error:
             raise InputError(
                 f"the Dask cluster at {address} failed: {error}; finished frames are kept, and the same command resumes"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
 
@@ -33,4 +33,4 @@ def make_cloud_message(points: Any, stamp_ns: int = 1, frame_id: str = "lidar", 
     cloud = np.zeros(len(points), [(k, v.dtype, v.shape[1:]) for k, v in values.items()])
     for name, column in values.items():
         cloud[name] = column
-    return from_array(cloud, make_header(stamp_ns, frame_id, bag_message), bag_message)
+    return from_array(cloud, make_header(stamp_ns, frame_id, make_bag_message), make_bag_message)

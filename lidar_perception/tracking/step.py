@@ -100,7 +100,7 @@ def update(
             their heading.
         seconds: Time since the previous frame.
     """
-    updated = states.copy()
+    new_states = states.copy()
     kinds = KIND_IDS[states.class_ids[i]]
     noise = np.column_stack(
         [*[_collect_by_kind(params, "position")[kinds]] * 2, _collect_by_kind(params, "heading")[kinds]]
@@ -109,19 +109,19 @@ def update(
     if fixed:
         means, covariances = motion.constrain_to_heading(means, covariances, _collect_by_kind(params, "slip")[kinds])
     agreement = states.heading_agreement[i] * DECAY + scores * np.sign(np.cos(boxes[:, 6] - means[:, motion.HEADING]))
-    updated.means[i], updated.heading_agreement[i] = motion.flip_reversed_headings(
+    new_states.means[i], new_states.heading_agreement[i] = motion.flip_reversed_headings(
         means, agreement, MAX_REVERSE_SPEED[kinds] if fixed else np.full(len(i), np.inf)
     )
-    updated.covariances[i] = covariances
+    new_states.covariances[i] = covariances
     gain = states.height_variances[i] / (states.height_variances[i] + HEIGHT_NOISE**2)
-    updated.heights[i] += gain * (boxes[:, 2] - states.heights[i])
-    updated.height_variances[i] *= 1.0 - gain
+    new_states.heights[i] += gain * (boxes[:, 2] - states.heights[i])
+    new_states.height_variances[i] *= 1.0 - gain
     weight = scores / (states.size_weights[i] + scores)
-    updated.sizes[i] += weight[:, None] * (boxes[:, 3:6] - states.sizes[i])
-    updated.size_weights[i] = np.minimum(states.size_weights[i] + scores, MAX_SIZE_WEIGHT)
-    updated.moving[:] = compute_moving_probability(updated.means, updated.covariances, params.moving_speed)
-    _add_evidence(updated, i, class_ids, scores, params, seconds)
-    return updated
+    new_states.sizes[i] += weight[:, None] * (boxes[:, 3:6] - states.sizes[i])
+    new_states.size_weights[i] = np.minimum(states.size_weights[i] + scores, MAX_SIZE_WEIGHT)
+    new_states.moving[:] = compute_moving_probability(new_states.means, new_states.covariances, params.moving_speed)
+    _add_evidence(new_states, i, class_ids, scores, params, seconds)
+    return new_states
 
 
 def _add_evidence(

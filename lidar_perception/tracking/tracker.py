@@ -208,22 +208,24 @@ def _to_sensor_frame(states: States, ego: Ego, seen: np.ndarray, params: Trackin
     indices = np.flatnonzero(
         (scores >= params.report) & (seen | (to_probability(states.present) >= params.report_unseen))
     )
-    published, to_sensor = states.take(indices), np.linalg.inv(ego.pose)
+    published_states, to_sensor = states.take(indices), np.linalg.inv(ego.pose)
     cos, sin = (to_sensor[:2, 0] / max(np.hypot(*to_sensor[:2, 0]), 1e-9)).tolist()
     side = -1.0 if to_sensor[2, 2] < 0 else 1.0  # -1 for an upside-down sensor
-    covariances = motion.rotate_covariances(published.covariances, cos, sin, side)
-    velocities = published.means[:, 2:4] @ np.array([[cos, sin], [-side * sin, side * cos]])
-    detections = Detections.of(transform_boxes(published.to_boxes(), to_sensor), published.class_ids, scores[indices])
+    covariances = motion.rotate_covariances(published_states.covariances, cos, sin, side)
+    velocities = published_states.means[:, 2:4] @ np.array([[cos, sin], [-side * sin, side * cos]])
+    detections = Detections.of(
+        transform_boxes(published_states.to_boxes(), to_sensor), published_states.class_ids, scores[indices]
+    )
     return Tracks(
-        published.ids,
+        published_states.ids,
         detections,
         velocities,
-        published.moving,
+        published_states.moving,
         covariances,
-        side * published.means[:, 5],
-        published.height_variances,
+        side * published_states.means[:, 5],
+        published_states.height_variances,
         seen[indices],
-        published.ages,
+        published_states.ages,
     )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import LIVOX_PACKAGES, bag_message, decode
+from lidar_perception.wire.codec import LIVOX_PACKAGES, decode, make_bag_message
 from lidar_perception.wire.compression import decompress
 from lidar_perception.wire.livox import decode_livox
 
@@ -115,7 +115,7 @@ def _decompress(msg: Any) -> Any:
         data = decompress(msg.compressed_data.tobytes(), compression, None)
     except Exception as error:  # zlib and zstandard raise their own types
         raise InputError(f"a {compression}-compressed cloud is damaged ({error})") from None
-    return bag_message(
+    return make_bag_message(
         POINT_CLOUD,
         data=np.frombuffer(data, np.uint8),
         **{

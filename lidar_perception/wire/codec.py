@@ -44,7 +44,7 @@ def load_typestore() -> Typestore:
     return store
 
 
-def bag_message(type_name: str, /, **fields: Any) -> Any:
+def make_bag_message(type_name: str, /, **fields: Any) -> Any:
     """Make a message of a rosbags class; fields that are not given are zero, empty or False."""
     names = {}
     for name, kind in load_typestore().fielddefs[type_name][1]:
@@ -79,7 +79,7 @@ def _make_zero(type_name: tuple[Any, Any]) -> Any:
         name = detail[0]
         return {"string": "", "bool": False}.get(name, 0.0 if name.startswith("float") else 0)
     if node == Nodetype.NAME:
-        return bag_message(detail)
+        return make_bag_message(detail)
     element, count = detail
     count = count if node == Nodetype.ARRAY else 0
     if element[0] == Nodetype.BASE and element[1][0] != "string":

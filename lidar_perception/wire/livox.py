@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import SECOND_NS, make_header
 
@@ -51,8 +51,8 @@ def decode_livox(data: bytes) -> Any:
             "itemsize": POINT_BYTES,
         }
     )
-    header = make_header(seconds * SECOND_NS + nanoseconds, frame_id, bag_message)
-    return from_array(np.frombuffer(points + b"\0", kind, count), header, bag_message)
+    header = make_header(seconds * SECOND_NS + nanoseconds, frame_id, make_bag_message)
+    return from_array(np.frombuffer(points + b"\0", kind, count), header, make_bag_message)
 
 
 def convert_livox_ros1_to_cdr(data: bytes) -> bytes:

@@ -27,7 +27,7 @@ from lidar_perception.data.to_bag import write_bag
 from lidar_perception.testing.bags import copy_bag
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.types import GroundTruth, InputError
-from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.codec import encode, make_bag_message
 from lidar_perception.wire.compression import decompress
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, IMAGE, POINTS, TRUTH
 from msg_utils.point_cloud2 import to_array
@@ -245,7 +245,7 @@ def test_files_of_a_split_bag_are_read_in_order_of_time(tmp_path, storage):
         with BagWriter(tmp_path / f"{name}_ours") as bag:
             bag.add_topic("/text", "std_msgs/msg/String")
             for stamp in stamps:
-                bag.write("/text", stamp, bag_message("std_msgs/msg/String", data=str(stamp)))
+                bag.write("/text", stamp, make_bag_message("std_msgs/msg/String", data=str(stamp)))
         parts.append(copy_bag(tmp_path / f"{name}_ours", tmp_path / name, storage))
     metadata = yaml.safe_load((parts[0] / "metadata.yaml").read_text())
     info = metadata["rosbag2_bagfile_information"]

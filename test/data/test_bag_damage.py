@@ -20,7 +20,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.testing.bags import copy_bag
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.topics import POINTS
 from msg_utils.point_cloud2 import from_array
 
@@ -254,7 +254,7 @@ def test_chunk_that_declares_terabytes_is_rejected(written, tmp_path):
 def test_bag_without_clouds_lists_its_topics(tmp_path):
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/text", "std_msgs/msg/String")
-        bag.write("/text", 1, bag_message("std_msgs/msg/String", data="hello"))
+        bag.write("/text", 1, make_bag_message("std_msgs/msg/String", data="hello"))
     with pytest.raises(InputError) as error:
         open_recording(tmp_path / "bag")
     for word in (str(tmp_path / "bag"), "no sensor_msgs/PointCloud2", "/text (std_msgs/msg/String)", "driver"):
@@ -266,7 +266,7 @@ def test_unusable_cloud_does_not_affect_others(tmp_path):
     write_bag(tmp_path / "bag", scans(1))
     with BagWriter(tmp_path / "mixed") as bag:
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
-        bag.write(POINTS, 1, from_array(cloud, header(bag_message, 1), bag_message))
+        bag.write(POINTS, 1, from_array(cloud, header(make_bag_message, 1), make_bag_message))
         for topic, _, data in message_bytes(tmp_path / "bag"):
             if topic == POINTS:
                 bag.write(POINTS, 2, data)

@@ -17,7 +17,7 @@ from lidar_perception.data.frame import CAMERA, Frame, split_drives
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import to_point_array, write_bag
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_truth_markers
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
 from msg_utils.point_cloud2 import from_array
@@ -135,10 +135,10 @@ def test_zero_stamps_are_replaced_only_if_all_are_zero(tmp_path, stamps, expecte
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")
         for i, stamp in enumerate(stamps):
-            head = header(bag_message, stamp)
+            head = header(make_bag_message, stamp)
             points = to_point_array(scans(1)[0].load())
-            bag.write(POINTS, 70 + i, from_array(points, head, bag_message))
-            bag.write(TRUTH, 70 + i, make_truth_markers(walker_truth(), head, bag_message))
+            bag.write(POINTS, 70 + i, from_array(points, head, make_bag_message))
+            bag.write(TRUTH, 70 + i, make_truth_markers(walker_truth(), head, make_bag_message))
     recording = open_recording(tmp_path / "bag")
     assert [frame.stamp_ns for frame in recording] == expected
     assert [frame.stamp_ns for frame in recording.frames[:]] == expected

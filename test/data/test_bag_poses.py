@@ -12,7 +12,7 @@ from lidar_perception.data.to_bag import write_bag
 from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.robot.poses import invert_pose
 from lidar_perception.testing.clouds import make_cloud_message
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_odometry
 from lidar_perception.wire.topics import ODOMETRY, TF, TF_STATIC
 from lidar_perception.wire.transforms import ODOMETRY_MESSAGE, TF_MESSAGE
@@ -101,7 +101,7 @@ def test_no_pose_is_guessed(tmp_path):
                 ODOMETRY_MESSAGE,
                 START - SECOND_NS,
                 make_odometry(
-                    base_at(START), make_header(START - SECOND_NS, "odom", bag_message), "lidar", bag_message
+                    base_at(START), make_header(START - SECOND_NS, "odom", make_bag_message), "lidar", make_bag_message
                 ),
             )
         ],
@@ -120,7 +120,7 @@ def test_no_pose_is_guessed(tmp_path):
     )
     assert POSES not in circle.has
     other = recorded(
-        tmp_path / "other", [(TF, "std_msgs/msg/String", START, bag_message("std_msgs/msg/String", data="text"))]
+        tmp_path / "other", [(TF, "std_msgs/msg/String", START, make_bag_message("std_msgs/msg/String", data="text"))]
     )
     assert POSES not in other.has
 

@@ -18,7 +18,7 @@ from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.open import open_recording
 from lidar_perception.testing.bags import copy_bag
 from lidar_perception.types import InputError, InputWarning
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.topics import EXTRINSICS, POINTS
 
 STATE = "my_robot_msgs/msg/State"
@@ -390,7 +390,7 @@ def write_parts(folder, stamps):
         with BagWriter(folder / f"part{i}") as bag:
             bag.add_topic("/text", "std_msgs/msg/String")
             for stamp in part:
-                bag.write("/text", stamp, bag_message("std_msgs/msg/String", data=str(stamp)))
+                bag.write("/text", stamp, make_bag_message("std_msgs/msg/String", data=str(stamp)))
         yield folder / f"part{i}"
 
 

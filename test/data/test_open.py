@@ -21,7 +21,7 @@ from lidar_perception.data.raw_clouds import open_clouds
 from lidar_perception.data.semantickitti import write_scan
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
 
@@ -103,8 +103,8 @@ def test_cloud_topic_of_a_bag_is_found_or_chosen(tmp_path):
                         STAMP + i,
                         from_array(
                             scene(i).astype("<f4").view([(n, "<f4") for n in "xyzi"]).ravel(),
-                            make_header(STAMP + i, "lidar", bag_message),
-                            bag_message,
+                            make_header(STAMP + i, "lidar", make_bag_message),
+                            make_bag_message,
                         ),
                     )
         return tmp_path / name

@@ -11,7 +11,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.pcd import decompress_lzf, read_pcd
 from lidar_perception.data.raw_clouds import choose_clouds, open_clouds
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.point_cloud2 import from_array, to_array
 from msg_utils.stamps import make_header
 
@@ -208,8 +208,8 @@ def write(path, topics, count=4):
             bag.add_topic(topic, "sensor_msgs/msg/PointCloud2")
         for i in range(count):
             for topic in topics:
-                header = make_header(i * 10**8, topic.strip("/"), bag_message)
-                message = from_array(make_bag_points(90 + i), header, bag_message)
+                header = make_header(i * 10**8, topic.strip("/"), make_bag_message)
+                message = from_array(make_bag_points(90 + i), header, make_bag_message)
                 bag.write(topic, i * 10**8, message)
 
 

@@ -14,7 +14,7 @@ from lidar_perception.data.levelling import SensorMount, level_frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import write_scan
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
 
@@ -128,8 +128,8 @@ def test_scale_depends_on_the_type_of_the_field(tmp_path, kind, values, full):
     with BagWriter(tmp_path / "drive") as writer:
         writer.add_topic("/points", "sensor_msgs/msg/PointCloud2")
         for i in (1, 2):
-            stamped = make_header(i * 10**8, "lidar", bag_message)
-            writer.write("/points", i * 10**8, from_array(points, stamped, bag_message))
+            stamped = make_header(i * 10**8, "lidar", make_bag_message)
+            writer.write("/points", i * 10**8, from_array(points, stamped, make_bag_message))
     expected = np.where(np.asarray(values, float) > 0, values, 0).astype(np.float32)
     for frame in open_recording(tmp_path / "drive"):
         assert np.array_equal(frame.load().intensity, expected / np.float32(full))

@@ -16,7 +16,7 @@ from time import monotonic, sleep
 
 from fuzz.case import FAILED, REFUSED, SURVIVED, Outcome
 from lidar_perception.candidates.warm_up import warm_up
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 
 
 def judge_command(code: int | None, out: str, errors: str) -> Outcome:
@@ -47,7 +47,7 @@ def load_all() -> None:
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             with suppress(ImportError):  # of an extra
                 importlib.import_module(module.name)
-    bag_message("sensor_msgs/msg/PointCloud2")
+    make_bag_message("sensor_msgs/msg/PointCloud2")
     warm_up()
 
 

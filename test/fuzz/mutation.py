@@ -13,7 +13,7 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from fuzz.case import pick
-from lidar_perception.wire.codec import bag_message, load_typestore
+from lidar_perception.wire.codec import load_typestore, make_bag_message
 
 INTEGERS = (0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
 FLOATS = (0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 1e-40, 1e38, -1e38, 1e308, 1e5, -1.0)
@@ -156,7 +156,7 @@ def _change_list(message: Any, name: str, element: tuple, rng: np.random.Generat
     items = list(getattr(message, name))
     kind = what = pick(rng, ("inside", "inside", "drop", "double", "new"))
     if kind == "new" or not items:
-        items.append("x" if element[0] == Nodetype.BASE else bag_message(element[1]))
+        items.append("x" if element[0] == Nodetype.BASE else make_bag_message(element[1]))
     elif kind == "inside" and element[0] == Nodetype.NAME:
         at = int(rng.integers(len(items)))
         what = f"[{at}].{mutate_message(items[at], rng)}"

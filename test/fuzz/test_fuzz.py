@@ -22,7 +22,7 @@ from fuzz.valid_messages import CLOUD, make_cloud, make_valid_message, mutate_va
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.external_node import create_context, shut_down_context
-from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.codec import encode, make_bag_message
 from msg_utils.point_cloud2 import add_columns, to_array
 
 COLUMNS = ("ground", "in_view", "cluster_id", "intensity")
@@ -96,7 +96,7 @@ def test_extreme_columns_cost_no_memory(nodes, name):
         for kind, largest in LARGEST.items():
             least, odd = -largest if kind[0] in "if" else 0, np.nan if kind[0] == "f" else 2
             for values in (np.where(turn < 7, largest, 0), np.choose(turn, [1, largest, least, odd, largest, 0, 1])):
-                data = encode(add_columns(plain, bag_message, **{column: values.astype(kind)}))
+                data = encode(add_columns(plain, make_bag_message, **{column: values.astype(kind)}))
                 before = read_memory_mb("VmRSS", reset=True)
                 outcome = node.attempt("input/points", data, params, False)
                 case = column, kind, values[:7].tolist(), outcome.reason

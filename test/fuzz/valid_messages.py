@@ -11,7 +11,7 @@ from fuzz.case import pick
 from fuzz.mutation import FLOATS, INTEGERS, mutate_message
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, GroundTruth
-from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import make_camera_info, make_extrinsics, make_truth_markers
 from msg_utils.point_cloud2 import CloudError, add_columns, from_array, to_array
 from msg_utils.stamps import make_header
@@ -63,7 +63,7 @@ def make_points(seed: int = 0, people: int = 3, ground: int = 500) -> np.ndarray
 
 def make_message_header() -> Any:
     """Return the header of all messages."""
-    return make_header(STAMP, "lidar", bag_message)
+    return make_header(STAMP, "lidar", make_bag_message)
 
 
 def make_cloud(kind: str = "columns") -> Any:
@@ -72,11 +72,11 @@ def make_cloud(kind: str = "columns") -> Any:
     points = np.zeros(len(xyz), np.dtype(LAYOUTS.get(kind, PLAIN)))
     for i, name in enumerate("xyz"):
         points[name] = xyz[:, i]
-    message = from_array(points, make_message_header(), bag_message, height=4 if kind == "rows" else 1)
+    message = from_array(points, make_message_header(), make_bag_message, height=4 if kind == "rows" else 1)
     if kind == "columns":
         body = (xyz[:, 2] > -SENSOR_HEIGHT + 0.05).astype("u1")
         ids = np.where(body, 1 + np.arange(len(xyz)) // 90, 0).astype("u4")
-        message = add_columns(message, bag_message, ground=1 - body, in_view=np.ones_like(body), cluster_id=ids)
+        message = add_columns(message, make_bag_message, ground=1 - body, in_view=np.ones_like(body), cluster_id=ids)
     return message
 
 
@@ -87,18 +87,22 @@ def make_valid_message(kind: str) -> bytes:
         return encode(make_cloud())
     if kind == "visualization_msgs/msg/MarkerArray":
         truth = GroundTruth.of([PERSON], [PEDESTRIAN], [{"track_id": 3}])
-        return encode(make_truth_markers(truth, make_message_header(), bag_message))
+        return encode(make_truth_markers(truth, make_message_header(), make_bag_message))
     if kind == "sensor_msgs/msg/CameraInfo":
-        return encode(make_camera_info(FORWARD_CAMERA, make_header(STAMP, "camera_optical", bag_message), bag_message))
+        return encode(
+            make_camera_info(FORWARD_CAMERA, make_header(STAMP, "camera_optical", make_bag_message), make_bag_message)
+        )
     if kind == "geometry_msgs/msg/TransformStamped":
-        return encode(make_extrinsics(FORWARD_CAMERA, make_message_header(), bag_message))
+        return encode(make_extrinsics(FORWARD_CAMERA, make_message_header(), make_bag_message))
     if kind == "geometry_msgs/msg/PointStamped":
         x, y, z = map(float, PERSON[:3])
         return encode(
-            bag_message(kind, header=make_message_header(), point=bag_message("geometry_msgs/msg/Point", x=x, y=y, z=z))
+            make_bag_message(
+                kind, header=make_message_header(), point=make_bag_message("geometry_msgs/msg/Point", x=x, y=y, z=z)
+            )
         )
     if kind == "nav_msgs/msg/Odometry":
-        message = bag_message(kind, header=make_message_header(), child_frame_id="lidar")
+        message = make_bag_message(kind, header=make_message_header(), child_frame_id="lidar")
         message.pose.pose.orientation.w = 1.0
         return encode(message)
     raise LookupError(f"there is no valid message of type {kind}")
@@ -157,7 +161,7 @@ def _add_column(message: Any, rng: np.random.Generator) -> str:
         values = np.where(rng.random(count) < 0.01, float(pick(rng, INTEGERS)), 0.0)
     with np.errstate(invalid="ignore", over="ignore"):
         column = values.astype(kind)
-    changed = add_columns(message, bag_message, **{name: column})
+    changed = add_columns(message, make_bag_message, **{name: column})
     for field in ("fields", "point_step", "row_step", "data"):
         setattr(message, field, getattr(changed, field))
     return f"{name} as {kind}, {how}"

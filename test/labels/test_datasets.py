@@ -27,7 +27,7 @@ from lidar_perception.simulation.recording import simulate_frames
 from lidar_perception.simulation.sensor import make_generic_sensor
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.types import SENSOR_HEIGHT, Detections, GroundTruth, InputError, PointCloud
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_detection_markers
 from lidar_perception.wire.topics import ODOMETRY, POINTS
 from lidar_studio import results
@@ -207,8 +207,8 @@ def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
         expected = []
         for i, frame in enumerate(frames):
             found = Detections.of(rng.uniform(1, 9, (i, 7)) / [1, 1, 1, 1, 1, 1, 3], 0, 0.5)
-            header = make_header(frame.stamp_ns, "velodyne", bag_message)
-            bag.write("/found", frame.stamp_ns, make_detection_markers(found, header, bag_message))
+            header = make_header(frame.stamp_ns, "velodyne", make_bag_message)
+            bag.write("/found", frame.stamp_ns, make_detection_markers(found, header, make_bag_message))
             bag.write(
                 "/tracks",
                 frame.stamp_ns,
@@ -217,7 +217,7 @@ def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
                     ["tree"] * i,
                     found.scores.tolist(),
                     header=header,
-                    make=bag_message,
+                    make=make_bag_message,
                     ids=[100 + k for k in range(i)],
                 ),
             )
@@ -240,7 +240,7 @@ def test_boxes_are_transformed_to_the_frame_of_the_clouds(parts, tmp_path):
     rows = []
     for stamp in stamps():
         marked = to_marker_array(
-            boxes, ["Car"], ids=[1], make=bag_message, header=make_header(stamp, "odom", bag_message)
+            boxes, ["Car"], ids=[1], make=make_bag_message, header=make_header(stamp, "odom", make_bag_message)
         )
         rows += [(topic, MARKERS, stamp, marked) for topic in ("/n/output/detections", "/n/output/tracks")]
     recording = recorded(tmp_path / "bag", *map(list, parts), rows)

@@ -81,7 +81,7 @@ def test_from_marker_array_inverts_to_marker_array(make, rows, remarks):
 
 @given(rows=objects, remarks=notes)
 def test_markers_survive_the_wire(rows, remarks):
-    sent = array(codec.bag_message, rows, scores=[r[2] for r in rows], extras=[r[3] for r in rows], notes=remarks)
+    sent = array(codec.make_bag_message, rows, scores=[r[2] for r in rows], extras=[r[3] for r in rows], notes=remarks)
     raw = codec.encode(sent)
     read = codec.decode(raw, "visualization_msgs/msg/MarkerArray")
     assert codec.encode(read) == raw
@@ -201,8 +201,8 @@ def test_from_detection_array_inverts_to_detection_array(rows):
         np.array([r[0] for r in rows]),
         [r[1] for r in rows],
         [r[2] for r in rows],
-        header=header(codec.bag_message),
-        make=codec.bag_message,
+        header=header(codec.make_bag_message),
+        make=codec.make_bag_message,
     )
     for read in (msg, codec.decode(codec.encode(msg), "vision_msgs/msg/Detection3DArray")):
         got = from_detection_array(read)
@@ -217,7 +217,7 @@ def test_from_detection_array_inverts_to_detection_array(rows):
 
 def test_a_detection_is_of_its_most_likely_class():
     msg = to_detection_array(
-        np.ones((2, 7)), ["Car", "Van"], [0.3, 0.5], header=header(codec.bag_message), make=codec.bag_message
+        np.ones((2, 7)), ["Car", "Van"], [0.3, 0.5], header=header(codec.make_bag_message), make=codec.make_bag_message
     )
     msg.detections[0].results.extend(msg.detections[1].results)
     msg.detections[1].results.clear()

@@ -17,7 +17,7 @@ from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placement import find_level_transform, make_tilted_pose
 from lidar_perception.robot.poses import invert_pose, transform_points
 from lidar_perception.types import PointCloud
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import to_point_cloud
 from msg_utils.point_cloud2 import from_array
 
@@ -124,7 +124,7 @@ def test_cropped_message_has_points_of_cropped_frame():
     for i, name in enumerate("xyz"):
         cloud[name] = make_points(300)[:, i]
     cloud["x"][::7] = np.nan
-    frame, usable = to_point_cloud(from_array(cloud, header(bag_message), bag_message))
+    frame, usable = to_point_cloud(from_array(cloud, header(make_bag_message), make_bag_message))
     kept, _ = crop_frame(frame, CROP)
     finite = np.isfinite(cloud["x"])
     np.testing.assert_array_equal(usable.take(kept), np.flatnonzero(finite & select_points(make_points(300), CROP)))

@@ -12,7 +12,7 @@ from ros_samples import BAD, CLOUD, MARKERS, QUIET, big_endian, cloud
 from lidar_perception.data.open import open_recording
 from lidar_perception.scoring.centres.report import select_pedestrians
 from lidar_perception.testing.detections import assert_detections
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import to_point_cloud
 from msg_utils.markers import from_marker_array
 from msg_utils.point_cloud2 import to_array
@@ -160,10 +160,10 @@ def test_diagnostics_report_missing_camera_and_seed(send, peer, good_cloud, driv
         people = select_pedestrians(next(iter(open_recording(drive_bag))).truth())
         nearest = people[np.argmin(np.hypot(people[:, 0], people[:, 1]))]
         click = peer.advertise("/clicked_point", "geometry_msgs/msg/PointStamped")
-        point = bag_message("geometry_msgs/msg/Point", x=nearest[0], y=nearest[1], z=nearest[2])
+        point = make_bag_message("geometry_msgs/msg/Point", x=nearest[0], y=nearest[1], z=nearest[2])
         for frame_id, words in (("map", "frame 'map'"), ("velodyne", "detecting")):
-            clicked = bag_message(
-                "geometry_msgs/msg/PointStamped", point=point, header=make_header(0, frame_id, bag_message)
+            clicked = make_bag_message(
+                "geometry_msgs/msg/PointStamped", point=point, header=make_header(0, frame_id, make_bag_message)
             )
             peer.send(click, clicked, click.get_subscription_count, "a subscriber of the click")
             is_reported(words)

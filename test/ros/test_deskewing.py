@@ -11,7 +11,7 @@ from robot_messages import PERIOD, START, give, message, mount_pose, odometry, p
 
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.robot.deskew import make_constant_motion, skew
-from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import read_column, to_point_cloud
 from msg_utils.point_cloud2 import to_array
 from msg_utils.stamps import make_time
@@ -82,7 +82,7 @@ def test_cloud_of_moving_sensor_is_compensated(start, source):
     )
     give(node, message(raw, START + PERIOD))
     assert "no time column" in problems(node) and len(node.sent["points"]) == 3
-    assert make_time(START, bag_message).sec == after.header.stamp.sec and len(frame_)
+    assert make_time(START, make_bag_message).sec == after.header.stamp.sec and len(frame_)
 
 
 def test_first_cloud_waits_for_odometry_of_its_whole_turn(start):

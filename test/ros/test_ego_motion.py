@@ -23,7 +23,7 @@ from lidar_perception.robot.transform_tree import MissingTransform
 from lidar_perception.tracking.ego import has_odometry
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, Detections
-from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import make_detection_markers, to_class_ids
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import make_header
@@ -36,7 +36,7 @@ def base_at(i):
 
 
 def header(stamp, frame_id="lidar"):
-    return make_header(stamp, frame_id, bag_message)
+    return make_header(stamp, frame_id, make_bag_message)
 
 
 def tracked(node):
@@ -53,7 +53,7 @@ def drive(node, tell, poses, frame_id="lidar"):
         stamp = START + i * TENTH
         tell(i, stamp)
         seen = Detections.of(transform_boxes(found.boxes, invert_pose(at)), found.class_ids, found.scores)
-        node.on_markers(make_detection_markers(seen, header(stamp, frame_id), bag_message))
+        node.on_markers(make_detection_markers(seen, header(stamp, frame_id), make_bag_message))
         tracks, shown = library(seen, stamp, at), tracked(node)
         assert shown.ids.tolist() == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
         np.testing.assert_allclose(shown.boxes, tracks.detections.boxes, atol=1e-4)
@@ -97,13 +97,13 @@ def test_missing_odometry_to_sensor_transform_is_reported(start):
     stamp = START + 10 * TENTH
     node.transforms.on_odometry(odometry(base_at(10), stamp))
     found = next(crowd())
-    node.on_markers(make_detection_markers(found, header(stamp), bag_message))
+    node.on_markers(make_detection_markers(found, header(stamp), make_bag_message))
     assert min(tracked(node).ids) > 6  # the poses are others from here on: all tracks ended
 
 
 def test_missing_transform_is_named(start):
     node = start(TrackerNode, **{"ego.source": "tf", "input.fixed_frame": "map"})
-    node.on_markers(make_detection_markers(next(crowd()), header(START), bag_message))
+    node.on_markers(make_detection_markers(next(crowd()), header(START), make_bag_message))
     assert "TF does not connect 'lidar' with 'map'" in node.state[1]
 
 
@@ -119,7 +119,9 @@ def test_auto_falls_back_to_scans_and_returns_to_poses(start, better):
         for i in range(first, first + count):
             if len(node._receptions()) > node_inputs:
                 give_to_points(message(xyz, START + i * TENTH))
-            found.deliver(encode(make_detection_markers(next(crowd()), header(START + i * TENTH), bag_message)), False)
+            found.deliver(
+                encode(make_detection_markers(next(crowd()), header(START + i * TENTH), make_bag_message)), False
+            )
 
     def give_to_points(cloud):
         points = next(r for r in node._receptions() if r.topic.endswith("/points"))
@@ -196,7 +198,7 @@ def test_stopped_or_foreign_clock_odometry_is_reported(start, monkeypatch):
 
     def report(seconds):
         stamp = header(START + round(seconds * 10 * TENTH))
-        found.deliver(encode(make_detection_markers(next(crowd()), stamp, bag_message)), False)
+        found.deliver(encode(make_detection_markers(next(crowd()), stamp, make_bag_message)), False)
         return node.state[1]
 
     node.transforms.on_odometry(odometry(base_at(0), START + 1000 * 10 * TENTH, "lidar"))
@@ -218,7 +220,7 @@ def test_source_that_is_always_late_is_named(start, source, lag):
             node.transforms.on_odometry(odometry(base_at(i), past, "lidar"))
         else:
             node.transforms.on_tf(transforms(("odom", "lidar", base_at(i), past)), static=False)
-        node.on_markers(make_detection_markers(next(crowd()), header(stamp), bag_message))
+        node.on_markers(make_detection_markers(next(crowd()), header(stamp), make_bag_message))
         assert f"{lag:.3f} s older than needed" in node.state[1]
     assert node.counts["ego"] == source
 
@@ -276,7 +278,7 @@ def test_scan_poses_are_converted_to_detection_frame(start):
 
 def test_foreign_class_names_are_mapped_or_reported(start):
     found = next(crowd())
-    there = make_detection_markers(found, header(START), bag_message)
+    there = make_detection_markers(found, header(START), make_bag_message)
     for marker in there.markers:
         marker.ns = {"Pedestrian": "person", "Car": "car", "Cyclist": "BICYCLE"}.get(marker.ns, marker.ns)
     node = start(TrackerNode)

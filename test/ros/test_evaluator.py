@@ -14,7 +14,7 @@ from tracking_samples import START, TENTH, crowd
 from lidar_perception.camera import Calibration
 from lidar_perception.nodes.replay.evaluator import MAX_INCOMPLETE_FRAMES, Evaluator
 from lidar_perception.types import CLASSES, Detections, InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_camera_info, make_detection_markers, make_extrinsics
 from lidar_perception.wire.topics import CAMERA_FRAME
 from msg_utils.stamps import make_header
@@ -22,7 +22,7 @@ from msg_utils.stamps import make_header
 
 def array(number, frame_id="lidar"):
     return make_detection_markers(
-        next(crowd()), make_header(START + number * TENTH, frame_id, bag_message), bag_message
+        next(crowd()), make_header(START + number * TENTH, frame_id, make_bag_message), make_bag_message
     )
 
 
@@ -95,8 +95,8 @@ def objects(stamp, cars=(), cyclists=(), pedestrians=()):
     boxes = np.array(rows, float).reshape(-1, 8)
     return make_detection_markers(
         Detections.of(boxes[:, :7], boxes[:, 7].astype(int), np.full(len(boxes), 0.9)),
-        make_header(stamp, "lidar", bag_message),
-        bag_message,
+        make_header(stamp, "lidar", make_bag_message),
+        make_bag_message,
     )
 
 
@@ -111,9 +111,9 @@ def test_all_classes_are_scored_and_precision_at_the_end(with_camera, start, tmp
             1200,
             370,
         )
-        header = make_header(0, CAMERA_FRAME, bag_message)
-        node.camera_info = make_camera_info(camera, header, bag_message)
-        node.extrinsics = make_extrinsics(camera, make_header(0, "lidar", bag_message), bag_message)
+        header = make_header(0, CAMERA_FRAME, make_bag_message)
+        node.camera_info = make_camera_info(camera, header, make_bag_message)
+        node.extrinsics = make_extrinsics(camera, make_header(0, "lidar", make_bag_message), make_bag_message)
     frames = [  # labels and detections
         (dict(cars=[20, -20], pedestrians=[10]), dict(cars=[20, -30], pedestrians=[10, 30])),
         (dict(cars=[15], cyclists=[12]), dict(cars=[15], pedestrians=[9])),

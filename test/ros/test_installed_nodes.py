@@ -16,7 +16,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.main import STOP_SIGNALS
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 
 PREFIX = Path(sys.prefix)
 STARTED_BY = {
@@ -90,7 +90,7 @@ def test_node_stops_cleanly_at_any_stage(how, node, stage, number, processes):
 
 @pytest.mark.parametrize("number", sorted(STOP_SIGNALS))
 def test_recorder_completes_its_bag(number, processes, peer, tmp_path):
-    bag, note = tmp_path / "bag", bag_message(NOTE)
+    bag, note = tmp_path / "bag", make_bag_message(NOTE)
     process, _ = start(
         processes, "ros2 run", "bag_recorder", "--ros-args", "-p", f"bag:={bag}", "-p", "topics:=[/note]"
     )

@@ -21,7 +21,7 @@ from lidar_perception.nodes.links import Links, Output
 from lidar_perception.nodes.runtime import LATCHED, RELIABLE
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.types import Detections
-from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import make_detection_rows
 from msg_utils.markers import MarkerRows, from_marker_array
 from msg_utils.messages import load_message_class
@@ -115,7 +115,7 @@ def test_link_ends_with_the_nodes_that_made_it(graph):
 def test_tracker_reads_the_same_objects_from_rows_and_from_cdr():
     rng = np.random.default_rng(0)
     found = Detections.of(rng.normal(0, 5, (20, 7)) ** 2, rng.integers(0, 3, 20), rng.random(20))
-    header = make_header(10**18 + 5, "velodyne", bag_message)
+    header = make_header(10**18 + 5, "velodyne", make_bag_message)
     for detections in (found, Detections.none()):
         rows = MarkerRows(make_detection_rows(detections, {("Car", 99)}), header)
         sent: list[bytes] = []

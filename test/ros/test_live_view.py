@@ -18,7 +18,7 @@ from robot_messages import mount_pose, transforms
 from lidar_perception.nodes.graph import SINGLE
 from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, has_tf
 from lidar_perception.robot.poses import transform_boxes
-from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.codec import encode, make_bag_message
 from lidar_perception.wire.messages import to_detections
 from lidar_perception.wire.transforms import TF_MESSAGE
 from msg_utils.markers import from_marker_array, to_marker_array
@@ -160,8 +160,8 @@ def test_boxes_in_another_frame_are_shown_where_tf_says(view, received, shared_p
                         transform_boxes(found.boxes, place),
                         found.labels,
                         found.scores,
-                        make=bag_message,
-                        header=make_header(found.stamp_ns, "base", bag_message),
+                        make=make_bag_message,
+                        header=make_header(found.stamp_ns, "base", make_bag_message),
                     )
                 )
             )

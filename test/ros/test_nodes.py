@@ -25,7 +25,7 @@ from lidar_perception.nodes.rclpy_compat import parameter_names
 from lidar_perception.nodes.runtime import ERROR, LATCHED, OK, WARN
 from lidar_perception.param_fields import collect_fields, flatten
 from lidar_perception.testing.clouds import make_cloud_message
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.markers import from_marker_array
 
 CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
@@ -196,7 +196,7 @@ def test_unused_inputs_change_nothing(perception, shared_peer, talker, good_clou
         ("/perception/input/extrinsics", "geometry_msgs/msg/TransformStamped"),
     ):
         other = peer.advertise(topic, kind, LATCHED)
-        peer.send(other, bag_message(kind), other.get_subscription_count, "a subscriber")
+        peer.send(other, make_bag_message(kind), other.get_subscription_count, "a subscriber")
     before = len(found)
     peer.send(talker, good_cloud, lambda: len(found) > before + 2, "more candidates")
     np.testing.assert_array_equal(from_marker_array(found[-1]).boxes, first.boxes)

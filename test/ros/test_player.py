@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
 from lidar_perception.nodes.runtime import LATCHED, WAITING
 from lidar_perception.wire.clouds import COMPRESSED, LIVOX
-from lidar_perception.wire.codec import bag_message, decode
+from lidar_perception.wire.codec import decode, make_bag_message
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
 from msg_utils.point_cloud2 import to_array
 from msg_utils.stamps import to_ns
@@ -37,9 +37,9 @@ def text_bag(tmp_path_factory):
     with BagWriter(path) as bag:
         bag.add_topic("/text", TEXT, SENSOR_QOS)
         bag.add_topic("/note", TEXT, LATCHED_QOS)
-        bag.write("/note", START, bag_message(TEXT, data="latched"))
+        bag.write("/note", START, make_bag_message(TEXT, data="latched"))
         for i in range(20):
-            bag.write("/text", START + i * STEP, bag_message(TEXT, data=str(i)))
+            bag.write("/text", START + i * STEP, make_bag_message(TEXT, data=str(i)))
     return path
 
 
@@ -102,10 +102,10 @@ def test_static_transforms_accumulate_others_keep_last(monkeypatch, start, tmp_p
         bag.add_topic("/tf_static", TEXT, LATCHED_QOS)
         bag.add_topic("/info", INFO, LATCHED_QOS)
         for i in range(20):
-            bag.write("/tf_static", START + i, bag_message(TEXT, data=str(i)))
-            bag.write("/info", START + i, bag_message(INFO, width=i))
+            bag.write("/tf_static", START + i, make_bag_message(TEXT, data=str(i)))
+            bag.write("/info", START + i, make_bag_message(INFO, width=i))
         bag.add_topic("/text", TEXT, SENSOR_QOS)
-        bag.write("/text", START + STEP, bag_message(TEXT))
+        bag.write("/text", START + STEP, make_bag_message(TEXT))
     player = start(bag_player.BagPlayer, bag=str(tmp_path / "bag"), start_offset=0.05)
     player._publish_latched()
     assert [decode(d, TEXT).data for d in player.sent["tf_static"]] == [*map(str, range(20))]
@@ -125,7 +125,7 @@ def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path)
             ("/livox", LIVOX[1], [livox_message(points)] * 2),
             ("/zlib", COMPRESSED, [compressed_message(plain, "zlib")]),
             ("/draco", COMPRESSED, [compressed_message(plain, "draco")] * 2),
-            ("/text", TEXT, [bag_message(TEXT, data="text")]),
+            ("/text", TEXT, [make_bag_message(TEXT, data="text")]),
         ):
             bag.add_topic(topic, kind)
             for message in messages:

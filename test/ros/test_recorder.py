@@ -12,14 +12,14 @@ from rclpy.clock import ClockType
 
 from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.runtime import LATCHED, RELIABLE, SENSOR_DATA
-from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.codec import encode, make_bag_message
 
 TEXT, INFO = "std_msgs/msg/String", "sensor_msgs/msg/CameraInfo"
 
 
 def test_the_recorder_has_what_each_of_several_publishers_latched(processes, peer, tmp_path):
     for i in range(6):  # as each node with a fixed sensor does on /tf_static
-        peer.advertise("/note", TEXT, LATCHED).publish(encode(bag_message(TEXT, data=str(i))))
+        peer.advertise("/note", TEXT, LATCHED).publish(encode(make_bag_message(TEXT, data=str(i))))
     processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["/note"]})
     peer.wait(lambda: peer.get_value("bag_recorder", "frames") == "6", "six messages")
     assert processes.stop()["bag_recorder"] == 0
@@ -35,9 +35,9 @@ def test_late_publisher_with_weaker_qos_is_recorded(processes, peer, tmp_path):
     def frames():
         return int(peer.get_value("robot/bag_recorder", "frames") or 0)
 
-    peer.send(first, bag_message(TEXT, data="first"), frames, "the first")
+    peer.send(first, make_bag_message(TEXT, data="first"), frames, "the first")
     before, later = frames(), peer.advertise("/robot/text", TEXT, SENSOR_DATA)
-    peer.send(later, bag_message(TEXT, data="later"), lambda: frames() > before, "the later one")
+    peer.send(later, make_bag_message(TEXT, data="later"), lambda: frames() > before, "the later one")
     assert processes.stop()["robot.bag_recorder"] == 0
     with Bag(tmp_path / "bag") as bag:
         assert {m.data for _, _, m in bag.messages({"/robot/text"})} == {"first", "later"}

@@ -16,7 +16,7 @@ from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.transforms import STATIC_QOS
 from lidar_perception.param_fields import with_values
-from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.codec import encode, make_bag_message
 from lidar_perception.wire.messages import read_column, to_detections, to_point_cloud
 from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import from_marker_array
@@ -90,10 +90,10 @@ def test_tilted_sensor_gets_its_mount_from_tf(processes, peer):
     at = (person + moved[:3, 3]).tolist()
     peer.send(
         click,
-        bag_message(
+        make_bag_message(
             "geometry_msgs/msg/PointStamped",
-            header=make_header(START, "odom", bag_message),
-            point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at))),
+            header=make_header(START, "odom", make_bag_message),
+            point=make_bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at))),
         ),
         click.get_subscription_count,
         "a subscriber of the click",

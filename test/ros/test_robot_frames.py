@@ -22,7 +22,7 @@ from lidar_perception.nodes.transforms import NO_TF
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.robot.poses import invert_pose, transform_points
-from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import to_detections
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import make_header
@@ -54,10 +54,10 @@ def test_candidates_of_tilted_and_level_sensor_are_equal(start, tilt):
         xyz, person = walker(base)
         at = transform_points(person[None], invert_pose(camera))[0].tolist()
         node.seed._on_click(
-            bag_message(
+            make_bag_message(
                 "geometry_msgs/msg/PointStamped",
-                header=make_header(START, "eye", bag_message),
-                point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at))),
+                header=make_header(START, "eye", make_bag_message),
+                point=make_bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at))),
             )
         )
         give(node, message(xyz))
@@ -77,10 +77,10 @@ def test_seed_bank_keeps_the_last_clicks_and_skips_a_bad_one(start):
     def click(*places):
         for place in places:
             node.seed._on_click(
-                bag_message(
+                make_bag_message(
                     "geometry_msgs/msg/PointStamped",
-                    header=make_header(START, "lidar", bag_message),
-                    point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", place))),
+                    header=make_header(START, "lidar", make_bag_message),
+                    point=make_bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", place))),
                 )
             )
         give(node, cloud)
@@ -177,10 +177,10 @@ def test_click_and_candidates_in_rotated_cloud(start):
     xyz, person = transform_points(walker_scene()[:, :3].astype(np.float64), turn), WALKER[:3]
     at = transform_points(np.array(person, np.float64)[None], turn)[0]
     node.seed._on_click(
-        bag_message(
+        make_bag_message(
             "geometry_msgs/msg/PointStamped",
-            header=make_header(START, "lidar", bag_message),
-            point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at.tolist()))),
+            header=make_header(START, "lidar", make_bag_message),
+            point=make_bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at.tolist()))),
         )
     )
     give(node, message(xyz))

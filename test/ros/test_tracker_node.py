@@ -24,7 +24,7 @@ from lidar_perception.testing.processes import NodesUnderTest
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
-from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import make_detection_markers, make_odometry, to_detections, to_truth
 from lidar_perception.wire.topics import CAMERA_INFO, ODOMETRY, POINTS, TRUTH
 from msg_utils.detections import to_detection_array
@@ -38,7 +38,7 @@ DELETEALL = 3
 
 
 def header(stamp, frame_id="lidar"):
-    return make_header(stamp, frame_id, bag_message)
+    return make_header(stamp, frame_id, make_bag_message)
 
 
 def poses_of(path):
@@ -183,13 +183,13 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     def frame(found, frame_id="lidar"):
         nonlocal now
         now += TENTH
-        return make_detection_markers(found, header(now, frame_id), bag_message)
+        return make_detection_markers(found, header(now, frame_id), make_bag_message)
 
     def move(poses, child="lidar"):
         """Send poses of the next frames. A second child frame counts once the first is silent."""
         for i, at in enumerate(poses):
             stamp = now + (i + 1) * TENTH
-            message = make_odometry(at, header(stamp, "odom"), child, bag_message)
+            message = make_odometry(at, header(stamp, "odom"), child, make_bag_message)
             moving.publish(encode(message))
         peer.send(moving, message, lambda: peer.get_value(NODE, "last_pose_ns") == str(stamp), "the poses")
 
@@ -197,12 +197,12 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     for _ in range(3):
         assert read(send(frame(found)))[1] == [1]
     for late, words in (0, "same stamp as the previous one"), (3, "older than the previous one"):
-        old = make_detection_markers(found, header(now - late * TENTH), bag_message)
+        old = make_detection_markers(found, header(now - late * TENTH), make_bag_message)
         send(old, words, answered=False)
-    send(bag_message(MARKERS), "an array without a marker", answered=False)
+    send(make_bag_message(MARKERS), "an array without a marker", answered=False)
     now += TENTH
-    gone = bag_message("visualization_msgs/msg/Marker", header=header(now), action=DELETEALL)
-    assert read(send(bag_message(MARKERS, markers=[gone])))[:2] == (now, [1])  # missed once
+    gone = make_bag_message("visualization_msgs/msg/Marker", header=header(now), action=DELETEALL)
+    assert read(send(make_bag_message(MARKERS, markers=[gone])))[:2] == (now, [1])  # missed once
     bad = Detections.of([car(10), car(np.nan), [1, 1, 1, 0, 1, 1, 0]], CAR, [0.9, 0.9, np.nan])
     assert read(send(frame(bad), "2 of 3 detections are ignored"))[1] == [1]
     many = np.random.default_rng(0).uniform(1, 80, (10_000, 7))
@@ -215,7 +215,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
         last = send(frame(cars(person(30), kind=[PEDESTRIAN, CYCLIST][i % 2])))
     assert len({*read(last)[1]} - {*before}) == 1
 
-    assert read(send(make_detection_markers(found, header(0), bag_message), "no stamps"))[0] == 0
+    assert read(send(make_detection_markers(found, header(0), make_bag_message), "no stamps"))[0] == 0
     move([pose(0.8 * i) for i in range(12)])
     send(frame(found), "first pose arrived")
     for i in range(1, 12):
@@ -235,7 +235,7 @@ def test_detection_arrays_are_tracked_as_markers_are(start):
     """The node runs in this process, because vision_msgs may be missing."""
     node, tracker = start(TrackerNode), Tracker()
     node.transforms.on_odometry(
-        make_odometry(pose(50, 0, 1), header(START, "lidar"), "base", bag_message)
+        make_odometry(pose(50, 0, 1), header(START, "lidar"), "base", make_bag_message)
     )  # detections are in its fixed frame
     for i, found in enumerate(crowd()):
         stamp = START + i * TENTH
@@ -245,7 +245,7 @@ def test_detection_arrays_are_tracked_as_markers_are(start):
                 [CLASSES[kind] for kind in found.class_ids],
                 found.scores.tolist(),
                 header=header(stamp),
-                make=bag_message,
+                make=make_bag_message,
             )
         )
         tracks = tracker(found, stamp, np.eye(4))

@@ -14,7 +14,7 @@ from lidar_perception.scoring.tracking.from_bag import count_recorded_tracks, sc
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import GroundTruth, InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_truth_markers
 from lidar_perception.wire.topics import TRUTH
 from lidar_perception.wire.track_markers import make_track_markers, read_trails
@@ -33,7 +33,7 @@ def recorded(request, tmp_path):
             bag.add_topic(topic, MARKERS)
         for i, found in enumerate(crowd()):
             stamp = START + i * TENTH
-            header = make_header(stamp, "velodyne", bag_message)
+            header = make_header(stamp, "velodyne", make_bag_message)
             tracks = tracker(found, stamp)
             extras = [
                 {"track_id": k, "occluded": 0, "truncated": 0.0} if request.param else {} for k in range(len(found))
@@ -46,9 +46,9 @@ def recorded(request, tmp_path):
                 tracks.moving,
                 trails(tracks, tracker.pose, stamp, 1.0),
                 header,
-                bag_message,
+                make_bag_message,
             )
-            bag.write(TRUTH, stamp, make_truth_markers(truth, header, bag_message))
+            bag.write(TRUTH, stamp, make_truth_markers(truth, header, make_bag_message))
             bag.write(TRACKS, stamp, message)
     return tmp_path / "bag", request.param, message
 

@@ -28,7 +28,7 @@ from lidar_perception.simulation.recording import simulate_frames
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.point_cloud2 import from_array, to_array
 from msg_utils.stamps import make_header
 
@@ -42,7 +42,7 @@ def change_cloud(msg, change, frame_id="lidar"):
     """Return the cloud with its structured array replaced by change(points)."""
     points = to_array(msg).copy()
     points = change(points) if change else points
-    return from_array(points, make_header(0, frame_id, bag_message), bag_message)
+    return from_array(points, make_header(0, frame_id, make_bag_message), make_bag_message)
 
 
 def turn_by(matrix):

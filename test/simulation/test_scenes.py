@@ -26,7 +26,7 @@ from lidar_perception.simulation.terrain import surface_height
 from lidar_perception.simulation.trajectory import ROBOT_RADIUS_M, Trajectory, draw_trajectory
 from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.types import CLASSES, InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.point_cloud2 import from_array
 
 ROBOTS = [(scene, kind) for scene in ("campus", "indoor") for kind in SCENE_TYPES[scene].kinds]
@@ -138,7 +138,10 @@ def test_mixed_scenes_alternate():
 def test_setup_finds_the_height_indoors(kind):
     sensor = replace(find_sensor("vlp-16", 0.6), azimuth_step=float(np.radians(0.8)))
     frames = [simulate_scan(7, i, sensor, Scenes(kind, 1.0, "indoor")).frame for i in (0, 1, 90, 91)]
-    clouds = [from_array(to_point_array(frame), header(bag_message, frame.stamp_ns), bag_message) for frame in frames]
+    clouds = [
+        from_array(to_point_array(frame), header(make_bag_message, frame.stamp_ns), make_bag_message)
+        for frame in frames
+    ]
     mount = measure_mount([read_scan(cloud) for cloud in clouds])
     assert mount.height == pytest.approx(0.6, abs=0.02)
     assert np.degrees([mount.roll, mount.pitch]) == pytest.approx([0.0, 0.0], abs=0.2)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lidar_perception.robot.poses import make_pose, transform_boxes, transform_points
 from lidar_perception.types import Detections, InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.topics import TRUTH
 from lidar_perception.wire.track_markers import make_track_markers
 from lidar_studio import live_graph
@@ -32,7 +32,7 @@ def cloud(stamp, points=50):
     found["x"] = 1 + np.arange(points)
     found["ground"], found["cluster_id"] = 1, 0
     found["ground"][:10], found["cluster_id"][:10] = 0, 7_000_000
-    return from_array(found, make_header(stamp, "velodyne", bag_message), bag_message)
+    return from_array(found, make_header(stamp, "velodyne", make_bag_message), make_bag_message)
 
 
 def boxes(stamp, frame_id="velodyne", x=5.0, ids=(3,)):
@@ -168,8 +168,8 @@ def test_boxes_in_another_frame_are_transformed_once_tf_arrives(live, monkeypatc
             np.zeros((1, 2)),
             np.zeros(1),
             [transform_points(trail, pose)],
-            make_header(stamp, "odom", bag_message),
-            bag_message,
+            make_header(stamp, "odom", make_bag_message),
+            make_bag_message,
         )
         live.add_boxes(TRACKED, from_marker_array(tracks), tracks)
         if i:

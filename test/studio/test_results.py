@@ -18,7 +18,7 @@ from lidar_perception.data.bag import BagHandle, BagWriter
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.open import open_recording
 from lidar_perception.types import Detections, GroundTruth, InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_studio.cli.view import make_short_names
 from lidar_studio.drive import segment_frame, select_drive
 from lidar_studio.results import (
@@ -159,8 +159,8 @@ def test_tracks_of_all_trackers_in_a_bag_are_distinct(tmp_path):
                     np.tile([5.0, 0, 0, 1, 1, 1, 0], (2, 1)),
                     ["Car"] * 2,
                     ids=ids,
-                    header=make_header(10, "velodyne", bag_message),
-                    make=bag_message,
+                    header=make_header(10, "velodyne", make_bag_message),
+                    make=make_bag_message,
                 ),
             )
     found = read_recorded_results(BagPoses(BagHandle(tmp_path / "bag"), ""), [10]).tracks

@@ -10,7 +10,7 @@ import zstandard
 from samples import STAMP, header
 
 from lidar_perception.wire.clouds import COMPRESSED
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.point_cloud2 import from_array
 
 COMPRESS = {
@@ -41,12 +41,12 @@ def livox_message(
 ):
     """CustomMsg of rosbags' class."""
     rows = [
-        bag_message(f"{package}/msg/CustomPoint", **dict(zip(points, map(lambda v: v.item(), row))))
+        make_bag_message(f"{package}/msg/CustomPoint", **dict(zip(points, map(lambda v: v.item(), row))))
         for row in zip(*points.values())
     ]
-    return bag_message(
+    return make_bag_message(
         f"{package}/msg/CustomMsg",
-        header=header(bag_message, stamp_ns, frame_id),
+        header=header(make_bag_message, stamp_ns, frame_id),
         timebase=stamp_ns,
         point_num=len(rows),
         lidar_id=1,
@@ -56,9 +56,9 @@ def livox_message(
 
 def compressed_message(points: np.ndarray, packing: str, stamp_ns: int = STAMP):
     """CompressedPointCloud2 of rosbags' class, of a structured array; gzip is a kind of zlib."""
-    cloud = from_array(points, header(bag_message, stamp_ns), bag_message)
+    cloud = from_array(points, header(make_bag_message, stamp_ns), make_bag_message)
     packed = COMPRESS[packing](cloud.data.tobytes())
-    return bag_message(
+    return make_bag_message(
         COMPRESSED,
         compressed_data=np.frombuffer(packed, np.uint8),
         format="zlib" if packing == "gzip" else packing,

@@ -25,7 +25,7 @@ from lidar_perception.detectors.pointpillars.detector import load_detector
 from lidar_perception.nodes.graph import POINTNET, POINTPILLARS, build_graph
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.testing.clouds import make_cloud_message
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import to_detections, to_point_cloud
 from msg_utils.markers import compute_yaw, from_marker_array, make_box_pose
 
@@ -114,7 +114,7 @@ def assert_equal(objects, expected):
     found = to_detections(objects)
     assert len(expected) > 3
     np.testing.assert_array_equal(found.boxes[:, :6], expected.boxes[:, :6])
-    yaws = [compute_yaw(make_box_pose(box, bag_message)) for box in expected.boxes]  # -pi .. pi
+    yaws = [compute_yaw(make_box_pose(box, make_bag_message)) for box in expected.boxes]  # -pi .. pi
     np.testing.assert_array_equal(found.boxes[:, 6], np.float32(yaws))
     np.testing.assert_array_equal(found.scores, expected.scores)
     np.testing.assert_array_equal(found.class_ids, expected.class_ids)

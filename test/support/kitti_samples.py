@@ -19,7 +19,7 @@ from samples import (
 
 from lidar_perception.data.kitti.labels import format_label, to_labels
 from lidar_perception.types import GroundTruth
-from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import make_truth_markers, to_truth
 from msg_utils.markers import from_marker_array
 
@@ -90,7 +90,7 @@ def format_truth(truth: GroundTruth) -> list[str]:
 
 
 def through_markers(truth: GroundTruth) -> GroundTruth:
-    raw = encode(make_truth_markers(truth, header(bag_message), bag_message))
+    raw = encode(make_truth_markers(truth, header(make_bag_message), make_bag_message))
     return to_truth(from_marker_array(decode(raw, "visualization_msgs/msg/MarkerArray")))
 
 

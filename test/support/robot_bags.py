@@ -9,7 +9,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.robot.poses import make_pose
 from lidar_perception.testing.clouds import make_cloud_message
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_odometry
 from lidar_perception.wire.topics import POINTS, TF, TF_STATIC
 from lidar_perception.wire.transforms import ODOMETRY_MESSAGE, TF_MESSAGE
@@ -37,20 +37,20 @@ def stamps():
 
 def transform(parent, child, stamp, pose):
     x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    return bag_message(
+    return make_bag_message(
         "geometry_msgs/msg/TransformStamped",
         child_frame_id=child,
-        header=make_header(stamp, parent, bag_message),
-        transform=bag_message(
+        header=make_header(stamp, parent, make_bag_message),
+        transform=make_bag_message(
             "geometry_msgs/msg/Transform",
-            translation=bag_message("geometry_msgs/msg/Vector3", **dict(zip("xyz", pose[:3, 3]))),
-            rotation=bag_message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+            translation=make_bag_message("geometry_msgs/msg/Vector3", **dict(zip("xyz", pose[:3, 3]))),
+            rotation=make_bag_message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
         ),
     )
 
 
 def tf(*transforms):
-    return bag_message(TF_MESSAGE, transforms=list(transforms))
+    return make_bag_message(TF_MESSAGE, transforms=list(transforms))
 
 
 def moving(topic, child="base_link", seconds=CLOUDS / 10):
@@ -61,7 +61,7 @@ def moving(topic, child="base_link", seconds=CLOUDS / 10):
             topic,
             ODOMETRY_MESSAGE,
             stamp,
-            make_odometry(base_at(stamp), make_header(stamp, "odom", bag_message), child, bag_message),
+            make_odometry(base_at(stamp), make_header(stamp, "odom", make_bag_message), child, make_bag_message),
         )
 
 

@@ -9,7 +9,7 @@ from samples import scene as walker_scene
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.robot.poses import invert_pose, transform_points
-from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.codec import encode, make_bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
 
@@ -30,7 +30,7 @@ def message(xyz, stamp=START, intensity=None, frame_id="lidar", **columns):
     points["intensity"] = 0.3 if intensity is None else intensity
     for name, values in columns.items():
         points[name] = values
-    return from_array(points, make_header(stamp, frame_id, bag_message), bag_message)
+    return from_array(points, make_header(stamp, frame_id, make_bag_message), make_bag_message)
 
 
 def transforms(*rows):
@@ -40,7 +40,9 @@ def transforms(*rows):
 
 def odometry(pose, stamp, child="base", frame="odom"):
     t, q = pose[:3, 3].tolist(), Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
-    found = bag_message("nav_msgs/msg/Odometry", child_frame_id=child, header=make_header(stamp, frame, bag_message))
+    found = make_bag_message(
+        "nav_msgs/msg/Odometry", child_frame_id=child, header=make_header(stamp, frame, make_bag_message)
+    )
     for name, value in zip("xyz", t):
         setattr(found.pose.pose.position, name, value)
     for name, value in zip("xyzw", q):

@@ -7,7 +7,7 @@ import numpy as np
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.param_fields import with_values
 from lidar_perception.testing.clouds import make_cloud_message
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
 
@@ -37,13 +37,13 @@ def make_cloud_with_integer_z():
 
 def big_endian(xyz, stamp):
     points = np.asarray(xyz, np.float32).view(XYZ).reshape(-1).astype(XYZ.newbyteorder(">"))
-    return from_array(points, make_header(stamp, "lidar", bag_message), bag_message)
+    return from_array(points, make_header(stamp, "lidar", make_bag_message), make_bag_message)
 
 
 BAD = {  # defect -> message, words of the diagnostic
     "empty": (cloud(np.zeros((0, 3))), "no finite point"),
     "missing x": (make_cloud_without_x(), "no field 'x'"),
-    "no fields at all": (bag_message(CLOUD), "no field 'x'"),
+    "no fields at all": (make_bag_message(CLOUD), "no field 'x'"),
     "all NaN": (cloud(np.full((9, 3), np.nan)), "no finite point"),
     "cut": (cloud(np.ones((5, 3)), data=np.zeros(7, np.uint8)), "7 bytes"),
     "all infinite": (cloud(np.full((9, 3), np.inf)), "no finite point"),

@@ -17,7 +17,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import format_label, to_labels
 from lidar_perception.data.kitti.write import write_object
 from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, PointCloud
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.messages import make_ros_message
 from msg_utils.stamps import make_header
 
@@ -47,7 +47,7 @@ def for_all(cases):
 each_make = pytest.mark.parametrize(
     "make",
     [
-        pytest.param(bag_message, id="rosbags"),
+        pytest.param(make_bag_message, id="rosbags"),
         pytest.param(
             make_ros_message,
             id="ros",

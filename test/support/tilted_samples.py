@@ -13,7 +13,7 @@ from lidar_perception.simulation.returns import make_returns
 from lidar_perception.simulation.scene import ALL_STREETS
 from lidar_perception.simulation.sensor import Motion, Sensor, find_sensor, make_rays
 from lidar_perception.simulation.terrain import Ground, cast_ground, surface_height, to_compiled
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
 
@@ -137,7 +137,7 @@ def make_cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str =
     points = np.empty(len(order), kinds)
     for name, values in columns.items():
         points[name] = values
-    return from_array(points, make_header(stamp_ns, frame_id, bag_message), bag_message)
+    return from_array(points, make_header(stamp_ns, frame_id, make_bag_message), make_bag_message)
 
 
 def simulate_clouds(name: str, count: int = 4, even: bool = True, street: int = 40):

@@ -16,7 +16,7 @@ from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.testing.detections import assert_detections, to_objects
 from lidar_perception.testing.launching import include_launch_file, make_description
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_detection_markers, make_truth_markers, to_point_cloud
 from msg_utils.detections import to_detection_array
 from msg_utils.point_cloud2 import to_array
@@ -52,7 +52,7 @@ def test_every_kind_of_detections_says_the_same(make):
         expected,
         pairs_of(expected),
     ]
-    if make is not bag_message and importlib.util.find_spec("vision_msgs"):
+    if make is not make_bag_message and importlib.util.find_spec("vision_msgs"):
         kinds.append(to_detection_array(found.boxes, expected.labels, found.scores, header=header(make), make=make))
     for kind in kinds:
         objects = to_objects(kind)

@@ -10,7 +10,7 @@ from lidar_perception.robot.poses import transform_boxes
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import TRAIL_POINTS, Trails
 from lidar_perception.types import CLASSES, Detections
-from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.codec import decode, encode, make_bag_message
 from msg_utils.detections import to_detection_array
 from msg_utils.stamps import make_header
 
@@ -68,8 +68,8 @@ def test_detection_array_has_ids_and_covariances_of_tracks(tracks):
         found.scores,
         ids=tracks.ids + 40,
         covariances=tracks.to_pose_covariances(),
-        make=bag_message,
-        header=make_header(START, "lidar", bag_message),
+        make=make_bag_message,
+        header=make_header(START, "lidar", make_bag_message),
     )
     read = decode(encode(array), "vision_msgs/msg/Detection3DArray")
     assert [d.id for d in read.detections] == [str(i + 40) for i in tracks.ids.tolist()]

@@ -13,7 +13,7 @@ from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.array_codec import encode_detection_array, encode_markers
-from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import make_detection_rows
 from lidar_perception.wire.track_markers import make_track_rows
 from msg_utils.detections import to_detection_array
@@ -50,7 +50,7 @@ def assert_equal_cdr(got: bytes, rows, stamp_ns=START, frame_id="velodyne", life
     """Compare with both serializations; rclpy leaves the bytes of padding undefined."""
     ours, theirs = (
         rows_to_message(rows, header(make, stamp_ns, frame_id), make, lifetime_ns)
-        for make in (bag_message, make_ros_message)
+        for make in (make_bag_message, make_ros_message)
     )
     assert got == encode(ours)
     serialization = pytest.importorskip("rclpy.serialization", reason="needs rclpy")
@@ -60,7 +60,7 @@ def assert_equal_cdr(got: bytes, rows, stamp_ns=START, frame_id="velodyne", life
 
 @given(rows=rows, stamp_ns=st.integers(0, 2**60), frame_id=texts, lifetime_ns=st.integers(0, 2**60))
 def test_markers_have_the_bytes_of_the_message(rows, stamp_ns, frame_id, lifetime_ns):
-    head = header(bag_message, stamp_ns, frame_id)
+    head = header(make_bag_message, stamp_ns, frame_id)
     assert_equal_cdr(encode_markers(rows, head, lifetime_ns), rows, stamp_ns, frame_id, lifetime_ns)
 
 
@@ -79,13 +79,13 @@ def test_tracks_and_detections_have_the_bytes_of_the_message():
         )
         shown = list_marker_keys(track_rows)
         for rows in (track_rows, make_detection_rows(found)):
-            assert_equal_cdr(encode_markers(rows, header(bag_message, stamp)), rows, stamp)
+            assert_equal_cdr(encode_markers(rows, header(make_bag_message, stamp)), rows, stamp)
     assert shown
 
 
 def test_array_without_boxes_has_the_bytes_of_the_message():
     rows = make_marker_rows(np.zeros((0, 7)), [])
-    assert_equal_cdr(encode_markers(rows, header(bag_message, START)), rows)
+    assert_equal_cdr(encode_markers(rows, header(make_bag_message, START)), rows)
 
 
 @given(boxes=st.lists(st.tuples(*6 * [numbers], st.floats(-4, 4)), max_size=3), frame_id=texts, seed=st.integers(0, 9))
@@ -96,7 +96,7 @@ def test_detection_array_has_the_bytes_of_the_message(boxes, frame_id, seed):
         boxes=boxes,
         labels=rng.choice(CLASSES, count).tolist(),
         scores=rng.random(count),
-        header=header(bag_message, START, frame_id),
+        header=header(make_bag_message, START, frame_id),
         **({"ids": rng.integers(0, 10**5, count), "covariances": rng.random((count, 6, 6))} if seed % 2 else {}),
     )
-    assert encode_detection_array(**given) == encode(to_detection_array(**given, make=bag_message))
+    assert encode_detection_array(**given) == encode(to_detection_array(**given, make=make_bag_message))

@@ -9,7 +9,7 @@ from samples import CALIBRATION, each_make, header
 from lidar_perception.camera import Calibration, Camera
 from lidar_perception.intensity import find_scale_problem
 from lidar_perception.types import Detections, InputError
-from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import (
     make_camera_info,
     make_detection_markers,
@@ -94,7 +94,7 @@ MESSAGES = {
 @pytest.mark.parametrize("build", MESSAGES.values(), ids=MESSAGES)
 def test_ros_and_rosbags_read_each_others_bytes(build):
     serialization = pytest.importorskip("rclpy.serialization", reason="needs rclpy")
-    ours, theirs = build(bag_message), build(make_ros_message)
+    ours, theirs = build(make_bag_message), build(make_ros_message)
     name = ours.__msgtype__
     raw = serialization.serialize_message(theirs)
     as_ros = load_message_class(name)
@@ -118,17 +118,17 @@ def test_message_fields_default_to_zero_as_in_ros(name):
     if name.endswith(("Pose", "Marker")):  # ROS starts at the unit quaternion
         pose = theirs if name.endswith("Pose") else theirs.pose
         pose.orientation.w = 0.0
-    got = serialization.deserialize_message(encode(bag_message(name)), load_message_class(name))
+    got = serialization.deserialize_message(encode(make_bag_message(name)), load_message_class(name))
     assert got == theirs
 
 
 def test_unknown_field_is_a_type_error():
     with pytest.raises(TypeError, match="has no field 'colour'"):
-        bag_message("visualization_msgs/msg/Marker", colour=1)
+        make_bag_message("visualization_msgs/msg/Marker", colour=1)
 
 
 def test_truncated_message_is_an_input_error():
-    raw = encode(MESSAGES["markers"](bag_message))
+    raw = encode(MESSAGES["markers"](make_bag_message))
     for size in range(0, len(raw), 7):
         with pytest.raises(InputError, match=f"^{size} bytes are not a valid visualization_msgs"):
             decode(raw[:size], "visualization_msgs/msg/MarkerArray")
@@ -149,15 +149,15 @@ def test_intensities_are_read_in_every_drivers_scale(kind, full):
     expected[0] = 1.0
     points = np.ones(len(expected), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", kind)])
     points["intensity"] = np.round(expected * full) if full > 1 else expected
-    read = to_point_cloud(from_array(points, header(bag_message), bag_message), 0.0)[0]
+    read = to_point_cloud(from_array(points, header(make_bag_message), make_bag_message), 0.0)[0]
     np.testing.assert_allclose(read.intensity, expected, atol=0.5 / 255)
     assert read.intensity.dtype == np.float32 and find_scale_problem(read.intensity) is None
     if np.dtype(kind).kind == "f":
         points["intensity"][1:4] = np.nan, np.inf, -np.inf
-        odd = to_point_cloud(from_array(points, header(bag_message), bag_message), 0.0)[0].intensity
+        odd = to_point_cloud(from_array(points, header(make_bag_message), make_bag_message), 0.0)[0].intensity
         assert not odd[1:4].any() and np.array_equal(odd[4:], read.intensity[4:])
     points["intensity"] = points["intensity"] * 0.02  # a scale that no driver uses
-    dark = to_point_cloud(from_array(points, header(bag_message), bag_message), float(full))[0]
+    dark = to_point_cloud(from_array(points, header(make_bag_message), make_bag_message), float(full))[0]
     assert "input.intensity_max" in find_scale_problem(dark.intensity)
     assert "input.intensity_max" in find_scale_problem(read.intensity * 2)
     assert find_scale_problem(dark.intensity[:100]) is None

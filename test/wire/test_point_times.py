@@ -7,7 +7,7 @@ import pytest
 from samples import STAMP, header
 
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.point_times import read_point_times, replace_points
 from msg_utils.point_cloud2 import from_array, to_array
@@ -35,7 +35,7 @@ def cloud(name, values, order="<"):
         [("x", f"{order}f4"), ("y", f"{order}f4"), ("z", f"{order}f8"), ("intensity", f"{order}f4"), (name, kind)],
     )
     points["x"], points["y"], points[name] = 5.0, np.arange(len(values)), values
-    return from_array(points, header(bag_message), bag_message)
+    return from_array(points, header(make_bag_message), make_bag_message)
 
 
 def all_indices(msg):
@@ -63,7 +63,7 @@ def test_replaced_points_have_the_time_of_the_stamp(driver):
     frame, _ = to_point_cloud(msg)
     moved = frame.xyz[chosen] + np.float32([1, 2, 3])
     times = read_point_times(msg, chosen)
-    after = replace_points(msg, bag_message, chosen, moved, times)
+    after = replace_points(msg, make_bag_message, chosen, moved, times)
     assert [f.name for f in after.fields] == [f.name for f in msg.fields]
     assert (after.point_step, after.width) == (msg.point_step, msg.width)
     np.testing.assert_array_equal(to_point_cloud(after)[0].xyz[chosen], moved)
@@ -107,7 +107,7 @@ def test_unusable_times_are_reported(name, values, words):
         len(values), [(n, "<f4") for n in ("x", "y", "z", "intensity")] + [(name, values.dtype, values.shape[1:])]
     )
     points[name] = values
-    msg = from_array(points, header(bag_message), bag_message)
+    msg = from_array(points, header(make_bag_message), make_bag_message)
     with pytest.raises(InputError, match=words):
         read_point_times(msg, all_indices(msg))
 

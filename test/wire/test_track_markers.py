@@ -10,7 +10,7 @@ from tracking_samples import CAR, START, TENTH, crowd, pose
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import CLASSES, Detections
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_odometry, to_detections
 from lidar_perception.wire.track_markers import EXTRA_NAMESPACES, MAX_ID, NUMBER, VELOCITY, make_track_markers
 from msg_utils.markers import ADD, DELETE, from_marker_array, list_marker_keys
@@ -78,8 +78,8 @@ def test_large_ids_wrap_around():
         np.zeros((1, 2)),
         np.zeros(1),
         [np.zeros((1, 3))],
-        header(bag_message),
-        bag_message,
+        header(make_bag_message),
+        make_bag_message,
     )
     assert {(m.ns, m.id) for m in message.markers} == {(CLASSES[CAR], 7), (NUMBER, 7)}
     assert set(EXTRA_NAMESPACES).isdisjoint(CLASSES)

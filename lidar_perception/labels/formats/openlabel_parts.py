@@ -255,7 +255,7 @@ def parse_named_values(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str,
 
 
 def _is_number(value: Any) -> bool:
-    """Return True for a number in the range of float64, which other readers require."""
+    """Return True for a number in the range of float64; other tools cannot read larger ones."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 

@@ -65,12 +65,12 @@ def measure_heights(frames: list[ComparedFrame], name: str) -> dict[str, Any]:
 
         The medians are None without matches.
     """
-    detected, labelled = match_boxes(frames, name)
-    z_error, height = detected[:, 2] - labelled[:, 2], labelled[:, 5]
+    detected_boxes, label_boxes = match_boxes(frames, name)
+    z_error, height = detected_boxes[:, 2] - label_boxes[:, 2], label_boxes[:, 5]
     rows = {
         "z_error_m": z_error,
         "abs_z_error_m": np.abs(z_error),
-        "height_error_m": detected[:, 5] - height,
+        "height_error_m": detected_boxes[:, 5] - height,
         "height_m": height,
     }
     return {"pairs": len(z_error), **{key: _compute_median(values) for key, values in rows.items()}}
@@ -120,12 +120,12 @@ def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float)
         strict: For each of CORRECTIONS the percentage of pairs above the strict overlap in 3D
             (`space`) and in BEV (`above`), None without pairs.
     """
-    detected, labelled = match_boxes(frames, name, min_score)
-    differences, ranges = _compute_differences(detected, labelled), horizontal_range(labelled)
+    detected_boxes, label_boxes = match_boxes(frames, name, min_score)
+    differences, ranges = _compute_differences(detected_boxes, label_boxes), horizontal_range(label_boxes)
     masks = {
         f"{low:g}-{high:g} m".replace("-inf m", " m -"): (ranges >= low) & (ranges < high)
         for low, high in pairwise(RANGES)
-    } | {"all": np.ones(len(labelled), bool)}
+    } | {"all": np.ones(len(label_boxes), bool)}
     return {
         "min_score": min_score,
         "by_range": {
@@ -142,15 +142,15 @@ def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float)
             for title, mask in masks.items()
         },
         "strict": {
-            title: _measure_overlaps(detected, labelled, columns, DETECTED[name].strict)
+            title: _measure_overlaps(detected_boxes, label_boxes, columns, DETECTED[name].strict)
             for title, columns in CORRECTIONS.items()
         },
     }
 
 
-def _compute_differences(detected: np.ndarray, labelled: np.ndarray) -> dict[str, np.ndarray]:
-    azimuth = np.arctan2(labelled[:, 1], labelled[:, 0])
-    x, y, z, *sizes, yaw = (detected - labelled).T
+def _compute_differences(detected_boxes: np.ndarray, label_boxes: np.ndarray) -> dict[str, np.ndarray]:
+    azimuth = np.arctan2(label_boxes[:, 1], label_boxes[:, 0])
+    x, y, z, *sizes, yaw = (detected_boxes - label_boxes).T
     return dict(
         zip(
             ERRORS,
@@ -166,15 +166,15 @@ def _compute_differences(detected: np.ndarray, labelled: np.ndarray) -> dict[str
 
 
 def _measure_overlaps(
-    detected: np.ndarray, labelled: np.ndarray, columns: list[int], min_overlap: float
+    detected_boxes: np.ndarray, label_boxes: np.ndarray, columns: list[int], min_overlap: float
 ) -> dict[str, float | None]:
-    """Return the percentage of pairs above min_overlap after correcting columns of `detected`."""
-    if len(detected) == 0:
+    """Return the percentage of pairs above min_overlap after correcting columns of the boxes."""
+    if len(detected_boxes) == 0:
         return {"space": None, "above": None}
-    corrected = detected.copy()
-    corrected[:, columns] = labelled[:, columns]
+    corrected_boxes = detected_boxes.copy()
+    corrected_boxes[:, columns] = label_boxes[:, columns]
     bev, full = np.array(
-        [[iou[0, 0] for iou in bev_and_3d_iou(a[None], b[None])] for a, b in zip(corrected, labelled)]
+        [[iou[0, 0] for iou in bev_and_3d_iou(a[None], b[None])] for a, b in zip(corrected_boxes, label_boxes)]
     ).T
     return {"space": 100 * float((full > min_overlap).mean()), "above": 100 * float((bev > min_overlap).mean())}
 

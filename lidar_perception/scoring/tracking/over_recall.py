@@ -120,18 +120,18 @@ def _count_at_threshold(
         histories: dict[int, list[tuple[int, bool]]] = {}
         for f, matched_once in zip(frames, matched_frames):
             mean_scores = np.array([score[i] for i in f.track_ids.tolist()])
-            selected = np.flatnonzero(mean_scores >= threshold) if len(mean_scores) else np.zeros(0, int)
-            rows, columns = _match(f.overlap[:, selected])
-            columns = selected[columns]
+            track_indices = np.flatnonzero(mean_scores >= threshold) if len(mean_scores) else np.zeros(0, int)
+            rows, columns = _match(f.overlap[:, track_indices])
+            columns = track_indices[columns]
             matched_once[columns] = True
             hits += mean_scores[columns].tolist()
-            is_excused = f.excused[selected] & ~matched_once[selected]
+            is_excused = f.excused[track_indices] & ~matched_once[track_indices]
             ignored_hits = int(f.ignored[rows].sum())
             label_count = int((~f.ignored).sum())
             objects += label_count
             tp += len(rows)
             fn += label_count - (len(rows) - ignored_hits)
-            fp += len(selected) - len(rows) - int(is_excused.sum())
+            fp += len(track_indices) - len(rows) - int(is_excused.sum())
             overlap += float(f.overlap[rows, columns].sum())
             ids = np.full(len(f.true_ids), -1, np.int64)
             ids[rows] = f.track_ids[columns]
