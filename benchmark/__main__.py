@@ -168,13 +168,13 @@ def _measure(in_view: list[np.ndarray], scans: list[PointCloud], repeat: int) ->
     show("dbscan_in_view", clustering.measure_dbscan("DBSCAN, in view", obstacles_in_view, repeat, 12))
     show("threshold_in_view", ground.measure_threshold("Threshold, in view", in_view, repeat))
     if not scans:
-        errors.print(f"no scan has more than {MIN_FULL_SCAN_POINTS} points: whole scans are not measured")
+        errors.print(f"no scan has more than {MIN_FULL_SCAN_POINTS} points: skipping the full-scan benchmark")
         return content
-    show("dbscan_whole_scan", clustering.measure_dbscan("DBSCAN, whole scan", obstacles, repeat, 20))
+    show("dbscan_whole_scan", clustering.measure_dbscan("DBSCAN, full scan", obstacles, repeat, 20))
     for threshold in ("global", "local"):
         show(f"euclidean_{threshold}", clustering.measure_euclidean(cloth_obstacles, threshold, repeat))
     show("paper_c", clustering.measure_paper_c(full_scans, repeat))
-    show("threshold", ground.measure_threshold("Threshold, whole scan", full_scans, repeat))
+    show("threshold", ground.measure_threshold("Threshold, full scan", full_scans, repeat))
     show("patchwork", ground.measure_patchwork(scans, repeat))
     show("cloth", ground.measure_cloth(full_scans, repeat))
     return content

@@ -94,7 +94,7 @@ def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> 
             "ours": partial(cluster_euclidean, xyz, params),
         }
 
-    title = f"Adaptive Euclidean, {threshold} threshold, whole scan"
+    title = f"Adaptive Euclidean, {threshold} threshold, full scan"
     clock, same = Clock(repeat, make_calls(thin_cloud(clouds[0]))), 0
     for xyz in show_progress(clouds, title, len(clouds)):
         results = clock.time(make_calls(xyz))
@@ -113,7 +113,7 @@ def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
     def make_calls(xyz):
         return {"cloth": partial(segment_by_cloth, xyz), **{t: partial(segment, xyz, t) for t in ("global", "local")}}
 
-    title = "Paper C: cloth and Euclidean, whole scan"
+    title = "Paper C: cloth and Euclidean, full scan"
     clock = Clock(repeat, make_calls(thin_cloud(scans[0])))
     for xyz in show_progress(scans, title, len(scans)):
         clock.time(make_calls(xyz))

@@ -181,7 +181,7 @@ def _format_interval(interval: list[float]) -> str:
     type=click.FloatRange(0),
     default=4.0,
     show_default=True,
-    help="Pedestrians and cyclists, as a multiple of KITTI's.",
+    help="Number of pedestrians and cyclists relative to KITTI.",
 )
 @click.option("--cache", type=click.Path(path_type=Path), required=True, help="Folder for the detections.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path))

@@ -93,7 +93,7 @@ def print_measured(content: dict) -> None:
     console.print(table)
     for r in content["rows"]:
         if r["differ"]:
-            console.print(f"{r['name']}: {r['differ']} points have other labels")
+            console.print(f"{r['name']}: {r['differ']} points have different labels")
 
 
 def print_ground(content: dict) -> None:

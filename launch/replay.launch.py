@@ -154,7 +154,7 @@ def generate_launch_description():
             DeclareLaunchArgument(
                 "points", default_value="", description="Topic of the clouds; may be empty if the bag has only one."
             ),
-            DeclareLaunchArgument("rate", default_value="1.0", description="Speed of the replay."),
+            DeclareLaunchArgument("rate", default_value="1.0", description="Speed factor of the replay."),
             DeclareLaunchArgument(
                 "loop", default_value="false", choices=["true", "false"], description="Restart the bag at its end."
             ),
@@ -168,7 +168,7 @@ def generate_launch_description():
                 "single",
                 default_value="false",
                 choices=["true", "false"],
-                description="Let each detector find ground and clusters itself.",
+                description="Let each detector compute ground and clusters itself.",
             ),
             DeclareLaunchArgument(
                 "rviz",

@@ -325,8 +325,8 @@ def test_an_empty_config_sets_nothing(tmp_path):
         ("perception: {dbscan: {eps: 1}}", ("'perception'", "ros__parameters")),
         ("perception: 5", ("'perception'", "ros__parameters")),
         ("perception: {ros__parameters: [1]}", ("'perception'", "ros__parameters")),
-        ("- perception\n", ("no parameter file",)),
-        ("perception", ("no parameter file",)),
+        ("- perception\n", ("not a parameter file",)),
+        ("perception", ("not a parameter file",)),
     ],
 )
 def test_error_of_an_invalid_config_names_the_file(tmp_path, text, words):

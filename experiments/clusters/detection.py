@@ -62,7 +62,7 @@ def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[
     """
     truth, calibration = frame.truth(), frame.calibration()
     if truth is None:
-        raise InputError(f"{frame.points or frame.name} has no labels; put them beside the scans")
+        raise InputError(f"{frame.points or frame.name} has no labels; put the label files next to the scans")
 
     def detect(change: Change, sources: Mapping[str, Source]) -> tuple[dict[str, Any], dict[str, float]]:
         found = detect_with_all(change_cloud(frame.load(), change, frame.name), sources, frame.sensor_height)

@@ -82,7 +82,7 @@ def measure_segmentation(frame: Frame) -> dict[str, Any]:
     """
     truth = frame.truth()
     if truth is None:
-        raise InputError(f"{frame.points or frame.name} has no labels; put them beside the scans")
+        raise InputError(f"{frame.points or frame.name} has no labels; put the label files next to the scans")
     scan, camera = frame.load(), frame.camera()
     objects = find_objects_in_boxes(scan.xyz, truth)
     if camera is not None:

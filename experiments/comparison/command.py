@@ -39,7 +39,7 @@ def _list_runs() -> list[Runs]:
 @scoring_options()
 @path_option(
     "--weights",
-    "One more detector: weights of PointPillars or PointNet, or a class of your own, module:Class; may be repeated.",
+    "Additional detector: weights of PointPillars or PointNet, or a class of your own, module:Class; may be repeated.",
     multiple=True,
 )
 @out_file("--png", "Draw F1 and mean AP against time.")

@@ -32,7 +32,7 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.report import load_pedestrians
 from lidar_perception.types import CLASSES, PEDESTRIAN, SENSOR_HEIGHT, InputError
 
-NO_WEIGHTS = "no weights come with the package; give some with --weights"
+NO_WEIGHTS = "the package has no weights for this detector; give some with --weights"
 PERSON = CLASSES[PEDESTRIAN]
 CANDIDATES = "candidates"
 
@@ -104,7 +104,7 @@ def open_contenders(
     for path in [*files, *weights]:
         detector = open_one(path)
         if str(path) in LOAD or not isinstance(detector, NetworkDetector | CustomDetector):
-            raise InputError(f"{path} is compared already; give files of other weights")
+            raise InputError(f"{path} is already in the comparison; give different weights")
         name = _make_name(detector, [FUSED, *(other.name for other in opened)])
         opened.append(OpenedDetector(name, detector, path))
     found = [detector.to_contender() for detector in opened]

@@ -68,13 +68,13 @@ def _list_parameters(given: Mapping[str, Any]) -> list[Runs]:
     help="Train every network with this many seeds. Default: up to 3, as the budget allows.",
 )
 @device_option
-@click.option("--jobs", type=click.IntRange(1), help="Number of processes. Default: one for each core.")
+@click.option("--jobs", type=click.IntRange(1), help="Number of processes. Default: one per core.")
 @dask_option
 @limit_option
 @click.option(
     "--force",
     is_flag=True,
-    help="Start over, whatever is in --out. Networks that were trained there with the same settings are used again.",
+    help="Start over and replace the results in --out. Networks trained there with the same settings are reused.",
 )
 @settings_options(_list_parameters, "batch=8")
 def reproduce(
@@ -114,7 +114,7 @@ def reproduce(
     """
     name, data = _split_words(words, data)
     if dask and jobs:
-        raise click.UsageError("--jobs is for this machine, --dask for others: give one of them")
+        raise click.UsageError("--jobs and --dask cannot be combined; --jobs runs on this machine, --dask on others")
     from experiments.framework.report import group_skipped_frames, print_report, write_report
     from experiments.framework.runner import run_experiment, run_with_models
     from lidar_perception.runs.terminal import console
@@ -125,7 +125,7 @@ def reproduce(
     if experiment.training is None:
         refuse_options(
             ("budget", "seeds", "device", "config", "given"),
-            f"is for experiments that train networks; {name} trains none",
+            f"requires an experiment that trains networks; {name} trains none",
         )
         recording = _open_recording(data, split, out)
         records = run_experiment(experiment, recording, out, jobs=workers, dask=dask, force=force, limit=limit)

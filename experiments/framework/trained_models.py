@@ -283,7 +283,7 @@ def train_models(request: ModelRequest, plan: SharedPlan) -> dict[str, TrainedMo
                 spent = sum(done.seconds for done in trained.values())
                 optional = seed > 0 or not model.required
                 if optional and spent + plan.durations[first.name] > limit:
-                    errors.print(f"{model.name} is left out, as the budget is spent")
+                    errors.print(f"{model.name} is skipped because the budget is spent")
                     continue
                 errors.print(f"training {model.name}", style="bold")
                 _train(planned, request, folder, plan.speeds[first.name])
@@ -299,7 +299,7 @@ def _train(model: Model, request: ModelRequest, folder: Path, speed: Speed) -> N
     params = with_values(model.params, {"data.cache": str(request.out / "scans")})
     result = start_training(make_trainer(params), request.to_training(model, folder), params, find_commit(), speed)
     if result is not None and result.progress.stopped:
-        errors.print("stopped; the same command resumes")
+        errors.print("stopped; run the same command again to resume")
         raise KeyboardInterrupt
 
 

@@ -29,14 +29,14 @@ from lidar_perception.simulation.sensor import find_sensor
     type=click.FloatRange(0, 10),
     default=0.0,
     metavar="M",
-    help="Height of the sensor above the ground. Default: that of its file or preset.",
+    help="Height of the sensor above the ground. Default: the height in its file or preset.",
 )
 @click.option(
     "--frames",
     type=click.IntRange(1),
     default=40,
     show_default=True,
-    help="Number of simulated scans, each of another street.",
+    help="Number of simulated scans, each from a different street.",
 )
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
 @click.option(
@@ -44,7 +44,7 @@ from lidar_perception.simulation.sensor import find_sensor
     type=click.FloatRange(0, MAX_PEOPLE),
     default=1.0,
     show_default=True,
-    help="Pedestrians and cyclists, as a multiple of the usual number.",
+    help="Number of pedestrians and cyclists relative to the default.",
 )
 @out_file("--json", "Write every curve to this file.")
 @out_file("--png", "Draw every curve into this file.")

@@ -130,7 +130,7 @@ def measure_scans(scans: Iterable[Frame], protocol: PipelineParams) -> ScanMeasu
         except InputError as error:
             measured.skipped.append(str(error))
     if measured.skipped and not measured.scans:
-        raise InputError(f"none of {len(measured.skipped)} scans can be read: {measured.skipped[0]}")
+        raise InputError(f"none of the {len(measured.skipped)} scans can be read: {measured.skipped[0]}")
     return measured
 
 

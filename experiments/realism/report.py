@@ -23,7 +23,7 @@ def print_realism(content: dict, console: Console) -> None:
         row = content[side]
         objects = ", ".join(f"{count} {name}" for name, count in row["objects"].items())
         console.print(
-            f"{side}: {row['scans']} scans, {row['whole_scans']} of them whole; "
+            f"{side}: {row['scans']} scans, {row['whole_scans']} of them full revolutions; "
             f"{objects}; {row['pedestrian_frames']} scans with a pedestrian"
         )
     _print_curves(content, console)

@@ -76,7 +76,7 @@ CURVES = {
     "scan points": Curve("points per scan", ("all",), ""),
     "points": Curve("points", _BY_RANGE, log=True),
     "elevation": Curve("points", tuple(f"{a:g}..{a + 2:g}" for a in ELEVATIONS[:-1]), "elevation [deg]", log=True),
-    "ground share": Curve("share of points on the ground", _BY_RANGE),
+    "ground share": Curve("fraction of points on the ground", _BY_RANGE),
     "roughness": Curve("scatter about the ground of 1 m2, 75 % [m]", _BY_RANGE, step=ROUGH_STEP),
     "neighbour": Curve("distance to the nearest point [m]", _BY_RANGE),
     "clusters": Curve("clusters", _BY_RANGE),
@@ -87,7 +87,7 @@ CURVES = {
         for what in _SURFACES
     },
     **{
-        f"{what} intensity histogram": Curve(f"share of points, {what}", _BY_INTENSITY, "intensity", histogram=True)
+        f"{what} intensity histogram": Curve(f"fraction of points, {what}", _BY_INTENSITY, "intensity", histogram=True)
         for what in _SURFACES
     },
     **{

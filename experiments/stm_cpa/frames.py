@@ -52,18 +52,19 @@ def load_labelled_frame(frame: Frame) -> LabelledFrame:
     """
     truth = frame.truth()  # checked first because most frames of KITTI end here
     if truth is None:
-        raise InputError(f"{frame.points or frame.name} has no labels; put them beside the scans")
+        raise InputError(f"{frame.points or frame.name} has no labels; put the label files next to the scans")
     if PEDESTRIAN not in truth.class_ids:
         raise InputError("no Pedestrian is labelled; the paper leaves such frames out")
     cloud, calibration = frame.load(), frame.calibration()
     if calibration is None:
-        raise InputError(f"{frame.name} has no camera calibration; the paper crops to its view")
+        raise InputError(f"{frame.name} has no camera calibration, which the paper's crop to the camera's view needs")
     truth, camera = select_in_image(truth, calibration), calibration.camera()
     if PEDESTRIAN not in truth.class_ids:
         raise InputError("no Pedestrian is labelled in the image; the paper leaves such frames out")
     if not camera.in_view(cloud.xyz).any():
         raise InputError(
-            f"{frame.points or frame.name} has no point in the camera's view; download it and its calibration again"
+            f"{frame.points or frame.name} has no points in the camera's view; download the scan and its calibration "
+            "again"
         )
     return LabelledFrame(cloud, camera, truth, frame.sensor_height)
 
@@ -85,7 +86,7 @@ def make_nearest_seed(segmented: SegmentedCloud, labelled: LabelledFrame) -> See
         if class_id in VEHICLES and points_in_box(nearest[None, :3], box).any():
             x, y = nearest[:2]
             raise InputError(
-                f"the seed pedestrian at ({x:.1f}, {y:.1f}) m stands in a labelled "
-                f"{CLASSES[class_id]}; correct the labels"
+                f"the seed pedestrian at ({x:.1f}, {y:.1f}) m is inside a labelled {CLASSES[class_id]}; correct the "
+                "labels"
             )
     return seed_from_truth(segmented.xyz, segmented.ground, labelled.pedestrians)

@@ -27,7 +27,7 @@ class Choice(click.ParamType):
         names_by_spelling |= {_plain(name): name for name in self.choices}
         if (match := names_by_spelling.get(_plain(str(value)))) is not None:
             return match
-        self.fail(f"{value!r} is unknown{valid_names(str(value), self.choices)}", param, ctx)
+        self.fail(f"unknown value {value!r}{valid_names(str(value), self.choices)}", param, ctx)
 
     def get_metavar(self, param: Any, ctx: Any = None) -> str:
         return f"[{'|'.join(self.choices)}]"
@@ -117,5 +117,5 @@ class Group(click.Group):
         name = args[0]
         if self.get_command(ctx, name) is None and not name.startswith("-"):
             commands = self.list_commands(ctx)
-            ctx.fail(f"there is no command {name!r}{valid_names(name, commands)}")
+            ctx.fail(f"unknown command {name!r}{valid_names(name, commands)}")
         return super().resolve_command(ctx, args)

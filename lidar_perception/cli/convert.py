@@ -35,19 +35,24 @@ DATASETS, LABELS = tuple(LAYOUTS), tuple(FORMATS)
     type=Choice(dict.fromkeys((MCAP, *DATASETS, *LABELS)), ALIASES),
     help="Format to write.",
 )
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Bag, folder or file to make.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Bag, folder or file to create.")
 @path_option(
-    "--data", "Same as DATA. With both, DATA is the path of labels of this drive, which are converted.", "DRIVE"
+    "--data", "Same as DATA. If both are given, DATA is the path of labels of this drive, which are converted.", "DRIVE"
 )
 @click.option(
-    "--from", "labels_format", type=Choice(READERS, ALIASES), help="Format of the labels at DATA. Default: recognised."
+    "--from",
+    "labels_format",
+    type=Choice(READERS, ALIASES),
+    help="Format of the labels at DATA. Default: detected automatically.",
 )
 @click.option(
     "--detections",
     metavar="TOPIC",
     help="Take the boxes on this topic of the bag at DATA (MarkerArray or Detection3DArray), instead of its labels.",
 )
-@click.option("--points", default="", metavar="TOPIC", help="Clouds of a bag.  [default: /points, else the only ones]")
+@click.option(
+    "--points", default="", metavar="TOPIC", help="Topic of the clouds of a bag.  [default: /points, or the only one]"
+)
 @path_option(
     "--robot",
     "robot.param.yaml that `setup` wrote, for a recording with a tilted or turned "
@@ -56,13 +61,13 @@ DATASETS, LABELS = tuple(LAYOUTS), tuple(FORMATS)
 @click.option(
     "--deskew",
     is_flag=True,
-    help="Of a bag: move the points of each cloud to its "
+    help="For a bag: move the points of each cloud to its "
     "stamp, by its column of times and the odometry or TF of the bag.",
 )
-@click.option("--images", is_flag=True, help="To a bag: include the left colour images, as PNG.")
+@click.option("--images", is_flag=True, help="With --to mcap: include the left colour images, as PNG.")
 @split_option
 @limit_option
-@click.option("--force", is_flag=True, help="Replace what is there: a bag, or files of the same names.")
+@click.option("--force", is_flag=True, help="Replace an existing bag, or files with the same names.")
 def convert(
     source: Path | None,
     format: str,
@@ -103,14 +108,17 @@ def convert(
         raise click.UsageError("DATA is missing: give the path of a recording")
     given_labels = data is not None or (format in LABELS and format not in (MCAP, *DATASETS))
     for is_wrong, message in (
-        (images and (given_labels or format != MCAP), "--images is for --to mcap"),
+        (images and (given_labels or format != MCAP), "--images requires --to mcap"),
         (
             (robot is not None or deskew) and (given_labels or detections is not None),
-            "--robot and --deskew are for a recording with its clouds",
+            "--robot and --deskew require a recording with clouds",
         ),
-        (labels_format is not None and data is None, "--from is for labels at DATA; give their drive with --data"),
-        (labels_format is not None and detections is not None, "--detections is for a bag, --from for other labels"),
-        (data is not None and format == "nuscenes", "labels are written as nuscenes-detection or nuscenes-tracking"),
+        (labels_format is not None and data is None, "--from requires labels at DATA; give their drive with --data"),
+        (
+            labels_format is not None and detections is not None,
+            "--detections is for bags, --from for other labels; give one of them",
+        ),
+        (data is not None and format == "nuscenes", "for labels, choose --to nuscenes-detection or nuscenes-tracking"),
     ):
         if is_wrong:
             raise click.UsageError(message)
@@ -135,8 +143,8 @@ def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Ca
 
     if not any(layout.is_layout(recording.path) for layout in (bag_frames, cloud_folder)):
         raise InputError(
-            f"{recording.path} ({recording.layout}) has level clouds; --robot and "
-            "--deskew are for bags and files of clouds"
+            f"{recording.path} ({recording.layout}) has level clouds already; --robot and --deskew are for bags and "
+            "cloud files"
         )
     from lidar_perception.data.levelling import SensorMount, level_frame
 
@@ -265,4 +273,4 @@ def _convert_labels(
     written = export_labels(labels.take_first(count), format, out, recording.frames[:count], force)
     console.print(f"{out}: {written.boxes} boxes of {written.frames} frames, as {format}")
     for content in written.left_out:
-        console.print(f"left out: {content}, for which the format has no place", style="yellow")
+        console.print(f"left out: {content}, which the format cannot store", style="yellow")

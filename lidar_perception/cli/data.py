@@ -67,7 +67,7 @@ def make_jobs_option(what: str, least: int = 0) -> Callable:
         "--jobs",
         type=click.IntRange(least),
         default=lambda: min(count_cores(), MAX_DEFAULT_JOBS),
-        show_default=f"one for each core, {MAX_DEFAULT_JOBS} at most",
+        show_default=f"one per core, at most {MAX_DEFAULT_JOBS}",
         help=f"{what} The result is the same.",
     )
 
@@ -117,8 +117,7 @@ dask_option = click.option(
     "--dask",
     metavar="ADDRESS",
     help="Run on the workers of the Dask "
-    "scheduler at this address, such as tcp://10.0.0.1:8786. They must see "
-    "DATA under the same name.",
+    "scheduler at this address, such as tcp://10.0.0.1:8786. They must be able to read DATA at the same path.",
 )
 json_option = out_file("--json", "Write the scores to this file.", "json_file")
 intervals_option = click.option(
@@ -127,15 +126,10 @@ intervals_option = click.option(
     default=0,
     metavar="N",
     help="Also print bootstrap intervals from N resamples of the "
-    "drives, or of runs of 10 frames where there are few drives. 200 "
-    "are plenty.",
+    "drives, or of runs of 10 frames where there are few drives. 200 are enough.",
 )
 port_option = click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=0,
-    show_default=True,
-    help="Port on 127.0.0.1; 0: any that is free.",
+    "--port", type=click.IntRange(0, 65535), default=0, show_default=True, help="Port on 127.0.0.1; 0: any free port."
 )
 browser_option = click.option(
     "--open/--no-open", "browser", default=True, help="Open the page in a browser.  [default: open]"
@@ -193,7 +187,9 @@ def scoring_options(data: Callable = data_argument(), *, parallel: bool = True) 
         @functools.wraps(function)
         def wrapper(*args: Any, data, split, limit, json_file, jobs=1, dask=None, **kwargs: Any) -> Any:
             if dask and jobs > 1:
-                raise click.UsageError("--jobs is for this machine, --dask for others: give one of them")
+                raise click.UsageError(
+                    "--jobs and --dask cannot be combined; --jobs runs on this machine, --dask on others"
+                )
             options = ScoringOptions(data, split, limit, jobs, dask, json_file)
             return function(*args, options=options, **kwargs)
 
@@ -225,7 +221,7 @@ def open_and_describe(data: Path, *, level: bool = True, **how: Any) -> Any:
     measured = apply_measured_height(recording, clouds)
     if measured is not recording:
         height = next(iter(measured)).sensor_height
-        errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds", style="dim")
+        errors.print(f"its sensor is {height:.2f} m above the ground, measured on the first clouds", style="dim")
     if level and clouds:
         if (full_scale := recording.frames[0].intensity_max()) > 1:
             errors.print(f"its intensity is 0 .. {full_scale:g}, read as 0 .. 1", style="dim")

@@ -76,12 +76,14 @@ def _make_runs(detector: str) -> Runs:
     type=click.IntRange(1),
     default=40,
     show_default=True,
-    help="Length of the simulated drive, 10 frames a second.",
+    help="Length of the simulated drive, at 10 frames per second.",
 )
 @click.option(
     "--drive-seed", type=click.IntRange(0), default=38, show_default=True, help="Seed of the simulated drive."
 )
-@click.option("--rate", type=click.FloatRange(0.01, 100), default=1.0, show_default=True, help="Speed of the replay.")
+@click.option(
+    "--rate", type=click.FloatRange(0.01, 100), default=1.0, show_default=True, help="Speed factor of the replay."
+)
 @click.option("--single", is_flag=True, help="Run ground, clusters and detector in one process instead of three.")
 @click.option(
     "--processes/--one-process",
@@ -92,9 +94,8 @@ def _make_runs(detector: str) -> Runs:
 @click.option(
     "--real-time",
     is_flag=True,
-    help="Play at the speed of the sensor, even if the "
-    "machine cannot keep up. Without it each cloud is "
-    "sent once those before it have their results.",
+    help="Play in real time, even if the machine cannot keep up. By default, each cloud waits for the results of "
+    "earlier ones.",
 )
 @range_option
 @device_option
@@ -131,10 +132,10 @@ def demo(
       lidar-perception demo --detector candidates --config best
     """
     if data is not None:
-        refuse_options(("frames", "drive_seed"), "is for a simulated drive, which DATA replaces")
+        refuse_options(("frames", "drive_seed"), "applies to the simulated drive, which DATA replaces")
     (values,) = settings.values(_make_runs(detector))
     if detector == CANDIDATES and (range != "auto" or device != "auto"):
-        raise click.UsageError("--range and --device are for a detector with a network")
+        raise click.UsageError("--range and --device require a detector with a network")
     choice = make_detector_choice(detector, range, device, values, PAPER if detector == CANDIDATES else None)
     require_rclpy()  # checked before the drive is simulated
     recording = None if data is None else open_and_describe(data)
@@ -178,10 +179,10 @@ def demo(
         next(iter(replayed)).sensor_height,
     )
     console.print(f"results in {out}: result (bag), scores.json, logs" + (", birdseye.png" if picture else ""))
-    console.print(f"look at it: lidar-perception view {out / 'result'}")
+    console.print(f"show it: lidar-perception view {out / 'result'}")
     if missing := clouds - content["results"]:
         errors.print(
-            Text(f"{missing} clouds gave no result", "red")
+            Text(f"{missing} clouds produced no result", "red")
             + ("; without --real-time none is dropped" if real_time else f"; see {out}/logs")
         )
         if not real_time:
@@ -299,7 +300,7 @@ def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str
     try:
         result = score_recorded_tracks(frames, calibration)
     except InputError as error:
-        console.print(f"tracks: {count}; HOTA is not known: {error}")
+        console.print(f"tracks: {count}; HOTA is not available: {error}")
     for name in DETECTED:
         if scores := result.get(name):
             console.print(
@@ -364,7 +365,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
             frame,
             boxes,
             truth,
-            f"{hits[best][0]} of {hits[best][1]} labelled objects found",
+            f"{hits[best][0]} of {hits[best][1]} labelled objects detected",
             f"{best / 1e9:.1f} s",
             colors,
         ),

@@ -48,7 +48,7 @@ class Formats(click.ParamType):
 
 @click.command(cls=Command)
 @data_argument()
-@out_folder("Folder of the results.", required=True)
+@out_folder("Folder for the results.", required=True)
 @click.option(
     "--format",
     "--to",
@@ -70,10 +70,11 @@ class Formats(click.ParamType):
     type=click.FloatRange(0, 10),
     default=0.0,
     metavar="M",
-    help="Height of the sensor above the ground. Default: that of the recording, or measured on its first clouds.",
+    help="Height of the sensor above the ground. Default: the height in the recording, or measured on its first "
+    "clouds.",
 )
 @click.option(
-    "--track", is_flag=True, help="Write tracks, with ids and velocities, instead of the boxes of each frame alone."
+    "--track", is_flag=True, help="Write tracks, with ids and velocities, instead of separate boxes for each frame."
 )
 @click.option(
     "--ego",
@@ -157,14 +158,13 @@ def detect(
     from lidar_perception.tracking.drive_tracker import choose_ego_source
 
     if dask and jobs > 1:
-        raise click.UsageError("--jobs is for this machine, --dask for others: give one of them")
+        raise click.UsageError("--jobs and --dask cannot be combined; --jobs runs on this machine, --dask on others")
     if not track and (ego != "auto" or tracking != TrackingParams()):
-        raise click.UsageError("--ego and --set tracking.* are for --track")
+        raise click.UsageError("--ego and --set tracking.* require --track")
     recording = open_and_describe(data, split=split, sensor_height=mount_height or None)
     if track and not recording.is_sequential:
         raise InputError(
-            f"{data} ({recording.layout}) has frames that do not follow each other, "
-            "so nothing can be tracked; leave out --track"
+            f"{data} ({recording.layout}) has unrelated frames, so tracking is impossible; leave out --track"
         )
     chosen = list(dict.fromkeys(name for names in formats for name in names))
     if not chosen and not png and video is None:

@@ -33,7 +33,7 @@ def info(data: Path, as_json: bool) -> None:
     """
     layout = find_layout(data)
     if layout is None and data.is_dir():
-        raise InputError(f"{data} has no metadata.yaml and is no other recording: {describe_formats()}")
+        raise InputError(f"{data} has no metadata.yaml and is not another kind of recording: {describe_formats()}")
     if layout in (None, bag_frames):
         content, show = _bag(data), _print_bag
     else:

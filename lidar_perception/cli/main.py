@@ -13,13 +13,13 @@ from lidar_perception.cli.command import Group
 
 COMMANDS = {  # verb -> (module.function, description in the overview)
     "demo": ("lidar_perception.cli.demo.demo", "Replay a drive through the ROS 2 nodes and score the result."),
-    "convert": ("lidar_perception.cli.convert.convert", "Turn recordings and labels into bags and other formats."),
+    "convert": ("lidar_perception.cli.convert.convert", "Convert recordings and labels to bags and other formats."),
     "detect": ("lidar_perception.cli.detect.detect", "Run a detector on a recording and write its results."),
     "evaluate": ("lidar_perception.cli.evaluate.group.evaluate", "Score the algorithms without ROS."),
-    "view": ("lidar_studio.cli.view.view", "Look at a recording and its results on a page in the browser."),
+    "view": ("lidar_studio.cli.view.view", "Show a recording and its results in the browser."),
     "setup": ("lidar_perception.cli.setup.setup", "Measure a sensor and its mounting from unlabelled clouds."),
-    "label": ("lidar_studio.cli.label.label", "Label a drive on a page in the browser."),
-    "seed": ("lidar_perception.cli.seed.seed", "Make a template of a seed pedestrian."),
+    "label": ("lidar_studio.cli.label.label", "Label a drive in the browser."),
+    "seed": ("lidar_perception.cli.seed.seed", "Create a template of a seed pedestrian."),
     "simulate": ("lidar_perception.cli.simulate.simulate", "Write simulated, labelled scans as a bag or a data set."),
     "train": ("lidar_perception.cli.train.train", "Train a detector on recordings or simulated streets."),
     "import-weights": (
@@ -27,7 +27,7 @@ COMMANDS = {  # verb -> (module.function, description in the overview)
         "Import PointPillars weights from other projects.",
     ),
     "export": ("lidar_perception.cli.weights.export", "Export a network for another runtime."),
-    "info": ("lidar_perception.cli.info.info", "List what is in a bag or another recording."),
+    "info": ("lidar_perception.cli.info.info", "List the content of a bag or another recording."),
     "run": ("lidar_perception.cli.run.run_node", "Start one ROS node."),
 }
 

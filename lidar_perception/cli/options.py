@@ -60,13 +60,10 @@ class Settings:
         whose = " or ".join(dict.fromkeys(each.name for each in runs))
         for name, _ in self.given:
             if name not in known and name.startswith("input."):
-                raise InputError(
-                    f"{name} is for messages, which nodes read; the intensities of a "
-                    "recording have a scale of their own"
-                )
+                raise InputError(f"{name} applies to messages read by nodes; a recording has its own intensity scale")
             if name not in known:
                 raise InputError(
-                    f"there is no parameter {name[:80]!r} of {whose}{_guess(name, known)} (--set help lists them all)"
+                    f"unknown parameter {name[:80]!r} of {whose}{_guess(name, known)} (--set help lists them all)"
                 )
         found: list[dict[str, Any]] = [{} for _ in runs]
         if self.config is not None:
@@ -106,7 +103,7 @@ def _value(name: str, f: Field[Any], text: str) -> Any:
         return tuple(_scalar(kind, word.strip()) for word in inner.split(",") if word.strip())
     except (ValueError, KeyError):
         many = (
-            "a list of numbers such as 0.15,0.3"
+            "a list of numbers, e.g. 0.15,0.3"
             if isinstance(f.default, tuple)
             else {bool: "true or false", int: "a whole number", float: "a number"}[kind]
         )
@@ -268,9 +265,8 @@ range_option = click.option(
     type=Choice(RANGE_CHOICES),
     default="auto",
     show_default=True,
-    help="Range of the detector: 69 m ahead, or 51 m "
-    "in all directions, which takes more than twice as long. auto: the "
-    "range that its weights were trained for, ahead for the shipped ones.",
+    help="Range of the detector: 69 m ahead, or 51 m in all directions, which takes more than twice as long. auto: "
+    "the range that its weights were trained for (shipped weights: ahead).",
 )
 device_option = click.option(
     "--device", default="auto", show_default=True, help="Where networks run: auto, cpu, cuda or cuda:N."
@@ -300,13 +296,10 @@ def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> 
             results = kwargs.get("results")
             if results is not None and (weights is not None or settings or range != "auto"):
                 form = next(p.metavar for p in click.get_current_context().command.params if p.name == "results")
-                raise click.UsageError(
-                    f"give either --results {form} or --weights FILE, --range, "
-                    "--config and --set, which are for a detector that runs"
-                )
+                raise click.UsageError(f"give either --results {form}, or --weights with --range, --config and --set")
             name = str(weights) if weights else None if results else default
             if name is None and settings:
-                raise click.UsageError("--config and --set are for a detector that runs; give --weights")
+                raise click.UsageError("--config and --set require --weights")
             values: list[dict[str, Any]] = [{}, {}]
             if name is not None:
                 values = settings.values(make_runs(name), *others) if settings else values
@@ -335,7 +328,7 @@ def detectors_options(function: Callable) -> Callable:
         *args: Any, weights: tuple[Path, ...], range: str, device: str, settings: Settings, **kwargs: Any
     ) -> Any:
         if settings and not weights:
-            raise click.UsageError("--config and --set are for a detector that runs; give --weights")
+            raise click.UsageError("--config and --set require --weights")
         values = settings.values(*map(make_runs, weights)) if settings else [{} for _ in weights]
         chosen = tuple(make_detector_choice(name, range, device, own) for name, own in zip(weights, values))
         return function(*args, detectors=chosen, **kwargs)

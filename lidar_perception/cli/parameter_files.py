@@ -42,9 +42,7 @@ def read_parameters(
     if str(path) in CONFIGURATIONS:
         configuration = CONFIGURATIONS[str(path)]
         if others := sorted(configuration.keys() - known.keys()):
-            raise InputError(
-                f"the configuration {path} is for candidates; there is no {others[0]} here, give a parameter file"
-            )
+            raise InputError(f"the configuration {path} is for candidates, not {others[0]}; give a parameter file")
         return dict(configuration), []
     content = _load_file(path)
     visited = count()
@@ -53,7 +51,7 @@ def read_parameters(
     unknown: list[str] = []
     for node, section in content.items():
         if not (isinstance(section, dict) and isinstance(section.get("ros__parameters", ()), dict | None)):
-            raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for the form")
+            raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for examples")
         if nodes is not None and not _is_for_nodes(str(node), nodes):
             name = str(node).rpartition("/")[2]
             if name not in NODES and (suggestion := did_you_mean(name, nodes)):
@@ -61,7 +59,7 @@ def read_parameters(
             continue
         for name, value in _iterate_dotted(path, section.get("ros__parameters") or {}, visited):
             if not isinstance(name, str):
-                raise InputError(f"{path}: {name!r} is no name of a parameter; put it into quotes")
+                raise InputError(f"{path}: {name!r} is not a parameter name; quote it")
             if name in known:
                 values[name] = value
             elif any(k.startswith(f"{name}.") or name.startswith(f"{k}.") for k in known):
@@ -74,14 +72,14 @@ def read_parameters(
 def _load_file(path: Path) -> dict[Any, Any]:
     if not path.exists():
         raise InputError(
-            f"cannot read the parameter file {path}: there is no such file" + valid_names(str(path), CONFIGURATIONS)
+            f"cannot read the parameter file {path}: file not found" + valid_names(str(path), CONFIGURATIONS)
         )
     try:
         content = yaml.safe_load(read_text(path, MAX_BYTES))
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         raise InputError(f"cannot read the parameter file {path}: {shorten_error(error)}") from None
     if not isinstance(content, dict | None):
-        raise InputError(f"{path} is no parameter file; see config/ for the form")
+        raise InputError(f"{path} is not a parameter file; see config/ for examples")
     return content or {}
 
 
@@ -92,7 +90,7 @@ def _is_for_nodes(section: str, nodes: Collection[str]) -> bool:
 
 def _describe_wrong_level(name: str, known: Iterable[str]) -> str:
     inner = [k for k in known if k.startswith(f"{name}.")]
-    return f"a group, not a value; it holds {', '.join(inner)}" if inner else "below a parameter that holds no others"
+    return f"a group, not a value; it contains {', '.join(inner)}" if inner else "below a parameter that is not a group"
 
 
 def _iterate_dotted(
@@ -104,7 +102,7 @@ def _iterate_dotted(
     """
     for key, value in section.items():
         if next(visited) >= MAX_NAMES or depth >= MAX_DEPTH:
-            raise InputError(f"{path} has more than {MAX_NAMES} parameters, or groups in more than {MAX_DEPTH} others")
+            raise InputError(f"{path} has more than {MAX_NAMES} parameters, or more than {MAX_DEPTH} nested groups")
         if not isinstance(key, str):
             yield key, value
         elif isinstance(value, dict):

@@ -23,7 +23,7 @@ COLORS = {"high": "green", "fair": "default", "low": "yellow"}
 
 @click.command(cls=Command)
 @data_argument(
-    "A bag, a .pcd, .ply, .npy or .bin file or a folder of them, or the folder of a data set. No label is needed."
+    "A bag, a .pcd, .ply, .npy or .bin file or a folder of them, or the folder of a data set. Labels are not needed."
 )
 @out_folder("Folder for the files.", required=True)
 @click.option("--topic", metavar="TOPIC", help="Topic of the clouds, for a bag with several sensors.")
@@ -32,7 +32,7 @@ COLORS = {"high": "green", "fair": "default", "low": "yellow"}
     type=click.IntRange(1),
     default=40,
     show_default=True,
-    help="Number of clouds to look at, in pairs spread over all.",
+    help="Number of clouds to use, in pairs spread over the recording.",
 )
 @click.option(
     "--height-hint",
@@ -68,7 +68,7 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
     with show_scanning(data):
         clouds = open_clouds(data, topic)
     if topic is not None and not clouds.topic:
-        raise InputError(f"--topic {topic} is for a bag, and {data} is {clouds.layout}")
+        raise InputError(f"--topic {topic} requires a bag; {data} is {clouds.layout}")
     count = f"{clouds.count} cloud{'s' * (clouds.count != 1)}"
     errors.print(f"{data}: {clouds.layout}, {count}", style="dim")
     numbers, scans_read, skipped = [], [], []

@@ -27,7 +27,7 @@ from lidar_perception.types import InputError
 
 
 @click.command(cls=Command)
-@out_folder("Bag or folder to make.", required=True)
+@out_folder("Bag or folder to create.", required=True)
 @click.option(
     "--format",
     "--to",
@@ -50,7 +50,7 @@ from lidar_perception.types import InputError
     type=click.FloatRange(0, 10),
     default=0.0,
     metavar="M",
-    help="Height of the sensor above the ground. Default: that of its file or preset.",
+    help="Height of the sensor above the ground. Default: the height in its file or preset.",
 )
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True, help="Number of scans.")
 @click.option(
@@ -65,7 +65,7 @@ from lidar_perception.types import InputError
     default="street",
     show_default=True,
     metavar="NAME",
-    help=f"One of {', '.join(SCENE_TYPES)}, or several in turn, such as street,campus.",
+    help=f"One of {', '.join(SCENE_TYPES)}, or several that alternate, such as street,campus.",
 )
 @click.option(
     "--kind",
@@ -81,7 +81,7 @@ from lidar_perception.types import InputError
     type=click.FloatRange(0, MAX_PEOPLE),
     default=1.0,
     show_default=True,
-    help="Pedestrians and cyclists, as a multiple of the usual; on streets of KITTI's.",
+    help="Number of pedestrians and cyclists relative to the default (on streets: that of KITTI).",
 )
 @click.option(
     "--streets-of",
@@ -90,7 +90,7 @@ from lidar_perception.types import InputError
     help="Scans of each street. Default: 1 for kitti, a drive of 20 s for the others.",
 )
 @click.option(
-    "--jobs", type=click.IntRange(1), help="Processes that write the folders of a data set. Default: one for each core."
+    "--jobs", type=click.IntRange(1), help="Processes that write the folders of a data set. Default: one per core."
 )
 @click.option("--resume", is_flag=True, help="Resume an unfinished data set; needs identical settings.")
 @click.option("--force", is_flag=True, help="Replace an earlier simulated data set in --out.")
@@ -122,7 +122,7 @@ def simulate(
     """
     scenes = Scenes(kind, people, scene)
     if resume and force:
-        raise click.UsageError("--resume resumes, --force starts over: give one of them")
+        raise click.UsageError("--resume continues the run, --force starts over; give one of them")
     sensor = find_sensor(sensor_name, mount_height)
     plan = DatasetPlan(
         layout, sensor, seed, frames, streets_of or (1 if layout == "kitti" else longest_drive(sensor)), scenes
@@ -130,8 +130,7 @@ def simulate(
     if layout == "mcap":
         if resume:
             raise click.UsageError(
-                "a bag is one file and cannot be resumed; make kitti-tracking, "
-                "which can, and turn it into a bag with 'convert'"
+                "a bag cannot be resumed; simulate kitti-tracking instead and convert it to a bag with 'convert'"
             )
         _write_bag(out, plan, force)
     else:

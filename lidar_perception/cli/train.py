@@ -24,7 +24,7 @@ from lidar_perception.types import InputError
 
 OPTIONS = (
     data_argument(
-        "Training data: a data set or bag, or `sim` for simulated scenes; may be repeated to mix them.",
+        "Training data: a data set or bag, or `sim` for simulated scenes; repeat it to mix them.",
         several=True,
         kind=str,
     ),
@@ -36,20 +36,19 @@ OPTIONS = (
     ),
     path_option("--split", "Train on the frames of --data, or whole sequences, listed in this file, one per line."),
     path_option("--val-split", "Validate on the frames or sequences listed in this file."),
-    out_folder("Folder for best.safetensors, last.safetensors, logs and the state.", required=True),
+    out_folder("Folder for best.safetensors, last.safetensors, logs and the training state.", required=True),
     click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one."),
     path_option(
         "--init", "Start from the matching weights of this checkpoint; `package`: the shipped weights.", "FILE|package"
     ),
     device_option,
-    make_jobs_option("Processes that prepare scenes; 0: only this one."),
+    make_jobs_option("Processes that prepare scenes; 0: only this process."),
     click.option(
         "--budget",
         type=float,
         metavar="HOURS",
-        help="Time budget on this machine. It "
-        "determines scans, steps and validations that are not given. When it is used up, "
-        "the run stops and can be resumed. Default: 2, or no limit with --steps or "
+        help="Time budget on this machine. It determines the number of scans, steps and validations unless given. "
+        "When it is used up, the run stops and can be resumed. Default: 2, or no limit with --steps or "
         "--epochs.",
     ),
 )
@@ -190,7 +189,7 @@ def fused(
     from lidar_perception.training.fusion_curves import fit_fusion
 
     print_fused(fit_fusion(weights, classifier, out, params, jobs))
-    console.print(f"{out}: --weights of commands, and fused.weights of the node, take it")
+    console.print(f"use {out} with --weights of commands, or as fused.weights of the node")
 
 
 def run(request: TrainingRequest, params: PointPillarsTraining | PointNetTraining) -> None:
@@ -226,8 +225,8 @@ def print_fused(fits: Any) -> None:
     console.print(table)
     if unfitted:
         console.print(
-            f"{', '.join(unfitted)}: too few to fit curves to; those of the package stay. "
-            "More --scans, or another --scene, have more"
+            f"{', '.join(unfitted)}: too few samples to fit curves, so the packaged curves remain; use more --scans "
+            "or another --scene"
         )
 
 
@@ -236,14 +235,16 @@ def print_result(progress: Any, steps: int, batches: Any, out: Path) -> None:
     if batches.skipped:
         console.print(f"{len(batches.skipped)} scenes could not be used, such as: {next(iter(batches.skipped))}")
     if progress.skipped:
-        console.print(f"{progress.skipped} of {progress.step} steps were skipped: not finite")
+        console.print(
+            f"{progress.skipped} of {progress.step} steps were skipped because of values that were not finite"
+        )
     if progress.best is not None:
         console.print(f"{out / 'best.safetensors'}: score {progress.best:.2f} at step {progress.best_step}")
     if progress.left_out:
-        console.print(f"{progress.left_out:.0f} of {steps} planned steps were left out, to end within the budget")
+        console.print(f"{progress.left_out:.0f} of {steps} planned steps were skipped to end within the budget")
     if progress.late:
         console.print(
-            "the budget is spent and the learning rate has not come down: "
+            "the budget is spent before the learning rate has decayed: "
             f"{steps - progress.step - progress.left_out:.0f} of {steps} steps are "
             "missing; continue with --resume"
         )

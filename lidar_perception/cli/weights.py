@@ -18,7 +18,7 @@ from lidar_perception.runs.terminal import console
     "--classes",
     metavar="A,B,C",
     default="",
-    help="Classes in the order of training. Default: the project's own order for KITTI.",
+    help="Classes in the order used for training. Default: the project's order for KITTI.",
 )
 @click.option("--half", is_flag=True, help="Store the weights of layers as float16.")
 def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:

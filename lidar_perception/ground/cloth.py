@@ -131,7 +131,7 @@ def _drop_sunk_cells(lowest, depth):
                         break
                 if level > 2:
                     break
-                if higher >= 4:  # all neighbours but one
+                if higher >= 4:  # all neighbours except at most one
                     sunk.append((r, c))
                     break
     for r, c in sunk:

@@ -77,7 +77,7 @@ class DetectorNode(ManagedNode):
             try:
                 find_device(device)
             except InputError as error:
-                device, fallback = "cpu", f"{error}; the CPU is used"
+                device, fallback = "cpu", f"{error}; falling back to the CPU"
         with lock_compilation(self.get_logger().info):
             detector = self.load(weights, device)
         detector.fallback = detector.fallback or fallback

@@ -110,15 +110,12 @@ class EgoInput:
             topic = self.node.resolve_topic_name("~/input/odometry")
             silent = monotonic() - self.transforms.odometry_arrival
             if silent > ODOMETRY_TIMEOUT_S and stamp - last > self.params().max_gap * SECOND_NS:
-                return (
-                    f"no odometry on {topic} for {silent:.0f} s: the sensor is assumed to "
-                    "stand; is the odometry running?"
-                )
+                return f"no odometry on {topic} for {silent:.0f} s: assuming a sensor at rest; is the odometry running?"
             if silent <= ODOMETRY_TIMEOUT_S and abs(last - stamp) > MAX_OFFSET_NS:
                 return (
                     f"the odometry on {topic} is stamped {abs(last - stamp) / SECOND_NS:.0f} s "
-                    f"{'ahead of' if last > stamp else 'behind'} the detections, so none of "
-                    "its poses is used: do both use the same clock (use_sim_time)?"
+                    f"{'ahead of' if last > stamp else 'behind'} the detections, so its poses are ignored: do both "
+                    "use the same clock (use_sim_time)?"
                 )
         if wanted == "tf" and self.source != "tf":
             fixed = self.node.node_params.input.fixed_frame
@@ -134,7 +131,7 @@ class EgoInput:
             )
         if not self.is_mounting_known and frame_id:
             return (
-                f"the odometry is of '{odometry_child}', the detections are in '{frame_id}', "
+                f"the odometry describes '{odometry_child}', the detections are in '{frame_id}', "
                 "and TF does not connect them: they are assumed to coincide"
                 + ("; its child_frame_id is empty" if not odometry_child else "")
             )

@@ -86,7 +86,7 @@ def build_graph(detectors: Sequence[str], single: bool = False, tracking: bool =
     """
     for name in detectors:
         if name not in DETECTOR_NODES:
-            raise InputError(f"detectors: '{name}' is none of {', '.join(DETECTOR_NODES)}")
+            raise InputError(f"detectors: '{name}' is unknown; choose from {', '.join(DETECTOR_NODES)}")
     parts = [(SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[name] for name in detectors]
     if tracking:
         parts += [{tracker: _remap_tracker(name, single)} for tracker, name in find_trackers(detectors).items()]
@@ -291,7 +291,7 @@ def reserve_domain() -> int:
                 continue
         _domain_locks.append(lock)
         return domain
-    raise InputError("all ROS domains 1..100 are in use on this machine")
+    raise InputError("all ROS domains 1 to 100 are in use on this machine; stop other ROS processes")
 
 
 class Processes:

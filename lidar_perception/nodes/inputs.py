@@ -206,7 +206,7 @@ class SeedInput:
             self.deliver(
                 cloud,
                 _raise_missing(
-                    "no ground truth with the stamp of this cloud; is it published, with the same header.stamp?"
+                    "no ground truth with the stamp of this cloud; is it published with the same header.stamp?"
                 ),
             )
         else:
@@ -244,8 +244,7 @@ class SeedInput:
         except MissingTransform as error:
             raise InputError(
                 f"the clicked point is in frame '{frame_id}' but the cloud in "
-                f"'{header.frame_id}' ({error}); set that as the fixed frame and "
-                "click again"
+                f"'{header.frame_id}' ({error}); choose the cloud's frame as fixed frame and click again"
             ) from None
         point = transform_points(np.array([[p.x, p.y, p.z]]), pose)[0]
         (seed,) = make_click_source(point, self.params)(segmented)

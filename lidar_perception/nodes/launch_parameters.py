@@ -23,7 +23,7 @@ def list_parameter_files(config: str, experts: str = "") -> list[str]:
     """
     files = [config] if Path(config).is_file() else [f for f in config.split(",") if f]
     if missing := [file for file in files if not Path(file).is_file()]:
-        raise InputError(f"config: no such parameter file: {missing[0]}")
+        raise InputError(f"config: parameter file not found: {missing[0]}")
     if experts and experts not in CONFIGS:
         if not Path(experts).is_file():
             raise InputError(f"experts: {experts} is neither a parameter file nor a detector ({', '.join(CONFIGS)})")
@@ -100,7 +100,6 @@ def _parse_weights(text: str, networks: list[str]) -> dict[str, str]:
     pairs = dict(part.partition("=")[::2] for part in text.split(","))
     if unknown := [name for name in pairs if name not in networks]:
         raise InputError(
-            f"weights: '{unknown[0]}' is not one of {', '.join(networks)}; with "
-            "several networks give NAME=FILE,NAME=FILE"
+            f"weights: '{unknown[0]}' is not one of {', '.join(networks)}; for several networks use NAME=FILE,NAME=FILE"
         )
     return pairs

@@ -58,8 +58,8 @@ SWITCHES: dict[str, Any] = dict(default_value="false", choices=["true", "false"]
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "namespace": dict(
         default_value="",
-        description="Namespace of all nodes and topics, for one of "
-        "several sensors; /diagnostics, /tf and /clock stay global.",
+        description="Namespace of all nodes and topics, to tell several sensors apart; /diagnostics, /tf and /clock "
+        "stay global.",
     ),
     "name_prefix": dict(default_value="", description="Prefix of all node names."),
     "points": dict(default_value=relative_name(POINTS), description="Topic of the clouds."),
@@ -68,8 +68,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
         description="Parameter input.reliability: auto, reliable or best_effort; empty: as in the parameter file.",
     ),
     "base_frame": dict(
-        default_value="",
-        description="Parameter base_frame: the mounting comes from TF; empty: as in the parameter file.",
+        default_value="", description="Parameter base_frame: TF gives the mounting; empty: as in the parameter file."
     ),
     "target_frame": dict(
         default_value="",
@@ -118,7 +117,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "odometry": dict(
         default_value=relative_name(ODOMETRY), description="Topic of the odometry for the trackers and deskew."
     ),
-    "single": dict(**SWITCHES, description="Run each detector in one process that finds ground and clusters itself."),
+    "single": dict(**SWITCHES, description="Run each detector in one process that also computes ground and clusters."),
     "processes": dict(
         default_value="auto",
         choices=["auto", "true", "false"],
@@ -134,7 +133,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "respawn": dict(
         **SWITCHES,
         description="Restart a node that has ended, for example after a "
-        "crash; with autostart:=false it is not configured then.",
+        "crash; with autostart:=false the restarted node is not configured.",
     ),
     "rviz": dict(**SWITCHES, description="Start RViz with config/lidar_perception.rviz in the same namespace."),
     "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: velodyne, as in the RViz file."),
@@ -276,7 +275,9 @@ def describe_conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
     detectors, given = _detectors(value), value["experts"]
     if value["single"] == "true":
         return (
-            ["experts has no effect: with single:=true each detector finds ground and clusters itself"] if given else []
+            ["experts has no effect: with single:=true each detector computes ground and clusters itself"]
+            if given
+            else []
         )
     if given not in ("", *CONFIGS):
         return []
@@ -289,8 +290,8 @@ def describe_conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
         others = [f"{key} {number}" for key, number in numbers[name].items() if number != numbers[chosen][key]]
         if others:
             lines.append(
-                f"ground and clusters use the parameters of {chosen}; {name} has other "
-                f"ones: {', '.join(others)}. Choose with experts:=NAME or experts:=FILE"
+                f"ground and clusters use the parameters of {chosen}; those of {name} differ: {', '.join(others)}. "
+                "Choose with experts:=NAME or experts:=FILE"
             )
     return lines
 

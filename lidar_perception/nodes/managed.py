@@ -188,7 +188,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
             self._deactivate()
         if self.inputs:
             self._forget_configuration()
-        self.report(OK, "shut down; the process ends at SIGINT or SIGTERM")
+        self.report(OK, "shut down; send SIGINT or SIGTERM to end the process")
         return SUCCESS
 
     def _find_problem(self, step: Callable[[], Any]) -> str | None:

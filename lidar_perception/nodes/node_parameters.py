@@ -39,7 +39,7 @@ def describe_misspelt_parameters(names: Iterable[str]) -> list[str]:
         matches = get_close_matches(name, known, 1, MIN_SIMILARITY)
         if name not in known and (matches or (name.partition(".")[0] in groups and "." in name)):
             lines.append(
-                f"no node has a parameter {name[:80]!r}, so it changes nothing"
-                + (f"; is '{matches[0]}' meant?" if matches else "; --help lists all")
+                f"unknown parameter {name[:80]!r} is ignored"
+                + (f"; did you mean '{matches[0]}'?" if matches else "; --help lists all")
             )
     return lines

@@ -207,8 +207,6 @@ class CandidateOutputs:
         elif len(candidates.stage1) == 0:
             self.node.report(WARN, "no cluster has the seed's height")
         elif len(candidates.final) == 0:
-            self.node.report(
-                WARN, f"none of {len(candidates.stage1)} clusters of the seed's height looks like the seed"
-            )
+            self.node.report(WARN, f"none of {len(candidates.stage1)} clusters of the seed's height resembles the seed")
         else:
             self.node.report(OK, "detecting")

@@ -35,7 +35,7 @@ def read_sections(path: str | Path) -> dict[str, dict[str, Any]]:
             raise
         raise InputError(f"cannot read the parameter file {path}: {shorten_error(error)}") from None
     if not isinstance(content, dict):
-        raise InputError(f"{path} is not a parameter file; see config/ for the form")
+        raise InputError(f"{path} is not a parameter file; see config/ for examples")
     visited = count()
     sections: dict[str, dict[str, Any]] = {}
     for node, group in _iterate_leaves(path, content, visited, "/", stop="ros__parameters"):
@@ -83,7 +83,7 @@ def describe_unknown_nodes(path: str | Path, nodes: Collection[str], only_simila
         guess = closest_name(name, [*nodes, *NODES])
         if guess in nodes or not only_similar:
             lines.append(
-                f"{path}: no node here is called {name[:80]!r}, so its parameters change "
-                "nothing" + (f"; did you mean {guess!r}?" if guess else "")
+                f"{path}: unknown node {name[:80]!r}; its parameters are ignored"
+                + (f"; did you mean {guess!r}?" if guess else "")
             )
     return [*islice(lines, MAX_LINES)]

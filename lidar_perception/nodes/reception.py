@@ -29,16 +29,13 @@ RETRY_DURATION_S = 0.3  # duration of the renewed wait
 SILENT_PERIODS, STALE_PERIODS = 3.0, 6.0
 # Kind of publisher -> (hint when no clouds arrive, hint when too few arrive).
 QUESTIONS = {
-    "sensor": ("is the sensor{} running, and connected?", "is the sensor{} overloaded?"),
+    "sensor": ("is the sensor{} connected and running?", "is the sensor{} overloaded?"),
     "detector": (
-        "is the detector{} running, and does it get clouds?",
-        "is the detector{} overloaded, or does it get fewer clouds?",
+        "is the detector{} running and receiving clouds?",
+        "is the detector{} overloaded, or is its input slower?",
     ),
-    "node": (
-        "is the node{} running, and does it get clouds?",
-        "is the node{} overloaded, or does it get fewer clouds?",
-    ),
-    "player": ("has the player{} reached the end of its bag, or is it paused?", "does the player{} play more slowly?"),
+    "node": ("is the node{} running and receiving clouds?", "is the node{} overloaded, or is its input slower?"),
+    "player": ("is the player{} paused, or at the end of its bag?", "is the player{} playing at a lower rate?"),
 }
 FASTDDS_PROFILE = files("lidar_perception.nodes") / "fastdds.xml"
 
@@ -171,7 +168,7 @@ class Reception:
             self._disconnect()
             self._connect()
             self.arrivals.record_interruption(0)
-            self.node.get_logger().info(f"{self.topic} is received {self._reliability_label()} now")
+            self.node.get_logger().info(f"{self.topic} is now received {self._reliability_label()}")
         if self.output is not None:
             self.last_publishers = self.publishers() or self.last_publishers
             return
@@ -187,7 +184,7 @@ class Reception:
         self.reliability = chosen
         self.node.destroy_subscription(self.subscription)
         self._subscribe()
-        self.node.get_logger().info(f"{self.topic} is received {self._reliability_label()} now")
+        self.node.get_logger().info(f"{self.topic} is now received {self._reliability_label()}")
 
     def _reliability_label(self) -> str:
         if self.output is not None:
@@ -312,7 +309,7 @@ class Reception:
         if lost > params.max_lost * total:
             remedy = self._suggest_remedy(publishers or self.last_publishers)
             problems.append(
-                ("lost", WARN, f"{lost} of the last {sent} {self.what}s on {self.topic} were lost on the way; {remedy}")
+                ("lost", WARN, f"{lost} of the last {sent} {self.what}s on {self.topic} were lost in transit; {remedy}")
             )
         if dropped > params.max_dropped * total:
             problems.append(

@@ -186,9 +186,9 @@ class LidarNode(Node):
                 return  # another QoS profile matches
             topic = self.resolve_topic_name(name)
             remedy = (
-                "let it publish transient local (ros2 bag play: --qos-profile-overrides-path)"
+                "make it publish transient local (ros2 bag play: --qos-profile-overrides-path)"
                 if event.last_policy_kind == QoSPolicyKind.DURABILITY
-                else f"let it publish reliable, or set qos_overrides.{topic}.subscription.reliability to best_effort"
+                else f"make it publish reliable, or set qos_overrides.{topic}.subscription.reliability to best_effort"
             )
             self.report(
                 WARN, f"a publisher on {topic} offers an incompatible QoS, so none of its messages arrive: {remedy}"
@@ -267,8 +267,8 @@ class LidarNode(Node):
         if stamp_ns < self.last_stamp_ns - JUMP_NS:
             self.counts["time_went_back"] = self.counts.get("time_went_back", 0) + 1
             self.get_logger().info(
-                "time jumped back, as when a bag restarts; pending data is "
-                "dropped (logged once, counted in /diagnostics)",
+                "time jumped back, as when a bag restarts; dropping pending data (logged once, counted in "
+                "/diagnostics)",
                 once=True,
             )
         self.last_stamp_ns = stamp_ns
@@ -323,9 +323,8 @@ class LidarNode(Node):
                 (
                     "name",
                     WARN,
-                    f"another node is called {self.get_fully_qualified_name()} "
-                    "too, so topics and parameters of both are mixed; end one, or give it "
-                    "another namespace",
+                    f"another node is also called {self.get_fully_qualified_name()}, "
+                    "so their topics and parameters are mixed; stop one, or change its namespace",
                 )
             )
         before, self._present = self._present, {kind for kind, _, _ in found}

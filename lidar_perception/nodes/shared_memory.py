@@ -39,7 +39,7 @@ def use_large_shared_memory(from_driver: bool = False) -> None:
     if profile != "fastdds.xml":
         print(
             f"/dev/shm has only {free / 2**20:.0f} MB free, so clouds above "
-            f"{3 if profile else 0} MB may get lost between processes; start the container with "
+            f"{3 if profile else 0} MB may be lost between processes; start the container with "
             "--shm-size=1g",
             file=sys.stderr,
         )

@@ -90,8 +90,8 @@ class TrackOutputs:
             return None
         self.tracker.reset()
         return (
-            f"detections in '{before}' and in '{frame_id}' are mixed, and tracks end at every "
-            "change; start one tracker for each sensor"
+            f"detections in '{before}' and in '{frame_id}' are mixed, so tracks end at every change; start one "
+            "tracker for each sensor"
         )
 
     def _send(self, header: Any, stamp: int, tracks: Tracks) -> None:

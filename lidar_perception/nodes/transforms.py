@@ -34,7 +34,7 @@ TF_QOS = QoSProfile(depth=100)
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 ODOMETRY_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # best effort matches every publisher
 ODOMETRY_TIMEOUT_S = 2.0  # silence after which odometry in another frame is accepted
-NO_TF = "tf2_msgs is not installed, so TF is not available; install ROS 2's tf2_msgs"
+NO_TF = "TF is not available because tf2_msgs is not installed; install the ROS 2 package tf2_msgs"
 
 
 def has_tf() -> bool:
@@ -111,7 +111,7 @@ class Transforms:
             if now - self.odometry_arrival < ODOMETRY_TIMEOUT_S:
                 self.ignored_arrival = now
                 self.problem_by_source["odometry"] = (
-                    f"two odometries on {self.node.resolve_topic_name('~/input/odometry')}: that "
+                    f"two odometry sources on {self.node.resolve_topic_name('~/input/odometry')}: that "
                     f"of '{child}' in '{frame}' is ignored, that of '{self.odometry_child}' in "
                     f"'{self.odometry_frame}' is used; publish them on separate topics"
                 )
@@ -189,7 +189,7 @@ class Transforms:
         if base is not None and not 0.0 <= base[2, 3] <= 50.0:
             self.problem_by_source["base_frame"] = (
                 f"'{frame_id}' is {base[2, 3]:.2f} m above '{self.base_frame}', which must be on "
-                "the ground (as base_footprint is); ground.sensor_pose is used"
+                "the ground (as base_footprint is); using ground.sensor_pose"
             )
             base = None
         ahead = np.radians(self.node.node_params.input.ahead)
@@ -214,9 +214,7 @@ class Transforms:
         try:
             return self.tree.lookup(frame, frame_id, stamp_ns)
         except MissingTransform as error:
-            fallback = {"base_frame": "ground.sensor_pose is used", "target_frame": f"results are in '{frame_id}'"}[
-                what
-            ]
+            fallback = {"base_frame": "using ground.sensor_pose", "target_frame": f"results are in '{frame_id}'"}[what]
             self.problem_by_source[what] = f"{what} '{frame}': {error}; {fallback}"
             return None
 
@@ -246,7 +244,7 @@ class Transforms:
             elif crop.body[5] <= 0.0:
                 self.problem_by_source["crop.body"] = (
                     f"crop.body ends {-crop.body[5]:.2f} m below the ground of '{self.base_frame}'"
-                    "; give it in that frame, as the file of `setup` does"
+                    "; specify it in that frame, as the file of `setup` does"
                 )
         level = placement.level
         pose = None if placement.base is not None else self._configured_pose()
@@ -321,7 +319,7 @@ class Transforms:
             self.subscribe_to_tf()
             pose = self._configured_pose() if self.odometry_child == self.base_frame else None
             if pose is None:
-                raise MissingTransform(f"the odometry is of '{self.odometry_child}': {error}", error.late) from None
+                raise MissingTransform(f"the odometry describes '{self.odometry_child}': {error}", error.late) from None
             return pose[None]
 
     def is_connected_to_odometry(self, frame_id: str) -> bool:

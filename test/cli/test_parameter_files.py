@@ -74,10 +74,10 @@ def test_a_config_says_the_same_as_set_and_set_wins(bag, tmp_path):
 @pytest.mark.parametrize(
     "section, words",
     [
-        ("stm: 5", "'stm' is a group, not a value; it holds stm.threshold"),
+        ("stm: 5", "'stm' is a group, not a value; it contains stm.threshold"),
         ("stm: {threshold: {of: 5}}", "'stm.threshold.of' is below a parameter"),
-        ("5: 6", "5 is no name of a parameter"),
-        ("{stm: {on: 1}}", "True is no name of a parameter"),
+        ("5: 6", "5 is not a parameter name"),
+        ("{stm: {on: 1}}", "True is not a parameter name"),
         ("[" * 700, "cannot read the parameter file"),
         ("a: 2001-99-99", "cannot read the param"),
         (
@@ -88,7 +88,7 @@ def test_a_config_says_the_same_as_set_and_set_wins(bag, tmp_path):
             "\n    ".join(["a0: &a0 {}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}" for i in range(40)]),
             "more than 10000 parameters",
         ),
-        ("&a {b: *a}", "more than 20 others"),
+        ("&a {b: *a}", "more than 20 nested groups"),
     ],
     ids=range(9),
 )
@@ -124,7 +124,7 @@ def test_misspelt_parameter_is_reported(tmp_path, capsys):
     )
     assert read_config(file, PipelineParams()) == {}
     (said,) = capsys.readouterr().err.splitlines()
-    assert ".heigth', so it changes nothing; is 'ground.sensor_pose.height' meant" in said
+    assert ".heigth' is ignored; did you mean 'ground.sensor_pose.height'" in said
 
 
 SECTIONS = """
@@ -167,8 +167,8 @@ def test_only_the_sections_of_what_runs_are_read(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("fused_detectr: {ros__parameters: {}}", "no node 'fused_detectr'; did you mean 'fused_detec"),
-        ("/**: {ros__parameters: {fused.score.car: 1}}", "is 'fused.scores.car' meant?"),
+        ("fused_detectr: {ros__parameters: {}}", "unknown node fused_detectr; did you mean 'fused_detec"),
+        ("/**: {ros__parameters: {fused.score.car: 1}}", "did you mean 'fused.scores.car'?"),
         ("/**: {ros__parameters: {a: 1}}", "p.yaml has no parameter of fused"),
     ],
 )

@@ -358,9 +358,9 @@ def test_numbers_that_are_not_finite_are_not_written(kitti, tmp_path, monkeypatc
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (["--format", "kiti"], "'kiti' is unknown; did you mean 'kitti'"),
-        (["--ego", "none"], "are for --track"),
-        (["--track"], "do not follow each other"),
+        (["--format", "kiti"], "unknown value 'kiti'; did you mean 'kitti'"),
+        (["--ego", "none"], "require --track"),
+        (["--track"], "unrelated frames"),
         (["--min-score", 2], "2"),
     ],
 )

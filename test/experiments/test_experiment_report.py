@@ -91,7 +91,7 @@ def test_experiment_runs_by_its_name(few, tmp_path, monkeypatch):
         (["stm-cpa-configuration"], "did you mean 'stm-cpa-configurations'"),
         (["--jobs", "0"], "0 is"),
         (["--limit", "0"], "0 is"),
-        (["--jobs", "2", "--dask", "a:1"], "give one of them"),
+        (["--jobs", "2", "--dask", "a:1"], "cannot be combined"),
         (["none"], "'none'"),
     ],
 )

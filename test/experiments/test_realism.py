@@ -341,7 +341,7 @@ def test_broken_scans_are_skipped_and_counted(tmp_path):
     assert compare_scans(measured, measured)["real"]["skipped"] == measured.skipped
     for scan in scans:
         write(scan, b"cut")
-    with pytest.raises(InputError, match=r"none of 3 scans can be read: .*000000.bin"):
+    with pytest.raises(InputError, match=r"none of the 3 scans can be read: .*000000.bin"):
         measure_scans(select_frames(open_recording(tmp_path)), PAPER)
 
 

@@ -251,7 +251,7 @@ def test_overlaps_of_known_boxes():
         ),
         (
             lambda label: label + "Car 0.00 0 0.00 0.00 0.00 0.00 0.00 9.00 90.00 90.00 0.00 3.00 20.00 0.00\n",
-            "stands in a labelled Car",
+            "is inside a labelled Car",
         ),
     ],
 )

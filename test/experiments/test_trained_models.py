@@ -89,7 +89,7 @@ def test_optional_models_are_left_out_when_the_budget_is_spent(tmp_path, capsys)
     request = make_request(tmp_path, budget=1e-9, seeds=2)
     trained = train_models(request, plan_training(request))
     assert [*trained] == ["v0 seed 0"]
-    assert "v0 half seed 0 is left out" in capsys.readouterr().err
+    assert "v0 half seed 0 is skipped" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("least, planned", [(1, ["v0 seed 0", "v0 half seed 0"]), (10**9, ["v0 seed 0"])])

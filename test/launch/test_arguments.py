@@ -22,7 +22,7 @@ NOTHING_STARTS = {"detectors": "dream"}
     [
         ("fused", {"pionts": "/cloud"}, "no launch argument 'pionts'; did you mean 'points'?"),
         ("two_lidars", {"fused.scores.car": "0.7"}, "a parameter of fused_detector"),
-        ("fused", {"launch-prefix": ""}, "'dream' is none of"),
+        ("fused", {"launch-prefix": ""}, "'dream' is unknown"),
     ],
 )
 def test_argument_that_a_launch_file_does_not_have_is_refused(name, given, words, capfd):

@@ -116,7 +116,7 @@ def test_what_demo_did_not_make_stays(drive_bag, make_bag, tmp_path):
     ("arguments", "words"),
     [
         (["--config", "best"], "the configuration best is for candidates"),
-        (["--set", "stm.threshold=0.5"], "there is no parameter 'stm.threshold' of fused"),
+        (["--set", "stm.threshold=0.5"], "unknown parameter 'stm.threshold' of fused"),
         (["--ground-method", "cloth"], "--set ground.method=VALUE"),
         (["--detector", "candidates", "--set", "fused.proposals=0.1"], "of candidates"),
     ],

@@ -92,7 +92,7 @@ def test_missing_odometry_to_sensor_transform_is_reported(start):
     drive(
         node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp)), [base_at(i) for i in range(10)]
     )
-    assert "odometry is of 'base', the detections are in 'lidar'" in node.state[1]
+    assert "odometry describes 'base', the detections are in 'lidar'" in node.state[1]
     node.transforms.on_tf(transforms(("base", "lidar", SENSOR, 0)), static=True)
     stamp = START + 10 * TENTH
     node.transforms.on_odometry(odometry(base_at(10), stamp))

@@ -144,7 +144,7 @@ def test_all_classes_are_scored_and_precision_at_the_end(with_camera, start, tmp
         ({"classes": ["Cart"]}, "no class 'Cart'; did you mean 'Car'"),
         ({"stages": ["ground_truth"]}, "must be distinct names"),
         ({"stages": ["a", "a"]}, "must be distinct names"),
-        ({"timing": ["foo"]}, "not of the form"),
+        ({"timing": ["foo"]}, "does not have the form"),
     ],
 )
 def test_unusable_parameters_are_refused(start, values, words):

@@ -203,9 +203,9 @@ def test_arguments_override_user_file_and_defaults(launched, tmp_path):
 @pytest.mark.parametrize(
     "section, words",
     [
-        ("fused_detectr", "is called 'fused_detectr'.*; did you mean 'fused_detector'"),
+        ("fused_detectr", "unknown node 'fused_detectr'.*; did you mean 'fused_detector'"),
         ("/left/ground_segmentaton", "'ground_segmentaton'.* 'ground_segmentation'"),
-        ("controller_server", "is called 'controller_server', so its parameters change nothing$"),
+        ("controller_server", "unknown node 'controller_server'; its parameters are ignored$"),
         ("/**", ""),
         ("/*", ""),
         ("/left/**", ""),
@@ -351,11 +351,11 @@ def test_replay_connects_player_nodes_and_evaluator(detectors, single, launched,
 @pytest.mark.parametrize(
     "given, words",
     [
-        ({"detectors": "candidates,dream"}, "'dream' is none of candidates, pointpillars, pointnet"),
+        ({"detectors": "candidates,dream"}, "'dream' is unknown; choose from candidates, pointpillars, pointnet"),
         ({"detectors": ""}, "detectors is empty"),
         ({"detectors": SEVERAL, "weights": "w.safetensors"}, "NAME=FILE"),
         ({"detectors": SEVERAL, "weights": "v5=w"}, "'v5' is not one of"),
-        ({"config": "all.yaml"}, "config: no such parameter file: all.yaml"),
+        ({"config": "all.yaml"}, "config: parameter file not found: all.yaml"),
         ({"experts": "pointnets"}, "pointnets is neither a parameter file nor a detector"),
     ],
 )

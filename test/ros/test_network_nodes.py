@@ -206,7 +206,7 @@ UNUSABLE = {  # by detector: parameters made in a folder, level, words; more in 
             2,
             "'cuda:99' is not available",
         ),
-        (lambda folder: {**other_version(folder), "pointpillars.device": "cuda:99"}, 1, "the CPU is used"),
+        (lambda folder: {**other_version(folder), "pointpillars.device": "cuda:99"}, 1, "falling back to the CPU"),
         (nan_weights, 1, "scores are NaN"),
         *[
             (

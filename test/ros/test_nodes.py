@@ -48,7 +48,7 @@ def test_every_node_ends_with_code_0(processes, peer, tmp_path, drive_bag):
     assert {n: p.returncode for n, p in processes.running.items()} == dict.fromkeys(NODES, 0)
     logs = [*map(processes.read_log, NODES)]
     assert not any("Traceback" in log for log in logs)
-    assert all("'input.queu', so it changes nothing; is 'input.queue' meant" in log for log in logs)
+    assert all("'input.queu' is ignored; did you mean 'input.queue'" in log for log in logs)
 
 
 @pytest.fixture(scope="module")
@@ -271,4 +271,4 @@ def test_misspelt_parameter_file_section_is_reported(processes, tmp_path):
         assert process.poll() is None
         sleep(0.05)
     (warned,) = [line for line in log.splitlines() if "[WARN]" in line and "mine.yaml" in line]
-    assert "no node here is called 'trackr'" in warned and "did you mean 'tracker'" in warned
+    assert "unknown node 'trackr'" in warned and "did you mean 'tracker'" in warned

@@ -290,8 +290,8 @@ BAD = {
     "bad_name": ({"remap": ["/text:=a b"]}, "'a b' is not a topic name"),
     "no_name": ({"remap": ["/text:="]}, "'' is not a topic name"),
     "wait_for": ({"wait_for": ["/text:=x"]}, "must be TOPIC or TOPIC:=COUNT"),
-    "offset": ({"start_offset": 60.0}, "start_offset 60 s is after the end"),
-    "types": ({"remap": [f"{POINTS}:={TRUTH}"]}, "would have the types"),
+    "offset": ({"start_offset": 60.0}, "start_offset 60 s is past the end"),
+    "types": ({"remap": [f"{POINTS}:={TRUTH}"]}, "would carry the types"),
     "rate": ({"rate": -1.0}, "rate"),
     "truncated": ({}, "truncated"),
 }

@@ -97,7 +97,7 @@ def test_clouds_of_a_driver_without_our_profile(processes, peer):
         assert done() - 30 > 15  # a plain rclpy subscriber gets a third of them
     if value("lost"):
         log = (processes.logs / f"{NODE}.log").read_text()
-        assert log.count("were lost on the way; let /driver publish reliable") == 1
+        assert log.count("were lost in transit; let /driver publish reliable") == 1
     peer.set_parameter(f"/{NODE}", "input.error_after", 1000)
     peer.set_parameter(f"/{NODE}", "input.stale_after", 1000)
     peer.wait(lambda: "no cloud" not in peer.get_message(NODE), "no limit")
@@ -172,7 +172,7 @@ def test_two_sensors_in_namespaces(two_sensors, shared_peer):
 
 def test_two_nodes_of_one_name_are_reported(two_sensors, shared_peer, processes):
     processes.start("clustering", {}, {}, namespace="left")
-    shared_peer.wait_for_diagnostics("left/clustering", "another node is called /left/clustering", WARN)
+    shared_peer.wait_for_diagnostics("left/clustering", "another node is also called /left/clustering", WARN)
 
 
 def infos(numbers, period=10**8):
@@ -290,9 +290,9 @@ def test_source_of_losses_is_named_after_it_has_ended(start, monkeypatch):
 @pytest.mark.parametrize(
     "topic, what, publisher, silent, slow",
     [
-        ("/velodyne_points", "cloud", "driver", "is the sensor /driver running", "is the sensor /dri"),
-        ("/velodyne_points", "cloud", "", "is the sensor running, and connected?", "sensor overloaded"),
-        ("/points", "cloud", "rosbag2_player", "has the player /rosbag2_player reached", "more slowly"),
+        ("/velodyne_points", "cloud", "driver", "is the sensor /driver connected and running", "is the sensor /dri"),
+        ("/velodyne_points", "cloud", "", "is the sensor connected and running?", "sensor overloaded"),
+        ("/points", "cloud", "rosbag2_player", "is the player /rosbag2_player paused", "lower rate"),
         (
             "/clustering/output/points",
             "cloud",
@@ -304,7 +304,7 @@ def test_source_of_losses_is_named_after_it_has_ended(start, monkeypatch):
             "/fused_detector/output/detections",
             "array",
             "fused_detector",
-            "is the detector /fused_detector running, and does it get clouds?",
+            "is the detector /fused_detector running and receiving clouds?",
             "is the detector /fused",
         ),
         ("/boxes", "array", "", "is the detector running", "is the detector overloaded"),

@@ -226,7 +226,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     now += 6 * TENTH
     send(frame(cars(car(10 - 0.8 * 18))), "pose is missing")
     move([pose(0.8 * 19)], "base")
-    send(frame(cars(car(10 - 0.8 * 19))), "odometry is of 'base'")
+    send(frame(cars(car(10 - 0.8 * 19))), "odometry describes 'base'")
     processes.check()
     assert "Traceback" not in (processes.logs / f"{NODE}.log").read_text()
 

@@ -227,7 +227,7 @@ def test_frames_without_labels_are_written_and_not_scored(kitti, detector, tmp_p
     line = error_of(
         monkeypatch, capsys, "--data", kitti, "--weights", "w", "--write-results", kitti / "training/label_2"
     )
-    assert "label_2 has files already" in line
+    assert "label_2 already contains files" in line
     (kitti / "training/label_2/000000.txt").unlink()
     content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", tmp_path / "others")
     assert content["frames"] == 0
@@ -311,11 +311,11 @@ def test_missing_files_and_labels_are_named(kitti, found, tmp_path, monkeypatch,
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (["--data", "a", "--results", "b", "--weights", "c"], "give either --results DIR or"),
-        (["--data", "a", "--results", "b", "--keep", "0.1"], "--keep thins the scans"),
+        (["--data", "a", "--results", "b", "--weights", "c"], "give either --results DIR, or"),
+        (["--data", "a", "--results", "b", "--keep", "0.1"], "--keep requires --weights"),
         (["--data", "a", "--weights", "b", "--keep", "1.1"], "1.1 is not in the range"),
         (["--results", "b"], "DATA is missing"),
-        (["--data", "a", "--results", "b", "--write-results", "c"], "has its files already"),
+        (["--data", "a", "--results", "b", "--write-results", "c"], "already contains result files"),
     ],
 )
 def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):

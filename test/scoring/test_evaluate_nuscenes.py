@@ -196,7 +196,7 @@ def test_files_that_are_no_results_are_named(root, tmp_path, monkeypatch, capsys
         (["--data", "a"], "give either --results JSON or --weights FILE"),
         (["--data", "a", "--results", "b", "--weights", "c"], "give either"),
         (["--results", "b"], "DATA is missing"),
-        (["--data", "a", "--results", "b", "--write-results", "c"], "such a file already"),
+        (["--data", "a", "--results", "b", "--write-results", "c"], "already is a result file"),
     ],
 )
 def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):

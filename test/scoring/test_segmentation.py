@@ -392,9 +392,9 @@ def test_invalid_calls_name_the_reason(tmp_path):
     kitti = object_folder(tmp_path / "kitti")
     for arguments, text in (
         ([], "DATA is missing"),
-        (["--data", root, "--methods", "magic"], "is no method"),
-        (["--data", kitti, "--png", "a.png"], "--png draws"),
-        (["--data", kitti, "--methods", "threshold"], "labelled points only"),
+        (["--data", root, "--methods", "magic"], "unknown method"),
+        (["--data", kitti, "--png", "a.png"], "--png requires"),
+        (["--data", kitti, "--methods", "threshold"], "require labelled points"),
     ):
         result = run(*arguments)
         assert result.exit_code == 2 and text in result.output

@@ -226,7 +226,7 @@ def test_train_fused_writes_usable_file(tmp_path, monkeypatch, capsys):
     assert exit_of(monkeypatch, *command) == 0
     printed = capsys.readouterr()
     assert "2 street scans of vlp-16 at 1 m, all around" in printed.err
-    assert "too few to fit curves to" in " ".join(printed.out.split())
+    assert "too few samples to fit curves" in " ".join(printed.out.split())
     fusion = read_fusion(out)
     assert fusion.models == load_shipped_models() and fusion.curve_warning is None
     assert fusion.fitted_to["sensor"] == "vlp-16" and fusion.fitted_to["range"] == "around"

@@ -26,14 +26,14 @@ def with_recorded_setup(recording: Any, params: PipelineParams) -> PipelineParam
 
     params = with_recorded_height(recording, params)
     if params.view.enabled and CAMERA not in recording.has:
-        errors.print(f"{recording.path} has no camera calibration: the whole scan is processed")
+        errors.print(f"{recording.path} has no camera calibration: processing the full scan")
         return with_values(params, {"view.enabled": False})
     return params
 
 
 @click.command(cls=Command)
 @scoring_options()
-@out_file("--png", "Draw the frame with most pedestrians from above.")
+@out_file("--png", "Draw a bird's-eye view of the frame with the most pedestrians.")
 @parameter_options(PAPER)
 def candidates(options: ScoringOptions, png: Path | None, params: PipelineParams) -> None:
     """Score the pedestrian candidates of the STM-CPA paper against Pedestrian labels.
@@ -53,7 +53,7 @@ def candidates(options: ScoringOptions, png: Path | None, params: PipelineParams
     recording = options.open_recording(BOXES)
     params = with_recorded_setup(recording, params)
     if params.seed.source == "click":
-        raise click.UsageError("there is nobody to click here; use --set seed.source=file")
+        raise click.UsageError("seed.source=click needs a person who clicks; use --set seed.source=file")
     report = CandidateReport()
     options.fill(report, recording, partial(measure_candidates, params))
     if report.frames == 0:

@@ -52,15 +52,15 @@ class DetectionRequest:
         if not self.errors:
             refuse_options(("errors_from",), "goes with --errors")
         if self.detector is None:
-            refuse_options(("min_score", "device"), "is for a detector that runs; --results DIR has its boxes already")
+            refuse_options(("min_score", "device"), "requires --weights; --results DIR already contains the boxes")
             if self.write_results is not None:
                 raise click.UsageError(
-                    "--write-results writes the detections of a detector; --results DIR has its files already"
+                    "--write-results requires --weights; --results DIR already contains result files"
                 )
             if self.keep != 1:
-                raise click.UsageError("--keep thins the scans that a detector sees; --results DIR sees none")
+                raise click.UsageError("--keep requires --weights; with --results DIR no detector reads scans")
         elif self.write_results is not None and self.write_results.is_dir() and any(self.write_results.iterdir()):
-            raise InputError(f"{self.write_results} has files already; give another name")
+            raise InputError(f"{self.write_results} already contains files; give another folder")
 
     def open_recording(self) -> Any:
         """Open the recording. Labels are required unless detections are written."""
@@ -142,22 +142,23 @@ def _print_scores(content: dict[str, Any]) -> None:
     type=click.FloatRange(0, 1),
     default=MIN_SCORE,
     show_default=True,
-    help="Leave out boxes of --weights with a lower score. Average precision needs "
-    "precision at every recall, so keep this lower than a robot would.",
+    help="Minimum score of boxes of --weights. Average precision needs weak boxes too, so keep this below a robot's "
+    "threshold.",
 )
 @click.option(
     "--keep",
     type=click.FloatRange(0, 1),
     default=1.0,
     metavar="SHARE",
-    help="Keep only this share of the points of each scan, 0..1, drawn at random but always the same. Default: 1.",
+    help="Keep only this fraction (0 to 1) of the points of each scan, drawn with a fixed seed. Default: 1.",
 )
 @click.option(
     "--mount-height",
     type=click.FloatRange(0, 10),
     default=0.0,
     metavar="M",
-    help="Height of the sensor above the ground. Default: that of the recording, or measured on its first clouds.",
+    help="Height of the sensor above the ground. Default: the height in the recording, or measured on its first "
+    "clouds.",
 )
 @out_folder(
     "Write the detections of --weights as KITTI result files, also for frames without labels.", "--write-results"
@@ -165,9 +166,7 @@ def _print_scores(content: dict[str, Any]) -> None:
 @click.option(
     "--errors",
     is_flag=True,
-    help="Also print how found boxes differ from the true "
-    "ones, by class and range, what each difference costs, and whether scores are "
-    "probabilities.",
+    help="Also print the box errors by class and range, their effect on AP, and whether scores are calibrated.",
 )
 @click.option(
     "--errors-from",
@@ -175,7 +174,7 @@ def _print_scores(content: dict[str, Any]) -> None:
     default=0.2,
     show_default=True,
     metavar="SCORE",
-    help="With --errors: look at boxes from this score on.",
+    help="With --errors: minimum score of boxes to analyse.",
 )
 @intervals_option
 def detection(options: ScoringOptions, **choices: Any) -> None:

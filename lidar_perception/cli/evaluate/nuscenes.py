@@ -38,9 +38,7 @@ class NuscenesRequest:
         if (self.results is None) == (self.detector is None):
             raise click.UsageError("give either --results JSON or --weights FILE")
         if self.write_results is not None and self.detector is None:
-            raise click.UsageError(
-                "--write-results writes the detections of --weights; --results JSON is such a file already"
-            )
+            raise click.UsageError("--write-results requires --weights; --results JSON already is a result file")
 
     def open_recording(self) -> Any:
         """Open the recording, which must be nuScenes."""

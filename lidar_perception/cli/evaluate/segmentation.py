@@ -36,7 +36,7 @@ class MethodList(click.ParamType):
         names = value if isinstance(value, tuple) else tuple(str(value).split(","))
         known = GROUND_METHODS + CLUSTERING_METHODS
         if unknown := [name for name in names if name not in known]:
-            self.fail(f"there is no method {unknown[0]!r}{valid_names(unknown[0], known)}", param, ctx)
+            self.fail(f"unknown method {unknown[0]!r}{valid_names(unknown[0], known)}", param, ctx)
         return names
 
 
@@ -46,9 +46,9 @@ class MethodList(click.ParamType):
     "--methods",
     type=MethodList(),
     default=GROUND_METHODS + CLUSTERING_METHODS,
-    help="Methods to score, of ground and of clustering, with commas between. Default: all.",
+    help="Comma-separated ground and clustering methods to score. Default: all.",
 )
-@out_file("--png", "Draw the ground of the first scan with labelled points from above.")
+@out_file("--png", "Draw a bird's-eye view of the ground of the first scan with labelled points.")
 @parameter_options(
     SegmentationParams(), "segmentation", ("perception", "ground_segmentation", "clustering"), "ground.method=patchwork"
 )
@@ -79,11 +79,11 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
         if recording not in labelled:
             recording.require(BOXES, "evaluate segmentation")
     if png is not None and not (labelled and grounds):
-        raise click.UsageError(
-            "--png draws the ground of a scan with labelled points: give SemanticKITTI and a method of ground"
-        )
+        raise click.UsageError("--png requires labelled points (SemanticKITTI) and a ground method")
     if not (labelled or clusterings):
-        raise click.UsageError("ground is scored on labelled points only: give SemanticKITTI or a method of clustering")
+        raise click.UsageError(
+            "ground methods require labelled points: give SemanticKITTI, or choose a clustering method"
+        )
     report = SegmentationReport()
     for recording in recordings:
         report.source = recording.layout
@@ -94,8 +94,8 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
     content = report.compute()
     if report.without_camera:
         errors.print(
-            f"{', '.join(map(str, options.data))}: {report.without_camera} frames "
-            "without a camera calibration were scored as a whole"
+            f"{', '.join(map(str, options.data))}: {report.without_camera} frames have no camera calibration; scored "
+            "all around instead of in the camera's view"
         )
     print_scores(content, params.ground.method, console)
     options.write(content)

@@ -50,9 +50,8 @@ def tracking(options: ScoringOptions, detector: DetectorChoice, tracking: Tracki
     report, source = TrackingReport(), choose_ego_source(recording, ego)
     if (ego, source) == ("auto", "kiss_icp") and POSES in recording.has:
         console.print(
-            Text("no pose", "yellow") + ": the first frames have none, so poses are by "
-            "KISS-ICP; see whether the odometry or TF of the recording has the clock of "
-            "its clouds"
+            Text("no pose", "yellow") + ": the first frames have no poses, so KISS-ICP is used; check that odometry, "
+            "TF and clouds of the recording share one clock"
         )
     options.fill(report, recording, partial(measure_tracking, open_detector, tracking, source))
     if not report.frames:

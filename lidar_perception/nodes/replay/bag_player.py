@@ -59,7 +59,7 @@ class BagPlayer(LidarNode):
         self.publishers_by_topic = {t: p for t in self.names if (p := self._make_publisher(t))}
         if not self.publishers_by_topic:
             raise InputError(
-                f"{self.params.bag}: nothing to play; no topic is left of "
+                f"{self.params.bag}: nothing to play; no playable topic among "
                 f"{', '.join(self.bag.topics) or 'an empty bag'}"
             )
         self.awaited = self._parse_wait_for()
@@ -67,9 +67,9 @@ class BagPlayer(LidarNode):
         self.start_ns = self.bag.start_ns + int(self.params.start_offset * SECOND_NS)
         if self.start_ns > self.bag.end_ns:
             raise InputError(
-                f"start_offset {self.params.start_offset:g} s is after the end of "
-                f"{self.params.bag}, which has "
-                f"{(self.bag.end_ns - self.bag.start_ns) / SECOND_NS:.1f} s"
+                f"start_offset {self.params.start_offset:g} s is past the end of "
+                f"{self.params.bag}, which is "
+                f"{(self.bag.end_ns - self.bag.start_ns) / SECOND_NS:.1f} s long"
             )
         self.stop_ns = self.start_ns + int(self.params.duration * SECOND_NS) if self.params.duration else None
         self.paused = self.params.start_paused
@@ -104,7 +104,7 @@ class BagPlayer(LidarNode):
         for topic, name in expanded.items():
             if kinds.setdefault(name, self.kinds[topic]) != self.kinds[topic]:
                 raise InputError(
-                    f"{name} would have the types {kinds[name]} and {self.kinds[topic]}; remap {topic} to another name"
+                    f"{name} would carry the types {kinds[name]} and {self.kinds[topic]}; remap {topic} to another name"
                 )
         return expanded
 
@@ -134,7 +134,7 @@ class BagPlayer(LidarNode):
                 self.names[topic], kind, _qos(self.bag.qos(topic), self._count_latched(topic), lossless=self.follows)
             ).publisher
         except (ModuleNotFoundError, AttributeError):
-            self.get_logger().warning(f"{topic} is not played: {kind} is not installed here")
+            self.get_logger().warning(f"{topic} is not played: {kind} is not installed on this machine")
             return None
 
     def _is_latched(self, topic: str) -> bool:

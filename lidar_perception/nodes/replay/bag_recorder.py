@@ -33,7 +33,7 @@ class BagRecorder(LidarNode):
     def __init__(self, **options: Any):
         super().__init__("bag_recorder", RecorderParams(), **options)
         if not self.params.bag or not self.params.topics:
-            raise InputError("parameters 'bag' and 'topics' must name the bag and its topics")
+            raise InputError("parameters 'bag' and 'topics' are required")
         self.writer = BagWriter(self.params.bag, compression=self.params.compression)
         self.writer.__enter__()
         self.waiting = list(dict.fromkeys(map(self.resolve_topic_name, self.params.topics)))
@@ -52,7 +52,8 @@ class BagRecorder(LidarNode):
     def _discover(self) -> None:
         if self.failure:
             raise InputError(
-                f"cannot write the bag {self.params.bag}: {self.failure}; the part so far is in {self.writer.partial}"
+                f"cannot write the bag {self.params.bag}: {self.failure}; the messages written so far are in "
+                f"{self.writer.partial}"
             )
         types = dict(self.get_topic_names_and_types())
         for topic in [t for t in self.waiting if t in types]:
@@ -62,7 +63,7 @@ class BagRecorder(LidarNode):
             self.waiting.remove(topic)
             if (kind := self._find_class(types[topic][0])) is None:
                 self.get_logger().warning(
-                    f"{topic} is not recorded: {types[topic][0]} is not installed here, or unknown"
+                    f"{topic} is not recorded: {types[topic][0]} is unknown or not installed on this machine"
                 )
                 continue
             self._subscribe(topic, kind)
@@ -78,9 +79,9 @@ class BagRecorder(LidarNode):
             self.reported = missing
             self.report(
                 WARN,
-                f"{self.counts['lost']} messages were lost on the way and "
-                f"{self.counts['dropped']} dropped, because the disk is too slow: "
-                "record fewer topics, or use a faster machine",
+                f"{self.counts['lost']} messages were lost in transit and "
+                f"{self.counts['dropped']} dropped because the disk is too slow; record fewer topics or use a faster "
+                "disk",
             )
         elif self.waiting:
             self.report(WARN, f"waiting for {', '.join(self.waiting)}", expected=True)

@@ -113,7 +113,7 @@ class Evaluator(LidarNode):
             self.counts["incomplete"] += 1
             self.report(
                 WARN,
-                f"frames are not scored that have no message on "
+                f"not scoring frames without a message on "
                 f"{self._topics(missing)} with the same header.stamp; stamps must be equal "
                 "to the nanosecond",
             )
@@ -191,7 +191,7 @@ class Evaluator(LidarNode):
                     (
                         f"publishers of {name}",
                         WARN,
-                        f"{count} publishers on {topic}: only the first array of a frame counts; remap all but one",
+                        f"{count} publishers on {topic}: only the first array of a frame is used; remap all but one",
                     )
                 )
         if self.frame_mismatch:
@@ -200,7 +200,7 @@ class Evaluator(LidarNode):
                     "frames",
                     WARN,
                     f"the compared boxes are in different frames: "
-                    f"{self.frame_mismatch}; publish both in one frame (target_frame)",
+                    f"{self.frame_mismatch}; publish both in the same frame (target_frame)",
                 )
             )
         if self.unwritten:
@@ -259,12 +259,12 @@ def _check(params: EvaluatorParams) -> None:
     if TRUTH in params.stages or len({*params.stages}) < len(params.stages) or not params.stages:
         raise InputError(f"stages: {list(params.stages)} must be distinct names of inputs other than {TRUTH}")
     if not params.classes:
-        raise InputError(f"classes: give one or more of {', '.join(DETECTED)}")
+        raise InputError(f"classes: choose one or more of {', '.join(DETECTED)}")
     for name in params.classes:
         if name not in DETECTED:
             raise unknown_name("class", name, [*DETECTED])
     if short := [topic for topic in params.timing if topic.count("/") < 2]:
-        raise InputError(f"timing: {short[0]} is not of the form .../NODE/debug/WHAT")
+        raise InputError(f"timing: {short[0]} does not have the form .../NODE/debug/WHAT")
     if params.file and (
         Path(params.file).is_dir() or (Path(params.file).parent.exists() and not Path(params.file).parent.is_dir())
     ):

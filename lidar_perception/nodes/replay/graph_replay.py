@@ -176,7 +176,7 @@ def replay(
     if failed := {node: code for node, code in codes.items() if code}:
         errors.print(Text(f"exit codes {failed}", "red") + f"; see {out}/logs")
     if monitor.frames == 0:
-        raise InputError(f"no cloud of {drive} gave a result; see {out}/logs")
+        raise InputError(f"{drive}: no cloud produced a result; see {out}/logs")
     return {
         **(json.loads(scores.read_text()) if scored else {}),
         "clouds": clouds,
