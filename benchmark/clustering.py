@@ -104,7 +104,7 @@ def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> 
 
 
 def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
-    """Measure paper C's segmentation of whole scans: cloth, then Euclidean clustering."""
+    """Measure paper C's segmentation of full scans: cloth, then Euclidean clustering."""
 
     def segment(xyz, threshold):
         rest = xyz.compress(~segment_by_cloth(xyz), axis=0)

@@ -40,7 +40,7 @@ MAX_SLOW_SCANS = 3  # scans for the full network on a CPU, which takes half a se
 
 
 def measure_detection(scans: list[PointCloud], repeat: int, sizes: Sequence[str] = tuple(SIZES)) -> dict:
-    """Measure the median time of each step over whole scans, versions in turn, all in torch.
+    """Measure the median time of each step over full scans, versions in turn, all in torch.
 
     Weights are random: time depends on them only through the number of anchors above the
     thresholds, which let CANDIDATES anchors pass.

@@ -43,7 +43,7 @@ def measure_threshold(title: str, clouds: list[np.ndarray], repeat: int) -> dict
 
 def measure_patchwork(frames: list[PointCloud], repeat: int) -> dict:
     """Measure ours and the bare library on an existing array, with a new object per cloud."""
-    title, name = "Patchwork++, whole scan", peers.PATCHWORK.name
+    title, name = "Patchwork++, full scan", peers.PATCHWORK.name
     points = np.median([len(f) for f in frames])
     if peers.PATCHWORK.find_problem():
         return make_measurement(title, len(frames), points, [make_row(name, note=peers.PATCHWORK.find_problem())])
@@ -77,7 +77,7 @@ def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
 
     The wheel's time excludes its float64 array and the mask from its indices.
     """
-    title, name = "Cloth, whole scan", peers.CLOTH.name
+    title, name = "Cloth, full scan", peers.CLOTH.name
     scans = [_crop_to_max_range(xyz) for xyz in scans]
     points = np.median([len(s) for s in scans])
     if peers.CLOTH.find_problem():

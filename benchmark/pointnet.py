@@ -31,7 +31,7 @@ MAX_NETWORK_MS, MAX_DETECTOR_MS = 40.0, 120.0  # targets in ms for the network a
 
 
 def measure_pointnet(scans: Sequence[PointCloud], repeat: int) -> dict:
-    """Measure median times over whole scans.
+    """Measure median times over full scans.
 
     The networks have random weights, which do not affect time, and process MAX_CLUSTERS clusters of a
     scan, or as many as it has.
