@@ -55,7 +55,7 @@ def read_parameters(
         if nodes is not None and not _is_for_nodes(str(node), nodes):
             name = str(node).rpartition("/")[2]
             if name not in NODES and (suggestion := did_you_mean(name, nodes)):
-                lines.append(f"there is no node {name[:80]!r}{suggestion}")
+                lines.append(f"unknown node {name[:80]!r}{suggestion}")
             continue
         for name, value in _iterate_dotted(path, section.get("ros__parameters") or {}, visited):
             if not isinstance(name, str):

@@ -167,7 +167,7 @@ def test_only_the_sections_of_what_runs_are_read(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("fused_detectr: {ros__parameters: {}}", "unknown node fused_detectr; did you mean 'fused_detec"),
+        ("fused_detectr: {ros__parameters: {}}", "unknown node 'fused_detectr'; did you mean 'fused_detec"),
         ("/**: {ros__parameters: {fused.score.car: 1}}", "did you mean 'fused.scores.car'?"),
         ("/**: {ros__parameters: {a: 1}}", "p.yaml has no parameter of fused"),
     ],
