@@ -30,10 +30,8 @@ from lidar_perception.detectors.checkpoint import (
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.network import load_pointnet
-from lidar_perception.detectors.pointnet.weights_file import JUDGE
-from lidar_perception.detectors.pointnet.weights_file import WEIGHTS as POINTNET_WEIGHTS
 from lidar_perception.detectors.pointpillars.network import load_network
-from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
+from lidar_perception.detectors.weights_file import JUDGE, POINTNET_WEIGHTS, POINTPILLARS_WEIGHTS
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console
 from lidar_perception.scoring.detections import measure_detector
@@ -198,7 +196,7 @@ def main(weights: Path, folders: tuple[Path, ...], second_path: Path | None, jud
     if header.network == POINTNET:
         out = POINTNET_WEIGHTS.with_name(JUDGE) if judge else POINTNET_WEIGHTS
     else:
-        out = WEIGHTS / f"pointpillars_{header.config.version}_{header.config.size}.safetensors"
+        out = POINTPILLARS_WEIGHTS / f"pointpillars_{header.config.version}_{header.config.size}.safetensors"
     out.parent.mkdir(exist_ok=True)
     save_checkpoint(out, network, header, half=True)
     results = {folder.name: evaluate_weights(out, folder) for folder in folders}

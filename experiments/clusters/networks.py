@@ -10,9 +10,8 @@ from typing import NamedTuple
 from experiments.framework.trained_models import Model, TrainedModel
 from lidar_perception.detectors.pointnet.config import ABLATIONS
 from lidar_perception.detectors.pointnet.params import PointNetParams
-from lidar_perception.detectors.pointnet.weights_file import weights_file as pointnet_file
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
-from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
+from lidar_perception.detectors.weights_file import find_pointnet_weights, find_pointpillars_weights
 from lidar_perception.param_fields import with_values
 from lidar_perception.training.params import PointNetTraining
 
@@ -27,9 +26,9 @@ class Source(NamedTuple):
 OURS = "improved"
 BASELINES = ("pointnet", "pointnet2")
 SHIPPED = {
-    "PointNet, shipped": Source(pointnet_file(PointNetParams())),
-    "PointNet, shipped, gamma 0.8": Source(pointnet_file(PointNetParams()), 0.8),
-    "PointPillars V0, shipped": Source(pointpillars_file(PointPillarsParams(version="v0"))),
+    "PointNet, shipped": Source(find_pointnet_weights(PointNetParams())),
+    "PointNet, shipped, gamma 0.8": Source(find_pointnet_weights(PointNetParams()), 0.8),
+    "PointPillars V0, shipped": Source(find_pointpillars_weights(PointPillarsParams(version="v0"))),
 }
 COMPARED = (OURS, *BASELINES, *SHIPPED)  # compared by difficulty, on modified clouds and on drives
 RADII = {

@@ -23,10 +23,9 @@ from lidar_perception.detectors.custom import CustomDetector
 from lidar_perception.detectors.open import FUSED, LOAD, ConfigurableDetector, open_detector, resolve_weights
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.params import PointNetParams
-from lidar_perception.detectors.pointnet.weights_file import weights_file as pointnet_file
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
-from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
+from lidar_perception.detectors.weights_file import find_pointnet_weights, find_pointpillars_weights
 from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.report import load_pedestrians
@@ -129,11 +128,13 @@ def open_contenders_alone(*arguments: Any) -> list[Contender]:
 def _find_package_files() -> tuple[list[Path], dict[str, str]]:
     """Return the weights in the package, and the names of missing ones with the reason."""
     finders: dict[str, Callable[[], Path]] = {
-        f"PointPillars {version} {size}": partial(pointpillars_file, PointPillarsParams(version=version, size=size))
+        f"PointPillars {version} {size}": partial(
+            find_pointpillars_weights, PointPillarsParams(version=version, size=size)
+        )
         for size in SIZES
         for version in VERSIONS
     }
-    finders["PointNet"] = partial(pointnet_file, PointNetParams())
+    finders["PointNet"] = partial(find_pointnet_weights, PointNetParams())
     files, absent = [], {}
     for name, find in finders.items():
         try:

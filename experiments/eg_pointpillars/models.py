@@ -10,7 +10,7 @@ from experiments.framework.trained_models import Model, TrainedModel, count_para
 from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.pointpillars.config import VERSIONS
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
-from lidar_perception.detectors.pointpillars.weights_file import weights_file
+from lidar_perception.detectors.weights_file import find_pointpillars_weights
 from lidar_perception.param_fields import with_values
 from lidar_perception.training.params import PointPillarsTraining
 
@@ -53,7 +53,7 @@ def read_shipped_models() -> dict[str, TrainedModel]:
     """
     shipped = {}
     for version in VERSIONS:
-        file = weights_file(PointPillarsParams(version=version, size="compact"))
+        file = find_pointpillars_weights(PointPillarsParams(version=version, size="compact"))
         last = read_header(file).training
         model = Model(version.upper(), with_values(TRAINING, {"version": version}))
         shipped[model.name] = TrainedModel(

@@ -23,7 +23,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
-from lidar_perception.detectors.pointpillars.weights_file import weights_file
+from lidar_perception.detectors.weights_file import find_pointpillars_weights
 from lidar_perception.geometry import bev_and_3d_iou
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, count_by_range, find_range_bins, match_centres
@@ -89,7 +89,7 @@ def detect_pedestrians(labelled: LabelledFrame) -> np.ndarray:
 @cache
 def open_pointpillars(height: float) -> Detector:
     """Open PointPillars V0 with the shipped weights for a sensor `height` metres above the ground."""
-    weights = weights_file(PointPillarsParams(version="v0"))
+    weights = find_pointpillars_weights(PointPillarsParams(version="v0"))
     return open_detector(weights, "cpu", sensor_height=height, settings={"pointpillars.warm_up": False})
 
 

@@ -21,7 +21,7 @@ class NetworkDetector:
 
     Attributes:
         params: dataclass with the groups input, crop, ground, ... and `group`; see with_params.
-        warning: why scores are not reliable or classes are never detected, or None.
+        warning: reason why scores are unreliable or classes are never detected, or None.
     """
 
     group: ClassVar[str]  # name of the detector's own parameter group (a NetworkParams)
@@ -31,7 +31,7 @@ class NetworkDetector:
 
     @property
     def networks(self) -> tuple[TrainedNetwork, ...]:
-        """The networks; the first one decides which classes are detected and where."""
+        """The networks; the first one determines classes and range."""
         raise NotImplementedError
 
     def __call__(
@@ -40,14 +40,16 @@ class NetworkDetector:
         """Detect the objects in a cloud, see contract.Detector.
 
         Raises:
-            InputError: also if CUDA is out of memory and the parameter cpu_fallback is off.
+            InputError: bad input, or CUDA is out of memory and the parameter cpu_fallback is off.
         """
         frame, ground, cluster_ids, problem = accept(cloud, ground, cluster_ids, self.settings.use_intensity)
         if self.params.crop.enabled:
-            kept, frame = crop_with_sensor_pose(frame, self.params.crop, self.params.ground.sensor_pose)
-            ground, cluster_ids = (column if column is None else column.take(kept) for column in (ground, cluster_ids))
-        found = self.detect(frame, ground, cluster_ids)
-        return replace(found, problem=join_problems(problem, found.problem)) if problem else found
+            indices, frame = crop_with_sensor_pose(frame, self.params.crop, self.params.ground.sensor_pose)
+            ground, cluster_ids = (
+                column if column is None else column.take(indices) for column in (ground, cluster_ids)
+            )
+        result = self.detect(frame, ground, cluster_ids)
+        return replace(result, problem=join_problems(problem, result.problem)) if problem else result
 
     def detect(self, frame: PointCloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None) -> DetectionResult:
         """Detect the objects in a checked and cropped frame."""
@@ -55,17 +57,17 @@ class NetworkDetector:
 
     @property
     def settings(self) -> NetworkParams:
-        """The detector's own group of params."""
+        """The group of `params` with the settings of this detector."""
         return getattr(self.params, self.group)
 
     @property
     def device(self) -> str:
-        """Device that the first network runs on now: cpu, cuda or cuda:N."""
+        """Current device of the first network: cpu, cuda or cuda:N."""
         return self.networks[0].device
 
     @property
     def fallback(self) -> str | None:
-        """Why a network runs on the CPU instead of the chosen device, or None."""
+        """Reason why a network runs on the CPU instead of the chosen device, or None."""
         return next((network.placement.fallback for network in self.networks if network.placement.fallback), None)
 
     @fallback.setter
@@ -74,7 +76,7 @@ class NetworkDetector:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the classes that it can detect."""
+        """Names of the classes that the detector can detect."""
         return self.networks[0].classes
 
     @property
@@ -84,30 +86,30 @@ class NetworkDetector:
 
     @property
     def range(self) -> str:
-        """Covered area: "ahead" of the sensor only, or "around" it."""
+        """Covered area: "ahead" (in front of the sensor) or "around" (all directions)."""
         low = getattr(self.networks[0].config, "low", None)  # PointNet has no range
         return "around" if low is None or low[0] < 0 else "ahead"
 
     def with_params(self, params: Any) -> Self:
-        """Return this detector, with the same networks, for other parameters."""
+        """Return a copy of this detector with other parameters and the same networks."""
         other = copy.copy(self)
         other.params = params
         return other
 
     def with_min_score(self, min_score: float) -> Self:
-        """Return this detector with one threshold for all classes."""
+        """Return a copy of this detector with one threshold for all classes."""
         settings = replace(self.settings, scores=ScoreParams.for_all_classes(min_score))
         return self.with_params(replace(self.params, **{self.group: settings}))
 
     def with_sensor_height(self, height: float) -> Self:
-        """Return this detector for a sensor mounted `height` metres above the ground."""
+        """Return a copy of this detector for a sensor `height` metres above the ground."""
         return self.with_params(set_sensor_height(self.params, height))
 
     def with_range(self, range: str) -> Self:
-        """Return this detector for another range.
+        """Return a copy of this detector with another range.
 
         Args:
-            range: ahead, around, or auto, the range that its weights were trained for. PointNet
+            range: ahead, around, or auto (the range of the training). PointNet
                 always covers all directions.
 
         Raises:
@@ -118,18 +120,17 @@ class NetworkDetector:
         return self
 
     def with_raw_scores(self) -> Self:
-        """Return this detector with the scores of its network instead of calibrated ones."""
+        """Return a copy of this detector that reports uncalibrated scores."""
         raise NotImplementedError
 
 
 def make_synthetic_frame(pose: SensorPoseParams) -> PointCloud:
-    """Return flat ground with three objects on it for the first run: one of them dense, and one
-    across the limit of two bands of DBSCAN."""
+    """Return a synthetic cloud that triggers JIT compilation of every stage: flat ground with three objects."""
     rng = np.random.default_rng(0)
     ground = rng.uniform(0, 40, (2000, 3)) * [1, 1, 0.001] - [0, 20, SENSOR_HEIGHT]
     target = rng.uniform(-0.5, 0.5, (400, 3)) + [8, 0, -0.8]
     dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 4, -0.8]  # DBSCAN uses a different code path for dense points
-    across = rng.uniform(-0.3, 0.3, (400, 3)) + [15, 0, -0.8]
-    xyz = np.concatenate([ground, target, dense, across]).astype(np.float32)
+    at_band_limit = rng.uniform(-0.3, 0.3, (400, 3)) + [15, 0, -0.8]  # two bands of DBSCAN meet at 15 m
+    xyz = np.concatenate([ground, target, dense, at_band_limit]).astype(np.float32)
     xyz[:, 2] -= pose.height - SENSOR_HEIGHT
     return PointCloud(xyz, rng.uniform(0.1, 0.9, len(xyz)).astype(np.float32))

@@ -12,75 +12,75 @@ from numba import njit
 from lidar_perception.classes import CAR
 from lidar_perception.geometry import points_in_boxes, quantile, wrap_angle, wrap_line
 
-MARGIN_M = 0.4  # points up to this distance from a box belong to it
+MARGIN_M = 0.4  # margin around a box within which points belong to it
 MIN_HEIGHT_M = 0.2  # lower points in a box are not used
-MIN_FACE_POINTS = 30
-FACE_QUANTILE = 0.03  # quantile of the points of a face that marks its surface
+MIN_FACE_POINTS = 30  # faces with fewer points are not used
+FACE_QUANTILE = 0.03  # quantile of the point depths that is taken as the surface of a face
 # Depth of that quantile behind a labelled face, in metres, measured on 60 simulated scans.
 FRONT, REAR, SIDE = 0.03, 0.03, -0.01
-MIN_FACE_SLOPE = 0.3  # tangent of the flattest angle at which a face is used
+MIN_FACE_SLOPE = 0.3  # tangent of the minimum viewing angle of a face
 
 
-def move_towards(boxes: np.ndarray, others: np.ndarray, share: float) -> np.ndarray:
+def move_towards(boxes: np.ndarray, others: np.ndarray, weight: float) -> np.ndarray:
     """Interpolate between the boxes (K, 7) of two networks.
 
     Args:
-        others: (K, 7) boxes of the same objects; a box is not changed where its other one is NaN.
-        share: 0 returns `boxes`, 1 returns `others`, but with the heading (front end) of `boxes`.
+        others: (K, 7) boxes of the same objects; NaN: do not change this box.
+        weight: 0 returns `boxes`, 1 returns `others`, except that the front stays on the same side.
     """
     difference = np.where(np.isfinite(others), others - boxes, 0.0)
     difference[:, 6] = wrap_line(difference[:, 6])
-    moved = boxes + share * difference
+    moved = boxes + weight * difference
     moved[:, 6] = wrap_angle(moved[:, 6])
     return moved
 
 
-def move_to_ground(boxes: np.ndarray, ground_heights: np.ndarray, share: float) -> np.ndarray:
+def move_to_ground(boxes: np.ndarray, ground_heights: np.ndarray, weight: float) -> np.ndarray:
     """Move boxes (K, 7) vertically towards the ground.
 
     Args:
         ground_heights: (K,) z of the ground below each box; a box with NaN is not moved.
-        share: 0 keeps the boxes, 1 moves their bottoms onto the ground.
+        weight: 0 keeps the boxes, 1 moves their bottoms onto the ground.
     """
     moved = boxes.copy()
-    offset = share * (ground_heights - (boxes[:, 2] - boxes[:, 5] / 2))
+    offset = weight * (ground_heights - (boxes[:, 2] - boxes[:, 5] / 2))
     moved[:, 2] += np.where(np.isfinite(offset), offset, 0.0)
     return moved
 
 
-def move_cars_to_points(boxes: np.ndarray, class_ids: np.ndarray, xyz: np.ndarray, share: float) -> np.ndarray:
-    """Return boxes (K, 7) float64 with the cars moved by move_to_points."""
+def move_cars_to_points(boxes: np.ndarray, class_ids: np.ndarray, xyz: np.ndarray, weight: float) -> np.ndarray:
+    """Apply move_to_points to the cars among boxes (K, 7); return all boxes as float64."""
     moved, cars = np.array(boxes, np.float64), class_ids == CAR
-    if share and cars.any():
-        moved[cars] = move_to_points(moved[cars], xyz, share)
+    if weight and cars.any():
+        moved[cars] = move_to_points(moved[cars], xyz, weight)
     return moved
 
 
-def move_to_points(boxes: np.ndarray, xyz: np.ndarray, share: float) -> np.ndarray:
+def move_to_points(boxes: np.ndarray, xyz: np.ndarray, weight: float) -> np.ndarray:
     """Move boxes (K, 7) along their axes so that their visible faces fit the points (N, 3).
 
     The sensor is at the origin. Boxes move by at most MARGIN_M. A face with fewer than
     MIN_FACE_POINTS points does not move its box.
 
     Args:
-        share: 0 keeps the boxes, 1 moves the faces all the way.
+        weight: 0 keeps the boxes, 1 moves the faces all the way.
     """
     indices, first = points_in_boxes(xyz, boxes, MARGIN_M)
-    return _move_to_points(np.asarray(boxes, np.float64), xyz[indices].astype(np.float64), first, share)
+    return _move_to_points(np.asarray(boxes, np.float64), xyz[indices].astype(np.float64), first, weight)
 
 
 @njit(cache=True, nogil=True)
-def _move_to_points(boxes, points, first, share):
+def _move_to_points(boxes, points, first, weight):
     moved = boxes.copy()
     for k in range(len(boxes)):
         x, y, z = boxes[k, :3]
         cos, sin = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
         sensor = np.array([-cos * x - sin * y, sin * x - cos * y])
-        own = points[first[k] : first[k + 1]]
-        own = own[own[:, 2] > z - boxes[k, 5] / 2 + MIN_HEIGHT_M]
-        flat = np.empty((len(own), 2))
-        flat[:, 0] = cos * (own[:, 0] - x) + sin * (own[:, 1] - y)
-        flat[:, 1] = cos * (own[:, 1] - y) - sin * (own[:, 0] - x)
+        box_points = points[first[k] : first[k + 1]]
+        box_points = box_points[box_points[:, 2] > z - boxes[k, 5] / 2 + MIN_HEIGHT_M]
+        flat = np.empty((len(box_points), 2))
+        flat[:, 0] = cos * (box_points[:, 0] - x) + sin * (box_points[:, 1] - y)
+        flat[:, 1] = cos * (box_points[:, 1] - y) - sin * (box_points[:, 0] - x)
         for axis in range(2):
             half, side = boxes[k, 3 + axis] / 2, np.sign(sensor[axis])
             if abs(sensor[axis]) <= half or (abs(sensor[axis]) < MIN_FACE_SLOPE * abs(sensor[1 - axis])):
@@ -90,7 +90,7 @@ def _move_to_points(boxes, points, first, share):
                 continue
             depth = quantile(half - side * face[:, axis], FACE_QUANTILE)
             expected = SIDE if axis == 1 else (FRONT if side > 0 else REAR)
-            offset = -side * share * min(max(depth - expected, -MARGIN_M), MARGIN_M)
+            offset = -side * weight * min(max(depth - expected, -MARGIN_M), MARGIN_M)
             moved[k, 0] += offset * (cos if axis == 0 else -sin)
             moved[k, 1] += offset * (sin if axis == 0 else cos)
     return moved

@@ -20,18 +20,17 @@ Lines = Mapping[str, tuple[float, float]]  # class -> (slope > 0, offset), in lo
 
 
 def calibrate_scores(detections: Detections, lines: Lines) -> Detections:
-    """Return the detections, in the same order, with probabilities as scores. The scores of classes
-    without a line do not change."""
+    """Replace scores by calibrated probabilities; scores of classes without a line do not change."""
     scores = detections.scores.copy()
     for name, (slope, offset) in lines.items():
-        own = detections.class_ids == CLASSES.index(name)
+        in_class = detections.class_ids == CLASSES.index(name)
         with np.errstate(divide="ignore"):  # scores 0 and 1 are mapped to themselves
-            scores[own] = expit(slope * logit(scores[own].astype(np.float64)) + offset)
+            scores[in_class] = expit(slope * logit(scores[in_class].astype(np.float64)) + offset)
     return replace(detections, scores=scores)
 
 
 def to_raw_score(name: str, score: float, lines: Lines) -> float:
-    """Return the raw network score of class `name` that is calibrated to `score`."""
+    """Return the raw network score of class `name` that calibration maps to `score`."""
     if name not in lines or score in (0.0, 1.0):
         return score
     slope, offset = lines[name]

@@ -60,7 +60,7 @@ class CandidateDetector:
         """Detect pedestrians, see contract.Detector.
 
         Raises:
-            InputError: also if there is no seed, or if `params` need a camera and there is none.
+            InputError: bad input, no seed, or a missing camera that `params` require.
         """
         frame, ground, cluster_ids, _ = accept(cloud, ground, cluster_ids)
         segmented, candidates = find_candidates(

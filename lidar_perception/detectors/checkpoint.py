@@ -1,6 +1,6 @@
 """Checkpoints of all networks: safetensors files with a JSON header that describes the network.
 
-Only functions that take or return a network of torch load torch.
+Reading headers does not import torch.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ Net = TypeVar("Net", bound="torch.nn.Module")
 
 
 class Config(Protocol):
-    """Description of a network, a dataclass. `network` is its name in NETWORKS."""
+    """Dataclass that describes a network; `network` is its key in NETWORKS."""
 
     network: ClassVar[str]
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the classes that it detects."""
+        """Names of the detected classes."""
 
     @property
     def title(self) -> str:
@@ -56,7 +56,7 @@ NETWORKS: dict[str, tuple[str, str, type[Config]]] = {  # kind -> (title, use, c
 
 @dataclass(frozen=True)
 class Header:
-    """Metadata of a checkpoint. All values can be written as JSON.
+    """Metadata of a checkpoint; all values are JSON serializable.
 
     Attributes:
         config: description of the network.
@@ -78,8 +78,10 @@ class Header:
         return self.config.network
 
     def find_height_mismatch(self, height: float) -> str | None:
-        """Return a warning if the weights were trained for another sensor height than `height`
-        metres; None if they were not, or if the training height is unknown."""
+        """Return a warning if the weights were trained for a sensor height other than `height` metres.
+
+        None if the heights agree or the training height is unknown.
+        """
         sensor = self.training.get("sensor")
         if (
             not isinstance(sensor, dict)
@@ -87,8 +89,8 @@ class Header:
             or (abs(sensor["height"] - height) < MIN_HEIGHT_DIFFERENCE_M)
         ):
             return None
-        which = f"the sensor {sensor['name']}" if sensor.get("name") else "a sensor"
-        return f"trained for {which} at {sensor['height']:g} m, and used with one at {height:g} m"
+        sensor_text = f"the sensor {sensor['name']}" if sensor.get("name") else "a sensor"
+        return f"trained for {sensor_text} at {sensor['height']:g} m, used with one at {height:g} m"
 
     def to_json(self) -> str:
         """Return the header as JSON text."""
@@ -105,7 +107,7 @@ class Header:
         )
 
     @staticmethod
-    def from_json(text: str | None, source: str, kind: type[Config] | None = None) -> Header:
+    def from_json(text: str | None, source: str, config_class: type[Config] | None = None) -> Header:
         """Read a header from JSON text, the inverse of to_json.
 
         Args:
@@ -117,9 +119,9 @@ class Header:
         """
         content = _parse_header(text, source)
         title, use, config = NETWORKS[content["network"]]
-        if kind is not None and content["network"] != kind.network:
-            wanted, own_use, _ = NETWORKS[kind.network]
-            raise InputError(f"{source} holds a {title}, which is for {use}; {own_use} take a {wanted}")
+        if config_class is not None and content["network"] != config_class.network:
+            expected_title, own_use, _ = NETWORKS[config_class.network]
+            raise InputError(f"{source} contains a {title} for {use}; {own_use} require a {expected_title}")
         return Header(
             parse_config(config, content["config"], source),
             content["training"],
@@ -133,27 +135,28 @@ PARTS = {"config": dict, "training": dict, "metrics": dict, "commit": str}
 
 
 def _parse_header(text: str | None, source: str) -> dict[str, Any]:
-    """Return the parts of a header. InputError if one is missing, or the network is unknown."""
+    """Parse a header and check its parts and its network."""
     try:
         content = json.loads(text or "")
         parts = {name: content[name] for name in ("format", *PARTS)}
         network = content.get("network", POINTPILLARS)  # files of early versions lack this key
         calibration = content.get("calibration", {})
-        if not all(isinstance(parts[name], kind) for name, kind in PARTS.items()):
+        if not all(isinstance(parts[name], config_class) for name, config_class in PARTS.items()):
             raise TypeError
     except (TypeError, ValueError, KeyError, AttributeError, RecursionError):
         raise InputError(
             f"{source} has no header of this package; use import-weights for weights of other projects"
         ) from None
     if parts["format"] != FORMAT:
-        raise InputError(f"{source} has format {str(parts['format'])[:40]}, this version reads {FORMAT}")
+        raise InputError(f"{source} has format {str(parts['format'])[:40]}, this version supports {FORMAT}")
     if not isinstance(network, str) or network not in NETWORKS:
-        raise InputError(f"{source} holds a network {str(network)[:40]!r}, this version knows {' and '.join(NETWORKS)}")
+        raise InputError(
+            f"{source} contains an unknown network {str(network)[:40]!r}; supported are {' and '.join(NETWORKS)}"
+        )
     return {"network": network, "calibration": calibration, **parts}
 
 
 def _parse_calibration(content: Any, source: str) -> dict[str, tuple[float, float]]:
-    """Return the calibration of a header. InputError if it is invalid."""
     try:
         lines = {name: (float(slope), float(offset)) for name, (slope, offset) in content.items()}
         if all(
@@ -167,7 +170,7 @@ def _parse_calibration(content: Any, source: str) -> dict[str, tuple[float, floa
 
 
 def read_network_name(path: str | Path) -> str:
-    """Return the name of a checkpoint's network in NETWORKS. InputError if it cannot be read."""
+    """Return the key in NETWORKS of a checkpoint. InputError if the file is not a checkpoint."""
     return _parse_header(_read(Path(path), tensors=False)[0], str(path))["network"]
 
 
@@ -175,7 +178,7 @@ def save_checkpoint(path: str | Path, network: torch.nn.Module, header: Header, 
     """Write the weights and the header of a network atomically.
 
     Args:
-        half: store the weights of layers as float16; norms and biases remain float32.
+        half: store layer weights as float16; norms and biases remain float32.
     """
     from safetensors.torch import save
 
@@ -199,7 +202,7 @@ def _to_stored(value: torch.Tensor, half: bool) -> torch.Tensor:
     return value.contiguous()
 
 
-def read_header(path: str | Path, kind: type[Config] | None = None) -> Header:
+def read_header(path: str | Path, config_class: type[Config] | None = None) -> Header:
     """Read the header of a checkpoint.
 
     Args:
@@ -208,17 +211,17 @@ def read_header(path: str | Path, kind: type[Config] | None = None) -> Header:
     Raises:
         InputError: the file is missing or broken, has no header, or has a config of another class.
     """
-    return Header.from_json(_read(Path(path), tensors=False)[0], str(path), kind)
+    return Header.from_json(_read(Path(path), tensors=False)[0], str(path), config_class)
 
 
-def read_checkpoint(path: str | Path, kind: type[Config]) -> tuple[Header, dict[str, torch.Tensor]]:
-    """Read the header and the tensors as stored, on the CPU. InputError as in read_header."""
+def read_checkpoint(path: str | Path, config_class: type[Config]) -> tuple[Header, dict[str, torch.Tensor]]:
+    """Read the header and the tensors, on the CPU with the dtypes of the file. InputError as in read_header."""
     text, tensors = _read(Path(path))
-    return Header.from_json(text, str(path), kind), tensors
+    return Header.from_json(text, str(path), config_class), tensors
 
 
-def read_arrays(path: str | Path, kind: type[Config]) -> tuple[Header, dict[str, np.ndarray]]:
-    """Read the header and the tensors as stored, without loading torch.
+def read_arrays(path: str | Path, config_class: type[Config]) -> tuple[Header, dict[str, np.ndarray]]:
+    """Read the header and the tensors, with the dtypes of the file, without importing torch.
 
     Raises:
         InputError: see read_header.
@@ -228,13 +231,13 @@ def read_arrays(path: str | Path, kind: type[Config]) -> tuple[Header, dict[str,
         text, tensors = _read(Path(path), framework="np")
     except (TypeError, AttributeError) as error:  # raised by safetensors
         raise WeightsMismatch(str(error)) from None
-    return Header.from_json(text, str(path), kind), tensors
+    return Header.from_json(text, str(path), config_class), tensors
 
 
 def load_checkpoint(
-    path: str | Path, kind: type[Config], make: Callable[[Any], Net], expected: Any = None
+    path: str | Path, config_class: type[Config], make: Callable[[Any], Net], expected: Any = None
 ) -> tuple[Header, Net]:
-    """Load the header and the network of a checkpoint: float32, on the CPU, in training mode.
+    """Load the header and the network of a checkpoint, in float32, on the CPU and in training mode.
 
     Args:
         kind: class of the config.
@@ -242,49 +245,49 @@ def load_checkpoint(
         expected: config that the checkpoint must have; None: any.
 
     Raises:
-        InputError: see read_header and require_same_config; or the weights do not fit the config.
+        InputError: see read_header and require_same_config, or the weights do not fit the config.
     """
     import torch
 
-    header, tensors = read_checkpoint(path, kind)
+    header, tensors = read_checkpoint(path, config_class)
     if expected is not None:
         require_same_config(header.config, expected, str(path))
-    with torch.device("meta"):  # shapes only: allocate no memory before they are checked
-        wanted = make(header.config).state_dict()
-    for name in sorted({*wanted, *tensors}, key=str):
-        ours, theirs = (_describe_tensor(state.get(name)) for state in (wanted, tensors))
-        if ours != theirs:
+    with torch.device("meta"):  # shapes only, to check them before allocating memory
+        state_dict = make(header.config).state_dict()
+    for name in sorted({*state_dict, *tensors}, key=str):
+        required, actual = (_describe_tensor(state.get(name)) for state in (state_dict, tensors))
+        if required != actual:
             raise InputError(
-                f"the weights in {path} do not fit its header: {name[:80]} is {theirs}, and should be {ours}"
+                f"the weights in {path} do not fit its header: {name[:80]} is {actual}, expected {required}"
             )
     network = make(header.config)
-    network.load_state_dict({name: value.to(wanted[name].dtype) for name, value in tensors.items()})
+    network.load_state_dict({name: value.to(state_dict[name].dtype) for name, value in tensors.items()})
     return header, network
 
 
 def _describe_tensor(value: torch.Tensor | None) -> str:
     if value is None:
         return "missing"
-    kind = "floats" if value.is_floating_point() else str(value.dtype).removeprefix("torch.")
-    return f"{kind} of shape {tuple(value.shape)}"
+    config_class = "floats" if value.is_floating_point() else str(value.dtype).removeprefix("torch.")
+    return f"{config_class} of shape {tuple(value.shape)}"
 
 
-def copy_matching_weights(network: torch.nn.Module, path: str | Path, kind: type[Config]) -> tuple[int, int]:
-    """Copy the weights of a checkpoint that fit a network, for fine-tuning; configs may differ.
+def copy_matching_weights(network: torch.nn.Module, path: str | Path, config_class: type[Config]) -> tuple[int, int]:
+    """Copy matching weights of a checkpoint into a network for fine-tuning; configs may differ.
 
     Tensors with the same name and shape are copied. If only the number of inputs differs, the
-    common inputs are copied and new ones start at 0. All other tensors remain unchanged.
+    common inputs are copied and the new ones are set to 0. All other tensors remain unchanged.
 
     Args:
         kind: class of the config.
 
     Returns:
-        Number of copied tensors, and of all tensors of the network.
+        Number of copied tensors and total number of tensors of the network.
 
     Raises:
-        InputError: see read_header; or no tensor fits.
+        InputError: see read_header, or no tensor matches.
     """
-    _, tensors = read_checkpoint(path, kind)
+    _, tensors = read_checkpoint(path, config_class)
     state = network.state_dict()
     copied = 0
     for name, value in state.items():
@@ -301,24 +304,24 @@ def copy_matching_weights(network: torch.nn.Module, path: str | Path, kind: type
             continue
         copied += 1
     if not copied:
-        raise InputError(f"no layer of {path} fits the network that is to be trained")
+        raise InputError(f"no layer of {path} matches the network to train")
     return copied, len(state)
 
 
-def require_same_config(found: Any, wanted: Any, source: str) -> None:
-    """Raise an InputError with the first fields in which two configs differ, and their values."""
-    ours, theirs = dataclasses.asdict(wanted), dataclasses.asdict(found)
-    different = [name for name in ours if ours[name] != theirs[name]]
+def require_same_config(config: Any, expected: Any, source: str) -> None:
+    """Raise an InputError that lists the first fields in which two configs differ."""
+    required, actual = dataclasses.asdict(expected), dataclasses.asdict(config)
+    different = [name for name in required if required[name] != actual[name]]
     if different:
-        shown = "; ".join(f"{name} is {theirs[name]}, expected was {ours[name]}" for name in different[:3])
-        raise InputError(f"{source} holds another network: {shown}")
+        fields = "; ".join(f"{name} is {actual[name]}, expected {required[name]}" for name in different[:3])
+        raise InputError(f"{source} contains another network: {fields}")
 
 
 def _read(path: Path, tensors: bool = True, framework: str = "pt") -> tuple[str | None, dict[str, Any]]:
-    """Return the text of the header, None if there is none, and the tensors.
+    """Return the text of the header (None if missing) and the tensors.
 
     Args:
-        framework: of the tensors, pt for torch or np for NumPy.
+        framework: type of the tensors: pt (torch) or np (NumPy).
     """
     if not path.is_file():
         raise InputError(f"there is no checkpoint {path}")

@@ -1,8 +1,4 @@
-"""The interface of all detectors: a function from a point cloud to a DetectionResult.
-
-PointPillars, PointNet, the fused detector, exported networks and STM-CPA candidates implement it.
-Nodes, evaluation, training and scripts use nothing else.
-"""
+"""The interface of all detectors: a function from a point cloud to a DetectionResult."""
 
 from __future__ import annotations
 
@@ -27,8 +23,8 @@ class DetectionResult:
     Attributes:
         detections: in the coordinates of the cloud, without the vehicle that carries the sensor.
         timings: milliseconds of each step (on CUDA after synchronisation).
-        problem: why nothing or little can be detected, with the remedy; None without a problem.
-        best: highest score of each class if no score reached its threshold; otherwise empty.
+        problem: reason why little or nothing can be detected, with the remedy; None if all is well.
+        best: highest score of each class if no score reached its threshold, otherwise empty.
     """
 
     detections: Detections
@@ -42,7 +38,7 @@ class Detector(Protocol):
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the classes that it can detect, a subset of types.CLASSES."""
+        """Names of the classes that the detector can detect, a subset of types.CLASSES."""
 
     @property
     def min_scores(self) -> Mapping[str, float]:
@@ -75,8 +71,8 @@ class Accepted(NamedTuple):
 
     Attributes:
         frame: the usable points of the cloud, with the intensity in 0..1.
-        ground, cluster_ids: columns of these points.
-        problem: see find_scale_problem.
+        ground, cluster_ids: values of these points, or None.
+        problem: problem of the intensity scale, see find_scale_problem.
     """
 
     frame: PointCloud
@@ -90,33 +86,30 @@ def accept(
 ) -> Accepted:
     """Check and convert the arguments of a detector, see Detector.__call__.
 
-    An intensity outside 0..1 is divided by the scale that it seems to have. This is a guess from
-    one cloud, so it is also reported as a problem.
+    An intensity outside 0..1 is divided by its apparent scale. The scale is guessed from one cloud,
+    so it is also reported as a problem.
 
     Args:
-        use_intensity: False: the detector leaves the intensity out.
+        use_intensity: False if the detector ignores the intensity.
     """
     frame = as_point_cloud(cloud)
     check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
     ground = None if ground is None else np.asarray(ground, bool)
     cluster_ids = None if cluster_ids is None else np.asarray(cluster_ids)
     if frame is not cloud and not (usable := usable_returns(frame.xyz)).all():
-        kept = np.flatnonzero(usable)
-        frame = frame.take(kept)
-        ground, cluster_ids = (column if column is None else column.take(kept) for column in (ground, cluster_ids))
+        indices = np.flatnonzero(usable)
+        frame = frame.take(indices)
+        ground, cluster_ids = (column if column is None else column.take(indices) for column in (ground, cluster_ids))
     problem = find_scale_problem(frame.intensity) if use_intensity else None
     if problem and frame.intensity is not None:
-        full = guess_scale(frame.intensity)
-        if full != 1.0:
-            frame = replace(frame, intensity=to_unit(frame.intensity, full))
+        scale = guess_scale(frame.intensity)
+        if scale != 1.0:
+            frame = replace(frame, intensity=to_unit(frame.intensity, scale))
     return Accepted(frame, ground, cluster_ids, problem)
 
 
 def join_problems(*problems: str | None) -> str | None:
-    """Join problems in this order, leaving out those that a later one contains; None if there are
-    no problems."""
-    found = [problem for problem in problems if problem]
-    return (
-        "; ".join(problem for i, problem in enumerate(found) if not any(problem in later for later in found[i + 1 :]))
-        or None
-    )
+    """Join problems in order, without those that a later one contains; None if there are none."""
+    texts = [problem for problem in problems if problem]
+    unique = [text for i, text in enumerate(texts) if not any(text in later for later in texts[i + 1 :])]
+    return "; ".join(unique) or None

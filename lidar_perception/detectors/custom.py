@@ -39,14 +39,14 @@ class MountParams(Params):
 
 @dataclass(frozen=True)
 class CustomParams(Params):
-    """Thresholds of the detections."""
+    """Score thresholds of a custom detector."""
 
     scores: ScoreParams = ScoreParams.for_all_classes(0.0)
 
 
 @dataclass(frozen=True)
 class CustomDetectorParams:
-    """All parameter groups of a custom detector, without settings of the class itself."""
+    """Parameter groups of a custom detector; settings of the class itself are not included."""
 
     crop: CropParams = CropParams()
     ground: MountParams = MountParams()
@@ -58,11 +58,11 @@ class CustomDetector:
     """Adapter from a function of a cloud to contract.Detector.
 
     Attributes:
-        name: for messages.
-        build: returns the function for a sensor height in metres.
-        classes: names of the classes that it can detect.
-        params: crop, mounting and, in the group `group`, the thresholds.
-        device: shown in the status of a node.
+        name: name of the detector in messages.
+        build: returns the detector function for a sensor height in metres.
+        classes: names of the detectable classes.
+        params: crop, mounting pose and, in the group `group`, the thresholds.
+        device: device shown in the status of a node.
     """
 
     name: str
@@ -83,23 +83,23 @@ class CustomDetector:
         return {name: self.scores.get(name) for name in self.classes}
 
     def with_params(self, params: Any) -> CustomDetector:
-        """Return this detector with other parameters."""
+        """Return a copy of this detector with other parameters."""
         return replace(self, params=params)
 
     def with_min_score(self, min_score: float) -> CustomDetector:
-        """Return this detector with one threshold for all classes."""
+        """Return a copy of this detector with one threshold for all classes."""
         scores = ScoreParams.for_all_classes(min_score)
-        own = replace(getattr(self.params, self.group), scores=scores)
-        return self.with_params(replace(self.params, **{self.group: own}))
+        group = replace(getattr(self.params, self.group), scores=scores)
+        return self.with_params(replace(self.params, **{self.group: group}))
 
     def with_sensor_height(self, height: float) -> CustomDetector:
-        """Return this detector for a sensor mounted `height` metres above the ground."""
+        """Return a copy of this detector for a sensor `height` metres above the ground."""
         return self.with_params(set_sensor_height(self.params, height))
 
     def __call__(
         self, cloud: Cloud, *, ground: np.ndarray | None = None, cluster_ids: np.ndarray | None = None
     ) -> DetectionResult:
-        """See contract.Detector; ground and cluster_ids are checked and not used.
+        """Detect the objects in a cloud, see contract.Detector; ground and cluster_ids are checked but not used.
 
         Raises:
             RunError: the function did not return Detections.
@@ -111,22 +111,21 @@ class CustomDetector:
 
             _, frame = crop_with_sensor_pose(frame, self.params.crop, pose)
         begin = perf_counter()
-        found = self.build(pose.height)(frame)
+        detections = self.build(pose.height)(frame)
         milliseconds = (perf_counter() - begin) * 1e3
-        if not isinstance(found, Detections):
+        if not isinstance(detections, Detections):
             raise RunError(
-                f"{self.name} returned {type(found).__name__}; a detector returns "
-                "Detections, such as lidar_perception.Detections.of(boxes, class_ids, "
-                "scores)"
+                f"{self.name} returned {type(detections).__name__} instead of Detections, such as "
+                "lidar_perception.Detections.of(boxes, class_ids, scores)"
             )
-        return DetectionResult(found[self.scores.passes(found)], {"detect": milliseconds}, problem)
+        return DetectionResult(detections[self.scores.passes(detections)], {"detect": milliseconds}, problem)
 
 
 def as_detector(detector: Detector | Callable[[PointCloud], Detections]) -> Detector:
-    """Return a Detector unchanged; wrap any other function of a cloud in an adapter.
+    """Return a Detector unchanged; wrap any other function of a cloud in a CustomDetector.
 
     Raises:
-        InputError: it cannot be called, or is a class instead of an instance.
+        InputError: the argument is not callable, or is a class instead of an instance.
     """
     if isinstance(detector, type) or not callable(detector):
         raise InputError(f"{detector!r} is not a detector; give an instance with __call__(cloud) -> Detections")
@@ -137,15 +136,15 @@ def as_detector(detector: Detector | Callable[[PointCloud], Detections]) -> Dete
 
 
 def find_reference(name: str) -> str | None:
-    """Return "module:Class" for a reference or the name of an entry point; None for other names."""
+    """Return "module:Class" for a reference or an entry point name; None for other names."""
     if REFERENCE.fullmatch(name):
         return None if Path(name).exists() else name
-    return next((each.value for each in entry_points(group=ENTRY_POINTS) if each.name == name), None)
+    return next((entry.value for entry in entry_points(group=ENTRY_POINTS) if entry.name == name), None)
 
 
 def entry_point_names() -> list[str]:
-    """List the detectors of other packages."""
-    return sorted({each.name for each in entry_points(group=ENTRY_POINTS)})
+    """Return the sorted names of the detectors that other packages provide."""
+    return sorted({entry.name for entry in entry_points(group=ENTRY_POINTS)})
 
 
 def load_custom_detector(
@@ -155,38 +154,37 @@ def load_custom_detector(
 
     Args:
         reference: "module:Class". The module is on Python's path or in the current folder.
-        device, range: passed on if the class takes an argument of that name, as is the
-            sensor_height of the parameters, in metres.
+        device, range: passed to the class if it has an argument of that name; so is the
+            sensor_height of `params`, in metres.
         params, group: see CustomDetector. Default: CustomDetectorParams.
 
     Raises:
-        InputError: the module or the class is missing or fails, or the class does not take the
-            range.
+        InputError: the module or class is missing or fails, or the class has no argument `range`.
     """
     make = _find_class(reference)
-    taken = _find_arguments(make)
-    if range != "auto" and "range" not in taken:
-        raise InputError(f"{reference} takes no range; leave it out, or add an argument `range` to the class")
-    values = {name: value for name, value in (("device", device), ("range", range)) if name in taken}
+    accepted = _find_arguments(make)
+    if range != "auto" and "range" not in accepted:
+        raise InputError(f"{reference} has no argument `range`; omit the range, or add the argument to the class")
+    values = {name: value for name, value in (("device", device), ("range", range)) if name in accepted}
 
     @lru_cache(maxsize=2)
     def build(height: float | None) -> Callable[[PointCloud], Any]:
-        own = values if height is None else {**values, "sensor_height": height}
+        arguments = values if height is None else {**values, "sensor_height": height}
         try:
-            detector = make(**own)
+            detector = make(**arguments)
         except Exception as error:
             raise InputError(f"{reference} cannot be created: {_describe(error)}") from error
         if not callable(detector):
             raise InputError(f"{reference} has no method __call__(cloud) -> Detections")
         return detector
 
-    takes_height = "sensor_height" in taken
+    takes_height = "sensor_height" in accepted
     params = CustomDetectorParams() if params is None else params
-    first = build(params.ground.sensor_pose.height if takes_height else None)
+    detector = build(params.ground.sensor_pose.height if takes_height else None)
     return CustomDetector(
         reference,
         lambda height: build(height if takes_height else None),
-        _find_classes(reference, first),
+        _find_classes(reference, detector),
         params,
         group,
         device,
@@ -195,30 +193,30 @@ def load_custom_detector(
 
 def _find_class(reference: str) -> Callable[..., Any]:
     module_name, _, class_name = reference.partition(":")
-    if (here := os.getcwd()) not in sys.path:
-        sys.path.append(here)  # `python -m` has it on the path, but a console script does not
+    if (folder := os.getcwd()) not in sys.path:
+        sys.path.append(folder)  # `python -m` has it on the path, but a console script does not
     try:
-        found: Any = importlib.import_module(module_name)
+        value: Any = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise InputError(f"{module_name} cannot be imported: {_describe(error)}") from error
         raise InputError(
-            f"there is no module {module_name!r}; run the command in its folder, or add the folder to PYTHONPATH"
+            f"there is no module {module_name!r}; run the command in its folder, or add its folder to PYTHONPATH"
         ) from None
     except Exception as error:
         raise InputError(f"{module_name} cannot be imported: {_describe(error)}") from error
     for name in class_name.split("."):
-        if not hasattr(found, name):
-            known = [key for key, value in vars(found).items() if isinstance(value, type)]
-            raise InputError(f"{module_name} has no class {class_name!r}{did_you_mean(class_name, known)}")
-        found = getattr(found, name)
-    if not callable(found):
-        raise InputError(f"{reference} is not a class but {type(found).__name__}")
-    return found
+        if not hasattr(value, name):
+            class_names = [key for key, candidate in vars(value).items() if isinstance(candidate, type)]
+            raise InputError(f"{module_name} has no class {class_name!r}{did_you_mean(class_name, class_names)}")
+        value = getattr(value, name)
+    if not callable(value):
+        raise InputError(f"{reference} is not a class but {type(value).__name__}")
+    return value
 
 
 def _find_arguments(make: Callable[..., Any]) -> set[str]:
-    """Return those of ARGUMENTS that a class takes by keyword."""
+    """Return the ARGUMENTS that a class accepts as keywords."""
     try:
         parameters = inspect.signature(make).parameters
     except ValueError:  # the class is written in C
@@ -231,14 +229,13 @@ def _find_arguments(make: Callable[..., Any]) -> set[str]:
 
 
 def _find_classes(name: str, detector: Any) -> tuple[str, ...]:
-    """Return the attribute `classes` of a detector, or the names of all classes."""
+    """Return the attribute `classes` of a detector; default: all classes."""
     classes = tuple(getattr(detector, "classes", DETECTED))
-    for each in classes:
-        if each not in CLASSES:
-            raise unknown_name(f"class of {name}", each, CLASSES)
+    for class_name in classes:
+        if class_name not in CLASSES:
+            raise unknown_name(f"class of {name}", class_name, CLASSES)
     return classes
 
 
 def _describe(error: Exception) -> str:
-    """Return type and message of an error in one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"

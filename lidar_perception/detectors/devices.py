@@ -21,7 +21,7 @@ CPU = "cpu"
 
 
 def find_device(name: str = "auto") -> str:
-    """Return the device for 'auto', 'cpu', 'cuda' or 'cuda:N'.
+    """Resolve and check a device name: 'auto', 'cpu', 'cuda' or 'cuda:N'.
 
     Raises:
         InputError: the name is unknown, or the machine has no such device.
@@ -39,14 +39,13 @@ def find_device(name: str = "auto") -> str:
     if not (available and int(match[1] or 0) < torch.cuda.device_count()):
         raise InputError(
             f"device {name!r} is not available: torch finds "
-            f"{torch.cuda.device_count() if available else 'no'} CUDA device here; "
-            "choose auto or cpu"
+            f"{torch.cuda.device_count() if available else 'no'} CUDA device; choose auto or cpu"
         )
     return name
 
 
 def _has_gpu_driver() -> bool:
-    """Return True if this machine has a GPU driver of NVIDIA or AMD, or torch is imported."""
+    """Return True if this machine has an NVIDIA or AMD driver, or torch is already imported."""
     if "torch" in sys.modules or Path("/dev/kfd").exists():
         return True
     try:
@@ -57,15 +56,15 @@ def _has_gpu_driver() -> bool:
 
 
 def uses_16_bits(amp: str) -> bool:
-    """Return True if the layers of a network use bf16 on the CPU; see params.make_amp_param."""
+    """Return True if `amp` selects bf16 on the CPU; see params.make_amp_param."""
     return amp == "bf16" or (amp == "auto" and has_bf16())
 
 
 def choose_dtype(amp: str, device: str | torch.device) -> torch.dtype | None:
-    """Return the dtype of a network's layers; None for float32.
+    """Return the dtype of autocast for a network's layers; None for float32.
 
     Args:
-        amp: off, bf16, fp16 (CUDA only), or auto: 16 bits if the device has instructions for it.
+        amp: off, bf16, fp16 (CUDA only), or auto: 16 bits if the device supports it.
     """
     import torch
 

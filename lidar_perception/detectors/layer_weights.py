@@ -9,36 +9,34 @@ import numpy as np
 
 
 class WeightsMismatch(ValueError):
-    """The tensors do not belong to the network. checkpoint.load_checkpoint(), which needs torch,
-    names the first one that differs."""
+    """The tensors do not fit the network; checkpoint.load_checkpoint() names the first mismatch."""
 
 
 class Weights(NamedTuple):
-    """Weight (O, I, kh, kw) of a convolution or (O, I) of a linear layer, and bias (O,) or None,
-    float32."""
+    """Weight, (O, I, kh, kw) for a convolution or (O, I) for a linear layer, and bias (O,) or None; float32."""
 
     weight: np.ndarray
     bias: np.ndarray | None
 
 
 class LayerWeights:
-    """The layers of a network by name. Each layer can be taken once.
+    """Layers of a network by name; each layer can be taken once.
 
     Args:
-        tensors: name -> array, the state_dict of a network in torch.
-        eps: of the batch norms.
+        tensors: state_dict of the torch network as NumPy arrays.
+        eps: epsilon of the batch norms.
     """
 
     def __init__(self, tensors: Mapping[str, np.ndarray], eps: float):
         self.tensors, self.eps = dict(tensors), eps
 
     def take(self, name: str, shape: tuple[int, ...], norm: str | None = None) -> Weights:
-        """Return a layer.
+        """Remove a layer and return its weights.
 
         Args:
-            shape: of its weight.
-            norm: name of the batch norm after a layer without bias. If the norm is already folded
-                in, the layer has a bias and the norm does not exist.
+            shape: expected shape of the weight.
+            norm: name of the batch norm after a layer without bias. If the file has no such norm,
+                it is already folded into the layer, which then has a bias.
 
         Raises:
             WeightsMismatch: the layer is missing or has another shape.
@@ -56,11 +54,11 @@ class LayerWeights:
         return Weights(weight * scale.reshape(-1, *[1] * (len(shape) - 1)), shift - mean * scale)
 
     def array(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """Return a tensor of floats as float32, or raise WeightsMismatch."""
-        found = self.tensors.pop(name, None)
-        if found is None or found.shape != shape or not np.issubdtype(found.dtype, np.floating):
+        """Remove a floating point tensor and return it as float32. WeightsMismatch if it does not fit."""
+        tensor = self.tensors.pop(name, None)
+        if tensor is None or tensor.shape != shape or not np.issubdtype(tensor.dtype, np.floating):
             raise WeightsMismatch(name)
-        return found.astype(np.float32)
+        return tensor.astype(np.float32)
 
     def finish(self) -> None:
         """Raise WeightsMismatch if a tensor has not been taken."""

@@ -1,6 +1,6 @@
 """Exact non-maximum suppression of rotated boxes.
 
-It runs on the CPU. For the few hundred boxes above the score threshold, a GPU would be slower.
+It runs on the CPU, which is faster than a GPU for the few hundred boxes above the threshold.
 """
 
 from __future__ import annotations
@@ -16,25 +16,31 @@ from lidar_perception.types import CLASSES, Detections
 def apply_nms(
     boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, classes: tuple[str, ...], params: NmsParams
 ) -> Detections:
-    """Return the boxes that survive NMS as detections, best score first.
+    """Apply NMS and return the remaining boxes as detections, best score first.
 
     Args:
-        boxes: (N, 7), with scores (N,).
+        boxes: (N, 7).
+        scores: (N,).
         labels: (N,) int, indices into `classes`.
     """
-    kept = rotated_nms(boxes, scores, labels, params.iou, params.across_classes)[: params.max_boxes]
+    indices = rotated_nms(boxes, scores, labels, params.iou, params.across_classes)[: params.max_boxes]
     ids = np.array([CLASSES.index(name) for name in classes])
-    return Detections.of(boxes[kept], ids[labels[kept]], scores[kept])
+    return Detections.of(boxes[indices], ids[labels[indices]], scores[indices])
 
 
 def rotated_nms(
     boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: float, across_classes: bool = False
 ) -> np.ndarray:
-    """Return the indices (M,) int64 of the boxes (N, 7) that survive, best score first; equal
-    scores keep their order.
+    """Return the indices (M,) int64 of the boxes that remain after NMS, best score first.
 
-    A box is dropped if a surviving box has a higher score, the same label (N,) int (any label with
-    across_classes), and a bird's-eye-view IoU with it above `iou`.
+    A box is dropped if its bird's-eye-view IoU with a remaining box of higher score and the same
+    label is above `iou`. Equal scores keep their order.
+
+    Args:
+        boxes: (N, 7).
+        scores: (N,).
+        labels: (N,) int.
+        across_classes: boxes of different labels suppress each other too.
     """
     order = np.argsort(-scores, kind="stable")
     group = np.zeros(len(order), np.int64) if across_classes else np.asarray(labels)[order]
@@ -45,23 +51,23 @@ def rotated_nms(
 @njit(cache=True, nogil=True)
 def _is_kept(boxes, group, iou, by_x):
     kept = np.ones(len(boxes), np.bool_)
-    reach, work = footprint_radii(boxes), np.empty((4, MAX_CORNERS))
+    radii, work = footprint_radii(boxes), np.empty((4, MAX_CORNERS))
     area = boxes[:, 3] * boxes[:, 4]
-    x, max_reach = boxes[by_x, 0], 0.0
-    for r in reach:
-        if r > max_reach:  # False for NaN, the radius of boxes that overlap nothing
-            max_reach = r
+    x, max_radius = boxes[by_x, 0], 0.0
+    for r in radii:
+        if r > max_radius:  # False for NaN, the radius of boxes that overlap nothing
+            max_radius = r
     for i in range(len(boxes)):
-        if not kept[i] or not reach[i] > 0:
+        if not kept[i] or not radii[i] > 0:
             continue
-        far = reach[i] + max_reach
-        for place in range(lower_bound(x, boxes[i, 0] - far), len(x)):
-            if x[place] > boxes[i, 0] + far:
+        max_distance = radii[i] + max_radius
+        for position in range(lower_bound(x, boxes[i, 0] - max_distance), len(x)):
+            if x[position] > boxes[i, 0] + max_distance:
                 break
-            j = by_x[place]
+            j = by_x[position]
             if j > i and kept[j] and group[i] == group[j]:
-                shared = overlap_area(boxes[i], boxes[j], reach[i] + reach[j], work)
-                kept[j] = shared <= 0 or shared / (area[i] + area[j] - shared) <= iou
+                overlap = overlap_area(boxes[i], boxes[j], radii[i] + radii[j], work)
+                kept[j] = overlap <= 0 or overlap / (area[i] + area[j] - overlap) <= iou
     return kept
 
 

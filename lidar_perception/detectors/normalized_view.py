@@ -1,4 +1,4 @@
-"""The view of a cloud that networks are trained on: as from a level sensor at SENSOR_HEIGHT."""
+"""Clouds transformed to the input of the networks: as from a level sensor at SENSOR_HEIGHT."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from lidar_perception.ground.surface import GroundSurface
 from lidar_perception.intensity import MIN_POINTS, normalize_intensity
 from lidar_perception.types import SENSOR_HEIGHT, Detections, PointCloud
 
-MAX_MAST_M = 1.0  # a car farther below the sensor passes under a gantry
-MAX_ROOF_GAP_M = 1.0  # less than half of a car's width and the gap to the next car
+MAX_MAST_M = 1.0  # maximum gap between the ego vehicle and the sensor on top of it
+MAX_ROOF_GAP_M = 1.0  # maximum horizontal gap to the ego vehicle; the next lane is farther away
 
 Corner = tuple[float, float, float]  # corner of a range: x, y, z in metres
 
@@ -25,12 +25,12 @@ class NormalizedView:
     """A cloud as a level sensor SENSOR_HEIGHT above the ground would have measured it.
 
     Attributes:
-        frame: the M points in the view, with the intensity of normalize_intensity(), None if the
-            cloud has no usable one.
+        frame: the M points in the view, with intensity from normalize_intensity(), which is None
+            if the cloud has no usable intensity.
         indices: (M,) int64 of these points in `source`.
-        source: the cloud in the sensor's own coordinates, N points.
-        pose: mounting of the sensor of `source`.
-        use_intensity: False: the view leaves the intensity out.
+        source: the original cloud of N points in sensor coordinates.
+        pose: mounting pose of the sensor.
+        use_intensity: False if the view ignores the intensity.
     """
 
     frame: PointCloud
@@ -47,13 +47,13 @@ class NormalizedView:
         high: Corner | None = None,
         use_intensity: bool = True,
     ) -> NormalizedView:
-        """Return the view of a cloud.
+        """Make the view of a cloud.
 
         Args:
-            low, high: range of the view, low <= x y z < high; points outside and points that are
-                not finite are left out. None: all points are kept.
-            use_intensity: False leaves the intensity out. Zeros would still be read, for example
-                by Patchwork++, which removes dark points below the ground as reflections.
+            low, high: range of the view, low <= x y z < high; other points and points with NaN are
+                dropped. None: all points are kept.
+            use_intensity: False sets the intensity to None. Zeros would change the results of
+                Patchwork++, which removes dark points below the ground as reflections.
         """
         shift = np.array([0, 0, pose.height - SENSOR_HEIGHT], np.float32)
         xyz, indices, frame = level_points(source.xyz, pose), np.arange(len(source)), source
@@ -71,23 +71,25 @@ class NormalizedView:
 
     def crop(self, low: Corner, high: Corner) -> NormalizedView:
         """Return the points of the view with low <= x y z < high."""
-        kept, frame = crop_to_range(self.frame, low, high)
-        return replace(self, frame=frame, indices=self.indices[kept])
+        indices, frame = crop_to_range(self.frame, low, high)
+        return replace(self, frame=frame, indices=self.indices[indices])
 
     def flatten(self, surface: GroundSurface) -> NormalizedView:
-        """Return the view with every point moved vertically, so that the surface of the ground is
-        SENSOR_HEIGHT below the sensor everywhere."""
+        """Move all points vertically, so that the ground is SENSOR_HEIGHT below the sensor everywhere."""
         xyz = self.frame.xyz.copy()
         xyz[:, 2] -= surface.at(xyz) + SENSOR_HEIGHT
         return replace(self, frame=replace(self.frame, xyz=xyz))
 
     def take(self, column: np.ndarray | None) -> np.ndarray | None:
-        """Return the values (M,) of a column (N,) of the source; None for None."""
+        """Select the values (M,) of this view from a column (N,) of the source; None for None."""
         return None if column is None else column.take(self.indices)
 
     def convert(self, column: np.ndarray | None, other: NormalizedView) -> np.ndarray | None:
-        """Return the values (M,) of a column of this view for the K points of another view of the
-        same source: (K,), 0 for points that are not in this view; None for None."""
+        """Convert a column (M,) of this view to another view of the same source, with K points.
+
+        Returns:
+            (K,), 0 for points that are not in this view; None for None.
+        """
         if column is None:
             return None
         values = np.zeros(len(self.source), column.dtype)
@@ -95,8 +97,7 @@ class NormalizedView:
         return values.take(other.indices)
 
     def intensity_problem(self) -> str | None:
-        """Return the problem if the cloud has no usable intensity; None if it has, or the view
-        leaves the intensity out."""
+        """Describe why the intensity is unusable; None if it is usable or the view ignores it."""
         intensity = self.source.intensity
         if (
             not self.use_intensity
@@ -104,7 +105,7 @@ class NormalizedView:
             or (intensity is not None and len(intensity) < MIN_POINTS)
         ):
             return None
-        lack = (
+        defect = (
             "has no intensity"
             if intensity is None
             else "has the intensity 0 everywhere"
@@ -112,7 +113,7 @@ class NormalizedView:
             else "has the same intensity nearly everywhere"
         )
         return (
-            f"the cloud {lack}, without which fewer people are found; set use_intensity to false if the sensor has none"
+            f"the cloud {defect}, so fewer people are found; set use_intensity to false if the sensor has no intensity"
         )
 
 
@@ -125,26 +126,23 @@ def _indices_in_range(xyz: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.
 
 
 def crop_to_range(frame: PointCloud, low: Corner, high: Corner) -> tuple[np.ndarray, PointCloud]:
-    """Return the points of a frame with low <= x y z < high: their indices (M,) int64, and the
-    frame of them."""
+    """Crop a frame to low <= x y z < high; return the indices (M,) int64 and the cropped frame."""
     indices = _indices_in_range(frame.xyz, np.array(low, np.float32), np.array(high, np.float32))
     return indices, frame.take(indices)
 
 
 def segment_view_ground(frame: PointCloud, params: GroundParams) -> np.ndarray:
-    """Return which points of the frame of a NormalizedView are ground, (M,) bool. The sensor pose
-    in `params` is not used."""
+    """Segment the ground of the frame of a NormalizedView, (M,) bool; ignores the pose in `params`."""
     return segment_ground(frame, replace(params, sensor_pose=SensorPoseParams()))
 
 
 def restore_detections(detections: Detections, pose: SensorPoseParams) -> Detections:
-    """Return detections of a NormalizedView in the coordinates of a sensor with this pose, without
-    the vehicle that carries it."""
+    """Transform detections of a NormalizedView to sensor coordinates and drop the ego vehicle."""
     return to_sensor_frame(drop_ego_vehicle(detections, pose.height), pose)
 
 
 def to_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detections:
-    """Return detections of a NormalizedView in the coordinates of a sensor with this pose."""
+    """Transform detections of a NormalizedView to the coordinates of a sensor with this pose."""
     boxes = detections.boxes.copy()
     boxes[:, 2] -= pose.height - SENSOR_HEIGHT
     if pose.roll or pose.pitch:
@@ -156,14 +154,14 @@ def to_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detection
 
 
 def drop_ego_vehicle(detections: Detections, height: float) -> Detections:
-    """Return the detections of a NormalizedView without the vehicle that carries the sensor.
+    """Remove detections of the ego vehicle, in the coordinates of a NormalizedView.
 
-    Dropped are boxes that contain the sensor, or are less than MAX_MAST_M above or below it. As a
-    roof is seen in parts, cars below the sensor are dropped if they are less than MAX_ROOF_GAP_M to
-    the side of it.
+    These are boxes that contain the sensor or are less than MAX_MAST_M above or below it. The roof
+    is only partly visible, so cars below the sensor at a horizontal distance of less than
+    MAX_ROOF_GAP_M are dropped too.
 
     Args:
-        height: real height of the sensor above the ground in metres.
+        height: actual height of the sensor above the ground in metres.
     """
     x, y, z, length, width, box_height, yaw = detections.boxes.astype(np.float64).T
     z = z - (height - SENSOR_HEIGHT)

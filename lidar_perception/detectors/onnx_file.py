@@ -47,7 +47,7 @@ def write_onnx(
         ) from None
     import torch
 
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is missing
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # hide the warning about missing torchvision
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
@@ -71,7 +71,7 @@ def open_session(path: str | Path) -> tuple[Any, str | None]:
     """Open an exported network in ONNX Runtime, on the CPU.
 
     Returns:
-        The session, and the text of the header, None without one.
+        The session and the text of the header, None if it is missing.
 
     Raises:
         InputError: onnxruntime is not installed, or the file is missing or invalid.
@@ -93,7 +93,7 @@ def open_session(path: str | Path) -> tuple[Any, str | None]:
 
 
 def run_session(session: Any, source: str, outputs: Sequence[str], inputs: Mapping[str, Any]) -> list[Any]:
-    """Return the outputs of a session. InputError that names the file `source` if it fails."""
+    """Run a session and return its outputs. InputError with the file name `source` if it fails."""
     try:
         return session.run(list(outputs), dict(inputs))
     except Exception as error:  # onnx exceptions share no base class
@@ -101,14 +101,14 @@ def run_session(session: Any, source: str, outputs: Sequence[str], inputs: Mappi
 
 
 def read_exported_header(path: Path) -> Header:
-    """Return the header of an exported file. InputError if it cannot be read, or has none."""
+    """Read the header of an exported file. InputError if it is missing or invalid."""
     return Header.from_json(open_session(path)[1], str(path))
 
 
 def read_exported_name(path: Path) -> str:
-    """Return the name of the network of an exported file in checkpoint.NETWORKS.
+    """Return the key in checkpoint.NETWORKS of an exported file.
 
-    A file without a readable header counts as PointPillars, whose loader reports the error.
+    Without a valid header this is PointPillars, whose loader then reports the error.
     """
     with suppress(InputError):
         return read_exported_header(path).network

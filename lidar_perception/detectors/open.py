@@ -45,7 +45,7 @@ DETECTOR_BY_SUFFIX = {ONNX: POINTPILLARS, ".json": FUSED}  # suffixes of files o
 
 
 class ConfigurableDetector(Detector, Protocol):
-    """A detector with the parameters of its node, a dataclass."""
+    """A detector whose `params` are the parameters of its node, a dataclass."""
 
     params: Any
 
@@ -68,7 +68,8 @@ def open_detector(
 ) -> ConfigurableDetector:
     """Open a detector by its name or from a file of weights.
 
-    The first call on a machine compiles for a minute or two and reports it on standard error.
+    The first call on a machine compiles Numba functions for a minute or two and reports this on
+    standard error.
 
     Args:
         weights: name of a detector (fused, pointpillars or pointnet) with its shipped weights; or
@@ -77,7 +78,7 @@ def open_detector(
         device: auto, cpu, cuda or cuda:N.
         sensor_height: height of the sensor above the ground in metres; None: 1.73 m, as in KITTI.
         min_score: threshold of every class, 0..1; None: the defaults.
-        range: ahead, around, or auto, the range that the weights were trained for.
+        range: ahead, around, or auto (the range of the training).
         settings: other parameters by their dotted names, such as {"fused.scores.car": 0.7}. They
             take precedence over the arguments above.
 
@@ -93,7 +94,7 @@ def open_detector(
     if range != "auto" and kind != POINTNET:
         arguments[f"{kind}.range"] = range
     if path is not None and f"{kind}.weights" in settings:
-        raise InputError(f"{kind}.weights is set, and {path} is given too; give one of them")
+        raise InputError(f"both {kind}.weights and {path} are given; give one of them")
     try:
         if reference is not None:
             custom = (
@@ -103,8 +104,8 @@ def open_detector(
             )
             detector: Any = load_custom_detector(reference, device, range, custom)
         elif kind in PARAMS:
-            own = settings.get("pointnet.weights") if kind == POINTNET else None
-            params = with_values(default_params(own or weights), {**arguments, **settings})
+            weights_param = settings.get("pointnet.weights") if kind == POINTNET else None
+            params = with_values(default_params(weights_param or weights), {**arguments, **settings})
             detector = _loader(kind)(path or "", getattr(params, kind).device, params)
         else:
             detector = _loader(kind)(path or "", device)
@@ -125,8 +126,8 @@ def default_params(weights: str | Path) -> Any:
     """Return the default parameters of a detector, a dataclass of groups.
 
     Args:
-        weights: name of a detector, or file of its weights. The ground and clustering parameters of
-            PointNet are those that its weights were trained with.
+        weights: name of a detector, or file of its weights. PointNet gets the ground and clustering
+            parameters of its training.
 
     Raises:
         InputError: there is no such detector or file.
@@ -156,7 +157,7 @@ def _module_name(path: str) -> str:
 def _as_trained(params: Any, path: Path | None) -> Any:
     from lidar_perception.detectors.checkpoint import read_header
     from lidar_perception.detectors.pointnet.config import PointNetConfig
-    from lidar_perception.detectors.pointnet.weights_file import weights_file
+    from lidar_perception.detectors.weights_file import find_pointnet_weights
 
     try:
         if path is not None and path.suffix == ONNX:
@@ -164,18 +165,18 @@ def _as_trained(params: Any, path: Path | None) -> Any:
 
             config = read_exported_header(path).config
         else:
-            config = read_header(path or weights_file(params.pointnet), PointNetConfig).config
+            config = read_header(path or find_pointnet_weights(params.pointnet), PointNetConfig).config
     except InputError:
         if path is not None:
             raise
-        return params  # opening the detector will report the missing weights
+        return params  # open_detector reports the missing weights
     return replace(params, ground=config.ground, clustering=config.clustering)
 
 
 def resolve_weights(weights: str | Path) -> tuple[str, Path | None]:
-    """Return the name of a detector and the file of its weights.
+    """Resolve a detector name, custom class or file to a detector name and the file of its weights.
 
-    The file is None for shipped weights and for classes of your own.
+    The file is None for shipped weights and for custom detectors.
 
     Raises:
         InputError: `weights` is not a detector, a class or a file of weights.
@@ -189,7 +190,7 @@ def resolve_weights(weights: str | Path) -> tuple[str, Path | None]:
 
 
 def find_kind(path: Path) -> str:
-    """Return the key in LOAD for a file of weights. InputError if it is not one."""
+    """Return the key in LOAD for a file of weights. InputError if the file is not valid."""
     if path.suffix == ONNX and path.is_file():
         from lidar_perception.detectors.onnx_file import read_exported_name
 
@@ -204,8 +205,8 @@ def find_kind(path: Path) -> str:
 def check_weights(path: Path, height: float) -> list[str]:
     """Return warnings about a file of weights, for a sensor `height` metres above the ground.
 
-    Warnings are about another sensor height in training, scores that are not calibrated, and
-    classes that are never detected. Exported networks have no header and get none.
+    Reasons: another sensor height in training, uncalibrated scores, classes that are never
+    detected. Exported networks are not checked.
     """
     if DETECTOR_BY_SUFFIX.get(path.suffix) == FUSED:
         from lidar_perception.detectors.fused.fusion import read_fusion
@@ -232,7 +233,7 @@ def _read_header(path: Path) -> Header | None:
 
 @dataclass(frozen=True)
 class DetectorChoice:
-    """Arguments of open_detector, for a detector that is opened later."""
+    """Arguments of open_detector for a detector to open later, such as in a worker process."""
 
     weights: str = FUSED
     range: str = "auto"
@@ -241,8 +242,7 @@ class DetectorChoice:
 
     @property
     def later_imports(self) -> tuple[str, ...]:
-        """Modules that open() imports: importing torch takes longer than detecting for 10 clouds,
-        so processes that share the work import it once."""
+        """Modules that open() imports; preload them before forking, since importing torch is slow."""
         loader = LOAD.get(resolve_weights(self.weights)[0])
         return () if loader is None else (_module_name(loader),)
 

@@ -9,25 +9,25 @@ from itertools import pairwise
 
 from lidar_perception.runs.threads import get_thread_count
 
-PARTS_PER_THREAD = 4  # if one thread is delayed, the others take over its parts
+PARTS_PER_THREAD = 4  # small parts balance the load between threads
 
 
 def run_in_parts(compute: Callable[[int, int], None], count: int, max_parts: int) -> None:
-    """Call compute(begin, end) for parts that together are 0 .. count, on as many threads as
-    get_thread_count() says. Only functions that release the GIL become faster.
+    """Call compute(begin, end) for parts of the range 0 .. count on get_thread_count() threads.
 
     Args:
-        max_parts: maximum number of ranges; small amounts of work need few.
+        compute: function that releases the GIL.
+        max_parts: maximum number of parts; small amounts of work need few.
     """
     threads = get_thread_count()
     parts = min(max_parts, threads * PARTS_PER_THREAD, count)
     if threads == 1 or parts < 2:
         compute(0, count)
         return
-    waiting = iter([*pairwise(count * i // parts for i in range(parts + 1))])
+    queue = iter([*pairwise(count * i // parts for i in range(parts + 1))])
 
     def work() -> None:
-        for begin, end in waiting:
+        for begin, end in queue:
             compute(begin, end)
 
     helpers = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]

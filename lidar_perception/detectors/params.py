@@ -26,7 +26,7 @@ class ScoreParams(Params):
 
     @staticmethod
     def for_all_classes(score: float) -> ScoreParams:
-        """Return one threshold for all classes."""
+        """Make parameters with one threshold for all classes."""
         return ScoreParams(score, score, score, score)
 
     def with_maximum(self, score: float) -> ScoreParams:
@@ -85,7 +85,7 @@ def make_engine_param(more: str = "") -> Any:
     """Return the parameter `engine` of detectors with PointPillars.
 
     Args:
-        more: a sentence on the other network of the detector, appended to the description.
+        more: sentence about another network of the detector, appended to the description.
     """
     return param(
         "auto",

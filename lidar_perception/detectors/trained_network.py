@@ -28,7 +28,7 @@ class Placement:
     """Device of a network, shared by all copies of a TrainedNetwork.
 
     Attributes:
-        fallback: why the network runs on the CPU instead of the chosen device, or None.
+        fallback: reason why the network runs on the CPU instead of the chosen device, or None.
     """
 
     device: str
@@ -36,7 +36,7 @@ class Placement:
 
 
 class TrainedNetwork:
-    """Base class of a network in inference mode, with the header of its weights and its device."""
+    """Base class of networks in inference mode, with header and device."""
 
     def __init__(self, network: Movable, header: Header, device: str):
         self.network, self.header = network, header
@@ -57,7 +57,7 @@ class TrainedNetwork:
         return self.placement.device
 
     def with_raw_scores(self) -> Self:
-        """Return the same network with its own scores instead of calibrated probabilities."""
+        """Return a copy that reports uncalibrated scores."""
         return self._with_header(replace(self.header, calibration={}))
 
     def _with_header(self, header: Header) -> Self:
@@ -66,12 +66,11 @@ class TrainedNetwork:
         return other
 
     def to_raw_scores(self, scores: Mapping[str, float]) -> list[float]:
-        """Convert calibrated scores by class to the network's own scores, in the order of
-        `classes`."""
+        """Convert calibrated scores by class to raw network scores, in the order of `classes`."""
         return [to_raw_score(name, scores[name], self.header.calibration) for name in self.classes]
 
     def move(self, device: str, cpu_fallback: bool = True) -> None:
-        """Run on another device from now on, or on the CPU if the device is out of memory.
+        """Move to another device, or to the CPU if the device is out of memory.
 
         Raises:
             InputError: the device is out of memory, and `cpu_fallback` is False.
@@ -83,7 +82,7 @@ class TrainedNetwork:
             self._fall_back(error, cpu_fallback)
 
     def run(self, work: Callable[[], Result], cpu_fallback: bool = True) -> Result:
-        """Return work(); call it again on the CPU if the device is out of memory.
+        """Return work(); repeat it on the CPU if the device is out of memory.
 
         Raises:
             InputError: the device is out of memory, and `cpu_fallback` is False.
@@ -101,12 +100,12 @@ class TrainedNetwork:
         if self.device == CPU or not cpu_fallback:
             raise InputError(f"{self.device} is out of memory; use the CPU or a smaller network") from error
         self.placement.fallback = (
-            f"{self.device} is out of memory, so the network runs on the CPU; close other programs and start again"
+            f"{self.device} is out of memory, so the network runs on the CPU; close other programs and restart"
         )
         self.move(CPU)
 
     def now(self) -> float:
-        """Return a time in seconds, after all work queued on the device is done."""
+        """Return the time in seconds after all queued work on the device is done."""
         if self.device.startswith("cuda"):
             import torch
 
@@ -114,8 +113,10 @@ class TrainedNetwork:
         return perf_counter()
 
     def find_best_scores(self, scores: Iterable[float]) -> tuple[dict[str, float], str | None]:
-        """Return the highest scores by class, for a cloud in which none reached its threshold, and
-        the problem if one is NaN."""
+        """Return the highest scores by class, and a problem if one of them is NaN.
+
+        For clouds without detections.
+        """
         best = dict(zip(self.classes, scores))
         return best, (
             "the network's scores are NaN; check the weights and the intensity"

@@ -1,18 +1,54 @@
-"""Check of the file that a parameter names, without loading torch."""
+"""Paths of the weights of PointPillars and PointNet, without importing torch."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.types import InputError
+
+POINTPILLARS_WEIGHTS = Path(__file__).parent / "pointpillars" / "weights"  # folder with one file per version and size
+POINTNET_WEIGHTS = Path(__file__).parent / "pointnet" / "weights" / "pointnet.safetensors"
+JUDGE = "judge.safetensors"  # file name of the weights that classify boxes of other detectors, beside POINTNET_WEIGHTS
 
 
 def require_weights(path: str, parameter: str) -> Path:
-    """Return the path of a file of weights.
+    """Return the path of a file of weights. InputError that names `parameter` if it does not exist."""
+    if not Path(path).is_file():
+        raise InputError(f"there is no checkpoint {path}; set {parameter} to an existing file")
+    return Path(path)
+
+
+def find_pointpillars_weights(params: PointPillarsParams) -> Path:
+    """Return `params.weights`, by default the shipped file for the version and size in `params`.
 
     Raises:
         InputError: the file does not exist.
     """
-    if not Path(path).is_file():
-        raise InputError(f"there is no checkpoint {path}; set {parameter} to an existing file")
-    return Path(path)
+    if params.weights:
+        return require_weights(params.weights, "pointpillars.weights")
+    version = "v4" if params.version == "auto" else params.version
+    size = "compact" if params.size == "auto" else params.size
+    path = POINTPILLARS_WEIGHTS / f"pointpillars_{version}_{size}.safetensors"
+    if not path.is_file():
+        raise InputError(f"the package has no weights for {version} {size}; set pointpillars.weights to a checkpoint")
+    return path
+
+
+def find_pointnet_weights(params: PointNetParams) -> Path:
+    """Return `params.weights`, by default the shipped file. InputError if it does not exist."""
+    if params.weights:
+        return require_weights(params.weights, "pointnet.weights")
+    return _require_shipped(POINTNET_WEIGHTS)
+
+
+def find_judge_weights() -> Path:
+    """Return the weights trained to classify boxes of other detectors. InputError if missing."""
+    return _require_shipped(POINTNET_WEIGHTS.with_name(JUDGE))
+
+
+def _require_shipped(path: Path) -> Path:
+    if not path.is_file():
+        raise InputError("the package has no PointNet weights; set pointnet.weights to a checkpoint")
+    return path

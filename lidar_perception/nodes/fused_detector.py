@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidar_perception.detectors.custom import find_reference, load_custom_detector
-from lidar_perception.detectors.fused.fusion import weights_file
+from lidar_perception.detectors.fused.fusion import find_fused_weights
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
 from lidar_perception.nodes.detector_node import DetectorNode
 from lidar_perception.nodes.outputs import DetectionOutputs
@@ -42,7 +42,7 @@ class FusedNode(DetectorNode):
         self.input("points", CLOUD, self.on_points)
 
     def weights(self) -> Path:
-        return weights_file(self.params.fused)
+        return find_fused_weights(self.params.fused)
 
     def load(self, weights: Path, device: str) -> FusedDetector:
         from lidar_perception.detectors.fused.detector import load_fused_detector

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams
-from lidar_perception.detectors.pointnet.weights_file import weights_file
+from lidar_perception.detectors.weights_file import find_pointnet_weights
 from lidar_perception.nodes.detector_node import DetectorNode
 from lidar_perception.params import DetectionNodeParams
 
@@ -25,7 +25,7 @@ class PointNetNode(DetectorNode):
         super().__init__("pointnet_detector", PointNetDetectorParams(), DetectionNodeParams(), **options)
 
     def weights(self) -> Path:
-        return weights_file(self.params.pointnet)
+        return find_pointnet_weights(self.params.pointnet)
 
     def load(self, weights: Path, device: str) -> PointNetDetector:
         from lidar_perception.detectors.pointnet.detector import load_pointnet_detector

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
-from lidar_perception.detectors.pointpillars.weights_file import weights_file
+from lidar_perception.detectors.weights_file import find_pointpillars_weights
 from lidar_perception.nodes.detector_node import DetectorNode
 from lidar_perception.params import DetectionNodeParams
 
@@ -25,7 +25,7 @@ class PointPillarsNode(DetectorNode):
         super().__init__("pointpillars_detector", DetectorParams(), DetectionNodeParams(), **options)
 
     def weights(self) -> Path:
-        return weights_file(self.params.pointpillars)
+        return find_pointpillars_weights(self.params.pointpillars)
 
     def load(self, weights: Path, device: str) -> PointPillarsDetector:
         from lidar_perception.detectors.pointpillars.detector import load_detector

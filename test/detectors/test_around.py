@@ -18,7 +18,7 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointpillars.config import HALF, RANGES
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
-from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
+from lidar_perception.detectors.weights_file import POINTPILLARS_WEIGHTS
 from lidar_perception.geometry import horizontal_range
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.centres.matching import match_centres
@@ -30,7 +30,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def shipped(version="v4", range="auto"):
-    return open_detector(WEIGHTS / f"pointpillars_{version}_compact.safetensors", "cpu", min_score=0.05, range=range)
+    return open_detector(
+        POINTPILLARS_WEIGHTS / f"pointpillars_{version}_compact.safetensors", "cpu", min_score=0.05, range=range
+    )
 
 
 def columns_of(scan):

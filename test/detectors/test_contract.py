@@ -16,12 +16,10 @@ from samples import CALIBRATION, crowd
 from experiments.comparison.contenders import open_contenders
 from lidar_perception.classes import CAR
 from lidar_perception.data.frame import Frame
-from lidar_perception.detectors import normalized_view
+from lidar_perception.detectors import normalized_view, weights_file
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.normalized_view import drop_ego_vehicle, restore_detections
-from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
-from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, InputError, PointCloud
@@ -41,16 +39,16 @@ def frame():
 def detectors(frame, tmp_path_factory):
     """Return the detector of every contender by name, with random networks."""
     folder = tmp_path_factory.mktemp("weights")
-    for name, made, config in (
+    for name, samples, config in (
         ("a", detection_samples, detection_samples.tiny()),
         ("b", pointnet_samples, pointnet_samples.small()),
     ):
-        save_checkpoint(folder / name, made.lively(config), Header(config))
+        save_checkpoint(folder / name, samples.lively(config), Header(config))
     with pytest.MonkeyPatch.context() as patch:
-        for module in pointpillars_weights, pointnet_weights:
-            patch.setattr(module, "WEIGHTS", folder / "none")
-        found, _ = open_contenders([folder / "a", folder / "b"], "cpu")
-    return {each.name: each.make_detector(frame) for each in found}
+        patch.setattr(weights_file, "POINTPILLARS_WEIGHTS", folder / "none")
+        patch.setattr(weights_file, "POINTNET_WEIGHTS", folder / "none")
+        contenders, _ = open_contenders([folder / "a", folder / "b"], "cpu")
+    return {contender.name: contender.make_detector(frame) for contender in contenders}
 
 
 def test_these_are_all(detectors):

@@ -218,7 +218,7 @@ def test_tensors_of_other_types_are_refused(tmp_path):
     path, state = tmp_path / "w.safetensors", lively(config).state_dict()
     for dtype in torch.bool, torch.int8, torch.complex64:
         write(path, {name: value.to(dtype) for name, value in state.items()}, Header(config).to_json())
-        with pytest.raises(InputError, match="should be floats of shape"):
+        with pytest.raises(InputError, match="expected floats of shape"):
             load_detector(path, "cpu", eager())
     write(
         path,

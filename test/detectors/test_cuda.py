@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
+from lidar_perception.detectors.weights_file import POINTPILLARS_WEIGHTS
 from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import Detections
@@ -17,7 +17,7 @@ pytestmark = [
     pytest.mark.usefixtures("streets"),
     pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU here"),
 ]
-DETECTORS = [*sorted(WEIGHTS.glob("*.safetensors")), "pointnet", "fused"]
+DETECTORS = [*sorted(POINTPILLARS_WEIGHTS.glob("*.safetensors")), "pointnet", "fused"]
 SURE = 0.3  # a score from which on a detection is in both
 
 

@@ -100,7 +100,7 @@ def test_a_config_that_cannot_be_is_refused(change, words):
 
 
 def test_another_network_is_refused_with_both_values():
-    with pytest.raises(InputError, match=r"f\.st .*version is v4, expected was v2"):
+    with pytest.raises(InputError, match=r"f\.st .*version is v4, expected v2"):
         require_same_config(make_config("v4"), make_config("v2"), "f.st")
 
 

@@ -36,8 +36,8 @@ from lidar_perception.detectors.fused.fusion import KNOTS, load_shipped_models
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.normalized_view import NormalizedView, drop_ego_vehicle, segment_view_ground
 from lidar_perception.detectors.pointnet import classifier
-from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
 from lidar_perception.detectors.trained_network import Placement
+from lidar_perception.detectors.weights_file import POINTPILLARS_WEIGHTS
 from lidar_perception.geometry import bev_iou, centre_distances, points_in_box, points_in_boxes, wrap_angle
 from lidar_perception.param_fields import with_values
 from lidar_perception.simulation.scene import Scenes
@@ -385,5 +385,5 @@ def test_cloud_without_intensity_goes_to_own_networks():
     assert same(around(without), around.load_blind("around")(without))
     low = detector.with_min_score(0.01)
     assert len(low(without).detections) >= len(detector(without).detections)
-    own = load_fused_detector(WEIGHTS / "pointpillars_v0_compact.safetensors", "cpu", EAGER)
+    own = load_fused_detector(POINTPILLARS_WEIGHTS / "pointpillars_v0_compact.safetensors", "cpu", EAGER)
     assert own.load_blind is None  # networks of the user see every cloud

@@ -17,12 +17,12 @@ from pointnet_samples import CPU, eager, lively, make_classifier, random_detecto
 from samples import object_folder
 
 from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.detectors import weights_file
 from lidar_perception.detectors.checkpoint import Header, read_header, read_network_name, save_checkpoint
 from lidar_perception.detectors.checkpoint import Header as PointPillarsHeader
 from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.detectors.normalized_view import to_sensor_frame
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.detectors.pointnet import weights_file as weights_module
 from lidar_perception.detectors.pointnet.detector import PointNetDetector, load_pointnet_detector
 from lidar_perception.detectors.pointnet.network import load_pointnet
 from lidar_perception.detectors.pointnet.params import CLUSTERING, GROUND, STEPS
@@ -316,16 +316,16 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
 
 def test_weights_of_other_network_or_classes_are_refused(saved, tmp_path):
     path, other, header = saved
-    with pytest.raises(InputError, match=r"holds a PointNet, .*pointnet_detector.*PointPillars"):
+    with pytest.raises(InputError, match=r"contains a PointNet .*pointnet_detector.*PointPillars"):
         load_network(path)
-    with pytest.raises(InputError, match=r"holds a PointPillars, .*pointpillars_detector"):
+    with pytest.raises(InputError, match=r"contains a PointPillars .*pointpillars_detector"):
         load_pointnet(other)
     unknown = with_header(path, tmp_path / "u.safetensors", network="transformer")
     for read in read_header, read_network_name, load_network:
-        with pytest.raises(InputError, match="'transformer', this version knows"):
+        with pytest.raises(InputError, match="'transformer'; supported are"):
             read(unknown)
     two = small(classes=("Car", "Pedestrian"), sizes=header.config.sizes[:2])
-    with pytest.raises(InputError, match=r"classes is .*Cyclist.*expected was"):
+    with pytest.raises(InputError, match=r"classes is .*Cyclist.*expected"):
         load_pointnet(path, two)
     config = json.loads(header.to_json())["config"]
     for change, words in (
@@ -376,7 +376,7 @@ def test_evaluation_runs_either_network(saved, tmp_path):
 
 def test_missing_shipped_weights_are_requested(saved, tmp_path, monkeypatch):
     path, _, _ = saved
-    monkeypatch.setattr(weights_module, "WEIGHTS", tmp_path / "own.safetensors")
+    monkeypatch.setattr(weights_file, "POINTNET_WEIGHTS", tmp_path / "own.safetensors")
     with pytest.raises(InputError, match="the package has no PointNet weights"):
         load_pointnet_detector()
     named = with_values(eager(), {"pointnet.weights": str(path)})

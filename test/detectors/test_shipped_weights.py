@@ -10,9 +10,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.boxes import MARGIN_M
 from lidar_perception.detectors.checkpoint import read_header, read_network_name
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.detectors.pointnet.weights_file import WEIGHTS as POINTNET
-from lidar_perception.detectors.pointnet.weights_file import find_judge_weights
-from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
+from lidar_perception.detectors.weights_file import POINTNET_WEIGHTS, POINTPILLARS_WEIGHTS, find_judge_weights
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.simulation.drive import simulate_scan
@@ -21,12 +19,12 @@ from lidar_perception.types import CLASSES
 
 # Others run these lines.
 pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread", "streets")]
-FILES = [*sorted(WEIGHTS.glob("*.safetensors")), POINTNET, find_judge_weights()]
+FILES = [*sorted(POINTPILLARS_WEIGHTS.glob("*.safetensors")), POINTNET_WEIGHTS, find_judge_weights()]
 MOST = {"pointpillars": 30e6, "pointnet": 6e6}  # bytes of all files
 
 
 def test_they_are_small_enough_and_there():
-    assert (WEIGHTS / "pointpillars_v4_compact.safetensors") in FILES  # the default
+    assert (POINTPILLARS_WEIGHTS / "pointpillars_v4_compact.safetensors") in FILES  # the default
     for network, most in MOST.items():
         assert 0 < sum(f.stat().st_size for f in FILES if read_network_name(f) == network) < most
 

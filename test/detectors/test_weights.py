@@ -16,10 +16,10 @@ from click.testing import CliRunner
 from detection_samples import eager, frame, lively, make_detector, random_detector, same, tiny
 
 from lidar_perception.cli.main import cli
+from lidar_perception.detectors import weights_file
 from lidar_perception.detectors.checkpoint import Header, copy_matching_weights, read_header, save_checkpoint
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.detector import _load_network
-from lidar_perception.detectors.pointpillars import weights_file as weights_module
 from lidar_perception.detectors.pointpillars.config import NetworkConfig, make_config
 from lidar_perception.detectors.pointpillars.detector import load_detector
 from lidar_perception.detectors.pointpillars.import_weights import import_weights
@@ -66,7 +66,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
 
 def test_other_config_is_refused_with_both_values(saved):
     path, _, _ = saved
-    with pytest.raises(InputError, match=r"version is v4, expected was v2"):
+    with pytest.raises(InputError, match=r"version is v4, expected v2"):
         load_network(path, tiny("v2"))
     wanted = with_values(DetectorParams(), {"pointpillars.version": "v1"})
     with pytest.raises(InputError, match=r"has the version v4, not v1"):
@@ -122,7 +122,7 @@ def test_invalid_checkpoint_files_are_refused(saved, tmp_path):
         ("later", dict(format=9), "format 9"),
         ("unknown", dict(config={**other["config"], "colour": 1}), "'colour'"),
         ("unfit", dict(config={**other["config"], "fpn_channels": 9}), "do not fit"),
-        ("odd", dict(config={**other["config"], "cell": "wide"}), "describes no network"),
+        ("odd", dict(config={**other["config"], "cell": "wide"}), "has an invalid network config"),
     ):
         kept = {k: v for k, v in names.items() if k != "__metadata__"}
         if change:
@@ -151,7 +151,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(saved, monkeypatch):
 
 
 def test_missing_shipped_weights_are_requested(tmp_path, monkeypatch):
-    monkeypatch.setattr(weights_module, "WEIGHTS", tmp_path)
+    monkeypatch.setattr(weights_file, "POINTPILLARS_WEIGHTS", tmp_path)
     with pytest.raises(InputError, match="no weights for v4 compact"):
         load_detector("", "cpu")
     wanted = with_values(eager(engine="torch"), {"pointpillars.version": "v1"})

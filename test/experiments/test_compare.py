@@ -20,10 +20,9 @@ from experiments.comparison.contenders import open_contenders
 from experiments.comparison.outcomes import ComparisonReport, Contender, rotate, start_comparison
 from experiments.comparison.report import spread_heights
 from lidar_perception.data.open import open_recording
+from lidar_perception.detectors import weights_file
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.contract import DetectionResult
-from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
-from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
 from lidar_perception.scoring.kitti.protocol import SCORED
 from lidar_perception.scoring.run import fill_report
 from lidar_perception.types import Detections, InputError
@@ -37,8 +36,8 @@ ROW = {"weights", "classes", "ap", "mean_ap", "pedestrian_centres", "ms", "ms_of
 @pytest.fixture
 def bare(monkeypatch, tmp_path):
     """A package without weights."""
-    monkeypatch.setattr(pointpillars_weights, "WEIGHTS", tmp_path / "none")
-    monkeypatch.setattr(pointnet_weights, "WEIGHTS", tmp_path / "none.safetensors")
+    monkeypatch.setattr(weights_file, "POINTPILLARS_WEIGHTS", tmp_path / "none")
+    monkeypatch.setattr(weights_file, "POINTNET_WEIGHTS", tmp_path / "none.safetensors")
 
 
 @pytest.fixture(scope="module")

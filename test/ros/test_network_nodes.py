@@ -19,7 +19,7 @@ from lidar_perception.candidates.pipeline import segment_cloud
 from lidar_perception.cli.options import read_config
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.checkpoint import Header, read_header, save_checkpoint
-from lidar_perception.detectors.fused.fusion import weights_file
+from lidar_perception.detectors.fused.fusion import find_fused_weights
 from lidar_perception.detectors.fused.params import FusedParams
 from lidar_perception.detectors.normalized_view import NormalizedView, segment_view_ground
 from lidar_perception.detectors.pointpillars.config import AHEAD, RANGES, NetworkConfig
@@ -179,14 +179,14 @@ def nan_weights(folder):
 
 def unshipped_version():
     """Version and size of a PointPillars whose weights are not shipped, or None."""
-    from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
+    from lidar_perception.detectors.weights_file import POINTPILLARS_WEIGHTS
 
     return next(
         (
             (v, size)
             for v in ("v4", "v3", "v2", "v1", "v0")
             for size in ("compact", "full")
-            if not (WEIGHTS / f"pointpillars_{v}_{size}.safetensors").is_file()
+            if not (POINTPILLARS_WEIGHTS / f"pointpillars_{v}_{size}.safetensors").is_file()
         ),
         None,
     )
@@ -220,7 +220,7 @@ UNUSABLE = {  # by detector: parameters made in a folder, level, words; more in 
     POINTNET_NODE.node: [
         (lambda folder: {"pointnet.weights": "/nowhere.safetensors"}, 2, MISSING),
         (lambda folder: {"pointnet.weights": str(folder / (300 * "a"))}, 2, "File name too long"),
-        (lambda folder: {"pointnet.weights": str(small_v4(folder))}, 2, "holds a PointPillars, which is for"),
+        (lambda folder: {"pointnet.weights": str(small_v4(folder))}, 2, "contains a PointPillars for"),
     ],
     FUSED_NODE.node: [(lambda folder: {"fused.weights": "/nowhere.safetensors"}, 2, MISSING)],
 }
@@ -286,7 +286,7 @@ def test_help_lists_parameters(node, words, capsys):
 def test_experts_segment_the_points_that_the_detector_reads(start, range):
     """Ground as the detector computes it; the parts of the cloud have all its points."""
     node = start(GroundSegmentation, range=range, **{"ground.method": "patchwork"})
-    assert read_header(weights_file(FusedParams()), NetworkConfig).config.low == AHEAD["low"]
+    assert read_header(find_fused_weights(FusedParams()), NetworkConfig).config.low == AHEAD["low"]
     cloud = message(1)
     node.nonground.publisher.get_subscription_count = lambda: 1
     node.on_points(cloud)

@@ -24,18 +24,17 @@ from lidar_perception.detectors.fused.evidence import compute_probabilities
 from lidar_perception.detectors.fused.fusion import (
     KNOTS,
     PACKAGE,
+    find_fused_weights,
     find_fusion,
     load_shipped_models,
     read_fusion,
-    weights_file,
     write_fusion,
 )
 from lidar_perception.detectors.fused.params import FusedParams
 from lidar_perception.detectors.open import check_weights, open_detector
 from lidar_perception.detectors.pointnet.params import PointNetParams
-from lidar_perception.detectors.pointnet.weights_file import weights_file as classifier_file
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
-from lidar_perception.detectors.pointpillars.weights_file import weights_file as proposer_file
+from lidar_perception.detectors.weights_file import find_pointnet_weights, find_pointpillars_weights
 from lidar_perception.param_fields import with_values
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.training.fusion_curves import MIN_SAMPLES, Samples, collect_samples, fit_classes
@@ -113,7 +112,7 @@ def others(tmp_path):
     """Write a fusion file with other curves than the package, for a copy of the PointNet."""
     classifier = tmp_path / "own/pointnet.safetensors"
     classifier.parent.mkdir()
-    classifier.write_bytes(classifier_file(PointNetParams()).read_bytes())
+    classifier.write_bytes(find_pointnet_weights(PointNetParams()).read_bytes())
     models = json.loads(json.dumps(load_shipped_models()))
     for model in models.values():
         model["bias"] += 1.0
@@ -126,14 +125,14 @@ def test_fusion_file_round_trip_in_moved_folder(others, tmp_path, monkeypatch):
     fusion = read_fusion(path)
     assert fusion.models == models and fusion.fitted_to == {"scans": 3}
     assert fusion.curve_warning is None
-    assert fusion.proposer == proposer_file(PointPillarsParams())
+    assert fusion.proposer == find_pointpillars_weights(PointPillarsParams())
     moved = tmp_path.parent / f"{tmp_path.name}-moved"
     tmp_path.rename(moved)
     again = read_fusion(moved / "fused.json")
     assert again.classifier == moved / "own/pointnet.safetensors" and again.curve_warning is None
     monkeypatch.chdir(moved)
     assert open_detector("fused.json", "cpu").models == models
-    assert weights_file(FusedParams(weights="fused.json")).name == "fused.json"
+    assert find_fused_weights(FusedParams(weights="fused.json")).name == "fused.json"
     # Weights that changed or are lost.
     again.classifier.write_bytes(again.classifier.read_bytes() + b"\0")
     assert "pointnet.safetensors, so its scores" in read_fusion(moved / "fused.json").curve_warning
@@ -146,11 +145,11 @@ def test_package_curves_warn_about_other_weights(others):
     path, _ = others
     assert find_fusion().curve_warning is None and check_weights(PACKAGE, 1.73) == []
     assert open_detector("fused", "cpu").warning is None
-    other = str(proposer_file(PointPillarsParams(version="v1")))
+    other = str(find_pointpillars_weights(PointPillarsParams(version="v1")))
     for params in FusedParams(weights=other), FusedParams(classifier=other):
-        assert f"other weights than {other}" in find_fusion("", params).curve_warning
+        assert f"not fitted to {other}" in find_fusion("", params).curve_warning
         assert find_fusion("", params).models == load_shipped_models()
-    with pytest.raises(InputError, match=r"has its own PointNet weights; leave fused.classifier"):
+    with pytest.raises(InputError, match=r"refers to its own PointNet weights; leave fused.classifier"):
         find_fusion(path, FusedParams(classifier=other))
     for group in "weights", "classifier":
         with pytest.raises(InputError, match=rf"no checkpoint nowhere; .* fused.{group}"):

@@ -17,7 +17,7 @@ from samples import object_folder, scene, walker_label, write
 from lidar_perception.cli.main import cli
 from lidar_perception.detectors.checkpoint import read_header, save_header
 from lidar_perception.detectors.pointnet.params import PointNetParams
-from lidar_perception.detectors.pointnet.weights_file import weights_file
+from lidar_perception.detectors.weights_file import find_pointnet_weights
 from lidar_perception.runs import terminal
 from lidar_perception.runs.resuming import lock_folder
 from lidar_perception.training import planning, start
@@ -126,7 +126,7 @@ def test_run_directory_is_locked(tmp_path):
 def test_foreign_weights_in_out_are_not_replaced(tmp_path, more):
     weights = tmp_path / "run/best.safetensors"
     weights.parent.mkdir()
-    shutil.copy(weights_file(PointNetParams()), weights)
+    shutil.copy(find_pointnet_weights(PointNetParams()), weights)
     assert "would be replaced" in refuse(tmp_path, "--init", str(weights), *more)
 
 
@@ -200,7 +200,7 @@ def test_resumed_run_keeps_plan_and_refuses_other_settings(tmp_path, one_thread)
     assert record["sensor"] == {"name": str(sensor), "height": 0.6, "beams": 5}
     header = read_header(out / "last.safetensors")
     assert header.find_height_mismatch(0.7) is None
-    assert "at 0.6 m, and used with one at 1.73 m" in header.find_height_mismatch(1.73)
+    assert "at 0.6 m, used with one at 1.73 m" in header.find_height_mismatch(1.73)
     plan = json.loads((out / RUN).read_text())["plan"]
     assert (plan["scans"], plan["steps"]) == (2, 2)
     other = CliRunner().invoke(cli, [*arguments, "--resume"])
@@ -275,7 +275,7 @@ def test_run_is_not_resumed_with_changed_split_or_weights(tmp_path, monkeypatch)
 
     monkeypatch.setattr(start, "_prepare_scenes", stop)
     split = write(tmp_path / "split.txt", "000000\n000001\n000002\n")
-    init = Path(shutil.copy(weights_file(PointNetParams()), tmp_path / "init.safetensors"))
+    init = Path(shutil.copy(find_pointnet_weights(PointNetParams()), tmp_path / "init.safetensors"))
     arguments = [
         "train",
         "pointnet",

@@ -12,7 +12,7 @@ from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.config import NETWORKS
 from lidar_perception.detectors.pointnet.network import load_pointnet
-from lidar_perception.detectors.pointnet.weights_file import find_judge_weights
+from lidar_perception.detectors.weights_file import find_judge_weights
 from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training.params import PointNetTraining

@@ -11,7 +11,7 @@ from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import ScoringOptions, no_labels_error, path_option, scoring_options
 from lidar_perception.cli.options import Runs, Settings, checked, settings_options
 from lidar_perception.detectors.open import POINTNET, default_params, resolve_weights
-from lidar_perception.detectors.pointnet.weights_file import WEIGHTS
+from lidar_perception.detectors.weights_file import POINTNET_WEIGHTS
 from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
@@ -22,7 +22,7 @@ def _find_checkpoint(weights: Path | None) -> Path:
     network, path = (POINTNET, None) if weights is None else resolve_weights(weights)
     if network != POINTNET:
         raise InputError(f"{weights} is a detector {network}; give a checkpoint of {POINTNET}")
-    return path or WEIGHTS
+    return path or POINTNET_WEIGHTS
 
 
 def _make_runs(weights: Path | None) -> Runs:

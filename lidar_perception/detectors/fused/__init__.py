@@ -1,1 +1,1 @@
-"""One detector of several: PointPillars, the cluster network and silhouettes, weighed together."""
+"""The fused detector: PointPillars, PointNet and silhouettes, combined to one probability."""

@@ -1,4 +1,4 @@
-"""Fused detector: PointPillars proposes boxes, PointNet and silhouettes of clusters judge them."""
+"""Fused detector: PointPillars proposes boxes; PointNet and cluster silhouettes verify them."""
 
 from __future__ import annotations
 
@@ -55,18 +55,18 @@ from lidar_perception.geometry import bev_iou, centre_distances
 from lidar_perception.ground.surface import GroundSurface, fit_ground_surface
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, PointCloud
 
-MAX_RELIEF_M = 2.0  # height of hills, and depth of hollows, around the sensor
+MAX_RELIEF_M = 2.0  # maximum height difference of the ground around the sensor
 
 
 class Proposals(NamedTuple):
-    """Proposed boxes in a NormalizedView with flat ground and the evidence for them.
+    """Proposed boxes in a flattened NormalizedView and the evidence for them.
 
     Attributes:
         detections: K proposals; boxes that PointNet classified are moved towards its boxes.
         evidence: log-odds (K,) of each source.
         obstacles: (N, 3) xyz of the points of the view that are not ground.
-        surface: surface of the ground before it was made flat.
-        problem: why nothing or little can be detected, or None.
+        surface: ground surface before flattening.
+        problem: reason why little or nothing can be detected, or None.
         timings: milliseconds of each step.
     """
 
@@ -79,15 +79,17 @@ class Proposals(NamedTuple):
 
 
 class FusedDetector(NetworkDetector):
-    """A detector, see contract.py, made of two networks. Its range and classes are those of the
-    proposer. Ground and the clusters for PointPillars are computed where they are None.
+    """Detector that combines two networks, see contract.py.
+
+    Range and classes are those of the proposer. Ground and the clusters for PointPillars are
+    computed if they are None.
 
     Args:
-        proposer, classifier: the networks. The curves of `models` were fitted to the proposer's
-            raw scores.
-        models: curves that turn evidence into probabilities; None: the shipped ones.
+        proposer, classifier: the networks.
+        models: curves that convert evidence, with raw scores of the proposer, to probabilities;
+            None: the shipped ones.
         load_blind: load_blind(range) returns the detector for clouds without usable intensity;
-            None: this one detects in them, too.
+            None: use this detector for them too.
     """
 
     group = "fused"
@@ -121,7 +123,7 @@ class FusedDetector(NetworkDetector):
         return other
 
     def with_raw_scores(self) -> FusedDetector:
-        """Return this detector: its scores are not calibrated any further."""
+        """Return this detector, whose scores have no further calibration."""
         return self
 
     def detect(self, frame: PointCloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None) -> DetectionResult:
@@ -139,7 +141,7 @@ class FusedDetector(NetworkDetector):
         return DetectionResult(detections, timings, proposals.problem or chosen.fallback, best)
 
     def _make_view(self, frame: PointCloud) -> NormalizedView:
-        """Return the points in the range of the network, and up to MAX_RELIEF_M above or below."""
+        """Make the view of the network's range, extended by MAX_RELIEF_M upwards and downwards."""
         config, relief = self.proposer.config, np.array([0, 0, MAX_RELIEF_M])
         return NormalizedView.of(
             frame,
@@ -150,7 +152,7 @@ class FusedDetector(NetworkDetector):
         )
 
     def propose(self, frame: PointCloud) -> Proposals:
-        """Return all proposals for a cropped frame with the evidence of all sources."""
+        """Return all proposals for a cropped frame, with the evidence of all sources."""
         return self._propose(self._make_view(frame))
 
     def _propose(
@@ -160,11 +162,10 @@ class FusedDetector(NetworkDetector):
         cluster_ids: np.ndarray | None = None,
         min_scores: ScoreParams = ScoreParams.for_all_classes(0.0),
     ) -> Proposals:
-        """Return the proposals for the result of _make_view() with the evidence of all sources.
+        """Return the proposals for the result of _make_view(), with the evidence of all sources.
 
         Args:
-            min_scores: the classifier, which takes most time, skips proposals that cannot reach
-                these scores.
+            min_scores: PointNet, the slowest step, skips proposals that cannot reach these scores.
         """
         times = [perf_counter()]
         settings, params, config = self.settings, self.params, self.proposer.config
@@ -177,13 +178,13 @@ class FusedDetector(NetworkDetector):
         obstacles = flat.frame.take(np.flatnonzero(~flat_ground))
         floor = flat.frame.xyz.compress(flat_ground, axis=0)
         times.append(perf_counter())
-        # Compiled code releases the GIL, and much of PointPillars runs in one thread.
+        # Clustering runs in parallel: it releases the GIL, and much of PointPillars is single-threaded.
         with ThreadPoolExecutor(1) as pool:
             clusters = pool.submit(cluster_obstacles, flat.frame.xyz, flat_ground, params.people, wide.source.xyz)
             _, cluster_ids = run_experts(
                 view.frame, config, is_ground, view.take(cluster_ids), params.ground, params.clustering
             )
-            found = self.proposer.propose(
+            proposal = self.proposer.propose(
                 flat,
                 flat_ground,
                 view.convert(cluster_ids, flat),
@@ -193,7 +194,7 @@ class FusedDetector(NetworkDetector):
             )
             people = clusters.result()[~flat_ground]
         times.append(perf_counter())
-        proposed = drop_ego_vehicle(found.detections, view.pose.height)
+        proposed = drop_ego_vehicle(proposal.detections, view.pose.height)
         evidence = {
             "network": to_log_odds(proposed.scores),
             "silhouette": to_log_odds(find_silhouette_confidence(proposed.boxes, obstacles.xyz, floor, people)),
@@ -210,28 +211,32 @@ class FusedDetector(NetworkDetector):
             evidence,
             obstacles.xyz,
             surface,
-            found.problem,
+            proposal.problem,
             dict(zip(STEPS[1:], (np.diff(times) * 1e3).tolist())),
         )
 
     def decide(self, proposals: Proposals) -> tuple[Detections, dict[str, float]]:
-        """Return the proposals that are detections, best first, in the coordinates of the view;
-        without any, also the highest score of each class."""
+        """Convert proposals to detections.
+
+        Returns:
+            Detections in the coordinates of the view, best first; and the highest score of each
+            class if there are none.
+        """
         settings, class_ids = self.settings, proposals.detections.class_ids
         scored = replace(
             proposals.detections,
             scores=compute_probabilities(self.models, class_ids, proposals.evidence),
             sources=compute_source_probabilities(self.models, class_ids, proposals.evidence),
         )
-        found = scored[settings.scores.passes(scored)]
-        if len(found) == 0:
-            return found, {
+        selected = scored[settings.scores.passes(scored)]
+        if len(selected) == 0:
+            return selected, {
                 name: float(scored.scores[class_ids == CLASSES.index(name)].max(initial=0.0)) for name in self.classes
             }
-        boxes = move_cars_to_points(found.boxes, found.class_ids, proposals.obstacles, settings.on_points)
+        boxes = move_cars_to_points(selected.boxes, selected.class_ids, proposals.obstacles, settings.on_points)
         heights = proposals.surface.at(boxes)
         boxes[:, 2] += heights + SENSOR_HEIGHT
-        moved = replace(found, boxes=move_to_ground(boxes, heights, settings.on_ground).astype(np.float32))
+        moved = replace(selected, boxes=move_to_ground(boxes, heights, settings.on_ground).astype(np.float32))
         return moved[remove_duplicates(moved, settings)], {}
 
     def warm_up(self) -> None:
@@ -242,9 +247,9 @@ class FusedDetector(NetworkDetector):
 def remove_duplicates(detections: Detections, params: FusedParams) -> np.ndarray:
     """Return the indices (M,) int64 of one detection per object, best score first.
 
-    Two detections of a class are one object if they overlap by more than nms.iou. Cars are already
-    one if they overlap by more than same_car; people walk side by side, so they and cyclists are
-    one if their centres are closer than same_place.
+    Two detections of a class are duplicates if their IoU is above nms.iou. Cars are duplicates also
+    if their IoU is above same_car, pedestrians and cyclists if their centres are closer than
+    same_place.
     """
     order = rotated_nms(
         detections.boxes, detections.scores, detections.class_ids, params.nms.iou, params.nms.across_classes
@@ -263,8 +268,8 @@ def load_fused_detector(
     """Load the fused detector.
 
     Args:
-        path: output of `train fused`, or weights of PointPillars; empty: the files in `params`, by
-            default the shipped ones.
+        path: output of `train fused`, or weights of PointPillars; empty: files named in `params`,
+            by default the shipped ones.
 
     Raises:
         InputError: see find_fusion, load_detector and load_pointnet_detector.
@@ -280,8 +285,8 @@ def load_fused_detector(
 
 def _load_blind(device: str, params: FusedDetectorParams, range: str) -> FusedDetector:
     """Load the shipped detector for clouds without usable intensity."""
-    own = replace(params, fused=replace(params.fused, range=range))
-    return _load_fusion(read_fusion(NO_INTENSITY), device, own)
+    blind_params = replace(params, fused=replace(params.fused, range=range))
+    return _load_fusion(read_fusion(NO_INTENSITY), device, blind_params)
 
 
 def _load_fusion(fusion: Fusion, device: str, params: FusedDetectorParams) -> FusedDetector:

@@ -1,12 +1,12 @@
-"""Evidence for each proposal and its combination to a probability.
+"""Evidence for proposals, and its combination to a probability.
 
 The sources are PointPillars' score, the silhouettes of clusters near the centre, and the
 classification of the points by PointNet. All coordinates are those of a level sensor at
 SENSOR_HEIGHT. Clusters without a proposal are ignored: they did not improve the detections.
 
-The log-odds of a class are a sum of one curve per source. Sources that see the same object are not
-independent, so a plain sum would be overconfident. The curves are therefore fitted jointly, on
-simulated scans that no source was trained on, so that the sum is a calibrated probability.
+The log-odds of a class are the sum of one curve per source. The sources are not independent, so a
+plain sum of log-odds would be overconfident. The curves are therefore fitted jointly, on simulated
+scans outside the training sets, which makes the result a calibrated probability.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from lidar_perception.types import CLASSES
 # Size limits of clusters that may be a person or a cyclist.
 MIN_HEIGHT_M, MAX_HEIGHT_M, MAX_LENGTH_M = 0.8, 2.6, 2.8
 MAX_DISTANCE_M = 0.6  # maximum distance between the centres of a proposal and its cluster
-MIN_PROBABILITY, MAX_PROBABILITY = 0.001, 0.999  # no source is certain
+MIN_PROBABILITY, MAX_PROBABILITY = 0.001, 0.999  # limits for every source
 
 # Source -> log-odds (K,) float64 that each of K proposals has the proposed class; NaN where
 # the source gives no evidence.
@@ -37,14 +37,13 @@ Evidence = dict[str, np.ndarray]
 def find_silhouette_confidence(
     boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray
 ) -> np.ndarray:
-    """Return the highest confidence that a cluster near each box is a pedestrian.
+    """Return, for each box, the highest confidence that a nearby cluster is a pedestrian.
 
     Args:
         boxes: (K, 7) proposals.
         xyz: (N, 3) points that are not ground.
         ground: (G, 3) ground points.
-        cluster_ids: (N,) cluster ids 1..J, 0 for no cluster; clustered with the parameters for
-            people.
+        cluster_ids: (N,) 1..J, 0 for no cluster, computed with the parameters for people.
 
     Returns:
         (K,) float64, 0..1; 0 for boxes without a cluster of a suitable size.
@@ -64,32 +63,33 @@ def find_silhouette_confidence(
 
 
 def to_log_odds(probabilities: np.ndarray) -> np.ndarray:
-    """Return log-odds (K,) float64 of clipped probabilities (K,); NaN remains NaN."""
+    """Convert probabilities (K,), clipped, to log-odds (K,) float64; NaN remains NaN."""
     return logit(np.clip(np.asarray(probabilities, np.float64), MIN_PROBABILITY, MAX_PROBABILITY))
 
 
 def compute_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence) -> np.ndarray:
-    """Return the probability (K,) float32 that each proposal is an object of its class.
+    """Return the probability (K,) float32 that each proposal is an object of the proposed class.
 
     Args:
         class_ids: (K,) indices into CLASSES; a class without a model gets 0.
     """
     result = np.zeros(len(class_ids), np.float32)
     for class_id in np.unique(class_ids):
-        own = class_ids == class_id
+        in_class = class_ids == class_id
         if CLASSES[class_id] in models:
-            result[own] = expit(
-                compute_log_odds(models[CLASSES[class_id]], {source: odds[own] for source, odds in evidence.items()})
+            result[in_class] = expit(
+                compute_log_odds(
+                    models[CLASSES[class_id]], {source: odds[in_class] for source, odds in evidence.items()}
+                )
             )
     return result
 
 
 def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence, source: str) -> np.ndarray:
-    """Return the highest probability (K,) float32 that each proposal can reach for any evidence of
-    `source`.
+    """Return the upper bound (K,) float32 of the probability over all possible evidence of `source`.
 
-    A curve is linear between its knots and constant beyond, so its maximum is at a knot or, without
-    evidence, its value for unknown.
+    A curve is piecewise linear and constant beyond its knots, so its maximum is at a knot or is its
+    value for missing evidence.
     """
     best = np.full(len(class_ids), np.nan)
     for class_id in np.unique(class_ids):
@@ -102,7 +102,7 @@ def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: E
 def compute_source_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence) -> dict[str, np.ndarray]:
     """Return, by source, the probability (K,) float32 from this source alone.
 
-    It is NaN where the source gives no evidence, or is not part of the model of the class.
+    NaN: the source gives no evidence, or the model of the class does not use it.
     """
     used_for = {
         source: [i for i, name in enumerate(CLASSES) if source in models.get(name, {"curves": {}})["curves"]]

@@ -1,6 +1,6 @@
 """Fusion files: the two networks of the fused detector and the curves that combine their scores.
 
-`train fused` writes such a file; fusion.json is the shipped one. Reading does not import torch.
+`train fused` writes such a file; fusion.json ships with the package. Reading does not import torch.
 """
 
 from __future__ import annotations
@@ -19,17 +19,15 @@ import numpy as np
 from lidar_perception.classes import DETECTED
 from lidar_perception.detectors.fused.params import FusedParams
 from lidar_perception.detectors.pointnet.config import PointNetConfig
-from lidar_perception.detectors.pointnet.weights_file import find_judge_weights
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
-from lidar_perception.detectors.pointpillars.weights_file import weights_file as proposer_file
-from lidar_perception.detectors.weights_file import require_weights
+from lidar_perception.detectors.weights_file import find_judge_weights, find_pointpillars_weights, require_weights
 from lidar_perception.runs.files import read_text, shorten_error, write_text
 from lidar_perception.types import InputError
 
 PACKAGE = Path(__file__).with_name("fusion.json")
 NO_INTENSITY = PACKAGE.with_name("fusion_no_intensity.json")  # file for clouds without intensity
-SUFFIX = ".json"  # distinguishes a fusion file from a checkpoint
+SUFFIX = ".json"  # suffix of fusion files
 MAX_BYTES = 10**6
 MAX_LOG_ODDS = 1000.0
 MAX_KNOTS = 64
@@ -52,7 +50,7 @@ class Fusion:
         proposer, classifier: weights of PointPillars and of PointNet.
         digests: sha256 of the weights that `models` were fitted to.
         models: curves by class.
-        fitted_to: description of the fit: data and numbers of proposals.
+        fitted_to: data and numbers of proposals of the fit.
     """
 
     proposer: Path
@@ -64,17 +62,16 @@ class Fusion:
     @property
     def curve_warning(self) -> str | None:
         """Warning if the curves were fitted to other weights, or None."""
-        others = [
+        refitted = [
             str(path)
-            for path, known in zip((self.proposer, self.classifier), self.digests)
-            if compute_digest(path) != known
+            for path, digest in zip((self.proposer, self.classifier), self.digests)
+            if compute_digest(path) != digest
         ]
-        if not others:
+        if not refitted:
             return None
         return (
-            f"the curves of fused were fitted to other weights than {' and '.join(others)}, so "
-            "its scores are not calibrated probabilities; fit the curves with "
-            "`lidar-perception train fused`"
+            f"the curves of fused were not fitted to {' and '.join(refitted)}, so its scores are not "
+            "calibrated probabilities; fit the curves with `lidar-perception train fused`"
         )
 
     def find_warnings(self, classes: Iterable[str]) -> list[str]:
@@ -83,18 +80,13 @@ class Fusion:
         Args:
             classes: classes of the proposer.
         """
-        others = [name for name in classes if name not in self.models]
-        return [
-            *filter(None, [self.curve_warning]),
-            *(
-                [
-                    f"fused detects no {' and no '.join(others)}, because it has curves only for "
-                    f"{', '.join(self.models)}; use {self.proposer} alone to detect them"
-                ]
-                if others
-                else []
-            ),
-        ]
+        warnings = [self.curve_warning] if self.curve_warning else []
+        if missing := [name for name in classes if name not in self.models]:
+            warnings.append(
+                f"fused detects no {' and no '.join(missing)}, because it has curves only for "
+                f"{', '.join(self.models)}; use {self.proposer} alone to detect them"
+            )
+        return warnings
 
 
 def compute_digest(path: Path) -> str:
@@ -112,21 +104,21 @@ def find_fusion(path: str | Path = "", params: FusedParams = FusedParams()) -> F
     Raises:
         InputError: a file is missing or invalid.
     """
-    named = str(path) if str(path) not in ("", ".") else params.weights
-    if named.endswith(SUFFIX):
+    name = str(path) if str(path) not in ("", ".") else params.weights
+    if name.endswith(SUFFIX):
         if params.classifier:
-            raise InputError(f"{named} has its own PointNet weights; leave fused.classifier empty")
-        return read_fusion(require_weights(named, "fused.weights"))
-    own = read_fusion(PACKAGE)
+            raise InputError(f"{name} refers to its own PointNet weights; leave fused.classifier empty")
+        return read_fusion(require_weights(name, "fused.weights"))
+    shipped = read_fusion(PACKAGE)
     return replace(
-        own,
-        proposer=require_weights(named, "fused.weights") if named else own.proposer,
-        classifier=require_weights(params.classifier, "fused.classifier") if params.classifier else own.classifier,
+        shipped,
+        proposer=require_weights(name, "fused.weights") if name else shipped.proposer,
+        classifier=require_weights(params.classifier, "fused.classifier") if params.classifier else shipped.classifier,
     )
 
 
-def weights_file(params: FusedParams) -> Path:
-    """Return the file in `params.weights`, by default the shipped weights of PointPillars.
+def find_fused_weights(params: FusedParams) -> Path:
+    """Return the path `params.weights`, by default the shipped weights of PointPillars.
 
     Raises:
         InputError: this file or another part of the detector is missing.
@@ -137,7 +129,7 @@ def weights_file(params: FusedParams) -> Path:
 
 @cache
 def load_shipped_models() -> Models:
-    """Return the curves that ship with the package."""
+    """Load the curves that ship with the package."""
     return json.loads(PACKAGE.read_text())["classes"]
 
 
@@ -149,8 +141,8 @@ def read_fusion(path: Path) -> Fusion:
     """
     try:
         content = json.loads(read_text(path, MAX_BYTES))
-        known, models = [content[name] for name in NETWORKS], content["classes"]
-        files, digests = ([str(part[key]) for part in known] for key in ("file", "sha256"))
+        networks, models = [content[name] for name in NETWORKS], content["classes"]
+        files, digests = ([str(part[key]) for part in networks] for key in ("file", "sha256"))
         fitted_to = dict(content["fitted_to"])
         _check(models)
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
@@ -170,7 +162,7 @@ def read_fusion(path: Path) -> Fusion:
 def write_fusion(
     path: Path, weights: tuple[Path | None, Path | None], models: Models, fitted_to: Mapping[str, Any]
 ) -> None:
-    """Write a fusion file. It refers to the weights by relative paths.
+    """Write a fusion file, which refers to the weights by relative paths.
 
     Args:
         weights: files of PointPillars and PointNet; None: the shipped one.
@@ -185,8 +177,8 @@ def write_fusion(
 
 
 def _shipped() -> tuple[Path, Path]:
-    """Return the shipped weights of both networks. InputError if they are missing."""
-    return proposer_file(PointPillarsParams()), find_judge_weights()
+    """Return the paths of the shipped weights of both networks. InputError if they are missing."""
+    return find_pointpillars_weights(PointPillarsParams()), find_judge_weights()
 
 
 def _check(models: Any) -> None:
@@ -205,7 +197,7 @@ def _check(models: Any) -> None:
 
 
 def _numbers(values: Any) -> np.ndarray:
-    """Return log-odds as (K,) float64. ValueError if they are not numbers up to MAX_LOG_ODDS."""
+    """Convert log-odds to (K,) float64. ValueError if they are invalid or above MAX_LOG_ODDS."""
     if not all(type(value) in (int, float) for value in values):
         raise ValueError("log-odds must be numbers")
     numbers = np.array(values, np.float64)

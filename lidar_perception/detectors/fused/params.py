@@ -1,4 +1,4 @@
-"""Parameters of the detector: flags, ROS parameters and docs are made from these fields."""
+"""Parameters of the fused detector, the source of ROS parameters, command line options and docs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lidar_perception.param_fields import param
 from lidar_perception.robot.params import CropParams
 from lidar_perception.wire.params import InputParams
 
-STEPS = ("preprocess", "ground", "proposals", "evidence", "fusion")
+STEPS = ("preprocess", "ground", "proposals", "evidence", "fusion")  # keys of the timings
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from lidar_perception.detectors.pointnet.compiled import CompiledPointNet
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams, PointNetParams
 from lidar_perception.detectors.pointnet.predict import Network, Predictions, select_detections
-from lidar_perception.detectors.pointnet.weights_file import weights_file
+from lidar_perception.detectors.weights_file import find_pointnet_weights
 from lidar_perception.runs.threads import set_thread_count
 from lidar_perception.types import InputError, PointCloud
 
@@ -149,7 +149,7 @@ def load_pointnet_detector(
         InputError: the file is missing or not a PointNet, or the device does not exist.
     """
     settings = PointNetParams() if params is None else params.pointnet
-    path = Path(path) if str(path) not in ("", ".") else weights_file(settings)
+    path = Path(path) if str(path) not in ("", ".") else find_pointnet_weights(settings)
     if settings.threads:
         set_thread_count(settings.threads)
     target = CPU if path.suffix == ".onnx" and device == "auto" else find_device(device)

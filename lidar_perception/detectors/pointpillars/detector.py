@@ -22,7 +22,7 @@ from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
 from lidar_perception.detectors.pointpillars.prediction import Network
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.pointpillars.sparse import SparseNetwork, find_unsupported_part
-from lidar_perception.detectors.pointpillars.weights_file import weights_file
+from lidar_perception.detectors.weights_file import find_pointpillars_weights
 from lidar_perception.runs.threads import set_thread_count
 from lidar_perception.types import InputError, PointCloud
 
@@ -102,7 +102,7 @@ def load_detector(
         InputError: the file is missing or not of the version and size in `params`, the device does
             not exist, or the engine cannot run the network.
     """
-    path = Path(path) if str(path) not in ("", ".") else weights_file(params.pointpillars)
+    path = Path(path) if str(path) not in ("", ".") else find_pointpillars_weights(params.pointpillars)
     if params.pointpillars.threads:
         set_thread_count(params.pointpillars.threads)
     network: Network

@@ -15,10 +15,8 @@ from lidar_perception.detectors.checkpoint import POINTPILLARS, read_network_nam
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetParams
-from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
-from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
-from lidar_perception.detectors.weights_file import require_weights
+from lidar_perception.detectors.weights_file import find_pointnet_weights, find_pointpillars_weights, require_weights
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.data import Batches, Item, SceneReader, Stream, load_items
 from lidar_perception.training.params import PointNetTraining
@@ -47,7 +45,7 @@ def find_proposer(params: PointNetTraining) -> Path | None:
         InputError: The file is missing, or is not a PointPillars checkpoint.
     """
     if params.proposer in ("", str(PACKAGE)):
-        return pointpillars_file(PointPillarsParams()) if params.proposer else None
+        return find_pointpillars_weights(PointPillarsParams()) if params.proposer else None
     path = require_weights(params.proposer, "proposer")
     if read_network_name(path) != POINTPILLARS:
         raise InputError(f"{path} is not a PointPillars checkpoint; give one with --proposer")
@@ -67,7 +65,7 @@ class PointNetTrainer:
 
     def packaged_weights(self, params: PointNetTraining) -> Path:
         """Return the weights of the improved network, which partly fit the other configurations."""
-        return weights_file(PointNetParams())
+        return find_pointnet_weights(PointNetParams())
 
     def max_cuts(self, params: PointNetTraining) -> int:
         """Return a number larger than any data set, since clusters are cut from all scenes."""

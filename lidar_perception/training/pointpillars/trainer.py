@@ -20,7 +20,7 @@ from lidar_perception.detectors.pointpillars.network import PointPillars, channe
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.proposer import PointPillarsProposer
 from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
-from lidar_perception.detectors.pointpillars.weights_file import weights_file
+from lidar_perception.detectors.weights_file import find_pointpillars_weights
 from lidar_perception.training.cut_objects import CutObjects, cut_objects, join_databases
 from lidar_perception.training.data import Batches, Item, SceneReader, Stream
 from lidar_perception.training.database import Database
@@ -58,7 +58,7 @@ class PointPillarsTrainer:
 
     def packaged_weights(self, params: PointPillarsTraining) -> Path:
         """Return the weights of the same version and size."""
-        return weights_file(PointPillarsParams(version=params.version, size=params.size))
+        return find_pointpillars_weights(PointPillarsParams(version=params.version, size=params.size))
 
     def max_cuts(self, params: PointPillarsTraining) -> int:
         """Return the number of scenes from which objects are cut; 0 if no objects are pasted."""
