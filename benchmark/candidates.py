@@ -71,7 +71,7 @@ def _median_of_steps(times: dict[str, list[float]], runs: list[dict[str, float]]
 
 
 def _count_shared(a: np.ndarray, b: np.ndarray) -> int:
-    """Count the boxes of a that have one in b within MAX_DIFFERENCE_M metres in every value."""
+    """Count the boxes of `a` that differ from a box of `b` by at most MAX_DIFFERENCE_M in every value."""
     if len(a) == 0 or len(b) == 0:
         return 0
     return int((np.abs(a[:, None] - b[None]).max(axis=2) <= MAX_DIFFERENCE_M).any(axis=1).sum())

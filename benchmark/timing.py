@@ -33,7 +33,7 @@ def time_interleaved(
 
 
 class Clock:
-    """Stopwatch over frames. The calls of warm are made once before, untimed, on a thin cloud."""
+    """Timer of several functions over frames. The calls in `warm` run once before, without being timed."""
 
     def __init__(self, repeat: int, warm: Calls, clock: Callable[[], float] = perf_counter) -> None:
         self.repeat, self.clock = repeat, clock

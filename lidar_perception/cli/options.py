@@ -232,7 +232,7 @@ def weights_of(given: Mapping[str, Any]) -> list[str]:
 
 
 def make_runs(weights: str | Path, on_messages: bool = False) -> Runs:
-    """Return the detector of a value of --weights with its parameters.
+    """Return the parameters of the detector that a value of --weights selects.
 
     Args:
         on_messages: the detector runs in a node, so it has the parameters of input messages, too.

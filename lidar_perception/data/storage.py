@@ -38,7 +38,7 @@ class StorageFile(Protocol):
     """A storage file open for reading. Its content never depends on metadata.yaml.
 
     Attributes:
-        times: of the first and last message in ns; None without messages.
+        times: times of the first and last message in ns; None without messages.
     """
 
     topics: list[Topic]

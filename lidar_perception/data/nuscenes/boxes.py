@@ -126,7 +126,7 @@ class GlobalBoxes:
 
     @property
     def yaws(self) -> np.ndarray:
-        """Direction (K,) of the boxes' lengths in the x-y plane, radians."""
+        """Yaw angles (K,) of the boxes in the x-y plane, in radians."""
         forward = to_matrices(self.rotations)[:, :, 0]
         return np.arctan2(forward[:, 1], forward[:, 0])
 

@@ -70,7 +70,7 @@ def is_layout(path: Path) -> bool:
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the key frames of ROOT, which has one version, or of ROOT/VERSION."""
+    """Open the key frames of a data set: ROOT/VERSION, or ROOT if it has only one version."""
     if (path / "sample_data.json").is_file():
         root, version = path.absolute().parent, path.absolute().name
     else:

@@ -213,8 +213,8 @@ def _to_columns(tables: Tables, block: list[tuple]) -> np.ndarray:
 def _compute_velocities(centres: np.ndarray, seconds: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
     """Compute velocities (K, 2) m/s from the previous to the next label of the same object.
 
-    A missing label is replaced by the label itself. NaN without neighbours, or if they are too far
-    away in time.
+    Without a previous or next label, the label itself is used. NaN if there is neither, or if they
+    are too far apart in time.
     """
     own = np.arange(len(centres))
     first, last = (np.where(rows >= 0, rows, own) for rows in neighbours.T)
