@@ -132,7 +132,8 @@ def _make_ablation_section(draws: Draws, data: str, models: Mapping[str, Trained
     note = (
         "Every network is trained on the same scenes with the same number of steps. pointnet: "
         "PointNet without T-Net; pointnet2: PointNet++ with single-scale grouping. p: twice "
-        "the share of samples of frames with a difference of the other sign."
+        "the share of samples of frames with a difference of the other sign. It does not cover the "
+        "differences between trainings: they need several seeds (--seeds)."
     )
     scenes = sorted({model.scenes for model in models.values()})
     text = f"Trained on {', '.join(map(str, scenes))} scenes. {ABOUT_MAP}" if scenes else ABOUT_MAP
