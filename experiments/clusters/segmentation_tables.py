@@ -159,7 +159,7 @@ def _make_sweeps_section(records: list[dict], data: str) -> Section:
             )
         lines = (
             make_line("measured", values, np.stack(estimates, axis=1)),
-            Line("measured, best of the paper", (paper.BEST[name],) * 2, (0.0, 100.0), dashed=True),
+            Line("the paper's value", (paper.BEST[name],) * 2, (0.0, 100.0), dashed=True),
         )
         panels.append(Panel(name, name, "IoU [%]", lines))
     return Section(
