@@ -1,4 +1,4 @@
-"""Clustering of a cloud by the method that the parameters name."""
+"""Clustering of a cloud with a selectable method."""
 
 from __future__ import annotations
 
@@ -57,15 +57,15 @@ def cluster_obstacles(
     Args:
         cloud: M points, as cluster() takes them.
         ground: (M,) bool.
-        sensor_xyz: (N, 3) points relative to the sensor, from which the density is measured if
-            params.density is set; by default the cloud itself. Needed where the cloud has been
-            moved to another height.
+        sensor_xyz: (N, 3) points in sensor coordinates to measure the density from if
+            params.density is set; default: the cloud itself. Needed if the cloud was shifted
+            vertically.
 
     Returns:
-        (M,) int32 ids as of cluster(); ground points have 0.
+        (M,) int32 ids as in cluster(); ground points have 0.
 
     Raises:
-        InputError: for a ground of another length.
+        InputError: ground has another length than the cloud.
     """
     xyz, ground = as_point_cloud(cloud).xyz, np.asarray(ground, bool)
     check_columns(len(xyz), ground=ground)

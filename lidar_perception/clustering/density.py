@@ -23,8 +23,11 @@ LAST_BAND_FACTOR = 1.5  # assumed end of the last band, as a multiple of the las
 def measure_density(xyz: np.ndarray) -> float:
     """Return the mean number of points per square degree around a point, seen from the sensor.
 
-    xyz: (N, 3) float32, metres from the sensor; N may be 0. The result is 0 if no usable point has
-    another in its cell of the view. KITTI's HDL-64E has 13 to 16, also in cropped clouds.
+    Args:
+        xyz: (N, 3) float32 in sensor coordinates, metres; N may be 0.
+
+    Returns:
+        0 if no two usable points share a cell of CELL_DEG. KITTI's HDL-64E has 13 to 16.
     """
     step = max(len(xyz) // MAX_SAMPLED, 1)
     sampled = np.ascontiguousarray(xyz[::step])

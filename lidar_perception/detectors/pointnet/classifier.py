@@ -38,9 +38,8 @@ class PointNetClassifier(TrainedNetwork):
         """Classify the points in boxes of a NormalizedView.
 
         Args:
-            proposals: K boxes with their classes; K may be 0. The result for one does not depend
-                on the others.
-            obstacles: the points of the view that are not ground.
+            proposals: K boxes with their classes; K may be 0. Each is classified independently.
+            obstacles: non-ground points of the view.
             ground: (G, 3) xyz of the ground points of the view.
             selected: (K,) bool, the proposals to classify. Proposals with a class that the network
                 does not have, or with fewer than MIN_POINTS points, are skipped too.

@@ -88,7 +88,7 @@ class PointNetDetector(NetworkDetector):
         return DetectionResult(detections, timings, problem or self.fallback, best)
 
     def _make_detections(self, predicted: Predictions) -> tuple:
-        """Return the detections, and the result of find_best_scores."""
+        """Return the detections, the best scores by class and a problem or None."""
         broken = None
         best: dict[str, float] = {}
         valid = np.isfinite(np.column_stack([predicted.probabilities, predicted.boxes])).all(axis=1)
@@ -165,7 +165,7 @@ def load_pointnet_detector(
 
 
 def _load_network(path: Path, device: str, engine: str) -> tuple[Header, Network]:
-    """Load a checkpoint, with torch only if no compiled kernels can run it; or an exported file."""
+    """Load a checkpoint or an exported file; torch is used only if compiled kernels cannot run it."""
     if path.suffix == ".onnx":
         from lidar_perception.detectors.pointnet.onnx import OnnxPointNet
 

@@ -15,7 +15,7 @@ SMOOTH = 0.2  # the box loss is linear above this error
 
 
 class Losses(NamedTuple):
-    """Scalars; total is the weighted sum of the others."""
+    """Loss terms as scalars; total is the weighted sum of the others."""
 
     total: Tensor
     classes: Tensor
@@ -38,7 +38,7 @@ def cluster_loss(
     Args:
         labels: (B,) class, K for background, -1 for unknown (ignored).
         targets: B encoded boxes.
-        has_box: (B,) bool, the clusters whose box counts.
+        has_box: (B,) bool, clusters included in the box loss.
         weights: (K + 1,) weight of each class; None: 1.
     """
     classes = functional.cross_entropy(outputs.logits.float(), labels, weight=weights, ignore_index=-1)

@@ -61,7 +61,7 @@ class Predictions:
 def select_detections(
     predictions: Predictions, config: PointNetConfig, min_scores: Sequence[float], nms: NmsParams = NmsParams()
 ) -> Detections:
-    """Return the boxes that reach the threshold of their class, min_scores (C,), after NMS."""
+    """Apply NMS to the boxes whose score reaches the threshold of their class, min_scores (C,)."""
     chosen = np.flatnonzero(predictions.scores >= np.asarray(min_scores)[predictions.labels])
     chosen = chosen[np.argsort(-predictions.scores[chosen], kind="stable")][: nms.candidates]
     return apply_nms(
@@ -87,8 +87,7 @@ def predict(network: Network, clusters: Clusters, seed: int = 0, labels: np.ndar
 
 
 def compute_probabilities(logits: np.ndarray, temperature: np.ndarray, offsets: np.ndarray) -> np.ndarray:
-    """Return calibrated probabilities (B, K + 1) float32 of logits (B, K + 1), which are
-    softmax(logits / temperature + offsets)."""
+    """Compute calibrated probabilities softmax(logits / temperature + offsets), (B, K + 1) float32."""
     with np.errstate(all="ignore"):  # broken weights are reported elsewhere
         scaled = logits / temperature + offsets
         exponentials = np.exp(scaled - scaled.max(axis=1, keepdims=True))

@@ -22,7 +22,7 @@ class TorchPointNet:
     """A PointNet in eval mode, on its device.
 
     Args:
-        engine: implementation on the CPU: torch; or auto, compiled kernels if the CPU has AVX2.
+        engine: implementation on the CPU: torch, or auto for compiled kernels if the CPU has AVX2.
     """
 
     def __init__(self, network: PointNet, engine: str = "torch"):
@@ -46,8 +46,8 @@ class TorchPointNet:
 def run_network(network: PointNet, inputs: ClusterInput, chunk: int = CHUNK) -> Outputs[Tensor]:
     """Return the network's outputs for one or more clusters.
 
-    Most clusters have few points. Clusters of similar size form a batch, padded only to the largest
-    of them.
+    Clusters of similar size form a batch that is padded to its largest cluster, because most
+    clusters have few points.
     """
     device, min_size = network.temperature.device, network.config.least_points
     sizes = np.maximum(inputs.valid.sum(axis=1), min_size)

@@ -55,8 +55,7 @@ class PointPillarsDetector(NetworkDetector):
     def propose(
         self, frame: PointCloud, ground: np.ndarray | None = None, cluster_ids: np.ndarray | None = None
     ) -> DetectionResult:
-        """Return what detect() returns, but in the coordinates of a NormalizedView and with the
-        vehicle that carries the sensor."""
+        """Detect objects as detect() does, but in NormalizedView coordinates and with the ego vehicle."""
         t0 = perf_counter()
         config, settings = self.proposer.config, self.settings
         view = NormalizedView.of(frame, self.params.ground.sensor_pose, config.low, config.high, settings.use_intensity)
@@ -144,7 +143,7 @@ def load_detector(
 
 
 def _load_network(path: Path, device: str, params: PointPillarsParams) -> tuple[Header, Network]:
-    """Load the network of a checkpoint; with torch only where the sparse engine cannot run it."""
+    """Load the network of a checkpoint; torch is used only if the sparse engine cannot run it."""
     if device == CPU and params.engine != "torch":
         reason = find_unsupported_part(read_header(path, NetworkConfig).config)
         if not reason and uses_16_bits(params.amp):

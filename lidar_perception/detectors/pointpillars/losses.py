@@ -17,7 +17,7 @@ SMOOTH = 1 / 9  # the box loss is linear above this error
 
 
 class Losses(NamedTuple):
-    """Scalars; total is the weighted sum of the others."""
+    """Loss terms as scalars; total is the weighted sum of the others."""
 
     total: Tensor
     classes: Tensor

@@ -68,7 +68,7 @@ class PointPillarsProposer(TrainedNetwork):
         self.anchors = make_anchors(self.pass_config)
 
     def with_range(self, range: str) -> PointPillarsProposer:
-        """Return this network for another range, see NetworkDetector.with_range."""
+        """Return a copy of this network for another range, see NetworkDetector.with_range."""
         if range == "auto" or (range == "around") == (self.config.low[0] < 0):
             return self
         if self.network.has_fixed_range:
@@ -100,8 +100,7 @@ class PointPillarsProposer(TrainedNetwork):
             scores: thresholds of the calibrated scores.
 
         Returns:
-            Detections, which may include the vehicle that carries the sensor, and the timings of
-            TIMED_STEPS.
+            Detections, which may include the ego vehicle, and the timings of TIMED_STEPS.
         """
         begin = self.now()
         inputs = self._make_inputs(view, ground, cluster_ids)
@@ -123,7 +122,7 @@ class PointPillarsProposer(TrainedNetwork):
     def _make_inputs(
         self, view: NormalizedView, ground: np.ndarray | None, cluster_ids: np.ndarray | None
     ) -> dict[bool, NetworkInput]:
-        """Return the inputs of the passes that have points, by whether the cloud is rotated."""
+        """Return the inputs of all passes that have points; the key is True for the rotated pass."""
         if len(self.half_turns) == 1:
             inputs = {False: make_network_input(view.frame, self.config, ground, cluster_ids)}
         else:
@@ -153,7 +152,7 @@ class PointPillarsProposer(TrainedNetwork):
         return [begin, self.now()], dict(zip(inputs, predictions))
 
     def _decode(self, predictions: dict[bool, Prediction], min_scores: list[float], nms: NmsParams) -> DetectionResult:
-        """Return the detections of all passes together."""
+        """Decode and merge the predictions of all passes."""
         passes = [
             self._select_boxes(half_turn, prediction, min_scores, nms.candidates)
             for half_turn, prediction in predictions.items()
@@ -172,7 +171,7 @@ class PointPillarsProposer(TrainedNetwork):
         return DetectionResult(calibrate_scores(detections, self.header.calibration), problem=problem, best=best)
 
     def _select_boxes(self, half_turn: bool, prediction: Prediction, min_scores: list[float], max_boxes: int) -> Boxes:
-        """Return the boxes of one pass that reach their thresholds, rotated back."""
+        """Return the boxes of one pass above their thresholds, rotated back to the view."""
         logits = prediction.logits
         limits = np.array([*map(_logit, min_scores)], np.float32)
         # Loops over classes, because a reduction over three columns takes three times as long.
@@ -194,7 +193,7 @@ class PointPillarsProposer(TrainedNetwork):
         return found._replace(boxes=rotate_boxes_half_turn(found.boxes)) if half_turn else found
 
     def _find_problem(self, view: NormalizedView, inputs: dict[bool, NetworkInput]) -> str | None:
-        """Return why nothing, or little, can be detected in a view, with the remedy, or None."""
+        """Return the reason why little or nothing can be detected, with the remedy, or None."""
         if len(view.source) == 0:
             return "the cloud is empty or has no finite point, or crop.* leaves none"
         if len(view) == 0:

@@ -46,12 +46,12 @@ class Layer:
         return 1 if self.weights[0].shape[1] == 9 else 0
 
     def grid(self, grids: Sequence[Grid]) -> Grid:
-        """Return the size (H, W) of its map, given the sizes of earlier maps."""
+        """Return the size (H, W) of the layer's output, given the sizes of earlier maps."""
         height, width = grids[self.sources[0]]
         return height // self.stride, width // self.stride
 
     def find_reached(self, occupied: Sequence[np.ndarray]) -> np.ndarray:
-        """Return (H, W) bool, True where its value depends on an occupied cell of earlier maps."""
+        """Return (H, W) bool, True where the output depends on an occupied cell of earlier maps."""
         read = np.logical_or.reduce([occupied[source] for source in self.sources])
         mask = dilate(read, self.window)[:: self.stride, :: self.stride]
         if self.coarse is None:
@@ -59,8 +59,10 @@ class Layer:
         return mask | dilate(enlarge(occupied[self.coarse], self.scale), (self.scale + 1) // 2)
 
     def require(self, needed: np.ndarray, masks: Sequence[np.ndarray | None]) -> None:
-        """Mark, in the masks of earlier maps, the cells that its cells `needed` (H, W) depend on. A
-        mask is None if its map is computed completely."""
+        """Mark, in the masks of earlier maps, the input cells of the output cells `needed` (H, W).
+
+        A mask is None if its map is computed completely.
+        """
         for source in self.sources:
             if (mask := masks[source]) is not None:
                 read = np.zeros_like(mask)
@@ -70,8 +72,8 @@ class Layer:
             mask |= dilate(shrink(needed, self.scale), 1)
 
     def margin(self, margins: Sequence[int]) -> int:
-        """Return the width of the border, in cells, in which its map of an empty cloud may differ
-        from the inside, given the margins of earlier maps."""
+        """Return the width in cells of the border where the output for an empty cloud may differ from
+        the interior, given the margins of earlier maps."""
         own = max(-(-margins[source] // self.stride) for source in self.sources) + self.window
         if self.coarse is None:
             return own
@@ -102,7 +104,7 @@ def shrink(mask: np.ndarray, scale: int) -> np.ndarray:
 
 
 def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
-    """Return the layers of a network with an FPN neck that adds.
+    """Return the layers of a network with an additive FPN neck.
 
     The last layer computes the scores of the head, the one before it the input of the head. Map 0
     contains the pillars, map 1 the clusters if the network has that branch; then follows one map
