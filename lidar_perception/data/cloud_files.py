@@ -91,7 +91,7 @@ def read_points(file: Path) -> np.ndarray:
     """
     points = _rename_columns(READERS[file.suffix.lower()](file))
     if missing := {"x", "y", "z"} - set(points.dtype.names or ()):
-        raise InputError(f"{file} has no field {min(missing)}; it is not a point cloud")
+        raise InputError(f"{file} has no field {min(missing)}, so it is not a point cloud")
     return points
 
 

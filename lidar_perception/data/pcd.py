@@ -75,7 +75,7 @@ def _parse_points(content: bytes) -> np.ndarray:
     elif kind == "binary_compressed":
         points = _parse_compressed_points(data, layout, number)
     else:
-        raise ValueError(f"DATA {kind} is unknown")
+        raise ValueError(f"unknown kind of DATA: {kind}")
     kept = [name for name in names if not name.startswith("_") and layout[name].itemsize]
     return points if len(kept) == len(names) else points[kept]
 

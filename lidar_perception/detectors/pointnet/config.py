@@ -98,7 +98,7 @@ class PointNetConfig:
         ):
             raise ValueError("every count, width and radius must be above 0")
         if unknown := [name for name in self.classes if name not in CLASSES]:
-            raise ValueError(f"there is no class {unknown[0]!r}; known are {', '.join(CLASSES)}")
+            raise ValueError(f"unknown class {unknown[0]!r}; choose from {', '.join(CLASSES)}")
         if not self.classes or len(self.sizes) != len(self.classes):
             raise ValueError("classes and sizes differ in length")
         if len(set(self.classes)) < len(self.classes) or min(map(min, self.sizes)) <= 0:

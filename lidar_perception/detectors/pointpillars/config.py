@@ -181,7 +181,7 @@ class NetworkConfig:
         if not len(self.block_channels) == len(self.block_layers) == len(self.block_strides):
             raise ValueError("block_channels, block_layers and block_strides differ in length")
         if unknown := [name for name in self.classes if name not in CLASSES]:
-            raise ValueError(f"there is no class {unknown[0]!r}; known are {', '.join(CLASSES)}")
+            raise ValueError(f"unknown class {unknown[0]!r}; choose from {', '.join(CLASSES)}")
         if len(set(self.classes)) < len(self.classes):
             raise ValueError("a class has two anchors")
         if self.zero_row and not self.max_points:
