@@ -37,10 +37,10 @@ from lidar_studio.survey import FrameSurvey, survey_drive
 
 Array = np.ndarray[Any, Any]
 BOX_MARGIN_M = 0.1  # margin around a box when selecting its points
-# Two tracks are the same object if enough boxes coincide: this fraction of the shorter track's boxes,
+# Two tracks are the same object if enough boxes coincide: at least this fraction of the shorter's boxes.
 MIN_COMMON_SHARE = 0.5
-SAME_TRACK_DISTANCE_M = 0.7  # with centres within this distance,
-SAME_TRACK_LENGTH_SHARE = 0.4  # or within this fraction of the length
+SAME_TRACK_DISTANCE_M = 0.7  # maximum distance between the centres of coinciding boxes
+SAME_TRACK_LENGTH_SHARE = 0.4  # alternative maximum, as a fraction of the length
 
 
 class Proposer:

@@ -131,7 +131,7 @@ def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1, i
     data = np.ascontiguousarray(points).view(np.uint8).reshape(-1)
     byte_orders = {points.dtype[n].base.byteorder for n in points.dtype.names or ()} - {"|"}
     if len(byte_orders) > 1:
-        raise ValueError("fields of both byte orders cannot be in one cloud")
+        raise ValueError("a cloud cannot have fields of both byte orders")
     return _make_cloud(
         header,
         make,

@@ -43,7 +43,7 @@ class DriveTracker:
         self.tracker, self._read_pose = Tracker(params), make_pose_reader(self.ego)
         self.drive, self.has_pose = "", True
         self._last = "", -1  # sequence and stamp of the previous frame
-        self._number = 0  # of the drive
+        self._number = 0  # number of the drive
 
     def __call__(self, frame: Frame, detections: Detections) -> Tracks:
         """Update the tracks with a frame and return them in its LiDAR frame.

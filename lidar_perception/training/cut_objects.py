@@ -26,9 +26,9 @@ from lidar_perception.training.pasting import find_points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, PointCloud
 
 # Limits of background that resembles a standing person:
-MAX_WIDTH_M = 1.2  # maximum length of its sides
-MIN_TOP_M, MAX_TOP_M = 0.6, 4.5  # height of its top above the ground
-MAX_GAP_M = 0.8  # maximum height of its lowest point above the ground
+MAX_WIDTH_M = 1.2  # maximum length of the object's sides
+MIN_TOP_M, MAX_TOP_M = 0.6, 4.5  # height of the object's top above the ground
+MAX_GAP_M = 0.8  # maximum height of the object's lowest point above the ground
 MIN_DISTANCE_M = 0.3  # minimum distance from every labelled box
 MAX_BACKGROUND_OBJECTS = 20  # maximum number of such objects from a scene
 

@@ -226,7 +226,7 @@ def _read_state(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
         raise InputError(f"cannot read {path}: {reason}; remove it to start again") from None
     if different := find_differences(saved_settings, settings):
         raise InputError(
-            f"{path} is of a run with {'; '.join(different[:3])}; resume it with the same settings, "
+            f"{path} belongs to a run with {'; '.join(different[:3])}; resume it with the same settings, "
             "or give another --out"
         )
     return state

@@ -201,7 +201,7 @@ def test_onnx_files_with_other_inputs_are_refused(tmp_path):
         (dict(inputs=right[:2]), "other inputs"),
         (dict(inputs=[("points", TensorProto.DOUBLE, ["n", 4]), *right[1:]]), "other inputs"),
         (dict(inputs=[("points", TensorProto.FLOAT, ["n"]), *right[1:]]), "other inputs"),
-        (dict(inputs=right, outputs=("logits",)), "other inputs or outputs"),
+        (dict(inputs=right, outputs=("logits",)), "do not match its header"),
         (dict(inputs=right, header="[" * 99_999), "no header"),
         (dict(inputs=right, header=""), "no header"),
         (dict(inputs=right, header="NO UTF-8"), "cannot read"),

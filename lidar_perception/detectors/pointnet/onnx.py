@@ -74,7 +74,7 @@ class OnnxPointNet:
         self.config: PointNetConfig = self.header.config
         found = ({i.name for i in self.session.get_inputs()}, {o.name for o in self.session.get_outputs()})
         if found != ({*INPUTS}, {*Outputs._fields}):
-            raise InputError(f"{path} has other inputs or outputs than a network of its header; export it again")
+            raise InputError(f"{path} has inputs or outputs that do not match its header; export it again")
         self.temperature = np.ones(1, np.float32)  # 1 because the graph already calibrates
         self.offsets = np.zeros(len(self.config.classes) + 1, np.float32)
 

@@ -127,7 +127,7 @@ def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[Net
 def _load_state(path: Path) -> dict[str, Tensor]:
     """Load the tensors of a .pth file without running any code in it."""
     if not path.is_file():
-        raise InputError(f"there is no file {path}")
+        raise InputError(f"file not found: {path}")
     try:
         content: Any = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises many types for damaged files
@@ -176,7 +176,7 @@ def _make_config(project: Project, per_cell: int, classes: tuple[str, ...], path
         )
     known = {anchor.name: anchor for anchor in ANCHORS}
     if unknown := [name for name in names if name not in known]:
-        raise InputError(f"there is no anchor for {unknown[0]!r}; choose of {', '.join(known)}")
+        raise InputError(f"there is no anchor for {unknown[0]!r}; choose from {', '.join(known)}")
     anchors = tuple(
         AnchorClass(
             name,

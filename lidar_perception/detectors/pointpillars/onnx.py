@@ -94,7 +94,7 @@ class OnnxNetwork:
         wanted = {name: (f"tensor({kind})", len(shape)) for name, (kind, shape) in _inputs(header.config).items()}
         found = {i.name: (i.type, len(i.shape)) for i in session.get_inputs()}
         if found != wanted or not {*OUTPUTS} <= {o.name for o in session.get_outputs()}:
-            raise InputError(f"{path} has other inputs or outputs than a network of its header; export it again")
+            raise InputError(f"{path} has inputs or outputs that do not match its header; export it again")
         return header, OnnxNetwork(session, str(path), header.config)
 
     def to(self, device: str) -> None:
