@@ -197,10 +197,10 @@ def test_onnx_files_with_other_inputs_are_refused(tmp_path):
     assert onnx
     path = tmp_path / "n.onnx"
     for change, words in (
-        (dict(inputs=[("pixels", *right[0][1:]), *right[1:]]), "other inputs"),
-        (dict(inputs=right[:2]), "other inputs"),
-        (dict(inputs=[("points", TensorProto.DOUBLE, ["n", 4]), *right[1:]]), "other inputs"),
-        (dict(inputs=[("points", TensorProto.FLOAT, ["n"]), *right[1:]]), "other inputs"),
+        (dict(inputs=[("pixels", *right[0][1:]), *right[1:]]), "do not match its header"),
+        (dict(inputs=right[:2]), "do not match its header"),
+        (dict(inputs=[("points", TensorProto.DOUBLE, ["n", 4]), *right[1:]]), "do not match its header"),
+        (dict(inputs=[("points", TensorProto.FLOAT, ["n"]), *right[1:]]), "do not match its header"),
         (dict(inputs=right, outputs=("logits",)), "do not match its header"),
         (dict(inputs=right, header="[" * 99_999), "no header"),
         (dict(inputs=right, header=""), "no header"),
