@@ -12,8 +12,9 @@ from time import monotonic
 from typing import Any
 
 from lidar_perception.nodes.external_node import ExternalNode
+from lidar_perception.nodes.interfaces import CLOUD, MARKERS
 from lidar_perception.nodes.reception import Reception
-from lidar_perception.nodes.runtime import CLOUD, MARKERS, decode_message
+from lidar_perception.nodes.subscriptions import decode_message
 from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, TF_QOS, has_tf
 from lidar_perception.params import ReceptionParams
 from lidar_perception.runs.files import shorten_error

@@ -95,8 +95,9 @@ def test_documented_topics_are_those_of_the_node(generate, name, domain):
             *node.get_subscriber_names_and_types_by_node(name, "/"),
         ]
     }
-    assert {node.resolve_topic_name(f"~/input/{t}") for t in getattr(node, "waits_for", ())} >= {
-        reception.topic for reception in node._receptions()
+    watched = node.autostart.inputs if hasattr(node, "autostart") else ()
+    assert {node.resolve_topic_name(f"~/input/{t}") for t in watched} >= {
+        reception.topic for reception in node.inputs.receptions
     }
     shut_down_context(context, node)
     documented = set()

@@ -12,9 +12,9 @@ from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud, fit_grounded_boxes
 from lidar_perception.candidates.warm_up import warm_up_candidates
 from lidar_perception.nodes.inputs import SeedInput
+from lidar_perception.nodes.interfaces import CLOUD
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import CandidateOutputs
-from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.params import DetectionNodeParams, RefinementNodeParams
 from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.types import InputError
@@ -31,12 +31,12 @@ class CandidateRefinement(ManagedNode):
     def configure(self) -> None:
         with lock_compilation(self.get_logger().info):
             warm_up_candidates(PipelineParams(**vars(self.params)), segmented=True)
-        self.outputs = CandidateOutputs(self)
+        self.results = CandidateOutputs(self)
         self.seed = SeedInput(self, self.on_cloud)
-        self.input("points", CLOUD, self.seed.add_cloud)
+        self.inputs.subscribe("points", CLOUD, self.seed.add_cloud)
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
-        with self.frame(to_ns(msg.header.stamp)):
+        with self.diagnostics.measure_frame(to_ns(msg.header.stamp)):
             frame, indices = to_point_cloud(msg)
             frame = self.transforms.find_placement(msg.header).level_frame(frame)
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
@@ -49,4 +49,4 @@ class CandidateRefinement(ManagedNode):
             segmented = SegmentedCloud(
                 indices, frame.xyz, ground, ids, fit_grounded_boxes(frame.xyz, ground, ids, self.params.boxes), numbers
             )
-            self.outputs.publish(msg.header, frame.xyz, lambda: refine_segmented(segmented, source, self.params))
+            self.results.publish(msg.header, frame.xyz, lambda: refine_segmented(segmented, source, self.params))

@@ -9,9 +9,10 @@ import numpy as np
 from lidar_perception.candidates.segmented_cloud import diagnose_empty, fit_grounded_boxes
 from lidar_perception.candidates.warm_up import warm_up_clustering
 from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.nodes.diagnostics import OK, WARN
+from lidar_perception.nodes.interfaces import CLOUD
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import ClusterBoxes
-from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.params import BoxNodeParams, ClusteringNodeParams
 from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.wire.codec import make_bag_message
@@ -32,12 +33,12 @@ class Clustering(ManagedNode):
     def configure(self) -> None:
         with lock_compilation(self.get_logger().info):
             warm_up_clustering(self.params.clustering, self.params.boxes)
-        self.points = self.output("points", CLOUD)
+        self.points = self.outputs.advertise("points", CLOUD)
         self.boxes = ClusterBoxes(self)
-        self.input("points", CLOUD, self.on_points)
+        self.inputs.subscribe("points", CLOUD, self.on_points)
 
     def on_points(self, msg: Any) -> None:
-        with self.frame(to_ns(msg.header.stamp)):
+        with self.diagnostics.measure_frame(to_ns(msg.header.stamp)):
             frame, indices = to_point_cloud(msg)
             in_view = read_column(msg, "in_view", indices)
             if in_view is not None and (in_view == OUT_OF_RANGE).any():
@@ -49,13 +50,13 @@ class Clustering(ManagedNode):
             ids = cluster_obstacles(frame.xyz, ground, self.params.clustering)
             self.points.publish(add_columns(msg, make_bag_message, cluster_id=scatter_values(ids, indices, msg, "u4")))
         self.boxes.publish(msg.header, lambda: fit_grounded_boxes(frame.xyz, ground, ids, self.params.boxes))
-        self.counts["clusters"] = int(ids.max(initial=0))
+        self.diagnostics.counts["clusters"] = int(ids.max(initial=0))
         if column is None:
-            self.report(
+            self.diagnostics.report(
                 WARN,
                 "the cloud has no column 'ground', so all points are clustered; "
                 "remap ~/input/points to the output of the ground segmentation",
             )
         else:
             problem = diagnose_empty(len(frame), ground, ids)
-            self.report(WARN if problem else OK, problem or "clustering")
+            self.diagnostics.report(WARN if problem else OK, problem or "clustering")

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from lidar_perception.detectors.contract import DetectionResult, join_problems
+from lidar_perception.detectors.custom import find_reference, load_custom_detector
 from lidar_perception.detectors.params import NetworkParams
+from lidar_perception.nodes.diagnostics import OK, WARN
+from lidar_perception.nodes.interfaces import CLOUD
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import DetectionOutputs
-from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
+from lidar_perception.params import DetectionNodeParams
 from lidar_perception.runs.compiling import lock_compilation, report_compilation
 from lidar_perception.runs.machine import count_cores
 from lidar_perception.runs.threads import set_thread_count
@@ -20,54 +24,79 @@ from lidar_perception.wire.messages import read_cluster_ids, read_column
 from msg_utils.stamps import to_ns
 
 
+@dataclass(frozen=True)
+class NetworkLoader:
+    """Loads the detector of a node.
+
+    Attributes:
+        group: name of its parameter group, a NetworkParams.
+        steps: timed steps.
+        find_weights: returns the path of the weights for the parameters of the group, without
+            importing torch; raises InputError if the file does not exist.
+        load: loads a detector from (weights, device, parameters of the node) and warms it up;
+            raises InputError if the weights cannot be used.
+        describe_network: returns the name of a network, from its configuration.
+        allows_custom: the parameter weights may be the module:Class of a custom detector.
+    """
+
+    group: str
+    steps: tuple[str, ...]
+    find_weights: Callable[[Any], Path]
+    load: Callable[[Path, str, Any], Any]
+    describe_network: Callable[[Any], str]
+    allows_custom: bool = False
+
+
 class DetectorNode(ManagedNode):
     """~/input/points -> ~/output/detections.
 
-    A subclass names the parameter group of its network, finds the weights and loads the detector.
     Without a network the node publishes nothing, as an empty array would mean an empty scene.
     """
 
-    group: ClassVar[str]  # name of the parameter group (a NetworkParams)
-    steps: ClassVar[tuple[str, ...]]  # names of the timed steps
+    def __init__(self, name: str, params: Any, loader: NetworkLoader, **options: Any):
+        super().__init__(name, params, DetectionNodeParams(), **options)
+        self.loader = loader
 
     def configure(self) -> None:
         self.sensor = SensorCheck(self)
-        self.outputs = DetectionOutputs(self, self.steps)
+        self.results = DetectionOutputs(self, self.loader.steps)
+        weights = self._network_params(self.params).weights
+        if self.loader.allows_custom and (reference := find_reference(weights)):
+            self._load_custom_detector(reference)
+        else:
+            self._load_network()
+        self.inputs.subscribe("points", CLOUD, self.on_points)
+
+    def _network_params(self, params: Any) -> NetworkParams:
+        network_params: NetworkParams = getattr(params, self.loader.group)
+        return network_params
+
+    def _set_detector(self, detector: Any, name: str) -> None:
+        self.detector = detector
+        self.diagnostics.counts.update(network=f"{name}, {' '.join(detector.classes)}", device=detector.device)
+
+    def _load_custom_detector(self, reference: str) -> None:
+        group = self.loader.group
+        network_params: Any = getattr(self.params, group)
+        detector = load_custom_detector(
+            reference, network_params.device, network_params.range, params=self.params, group=group
+        )
+        self._set_detector(detector, reference)
+
+    def _load_network(self) -> None:
         with report_compilation(self.get_logger().info, whole_detector=True):
-            self.detector = self._load_detector()
-        name = self.describe_network(self.detector.networks[0].config)
-        self.counts.update(network=f"{name}, {' '.join(self.detector.classes)}", device=self.detector.device)
-        if self.detector.warning:  # not the state, which tells what the node waits for
-            self.counts["doubt"] = self.detector.warning
-            self.get_logger().warning(self.detector.warning)
-        if self.detector.fallback:
-            self.report(WARN, self.detector.fallback)
-        self.input("points", CLOUD, self.on_points)
+            detector = self._load_on_device()
+        self._set_detector(detector, self.loader.describe_network(detector.networks[0].config))
+        if detector.warning:  # not the state, which tells what the node waits for
+            self.diagnostics.counts["doubt"] = detector.warning
+            self.get_logger().warning(detector.warning)
+        if detector.fallback:
+            self.diagnostics.report(WARN, detector.fallback)
 
-    def weights(self) -> Path:
-        """Return the path of the weights, without importing torch.
-
-        Raises:
-            InputError: the file does not exist.
-        """
-        raise NotImplementedError
-
-    def load(self, weights: Path, device: str) -> Any:
-        """Load a detector and warm it up.
-
-        Raises:
-            InputError: the weights cannot be used.
-        """
-        raise NotImplementedError
-
-    def describe_network(self, config: Any) -> str:
-        """Return the name of a network for the diagnostics."""
-        raise NotImplementedError
-
-    def _load_detector(self) -> Any:
+    def _load_on_device(self) -> Any:
         """Load the detector; on the CPU if CUDA is missing and cpu_fallback is set."""
-        network_params, fallback = getattr(self.params, self.group), None
-        weights = self.weights()
+        network_params, fallback = self._network_params(self.params), None
+        weights = self.loader.find_weights(network_params)
         from lidar_perception.detectors.devices import find_device
 
         # One thread is the default, by the environment that main.py sets.
@@ -79,15 +108,15 @@ class DetectorNode(ManagedNode):
             except InputError as error:
                 device, fallback = "cpu", f"{error}; falling back to the CPU"
         with lock_compilation(self.get_logger().info):
-            detector = self.load(weights, device)
+            detector = self.loader.load(weights, device, self.params)
         detector.fallback = detector.fallback or fallback
         return detector
 
     def on_points(self, msg: Any) -> None:
-        with self.frame(to_ns(msg.header.stamp)):
+        with self.diagnostics.measure_frame(to_ns(msg.header.stamp)):
             frame, indices, params = self.sensor.read_frame(msg, with_intensity=True)
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
-            network_params = getattr(params, self.group)
+            network_params = self._network_params(params)
             detector = self.detector.with_params(self._lower_thresholds(params, network_params))
             result = detector(
                 frame,
@@ -95,31 +124,31 @@ class DetectorNode(ManagedNode):
                 cluster_ids=None if clusters is None else clusters[0],
             )
             weak = result.detections
-            if self.outputs.tracks is not None:
+            if self.results.tracks is not None:
                 result = replace(result, detections=weak[network_params.scores.passes(weak)])
-            tracking_problem = self.outputs.publish(msg.header, result.detections, result.timings, frame.xyz, weak=weak)
+            tracking_problem = self.results.publish(msg.header, result.detections, result.timings, frame.xyz, weak=weak)
         self._diagnose(frame, result, params, tracking_problem)
 
     def _lower_thresholds(self, params: Any, network_params: NetworkParams) -> Any:
         """Return params with thresholds that include the weak detections for the tracker."""
-        if self.outputs.tracks is None:
+        if self.results.tracks is None:
             return params
         low = network_params.scores.with_maximum(self.node_params.tracking.min_score)
-        return replace(params, **{self.group: replace(network_params, scores=low)})
+        return replace(params, **{self.loader.group: replace(network_params, scores=low)})
 
     def _diagnose(self, frame: PointCloud, result: DetectionResult, params: Any, tracking_problem: str | None) -> None:
         # The problem of the detector includes those of the intensity.
         problem = join_problems(
             result.problem, self.sensor.check_height(frame, params.ground.sensor_pose), tracking_problem
         )
-        self.counts.update(detections=len(result.detections), device=self.detector.device)
-        self.counts["best scores"] = " ".join(f"{name} {score:.2f}" for name, score in result.best.items())
+        self.diagnostics.counts.update(detections=len(result.detections), device=self.detector.device)
+        self.diagnostics.counts["best scores"] = " ".join(f"{name} {score:.2f}" for name, score in result.best.items())
         if problem:
-            self.report(WARN, problem)
+            self.diagnostics.report(WARN, problem)
         else:
-            self.report(
+            self.diagnostics.report(
                 OK,
                 "detecting"
                 if len(result.detections)
-                else f"nothing detected: every score is below its threshold in {self.group}.scores",
+                else f"nothing detected: every score is below its threshold in {self.loader.group}.scores",
             )

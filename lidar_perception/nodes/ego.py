@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lidar_perception.nodes.runtime import CLOUD, JUMP_NS, LidarNode
-from lidar_perception.robot.transform_tree import MissingTransform, TransformTree
+from lidar_perception.nodes.interfaces import CLOUD
+from lidar_perception.nodes.runtime import LidarNode
+from lidar_perception.robot.transform_tree import JUMP_NS, MissingTransform, TransformTree
 from lidar_perception.tracking.ego import NO_SOURCE, Odometry, choose_source, has_odometry
 from lidar_perception.tracking.params import EgoParams
 from lidar_perception.types import InputError
@@ -160,7 +161,7 @@ class EgoInput:
                 self.transforms.subscribe_to_tf()
         if not self._uses_scans():
             self.icp = None  # release the memory of the map
-            self.node.counts.pop(ICP_MS, None)
+            self.node.diagnostics.counts.pop(ICP_MS, None)
         return self.source
 
     def _is_connected(self, frame_id: str, stamp: int) -> bool:
@@ -213,7 +214,7 @@ class EgoInput:
     def _start_icp(self) -> None:
         self.icp = Odometry()
         if not self.clouds:
-            self.node.input("points", CLOUD, self._on_cloud)
+            self.node.inputs.subscribe("points", CLOUD, self._on_cloud)
 
     def _on_cloud(self, msg: Any) -> None:
         if not self._uses_scans():
@@ -236,6 +237,6 @@ class EgoInput:
         begin = thread_time()
         pose = self.icp(xyz)
         self.icp_ms.append((thread_time() - begin) * 1e3)
-        self.node.counts[ICP_MS] = f"{np.median(self.icp_ms):.1f}"
+        self.node.diagnostics.counts[ICP_MS] = f"{np.median(self.icp_ms):.1f}"
         self.scans.set(START, SCAN, stamp_ns, pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_quat())
-        self.node.counts["last_pose_ns"] = stamp_ns
+        self.node.diagnostics.counts["last_pose_ns"] = stamp_ns

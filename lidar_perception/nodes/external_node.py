@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.signals import SignalHandlerOptions
 from visualization_msgs.msg import MarkerArray
 
-from lidar_perception.nodes.runtime import RELIABLE
+from lidar_perception.nodes.interfaces import RELIABLE
 
 DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 SETTLE_S, MAX_SETTLE_S = 0.1, 3.0  # seconds

@@ -12,10 +12,11 @@ from lidar_perception.detectors.normalized_view import NormalizedView, segment_v
 from lidar_perception.detectors.pointpillars.config import RANGES
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import compute_inlier_share, fit_plane
+from lidar_perception.nodes.diagnostics import OK, WARN
 from lidar_perception.nodes.inputs import CameraInput
+from lidar_perception.nodes.interfaces import CLOUD
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import Obstacles
-from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import GroundExtraParams, GroundNodeParams
 from lidar_perception.runs.compiling import lock_compilation
@@ -40,14 +41,14 @@ class GroundSegmentation(ManagedNode):
             warm_up_ground(self.params.ground, self.params.view)
         self.camera = CameraInput(self)
         self.sensor = SensorCheck(self)
-        self.points = self.output("points", CLOUD)
-        self.ground = self.output("ground", CLOUD)
-        self.nonground = self.output("nonground", CLOUD)
+        self.points = self.outputs.advertise("points", CLOUD)
+        self.ground = self.outputs.advertise("ground", CLOUD)
+        self.nonground = self.outputs.advertise("nonground", CLOUD)
         self.obstacles = Obstacles(self)
-        self.input("points", CLOUD, self.on_points, needs=self.camera.find_missing_input)
+        self.inputs.subscribe("points", CLOUD, self.on_points, needs=self.camera.find_missing_input)
 
     def on_points(self, msg: Any) -> None:
-        with self.frame(to_ns(msg.header.stamp)):
+        with self.diagnostics.measure_frame(to_ns(msg.header.stamp)):
             frame, usable, params = self.sensor.read_frame(msg)
             camera = self.camera.get(msg.header, params.view)
             indices, visible_frame = crop_to_view(frame, camera, params.view)
@@ -70,13 +71,13 @@ class GroundSegmentation(ManagedNode):
         plane = fit_plane(segmented.xyz.compress(ground, axis=0))
         if plane is not None:
             share = compute_inlier_share(segmented.xyz, plane)
-            self.counts.update(
+            self.diagnostics.counts.update(
                 plane=" ".join(f"{v:.4f}" for v in plane),
                 plane_inlier_share=f"{share:.3f}",
                 ground_share=f"{ground.mean():.3f}",
             )
         problem = diagnose_empty(len(frame), ground) or self.sensor.find_problem(frame, params)
-        self.report(WARN if problem else OK, problem or "segmenting")
+        self.diagnostics.report(WARN if problem else OK, problem or "segmenting")
 
     def _publish_parts(
         self, msg: Any, frame: PointCloud, indices: np.ndarray, params: Any, ground: np.ndarray | None

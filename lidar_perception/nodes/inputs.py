@@ -21,9 +21,10 @@ from lidar_perception.candidates.seed_sources import (
 from lidar_perception.candidates.seeds import Seed, load_seeds
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
 from lidar_perception.nodes.graph import relative_name
-from lidar_perception.nodes.runtime import JUMP_NS, LATCHED, MARKERS, RELIABLE, SENSOR_DATA, LidarNode
+from lidar_perception.nodes.interfaces import LATCHED, MARKERS, RELIABLE, SENSOR_DATA
+from lidar_perception.nodes.runtime import LidarNode
 from lidar_perception.robot.poses import invert_pose, transform_boxes, transform_points
-from lidar_perception.robot.transform_tree import MissingTransform
+from lidar_perception.robot.transform_tree import JUMP_NS, MissingTransform
 from lidar_perception.types import PEDESTRIAN, InputError
 from lidar_perception.wire.messages import make_calibration, read_calibration, to_truth
 from lidar_perception.wire.params import ViewParams
@@ -41,8 +42,10 @@ class CameraInput:
         self.transforms: dict[tuple[str, str], Any] = {}
         # A latched subscription gets earlier messages, but none of a camera driver, which publishes
         # volatile and often best effort.
-        node.input("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED, SENSOR_DATA)
-        node.input("extrinsics", "geometry_msgs/msg/TransformStamped", self._on_transform, LATCHED, SENSOR_DATA)
+        node.inputs.subscribe("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED, SENSOR_DATA)
+        node.inputs.subscribe(
+            "extrinsics", "geometry_msgs/msg/TransformStamped", self._on_transform, LATCHED, SENSOR_DATA
+        )
 
     def _on_info(self, msg: Any) -> None:
         self.info = msg
@@ -153,9 +156,11 @@ class SeedInput:
         self.clicked_seeds: tuple[Seed, ...] = ()
         self.loaded_templates: tuple[str, tuple[Seed, ...]] | None = None
         self.matcher = StampMatcher(self._deliver_with_truth, on_drop=self._count_dropped)
-        node.input("ground_truth", MARKERS, self._on_truth, RELIABLE)
-        node.input(relative_name(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE, private=False)
-        node.inputs.append(self)
+        node.inputs.subscribe("ground_truth", MARKERS, self._on_truth, RELIABLE)
+        node.inputs.subscribe(
+            relative_name(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE, private=False
+        )
+        node.inputs.items.append(self)
         if self.params.source in ("file", "automatic"):
             self._load_templates()  # a missing file is reported before the first cloud
 
@@ -199,7 +204,7 @@ class SeedInput:
         self.matcher.add_partner(objects.stamp_ns, to_truth(objects))
 
     def _count_dropped(self, dropped: int) -> None:
-        self.node.counts["dropped"] = self.node.counts.get("dropped", 0) + dropped
+        self.node.diagnostics.counts["dropped"] = self.node.diagnostics.counts.get("dropped", 0) + dropped
 
     def _deliver_with_truth(self, cloud: Any, truth: Any) -> None:
         if truth is None:

@@ -1,4 +1,4 @@
-"""Links between the nodes of one process, which pass messages without serializing them."""
+"""Outputs of nodes, and links that pass messages within a process without serializing them."""
 
 from __future__ import annotations
 
@@ -7,11 +7,16 @@ from collections.abc import Callable
 from time import time_ns
 from typing import Any
 
-from rclpy.qos import DurabilityPolicy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from lidar_perception.nodes.diagnostics import Problem
+from lidar_perception.nodes.interfaces import RELIABLE
 from lidar_perception.wire.array_codec import encode_markers
-from lidar_perception.wire.codec import encode
+from lidar_perception.wire.codec import encode, warm_up_type
 from msg_utils.markers import MarkerRows
+from msg_utils.messages import load_message_class
 
 Receive = Callable[[Any, dict[str, int]], None]  # called with a message and its info, see Output
 
@@ -59,6 +64,40 @@ class Output:
         """End the links of this publisher."""
         if self.links is not None:
             self.links.remove(self)
+
+
+class Outputs:
+    """The outputs of a node."""
+
+    def __init__(self, node: Node, links: Links | None):
+        self.node, self.links = node, links
+        self.items: list[Output] = []
+
+    def advertise(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE) -> Output:
+        """Create a publisher of ~/output/TOPIC, or of any name that starts with ~ or /."""
+        warm_up_type(type_name)
+        publisher = self.node.create_publisher(
+            load_message_class(type_name),
+            topic if topic[0] in "~/" else f"~/output/{topic}",
+            qos,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+        self.items.append(Output(publisher, self.links))
+        return self.items[-1]
+
+    def clear(self) -> None:
+        """End the links of all outputs and forget them; their publishers are destroyed elsewhere."""
+        for output in self.items:
+            output.close()
+        self.items = []
+
+    def values(self) -> dict[str, Any]:
+        """Return the numbers of subscribers for the diagnostics."""
+        return {f"subscribers of {output.topic_name}": output.get_subscription_count() for output in self.items}
+
+    def problems(self) -> list[Problem]:
+        """Return no problems: missing subscribers are normal."""
+        return []
 
 
 def _to_cdr(message: Any) -> bytes:

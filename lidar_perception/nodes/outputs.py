@@ -12,7 +12,9 @@ from std_msgs.msg import Float64
 from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import classify_by_diagonal
 from lidar_perception.ground.obstacles import find_obstacles
-from lidar_perception.nodes.runtime import CLOUD, MARKERS, OK, RELIABLE, WARN, LidarNode
+from lidar_perception.nodes.diagnostics import OK, WARN
+from lidar_perception.nodes.interfaces import CLOUD, MARKERS, RELIABLE
+from lidar_perception.nodes.runtime import LidarNode
 from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, find_marker_lifetime_ns, has_detections_3d
 from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
@@ -41,7 +43,7 @@ class ClusterBoxes:
 
     def __init__(self, node: LidarNode):
         self.node = node
-        self.publisher = node.output("boxes", MARKERS)
+        self.publisher = node.outputs.advertise("boxes", MARKERS)
         self.marker_keys: Any = ()
 
     def publish(self, header: Any, boxes: Callable[[], np.ndarray]) -> None:
@@ -71,7 +73,7 @@ class Obstacles:
     """
 
     def __init__(self, node: LidarNode):
-        self.node, self.publisher = node, node.output("obstacles", CLOUD)
+        self.node, self.publisher = node, node.outputs.advertise("obstacles", CLOUD)
 
     def publish(self, msg: Any, xyz: np.ndarray, ground: np.ndarray, indices: np.ndarray) -> None:
         """Publish the obstacles of a cloud in the frame of the cloud.
@@ -100,7 +102,7 @@ class DetectionMarkers:
     """Publisher of detections as markers."""
 
     def __init__(self, node: LidarNode, topic: str):
-        self.node, self.publisher = node, node.output(topic, MARKERS)
+        self.node, self.publisher = node, node.outputs.advertise(topic, MARKERS)
         self.marker_keys: Any = ()
 
     def publish(self, header: Any, detections: Detections, clusters: np.ndarray | None = None) -> None:
@@ -201,12 +203,14 @@ class CandidateOutputs:
         self._diagnose(candidates, problem or tracking_problem)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:
-        self.node.counts["candidates"] = len(candidates.final)
+        self.node.diagnostics.counts["candidates"] = len(candidates.final)
         if problem:
-            self.node.report(WARN, problem)
+            self.node.diagnostics.report(WARN, problem)
         elif len(candidates.stage1) == 0:
-            self.node.report(WARN, "no cluster has the seed's height")
+            self.node.diagnostics.report(WARN, "no cluster has the seed's height")
         elif len(candidates.final) == 0:
-            self.node.report(WARN, f"none of {len(candidates.stage1)} clusters of the seed's height resembles the seed")
+            self.node.diagnostics.report(
+                WARN, f"none of {len(candidates.stage1)} clusters of the seed's height resembles the seed"
+            )
         else:
-            self.node.report(OK, "detecting")
+            self.node.diagnostics.report(OK, "detecting")

@@ -10,9 +10,9 @@ from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented_cloud import diagnose_empty
 from lidar_perception.candidates.warm_up import warm_up_candidates
 from lidar_perception.nodes.inputs import CameraInput, SeedInput
+from lidar_perception.nodes.interfaces import CLOUD
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes, Obstacles
-from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import PerceptionExtraParams
 from lidar_perception.runs.compiling import lock_compilation
@@ -34,21 +34,21 @@ class Perception(ManagedNode):
             warm_up_candidates(self.params)
         self.camera = CameraInput(self)
         self.sensor = SensorCheck(self)
-        self.outputs = CandidateOutputs(self, STEPS)
-        self.points = self.output("points", CLOUD)
+        self.results = CandidateOutputs(self, STEPS)
+        self.points = self.outputs.advertise("points", CLOUD)
         self.boxes = ClusterBoxes(self)
         self.obstacles = Obstacles(self)
         self.seed = SeedInput(self, self.on_cloud)
-        self.input("points", CLOUD, self.seed.add_cloud, needs=self.camera.find_missing_input)
+        self.inputs.subscribe("points", CLOUD, self.seed.add_cloud, needs=self.camera.find_missing_input)
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
-        with self.frame(to_ns(msg.header.stamp)):
+        with self.diagnostics.measure_frame(to_ns(msg.header.stamp)):
             frame, usable, params = self.sensor.read_frame(msg)
             segmented = segment_cloud(frame, self.camera.get(msg.header, params.view), params)
             problem = diagnose_empty(len(frame), segmented.ground, segmented.cluster_ids) or self.sensor.find_problem(
                 frame, params
             )
-            self.outputs.publish(msg.header, frame.xyz, lambda: refine_segmented(segmented, source, params), problem)
+            self.results.publish(msg.header, frame.xyz, lambda: refine_segmented(segmented, source, params), problem)
         indices = usable.take(segmented.indices)
         if self.points.get_subscription_count():
             self.points.publish(

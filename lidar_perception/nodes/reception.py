@@ -9,18 +9,17 @@ from importlib.resources import files
 from time import monotonic
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from lidar_perception.nodes.arrivals import DEPTH, WINDOW, Arrivals
+from lidar_perception.nodes.diagnostics import ERROR, STALE, WARN, Problem
 from lidar_perception.nodes.links import Links, Output
 from lidar_perception.nodes.rclpy_compat import InvalidHandle, parameter_overrides, take_messages
 from lidar_perception.nodes.shared_memory import SOCKET_BUFFER, read_socket_buffer_size
 from lidar_perception.params import ReceptionParams
 
-WARN, ERROR, STALE = DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
 BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
 MAX_HOLD_S = 1.0  # time during which newer clouds do not replace a waiting one
 RETRY_PERIOD_S = 5.0  # pause before waiting again after a timeout
@@ -38,8 +37,6 @@ QUESTIONS = {
     "player": ("is the player{} paused, or at the end of its bag?", "is the player{} playing at a lower rate?"),
 }
 FASTDDS_PROFILE = files("lidar_perception.nodes") / "fastdds.xml"
-
-Problem = tuple[str, bytes, str]  # (kind, level, message)
 
 
 class Reception:

@@ -46,10 +46,10 @@ class SensorCheck:
         frame, indices = to_point_cloud(msg, params.input.intensity_max if reads_intensity else None, self.scale)
         placement = self.node.transforms.find_placement(msg.header)
         params = self.node.transforms.with_mounting(params, placement)
-        self.node.counts.pop("cropped", None)
+        self.node.diagnostics.counts.pop("cropped", None)
         if params.crop.enabled:
             kept, frame = self.node.transforms.crop_frame(frame, params.crop, placement)
-            self.node.counts["cropped"] = len(indices) - len(kept)
+            self.node.diagnostics.counts["cropped"] = len(indices) - len(kept)
             indices, params = indices.take(kept), replace(params, crop=CropParams())
         return placement.level_frame(frame), indices, params
 
@@ -67,5 +67,5 @@ class SensorCheck:
         if not measured:
             return None
         height = float(np.median(measured))
-        self.node.counts["sensor_height"] = f"{height:.2f}"
+        self.node.diagnostics.counts["sensor_height"] = f"{height:.2f}"
         return find_height_problem(height, pose)

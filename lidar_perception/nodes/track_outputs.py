@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.nodes.ego import EgoInput
-from lidar_perception.nodes.runtime import MARKERS, RELIABLE, LidarNode
+from lidar_perception.nodes.interfaces import MARKERS, RELIABLE
+from lidar_perception.nodes.runtime import LidarNode
 from lidar_perception.params import DetectionNodeParams, TrackerNodeParams
 from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.tracking.ego import NO_SOURCE
@@ -49,7 +50,7 @@ class TrackOutputs:
         self.trails = Trails()
         self.frame_id: str | None = None
         self.marker_keys: Any = ()
-        self.markers = node.output("tracks", MARKERS)
+        self.markers = node.outputs.advertise("tracks", MARKERS)
         self.array = (
             node.create_publisher(load_message_class(DETECTIONS_3D), "~/output/tracks_3d", RELIABLE)
             if has_detections_3d()
@@ -129,12 +130,12 @@ class TrackOutputs:
         while now - self.count_history[0][0] > RATE_WINDOW_S or len(self.count_history) > 1000:
             self.count_history.popleft()
         before, born, ended = self.count_history[0]
-        self.node.counts.update(
+        self.node.diagnostics.counts.update(
             ego=self.ego.source, tracks=reported, alive=tracker.alive, born=tracker.started, ended=tracker.ended
         )
         if now > before:
-            self.node.counts["born_per_s"] = f"{(tracker.started - born) / (now - before):.2f}"
-            self.node.counts["ended_per_s"] = f"{(tracker.ended - ended) / (now - before):.2f}"
+            self.node.diagnostics.counts["born_per_s"] = f"{(tracker.started - born) / (now - before):.2f}"
+            self.node.diagnostics.counts["ended_per_s"] = f"{(tracker.ended - ended) / (now - before):.2f}"
 
 
 def find_marker_lifetime_ns(node: LidarNode) -> int:
@@ -143,7 +144,7 @@ def find_marker_lifetime_ns(node: LidarNode) -> int:
     It is at least MIN_LIFETIME_PERIODS periods of the input, for slow sensors.
     """
     seconds = node.node_params.output.marker_lifetime
-    rates = [rate for reception in node._receptions() if (rate := reception.expected_rate())]
+    rates = [rate for reception in node.inputs.receptions if (rate := reception.expected_rate())]
     if seconds and rates:
         seconds = max(seconds, min(MIN_LIFETIME_PERIODS / min(rates), MAX_LIFETIME_S))
     return int(seconds * SECOND_NS)

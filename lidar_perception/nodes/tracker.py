@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from lidar_perception.classes import DETECTED
+from lidar_perception.nodes.diagnostics import OK, WARN
+from lidar_perception.nodes.interfaces import MARKERS
 from lidar_perception.nodes.managed import ManagedNode
-from lidar_perception.nodes.runtime import MARKERS, OK, WARN
 from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, has_detections_3d
 from lidar_perception.params import TrackerExtraParams, TrackerNodeParams
 from lidar_perception.types import InputError
@@ -23,16 +24,16 @@ class TrackerNode(ManagedNode):
     with the header of the frame.
     """
 
-    waits_for = "detections", "detections_3d"
-
     def __init__(self, **options: Any):
-        super().__init__("tracker", TrackerNodeParams(), TrackerExtraParams(), **options)
+        super().__init__(
+            "tracker", TrackerNodeParams(), TrackerExtraParams(), ("detections", "detections_3d"), **options
+        )
 
     def configure(self) -> None:
         self.tracks = TrackOutputs(self, lambda: self.params, clouds=False)
-        self.input("detections", MARKERS, self.on_markers, needs=self._find_missing_pose)
+        self.inputs.subscribe("detections", MARKERS, self.on_markers, needs=self._find_missing_pose)
         if has_detections_3d():
-            self.input(
+            self.inputs.subscribe(
                 "detections_3d",
                 DETECTIONS_3D,
                 self.on_detections,
@@ -53,8 +54,8 @@ class TrackerNode(ManagedNode):
         self._track(msg.header, from_detection_array(msg))
 
     def _track(self, header: Any, objects: MarkedObjects) -> None:
-        self.frame_id = header.frame_id
-        with self.frame(to_ns(header.stamp)):
+        self.diagnostics.frame_id = header.frame_id
+        with self.diagnostics.measure_frame(to_ns(header.stamp)):
             problem = self.tracks.publish(header, to_detections(objects))
         problems = [problem] if problem else []
         if unknown := find_unknown_classes(objects.labels):
@@ -63,4 +64,4 @@ class TrackerNode(ManagedNode):
                 f"Misc: name them {', '.join(DETECTED)} in the ns of the markers or in "
                 "class_id"
             )
-        self.report(WARN if problems else OK, "; ".join(problems) or "tracking")
+        self.diagnostics.report(WARN if problems else OK, "; ".join(problems) or "tracking")

@@ -16,7 +16,7 @@ import numpy as np
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from lidar_perception.ground.params import SensorPoseParams
-from lidar_perception.nodes.reception import WARN, Problem
+from lidar_perception.nodes.diagnostics import WARN, Problem
 from lidar_perception.robot.crop import crop_frame
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placement import Placement, find_level_transform, make_tilted_pose
@@ -91,10 +91,10 @@ class Transforms:
         """Subscribe to the odometry, once."""
         if not self._has_odometry_subscription:
             self._has_odometry_subscription = True
-            self.node.input("odometry", ODOMETRY_MESSAGE, self.on_odometry, ODOMETRY_QOS)
+            self.node.inputs.subscribe("odometry", ODOMETRY_MESSAGE, self.on_odometry, ODOMETRY_QOS)
 
     def _subscribe(self, topic: str, qos: QoSProfile, static: bool) -> None:
-        self.node.input(topic, TF_MESSAGE, lambda m: self.on_tf(m, static), qos, private=False)
+        self.node.inputs.subscribe(topic, TF_MESSAGE, lambda m: self.on_tf(m, static), qos, private=False)
 
     def on_tf(self, msg: Any, static: bool) -> None:
         """Add a tf2_msgs/TFMessage to the tree. Invalid transforms are skipped and reported."""
@@ -121,7 +121,7 @@ class Transforms:
         if now - self.ignored_arrival > ODOMETRY_TIMEOUT_S:
             self.problem_by_source.pop("odometry", None)
         self.odometry_child, self.odometry_frame, self.odometry_arrival = child, frame, now
-        self.odometry_ns = self.node.counts["last_pose_ns"] = to_ns(msg.header.stamp)
+        self.odometry_ns = self.node.diagnostics.counts["last_pose_ns"] = to_ns(msg.header.stamp)
         self._clear_cache()
 
     def _clear_cache(self) -> None:
@@ -346,7 +346,7 @@ class Transforms:
         """
         if self.node.node_params.input.deskew == "off":
             return msg
-        begin, counts = perf_counter(), self.node.counts
+        begin, counts = perf_counter(), self.node.diagnostics.counts
         self.problem_by_source.pop("deskew", None)
         try:
             moved = self._move_points(msg)

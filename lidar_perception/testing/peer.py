@@ -11,7 +11,7 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 
 from lidar_perception.nodes.external_node import ExternalNode, to_parameters, to_values
 from lidar_perception.nodes.graph import Graph, find_connected_outputs
-from lidar_perception.nodes.runtime import RELIABLE, QoSProfile
+from lidar_perception.nodes.interfaces import RELIABLE, QoSProfile
 from lidar_perception.testing.processes import NodesUnderTest
 from lidar_perception.wire.codec import decode, encode, load_typestore
 from msg_utils.messages import load_message_class

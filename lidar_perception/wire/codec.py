@@ -73,6 +73,12 @@ def decode(data: bytes, type_name: str) -> Any:
         raise InputError(f"{len(data)} bytes are not a valid {type_name} ({error})") from None
 
 
+def warm_up_type(type_name: str) -> None:
+    """Let rosbags generate its code for a type, if it knows the type, before the first message."""
+    if type_name in load_typestore().fielddefs:
+        decode(encode(make_bag_message(type_name)), type_name)
+
+
 def _make_zero(type_name: tuple[Any, Any]) -> Any:
     node, detail = type_name
     if node == Nodetype.BASE:

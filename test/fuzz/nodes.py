@@ -14,10 +14,11 @@ from fuzz.case import FAILED, REFUSED, SURVIVED, Outcome
 from fuzz.valid_messages import CLOUD, make_valid_message
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes import load_node_class
+from lidar_perception.nodes.diagnostics import ERROR, OK
 from lidar_perception.nodes.external_node import Context, create_context, to_parameters
 from lidar_perception.nodes.graph import reserve_domain
+from lidar_perception.nodes.interfaces import MARKERS
 from lidar_perception.nodes.reception import Reception
-from lidar_perception.nodes.runtime import ERROR, MARKERS, OK
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode
 from lidar_perception.wire.transforms import ODOMETRY_MESSAGE
@@ -120,7 +121,7 @@ class FedNode:
         self.node.start()
         self.inputs = INPUTS[name][1]
         self.calls = {s.topic_name.removeprefix(f"/{name}").lstrip("/"): s.callback for s in self.node.subscriptions}
-        for made in self.node.inputs:
+        for made in self.node.inputs.items:
             if isinstance(made, Reception):  # without its queue
                 self.calls[made.topic.removeprefix(f"/{name}").lstrip("/")] = made.deliver
         self.params: dict[str, Any] = {}
@@ -153,9 +154,9 @@ class FedNode:
         OK."""
         if topic == "input/points":
             self.sent.clear()
-        self.node.state = (OK, "")
+        self.node.diagnostics.state = (OK, "")
         self.calls[topic](data)
-        return self.node.state
+        return self.node.diagnostics.state
 
     def deliver_valid(self, *first: str) -> list[tuple[bytes, str]]:
         """Deliver a valid message to some inputs, then to all, the cloud last."""
@@ -184,6 +185,6 @@ class FedNode:
                     return f"{topic} has boxes that are not finite"
             except (InputError, CloudError, ValueError) as error:
                 return f"{topic} cannot be read: {error}"
-        if any(isinstance(v, float) and math.isnan(v) for v in self.node.counts.values()):
-            return f"NaN in the diagnostics: {self.node.counts}"
+        if any(isinstance(v, float) and math.isnan(v) for v in self.node.diagnostics.counts.values()):
+            return f"NaN in the diagnostics: {self.node.diagnostics.counts}"
         return None

@@ -69,9 +69,9 @@ def start(domain):
         node = kind(context=context, parameter_overrides=overrides)
         nodes.append(node)
         node.start()
-        assert node.active
+        assert node.inputs.is_open
         node.sent = {}
-        for output in node._outputs:
+        for output in node.outputs.items:
             output.publisher.publish = node.sent.setdefault(output.topic_name.rpartition("/")[2], []).append
         return node
 

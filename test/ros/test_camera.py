@@ -13,7 +13,7 @@ from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
 from lidar_perception.nodes.graph import SINGLE, STAGES
-from lidar_perception.nodes.runtime import LATCHED, SENSOR_DATA
+from lidar_perception.nodes.interfaces import LATCHED, SENSOR_DATA
 from lidar_perception.param_fields import flatten
 from lidar_perception.scoring.centres.report import make_seed_source, select_pedestrians
 from lidar_perception.types import Detections

@@ -54,7 +54,7 @@ def test_cloud_of_moving_sensor_is_compensated(start, source):
     give(node, msg)
     as_it_is = decode(node.sent["points"][-1], "sensor_msgs/msg/PointCloud2")
     np.testing.assert_array_equal(to_array(as_it_is)["x"], raw[:, 0])
-    assert node.counts["not_deskewed"] == 1
+    assert node.diagnostics.counts["not_deskewed"] == 1
     assert "clouds are not deskewed" in problems(node)
 
     for i in range(-5, 16):
@@ -64,7 +64,7 @@ def test_cloud_of_moving_sensor_is_compensated(start, source):
         else:
             node.transforms.on_odometry(odometry(drive(stamp), stamp))
     give(node, msg)
-    assert "deskew" not in problems(node) and node.counts["deskewed"] == 1
+    assert "deskew" not in problems(node) and node.diagnostics.counts["deskewed"] == 1
     after = decode(node.sent["points"][-1], "sensor_msgs/msg/PointCloud2")
     moved = np.column_stack([to_array(after)[n] for n in "xyz"])
     others = np.setdiff1d(np.arange(len(still)), body)
@@ -90,17 +90,17 @@ def test_first_cloud_waits_for_odometry_of_its_whole_turn(start):
     xyz = (rng.uniform(-30, 30, (2000, 3)) * [1, 1, 0.001] - [0, 0, 1.8]).astype(np.float32)
     msg = message(xyz, t=np.linspace(0, 1e8, len(xyz)).astype("<u4"))
     node = start(GroundSegmentation, **{"input.deskew": "odometry"})
-    deliver = node._receptions()[0].deliver
+    deliver = node.inputs.receptions[0].deliver
     for i in range(-2, 9):
         node.transforms.on_odometry(odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
     needed = deliver(encode(msg), True)
     assert "/ground_segmentation/input/odometry" in needed and "0.020 s older" in needed
     assert "'lidar'" in needed and "child_frame_id" not in needed
-    assert node.counts["frames"] == 0
+    assert node.diagnostics.counts["frames"] == 0
     for i in (9, 10):
         node.transforms.on_odometry(odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
     assert deliver(encode(msg), True) is None
-    assert node.counts["deskewed"] == 1 and "not_deskewed" not in node.counts
+    assert node.diagnostics.counts["deskewed"] == 1 and "not_deskewed" not in node.diagnostics.counts
 
 
 @pytest.mark.parametrize("first, begin, sectors", [(0.3, 0.0, ()), (1.0, -1.0, (120.0, 240.0))])
@@ -108,7 +108,7 @@ def test_later_clouds_wait_for_the_end_of_their_turn(start, first, begin, sector
     """The first turn is partial, or the stamp is at the end of a turn, with cropped points there.
     Odometry comes every 0.02 s."""
     node = start(GroundSegmentation, **{"input.deskew": "odometry", "crop.sectors": sectors})
-    deliver = node._receptions()[0].deliver
+    deliver = node.inputs.receptions[0].deliver
     heard = iter(range(START, START + 20 * PERIOD, PERIOD // 5))
 
     def hear():
@@ -126,4 +126,4 @@ def test_later_clouds_wait_for_the_end_of_their_turn(start, first, begin, sector
             known = hear()
         while deliver(encode(message(xyz, stamp, time=seconds.astype("<f4"))), True):
             known = hear()
-    assert node.counts["deskewed"] == 7 - (first < 1.0)  # the duration is unknown at the second
+    assert node.diagnostics.counts["deskewed"] == 7 - (first < 1.0)  # the duration is unknown at the second

@@ -15,8 +15,8 @@ from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN
 from lidar_perception.nodes import ego as ego_module
 from lidar_perception.nodes import transforms as transforms_module
 from lidar_perception.nodes.ego import ICP_MS
+from lidar_perception.nodes.interfaces import MARKERS
 from lidar_perception.nodes.perception import Perception
-from lidar_perception.nodes.runtime import MARKERS
 from lidar_perception.nodes.tracker import TrackerNode
 from lidar_perception.robot.poses import invert_pose, transform_boxes
 from lidar_perception.robot.transform_tree import MissingTransform
@@ -73,8 +73,8 @@ def test_odometry_is_transformed_to_the_sensor(start, source):
             node.transforms.on_tf(transforms(("odom", "base", base_at(i), stamp)), static=False)
 
     drive(node, tell, [base_at(i) @ SENSOR for i in range(20)])
-    assert node.counts["ego"] == ("odometry" if source == "odometry" else "tf")
-    assert node.state[1] == "tracking"
+    assert node.diagnostics.counts["ego"] == ("odometry" if source == "odometry" else "tf")
+    assert node.diagnostics.state[1] == "tracking"
 
 
 def test_detections_in_the_frame_of_the_odometry_do_not_move(start):
@@ -92,7 +92,7 @@ def test_missing_odometry_to_sensor_transform_is_reported(start):
     drive(
         node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp)), [base_at(i) for i in range(10)]
     )
-    assert "odometry describes 'base', the detections are in 'lidar'" in node.state[1]
+    assert "odometry describes 'base', the detections are in 'lidar'" in node.diagnostics.state[1]
     node.transforms.on_tf(transforms(("base", "lidar", SENSOR, 0)), static=True)
     stamp = START + 10 * TENTH
     node.transforms.on_odometry(odometry(base_at(10), stamp))
@@ -104,7 +104,7 @@ def test_missing_odometry_to_sensor_transform_is_reported(start):
 def test_missing_transform_is_named(start):
     node = start(TrackerNode, **{"ego.source": "tf", "input.fixed_frame": "map"})
     node.on_markers(make_detection_markers(next(crowd()), header(START), make_bag_message))
-    assert "TF does not connect 'lidar' with 'map'" in node.state[1]
+    assert "TF does not connect 'lidar' with 'map'" in node.diagnostics.state[1]
 
 
 @pytest.mark.parametrize("better", ["odometry", "tf"])
@@ -112,26 +112,26 @@ def test_auto_falls_back_to_scans_and_returns_to_poses(start, better):
     if not has_odometry():
         pytest.skip("needs kiss-icp, the extra [odometry]")
     node = start(TrackerNode)
-    found = node._receptions()[0]
+    found = node.inputs.receptions[0]
     xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
 
     def frames(first, count):
         for i in range(first, first + count):
-            if len(node._receptions()) > node_inputs:
+            if len(node.inputs.receptions) > node_inputs:
                 give_to_points(message(xyz, START + i * TENTH))
             found.deliver(
                 encode(make_detection_markers(next(crowd()), header(START + i * TENTH), make_bag_message)), False
             )
 
     def give_to_points(cloud):
-        points = next(r for r in node._receptions() if r.topic.endswith("/points"))
+        points = next(r for r in node.inputs.receptions if r.topic.endswith("/points"))
         points.deliver(encode(cloud), False)
 
-    node_inputs = len(node._receptions())
+    node_inputs = len(node.inputs.receptions)
     frames(0, 10)
-    assert node.counts["ego"] == "none" and len(node._receptions()) == node_inputs
+    assert node.diagnostics.counts["ego"] == "none" and len(node.inputs.receptions) == node_inputs
     frames(10, 4)
-    assert node.counts["ego"] == "kiss_icp" and float(node.counts[ICP_MS]) > 0
+    assert node.diagnostics.counts["ego"] == "kiss_icp" and float(node.diagnostics.counts[ICP_MS]) > 0
     before = max(tracked(node).ids)
     for i in (13, 14, 15):
         stamp = START + i * TENTH
@@ -140,13 +140,13 @@ def test_auto_falls_back_to_scans_and_returns_to_poses(start, better):
         else:
             node.transforms.on_tf(transforms(("odom", "lidar", base_at(i), stamp)), static=False)
     frames(14, 2)
-    assert node.counts["ego"] == better and min(tracked(node).ids) > before
-    assert ICP_MS not in node.counts  # scans are not registered any more
+    assert node.diagnostics.counts["ego"] == better and min(tracked(node).ids) > before
+    assert ICP_MS not in node.diagnostics.counts  # scans are not registered any more
 
 
 def test_detector_cloud_waits_for_its_pose_with_timeout(start):
     node = start(Perception, **{"tracking.enabled": True, "ego.max_wait": 100.0})
-    deliver = node._receptions()[0].deliver
+    deliver = node.inputs.receptions[0].deliver
     xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     clouds = [encode(message(xyz, START + i * TENTH)) for i in range(20)]
     assert deliver(clouds[0], True) is None  # no pose yet
@@ -154,7 +154,7 @@ def test_detector_cloud_waits_for_its_pose_with_timeout(start):
     assert deliver(clouds[1], True) == "the pose of its time"
     node.transforms.on_odometry(odometry(base_at(1), START + TENTH, "lidar"))
     assert deliver(clouds[1], True) is None and len(node.sent["tracks"]) == 2
-    np.testing.assert_allclose(node.outputs.final.tracks.tracker.pose, base_at(1), atol=1e-9)
+    np.testing.assert_allclose(node.results.final.tracks.tracker.pose, base_at(1), atol=1e-9)
     assert deliver(clouds[2], True) == "the pose of its time"
     assert node.set_parameters([Parameter("ego.max_wait", value=0.0)])[0].successful
     assert deliver(clouds[2], True) is None  # the time to wait is over
@@ -168,9 +168,9 @@ def test_empty_cloud_is_answered_and_scan_poses_continue(start):
     node = start(Perception, **{"tracking.enabled": True, "ego.source": "kiss_icp"})
     xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     for i in range(6):
-        node._receptions()[0].deliver(encode(message(xyz[:0] if i == 3 else xyz, START + i * TENTH)), False)
-        assert node.counts["frames"] == len(node.sent["tracks"]) == i + 1
-    assert node.counts["ego"] == "kiss_icp" and node.outputs.final.tracks.ego.icp_restarts == 1
+        node.inputs.receptions[0].deliver(encode(message(xyz[:0] if i == 3 else xyz, START + i * TENTH)), False)
+        assert node.diagnostics.counts["frames"] == len(node.sent["tracks"]) == i + 1
+    assert node.diagnostics.counts["ego"] == "kiss_icp" and node.results.final.tracks.ego.icp_restarts == 1
 
 
 def test_late_poses_delay_frames_by_max_wait_once(start, monkeypatch):
@@ -194,15 +194,15 @@ def test_stopped_or_foreign_clock_odometry_is_reported(start, monkeypatch):
     node, now = start(TrackerNode), [100.0]
     for module in ego_module, transforms_module:
         monkeypatch.setattr(module, "monotonic", lambda: now[0])
-    found = node._receptions()[0]
+    found = node.inputs.receptions[0]
 
     def report(seconds):
         stamp = header(START + round(seconds * 10 * TENTH))
         found.deliver(encode(make_detection_markers(next(crowd()), stamp, make_bag_message)), False)
-        return node.state[1]
+        return node.diagnostics.state[1]
 
     node.transforms.on_odometry(odometry(base_at(0), START + 1000 * 10 * TENTH, "lidar"))
-    assert "1000 s ahead of the detections" in report(0) and "same clock" in node.state[1]
+    assert "1000 s ahead of the detections" in report(0) and "same clock" in node.diagnostics.state[1]
     node.transforms.on_odometry(odometry(base_at(0), START, "lidar"))
     now[0] += 5.0
     report(2)  # the tracker continues for the first seconds
@@ -221,8 +221,8 @@ def test_source_that_is_always_late_is_named(start, source, lag):
         else:
             node.transforms.on_tf(transforms(("odom", "lidar", base_at(i), past)), static=False)
         node.on_markers(make_detection_markers(next(crowd()), header(stamp), make_bag_message))
-        assert f"{lag:.3f} s older than needed" in node.state[1]
-    assert node.counts["ego"] == source
+        assert f"{lag:.3f} s older than needed" in node.diagnostics.state[1]
+    assert node.diagnostics.counts["ego"] == source
 
 
 def test_first_of_two_odometry_publishers_is_used(start, monkeypatch):
@@ -248,7 +248,7 @@ def test_odometry_without_child_frame_is_ignored(start):
         lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp, "")),
         [base_at(i) for i in range(10)],
     )
-    assert "child_frame_id is empty" in node.state[1]
+    assert "child_frame_id is empty" in node.diagnostics.state[1]
     with pytest.raises(MissingTransform, match="child_frame_id"):
         node.transforms.sensor_poses("odometry", "lidar", np.array([START]))
 
@@ -283,8 +283,8 @@ def test_foreign_class_names_are_mapped_or_reported(start):
         marker.ns = {"Pedestrian": "person", "Car": "car", "Cyclist": "BICYCLE"}.get(marker.ns, marker.ns)
     node = start(TrackerNode)
     node.on_markers(there)
-    assert node.state[1] == "tracking"
+    assert node.diagnostics.state[1] == "tracking"
     assert to_class_ids(["person", "CAR", "bicycle", "tree"]) == [PEDESTRIAN, CAR, CYCLIST, CLASSES.index("Misc")]
     there.markers[-1].ns = "sofa"
     node.on_markers(there)
-    assert "sofa" in node.state[1] and "Pedestrian" in node.state[1]
+    assert "sofa" in node.diagnostics.state[1] and "Pedestrian" in node.diagnostics.state[1]

@@ -39,8 +39,8 @@ def test_labels_may_be_late_and_lost_frames_count_once(start, late):
         if i >= late:
             node._add("ground_truth", array(i - late))
     given_up = count - MAX_INCOMPLETE_FRAMES if late > MAX_INCOMPLETE_FRAMES else 0
-    assert node.counts["frames"] == count - given_up
-    assert node.counts["incomplete"] + len(node.waiting) == given_up
+    assert node.diagnostics.counts["frames"] == count - given_up
+    assert node.diagnostics.counts["incomplete"] + len(node.waiting) == given_up
 
 
 def test_detections_wait_for_their_labels_up_to_a_limit(start):
@@ -48,9 +48,9 @@ def test_detections_wait_for_their_labels_up_to_a_limit(start):
     for name in "final", "ground_truth":
         for i in range(MAX_INCOMPLETE_FRAMES + 30):
             node._add(name, array(i))
-    assert node.counts["frames"] == MAX_INCOMPLETE_FRAMES and node.counts["incomplete"] == 30
-    assert not node.waiting and node.counts["repeated"] == 30
-    assert "nothing on /evaluator/input/ground_truth with their" in node.state[1] or (node.state[1] == "scoring")
+    assert node.diagnostics.counts["frames"] == MAX_INCOMPLETE_FRAMES and node.diagnostics.counts["incomplete"] == 30
+    assert not node.waiting and node.diagnostics.counts["repeated"] == 30
+    assert node.diagnostics.state[1] == "scoring"
 
 
 def test_file_error_is_reported_and_writing_retried(start, tmp_path):
@@ -73,12 +73,12 @@ def test_boxes_in_other_frames_are_scored_with_a_warning(start):
     node = start(Evaluator)
     node._add("ground_truth", array(0, "velo"))
     node._add("final", array(0, "odom"))
-    assert node.counts["frames"] == 1
+    assert node.diagnostics.counts["frames"] == 1
     for words in "ground_truth in 'velo'", "final in 'odom'":
         assert words in list_problems(node)
     node._add("ground_truth", array(1))
     node._add("final", array(1))
-    assert list_problems(node) == "" and np.isfinite(float(node.counts["F1 of final"]))
+    assert list_problems(node) == "" and np.isfinite(float(node.diagnostics.counts["F1 of final"]))
 
 
 def objects(stamp, cars=(), cyclists=(), pedestrians=()):
@@ -135,7 +135,7 @@ def test_all_classes_are_scored_and_precision_at_the_end(with_camera, start, tmp
     assert counts(content["classes"]["Cyclist"]) == (3, 0, 1, 1)
     assert content["ap"]["final"]["Pedestrian"]["3d"]["easy"]["r40"] == 50
     assert ("image" in content["ap"]["final"]["Car"]) == with_camera
-    assert node.counts["F1 of final, Car"] == ("1.000" if with_camera else "0.667")
+    assert node.diagnostics.counts["F1 of final, Car"] == ("1.000" if with_camera else "0.667")
 
 
 @pytest.mark.parametrize(

@@ -16,10 +16,10 @@ from rclpy.parameter import Parameter
 from ros_samples import CLOUD, MARKERS
 
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
+from lidar_perception.nodes.diagnostics import ERROR, OK, WAITING
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
 from lidar_perception.nodes.reception import Reception
-from lidar_perception.nodes.runtime import ERROR, OK, WAITING
 from lidar_perception.nodes.tracker import TrackerNode
 from lidar_perception.wire.codec import encode
 from msg_utils.messages import make_ros_message
@@ -155,7 +155,7 @@ def test_manager_drives_a_detector_through_all_states(nodes, peer, weights):
 
 def test_node_without_subscribers_reports_it(here, peer, monkeypatch):
     """A node that was restarted without its manager is reported, a deactivated one is not."""
-    monkeypatch.setattr("lidar_perception.nodes.managed.MANAGER_TIMEOUT_S", 0.0)
+    monkeypatch.setattr("lidar_perception.nodes.autostart.MANAGER_TIMEOUT_S", 0.0)
     for kind, topic, sent in ((GroundSegmentation, "points", CLOUD), (TrackerNode, "detections", MARKERS)):
         node = here(kind, {"autostart": False}, {f"~/input/{topic}": f"/{topic}"})
         name = node.get_name()
@@ -167,8 +167,8 @@ def test_node_without_subscribers_reports_it(here, peer, monkeypatch):
         drive(peer, name, "configure", "cleanup")
         peer.advertise(f"/{topic}", sent)
         peer.wait(lambda n=node, t=topic: n.count_publishers(f"/{t}"), "the input again")
-        node._tick()
-        assert node.state == (OK, "not configured")
+        node.autostart.check()
+        assert node.diagnostics.state == (OK, "not configured")
 
 
 def test_cleanup_frees_the_network(here, peer, weights):
@@ -178,7 +178,7 @@ def test_cleanup_frees_the_network(here, peer, weights):
     for stamp in (1, 2):
         drive(peer, NODE, "configure")
         held = [
-            weakref.ref(thing) for thing in (node.detector, node.detector.proposer.network, node.outputs, node.sensor)
+            weakref.ref(thing) for thing in (node.detector, node.detector.proposer.network, node.results, node.sensor)
         ]
         drive(peer, NODE, "activate")
         peer.send(talker, message(stamp), lambda n=stamp: received(found, n), "detections")
@@ -242,31 +242,31 @@ def test_failed_activation_is_reported_and_retried(here, peer, monkeypatch):
     with monkeypatch.context() as broken:
         broken.setattr(Reception, "open", refuse)
         node = here(GroundSegmentation, {}, {"~/input/points": "/in"})
-        assert (node.state_label(), node.state[0]) == ("inactive", ERROR)
-        assert "not active: RuntimeError: no such policy" in node.state[1]
-    monkeypatch.setattr("lidar_perception.nodes.managed.MIN_RETRY_PERIOD_S", 0.0)
-    node._retry_at = 0.0
-    peer.wait(lambda: node.active and node.state_label() == "active", "another attempt")
-    assert node.state[1] == WAITING
+        assert (node.state_label(), node.diagnostics.state[0]) == ("inactive", ERROR)
+        assert "not active: RuntimeError: no such policy" in node.diagnostics.state[1]
+    monkeypatch.setattr("lidar_perception.nodes.autostart.MIN_RETRY_PERIOD_S", 0.0)
+    node.autostart.retry_at = 0.0
+    peer.wait(lambda: node.inputs.is_open and node.state_label() == "active", "another attempt")
+    assert node.diagnostics.state[1] == WAITING
 
 
 def test_waiting_clouds_are_dropped_without_counting_pause(here, peer, good_cloud):
     """sent = frames + dropped + lost holds for clouds that are sent while the node is active."""
     node = here(GroundSegmentation, {"input.queue": 3}, {"~/input/points": "/in"})
     talker = peer.advertise("/in", CLOUD)
-    peer.send(talker, good_cloud, lambda: node.counts["frames"], "a frame")
+    peer.send(talker, good_cloud, lambda: node.diagnostics.counts["frames"], "a frame")
     name = "ground_segmentation"
-    (reception,) = node._receptions()
+    (reception,) = node.inputs.receptions
     sent = reception.arrivals.sent
     drive(peer, name, "deactivate")
     for _ in range(5):
         talker.publish(encode(good_cloud))
     drive(peer, name, "activate")
-    before = node.counts["frames"]
-    peer.send(talker, good_cloud, lambda: node.counts["frames"] > before, "a frame")
+    before = node.diagnostics.counts["frames"]
+    peer.send(talker, good_cloud, lambda: node.diagnostics.counts["frames"] > before, "a frame")
     arrivals = reception.arrivals
     assert arrivals.lost == 0 and arrivals.sent > sent
-    assert node.counts["frames"] + arrivals.dropped + len(reception.waiting) == arrivals.sent
+    assert node.diagnostics.counts["frames"] + arrivals.dropped + len(reception.waiting) == arrivals.sent
     reception.waiting.extend([b"cloud"] * 2)
     drive(peer, name, "deactivate")
     assert not reception.waiting and reception.arrivals.dropped >= 2

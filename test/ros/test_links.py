@@ -17,8 +17,8 @@ from lidar_perception.nodes.clustering import Clustering
 from lidar_perception.nodes.external_node import create_context, shut_down_context
 from lidar_perception.nodes.graph import build_graph
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
+from lidar_perception.nodes.interfaces import LATCHED, RELIABLE
 from lidar_perception.nodes.links import Links, Output
-from lidar_perception.nodes.runtime import LATCHED, RELIABLE
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.types import Detections
 from lidar_perception.wire.codec import decode, encode, make_bag_message
@@ -53,7 +53,7 @@ def graph(domain):
             executor.spin_once(timeout_sec=0.01)
 
     yield SimpleNamespace(
-        ground=ground, clustering=clustering, spin=spin, context=context, reception=clustering._receptions()[0]
+        ground=ground, clustering=clustering, spin=spin, context=context, reception=clustering.inputs.receptions[0]
     )
     executor.shutdown()
     shut_down_context(context, ground, clustering)

@@ -267,7 +267,7 @@ class Posts:
     node.on_points(message(1))
     found = from_marker_array(deserialize_message(node.sent["detections"][-1], MarkerArray))
     assert found.labels == ["Pedestrian"] and found.boxes[0, 5] == pytest.approx(0.5)
-    assert node.counts["network"] == "own_fused:Posts, Pedestrian"
+    assert node.diagnostics.counts["network"] == "own_fused:Posts, Pedestrian"
 
 
 @pytest.mark.parametrize(

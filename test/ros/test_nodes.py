@@ -18,11 +18,12 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.nodes import NODES
+from lidar_perception.nodes.diagnostics import ERROR, OK, WARN
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.inputs import StampMatcher
+from lidar_perception.nodes.interfaces import LATCHED
 from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.rclpy_compat import parameter_names
-from lidar_perception.nodes.runtime import ERROR, LATCHED, OK, WARN
 from lidar_perception.param_fields import collect_fields, flatten
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.wire.codec import make_bag_message
@@ -112,13 +113,13 @@ def test_every_parameter_is_readable_and_lists_may_be_empty(start, kind):
 def test_problem_with_changing_numbers_is_logged_once(start, monkeypatch):
     """The end of the problem is logged too, so the log ends with the current state."""
     node, lines = start(GroundSegmentation), []
-    monkeypatch.setattr(node, "_log", lambda level, message: lines.append((level, message)))
+    monkeypatch.setattr(node.diagnostics, "_log", lambda level, message: lines.append((level, message)))
     for i in range(100):
-        node.report(WARN, f"intensity goes up to {i / 7:.2g} where 1 is expected")
-        assert node.state[1].startswith(f"intensity goes up to {i / 7:.2g} ")
+        node.diagnostics.report(WARN, f"intensity goes up to {i / 7:.2g} where 1 is expected")
+        assert node.diagnostics.state[1].startswith(f"intensity goes up to {i / 7:.2g} ")
         if i % 3 == 0:
-            node.report(OK, "segmenting")
-    node.report(ERROR, "no field 'x'")
+            node.diagnostics.report(OK, "segmenting")
+    node.diagnostics.report(ERROR, "no field 'x'")
     assert [level for level, _ in lines] == [WARN, OK, ERROR]
 
 

@@ -19,7 +19,8 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
-from lidar_perception.nodes.runtime import LATCHED, WAITING
+from lidar_perception.nodes.diagnostics import WAITING
+from lidar_perception.nodes.interfaces import LATCHED
 from lidar_perception.wire.clouds import COMPRESSED, LIVOX
 from lidar_perception.wire.codec import decode, make_bag_message
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
@@ -110,7 +111,7 @@ def test_static_transforms_accumulate_others_keep_last(monkeypatch, start, tmp_p
     player._publish_latched()
     assert [decode(d, TEXT).data for d in player.sent["tf_static"]] == [*map(str, range(20))]
     assert [decode(d, INFO).width for d in player.sent["info"]] == [19]
-    depths = {o.topic_name: o.publisher.qos_profile.depth for o in player._outputs}
+    depths = {o.topic_name: o.publisher.qos_profile.depth for o in player.outputs.items}
     assert depths == {"/tf_static": 100, "/info": 10, "/text": 10}  # for late subscribers, too
 
 
@@ -142,7 +143,7 @@ def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path)
     sent = {topic: [decode(d, TEXT if topic == "text" else CLOUD) for d in data] for topic, data in player.sent.items()}
     assert [np.array_equal(to_array(cloud)["x"], points["x"]) for cloud in sent["livox"]] == [True, True]
     assert [len(to_array(cloud)) for cloud in sent["zlib"]] == [3]
-    assert (sent["draco"], texts(sent["text"]), player.counts["left_out"]) == ([], ["text"], 2)
+    assert (sent["draco"], texts(sent["text"]), player.diagnostics.counts["left_out"]) == ([], ["text"], 2)
 
 
 def test_bag_with_wrong_metadata_is_played_with_a_warning(start, text_bag, tmp_path, capfd):
@@ -343,7 +344,8 @@ def test_looped_single_message_bag_does_not_flood(monkeypatch, tmp_path):
     player, now, sent, served = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], [], []
     player.params, player.awaited, player.clock = PlayerParams(loop=True), {}, None
     player.paused, player.steps, player.stop = False, 0, Future()
-    player.served_at, player.report, player._count_pace = 0.0, lambda *_: None, lambda: None
+    player.served_at, player._count_pace = 0.0, lambda: None
+    player.diagnostics = SimpleNamespace(report=lambda *_: None)
     player.pace = SimpleNamespace(wait_for_answers=lambda *_: None)
     player._wait_until_delivered = lambda: None
     monkeypatch.setattr(bag_player, "monotonic", lambda: now[0])

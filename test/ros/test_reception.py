@@ -22,9 +22,9 @@ from lidar_perception.nodes import reception as reception_module
 from lidar_perception.nodes.arrivals import RATE_INTERVALS
 from lidar_perception.nodes.graph import STAGES
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
+from lidar_perception.nodes.interfaces import LATCHED
+from lidar_perception.nodes.interfaces import RELIABLE as RELIABLE_QOS
 from lidar_perception.nodes.reception import BEST_EFFORT, RELIABLE, WINDOW, Arrivals, Reception
-from lidar_perception.nodes.runtime import LATCHED
-from lidar_perception.nodes.runtime import RELIABLE as RELIABLE_QOS
 from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES, SOCKET_BUFFER, read_socket_buffer_size
 from lidar_perception.nodes.track_outputs import find_marker_lifetime_ns
 from lidar_perception.params import MarkerParams, ReceptionParams
@@ -240,7 +240,7 @@ OVERRIDE = f"qos_overrides./{NODE}/input/points.subscription.reliability"
     ],
 )
 def test_incompatible_publisher_is_reported_with_remedy(start, monkeypatch, values, remedy):
-    (reception,) = start(GroundSegmentation, **values)._receptions()
+    (reception,) = start(GroundSegmentation, **values).inputs.receptions
     for offered in ({RELIABLE}, {BEST_EFFORT}, {RELIABLE, BEST_EFFORT}):
         there = [
             SimpleNamespace(
@@ -259,21 +259,21 @@ def test_incompatible_publisher_is_reported_with_remedy(start, monkeypatch, valu
 
 def test_middleware_queue_holds_input_queue_clouds(start):
     for queue, depth in (1, 5), (20, 20):
-        (reception,) = start(GroundSegmentation, **{"input.queue": queue})._receptions()
+        (reception,) = start(GroundSegmentation, **{"input.queue": queue}).inputs.receptions
         assert reception.subscription.qos_profile.depth == reception.arrivals.depth == depth
 
 
 def test_unlatched_topic_error_names_the_remedy(peer, start):
     node = start(GroundSegmentation)
-    node.input("/static", TEXT, lambda _: None, LATCHED, private=False)
+    node.inputs.subscribe("/static", TEXT, lambda _: None, LATCHED, private=False)
     peer.advertise("/static", TEXT, RELIABLE_QOS)
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    peer.wait(lambda: [executor.spin_once(0.0), "transient local" in node.state[1]][1], "the remedy")
+    peer.wait(lambda: [executor.spin_once(0.0), "transient local" in node.diagnostics.state[1]][1], "the remedy")
 
 
 def test_source_of_losses_is_named_after_it_has_ended(start, monkeypatch):
-    (reception,) = start(GroundSegmentation, **{"input.max_lost": 0})._receptions()
+    (reception,) = start(GroundSegmentation, **{"input.max_lost": 0}).inputs.receptions
     driver = SimpleNamespace(
         node_namespace="/", node_name="driver", qos_profile=SimpleNamespace(reliability=BEST_EFFORT)
     )
@@ -384,7 +384,7 @@ def test_slow_sensor_is_not_reported_silent(monkeypatch, given, learned, error, 
         assert [kind for kind, _, _ in late.reception.problems()] == kinds
     for wanted, stay in ((0, 0), (2, lifetime), (9, 9)):
         node = SimpleNamespace(
-            _receptions=lambda: [late.reception],
+            inputs=SimpleNamespace(receptions=[late.reception]),
             node_params=SimpleNamespace(output=MarkerParams(marker_lifetime=wanted)),
         )
         assert find_marker_lifetime_ns(node) == stay * 10**9

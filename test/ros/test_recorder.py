@@ -11,7 +11,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 from rclpy.clock import ClockType
 
 from lidar_perception.data.bag import Bag
-from lidar_perception.nodes.runtime import LATCHED, RELIABLE, SENSOR_DATA
+from lidar_perception.nodes.interfaces import LATCHED, RELIABLE, SENSOR_DATA
 from lidar_perception.wire.codec import encode, make_bag_message
 
 TEXT, INFO = "std_msgs/msg/String", "sensor_msgs/msg/CameraInfo"
@@ -81,9 +81,9 @@ def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tm
     try:
         for _ in range(10):
             kept[-1](bytes(40))
-        assert node.counts["frames"] == 2 and node.counts["dropped"] == 8
+        assert node.diagnostics.counts["frames"] == 2 and node.diagnostics.counts["dropped"] == 8
         node._discover()
-        assert "8 dropped" in node.state[1]
+        assert "8 dropped" in node.diagnostics.state[1]
     finally:
         held.set()
         node.close()

@@ -161,7 +161,7 @@ def test_parameter_ahead_turns_the_view_of_the_detectors(start, weights, by):
     give(node, message(seen, intensity=scan.intensity))
     found, frame_id, _ = boxes_of(node)
     assert frame_id == "lidar" and len(found) == len(expected) > 5
-    assert node.counts["cropped"] == plain.counts["cropped"]
+    assert node.diagnostics.counts["cropped"] == plain.diagnostics.counts["cropped"]
     back = found.boxes.astype(np.float64)
     back[:, :3] = transform_points(back[:, :3], level)
     order, other = (np.lexsort(b[:, 1::-1].round(1).T) for b in (back, expected.boxes))
@@ -226,12 +226,11 @@ def test_body_crop_needs_a_known_frame(start):
     sensor = mount_pose(0.5, 0.0, 1.2, 0.0, 0.0, 0.0)  # the base's origin is behind it
     seen = transform_points(np.vstack([floor, [[0.3, 0.0, 0.8]], [[0.9, 0.0, 0.8]]]), invert_pose(sensor))
     give(node, message(seen))
-    assert not node.counts["cropped"] and "crop.body is not cropped" in problems(node)
+    assert not node.diagnostics.counts["cropped"] and "crop.body is not cropped" in problems(node)
     node.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
     give(node, message(seen, START + 1))
-    assert node.counts["cropped"] == 1 and "crop.body" not in problems(node)
+    assert node.diagnostics.counts["cropped"] == 1 and "crop.body" not in problems(node)
     low = start(GroundSegmentation, base_frame="base", **{"crop.body": [-0.5, -0.4, -1.0, 0.5, 0.4, -0.2]})
-    low.transforms = node.transforms.__class__(low)
     low.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
     give(low, message(seen))
     assert "crop.body ends 0.20 m below the ground of 'base'" in problems(low)
@@ -250,14 +249,14 @@ def test_unreadable_template_affects_candidates_only(start):
     node = start(Perception, **{"seed.source": "file"})
     assert node.set_parameters([Parameter("seed.file", value="/nowhere.npz")])[0].successful
     give(node, message(walker_scene()[:, :3]))
-    assert len(boxes_of(node)[0]) == 0 and "/nowhere.npz" in node.state[1]
+    assert len(boxes_of(node)[0]) == 0 and "/nowhere.npz" in node.diagnostics.state[1]
 
 
 def test_cloud_waits_for_late_or_missing_transform(start):
     """It does not wait for a transform that has stopped, nor without TF."""
     xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     node = start(Perception, target_frame="odom")
-    deliver, msg = node._receptions()[0].deliver, encode(message(xyz))
+    deliver, msg = node.inputs.receptions[0].deliver, encode(message(xyz))
     node.transforms.problem_by_source["TF"] = NO_TF
     assert deliver(msg, True) is None and boxes_of(node)[1] == "lidar"
     del node.transforms.problem_by_source["TF"]

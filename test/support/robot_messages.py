@@ -20,7 +20,7 @@ WALKING = {"seed.source": "click", "clustering.dbscan.eps": (0.5, 0.5, 0.5)}
 
 def give(node, msg):
     """The cloud as it comes from the middleware."""
-    node._receptions()[0].deliver(encode(msg), False)
+    node.inputs.receptions[0].deliver(encode(msg), False)
 
 
 def message(xyz, stamp=START, intensity=None, frame_id="lidar", **columns):
@@ -58,7 +58,7 @@ def mount_pose(x, y, height, yaw, pitch, roll):
 
 
 def problems(node):
-    return " ".join(p[2] for p in node._problems())
+    return " ".join(p[2] for p in node.diagnostics.find_problems())
 
 
 def walker(base):

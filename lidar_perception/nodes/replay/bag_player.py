@@ -17,8 +17,10 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from lidar_perception.data.bag import Bag
+from lidar_perception.nodes.diagnostics import OK, WARN
+from lidar_perception.nodes.interfaces import RELIABLE
 from lidar_perception.nodes.replay.pacing import Pace
-from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
+from lidar_perception.nodes.runtime import LidarNode
 from lidar_perception.nodes.transforms import STATIC_QOS
 from lidar_perception.params import PlayerParams
 from lidar_perception.types import InputError, InputWarning
@@ -130,7 +132,7 @@ class BagPlayer(LidarNode):
     def _make_publisher(self, topic: str) -> Any:
         kind = self.kinds[topic]
         try:
-            return self.output(
+            return self.outputs.advertise(
                 self.names[topic], kind, _qos(self.bag.qos(topic), self._count_latched(topic), lossless=self.follows)
             ).publisher
         except (ModuleNotFoundError, AttributeError):
@@ -151,7 +153,7 @@ class BagPlayer(LidarNode):
         """Play the bag; serve services and parameters between messages."""
         self.serve = executor.spin_once
         self._wait_for_subscribers()
-        self.report(OK, f"playing {self.params.bag}")
+        self.diagnostics.report(OK, f"playing {self.params.bag}")
         while not self.stop.done():
             begin = monotonic()
             self._play_once()
@@ -161,7 +163,7 @@ class BagPlayer(LidarNode):
                 self.serve(timeout_sec=left)
         self.pace.wait_for_answers(self._serve_answers, self.stop.done)
         self._count_pace()
-        self.report(OK, "stopped" if self.stop.done() else "the bag is played")
+        self.diagnostics.report(OK, "stopped" if self.stop.done() else "the bag is played")
         self._wait_until_delivered()
 
     def _wait_for_subscribers(self) -> None:
@@ -184,7 +186,7 @@ class BagPlayer(LidarNode):
             if not missing:
                 return
             if monotonic() > give_up:
-                self.report(
+                self.diagnostics.report(
                     WARN,
                     f"too few subscribers of {', '.join(missing)} (or publishers of "
                     f"topics in follow) after {self.params.wait_timeout:g} s; playing "
@@ -213,7 +215,7 @@ class BagPlayer(LidarNode):
     def _wait_until_delivered(self) -> None:
         from rclpy.duration import Duration
 
-        for publisher in (*self.publishers_by_topic.values(), self._diagnostics):
+        for publisher in (*self.publishers_by_topic.values(), self.diagnostics.publisher):
             if not self.stop.done():
                 publisher.wait_for_all_acked(Duration(seconds=2))
 
@@ -228,8 +230,8 @@ class BagPlayer(LidarNode):
             if topic == self.step_topic:
                 self._follow(played)
             self.publishers_by_topic[topic].publish(played)
-            self.counts["frames"] += topic == self.step_topic
-            self.last_stamp_ns = stamp
+            self.diagnostics.counts["frames"] += topic == self.step_topic
+            self.diagnostics.last_stamp_ns = stamp
 
     def _convert(self, topic: str, data: bytes) -> bytes | None:
         """Return the CDR of a message as played, or None for a cloud that cannot be converted.
@@ -244,7 +246,7 @@ class BagPlayer(LidarNode):
             if topic not in self.warned:
                 self.get_logger().warning(f"messages on {topic} are skipped: {error}")
             self.warned.add(topic)
-            self.counts["left_out"] = self.counts.get("left_out", 0) + 1
+            self.diagnostics.counts["left_out"] = self.diagnostics.counts.get("left_out", 0) + 1
             return None
 
     def _follow(self, cloud: bytes) -> None:
@@ -261,13 +263,13 @@ class BagPlayer(LidarNode):
 
     def _count_pace(self) -> None:
         if latencies := sorted(self.pace.latencies_ms):
-            self.counts.update(
+            self.diagnostics.counts.update(
                 latency_ms_median=f"{median(latencies):.1f}",
                 latency_ms_p95=f"{latencies[int(0.95 * (len(latencies) - 1))]:.1f}",
             )
         if self.follows:
             played = max((self.now_ns - self.start_ns) / SECOND_NS / self.params.rate, 1e-9)
-            self.counts.update(
+            self.diagnostics.counts.update(
                 unanswered=self.pace.unanswered,
                 held_s=f"{self.pace.held:.2f}",
                 slower=f"{(played + self.pace.held) / played:.2f}",

@@ -10,7 +10,8 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, BagWriter
-from lidar_perception.nodes.runtime import OK, WARN, LidarNode
+from lidar_perception.nodes.diagnostics import OK, WARN
+from lidar_perception.nodes.runtime import LidarNode
 from lidar_perception.params import RecorderParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import load_typestore
@@ -41,7 +42,7 @@ class BagRecorder(LidarNode):
         self.incompatible: set[str] = set()  # topics with a publisher of weaker QoS
         self.queue: queue.Queue = queue.Queue()
         self.queued, self.written = 0, 0  # bytes; each counter is updated by one thread only
-        self.counts.update(lost=0, dropped=0)
+        self.diagnostics.counts.update(lost=0, dropped=0)
         self.reported = 0  # number of lost and dropped messages already reported
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._write)
@@ -74,19 +75,19 @@ class BagRecorder(LidarNode):
             before = self.subscription_by_topic[topic]
             self.destroy_subscription(before)
             self._subscribe(topic, before.msg_type)
-        missing = self.counts["lost"] + self.counts["dropped"]
+        missing = self.diagnostics.counts["lost"] + self.diagnostics.counts["dropped"]
         if missing > self.reported:
             self.reported = missing
-            self.report(
+            self.diagnostics.report(
                 WARN,
-                f"{self.counts['lost']} messages were lost in transit and "
-                f"{self.counts['dropped']} dropped because the disk is too slow; record fewer topics or use a faster "
-                "disk",
+                f"{self.diagnostics.counts['lost']} messages were lost in transit and "
+                f"{self.diagnostics.counts['dropped']} dropped because the disk is too slow; "
+                "record fewer topics or use a faster disk",
             )
         elif self.waiting:
-            self.report(WARN, f"waiting for {', '.join(self.waiting)}", expected=True)
+            self.diagnostics.report(WARN, f"waiting for {', '.join(self.waiting)}", expected=True)
         else:
-            self.report(OK, "recording")
+            self.diagnostics.report(OK, "recording")
 
     @staticmethod
     def _find_class(type_name: str) -> type | None:
@@ -114,9 +115,9 @@ class BagRecorder(LidarNode):
         def enqueue(data: bytes) -> None:
             waiting = self.queued - self.written
             if waiting and waiting + len(data) > MAX_QUEUED:
-                self.counts["dropped"] += 1
+                self.diagnostics.counts["dropped"] += 1
                 return
-            self.counts["frames"] += 1
+            self.diagnostics.counts["frames"] += 1
             self.queued += len(data)
             self.queue.put(("message", topic, self.get_clock().now().nanoseconds, data))
 
@@ -127,7 +128,7 @@ class BagRecorder(LidarNode):
             qos,
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(
-                message_lost=self.count_lost, incompatible_qos=lambda _: self.incompatible.add(topic)
+                message_lost=self.diagnostics.count_lost, incompatible_qos=lambda _: self.incompatible.add(topic)
             ),
         )
 

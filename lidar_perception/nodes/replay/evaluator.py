@@ -14,8 +14,9 @@ from rclpy.qos import QoSProfile
 
 from lidar_perception.camera import Calibration
 from lidar_perception.classes import CAR, DETECTED
-from lidar_perception.nodes.reception import Problem
-from lidar_perception.nodes.runtime import ERROR, LATCHED, MARKERS, OK, SENSOR_DATA, WARN, LidarNode
+from lidar_perception.nodes.diagnostics import ERROR, OK, WARN, Problem
+from lidar_perception.nodes.interfaces import LATCHED, MARKERS, SENSOR_DATA
+from lidar_perception.nodes.runtime import LidarNode
 from lidar_perception.params import EvaluatorParams
 from lidar_perception.runs.compiling import lock_compilation
 from lidar_perception.runs.files import write_text
@@ -61,20 +62,21 @@ class Evaluator(LidarNode):
         self.done: dict[int, None] = {}  # ordered set of the stamps of scored and lost frames
         self.unwritten: str | None = None  # reason why the file is not written
         self.frame_mismatch: str | None = None  # description of the mismatch in the last frame
-        self.counts.update(incomplete=0, repeated=0)
+        self.diagnostics.counts.update(incomplete=0, repeated=0)
+        self.diagnostics.sources.append(self)
         with lock_compilation(self.get_logger().info):
             _warm_up()  # must precede the inputs, because bag_player starts once they exist
         for name in self.inputs_of_frame:
-            self.input(name, MARKERS, lambda m, n=name: self._add(n, m), LOSSLESS_QOS)
+            self.inputs.subscribe(name, MARKERS, lambda m, n=name: self._add(n, m), LOSSLESS_QOS)
         for topic, kind in (
             ("camera_info", "sensor_msgs/msg/CameraInfo"),
             ("extrinsics", "geometry_msgs/msg/TransformStamped"),
         ):
-            self.input(topic, kind, partial(setattr, self, topic), LATCHED, SENSOR_DATA)
+            self.inputs.subscribe(topic, kind, partial(setattr, self, topic), LATCHED, SENSOR_DATA)
         for topic in self.params.timing:
             *_, node, _, what = topic.split("/")  # .../NODE/debug/WHAT
             name = node if what == "processing_time_ms" else what.removesuffix("_ms")
-            self.input(
+            self.inputs.subscribe(
                 topic, "std_msgs/msg/Float64", lambda m, n=name: self._add_time(n, m.data), LOSSLESS_QOS, private=False
             )
         self.add_steady_timer(WRITE_PERIOD_S, self.write)
@@ -92,15 +94,15 @@ class Evaluator(LidarNode):
             )
         stamp = objects.stamp_ns
         if stamp in self.done:  # the bag was repeated, or the message is late
-            self.counts["repeated"] += 1
+            self.diagnostics.counts["repeated"] += 1
             return
         frame = self.waiting.setdefault(stamp, {})
         frame[name] = objects
         if len(frame) == len(self.inputs_of_frame):
             self._finish(stamp)
-            with self.frame(stamp):
+            with self.diagnostics.measure_frame(stamp):
                 self._score(frame)
-            self.report(
+            self.diagnostics.report(
                 OK,
                 "scoring"
                 if any(result.frames for result in self.results.values())
@@ -110,8 +112,8 @@ class Evaluator(LidarNode):
             oldest = next(iter(self.waiting))
             missing = [n for n in self.inputs_of_frame if n not in self.waiting[oldest]]
             self._finish(oldest)
-            self.counts["incomplete"] += 1
-            self.report(
+            self.diagnostics.counts["incomplete"] += 1
+            self.diagnostics.report(
                 WARN,
                 f"not scoring frames without a message on "
                 f"{self._topics(missing)} with the same header.stamp; stamps must be equal "
@@ -157,8 +159,8 @@ class Evaluator(LidarNode):
             result.update(
                 CandidateResult(boxes, {stage: objects.of_class(class_id) for stage, objects in stages.items()}, {})
             )
-        self.counts[f"scored{suffix}"] = result.frames
-        self.counts.update(
+        self.diagnostics.counts[f"scored{suffix}"] = result.frames
+        self.diagnostics.counts.update(
             {
                 f"F1 of {stage}{suffix}": f"{score.make_rows()['all']['f1']:.3f}"
                 for stage, score in result.scores.items()
@@ -173,9 +175,6 @@ class Evaluator(LidarNode):
 
     def _topics(self, names: Iterable[str]) -> str:
         return " and ".join(self.resolve_topic_name(f"~/input/{name}") for name in names)
-
-    def _sources(self) -> list[Any]:
-        return [*super()._sources(), self]
 
     def values(self) -> dict[str, Any]:
         """Return the values for the diagnostics."""
@@ -216,7 +215,7 @@ class Evaluator(LidarNode):
         first, *others = self.results
         return {
             **self.results[first].compute(),
-            "lost_frames": self.counts["incomplete"] + len(self.waiting),
+            "lost_frames": self.diagnostics.counts["incomplete"] + len(self.waiting),
             "classes": {name: self.results[name].compute() for name in others},
         }
 

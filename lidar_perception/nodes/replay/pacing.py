@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from time import monotonic
 from typing import Any
 
-from lidar_perception.nodes.runtime import MARKERS, RELIABLE
+from lidar_perception.nodes.interfaces import MARKERS, RELIABLE
 from msg_utils.messages import load_message_class
 
 MAX_WAITING = 1000  # maximum number of unanswered clouds and of timed answers

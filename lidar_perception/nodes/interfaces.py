@@ -1,0 +1,12 @@
+"""Message types and QoS profiles of the topics of nodes."""
+
+from __future__ import annotations
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+MARKERS = "visualization_msgs/msg/MarkerArray"
+
+SENSOR_DATA = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+RELIABLE = QoSProfile(depth=10)
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
