@@ -201,7 +201,7 @@ def test_missing_frames_are_named_and_parameters_used(start):
     for words in (
         "base_frame 'base_footprint'",
         "'lidar' is not in TF",
-        "sensor_pose is used",
+        "using ground.sensor_pose",
         "target_frame 'odom'",
         "results are in 'lidar'",
     ):
