@@ -111,9 +111,8 @@ def test_wheel_ships_the_weights_of_the_default_detector_and_v4(metadata):
     }
     assert shipped == {
         "judge.safetensors",
-        "judge_no_intensity.safetensors",
         "pointnet.safetensors",
         "pointpillars_v4_compact.safetensors",
-        "pointpillars_v4_compact_no_intensity.safetensors",
+        "pointpillars_v4_compact_nine_sensors.safetensors",
         "pointpillars_v4_full.safetensors",
     }

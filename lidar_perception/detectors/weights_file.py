@@ -10,6 +10,7 @@ from lidar_perception.types import InputError
 
 POINTPILLARS_WEIGHTS = Path(__file__).parent / "pointpillars" / "weights"  # folder with one file per version and size
 POINTNET_WEIGHTS = Path(__file__).parent / "pointnet" / "weights" / "pointnet.safetensors"
+PROPOSER = "pointpillars_v4_compact_nine_sensors.safetensors"
 JUDGE = "judge.safetensors"  # file name of the weights that classify boxes of other detectors, beside POINTNET_WEIGHTS
 
 
@@ -31,24 +32,27 @@ def find_pointpillars_weights(params: PointPillarsParams) -> Path:
     version = "v4" if params.version == "auto" else params.version
     size = "compact" if params.size == "auto" else params.size
     path = POINTPILLARS_WEIGHTS / f"pointpillars_{version}_{size}.safetensors"
-    if not path.is_file():
-        raise InputError(f"the package has no weights for {version} {size}; set pointpillars.weights to a checkpoint")
-    return path
+    return _require_shipped(path, f"{version} {size}", "pointpillars.weights")
+
+
+def find_proposer_weights() -> Path:
+    """Return the PointPillars weights of `fused`, trained on nine sensors. InputError if missing."""
+    return _require_shipped(POINTPILLARS_WEIGHTS / PROPOSER, "fused", "fused.weights")
 
 
 def find_pointnet_weights(params: PointNetParams) -> Path:
     """Return `params.weights`, by default the shipped file. InputError if it does not exist."""
     if params.weights:
         return require_weights(params.weights, "pointnet.weights")
-    return _require_shipped(POINTNET_WEIGHTS)
+    return _require_shipped(POINTNET_WEIGHTS, "PointNet", "pointnet.weights")
 
 
 def find_judge_weights() -> Path:
     """Return the weights trained to classify boxes of other detectors. InputError if missing."""
-    return _require_shipped(POINTNET_WEIGHTS.with_name(JUDGE))
+    return _require_shipped(POINTNET_WEIGHTS.with_name(JUDGE), "fused", "fused.classifier")
 
 
-def _require_shipped(path: Path) -> Path:
+def _require_shipped(path: Path, user: str, parameter: str) -> Path:
     if not path.is_file():
-        raise InputError("the package has no PointNet weights; set pointnet.weights to a checkpoint")
+        raise InputError(f"the package has no weights for {user}; set {parameter} to a checkpoint")
     return path

@@ -37,7 +37,6 @@ from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, 
 from lidar_perception.detectors.normalized_view import NormalizedView, drop_ego_vehicle, segment_view_ground
 from lidar_perception.detectors.pointnet import classifier
 from lidar_perception.detectors.trained_network import Placement
-from lidar_perception.detectors.weights_file import POINTPILLARS_WEIGHTS
 from lidar_perception.geometry import bev_iou, centre_distances, points_in_box, points_in_boxes, wrap_angle
 from lidar_perception.param_fields import with_values
 from lidar_perception.simulation.scene import Scenes
@@ -370,20 +369,19 @@ def test_parameters_can_change_between_clouds(detector):
     assert same(detector(frame()), detector(frame()))
 
 
-def test_cloud_without_intensity_goes_to_own_networks():
+def test_clouds_without_usable_intensity_have_their_own_curves():
     detector = load_fused_detector("", "cpu", EAGER)
-    blind = detector.load_blind("ahead")
-    assert blind.load_blind is None and blind.warning is None
-    assert blind.classes == detector.classes and detector.load_blind("ahead") is blind
+    dark = copy.copy(detector)
+    dark.models = detector.models_without_intensity
+    assert dark.models != detector.models
     scan = frame()
     without = replace(scan, intensity=None)
-    assert same(detector(without), blind(without))
-    assert same(detector(replace(scan, intensity=np.full_like(scan.intensity, 0.3))), blind(without))
+    any_score = detector.with_min_score(0.0), dark.with_min_score(0.0)
+    assert same(*(each(without) for each in any_score)) and not same(*(each(scan) for each in any_score))
+    assert same(detector(replace(scan, intensity=np.full_like(scan.intensity, 0.3))), detector(without))
     off = detector.with_params(with_values(detector.params, {"fused.use_intensity": False}))
-    assert same(off(scan), blind(without))
-    around = detector.with_range("around")
-    assert same(around(without), around.load_blind("around")(without))
+    assert same(off(scan), detector(without))
     low = detector.with_min_score(0.01)
     assert len(low(without).detections) >= len(detector(without).detections)
-    own = load_fused_detector(POINTPILLARS_WEIGHTS / "pointpillars_v0_compact.safetensors", "cpu", EAGER)
-    assert own.load_blind is None  # networks of the user see every cloud
+    one_set = FusedDetector(detector.proposer, detector.classifier, detector.params, detector.models)
+    assert one_set.models_without_intensity is one_set.models

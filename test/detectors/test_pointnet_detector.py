@@ -377,7 +377,7 @@ def test_evaluation_runs_either_network(saved, tmp_path):
 def test_missing_shipped_weights_are_requested(saved, tmp_path, monkeypatch):
     path, _, _ = saved
     monkeypatch.setattr(weights_file, "POINTNET_WEIGHTS", tmp_path / "own.safetensors")
-    with pytest.raises(InputError, match="the package has no PointNet weights"):
+    with pytest.raises(InputError, match="the package has no weights for PointNet"):
         load_pointnet_detector()
     named = with_values(eager(), {"pointnet.weights": str(path)})
     expected = random_detector()(frame())

@@ -34,7 +34,11 @@ from lidar_perception.detectors.fused.params import FusedParams
 from lidar_perception.detectors.open import check_weights, open_detector
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
-from lidar_perception.detectors.weights_file import find_pointnet_weights, find_pointpillars_weights
+from lidar_perception.detectors.weights_file import (
+    find_pointnet_weights,
+    find_pointpillars_weights,
+    find_proposer_weights,
+)
 from lidar_perception.param_fields import with_values
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.training.fusion_curves import MIN_SAMPLES, Samples, collect_samples, fit_classes
@@ -98,7 +102,7 @@ def test_object_counts_once_and_van_does_not_count(camera: Camera | None):
     )
     truth = GroundTruth.of(np.array([car, behind, person, van]), [CAR, CAR, PEDESTRIAN, CLASSES.index("Van")])
     scan = frame()
-    look = Proposals(found, {"network": np.arange(7.0)}, scan.xyz, scan.xyz[:0], None, {})
+    look = Proposals(found, {"network": np.arange(7.0)}, scan.xyz, scan.xyz[:0], None, {}, {})
     own = collect_samples(Frame.of("street", scan, truth, camera), look, 7)
     expected = {1.0: True, 2.0: True, 4.0: True, 5.0: False}
     if camera is not None:
@@ -116,7 +120,8 @@ def others(tmp_path):
     models = json.loads(json.dumps(load_shipped_models()))
     for model in models.values():
         model["bias"] += 1.0
-    write_fusion(tmp_path / "fused.json", (None, classifier), models, {"scans": 3})
+    dark = {name: {**model, "bias": model["bias"] - 2.0} for name, model in models.items()}
+    write_fusion(tmp_path / "fused.json", (None, classifier), models, {"scans": 3}, dark)
     return tmp_path / "fused.json", models
 
 
@@ -124,8 +129,9 @@ def test_fusion_file_round_trip_in_moved_folder(others, tmp_path, monkeypatch):
     path, models = others
     fusion = read_fusion(path)
     assert fusion.models == models and fusion.fitted_to == {"scans": 3}
+    assert fusion.models_without_intensity["Car"]["bias"] == pytest.approx(models["Car"]["bias"] - 2)
     assert fusion.curve_warning is None
-    assert fusion.proposer == find_pointpillars_weights(PointPillarsParams())
+    assert fusion.proposer == find_proposer_weights()
     moved = tmp_path.parent / f"{tmp_path.name}-moved"
     tmp_path.rename(moved)
     again = read_fusion(moved / "fused.json")
@@ -224,7 +230,7 @@ def test_train_fused_writes_usable_file(tmp_path, monkeypatch, capsys):
     ]
     assert exit_of(monkeypatch, *command) == 0
     printed = capsys.readouterr()
-    assert "2 street scans of vlp-16 at 1 m, all around" in printed.err
+    assert "2 street,campus,indoor scans of vlp-16 at 1 m, all around" in printed.err
     assert "too few samples to fit curves" in " ".join(printed.out.split())
     fusion = read_fusion(out)
     assert fusion.models == load_shipped_models() and fusion.curve_warning is None

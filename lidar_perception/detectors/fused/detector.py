@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache, partial
 from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
@@ -26,14 +24,7 @@ from lidar_perception.detectors.fused.evidence import (
     find_silhouette_confidence,
     to_log_odds,
 )
-from lidar_perception.detectors.fused.fusion import (
-    NO_INTENSITY,
-    Fusion,
-    Models,
-    find_fusion,
-    load_shipped_models,
-    read_fusion,
-)
+from lidar_perception.detectors.fused.fusion import Models, find_fusion, load_shipped_models
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.nms import keep_first, rotated_nms
 from lidar_perception.detectors.normalized_view import (
@@ -68,6 +59,7 @@ class Proposals(NamedTuple):
         surface: ground surface before flattening.
         problem: reason why little or nothing can be detected, or None.
         timings: milliseconds of each step.
+        models: curves for this cloud.
     """
 
     detections: Detections
@@ -76,6 +68,7 @@ class Proposals(NamedTuple):
     surface: GroundSurface
     problem: str | None
     timings: dict[str, float]
+    models: Models
 
 
 class FusedDetector(NetworkDetector):
@@ -88,8 +81,7 @@ class FusedDetector(NetworkDetector):
         proposer, classifier: the networks.
         models: curves that convert evidence, with raw scores of the proposer, to probabilities;
             None: the shipped ones.
-        load_blind: load_blind(range) returns the detector for clouds without usable intensity;
-            None: use this detector for them too.
+        models_without_intensity: curves for clouds without usable intensity; None: `models`.
     """
 
     group = "fused"
@@ -102,12 +94,12 @@ class FusedDetector(NetworkDetector):
         params: FusedDetectorParams = FusedDetectorParams(),
         models: Models | None = None,
         warning: str | None = None,
-        load_blind: Callable[[str], FusedDetector] | None = None,
+        models_without_intensity: Models | None = None,
     ):
         super().__init__(params, warning)
-        self.load_blind = load_blind
         self.proposer, self.classifier = proposer.with_raw_scores(), classifier
         self.models = load_shipped_models() if models is None else models
+        self.models_without_intensity = self.models if models_without_intensity is None else models_without_intensity
 
     @property
     def networks(self) -> tuple[TrainedNetwork, ...]:
@@ -129,16 +121,13 @@ class FusedDetector(NetworkDetector):
     def detect(self, frame: PointCloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None) -> DetectionResult:
         begin = perf_counter()
         wide = self._make_view(frame)
-        chosen = self
-        if self.load_blind is not None and wide.frame.intensity is None:
-            chosen = self.load_blind(self.range).with_params(self.params)
         preprocess = perf_counter() - begin
-        proposals = chosen._propose(wide, ground, cluster_ids, self.settings.scores)
+        proposals = self._propose(wide, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
-        detections, best = chosen.decide(proposals)
+        detections, best = self.decide(proposals)
         detections = restore_detections(detections, self.params.ground.sensor_pose)
         timings = {STEPS[0]: preprocess * 1e3, **proposals.timings, STEPS[-1]: (perf_counter() - begin) * 1e3}
-        return DetectionResult(detections, timings, proposals.problem or chosen.fallback, best)
+        return DetectionResult(detections, timings, proposals.problem or self.fallback, best)
 
     def _make_view(self, frame: PointCloud) -> NormalizedView:
         """Make the view of the network's range, extended by MAX_RELIEF_M upwards and downwards."""
@@ -169,6 +158,7 @@ class FusedDetector(NetworkDetector):
         """
         times = [perf_counter()]
         settings, params, config = self.settings, self.params, self.proposer.config
+        models = self.models_without_intensity if wide.frame.intensity is None else self.models
         view = wide.crop(config.low, config.high)
         is_ground = segment_view_ground(view.frame, params.ground) if ground is None else ground.take(view.indices)
         surface = fit_ground_surface(view.frame.xyz.compress(is_ground, axis=0), -SENSOR_HEIGHT)
@@ -199,7 +189,7 @@ class FusedDetector(NetworkDetector):
             "network": to_log_odds(proposed.scores),
             "silhouette": to_log_odds(find_silhouette_confidence(proposed.boxes, obstacles.xyz, floor, people)),
         }
-        limits = compute_max_probabilities(self.models, proposed.class_ids, evidence, "classifier")
+        limits = compute_max_probabilities(models, proposed.class_ids, evidence, "classifier")
         probability, boxes = self.classifier.classify(
             proposed, obstacles, floor, min_scores.passes(replace(proposed, scores=limits)), settings.cpu_fallback
         )
@@ -213,6 +203,7 @@ class FusedDetector(NetworkDetector):
             surface,
             proposal.problem,
             dict(zip(STEPS[1:], (np.diff(times) * 1e3).tolist())),
+            models,
         )
 
     def decide(self, proposals: Proposals) -> tuple[Detections, dict[str, float]]:
@@ -225,8 +216,8 @@ class FusedDetector(NetworkDetector):
         settings, class_ids = self.settings, proposals.detections.class_ids
         scored = replace(
             proposals.detections,
-            scores=compute_probabilities(self.models, class_ids, proposals.evidence),
-            sources=compute_source_probabilities(self.models, class_ids, proposals.evidence),
+            scores=compute_probabilities(proposals.models, class_ids, proposals.evidence),
+            sources=compute_source_probabilities(proposals.models, class_ids, proposals.evidence),
         )
         selected = scored[settings.scores.passes(scored)]
         if len(selected) == 0:
@@ -274,23 +265,7 @@ def load_fused_detector(
     Raises:
         InputError: see find_fusion, load_detector and load_pointnet_detector.
     """
-    fusion = find_fusion(path, params.fused)
-    detector = _load_fusion(fusion, device, params)
-    if fusion == find_fusion():
-        detector.load_blind = cache(partial(_load_blind, str(detector.device), params))
-    if params.fused.warm_up:
-        detector.warm_up()
-    return detector
-
-
-def _load_blind(device: str, params: FusedDetectorParams, range: str) -> FusedDetector:
-    """Load the shipped detector for clouds without usable intensity."""
-    blind_params = replace(params, fused=replace(params.fused, range=range))
-    return _load_fusion(read_fusion(NO_INTENSITY), device, blind_params)
-
-
-def _load_fusion(fusion: Fusion, device: str, params: FusedDetectorParams) -> FusedDetector:
-    settings = params.fused
+    settings, fusion = params.fused, find_fusion(path, params.fused)
     proposer = load_detector(
         fusion.proposer,
         device,
@@ -316,6 +291,14 @@ def _load_fusion(fusion: Fusion, device: str, params: FusedDetectorParams) -> Fu
             )
         ),
     ).classifier
-    return FusedDetector(
-        proposer, classifier, params, fusion.models, "; ".join(fusion.find_warnings(proposer.classes)) or None
+    detector = FusedDetector(
+        proposer,
+        classifier,
+        params,
+        fusion.models,
+        "; ".join(fusion.find_warnings(proposer.classes)) or None,
+        fusion.models_without_intensity,
     )
+    if settings.warm_up:
+        detector.warm_up()
+    return detector

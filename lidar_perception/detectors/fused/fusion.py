@@ -20,13 +20,12 @@ from lidar_perception.classes import DETECTED
 from lidar_perception.detectors.fused.params import FusedParams
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
-from lidar_perception.detectors.pointpillars.params import PointPillarsParams
-from lidar_perception.detectors.weights_file import find_judge_weights, find_pointpillars_weights, require_weights
+from lidar_perception.detectors.weights_file import find_judge_weights, find_proposer_weights, require_weights
 from lidar_perception.runs.files import read_text, shorten_error, write_text
 from lidar_perception.types import InputError
 
 PACKAGE = Path(__file__).with_name("fusion.json")
-NO_INTENSITY = PACKAGE.with_name("fusion_no_intensity.json")  # file for clouds without intensity
+WITHOUT_INTENSITY = "classes_without_intensity"  # key of the curves for clouds without intensity
 SUFFIX = ".json"  # suffix of fusion files
 MAX_BYTES = 10**6
 MAX_LOG_ODDS = 1000.0
@@ -51,6 +50,7 @@ class Fusion:
         digests: sha256 of the weights that `models` were fitted to.
         models: curves by class.
         fitted_to: data and numbers of proposals of the fit.
+        models_without_intensity: curves for clouds without intensity; None: `models`.
     """
 
     proposer: Path
@@ -58,6 +58,7 @@ class Fusion:
     digests: tuple[str, str]
     models: Models
     fitted_to: Mapping[str, Any]
+    models_without_intensity: Models | None = None
 
     @property
     def curve_warning(self) -> str | None:
@@ -143,8 +144,9 @@ def read_fusion(path: Path) -> Fusion:
         content = json.loads(read_text(path, MAX_BYTES))
         networks, models = [content[name] for name in NETWORKS], content["classes"]
         files, digests = ([str(part[key]) for part in networks] for key in ("file", "sha256"))
-        fitted_to = dict(content["fitted_to"])
+        fitted_to, models_without_intensity = dict(content["fitted_to"]), content.get(WITHOUT_INTENSITY)
         _check(models)
+        _check(models_without_intensity or {})
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
@@ -156,11 +158,15 @@ def read_fusion(path: Path) -> Fusion:
                 f"{path} needs {part}, which does not exist; restore the file, or run "
                 "`lidar-perception train fused` again"
             )
-    return Fusion(proposer, classifier, (digests[0], digests[1]), models, fitted_to)
+    return Fusion(proposer, classifier, (digests[0], digests[1]), models, fitted_to, models_without_intensity)
 
 
 def write_fusion(
-    path: Path, weights: tuple[Path | None, Path | None], models: Models, fitted_to: Mapping[str, Any]
+    path: Path,
+    weights: tuple[Path | None, Path | None],
+    models: Models,
+    fitted_to: Mapping[str, Any],
+    models_without_intensity: Models | None = None,
 ) -> None:
     """Write a fusion file, which refers to the weights by relative paths.
 
@@ -173,12 +179,13 @@ def write_fusion(
     parts = {}
     for name, file, default in zip(NETWORKS, weights, _shipped()):
         parts[name] = {"file": relpath(file, path.parent) if file else "", "sha256": compute_digest(file or default)}
-    write_text(path, json.dumps({**parts, "fitted_to": fitted_to, "classes": models}, indent=1))
+    more = {WITHOUT_INTENSITY: models_without_intensity} if models_without_intensity else {}
+    write_text(path, json.dumps({**parts, "fitted_to": fitted_to, "classes": models, **more}, indent=1))
 
 
 def _shipped() -> tuple[Path, Path]:
     """Return the paths of the shipped weights of both networks. InputError if they are missing."""
-    return find_pointpillars_weights(PointPillarsParams()), find_judge_weights()
+    return find_proposer_weights(), find_judge_weights()
 
 
 def _check(models: Any) -> None:
