@@ -45,7 +45,7 @@ def test_demo_scores_the_offline_result_in_one_process_and_in_many(drive_bag, ma
         (found,) = read_results(out / "result", list_result_topics(False, "fused")[FINAL])
         assert {f.stamp_ns for f in found} == frames.keys() and scores["results"] == len(frames)
         for answer in found:
-            assert_equal(answer.found, expected[answer.stamp_ns])
+            assert_equal(answer.published, expected[answer.stamp_ns])
         people = scores["detections"]["Pedestrian"]
         assert people["hits"] > 0 and people["hits"] + people["missed"] == people["labels"]
         assert scores["tracks"]["scores"]["Pedestrian"]["hits"] > 0
