@@ -112,8 +112,13 @@ def test_all_classes_are_scored_and_precision_at_the_end(with_camera, start, tmp
             370,
         )
         header = make_header(0, CAMERA_FRAME, make_bag_message)
-        node.camera_info = make_camera_info(camera, header, make_bag_message)
-        node.extrinsics = make_extrinsics(camera, make_header(0, "lidar", make_bag_message), make_bag_message)
+        node._on_camera("camera_info", make_camera_info(camera, header, make_bag_message))
+        extrinsics = make_extrinsics(camera, make_header(0, "lidar", make_bag_message), make_bag_message)
+        node._on_camera("extrinsics", extrinsics)
+        first = node._read_calibration()
+        assert node._read_calibration() is first  # it is not read for every frame
+        node._on_camera("extrinsics", extrinsics)
+        assert node._read_calibration() is not first
     frames = [  # labels and detections
         (dict(cars=[20, -20], pedestrians=[10]), dict(cars=[20, -30], pedestrians=[10, 30])),
         (dict(cars=[15], cyclists=[12]), dict(cars=[15], pedestrians=[9])),

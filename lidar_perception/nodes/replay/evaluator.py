@@ -58,6 +58,7 @@ class Evaluator(LidarNode):
         self.precision = {stage: DetectionReport() for stage in self.params.stages}
         self.camera_info: Any = None
         self.extrinsics: Any = None
+        self.calibration: Calibration | None = None  # read from both messages, until another one arrives
         self.waiting: dict[int, dict[str, MarkedObjects]] = {}
         self.done: dict[int, None] = {}  # ordered set of the stamps of scored and lost frames
         self.unwritten: str | None = None  # reason why the file is not written
@@ -72,7 +73,7 @@ class Evaluator(LidarNode):
             ("camera_info", "sensor_msgs/msg/CameraInfo"),
             ("extrinsics", "geometry_msgs/msg/TransformStamped"),
         ):
-            self.inputs.subscribe(topic, kind, partial(setattr, self, topic), LATCHED, SENSOR_DATA)
+            self.inputs.subscribe(topic, kind, partial(self._on_camera, topic), LATCHED, SENSOR_DATA)
         for topic in self.params.timing:
             *_, node, _, what = topic.split("/")  # .../NODE/debug/WHAT
             name = node if what == "processing_time_ms" else what.removesuffix("_ms")
@@ -127,7 +128,7 @@ class Evaluator(LidarNode):
             del self.done[next(iter(self.done))]
 
     def _score(self, frame: dict[str, MarkedObjects]) -> None:
-        truth, calibration = to_truth(frame[TRUTH]), self._calibration()
+        truth, calibration = to_truth(frame[TRUTH]), self._read_calibration()
         stages = {s: to_scored_labels(to_detections(frame[s])) for s in self.params.stages}
         visible_truth, visible = (
             (truth, stages)
@@ -167,11 +168,17 @@ class Evaluator(LidarNode):
             }
         )
 
-    def _calibration(self) -> Calibration | None:
+    def _on_camera(self, name: str, msg: Any) -> None:
+        setattr(self, name, msg)
+        self.calibration = None
+
+    def _read_calibration(self) -> Calibration | None:
         """Return the calibration of the camera, or None before its messages have arrived."""
         if self.camera_info is None or self.extrinsics is None:
             return None
-        return read_calibration(self.camera_info, self.extrinsics)
+        if self.calibration is None:
+            self.calibration = read_calibration(self.camera_info, self.extrinsics)
+        return self.calibration
 
     def _topics(self, names: Iterable[str]) -> str:
         return " and ".join(self.resolve_topic_name(f"~/input/{name}") for name in names)
