@@ -190,6 +190,11 @@ def generate_launch_description():
                 description="Take the time from /clock.",
             ),
             DeclareLaunchArgument("log_level", default_value="info", description="debug, info, ..."),
+            *(
+                DeclareLaunchArgument(name, **options)
+                for name, options in ARGUMENTS.items()
+                if name not in (*VALUES, "rviz", *GRAPH)
+            ),
             OpaqueFunction(function=lambda context: replay(context, given)),
         ]
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-import importlib
+import importlib.util
 import re
 from pathlib import Path
 
@@ -237,6 +237,18 @@ def test_section_of_unknown_node_is_a_warning(section, words, launched, tmp_path
 def test_unknown_launch_argument_is_refused(name, given, words, launched, drive_bag):
     with pytest.raises(InputError, match=re.escape(words)):
         launched(name)(**{given: "1"}, **({"bag": str(drive_bag)} if name == "replay" else {}))
+
+
+def test_replay_declares_the_arguments_of_its_graph(launched):
+    """`ros2 launch --show-args` lists declared arguments only."""
+    from lidar_perception.nodes.launching import ARGUMENTS
+
+    spec = importlib.util.spec_from_file_location("replay", ROOT / "launch" / "replay.launch.py")
+    file = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(file)
+    names = {getattr(entity, "name", None) for entity in file.generate_launch_description().entities}
+    assert names >= ARGUMENTS.keys() - {"namespace", "name_prefix"}
+    assert not names & {"namespace", "name_prefix"}
 
 
 @pytest.mark.parametrize("name, given", [("fused", "points"), ("fused", "launch-prefix"), ("two_lidars", "range")])

@@ -161,7 +161,7 @@ def test_nodes_of_one_process_have_their_own_parameters_and_end_at_a_signal(proc
     log = processes.read_log("graph")
     assert "Traceback" not in log
     (warned,) = [line for line in log.splitlines() if "'input.queu'" in line]
-    assert "[clustering]" in warned and "is 'input.queue' meant" in warned
+    assert "[clustering]" in warned and "did you mean 'input.queue'" in warned
 
 
 def test_bad_parameter_of_one_node_ends_the_process_with_code_2(processes):
