@@ -80,7 +80,7 @@ def assert_equal(config, points, drawn, reach=None, seed=0, share=1.0):
         expected = by_torch(network, pillars, maps)
     cells, features, logits = sparse_network(network).evaluate(pillars, maps, reach)
     assert len(cells) == len(expected[0]) or reach is not None
-    values = features.at(cells)[:, : expected[0].shape[1]]
+    values = features.values_at(cells)[:, : expected[0].shape[1]]
     for found, wanted in (values, expected[0]), (logits, expected[1]):
         np.testing.assert_allclose(found, wanted[cells], rtol=0, atol=TOLERANCE)
     return expected[0]

@@ -360,7 +360,7 @@ def test_files_with_other_content_are_refused(big, tmp_path, capsys):
     with zipfile.ZipFile(tmp_path / "damaged.pth", "w") as file:  # takes what nobody has put there
         file.writestr("x/data.pkl", b"\x80\x02R.")
         file.writestr("x/version", "3")
-    for name, words in (("x.pth", "weights only"), ("damaged.pth", "weights only"), ("none.pth", "no file")):
+    for name, words in (("x.pth", "weights only"), ("damaged.pth", "weights only"), ("none.pth", "file not found")):
         with pytest.raises(InputError, match=words):
             import_weights(tmp_path / name)
     assert capsys.readouterr().out == ""

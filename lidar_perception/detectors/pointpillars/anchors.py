@@ -1,7 +1,7 @@
 """Anchor boxes, and decoding of network outputs relative to them (SECOND, Yan et al. 2018).
 
-Every cell of the head's feature map has one anchor per class and yaw. Yaw is encoded modulo pi, and
-the half of the circle as a separate bin; targets.py has the inverse.
+Every cell of the head's feature map has one anchor per class and yaw. Yaw is encoded modulo pi;
+a separate bin tells the two directions apart. The inverse is in targets.py.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ def make_anchors(config: NetworkConfig) -> np.ndarray:
     """
     height, width = config.head_grid
     x, y = (
-        _centres(config.low[axis], config.high[axis], count, config.anchors_at)
+        _place_centres(config.low[axis], config.high[axis], count, config.anchors_at)
         for axis, count in ((0, width), (1, height))
     )
-    of_cell = [[a.z, *a.size, yaw] for a in config.anchors for yaw in config.yaws]
-    anchors = np.empty((height, width, len(of_cell), 7), np.float32)
+    cell_anchors = [[a.z, *a.size, yaw] for a in config.anchors for yaw in config.yaws]
+    anchors = np.empty((height, width, len(cell_anchors), 7), np.float32)
     anchors[..., 0] = x[None, :, None]
     anchors[..., 1] = y[:, None, None]
-    anchors[..., 2:] = of_cell
+    anchors[..., 2:] = cell_anchors
     return anchors.reshape(-1, 7)
 
 
@@ -37,8 +37,8 @@ def anchor_classes(config: NetworkConfig) -> np.ndarray:
     return np.tile(np.repeat(np.arange(len(config.anchors)), len(config.yaws)), height * width)
 
 
-def _centres(low: float, high: float, count: int, at: str) -> np.ndarray:
-    if at == "ends":
+def _place_centres(low: float, high: float, count: int, placement: str) -> np.ndarray:
+    if placement == "ends":
         return np.linspace(low, high, count, dtype=np.float32)
     return low + (np.arange(count, dtype=np.float32) + 0.5) * ((high - low) / count)
 
@@ -57,8 +57,8 @@ def decode(codes: np.ndarray, bins: np.ndarray, anchors: np.ndarray, offset: flo
     """
     with np.errstate(over="ignore", invalid="ignore"):  # broken weights are reported elsewhere
         diagonal = np.hypot(anchors[:, 3], anchors[:, 4])
-        line = codes[:, 6] + anchors[:, 6] - offset
-        yaw = line - np.floor(line / math.pi) * math.pi + offset + math.pi * bins.astype(line.dtype)
+        axis_yaw = codes[:, 6] + anchors[:, 6] - offset
+        yaw = axis_yaw - np.floor(axis_yaw / math.pi) * math.pi + offset + math.pi * bins.astype(axis_yaw.dtype)
         return np.column_stack(
             [
                 codes[:, 0] * diagonal + anchors[:, 0],

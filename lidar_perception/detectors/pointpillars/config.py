@@ -84,8 +84,10 @@ class AnchorClass:
 
 # All anchors stand on the ground.
 ANCHORS = tuple(
-    AnchorClass(name, of.anchor, of.anchor[2] / 2 - SENSOR_HEIGHT, of.matched, of.unmatched)
-    for name, of in DETECTED.items()
+    AnchorClass(
+        name, properties.anchor, properties.anchor[2] / 2 - SENSOR_HEIGHT, properties.matched, properties.unmatched
+    )
+    for name, properties in DETECTED.items()
 )
 
 

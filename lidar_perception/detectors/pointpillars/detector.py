@@ -49,8 +49,8 @@ class PointPillarsDetector(NetworkDetector):
         return self.params.pointpillars
 
     def detect(self, frame: PointCloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None) -> DetectionResult:
-        found = self.propose(frame, ground, cluster_ids)
-        return replace(found, detections=restore_detections(found.detections, self.params.ground.sensor_pose))
+        result = self.propose(frame, ground, cluster_ids)
+        return replace(result, detections=restore_detections(result.detections, self.params.ground.sensor_pose))
 
     def propose(
         self, frame: PointCloud, ground: np.ndarray | None = None, cluster_ids: np.ndarray | None = None
@@ -64,11 +64,11 @@ class PointPillarsDetector(NetworkDetector):
             view.frame, config, view.take(ground), view.take(cluster_ids), self.params.ground, self.params.clustering
         )
         t2 = perf_counter()
-        found = self.proposer.propose(view, *columns, settings.scores, settings.nms, settings.cpu_fallback)
-        timings = {**dict.fromkeys(STEPS, 0.0), **found.timings}
+        result = self.proposer.propose(view, *columns, settings.scores, settings.nms, settings.cpu_fallback)
+        timings = {**dict.fromkeys(STEPS, 0.0), **result.timings}
         timings["preprocess"] += (t1 - t0) * 1e3
         timings["experts"] = (t2 - t1) * 1e3
-        return replace(found, timings=timings)
+        return replace(result, timings=timings)
 
     def with_range(self, range: str) -> PointPillarsDetector:
         return self._with_proposer(self.proposer.with_range(range))
@@ -129,10 +129,10 @@ def load_detector(
             raise InputError(f"the sparse engine runs on the CPU, not on {target}; set device: cpu, or engine: auto")
         header, network = _load_network(path, target, params.pointpillars)
     for name in "version", "size":
-        wanted, actual = getattr(params.pointpillars, name), getattr(header.config, name)
-        if wanted not in ("auto", actual):
+        expected, actual = getattr(params.pointpillars, name), getattr(header.config, name)
+        if expected not in ("auto", actual):
             raise InputError(
-                f"{path} has the {name} {actual}, not {wanted}; change pointpillars.{name} or pointpillars.weights"
+                f"{path} has the {name} {actual}, not {expected}; change pointpillars.{name} or pointpillars.weights"
             )
     proposer = PointPillarsProposer(network, header).with_range(params.pointpillars.range)
     proposer.move(target, params.pointpillars.cpu_fallback)

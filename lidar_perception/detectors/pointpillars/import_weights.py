@@ -1,10 +1,10 @@
 """Import of PointPillars weights from OpenPCDet and mmdetection3d (1.x).
 
-Both projects store the same network under other names. The differences are converted exactly:
+Both projects store the same network under other names. These differences are converted exactly:
 
 - Points have a tenth input, the height above the middle of the range (middle_z of the config).
   mmdetection3d replaces x, y and z by x_p, y_p and z_p; the weights of both are added.
-- A pillar has its first 32 points and is padded with zeros that take part in the maximum
+- A pillar keeps its first 32 points and is padded with zeros, which take part in the maximum
   (max_points and zero_row of the config).
 - OpenPCDet spreads anchors from edge to edge, mmdetection3d places them at the centres of cells.
   The origin of the two heading bins and the height of anchors differ too. In mmdetection3d the z of
@@ -81,7 +81,7 @@ def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[Net
     """Import a .pth file of a network with KITTI's range and 0.16 m pillars.
 
     Args:
-        classes: classes in the order of training; empty: the order of the project.
+        classes: names of the classes in the order of training; empty: the classes of the project.
 
     Returns:
         Config, network (v0 full), and name of the project.
@@ -100,24 +100,24 @@ def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[Net
         )
     config = _make_config(project, _count_anchors(state, project, path), classes, path)
     network = make_network(config)
-    used, converted = {}, network.state_dict()
+    used_tensors, converted = {}, network.state_dict()
     for ours, theirs in _map_names(project, config).items():
         if theirs.endswith("num_batches_tracked") and theirs not in state:
             continue  # not in files of torch before 0.4.1
-        used[theirs] = _get_tensor(state, theirs, path)
-        converted[ours] = used[theirs]
+        used_tensors[theirs] = _get_tensor(state, theirs, path)
+        converted[ours] = used_tensors[theirs]
     linear = f"{project.points}linear.weight"
-    used[linear] = _get_tensor(state, linear, path)
-    converted["pillar_net.linear.weight"] = _convert_inputs(used[linear], project, path)
-    for name, wanted in network.state_dict().items():
-        if converted[name].shape != wanted.shape:
+    used_tensors[linear] = _get_tensor(state, linear, path)
+    converted["pillar_net.linear.weight"] = _convert_inputs(used_tensors[linear], project, path)
+    for name, value in network.state_dict().items():
+        if converted[name].shape != value.shape:
             raise InputError(
-                f"{path}: {name} has the shape {tuple(converted[name].shape)}, PointPillars needs {tuple(wanted.shape)}"
+                f"{path}: {name} has the shape {tuple(converted[name].shape)}, PointPillars needs {tuple(value.shape)}"
             )
-    left = [name for name in state if name not in used and state[name].is_floating_point()]
-    if left:
+    unused = [name for name in state if name not in used_tensors and state[name].is_floating_point()]
+    if unused:
         raise InputError(
-            f"{path} has {left[0]} and {len(left) - 1} more tensors that PointPillars "
+            f"{path} has {unused[0]} and {len(unused) - 1} more tensors that PointPillars "
             "does not have; it is another network"
         )
     network.load_state_dict(converted)
@@ -156,7 +156,7 @@ def _get_tensor(state: dict[str, Tensor], name: str, path: Path) -> Tensor:
 
 
 def _count_anchors(state: dict[str, Tensor], project: Project, path: Path) -> int:
-    """Return the number of anchors per cell, from the seven outputs of each."""
+    """Return the number of anchors per cell; each has seven outputs."""
     outputs = len(_get_tensor(state, f"{project.head[1]}.weight", path))
     if outputs % 14:
         raise InputError(
@@ -174,16 +174,16 @@ def _make_config(project: Project, per_cell: int, classes: tuple[str, ...], path
             f"{path} has {per_cell} anchors per cell, so {per_cell // 2} classes; "
             f"name them in the order of training instead of {', '.join(names)}"
         )
-    known = {anchor.name: anchor for anchor in ANCHORS}
-    if unknown := [name for name in names if name not in known]:
-        raise InputError(f"there is no anchor for {unknown[0]!r}; choose from {', '.join(known)}")
+    anchor_by_name = {anchor.name: anchor for anchor in ANCHORS}
+    if unknown := [name for name in names if name not in anchor_by_name]:
+        raise InputError(f"there is no anchor for {unknown[0]!r}; choose from {', '.join(anchor_by_name)}")
     anchors = tuple(
         AnchorClass(
             name,
-            known[name].size,
-            project.bottoms[name] + known[name].size[2] / 2,
-            known[name].matched,
-            known[name].unmatched,
+            anchor_by_name[name].size,
+            project.bottoms[name] + anchor_by_name[name].size[2] / 2,
+            anchor_by_name[name].matched,
+            anchor_by_name[name].unmatched,
         )
         for name in names
     )
@@ -202,18 +202,18 @@ def _make_config(project: Project, per_cell: int, classes: tuple[str, ...], path
 
 
 def _map_names(project: Project, config: NetworkConfig) -> dict[str, str]:
-    """Map our names of tensors to theirs, except that of the linear layer of points."""
+    """Map tensor names of this package to those of the project, except the linear layer of points."""
     names = {f"pillar_net.norm.{part}": f"{project.points}norm.{part}" for part in (*NORM_PARTS, "num_batches_tracked")}
 
-    def layer(ours: str, theirs: str, index: int) -> None:
+    def add_layer(ours: str, theirs: str, index: int) -> None:
         names[f"{ours}.0.weight"] = f"{theirs}{index}.weight"
         for part in (*NORM_PARTS, "num_batches_tracked"):
             names[f"{ours}.1.{part}"] = f"{theirs}{index + 1}.{part}"
 
     for i, layers in enumerate(config.block_layers):
         for j in range(layers + 1):  # each layer is a convolution, a norm and a ReLU
-            layer(f"blocks.{i}.{j}", project.block.format(i=i), project.first + 3 * j)
-        layer(f"neck.ups.{i}", project.neck.format(i=i), 0)
+            add_layer(f"blocks.{i}.{j}", project.block.format(i=i), project.first + 3 * j)
+        add_layer(f"neck.ups.{i}", project.neck.format(i=i), 0)
     for ours, theirs in zip(("scores", "codes", "directions"), project.head):
         for part in ("weight", "bias"):
             names[f"head.{ours}.{part}"] = f"{theirs}.{part}"
@@ -223,10 +223,10 @@ def _map_names(project: Project, config: NetworkConfig) -> dict[str, str]:
 def _convert_inputs(weight: Tensor, project: Project, path: Path) -> Tensor:
     """Convert weights (C, 10) to the inputs of this package."""
     if weight.shape[1] != COLUMNS:
-        older = " Weights of mmdetection3d 0.x have 9, and another order of box numbers." if project.centred_xyz else ""
+        hint = " Weights of mmdetection3d 0.x have 9, and another order of box numbers." if project.centred_xyz else ""
         raise InputError(
             f"{path}: the points have {weight.shape[1]} inputs; supported are "
-            f"{COLUMNS}: x y z intensity and the offsets from mean and middle.{older}"
+            f"{COLUMNS}: x y z intensity and the offsets from mean and middle.{hint}"
         )
     if project.centred_xyz:
         weight = weight.clone()

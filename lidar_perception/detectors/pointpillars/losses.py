@@ -29,11 +29,11 @@ def detection_loss(outputs: Outputs, targets: Targets, classes_of: Tensor) -> Lo
     """Compute the losses of B clouds.
 
     The focal loss of each class is divided by its number of positive anchors, then averaged over
-    the classes. The losses of boxes and directions are means over all positive anchors. Numbers of
-    anchors are at least 1 per cloud.
+    the classes. The losses of boxes and directions are means over all positive anchors. At least one
+    anchor per cloud is counted.
 
-    This gives all classes the same weight. Lang et al. divide by the positive anchors of all
-    classes, but a car has ten times as many as a pedestrian.
+    All classes therefore have the same weight. Lang et al. divide by the number of positive anchors
+    of all classes, but a car has ten times as many as a pedestrian.
 
     Args:
         classes_of: (A,) class of each anchor, see anchors.anchor_classes.
@@ -42,25 +42,28 @@ def detection_loss(outputs: Outputs, targets: Targets, classes_of: Tensor) -> Lo
     logits = outputs.logits.float()
     clouds, _, classes = logits.shape
     count = logits.new_zeros(classes).index_add_(0, classes_of, positive.sum(dim=0).to(logits))
-    share = (count.clamp(min=clouds) * classes).reciprocal()[classes_of]  # (A,)
-    wanted = functional.one_hot(targets.labels.clamp(min=0), classes).to(logits.dtype)
-    focal = focal_loss(logits, wanted * positive[..., None]).sum(dim=2)  # (B, A)
-    scores = ((focal * (targets.labels != IGNORED)).sum(dim=0) * share).sum()
-    number = count.sum().clamp(min=clouds)
+    anchor_weights = (count.clamp(min=clouds) * classes).reciprocal()[classes_of]  # (A,)
+    one_hot = functional.one_hot(targets.labels.clamp(min=0), classes).to(logits.dtype)
+    focal = focal_loss(logits, one_hot * positive[..., None]).sum(dim=2)  # (B, A)
+    scores = ((focal * (targets.labels != IGNORED)).sum(dim=0) * anchor_weights).sum()
+    positive_count = count.sum().clamp(min=clouds)
     codes, bins = targets.codes[positive], targets.bins[positive]  # (P, 7), (P,)
-    found = outputs.codes.float()[positive]
+    predicted = outputs.codes.float()[positive]
     # sin(a - b) ignores rotations by 180 degrees, which the direction loss handles
-    difference = torch.cat([found[:, :6] - codes[:, :6], torch.sin(found[:, 6:] - codes[:, 6:])], dim=1)
-    boxes = functional.smooth_l1_loss(difference, torch.zeros_like(difference), beta=SMOOTH, reduction="sum") / number
-    headings = functional.cross_entropy(outputs.directions.float()[positive], bins, reduction="sum") / number
+    difference = torch.cat([predicted[:, :6] - codes[:, :6], torch.sin(predicted[:, 6:] - codes[:, 6:])], dim=1)
+    boxes = (
+        functional.smooth_l1_loss(difference, torch.zeros_like(difference), beta=SMOOTH, reduction="sum")
+        / positive_count
+    )
+    headings = functional.cross_entropy(outputs.directions.float()[positive], bins, reduction="sum") / positive_count
     total = CLASS_WEIGHT * scores + BOX_WEIGHT * boxes + DIRECTION_WEIGHT * headings
     return Losses(total, scores, boxes, headings)
 
 
-def focal_loss(logits: Tensor, wanted: Tensor) -> Tensor:
-    """Return the elementwise focal loss; `wanted` is 0 or 1."""
-    entropy = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
+def focal_loss(logits: Tensor, targets: Tensor) -> Tensor:
+    """Return the elementwise focal loss; `targets` is 0 or 1."""
+    entropy = functional.binary_cross_entropy_with_logits(logits, targets, reduction="none")
     score = torch.sigmoid(logits)
-    miss = wanted * (1 - score) + (1 - wanted) * score
-    weight = wanted * ALPHA + (1 - wanted) * (1 - ALPHA)
+    miss = targets * (1 - score) + (1 - targets) * score
+    weight = targets * ALPHA + (1 - targets) * (1 - ALPHA)
     return weight * miss**GAMMA * entropy

@@ -78,19 +78,23 @@ class PillarNet(nn.Module):
         count = pillars.batch * height * width
         image = values.new_zeros(count, values.shape[1])  # (B * H * W, C), empty is 0
         if self.config.zero_row:
-            image = self._zero_rows(image, pillars.cells, inputs[:1])
+            image = self._add_zero_rows(image, pillars.cells, inputs[:1])
         # Values are non-negative, so the initial zeros do not affect the maximum.
         image.scatter_reduce_(0, pillars.cells[:, None].expand_as(values), values, "amax")
         return image.view(pillars.batch, height, width, -1).permute(0, 3, 1, 2)  # (B, C, H, W)
 
-    def _zero_rows(self, image: Tensor, cells: Tensor, like: Tensor) -> Tensor:
-        """Return image (B * H * W, C) with the value of an all-zero point in pillars that have
-        fewer than max_points points."""
+    def _add_zero_rows(self, image: Tensor, cells: Tensor, inputs: Tensor) -> Tensor:
+        """Add the output for an all-zero point to pillars with fewer than max_points points.
+
+        Args:
+            image: (B * H * W, C) zeros.
+            inputs: (1, inputs of the layer), a template for shape and dtype.
+        """
         ones = torch.ones_like(cells, dtype=image.dtype)
         sizes = image.new_zeros(len(image)).scatter_add(0, cells, ones)
-        partly = ((sizes > 0) & (sizes < self.config.max_points))[:, None]
-        zero = functional.relu(self.norm(self.linear(torch.zeros_like(like))))
-        return image + partly * zero
+        is_padded = ((sizes > 0) & (sizes < self.config.max_points))[:, None]
+        zero = functional.relu(self.norm(self.linear(torch.zeros_like(inputs))))
+        return image + is_padded * zero
 
 
 class MapNet(nn.Sequential):
@@ -133,11 +137,11 @@ class FpnNeck(nn.Module):
 
     def forward(self, maps: list[Tensor]) -> Tensor:  # finest first: H/2, H/4, H/8
         levels = [lateral(x) for lateral, x in zip(self.laterals, maps)]  # (B, 2C, ...) each
-        joined = levels.pop()
+        fused = levels.pop()
         for scale, level in zip(reversed(self.scales), reversed(levels)):
-            joined = functional.interpolate(joined, scale_factor=float(scale), mode="bilinear")
-            joined = joined + level if self.fusion == "add" else torch.cat([joined, level], dim=1)
-        return self.out(joined)  # (B, 2C, H/2, W/2)
+            fused = functional.interpolate(fused, scale_factor=float(scale), mode="bilinear")
+            fused = fused + level if self.fusion == "add" else torch.cat([fused, level], dim=1)
+        return self.out(fused)  # (B, 2C, H/2, W/2)
 
 
 class Head(nn.Module):
@@ -152,21 +156,21 @@ class Head(nn.Module):
         self.scores = nn.Conv2d(channels, per_cell * classes, 1)
         self.codes = nn.Conv2d(channels, per_cell * CODE, 1)
         self.directions = nn.Conv2d(channels, per_cell * BINS, 1)
-        nn.init.constant_(_bias(self.scores), -math.log((1 - PRIOR) / PRIOR))
+        nn.init.constant_(_get_bias(self.scores), -math.log((1 - PRIOR) / PRIOR))
         for layer, std in ((self.scores, 0.01), (self.codes, 0.001)):
             if not layer.weight.is_meta:  # on meta, normal_ would import torch's compiler (2 s)
                 nn.init.normal_(layer.weight, std=std)
 
     def forward(self, features: Tensor) -> Outputs:
         return Outputs(
-            _by_anchor(self.scores(features), self.classes),
-            _by_anchor(self.codes(features), CODE),
-            _by_anchor(self.directions(features), BINS),
+            _reshape_by_anchor(self.scores(features), self.classes),
+            _reshape_by_anchor(self.codes(features), CODE),
+            _reshape_by_anchor(self.directions(features), BINS),
         )
 
     def logits(self, features: Tensor) -> Tensor:
         """Return the logits (B, A, K) of forward."""
-        return _by_anchor(self.scores(features), self.classes)
+        return _reshape_by_anchor(self.scores(features), self.classes)
 
     def boxes_at(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
         """Return codes (M, 7) and directions (M, 2) at anchors (M,) of a single cloud."""
@@ -175,18 +179,18 @@ class Head(nn.Module):
 
         def apply(conv: nn.Conv2d, width: int) -> Tensor:
             weight = conv.weight.view(self.per_cell, width, -1)[numbers]  # (M, width, C)
-            bias = _bias(conv).view(self.per_cell, width)[numbers]
+            bias = _get_bias(conv).view(self.per_cell, width)[numbers]
             return torch.baddbmm(bias[:, :, None], weight, rows[:, :, None])[:, :, 0]
 
         return apply(self.codes, CODE), apply(self.directions, BINS)
 
 
-def _bias(conv: nn.Conv2d) -> Tensor:
+def _get_bias(conv: nn.Conv2d) -> Tensor:
     assert conv.bias is not None  # all convolutions of the head have a bias
     return conv.bias
 
 
-def _by_anchor(x: Tensor, width: int) -> Tensor:
+def _reshape_by_anchor(x: Tensor, width: int) -> Tensor:
     """Reshape (B, P * width, H, W), with P anchors per cell, to (B, H * W * P, width)."""
     return x.permute(0, 2, 3, 1).reshape(len(x), -1, width)
 
@@ -207,8 +211,11 @@ class PointPillars(nn.Module):
         self.blocks, self.neck, self.head = nn.ModuleList(blocks), neck, head
 
     def features(self, pillars: Pillars[Tensor], maps: Tensor | None = None) -> Tensor:
-        """Return the input of the head, (B, neck.channels, H/2, W/2); maps (B, 3, H, W) uint8 are
-        for V4."""
+        """Return the input of the head, (B, neck.channels, H/2, W/2).
+
+        Args:
+            maps: (B, 3, H, W) uint8, required for V4 only.
+        """
         x = self.pillar_net(pillars)  # (B, C, H, W)
         if self.map_net is not None:
             x = torch.cat([x, self.map_net(maps)], dim=1)  # (B, C + C', H, W)

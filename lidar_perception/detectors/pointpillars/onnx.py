@@ -40,8 +40,8 @@ class OneCloud(nn.Module):
         return tuple(self.network(Pillars(points, offsets, cells, 1, self.grid), cluster_map))
 
 
-def _inputs(config: NetworkConfig) -> dict[str, tuple[str, tuple[int, ...]]]:
-    """Return type and shape of each input, for COUNT points."""
+def _describe_inputs(config: NetworkConfig) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Return the type and shape of each input for COUNT points."""
     inputs: dict[str, tuple[str, tuple[int, ...]]] = {
         "points": ("float", (COUNT, config.point_columns)),
         "offsets": ("float", (COUNT, config.offset_columns)),
@@ -63,7 +63,9 @@ def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None
         InputError: the packages of the extra [onnx] are not installed.
     """
     config = header.config
-    inputs = {name: torch.zeros(shape, dtype=getattr(torch, kind)) for name, (kind, shape) in _inputs(config).items()}
+    inputs = {
+        name: torch.zeros(shape, dtype=getattr(torch, kind)) for name, (kind, shape) in _describe_inputs(config).items()
+    }
     inputs["cells"] += torch.arange(COUNT)
     dynamic = {
         name: None if name == "cluster_map" else {0: torch.export.Dim("points_in_range", min=1)} for name in inputs
@@ -91,9 +93,11 @@ class OnnxNetwork:
         """
         session, text = open_session(path)
         header = Header.from_json(text, str(path), NetworkConfig)
-        wanted = {name: (f"tensor({kind})", len(shape)) for name, (kind, shape) in _inputs(header.config).items()}
-        found = {i.name: (i.type, len(i.shape)) for i in session.get_inputs()}
-        if found != wanted or not {*OUTPUTS} <= {o.name for o in session.get_outputs()}:
+        expected = {
+            name: (f"tensor({kind})", len(shape)) for name, (kind, shape) in _describe_inputs(header.config).items()
+        }
+        actual = {i.name: (i.type, len(i.shape)) for i in session.get_inputs()}
+        if actual != expected or not {*OUTPUTS} <= {o.name for o in session.get_outputs()}:
             raise InputError(f"{path} has inputs or outputs that do not match its header; export it again")
         return header, OnnxNetwork(session, str(path), header.config)
 
@@ -101,12 +105,12 @@ class OnnxNetwork:
         """Do nothing: the network stays on the CPU."""
 
     def __call__(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None) -> Prediction:
-        given = dict(points=pillars.points, offsets=pillars.offsets, cells=pillars.cells, cluster_map=maps)
+        arrays = dict(points=pillars.points, offsets=pillars.offsets, cells=pillars.cells, cluster_map=maps)
         logits, codes, directions = run_session(
             self.session,
             self.source,
             OUTPUTS,
-            {name: value for name, value in given.items() if name in self.inputs and value is not None},
+            {name: value for name, value in arrays.items() if name in self.inputs and value is not None},
         )
         if [x.shape for x in (logits, codes, directions)] != self.shapes:
             raise InputError(

@@ -30,8 +30,13 @@ def make_pillar_batch(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillar
     row = ((points[:, 1] - low[1]) / config.cell).long().clamp_(max=height - 1)
     cells = (sample * height + row) * width + column
     if config.max_points:
-        kept = keep_first_per_cell(cells, config.max_points)
-        points, cells, column, row = points[kept], cells[kept], column[kept], row[kept]
+        first_indices = keep_first_per_cell(cells, config.max_points)
+        points, cells, column, row = (
+            points[first_indices],
+            cells[first_indices],
+            column[first_indices],
+            row[first_indices],
+        )
     middle = torch.stack(
         [
             points[:, 0] - ((column + 0.5) * config.cell + low[0]),
@@ -41,8 +46,8 @@ def make_pillar_batch(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillar
         dim=1,
     )
     # The means are over offsets, whose sums stay small, so the order of the points hardly matters.
-    counted = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)
-    sums = counted.new_zeros(len(clouds) * height * width, 4).index_add_(0, cells, counted)[cells]
+    offsets_and_ones = torch.cat([middle, torch.ones_like(middle[:, :1])], dim=1)
+    sums = offsets_and_ones.new_zeros(len(clouds) * height * width, 4).index_add_(0, cells, offsets_and_ones)[cells]
     offsets = torch.cat([middle - sums[:, :3] / sums[:, 3:], middle[:, : config.offset_columns - 3]], dim=1)
     return Pillars(points, offsets, cells, len(clouds), config.grid)
 

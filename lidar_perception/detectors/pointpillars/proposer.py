@@ -112,43 +112,43 @@ class PointPillarsProposer(TrainedNetwork):
 
         def work() -> tuple[list[float], DetectionResult]:
             times, predictions = self._predict(inputs)
-            found = self._decode(predictions, self.to_raw_scores(scores.get_all(self.classes)), nms)
-            return [begin, *times, self.now()], found
+            result = self._decode(predictions, self.to_raw_scores(scores.get_all(self.classes)), nms)
+            return [begin, *times, self.now()], result
 
-        times, found = self.run(work, cpu_fallback)
+        times, result = self.run(work, cpu_fallback)
         steps = dict(zip(TIMED_STEPS, (np.diff(times) * 1e3).tolist()))
-        return replace(found, timings=steps, problem=found.problem or problem or self.placement.fallback)
+        return replace(result, timings=steps, problem=result.problem or problem or self.placement.fallback)
 
     def _make_inputs(
         self, view: NormalizedView, ground: np.ndarray | None, cluster_ids: np.ndarray | None
     ) -> dict[bool, NetworkInput]:
-        """Return the inputs of all passes that have points; the key is True for the rotated pass."""
+        """Return the input of each pass that has points; the key is True for the rotated pass."""
         if len(self.half_turns) == 1:
             inputs = {False: make_network_input(view.frame, self.config, ground, cluster_ids)}
         else:
             frame, inputs = view.frame, {}
             if self.config.remove_ground and ground is not None:  # the network reads obstacles only
-                kept = np.flatnonzero(~ground)
-                frame, ground = frame.take(kept), ground[kept]
-                cluster_ids = None if cluster_ids is None else cluster_ids.take(kept)
+                obstacles = np.flatnonzero(~ground)
+                frame, ground = frame.take(obstacles), ground[obstacles]
+                cluster_ids = None if cluster_ids is None else cluster_ids.take(obstacles)
             for half_turn in self.half_turns:
                 indices, part = crop_to_range(
                     rotate_half_turn(frame) if half_turn else frame, self.pass_config.low, self.pass_config.high
                 )
-                own_ground, own_ids = (
+                part_ground, part_ids = (
                     column if column is None else column.take(indices) for column in (ground, cluster_ids)
                 )
-                inputs[half_turn] = make_network_input(part, self.pass_config, own_ground, own_ids)
-        return {half_turn: given for half_turn, given in inputs.items() if len(given.points)}
+                inputs[half_turn] = make_network_input(part, self.pass_config, part_ground, part_ids)
+        return {half_turn: network_input for half_turn, network_input in inputs.items() if len(network_input.points)}
 
     def _predict(self, inputs: dict[bool, NetworkInput]) -> tuple[list[float], dict[bool, Prediction]]:
-        """Return the start and end times of the network, and its outputs."""
+        """Run the network; return its start and end times and the prediction of each pass."""
         arguments = []
-        for given in inputs.values():
-            maps = None if given.cluster_map is None else given.cluster_map[None]
-            arguments.append((make_pillars(given.points, self.pass_config), maps))
+        for network_input in inputs.values():
+            maps = None if network_input.cluster_map is None else network_input.cluster_map[None]
+            arguments.append((make_pillars(network_input.points, self.pass_config), maps))
         begin = self.now()
-        predictions = [self.network(*each) for each in arguments]
+        predictions = [self.network(*pass_arguments) for pass_arguments in arguments]
         return [begin, self.now()], dict(zip(inputs, predictions))
 
     def _decode(self, predictions: dict[bool, Prediction], min_scores: list[float], nms: NmsParams) -> DetectionResult:
@@ -186,11 +186,11 @@ class PointPillarsProposer(TrainedNetwork):
         if prediction.anchors is not None:
             chosen = prediction.anchors[chosen]
         boxes = decode(codes, directions.argmax(axis=1), self.anchors[chosen], self.config.direction_offset)
-        found = Boxes(boxes, best, labels)
+        selected = Boxes(boxes, best, labels)
         if len(self.half_turns) > 1:
-            own = boxes[:, 0] >= -SHARED_M
-            found = Boxes(*(column[own] for column in found))
-        return found._replace(boxes=rotate_boxes_half_turn(found.boxes)) if half_turn else found
+            is_in_half = boxes[:, 0] >= -SHARED_M
+            selected = Boxes(*(column[is_in_half] for column in selected))
+        return selected._replace(boxes=rotate_boxes_half_turn(selected.boxes)) if half_turn else selected
 
     def _find_problem(self, view: NormalizedView, inputs: dict[bool, NetworkInput]) -> str | None:
         """Return the reason why little or nothing can be detected, with the remedy, or None."""
@@ -204,9 +204,9 @@ class PointPillarsProposer(TrainedNetwork):
                 f"{SENSOR_HEIGHT} m high; is x forward, and ground.sensor_pose right?"
             )
         intensity = view.frame.intensity
-        if intensity is not None and (lost := len(view) - np.count_nonzero(np.isfinite(intensity))):
+        if intensity is not None and (invalid_count := len(view) - np.count_nonzero(np.isfinite(intensity))):
             return (
-                f"{lost} of {len(view)} points are ignored because their intensity is NaN; use "
+                f"{invalid_count} of {len(view)} points are ignored because their intensity is NaN; use "
                 "0 for unknown intensities"
             )
         if not inputs:

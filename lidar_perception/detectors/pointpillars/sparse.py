@@ -3,9 +3,9 @@
 Without ground about 2 % of the pillars contain points. A layer whose receptive field contains
 neither points nor cells of the cluster map has the same value as for an empty cloud: one row of
 numbers, and a few more near the border of the grid. These rows are computed once. For each cloud,
-the layers compute only the other cells, and only those that the head needs: it is evaluated up to
-REACH cells from a point, because nothing is detected farther away. The result equals that of torch
-up to rounding.
+the layers compute only the other cells, and only those that the head needs. The head is evaluated
+up to REACH cells from a point, because nothing is detected farther away. The result equals that of
+torch up to rounding.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Map(NamedTuple):
     numbers: np.ndarray
     rows: np.ndarray
 
-    def at(self, cells: np.ndarray) -> np.ndarray:
-        """Return the values (M, C) of cells (M,), numbered row by row."""
+    def values_at(self, cells: np.ndarray) -> np.ndarray:
+        """Return the values (M, C) of the cells with flat indices (M,)."""
         width = self.numbers.shape[1] - 2
         return self.rows[self.numbers[1 + cells // width, 1 + cells % width]]
 
@@ -63,7 +63,7 @@ class SparseNetwork:
     """A network on the CPU, which can be called from several threads.
 
     Args:
-        config: a config for which find_unsupported_part returns None.
+        config: config for which find_unsupported_part returns None.
         tensors: state_dict of network.make_network(config), by name.
 
     Raises:
@@ -105,7 +105,7 @@ class SparseNetwork:
         anchors = (cells[:, None] * per_cell + np.arange(per_cell)).ravel()
 
         def boxes_at(chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            rows = features.at(cells[chosen // per_cell])[:, : self.config.fpn_channels]
+            rows = features.values_at(cells[chosen // per_cell])[:, : self.config.fpn_channels]
             numbers = chosen % per_cell
             return (
                 _evaluate_at(self.codes, per_cell, numbers, rows),
@@ -117,25 +117,26 @@ class SparseNetwork:
     def evaluate(
         self, pillars: Pillars[np.ndarray], maps: np.ndarray | None, reach: int | None
     ) -> tuple[np.ndarray, Map, np.ndarray]:
-        """Compute the network up to `reach` cells of the head from a point; None: everywhere.
+        """Evaluate the network at the cells of the head that are near a point.
 
         Args:
-            pillars: Of one cloud, which may be empty.
-            maps: As in prediction.Network.
+            pillars: Pillars of one cloud, which may be empty.
+            maps: Cluster map, see prediction.Network.
+            reach: Maximum distance from a point, in cells of the head; None: all cells.
 
         Returns:
-            Cells (M,) int64 of the head's grid, row by row; the map that the head reads; and
+            Flat indices (M,) int64 of the evaluated cells, the map that the head reads, and
             logits (M, anchors per cell * K) float32.
         """
         inputs = [self._make_pillar_map(pillars)]
         if self.has_map:
             assert maps is not None
             inputs.append(_make_cluster_map(maps[0]))
-        empty = self._make_empty_maps(pillars.grid)
-        chosen = self._choose_cells([of.numbers[1:-1, 1:-1] > 0 for of in inputs], reach)
-        *_, features, scores = self._run(inputs, chosen, empty)
-        logits = scores.rows[len(empty[-1].rows) :, : self.config.anchors_per_cell * len(self.config.classes)]
-        return np.flatnonzero(chosen[-1]), features, np.ascontiguousarray(logits)
+        empty_maps = self._make_empty_maps(pillars.grid)
+        cell_masks = self._choose_cells([source.numbers[1:-1, 1:-1] > 0 for source in inputs], reach)
+        *_, features, scores = self._run(inputs, cell_masks, empty_maps)
+        logits = scores.rows[len(empty_maps[-1].rows) :, : self.config.anchors_per_cell * len(self.config.classes)]
+        return np.flatnonzero(cell_masks[-1]), features, np.ascontiguousarray(logits)
 
     def _make_pillar_map(self, pillars: Pillars[np.ndarray]) -> Map:
         points, offsets, cells = pillars[:3]
@@ -147,7 +148,7 @@ class SparseNetwork:
         return Map(index, rows)
 
     def _choose_cells(self, occupied: list[np.ndarray], reach: int | None) -> list[np.ndarray]:
-        """Return the cells (H, W) bool that each layer has to compute."""
+        """Return a mask (H, W) bool of the cells to compute for each layer."""
         masks = list(occupied)
         for layer in self.layers:
             masks.append(layer.find_reached(masks))
@@ -158,19 +159,18 @@ class SparseNetwork:
             masks[-1] = dilate(shrink(occupied[0], scale), reach)
         # The layers before the blocks have few cells; selecting among them would cost more than
         # computing all.
-        needed = [None if i < self.first_block else np.zeros_like(mask) for i, mask in enumerate(masks)]
-        needed[-1] = masks[-1]
-        for i, mask in reversed([*enumerate(needed)]):
+        required = [None if i < self.first_block else np.zeros_like(mask) for i, mask in enumerate(masks)]
+        required[-1] = masks[-1]
+        for i, mask in reversed([*enumerate(required)]):
             if mask is not None:
-                self.layers[i - len(occupied)].require(mask, needed)
+                self.layers[i - len(occupied)].require(mask, required)
                 masks[i] &= mask
         return masks[len(occupied) :]
 
-    def _run(self, inputs: list[Map], chosen: Sequence[np.ndarray], empty: Sequence[Map]) -> list[Map]:
-        """Return the maps of all layers: new rows in the cells chosen, elsewhere those of an empty
-        cloud."""
+    def _run(self, inputs: list[Map], cell_masks: Sequence[np.ndarray], empty_maps: Sequence[Map]) -> list[Map]:
+        """Return the maps of all layers, with the rows of an empty cloud outside the masks."""
         maps = list(inputs)
-        for layer, mask, background in zip(self.layers, chosen, empty):
+        for layer, mask, background in zip(self.layers, cell_masks, empty_maps):
             maps.append(_compute_map(layer, maps, mask, background))
         return maps[len(inputs) :]
 
@@ -189,12 +189,12 @@ class SparseNetwork:
             coarsest = grid[0] // min(height for height, _ in grids)
             size = max((2 * margin + 1) * (grid[0] // height) for margin, (height, _) in zip(margins, grids))
             size = -(-size // coarsest) * coarsest
-            small = min(size, grid[0]), min(size, grid[1])
-            small_grids = [small] * count
+            small_grid = min(size, grid[0]), min(size, grid[1])
+            small_grids = [small_grid] * count
             for layer in self.layers:
                 small_grids.append(layer.grid(small_grids))
             inputs = [
-                Map(_make_blank_index(small), np.zeros((1, width), np.float32))
+                Map(_make_blank_index(small_grid), np.zeros((1, width), np.float32))
                 for width in (self.pillar_columns, pad_channels(3))[:count]
             ]
             maps = self._run(
@@ -205,13 +205,17 @@ class SparseNetwork:
                     for g, layer in zip(small_grids[count:], self.layers)
                 ],
             )
-            self._empty[grid] = [_enlarge_map(*each) for each in zip(maps, margins[count:], grids[count:])]
+            self._empty[grid] = [_enlarge_map(*arguments) for arguments in zip(maps, margins[count:], grids[count:])]
         return self._empty[grid]
 
 
 def _evaluate_at(layer: Weights, per_cell: int, numbers: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the outputs (N, C / per_cell) of a layer of the head at anchors number (N,) of their
-    cells, from the features (N, B) of these cells."""
+    """Evaluate a layer of the head at N anchors; return (N, C / per_cell).
+
+    Args:
+        numbers: (N,) index of each anchor within its cell.
+        rows: (N, B) features of the cells.
+    """
     weight = layer.weight.reshape(per_cell, -1, rows.shape[1])[numbers]
     assert layer.bias is not None
     return (weight @ rows[:, :, None])[:, :, 0] + layer.bias.reshape(per_cell, -1)[numbers]
@@ -231,13 +235,13 @@ def _make_cluster_map(maps: np.ndarray) -> Map:
     return Map(index, rows)
 
 
-def _compute_map(layer: Layer, maps: list[Map], chosen: np.ndarray, background: Map) -> Map:
-    """Return the map of a layer, computed in the cells `chosen` (H, W) bool."""
+def _compute_map(layer: Layer, maps: list[Map], mask: np.ndarray, background: Map) -> Map:
+    """Return the map of a layer, computed in the cells of `mask` (H, W) bool."""
     first = len(background.rows)
-    cells, index = kernels.number_cells(chosen, background.numbers, first)
+    cells, index = kernels.number_cells(mask, background.numbers, first)
     rows = np.empty((first + len(cells), len(layer.bias)), np.float32)
     rows[:first] = background.rows
-    sums, width = rows[first:], chosen.shape[1]
+    sums, width = rows[first:], mask.shape[1]
 
     def compute(begin: int, end: int) -> None:
         bias = layer.bias
@@ -256,20 +260,26 @@ def _compute_map(layer: Layer, maps: list[Map], chosen: np.ndarray, background: 
     return Map(index, rows)
 
 
-def _enlarge_map(of: Map, margin: int, grid: Grid) -> Map:
-    """Return the map of an empty cloud on a grid, made from that on a smaller grid."""
-    kept, places = zip(*(_find_axis_places(size, small - 2, margin) for size, small in zip(grid, of.numbers.shape)))
-    rows = of.rows[of.numbers[1:-1, 1:-1][np.ix_(*kept)]].reshape(-1, of.rows.shape[1])
+def _enlarge_map(small_map: Map, margin: int, grid: Grid) -> Map:
+    """Enlarge the map of an empty cloud from a small grid to a larger one."""
+    source_cells, positions = zip(
+        *(_map_axis_cells(size, small - 2, margin) for size, small in zip(grid, small_map.numbers.shape))
+    )
+    rows = small_map.rows[small_map.numbers[1:-1, 1:-1][np.ix_(*source_cells)]].reshape(-1, small_map.rows.shape[1])
     index = _make_blank_index(grid)
-    index[1:-1, 1:-1] = 1 + places[0][:, None] * len(kept[1]) + places[1]
+    index[1:-1, 1:-1] = 1 + positions[0][:, None] * len(source_cells[1]) + positions[1]
     return Map(index, np.concatenate([np.zeros_like(rows[:1]), rows]))
 
 
-def _find_axis_places(size: int, small: int, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for one axis, which of `small` cells to keep, and which of these has the value of
-    each of `size` cells."""
+def _map_axis_cells(size: int, small: int, margin: int) -> tuple[np.ndarray, np.ndarray]:
+    """Map the cells of one axis of a large grid to those of a small grid.
+
+    Returns:
+        Indices (K,) of the cells of the small grid to copy, and the position (size,) in these
+        indices for each cell of the large grid.
+    """
     if small <= 2 * margin:
         return np.arange(size), np.arange(size)
-    kept = np.r_[: margin + 1, small - margin : small]
+    source_cells = np.r_[: margin + 1, small - margin : small]
     cell = np.arange(size)
-    return kept, np.where(cell < size - margin, np.minimum(cell, margin), cell - size + len(kept))
+    return source_cells, np.where(cell < size - margin, np.minimum(cell, margin), cell - size + len(source_cells))

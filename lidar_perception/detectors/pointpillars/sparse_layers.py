@@ -52,32 +52,37 @@ class Layer:
 
     def find_reached(self, occupied: Sequence[np.ndarray]) -> np.ndarray:
         """Return (H, W) bool, True where the output depends on an occupied cell of earlier maps."""
-        read = np.logical_or.reduce([occupied[source] for source in self.sources])
-        mask = dilate(read, self.window)[:: self.stride, :: self.stride]
+        occupied_inputs = np.logical_or.reduce([occupied[source] for source in self.sources])
+        mask = dilate(occupied_inputs, self.window)[:: self.stride, :: self.stride]
         if self.coarse is None:
             return mask
         return mask | dilate(enlarge(occupied[self.coarse], self.scale), (self.scale + 1) // 2)
 
-    def require(self, needed: np.ndarray, masks: Sequence[np.ndarray | None]) -> None:
-        """Mark, in the masks of earlier maps, the input cells of the output cells `needed` (H, W).
+    def require(self, output_cells: np.ndarray, masks: Sequence[np.ndarray | None]) -> None:
+        """Mark the cells of earlier maps that are needed to compute `output_cells`.
 
-        A mask is None if its map is computed completely.
+        Args:
+            output_cells: (H, W) bool.
+            masks: mask of each map, changed in place; None if the map is computed completely.
         """
         for source in self.sources:
             if (mask := masks[source]) is not None:
-                read = np.zeros_like(mask)
-                read[:: self.stride, :: self.stride] = needed
-                mask |= dilate(read, self.window)
+                input_cells = np.zeros_like(mask)
+                input_cells[:: self.stride, :: self.stride] = output_cells
+                mask |= dilate(input_cells, self.window)
         if self.coarse is not None and (mask := masks[self.coarse]) is not None:
-            mask |= dilate(shrink(needed, self.scale), 1)
+            mask |= dilate(shrink(output_cells, self.scale), 1)
 
     def margin(self, margins: Sequence[int]) -> int:
-        """Return the width in cells of the border where the output for an empty cloud may differ from
-        the interior, given the margins of earlier maps."""
-        own = max(-(-margins[source] // self.stride) for source in self.sources) + self.window
+        """Return the width, in cells, of the border where the output for an empty cloud differs.
+
+        Args:
+            margins: the same width of each earlier map.
+        """
+        width = max(-(-margins[source] // self.stride) for source in self.sources) + self.window
         if self.coarse is None:
-            return own
-        return max(own, (margins[self.coarse] + 1) * self.scale)
+            return width
+        return max(width, (margins[self.coarse] + 1) * self.scale)
 
 
 def dilate(mask: np.ndarray, cells: int) -> np.ndarray:
@@ -93,12 +98,12 @@ def dilate(mask: np.ndarray, cells: int) -> np.ndarray:
 
 
 def enlarge(mask: np.ndarray, scale: int) -> np.ndarray:
-    """Return mask (H, W) with each cell repeated as scale x scale cells."""
+    """Upsample a mask (H, W) by `scale`, repeating each cell."""
     return mask.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
 def shrink(mask: np.ndarray, scale: int) -> np.ndarray:
-    """Return the mask (H, W) reduced by `scale`: True if any of scale x scale cells is."""
+    """Downsample a mask (H, W) by `scale`; a cell is True if any of its scale x scale cells is."""
     rows = np.logical_or.reduce([mask[i::scale] for i in range(scale)])
     return np.logical_or.reduce([rows[:, i::scale] for i in range(scale)])
 
@@ -107,8 +112,8 @@ def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
     """Return the layers of a network with an additive FPN neck.
 
     The last layer computes the scores of the head, the one before it the input of the head. Map 0
-    contains the pillars, map 1 the clusters if the network has that branch; then follows one map
-    per layer.
+    contains the pillars and map 1 the clusters, if the network has that branch. One map per layer
+    follows.
     """
     layers: list[Layer] = []
     widths = [config.pillar_channels, 3][: 2 if config.pseudo_map else 1]  # widths of the maps
@@ -119,14 +124,14 @@ def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
         out: int,
         kernel: int = 3,
         stride: int = 1,
-        normed: bool = True,
+        has_norm: bool = True,
         coarse: int | None = None,
         scale: int = 1,
     ) -> int:
-        read = [widths[source] for source in sources]
-        layer, norm = (f"{name}.0", f"{name}.1") if normed else (name, None)
-        weight, bias = tensors.take(layer, (out, sum(read), kernel, kernel), norm)
-        parts = np.split(weight.reshape(out, sum(read), -1), np.cumsum(read)[:-1], axis=1)
+        input_widths = [widths[source] for source in sources]
+        layer, norm = (f"{name}.0", f"{name}.1") if has_norm else (name, None)
+        weight, bias = tensors.take(layer, (out, sum(input_widths), kernel, kernel), norm)
+        parts = np.split(weight.reshape(out, sum(input_widths), -1), np.cumsum(input_widths)[:-1], axis=1)
         weights = tuple(map(pack_weights, parts))
         layers.append(
             Layer(
@@ -134,7 +139,7 @@ def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
                 weights,
                 pad_bias(bias, len(weights[0]) * BLOCK),
                 stride,
-                0.0 if normed else -math.inf,
+                0.0 if has_norm else -math.inf,
                 coarse,
                 scale,
             )
@@ -149,17 +154,19 @@ def make_layers(config: NetworkConfig, tensors: LayerWeights) -> list[Layer]:
             last = add(f"map_net.{i}", [last], out)
         sources = [0, last]
     levels = []
-    for i, (out, more, stride) in enumerate(zip(config.block_channels, config.block_layers, config.block_strides)):
-        for k in range(1 + more):
+    for i, (out, extra_layers, stride) in enumerate(
+        zip(config.block_channels, config.block_layers, config.block_strides)
+    ):
+        for k in range(1 + extra_layers):
             sources = [add(f"blocks.{i}.{k}", sources, out, stride=1 if k else stride)]
         levels += sources
     joined: int | None = None
     scales = [*config.block_strides[1:], 1]
     for i in reversed(range(len(levels))):
         joined = add(
-            f"neck.laterals.{i}", [levels[i]], config.fpn_channels, 1, normed=False, coarse=joined, scale=scales[i]
+            f"neck.laterals.{i}", [levels[i]], config.fpn_channels, 1, has_norm=False, coarse=joined, scale=scales[i]
         )
     assert joined is not None
     features = add("neck.out", [joined], config.fpn_channels)
-    add("head.scores", [features], config.anchors_per_cell * len(config.classes), 1, normed=False)
+    add("head.scores", [features], config.anchors_per_cell * len(config.classes), 1, has_norm=False)
     return layers

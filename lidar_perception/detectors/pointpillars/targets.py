@@ -70,8 +70,8 @@ def encode(boxes: Tensor, anchors: Tensor, offset: float) -> tuple[Tensor, Tenso
 
 def find_heading_bin(yaw: Tensor, offset: float) -> Tensor:
     """Return int64 bins: 0 for yaw in [offset, offset + pi), 1 for the other half of the circle."""
-    turned = torch.remainder(yaw - offset, 2 * math.pi)
-    return (turned >= math.pi).long()
+    relative = torch.remainder(yaw - offset, 2 * math.pi)
+    return (relative >= math.pi).long()
 
 
 def assign(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor) -> Targets:
@@ -93,32 +93,34 @@ def assign(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor
     usable = (boxes[:, 3:6] > 0).all(dim=1) & torch.isfinite(boxes).all(dim=1)
     for index, spec in enumerate(config.anchors):
         objects = boxes[usable & (labels == index)].to(anchors.dtype)
-        mine = find_near_anchors(anchors, config, objects, index)
-        if len(mine) == 0:
+        candidates = find_near_anchors(anchors, config, objects, index)
+        if len(candidates) == 0:
             continue
-        overlap = nearest_axis_iou(anchors[mine], objects)  # (A', M')
+        overlap = nearest_axis_iou(anchors[candidates], objects)  # (A', M')
         best, chosen = overlap.max(dim=1)
-        most = overlap.max(dim=0).values
-        forced = (overlap == most) & (most > 0)
-        chosen = torch.where(forced.any(dim=1), forced.int().argmax(dim=1), chosen)
-        positive = forced.any(dim=1) | (best >= spec.matched)
-        out_labels[mine[(best >= spec.unmatched) & ~positive]] = IGNORED
-        taken, target = mine[positive], objects[chosen[positive]]
-        out_labels[taken] = index
-        codes[taken], bins[taken] = encode(target, anchors[taken], config.direction_offset)
+        max_overlap = overlap.max(dim=0).values
+        is_best = (overlap == max_overlap) & (max_overlap > 0)
+        chosen = torch.where(is_best.any(dim=1), is_best.int().argmax(dim=1), chosen)
+        positive = is_best.any(dim=1) | (best >= spec.matched)
+        out_labels[candidates[(best >= spec.unmatched) & ~positive]] = IGNORED
+        positive_anchors, target = candidates[positive], objects[chosen[positive]]
+        out_labels[positive_anchors] = index
+        codes[positive_anchors], bins[positive_anchors] = encode(
+            target, anchors[positive_anchors], config.direction_offset
+        )
     return Targets(out_labels[None], codes[None], bins[None])
 
 
 def find_near_anchors(anchors: Tensor, config: NetworkConfig, boxes: Tensor, index: int) -> Tensor:
     """Return the indices (A',) int64, ascending, of the anchors of class `index` that may overlap
-    one of the boxes (M, 7). Most of a street is empty, so this saves most of the work."""
+    one of the boxes (M, 7). Most anchors are far from any object, so this saves most of the work."""
     per_cell = len(config.anchors) * len(config.yaws)
     cells = anchors.view(*config.head_grid, per_cell, 7)
-    reach = (boxes[:, 3:5].amax(dim=1) + max(config.anchors[index].size[:2])) / 2
-    column = (cells[0, :, 0, 0, None] - boxes[:, 0]).abs() <= reach  # (W, M)
-    row = (cells[:, 0, 0, 1, None] - boxes[:, 1]).abs() <= reach  # (H, M)
-    near = (row[:, None] & column).any(dim=2).flatten()  # (H * W,)
-    first = torch.nonzero(near) * per_cell + index * len(config.yaws)  # (cells, 1)
+    max_distance = (boxes[:, 3:5].amax(dim=1) + max(config.anchors[index].size[:2])) / 2
+    column = (cells[0, :, 0, 0, None] - boxes[:, 0]).abs() <= max_distance  # (W, M)
+    row = (cells[:, 0, 0, 1, None] - boxes[:, 1]).abs() <= max_distance  # (H, M)
+    is_near = (row[:, None] & column).any(dim=2).flatten()  # (H * W,)
+    first = torch.nonzero(is_near) * per_cell + index * len(config.yaws)  # (cells, 1)
     return (first + torch.arange(len(config.yaws), device=anchors.device)).reshape(-1)
 
 
@@ -152,15 +154,15 @@ def nearest_axis_iou(boxes: Tensor, others: Tensor) -> Tensor:
     """Return the bird's-eye-view IoU (N, M) of boxes (N, 7) and others (M, 7), each rotated to the
     nearest axis."""
     (low, high), (other_low, other_high) = _align(boxes), _align(others)
-    shared = torch.minimum(high[:, None], other_high) - torch.maximum(low[:, None], other_low)
-    shared = shared.clamp_(min=0).prod(dim=2)
+    intersection = torch.minimum(high[:, None], other_high) - torch.maximum(low[:, None], other_low)
+    intersection = intersection.clamp_(min=0).prod(dim=2)
     area, other_area = (high - low).prod(dim=1), (other_high - other_low).prod(dim=1)
-    return shared / (area[:, None] + other_area - shared)
+    return intersection / (area[:, None] + other_area - intersection)
 
 
 def _align(boxes: Tensor) -> tuple[Tensor, Tensor]:
     """Return the corners low (N, 2) and high (N, 2) of boxes (N, 7) rotated to the nearest axis."""
     folded = torch.remainder(boxes[:, 6] + math.pi / 2, math.pi) - math.pi / 2
-    across = (folded.abs() > math.pi / 4)[:, None]
-    half = torch.where(across, boxes[:, [4, 3]], boxes[:, [3, 4]]) / 2
+    is_sideways = (folded.abs() > math.pi / 4)[:, None]
+    half = torch.where(is_sideways, boxes[:, [4, 3]], boxes[:, [3, 4]]) / 2
     return boxes[:, :2] - half, boxes[:, :2] + half

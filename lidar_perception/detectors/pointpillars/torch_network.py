@@ -32,10 +32,10 @@ class TorchNetwork:
     @torch.inference_mode()
     def __call__(self, pillars: Pillars[np.ndarray], maps: np.ndarray | None) -> Prediction:
         points, offsets, cells = (torch.from_numpy(x).to(self.device) for x in pillars[:3])
-        own_maps = None if maps is None else torch.from_numpy(maps).to(self.device)
-        numbers = choose_dtype(self.amp, self.device)
-        with torch.autocast(torch.device(self.device).type, numbers, enabled=numbers is not None):
-            features = self.network.features(Pillars(points, offsets, cells, *pillars[3:]), own_maps).float()
+        device_maps = None if maps is None else torch.from_numpy(maps).to(self.device)
+        dtype = choose_dtype(self.amp, self.device)
+        with torch.autocast(torch.device(self.device).type, dtype, enabled=dtype is not None):
+            features = self.network.features(Pillars(points, offsets, cells, *pillars[3:]), device_maps).float()
         head = self.network.head
 
         @torch.inference_mode()
