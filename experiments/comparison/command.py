@@ -13,7 +13,7 @@ from lidar_perception.cli.data import (
     ScoringOptions,
     intervals_option,
     no_labels_error,
-    out_file,
+    out_file_option,
     path_option,
     scoring_options,
 )
@@ -42,7 +42,7 @@ def _list_runs() -> list[Runs]:
     "Additional detector: weights of PointPillars or PointNet, or a class of your own, module:Class; may be repeated.",
     multiple=True,
 )
-@out_file("--png", "Draw F1 and mean AP against time.")
+@out_file_option("--png", "Draw F1 and mean AP against time.")
 @intervals_option
 @range_option
 @device_option

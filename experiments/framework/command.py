@@ -15,7 +15,14 @@ import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.command import Choice, Command, refuse_options
-from lidar_perception.cli.data import WHAT, dask_option, limit_option, open_and_describe, out_folder, path_option
+from lidar_perception.cli.data import (
+    DATA_HELP,
+    dask_option,
+    limit_option,
+    open_and_describe,
+    out_folder_option,
+    path_option,
+)
 from lidar_perception.cli.options import Runs, Settings, checked, device_option, settings_options
 from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.machine import count_cores, read_cpu_name
@@ -47,13 +54,13 @@ def _list_parameters(given: Mapping[str, Any]) -> list[Runs]:
 
 @click.command(cls=Command)
 @click.argument("words", nargs=-1, metavar="[EXPERIMENT] DATA|sim")
-@path_option("--data", f"Same as DATA. {WHAT} `sim`: simulated scans.", "DATA|sim")
+@path_option("--data", f"Same as DATA. {DATA_HELP} `sim`: simulated scans.", "DATA|sim")
 @path_option(
     "--split",
     "Measure only the frames or sequences named in this file, one per line. "
     "Experiments that train use the others for training.",
 )
-@out_folder("Folder for the report; the same command resumes a run that was stopped.", required=True)
+@out_folder_option("Folder for the report; the same command resumes a run that was stopped.", required=True)
 @click.option(
     "--budget",
     type=click.FloatRange(0, min_open=True),

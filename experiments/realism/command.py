@@ -11,7 +11,7 @@ from experiments.realism.report import draw_realism, print_realism
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import data_argument, open_and_describe, out_file, write_json
+from lidar_perception.cli.data import data_argument, open_and_describe, out_file_option, write_json
 from lidar_perception.data.frame import BOXES
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.simulation.recording import simulate_frames
@@ -46,8 +46,8 @@ from lidar_perception.simulation.sensor import find_sensor
     show_default=True,
     help="Number of pedestrians and cyclists relative to the default.",
 )
-@out_file("--json", "Write every curve to this file.")
-@out_file("--png", "Draw every curve into this file.")
+@out_file_option("--json", "Write every curve to this file.")
+@out_file_option("--png", "Draw every curve into this file.")
 def realism(
     data: Path,
     sensor: str,

@@ -1,4 +1,4 @@
-"""Commands, groups and choices that name the closest match for a misspelt word."""
+"""Commands, groups and choices that suggest the closest match for a misspelt word."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from lidar_perception.types import did_you_mean, valid_names
 
 
 class Choice(click.ParamType):
-    """One of a fixed list of names. Case does not matter, and underscores count as hyphens.
+    """One of a fixed list of names; case is ignored, and underscores are accepted for hyphens.
 
-    aliases: other accepted spellings -> the name.
+    Args:
+        aliases: {other accepted spelling: name}.
     """
 
     name = "choice"
@@ -23,9 +24,9 @@ class Choice(click.ParamType):
         self.choices, self.aliases = choices, aliases
 
     def convert(self, value: Any, param: Any, ctx: Any) -> str:
-        names_by_spelling = {_plain(alias): name for alias, name in self.aliases.items()}
-        names_by_spelling |= {_plain(name): name for name in self.choices}
-        if (match := names_by_spelling.get(_plain(str(value)))) is not None:
+        names_by_spelling = {_normalize(alias): name for alias, name in self.aliases.items()}
+        names_by_spelling |= {_normalize(name): name for name in self.choices}
+        if (match := names_by_spelling.get(_normalize(str(value)))) is not None:
             return match
         self.fail(f"unknown value {value!r}{valid_names(str(value), self.choices)}", param, ctx)
 
@@ -38,14 +39,15 @@ class Choice(click.ParamType):
         return [CompletionItem(name) for name in self.choices if name.startswith(incomplete)]
 
 
-def _plain(name: str) -> str:
+def _normalize(name: str) -> str:
     return name.strip().lower().replace("_", "-")
 
 
 def refuse_options(names: Iterable[str], reason: str) -> None:
-    """Raise UsageError if one of these parameters of the command that runs was given.
+    """Raise UsageError if one of these parameters of the current command was given.
 
-    reason: the end of the message, such as "is for a simulated drive".
+    Args:
+        reason: end of the message, such as "requires --weights".
     """
     context = click.get_current_context()
     for param in context.command.params:
@@ -54,7 +56,7 @@ def refuse_options(names: Iterable[str], reason: str) -> None:
 
 
 class Command(click.Command):
-    """A command whose misspelt options get the closest match."""
+    """A command that suggests the closest match for a misspelt option."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         for param in self.params:
@@ -78,7 +80,7 @@ class Command(click.Command):
             ) from None
 
     def remedy(self, flag: str) -> str:
-        """Return the remedy for an unknown flag that an option knows; "" without one."""
+        """Return an option's suggestion for an unknown flag; "" if there is none."""
         return next(
             (
                 text
@@ -100,7 +102,7 @@ class HelpfulOption(click.Option):
         )
 
     def listing(self, options: Mapping[str, Any]) -> str:
-        """Return the listing, with the options that were given."""
+        """Return the list of possible values for these options."""
         raise NotImplementedError
 
     def suggest_option(self, flag: str) -> str:
@@ -109,7 +111,7 @@ class HelpfulOption(click.Option):
 
 
 class Group(click.Group):
-    """A group whose misspelt commands get the closest match."""
+    """A group that suggests the closest match for a misspelt command."""
 
     command_class = Command
 

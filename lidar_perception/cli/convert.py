@@ -83,14 +83,14 @@ def convert(
     limit: int | None,
     force: bool,
 ) -> None:
-    """Convert the recording DATA to one MCAP bag, to the folder of a data set with clouds, labels,
-    poses and calibration, or only its labels to a format of other tools. With --data DRIVE, DATA is
-    the path of labels of that drive.
+    """Convert the recording DATA to one MCAP bag, or to a data set folder with clouds, labels, poses
+    and calibration, or convert only its labels to the format of another tool. With --data DRIVE,
+    DATA is the path of labels of that drive.
 
     A bag has the topics /points, /ground_truth/detections, /camera/camera_info, /camera/extrinsics,
-    /tf_static, /odom and with --images /camera/image/compressed; scans that cannot be read are left
-    out of it, named and counted; the exit code is then 1. A folder or a file is written whole or
-    not at all, and nothing that is there is replaced without --force.
+    /tf_static, /odom and with --images /camera/image/compressed. Scans that cannot be read are
+    skipped and listed; the exit code is then 1. A folder or file is either written completely or
+    not at all. Nothing is replaced without --force.
 
     \b
     Examples:
@@ -106,17 +106,17 @@ def convert(
         source, data = data, None
     if source is None:
         raise click.UsageError("DATA is missing: give the path of a recording")
-    given_labels = data is not None or (format in LABELS and format not in (MCAP, *DATASETS))
+    converts_labels = data is not None or (format in LABELS and format not in (MCAP, *DATASETS))
     for is_wrong, message in (
-        (images and (given_labels or format != MCAP), "--images requires --to mcap"),
+        (images and (converts_labels or format != MCAP), "--images requires --to mcap"),
         (
-            (robot is not None or deskew) and (given_labels or detections is not None),
+            (robot is not None or deskew) and (converts_labels or detections is not None),
             "--robot and --deskew require a recording with clouds",
         ),
         (labels_format is not None and data is None, "--from requires labels at DATA; give their drive with --data"),
         (
             labels_format is not None and detections is not None,
-            "--detections is for bags, --from for other labels; give one of them",
+            "--detections and --from cannot be combined; --detections is for bags, --from for other labels",
         ),
         (data is not None and format == "nuscenes", "for labels, choose --to nuscenes-detection or nuscenes-tracking"),
     ):
@@ -124,7 +124,7 @@ def convert(
             raise click.UsageError(message)
     recording = open_and_describe(source if data is None else data, level=robot is None, split=split, points=points)
     transform = _make_frame_transform(recording, robot, deskew)
-    if given_labels:
+    if converts_labels:
         _convert_labels(source, recording, format, out, labels_format, data is not None, detections, limit, force)
     elif format == MCAP and detections is None:
         _convert_to_bag(source, recording, transform, out, images, limit, force)
@@ -133,9 +133,9 @@ def convert(
 
 
 def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], Any]:
-    """Return the function that levels and deskews a frame as nodes with this parameter file do.
+    """Return a function that levels and deskews a frame like nodes with this parameter file.
 
-    Without a file and deskewing it returns the frame unchanged.
+    Without a file and without deskewing, the function returns the frame unchanged.
     """
     if file is None and not deskew:
         return lambda frame: frame
@@ -143,7 +143,7 @@ def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Ca
 
     if not any(layout.is_layout(recording.path) for layout in (bag_frames, cloud_folder)):
         raise InputError(
-            f"{recording.path} ({recording.layout}) has level clouds already; --robot and --deskew are for bags and "
+            f"{recording.path} ({recording.layout}) already has level clouds; --robot and --deskew require bags or "
             "cloud files"
         )
     from lidar_perception.data.levelling import SensorMount, level_frame
@@ -215,7 +215,7 @@ def _convert_to_bag(
 
 
 def _read_topic_boxes(source: Path, recording: Any, topic: str) -> Any:
-    """Return the boxes on a topic of a bag as DriveLabels."""
+    """Read the boxes on a topic of a bag as DriveLabels."""
     from lidar_perception.data.open import split_topic
     from lidar_perception.labels.formats import bag
 

@@ -18,7 +18,7 @@ from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
 # docs/reference/recordings.md has the complete list.
-WHAT = (
+DATA_HELP = (
     "Bag (ROS 2 or ROS 1), KITTI, nuScenes or SemanticKITTI folder, .pcd, .ply, .npy or .bin "
     "files, or the output of `simulate`. BAG:/TOPIC names the clouds of a bag that has "
     "several."
@@ -26,9 +26,9 @@ WHAT = (
 MAX_DEFAULT_JOBS = 16  # maximum default number of processes, enough to feed a GPU
 
 
-def path_option(name: str, what: str, metavar: str = "FILE", **more: Any) -> Callable:
+def path_option(name: str, description: str, metavar: str = "FILE", **option_args: Any) -> Callable:
     """Return an option that takes a path."""
-    return click.option(name, type=click.Path(path_type=Path), metavar=metavar, help=what, **more)
+    return click.option(name, type=click.Path(path_type=Path), metavar=metavar, help=description, **option_args)
 
 
 class OutFile(click.Path):
@@ -36,15 +36,15 @@ class OutFile(click.Path):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
-        above = next(folder for folder in path.absolute().parents if folder.exists())
-        if path.is_dir() or str(path) == "-" or not (above.is_dir() and os.access(above, os.W_OK)):
+        parent = next(folder for folder in path.absolute().parents if folder.exists())
+        if path.is_dir() or str(path) == "-" or not (parent.is_dir() and os.access(parent, os.W_OK)):
             raise InputError(f"{path} cannot be written; give the name of a file")
         return path
 
 
-def out_file(name: str, what: str, *names: str, **more: Any) -> Callable:
+def out_file_option(name: str, description: str, *aliases: str, **option_args: Any) -> Callable:
     """Return an option that takes the path of a file to write."""
-    return click.option(name, *names, type=OutFile(path_type=Path), metavar="FILE", help=what, **more)
+    return click.option(name, *aliases, type=OutFile(path_type=Path), metavar="FILE", help=description, **option_args)
 
 
 class OutFolder(click.Path):
@@ -56,50 +56,66 @@ class OutFolder(click.Path):
         return path
 
 
-def out_folder(what: str, name: str = "--out", **more: Any) -> Callable:
+def out_folder_option(description: str, name: str = "--out", **option_args: Any) -> Callable:
     """Return an option that takes the path of a folder to write into."""
-    return click.option(name, type=OutFolder(path_type=Path), metavar="FOLDER", help=what, **more)
+    return click.option(name, type=OutFolder(path_type=Path), metavar="FOLDER", help=description, **option_args)
 
 
-def make_jobs_option(what: str, least: int = 0) -> Callable:
-    """Return the option --jobs, by default one process for each core; `what` starts its help."""
+def make_jobs_option(description: str, minimum: int = 0) -> Callable:
+    """Return the option --jobs, by default one process per core.
+
+    Args:
+        description: start of its help.
+        minimum: minimum number of processes.
+    """
     return click.option(
         "--jobs",
-        type=click.IntRange(least),
+        type=click.IntRange(minimum),
         default=lambda: min(count_cores(), MAX_DEFAULT_JOBS),
         show_default=f"one per core, at most {MAX_DEFAULT_JOBS}",
-        help=f"{what} The result is the same.",
+        help=f"{description} The result is the same.",
     )
 
 
 def data_argument(
-    what: str = WHAT, *, required: bool = True, several: bool = False, kind: Any = click.Path(path_type=Path)
+    description: str = DATA_HELP,
+    *,
+    required: bool = True,
+    several: bool = False,
+    value_type: Any = click.Path(path_type=Path),
 ) -> Callable:
     """Decorator: the argument DATA, and --data as another way to give it.
 
     Args:
-        what: help of --data.
-        required: giving neither is an error; otherwise the function gets data=None, or ().
-        several: accept any number of values, as a tuple.
-        kind: type of a value.
+        description: help of --data.
+        required: True if one of them must be given; otherwise the function gets data=None, or ().
+        several: True to accept any number of values, as a tuple.
+        value_type: type of a value.
     """
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
         def wrapper(*args: Any, data: Any, data_option: Any, **kwargs: Any) -> Any:
             if data and data_option:
-                shown, again = (" ".join(map(str, each if several else [each])) for each in (data, data_option))
-                raise click.UsageError(f"DATA is given twice, {shown} and --data {again}; give one")
+                argument_text, option_text = (
+                    " ".join(map(str, each if several else [each])) for each in (data, data_option)
+                )
+                raise click.UsageError(f"DATA is given twice, {argument_text} and --data {option_text}; give one")
             if required and not (data or data_option):
                 raise click.UsageError("DATA is missing: give the path of a recording")
             return function(*args, data=data or data_option, **kwargs)
 
         wrapper = click.option(
-            "--data", "data_option", type=kind, multiple=several, metavar="DATA", help=f"Same as DATA. {what}"
+            "--data",
+            "data_option",
+            type=value_type,
+            multiple=several,
+            metavar="DATA",
+            help=f"Same as DATA. {description}",
         )(wrapper)
         return click.argument(
             "data",
-            type=kind,
+            type=value_type,
             required=False,
             nargs=-1 if several else 1,
             metavar=("DATA" if required else "[DATA]") + "..." * several,
@@ -117,9 +133,9 @@ dask_option = click.option(
     "--dask",
     metavar="ADDRESS",
     help="Run on the workers of the Dask "
-    "scheduler at this address, such as tcp://10.0.0.1:8786. They must be able to read DATA at the same path.",
+    "scheduler at this address, such as tcp://10.0.0.1:8786. The workers must be able to read DATA at the same path.",
 )
-json_option = out_file("--json", "Write the scores to this file.", "json_file")
+json_option = out_file_option("--json", "Write the scores to this file.", "json_file")
 intervals_option = click.option(
     "--intervals",
     type=click.IntRange(0),
@@ -152,13 +168,16 @@ class ScoringOptions:
         """True if all frames are scored in this process."""
         return self.jobs == 1 and self.dask is None
 
-    def open_recording(self, needs: str | None, data: Path | None = None, **how: Any) -> Any:
-        """Open the recording, or another one at `data`, see open_and_describe.
+    def open_recording(self, needs: str | None, data: Path | None = None, **open_args: Any) -> Any:
+        """Open the recording, or another one at `data` (see open_and_describe).
+
+        Args:
+            needs: required content, such as data.frame.BOXES; None: nothing.
 
         Raises:
-            InputError: no frame has what the command needs, such as data.frame.BOXES.
+            InputError: the recording lacks the required content.
         """
-        recording = open_and_describe(data or self.data, split=self.split, **how)
+        recording = open_and_describe(data or self.data, split=self.split, **open_args)
         if needs is not None:
             recording.require(needs, click.get_current_context().command_path.partition(" ")[2])
         return recording
@@ -179,8 +198,8 @@ def scoring_options(data: Callable = data_argument(), *, parallel: bool = True) 
     options=ScoringOptions(...).
 
     Args:
-        data: the argument DATA.
-        parallel: False leaves out --jobs and --dask.
+        data: argument DATA.
+        parallel: False to leave out --jobs and --dask.
     """
 
     def decorate(function: Callable) -> Callable:
@@ -201,26 +220,26 @@ def scoring_options(data: Callable = data_argument(), *, parallel: bool = True) 
     return decorate
 
 
-def open_and_describe(data: Path, *, level: bool = True, **how: Any) -> Any:
-    """Open the recording at a path, see data.open.open_recording, and print its summary.
+def open_and_describe(data: Path, *, level: bool = True, **open_args: Any) -> Any:
+    """Open a recording (see data.open.open_recording) and print its summary.
 
-    If the recording does not give the height of the sensor, it is measured on the first clouds.
+    If the recording does not state the sensor height, it is measured on the first clouds.
 
     Args:
-        level: also report a tilted sensor and the scale of the intensity.
+        level: True to report a tilted sensor and the scale of the intensity.
     """
     from lidar_perception.data.mount_check import apply_measured_height, find_mount_problem, load_first_clouds
     from lidar_perception.data.open import open_recording
     from lidar_perception.wire.messages import diagnose_recorded_intensity
 
-    recording = open_recording(data, **how)
+    recording = open_recording(data, **open_args)
     errors.print(str(recording), style="dim")
     for line in describe_missing_scans(recording):
         errors.print(line, style="yellow")
     clouds = load_first_clouds(recording)
-    measured = apply_measured_height(recording, clouds)
-    if measured is not recording:
-        height = next(iter(measured)).sensor_height
+    recording_with_height = apply_measured_height(recording, clouds)
+    if recording_with_height is not recording:
+        height = next(iter(recording_with_height)).sensor_height
         errors.print(f"its sensor is {height:.2f} m above the ground, measured on the first clouds", style="dim")
     if level and clouds:
         if (full_scale := recording.frames[0].intensity_max()) > 1:
@@ -233,11 +252,11 @@ def open_and_describe(data: Path, *, level: bool = True, **how: Any) -> Any:
             ),
         ):
             errors.print(problem, style="yellow")
-    return measured
+    return recording_with_height
 
 
 def describe_missing_scans(recording: Any) -> list[str]:
-    """Return a line with the number of labels whose scan is missing; no line if there are none."""
+    """Return a message with the number of labels whose scan is missing; [] if there are none."""
     reasons = [reason for _, reason in recording.missing_scans]
     return [f"labels without a scan: {len(reasons)}, such as {reasons[0]}"] if reasons else []
 
@@ -259,7 +278,7 @@ def write_json(path: Path | None, content: dict) -> None:
         write_text(path, json.dumps(content, indent=1))
 
 
-def no_labels_error(recording: Any, skipped: list[str], what: str = "labels") -> InputError:
-    """Return the error for a run without scored frames, with the first reason."""
+def no_labels_error(recording: Any, skipped: list[str], requirement: str = "labels") -> InputError:
+    """Return the error for a run without scored frames, with the reason for the first frame."""
     reason = f" ({skipped[0]})" if skipped else ""
-    return InputError(f"{recording.path}: no frame with {what}{reason}")
+    return InputError(f"{recording.path}: no frame with {requirement}{reason}")

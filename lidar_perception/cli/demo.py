@@ -16,7 +16,7 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.classes import DETECTED
 from lidar_perception.cli.command import Choice, Command, refuse_options
-from lidar_perception.cli.data import WHAT, data_argument, open_and_describe, out_folder
+from lidar_perception.cli.data import DATA_HELP, data_argument, open_and_describe, out_folder_option
 from lidar_perception.cli.evaluate.candidates import with_recorded_setup
 from lidar_perception.cli.options import (
     CANDIDATES,
@@ -61,16 +61,16 @@ REPLACED = ("drive", "result", "logs")  # subfolders that the next demo replaces
 
 
 def _make_runs(detector: str) -> Runs:
-    """Return the detector that the nodes run, with its parameters."""
+    """Return the parameters of the detector that the nodes run."""
     return make_candidate_runs(on_messages=True) if detector == CANDIDATES else make_runs(detector, on_messages=True)
 
 
 @click.command(cls=Command)
-@data_argument(f"Replay this instead of the simulated drive; it needs labelled boxes: {WHAT}", required=False)
+@data_argument(f"Replay this instead of the simulated drive; it needs labelled boxes: {DATA_HELP}", required=False)
 @click.option(
     "--detector", type=Choice(SINGLE_PROCESS_NODES), default=FUSED, show_default=True, help="Detector to run."
 )
-@out_folder("Folder for the results.", default=Path("out/demo"), show_default=True)
+@out_folder_option("Folder for the results.", default=Path("out/demo"), show_default=True)
 @click.option(
     "--frames",
     type=click.IntRange(1),
@@ -116,12 +116,12 @@ def demo(
 ) -> None:
     """Replay a drive through the real nodes over DDS, and score the detections and their tracks.
 
-    Without options, makes a simulated drive with traffic and walking pedestrians, writes it as a
-    rosbag2 bag, replays it into the nodes, on a private ROS domain, and
-    prints the scores. Leaves in --out: the bag, the result bag, scores.json, birdseye.png and the
-    logs. With --detector candidates, pedestrians alone, by the protocol of the STM-CPA paper.
+    Without DATA, simulates a drive with traffic and walking pedestrians and writes it as a rosbag2
+    bag. Replays the bag into the nodes on a private ROS domain and prints the scores. Writes to
+    --out: the bag, the result bag, scores.json, birdseye.png and the logs. With --detector
+    candidates, scores only pedestrians, by the protocol of the STM-CPA paper.
 
-    It scores, so DATA needs labelled boxes. For a recording without labels use
+    DATA needs labelled boxes, because the results are scored. For a recording without labels use
     `detect` or `view DATA --weights fused`, and `setup` to measure its sensor.
 
     \b
@@ -198,7 +198,7 @@ def _remove_old_results(out: Path, data: Path | None, detector: str) -> None:
     old = [out / name for name in REPLACED if (out / name).exists()]
     if old and not (out / RECORD).is_file():
         raise InputError(
-            f"{old[0]} is there, and no {RECORD} beside it says that demo made it; remove it, or give another --out"
+            f"{old[0]} exists without a {RECORD}, so demo did not create it; remove it, or give another --out"
         )
     for folder in old:
         if data is not None and data.resolve().is_relative_to(folder.resolve()):
@@ -209,7 +209,7 @@ def _remove_old_results(out: Path, data: Path | None, detector: str) -> None:
 
 
 def _open_replayed(drive: Path, recording: Recording | None) -> Recording:
-    """Open the bag to replay, with the sensor height of the recording that it was made from."""
+    """Open the bag to replay, with the sensor height of the recording that it was converted from."""
     return open_recording(drive, sensor_height=None if recording is None else recording.frames[0].sensor_height)
 
 
@@ -222,7 +222,7 @@ def _load_node_params(choice: DetectorChoice, replayed: Recording) -> Any:
 
 
 def _write_compile_code(choice: DetectorChoice) -> str:
-    """Return Python code that compiles what the tracker, the detector and its inputs run."""
+    """Return Python code that compiles the tracker, the detector and the reading of its inputs."""
     lines = [f"from {tracker.__name__} import warm_up", "warm_up()"]
     if choice.weights == CANDIDATES:
         lines += [f"from {warm_up.__module__} import warm_up", "warm_up()"]
@@ -235,7 +235,7 @@ def _write_compile_code(choice: DetectorChoice) -> str:
 
 
 def _make_drive_bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
-    """Return the bag to replay: as given, or made from a recording or a simulated drive."""
+    """Return the bag to replay: the recording itself, or one written from it or a simulated drive."""
     if (
         recording is not None
         and isinstance(recording.frames, BagFrames)
@@ -256,7 +256,7 @@ def _make_drive_bag(path: Path, recording: Any, frames: int, drive_seed: int) ->
 
 
 def _print_detections(frames: Sequence[RecordedResult], calibration: Any) -> dict:
-    """Print and return the detection scores by class, for labels in the camera's view."""
+    """Print the detection scores by class, for labels in the camera's view; return them."""
     from lidar_perception.scoring.detections import FrameDetections
     from lidar_perception.scoring.kitti.default_threshold import print_scores_at_threshold, score_at_threshold
     from lidar_perception.scoring.kitti.report import DetectionReport
@@ -273,11 +273,11 @@ def _print_detections(frames: Sequence[RecordedResult], calibration: Any) -> dic
 
 def _print_pace(content: dict, rate: float, clouds: int) -> None:
     latency, stages, speed = content["latency_ms"], content["stage_ms"], rate / content["slower"]
-    pace = f"{rate:g}x real time"
+    pace_text = f"{rate:g}x real time"
     if content["slower"] >= 1.05 and stages:
         slowest = max(stages, key=lambda node: stages[node])
-        pace = f"{speed:.2g}x real time: {slowest} needs {stages[slowest]:.0f} ms per cloud on this machine"
-    console.print(f"{clouds} clouds replayed at {pace}")
+        pace_text = f"{speed:.2g}x real time: {slowest} needs {stages[slowest]:.0f} ms per cloud on this machine"
+    console.print(f"{clouds} clouds replayed at {pace_text}")
     console.print(
         f"{content['results']} results; latency cloud to tracks median "
         f"{latency['median']:.0f} ms, 95 % under {latency['p95']:.0f} ms; memory of the "
@@ -292,7 +292,7 @@ def _print_pace(content: dict, rate: float, clouds: int) -> None:
 
 
 def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str) -> dict:
-    """Print and return the scores of the tracks by class, and the source of the poses."""
+    """Print the scores of the tracks by class and the source of the poses; return the scores."""
     from lidar_perception.scoring.tracking.from_bag import count_recorded_tracks, score_recorded_tracks
     from lidar_perception.scoring.tracking.tables import EGO_TITLES
 
@@ -308,7 +308,7 @@ def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str
                 f"{scores['switches']} identity switches, HOTA {100 * scores['HOTA']:.1f} "
                 f"(detection {100 * scores['DetA']:.1f}, association {100 * scores['AssA']:.1f})"
             )
-    remedy = "; pip install 'lidar_perception[odometry]' takes them from the scans"
+    remedy = "; pip install 'lidar_perception[odometry]' to estimate them from the scans"
     console.print(f"tracks are with {EGO_TITLES[poses]}{remedy * (poses == NO_SOURCE)}")
     return {"found": count, "scores": result}
 
@@ -320,7 +320,7 @@ def _select_drawn_objects(frames: Sequence[RecordedResult], detector: str) -> di
 
 
 def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]], height: float) -> bool:
-    """Draw the recorded frame with most hits, and its tracks; return False without labels."""
+    """Draw the recorded frame with the most matches, and its tracks; return False without labels."""
     from lidar_perception.nodes.replay.graph_replay import TRACKS
     from lidar_perception.rendering.colors import color_by_cluster
     from lidar_perception.rendering.files import write_png
@@ -333,24 +333,24 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
     }
     if not hits:
         return False
-    best = max(hits, key=lambda s: (hits[s], s))  # the last such frame, because its trails are the longest
-    truth, detections = frames[best]
+    best_stamp = max(hits, key=lambda s: (hits[s], s))  # the last such frame, because its trails are the longest
+    truth, detections = frames[best_stamp]
     trails: dict[int, np.ndarray] = {}
-    drawing = None
+    cloud_msg = None
     with Bag(out / "result") as bag:
         for topic, _, msg in bag.messages({cloud, TRACKS} & set(bag.topics)):
             if topic == TRACKS:
-                if msg.markers and to_ns(msg.markers[0].header.stamp) == best:
+                if msg.markers and to_ns(msg.markers[0].header.stamp) == best_stamp:
                     detections, trails = from_marker_array(msg), read_trails(msg)
-            elif to_ns(msg.header.stamp) == best:
-                drawing = msg
-    if drawing is None:
+            elif to_ns(msg.header.stamp) == best_stamp:
+                cloud_msg = msg
+    if cloud_msg is None:
         return False
-    frame, indices = to_point_cloud(drawing)
-    ground = read_column(drawing, "ground", indices)
-    ids = read_column(drawing, "cluster_id", indices)
-    none = np.zeros(len(frame), int)
-    colors = None if ground is None else color_by_cluster(ground > 0, none if ids is None else renumber_ids(ids)[0])
+    frame, indices = to_point_cloud(cloud_msg)
+    ground = read_column(cloud_msg, "ground", indices)
+    ids = read_column(cloud_msg, "cluster_id", indices)
+    zeros = np.zeros(len(frame), int)
+    colors = None if ground is None else color_by_cluster(ground > 0, zeros if ids is None else renumber_ids(ids)[0])
     boxes = Boxes(
         detections.boxes,
         np.array(class_ids(detections.labels), int),
@@ -365,8 +365,8 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
             frame,
             boxes,
             truth,
-            f"{hits[best][0]} of {hits[best][1]} labelled objects detected",
-            f"{best / 1e9:.1f} s",
+            f"{hits[best_stamp][0]} of {hits[best_stamp][1]} labelled objects detected",
+            f"{best_stamp / 1e9:.1f} s",
             colors,
         ),
     )

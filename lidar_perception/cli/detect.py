@@ -1,4 +1,4 @@
-"""detect: run a detector on a recording and write its results."""
+"""detect: run a detector on a recording and write the results."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from lidar_perception.cli.data import (
     jobs_option,
     limit_option,
     open_and_describe,
-    out_file,
-    out_folder,
+    out_file_option,
+    out_folder_option,
     split_option,
 )
 from lidar_perception.cli.options import detector_options
@@ -42,13 +42,13 @@ class Formats(click.ParamType):
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, ...]:
         if isinstance(value, tuple):
             return value
-        one = Choice(FORMATS, ALIASES)
-        return tuple(one.convert(name, param, ctx) for name in str(value).split(","))
+        choice = Choice(FORMATS, ALIASES)
+        return tuple(choice.convert(name, param, ctx) for name in str(value).split(","))
 
 
 @click.command(cls=Command)
 @data_argument()
-@out_folder("Folder for the results.", required=True)
+@out_folder_option("Folder for the results.", required=True)
 @click.option(
     "--format",
     "--to",
@@ -91,7 +91,7 @@ class Formats(click.ParamType):
     help="With --format mcap: write the clouds into the bag too.",
 )
 @click.option("--png", is_flag=True, help="Draw a picture of every frame, png/FRAME.png.")
-@out_file("--video", "Draw a video: .mp4 (the extra [video]), .gif or .webp.")
+@out_file_option("--video", "Draw a video: .mp4 (the extra [video]), .gif or .webp.")
 @click.option(
     "--color",
     type=Choice(["height", "intensity"]),
@@ -164,19 +164,19 @@ def detect(
     recording = open_and_describe(data, split=split, sensor_height=mount_height or None)
     if track and not recording.is_sequential:
         raise InputError(
-            f"{data} ({recording.layout}) has unrelated frames, so tracking is impossible; leave out --track"
+            f"{data} ({recording.layout}) has unrelated frames, which cannot be tracked; leave out --track"
         )
-    chosen = list(dict.fromkeys(name for names in formats for name in names))
-    if not chosen and not png and video is None:
-        chosen = ["json"]
+    format_names = list(dict.fromkeys(name for names in formats for name in names))
+    if not format_names and not png and video is None:
+        format_names = ["json"]
     count = min(len(recording), limit or len(recording))
     if video is not None:
         check_video(video, count)
     height = recording.frames[0].sensor_height
-    for doubt in check_weights(Path(detector.weights), height):
-        errors.print(doubt)
-    open_ = partial(detector.open, sensor_height=height, min_score=min_score)
-    opened_detector = open_()
+    for warning in check_weights(Path(detector.weights), height):
+        errors.print(warning)
+    make_detector = partial(detector.open, sensor_height=height, min_score=min_score)
+    opened_detector = make_detector()
     header = make_header(
         recording,
         detector.weights,
@@ -187,19 +187,19 @@ def detect(
         device=detector.device,
     )
     if track and min_score is None:  # the tracker also uses weak detections
-        open_ = partial(detector.open, sensor_height=height, min_score=tracking.min_score)
-        opened_detector = open_()
+        make_detector = partial(detector.open, sensor_height=height, min_score=tracking.min_score)
+        opened_detector = make_detector()
     run = Run(recording, out, header, count)
     drawer = FrameDrawer(run, color)
-    makes: list[Any] = [
-        partial(Bag, clouds=clouds, tracked=track) if name == "mcap" else WRITERS[name] for name in chosen
+    writer_factories: list[Any] = [
+        partial(Bag, clouds=clouds, tracked=track) if name == "mcap" else WRITERS[name] for name in format_names
     ]
-    makes += [partial(PictureWriter, drawer=drawer)] if png else []
-    makes += [partial(VideoWriter, drawer=drawer, path=video)] if video else []
+    writer_factories += [partial(PictureWriter, drawer=drawer)] if png else []
+    writer_factories += [partial(VideoWriter, drawer=drawer, path=video)] if video else []
     summary = run_detector(
         run,
-        open_ if jobs > 1 or dask else lambda: opened_detector,
-        makes,
+        make_detector if jobs > 1 or dask else lambda: opened_detector,
+        writer_factories,
         tracking=tracking if track else None,
         ego=header["ego"] or "none",
         jobs=jobs,
@@ -226,8 +226,8 @@ def print_summary(summary: Summary, run: Run) -> None:
     for path in summary.paths:
         console.print(f"written: {path}")
     for remark, *others in run.remarks.values():
-        more = f" ({len(others)} more such frames)" if others else ""
-        console.print(Text("note", "yellow") + f": {remark}{more}")
+        suffix = f" ({len(others)} more such frames)" if others else ""
+        console.print(Text("note", "yellow") + f": {remark}{suffix}")
     for problem, count in content["problems"].items():
         frames = "frame" if count == 1 else "frames"
         console.print(Text("problem", "yellow") + f" in {count} {frames}: {problem}")

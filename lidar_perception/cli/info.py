@@ -1,4 +1,4 @@
-"""info: list the contents of a recording."""
+"""info: print the contents of a recording."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from lidar_perception.types import InputError
 @data_argument()
 @click.option("--json", "as_json", is_flag=True, help="Print JSON to standard output.")
 def info(data: Path, as_json: bool) -> None:
-    """Print the topics, types, counts and length of a bag; of any other recording its layout,
-    frames, times, first cloud and labels.
+    """Print the topics, types, counts and duration of a bag, or the layout, frames, times, first
+    cloud and labels of another recording.
 
     \b
     Examples:
@@ -35,16 +35,16 @@ def info(data: Path, as_json: bool) -> None:
     if layout is None and data.is_dir():
         raise InputError(f"{data} has no metadata.yaml and is not another kind of recording: {describe_formats()}")
     if layout in (None, bag_frames):
-        content, show = _bag(data), _print_bag
+        content, show = _describe_bag(data), _print_bag
     else:
-        content, show = _recording(data), _print_recording
+        content, show = _describe_recording(data), _print_recording
     if as_json:
         click.echo(json.dumps(content, indent=1))
     else:
         show(content)
 
 
-def _bag(path: Path) -> dict[str, Any]:
+def _describe_bag(path: Path) -> dict[str, Any]:
     with Bag(path) as bag:
         return {
             "path": str(path),
@@ -53,14 +53,14 @@ def _bag(path: Path) -> dict[str, Any]:
             "topics": [
                 {
                     "topic": topic,
-                    "type": kind,
+                    "type": type_name,
                     "messages": bag.counts[topic],
                     "qos": next(
                         (f"{qos.reliability.name.lower()}, {qos.durability.name.lower()}" for qos in bag.qos(topic)),
                         None,
                     ),
                 }
-                for topic, kind in sorted(bag.topics.items())
+                for topic, type_name in sorted(bag.topics.items())
             ],
             "unreadable": [
                 {"topic": name, "type": topic.type, "encoding": topic.encoding, "messages": topic.messages}
@@ -80,7 +80,7 @@ def _print_bag(content: dict[str, Any]) -> None:
     console.print(table)
 
 
-def _recording(path: Path) -> dict[str, Any]:
+def _describe_recording(path: Path) -> dict[str, Any]:
     recording = open_recording(path)
     first = recording.frames[0]
     scan, truth = first.load(), first.truth()

@@ -1,4 +1,4 @@
-"""lidar-perception VERB: the commands are imported only when they are called."""
+"""Main command lidar-perception; the modules of its commands are imported on first use."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COMMANDS = {  # verb -> (module.function, description in the overview)
         "Import PointPillars weights from other projects.",
     ),
     "export": ("lidar_perception.cli.weights.export", "Export a network for another runtime."),
-    "info": ("lidar_perception.cli.info.info", "List the content of a bag or another recording."),
+    "info": ("lidar_perception.cli.info.info", "Print the contents of a bag or another recording."),
     "run": ("lidar_perception.cli.run.run_node", "Start one ROS node."),
 }
 
@@ -35,7 +35,8 @@ COMMANDS = {  # verb -> (module.function, description in the overview)
 class LazyGroup(Group):
     """A group that imports the module of a command on first use.
 
-    commands_by_name: verb -> module.function, and its line in the overview.
+    Args:
+        commands_by_name: {verb: (module.function, description in the overview)}.
     """
 
     def __init__(self, *args: Any, commands_by_name: dict[str, tuple[str, str]], **kwargs: Any):
@@ -81,13 +82,13 @@ def cli() -> None:
       lidar-perception detect drive.bag --out results
       lidar-perception run fused_detector --ros-args -r '~/input/points:=/points'
 
-    Exit codes: 0 done, 1 ran but something failed, 2 the command or its input cannot be used, 130
-    stopped by ctrl-C.
+    Exit codes: 0 success, 1 partial failure (such as skipped frames), 2 invalid command or input,
+    130 stopped by ctrl-C.
     """
 
 
 def run_cli(group: click.Group, name: str) -> None:
-    """Run a group of commands; bad input is one line on stderr and exit code 2."""
+    """Run a group of commands; print bad input as one line on stderr and exit with code 2."""
     from lidar_perception.runs.files import convert_os_errors
     from lidar_perception.runs.memory import keep_freed_memory
     from lidar_perception.runs.threads import use_passive_waiting

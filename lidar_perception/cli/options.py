@@ -1,4 +1,4 @@
-"""--config and --set: the parameters of what runs. --weights, --range, --device: the detector.
+"""Options for parameters (--config, --set) and for the detector (--weights, --range, --device).
 
 @click.command(cls=Command)
 @detector_options()
@@ -35,8 +35,13 @@ ON_OFF = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no"
 
 @dataclass(frozen=True)
 class Runs:
-    """Something that runs, with parameters: its name, their fields by dotted name, and the nodes
-    whose sections of a parameter file apply to it (None: all)."""
+    """An algorithm whose parameters can be set.
+
+    Attributes:
+        name: shown in messages.
+        fields: its parameters by dotted name.
+        nodes: nodes whose sections of a parameter file apply; None: all.
+    """
 
     name: str
     fields: Fields
@@ -51,67 +56,68 @@ class Settings:
     given: tuple[tuple[str, str], ...]
 
     def values(self, *runs: Runs) -> list[dict[str, Any]]:
-        """Return {dotted name: value} for each of several things that run; --set wins.
+        """Return {dotted name: value} for each algorithm; --set takes precedence over --config.
 
         Raises:
-            InputError: a parameter of --set is of none of them, or a file cannot be used.
+            InputError: no algorithm has a parameter of --set, or a file cannot be used.
         """
-        known = {name: f for each in runs for name, f in each.fields.items()}
-        whose = " or ".join(dict.fromkeys(each.name for each in runs))
+        fields_by_name = {name: f for each in runs for name, f in each.fields.items()}
+        owners = " or ".join(dict.fromkeys(each.name for each in runs))
         for name, _ in self.given:
-            if name not in known and name.startswith("input."):
+            if name not in fields_by_name and name.startswith("input."):
                 raise InputError(f"{name} applies to messages read by nodes; a recording has its own intensity scale")
-            if name not in known:
+            if name not in fields_by_name:
                 raise InputError(
-                    f"unknown parameter {name[:80]!r} of {whose}{_guess(name, known)} (--set help lists them all)"
+                    f"unknown parameter {name[:80]!r} of {owners}{_suggest_parameter(name, fields_by_name)} "
+                    "(--set help lists them all)"
                 )
-        found: list[dict[str, Any]] = [{} for _ in runs]
+        values_by_run: list[dict[str, Any]] = [{} for _ in runs]
         if self.config is not None:
-            read = [read_parameters(self.config, each.fields, each.nodes) for each in runs]
-            found = [values for values, _ in read]
-            _warn(self.config, (line for _, lines in read for line in lines))
-            if not any(found):
-                errors.print(f"{self.config} has no parameter of {whose}", style="yellow")
+            contents = [read_parameters(self.config, each.fields, each.nodes) for each in runs]
+            values_by_run = [values for values, _ in contents]
+            _warn(self.config, (line for _, lines in contents for line in lines))
+            if not any(values_by_run):
+                errors.print(f"{self.config} has no parameter of {owners}", style="yellow")
         return [
             {
                 **values,
-                **{name: _value(name, each.fields[name], text) for name, text in self.given if name in each.fields},
+                **{name: _parse(name, each.fields[name], text) for name, text in self.given if name in each.fields},
             }
-            for each, values in zip(runs, found)
+            for each, values in zip(runs, values_by_run)
         ]
 
     def __bool__(self) -> bool:
         return self.config is not None or bool(self.given)
 
 
-def _guess(name: str, known: Fields) -> str:
-    """Return the end of a message: the parameter with the closest name, or with this last part."""
-    inner = [each for each in known if each.startswith(f"{name}.")]
-    if inner:
-        return f", which is a group with {', '.join(inner)}"
-    ends = [each for each in known if each.endswith(f".{name}")]
-    return f"; did you mean {ends[0]!r}?" if len(ends) == 1 else did_you_mean(name, known)
+def _suggest_parameter(name: str, fields: Fields) -> str:
+    """Return the end of an error message that suggests the parameter with the closest name."""
+    members = [each for each in fields if each.startswith(f"{name}.")]
+    if members:
+        return f", which is a group with {', '.join(members)}"
+    matches = [each for each in fields if each.endswith(f".{name}")]
+    return f"; did you mean {matches[0]!r}?" if len(matches) == 1 else did_you_mean(name, fields)
 
 
-def _value(name: str, f: Field[Any], text: str) -> Any:
+def _parse(name: str, f: Field[Any], text: str) -> Any:
     """Convert the text of a parameter to its type."""
-    kind = f.metadata["item"] or type(f.default)
+    value_type = f.metadata["item"] or type(f.default)
     try:
         if not isinstance(f.default, tuple):
-            return _scalar(kind, text)
-        inner = text.strip().removeprefix("[").removesuffix("]")
-        return tuple(_scalar(kind, word.strip()) for word in inner.split(",") if word.strip())
+            return _parse_scalar(value_type, text)
+        items = text.strip().removeprefix("[").removesuffix("]")
+        return tuple(_parse_scalar(value_type, word.strip()) for word in items.split(",") if word.strip())
     except (ValueError, KeyError):
-        many = (
+        expected = (
             "a list of numbers, e.g. 0.15,0.3"
             if isinstance(f.default, tuple)
-            else {bool: "true or false", int: "a whole number", float: "a number"}[kind]
+            else {bool: "true or false", int: "a whole number", float: "a number"}[value_type]
         )
-        raise InputError(f"--set {name}={text[:80]}: the value must be {many}") from None
+        raise InputError(f"--set {name}={text[:80]}: the value must be {expected}") from None
 
 
-def _scalar(kind: type, text: str) -> Any:
-    return ON_OFF[text.lower()] if kind is bool else kind(text)
+def _parse_scalar(value_type: type, text: str) -> Any:
+    return ON_OFF[text.lower()] if value_type is bool else value_type(text)
 
 
 class Assignment(click.ParamType):
@@ -122,8 +128,8 @@ class Assignment(click.ParamType):
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, str]:
         if isinstance(value, tuple):
             return value
-        name, equals, text = str(value).partition("=")
-        if not equals and value != "help":
+        name, separator, text = str(value).partition("=")
+        if not separator and value != "help":
             self.fail(
                 f"{value!r} must be NAME=VALUE, such as fused.scores.car=0.7; --set help lists all names", param, ctx
             )
@@ -131,23 +137,23 @@ class Assignment(click.ParamType):
 
 
 class SetOption(HelpfulOption):
-    """The option --set. runs: returns what runs for the options that were given."""
+    """The option --set. `runs` returns the algorithms that the options select."""
 
     def __init__(self, *args: Any, runs: Callable[[Mapping[str, Any]], list[Runs]], **more: Any):
         super().__init__(*args, **more)
         self.runs = runs
 
-    def listing(self, given: Mapping[str, Any]) -> str:
+    def listing(self, options: Mapping[str, Any]) -> str:
         return "\n".join(
-            line for each in self.runs(given) for line in (f"Parameters of {each.name}:", *describe_fields(each.fields))
+            line for run in self.runs(options) for line in (f"Parameters of {run.name}:", *describe_fields(run.fields))
         )
 
     def suggest_option(self, flag: str) -> str:
-        plain = flag.removeprefix("--").removeprefix("no-")
-        known = {
+        parameter = flag.removeprefix("--").removeprefix("no-")
+        names_by_flag = {
             name.replace(".", "-").replace("_", "-"): name for node in NODES for name in find_node_parameters(node)
         }
-        return f"; parameters are given as --set {known[plain]}=VALUE" if plain in known else ""
+        return f"; parameters are given as --set {names_by_flag[parameter]}=VALUE" if parameter in names_by_flag else ""
 
 
 def settings_options(
@@ -156,11 +162,11 @@ def settings_options(
     """Decorator: --config and --set, which the function gets as settings=Settings(...).
 
     Args:
-        runs: returns what runs for the options that were given, for `--set help`.
-        example: of --set, for the help.
-        candidates: the candidates may run, which have named configurations.
+        runs: returns the algorithms that the options select, for `--set help`.
+        example: assignment to show in the help.
+        candidates: True if the candidate pipeline, which has named configurations, can be selected.
     """
-    named = f" Or one of {', '.join(CONFIGURATIONS)}, for the candidates." if candidates else ""
+    config_note = f" Or one of {', '.join(CONFIGURATIONS)}, for the candidates." if candidates else ""
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
@@ -181,15 +187,19 @@ def settings_options(
         return click.option(
             "--config",
             type=click.Path(path_type=Path),
-            metavar="FILE|NAME" if named else "FILE",
-            help=f"ROS parameter file, as in config/; --set takes precedence.{named}",
+            metavar="FILE|NAME" if config_note else "FILE",
+            help=f"ROS parameter file, as in config/; --set takes precedence.{config_note}",
         )(wrapper)
 
     return decorate
 
 
 def make_candidate_runs(on_messages: bool = False) -> Runs:
-    """Return the candidate pipeline with its parameters; on_messages: it runs in nodes."""
+    """Return the parameters of the candidate pipeline.
+
+    Args:
+        on_messages: True if it runs in nodes, so that parameters of input messages are included.
+    """
     return Runs(CANDIDATES, _read_here(collect_fields(PAPER), on_messages), CANDIDATE_NODES)
 
 
@@ -199,8 +209,10 @@ def parameter_options(
     nodes: Collection[str] | None = CANDIDATE_NODES,
     example: str = "stm.threshold=0.5",
 ) -> Callable:
-    """Decorator: --config and --set of one dataclass of parameters, which the function gets as
-    params=."""
+    """Decorator: --config and --set for one dataclass of parameters.
+
+    The function gets the dataclass as params=...
+    """
     runs = Runs(name, _read_here(collect_fields(defaults), on_messages=False), nodes)
 
     def decorate(function: Callable) -> Callable:
@@ -225,9 +237,9 @@ def checked(params: Any, values: Mapping[str, Any]) -> Any:
         raise InputError(str(error)) from None
 
 
-def weights_of(given: Mapping[str, Any]) -> list[str]:
+def weights_of(options: Mapping[str, Any]) -> list[str]:
     """Return the values of --weights as a list."""
-    weights = given.get("weights") or ()
+    weights = options.get("weights") or ()
     return [*map(str, weights)] if isinstance(weights, tuple) else [str(weights)]
 
 
@@ -235,10 +247,10 @@ def make_runs(weights: str | Path, on_messages: bool = False) -> Runs:
     """Return the parameters of the detector that a value of --weights selects.
 
     Args:
-        on_messages: the detector runs in a node, so it has the parameters of input messages, too.
+        on_messages: True if it runs in nodes, so that parameters of input messages are included.
 
     Raises:
-        InputError: there is no such detector.
+        InputError: the detector is unknown.
     """
     params = default_params(weights)
     name = str(weights)
@@ -247,7 +259,7 @@ def make_runs(weights: str | Path, on_messages: bool = False) -> Runs:
 
 
 def _read_here(fields: Fields, on_messages: bool) -> Fields:
-    """Return the fields without those of input messages, unless messages are read."""
+    """Return the fields, without those for input messages if no messages are read."""
     return {name: f for name, f in fields.items() if on_messages or not name.startswith("input.")}
 
 
@@ -265,11 +277,11 @@ range_option = click.option(
     type=Choice(RANGE_CHOICES),
     default="auto",
     show_default=True,
-    help="Range of the detector: 69 m ahead, or 51 m in all directions, which takes more than twice as long. auto: "
-    "the range that its weights were trained for (shipped weights: ahead).",
+    help="Range of the detector: ahead (69 m), or around (51 m in all directions), which takes more than twice as "
+    "long. auto: the range that the weights were trained for (shipped weights: ahead).",
 )
 device_option = click.option(
-    "--device", default="auto", show_default=True, help="Where networks run: auto, cpu, cuda or cuda:N."
+    "--device", default="auto", show_default=True, help="Device to run networks on: auto, cpu, cuda or cuda:N."
 )
 
 
@@ -278,15 +290,15 @@ def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> 
     detector=DetectorChoice(...).
 
     Args:
-        default: the detector without --weights; None: the function gets detector=None. So it does
-            where the verb has an option --results, and that is given.
-        tracking: parameters of the tracker can be set too, and the function gets
+        default: detector without --weights. If None, the function gets detector=None. It also gets
+            None if the command has an option --results and that is given.
+        tracking: True to accept parameters of the tracker as well; the function gets them as
             tracking=TrackingParams(...).
     """
-    others = [TRACKER] if tracking else []
+    tracker_runs = [TRACKER] if tracking else []
 
     def runs(given: Mapping[str, Any]) -> list[Runs]:
-        return [*map(make_runs, weights_of(given) or [FUSED]), *others]
+        return [*map(make_runs, weights_of(given) or [FUSED]), *tracker_runs]
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
@@ -295,18 +307,20 @@ def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> 
         ) -> Any:
             results = kwargs.get("results")
             if results is not None and (weights is not None or settings or range != "auto"):
-                form = next(p.metavar for p in click.get_current_context().command.params if p.name == "results")
-                raise click.UsageError(f"give either --results {form}, or --weights with --range, --config and --set")
+                metavar = next(p.metavar for p in click.get_current_context().command.params if p.name == "results")
+                raise click.UsageError(
+                    f"give either --results {metavar}, or --weights with --range, --config and --set"
+                )
             name = str(weights) if weights else None if results else default
             if name is None and settings:
                 raise click.UsageError("--config and --set require --weights")
             values: list[dict[str, Any]] = [{}, {}]
             if name is not None:
-                values = settings.values(make_runs(name), *others) if settings else values
+                values = settings.values(make_runs(name), *tracker_runs) if settings else values
             if tracking:
                 kwargs["tracking"] = checked(Tracked(), values[1]).tracking
-            chosen = None if name is None else make_detector_choice(name, range, device, values[0])
-            return function(*args, detector=chosen, **kwargs)
+            choice = None if name is None else make_detector_choice(name, range, device, values[0])
+            return function(*args, detector=choice, **kwargs)
 
         wrapper = settings_options(runs)(wrapper)
         for option in device_option, range_option, weights_option(default):
@@ -330,8 +344,8 @@ def detectors_options(function: Callable) -> Callable:
         if settings and not weights:
             raise click.UsageError("--config and --set require --weights")
         values = settings.values(*map(make_runs, weights)) if settings else [{} for _ in weights]
-        chosen = tuple(make_detector_choice(name, range, device, own) for name, own in zip(weights, values))
-        return function(*args, detectors=chosen, **kwargs)
+        choices = tuple(make_detector_choice(name, range, device, params) for name, params in zip(weights, values))
+        return function(*args, detectors=choices, **kwargs)
 
     wrapper = settings_options(lambda given: [*map(make_runs, weights_of(given) or [FUSED])])(wrapper)
     for option in device_option, range_option, weights_option(multiple=True):
@@ -342,10 +356,10 @@ def detectors_options(function: Callable) -> Callable:
 def make_detector_choice(
     weights: str | Path, range: str, device: str, values: Mapping[str, Any], params: Any = None
 ) -> DetectorChoice:
-    """Return a detector to open later, with parameters that are checked now.
+    """Return a detector to open later; its parameters are checked now.
 
     Args:
-        params: default parameters, for a detector that open_detector does not know.
+        params: default parameters of a detector that open_detector does not support.
     """
     if values:
         checked(default_params(weights) if params is None else params, values)
@@ -354,20 +368,19 @@ def make_detector_choice(
 
 def weights_option(default: str | None = None, multiple: bool = False) -> Callable:
     """Return the option --weights; with `multiple` it may be repeated."""
-    more = " May be repeated." if multiple else f" Default: {default}." if default else ""
+    note = " May be repeated." if multiple else f" Default: {default}." if default else ""
     return click.option(
         "--weights",
         type=click.Path(path_type=Path),
         metavar="FILE|NAME",
         multiple=multiple,
-        help="The detector: a checkpoint, the output of `train fused`, one of fused, pointpillars "
-        "and pointnet with its shipped weights, or a class of your own, "
-        f"module:Class.{more}",
+        help="Detector: a checkpoint; the file that `train fused` wrote; fused, pointpillars or pointnet with the "
+        f"shipped weights; or your own class, module:Class.{note}",
     )
 
 
 def read_config(path: Path, known: Any, nodes: Collection[str] | None = None) -> dict[str, Any]:
-    """Read a parameter file, see read_parameters, and print names that may be misspelt.
+    """Read a parameter file (see read_parameters) and print names that may be misspelt.
 
     Args:
         known: a dataclass of parameters, or its fields.

@@ -1,4 +1,4 @@
-"""Reading of ROS parameter files by commands."""
+"""Reader of ROS parameter files for commands."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ Fields = Mapping[str, Field[Any]]
 
 
 def read_parameters(
-    path: Path, known: Fields, nodes: Collection[str] | None = None
+    path: Path, fields: Fields, nodes: Collection[str] | None = None
 ) -> tuple[dict[str, Any], list[str]]:
     """Read the values of a ROS parameter file, or of a named configuration of the candidates.
 
     Args:
         path: file, or a name of CONFIGURATIONS.
-        known: fields of the parameters to read, by dotted name; others are left out.
-        nodes: names of the nodes whose sections apply, and those for all nodes; None: all
-            sections.
+        fields: parameters to read, by dotted name; others are ignored.
+        nodes: names of the nodes whose sections apply, in addition to sections for all nodes; None:
+            all sections apply.
 
     Returns:
-        {dotted name: value}, not checked yet, and a line for each name that may be misspelt.
+        {dotted name: value}, not validated, and a message for each name that may be misspelt.
 
     Raises:
         InputError: the file cannot be read, or a name in it is on the wrong level.
     """
     if str(path) in CONFIGURATIONS:
         configuration = CONFIGURATIONS[str(path)]
-        if others := sorted(configuration.keys() - known.keys()):
+        if others := sorted(configuration.keys() - fields.keys()):
             raise InputError(f"the configuration {path} is for candidates, not {others[0]}; give a parameter file")
         return dict(configuration), []
     content = _load_file(path)
@@ -60,10 +60,10 @@ def read_parameters(
         for name, value in _iterate_dotted(path, section.get("ros__parameters") or {}, visited):
             if not isinstance(name, str):
                 raise InputError(f"{path}: {name!r} is not a parameter name; quote it")
-            if name in known:
+            if name in fields:
                 values[name] = value
-            elif any(k.startswith(f"{name}.") or name.startswith(f"{k}.") for k in known):
-                raise InputError(f"{path}: '{name}' is {_describe_wrong_level(name, known)}")
+            elif any(k.startswith(f"{name}.") or name.startswith(f"{k}.") for k in fields):
+                raise InputError(f"{path}: '{name}' is {_describe_wrong_level(name, fields)}")
             else:
                 unknown.append(name)
     return values, [*lines, *describe_misspelt_parameters(unknown)]
@@ -84,21 +84,25 @@ def _load_file(path: Path) -> dict[Any, Any]:
 
 
 def _is_for_nodes(section: str, nodes: Collection[str]) -> bool:
-    """Return True for a section for one of these nodes, or for all nodes."""
+    """Return True if a section applies to one of these nodes or to all nodes."""
     return section.rpartition("/")[2] in ("*", "**", *nodes)
 
 
-def _describe_wrong_level(name: str, known: Iterable[str]) -> str:
-    inner = [k for k in known if k.startswith(f"{name}.")]
-    return f"a group, not a value; it contains {', '.join(inner)}" if inner else "below a parameter that is not a group"
+def _describe_wrong_level(name: str, names: Iterable[str]) -> str:
+    members = [k for k in names if k.startswith(f"{name}.")]
+    return (
+        f"a group, not a value; it contains {', '.join(members)}"
+        if members
+        else "below a parameter that is not a group"
+    )
 
 
 def _iterate_dotted(
     path: Path, section: dict, visited: Iterator[int], prefix: str = "", depth: int = 0
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield (dotted name, value), with the name unchanged if it is not text.
+    """Yield (dotted name, value); a name that is not a string is yielded unchanged.
 
-    visited counts the entries of all groups, because YAML anchors can nest groups without end.
+    `visited` counts the entries of all groups, because YAML anchors can nest groups endlessly.
     """
     for key, value in section.items():
         if next(visited) >= MAX_NAMES or depth >= MAX_DEPTH:

@@ -1,4 +1,4 @@
-"""run: start nodes where `ros2 run` is not installed."""
+"""run: start a node where `ros2 run` is not installed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidar_perception.nodes import NODES
 @click.argument("node", type=Choice(NODES), metavar="NODE")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def run_node(node: str, arguments: tuple[str, ...]) -> None:
-    """Start one ROS NODE; what follows goes to it, as with `ros2 run lidar_perception NODE`.
+    """Start one ROS NODE with the remaining arguments, like `ros2 run lidar_perception NODE`.
 
     \b
     Example:

@@ -1,4 +1,4 @@
-"""seed: a template of a seed pedestrian."""
+"""seed: create a template of a seed pedestrian."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidar_perception.candidates.seed_sources import make_click_source, make_tru
 from lidar_perception.candidates.seeds import save_seed
 from lidar_perception.candidates.silhouette import to_pixels
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import data_argument, open_and_describe, out_file, with_recorded_height
+from lidar_perception.cli.data import data_argument, open_and_describe, out_file_option, with_recorded_height
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.runs.terminal import console
@@ -40,12 +40,12 @@ from lidar_perception.wire.params import ViewParams
     metavar="X Y Z",
     help="A point on the pedestrian, in the LiDAR frame; default: the nearest label.",
 )
-@out_file("--out", "Template to write.", required=True)
+@out_file_option("--out", "Template to write.", required=True)
 @parameter_options(PipelineParams(view=ViewParams(enabled=True)))
 def seed(
     data: Path, number: int | None, at: tuple[float, float, float] | None, out: Path, params: PipelineParams
 ) -> None:
-    """Take the silhouette and height of one pedestrian as a template for later runs.
+    """Save the silhouette and height of one pedestrian as a template for later runs.
 
     Use it with --set seed.source=file --set seed.file=OUT, or with these parameters of the nodes.
 

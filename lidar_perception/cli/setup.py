@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import data_argument, out_folder
+from lidar_perception.cli.data import data_argument, out_folder_option
 from lidar_perception.runs.files import make_folder, write_text
 from lidar_perception.runs.terminal import console, errors, make_progress, show_scanning
 from lidar_perception.types import InputError
@@ -25,7 +25,7 @@ COLORS = {"high": "green", "fair": "default", "low": "yellow"}
 @data_argument(
     "A bag, a .pcd, .ply, .npy or .bin file or a folder of them, or the folder of a data set. Labels are not needed."
 )
-@out_folder("Folder for the files.", required=True)
+@out_folder_option("Folder for the files.", required=True)
 @click.option("--topic", metavar="TOPIC", help="Topic of the clouds, for a bag with several sensors.")
 @click.option(
     "--scans",

@@ -1,4 +1,4 @@
-"""simulate: labelled scans without a data set."""
+"""simulate: write simulated, labelled scans."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.command import Choice, Command
-from lidar_perception.cli.data import out_folder
+from lidar_perception.cli.data import out_folder_option
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labels.names import ALIASES
 from lidar_perception.runs.compiling import report_compilation
@@ -27,7 +27,7 @@ from lidar_perception.types import InputError
 
 
 @click.command(cls=Command)
-@out_folder("Bag or folder to create.", required=True)
+@out_folder_option("Bag or folder to create.", required=True)
 @click.option(
     "--format",
     "--to",
@@ -112,7 +112,7 @@ def simulate(
 ) -> None:
     """Write labelled scans of simulated streets, campuses or interiors as a bag or data set.
 
-    A file INCOMPLETE marks an unfinished data set; --resume resumes it.
+    A file named INCOMPLETE marks an unfinished data set, which --resume completes.
 
     \b
     Examples:
@@ -122,7 +122,7 @@ def simulate(
     """
     scenes = Scenes(kind, people, scene)
     if resume and force:
-        raise click.UsageError("--resume continues the run, --force starts over; give one of them")
+        raise click.UsageError("--resume and --force cannot be combined; --force starts over")
     sensor = find_sensor(sensor_name, mount_height)
     plan = DatasetPlan(
         layout, sensor, seed, frames, streets_of or (1 if layout == "kitti" else longest_drive(sensor)), scenes

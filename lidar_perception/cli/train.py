@@ -1,4 +1,4 @@
-"""train: networks from labelled or simulated scenes."""
+"""train: train networks on labelled or simulated scenes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.command import Choice, Group
-from lidar_perception.cli.data import data_argument, make_jobs_option, out_file, out_folder, path_option
+from lidar_perception.cli.data import data_argument, make_jobs_option, out_file_option, out_folder_option, path_option
 from lidar_perception.cli.options import checked, device_option, parameter_options
 from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.terminal import console
@@ -26,7 +26,7 @@ OPTIONS = (
     data_argument(
         "Training data: a data set or bag, or `sim` for simulated scenes; repeat it to mix them.",
         several=True,
-        kind=str,
+        value_type=str,
     ),
     click.option(
         "--val",
@@ -36,7 +36,7 @@ OPTIONS = (
     ),
     path_option("--split", "Train on the frames of --data, or whole sequences, listed in this file, one per line."),
     path_option("--val-split", "Validate on the frames or sequences listed in this file."),
-    out_folder("Folder for best.safetensors, last.safetensors, logs and the training state.", required=True),
+    out_folder_option("Folder for best.safetensors, last.safetensors, logs and the training state.", required=True),
     click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one."),
     path_option(
         "--init", "Start from the matching weights of this checkpoint; `package`: the shipped weights.", "FILE|package"
@@ -55,7 +55,7 @@ OPTIONS = (
 
 
 def shared_options(function: Callable) -> Callable:
-    """Decorate a command with the options of all networks; it gets them as request=..."""
+    """Decorator: the options shared by all networks; the command gets them as request=..."""
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
@@ -68,24 +68,28 @@ def shared_options(function: Callable) -> Callable:
 
 
 def training_options(defaults: Any) -> Callable:
-    """Decorator: one flag for each field of a training, --config and --set. The function gets
-    params=...; flags take precedence."""
-    named = collect_fields(defaults)
+    """Decorator: one flag for each training parameter, and --config and --set.
+
+    The function gets params=...; flags take precedence.
+    """
+    fields_by_name = collect_fields(defaults)
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
         def wrapper(*args: Any, params: Any, **kwargs: Any) -> Any:
-            given = {name: value for name in named if (value := kwargs.pop(name.replace(".", "_"))) is not None}
-            return function(*args, params=checked(params, given), **kwargs)
+            flag_values = {
+                name: value for name in fields_by_name if (value := kwargs.pop(name.replace(".", "_"))) is not None
+            }
+            return function(*args, params=checked(params, flag_values), **kwargs)
 
-        for name, f in reversed(named.items()):
-            wrapper = _flag(name, f)(wrapper)
+        for name, f in reversed(fields_by_name.items()):
+            wrapper = _make_flag(name, f)(wrapper)
         return parameter_options(defaults, "training", None, "scene=campus")(wrapper)
 
     return decorate
 
 
-def _flag(name: str, f: Field[Any]) -> Callable:
+def _make_flag(name: str, f: Field[Any]) -> Callable:
     flag, variable = "--" + name.replace(".", "-").replace("_", "-"), name.replace(".", "_")
     meta, default = f.metadata, f.default
     if isinstance(default, bool):
@@ -95,14 +99,14 @@ def _flag(name: str, f: Field[Any]) -> Callable:
             default=None,
             help=f"{meta['doc']} Default: {'on' if default else 'off'}.",
         )
-    shown = f"{default:.4g}" if isinstance(default, float) else default
+    default_text = f"{default:.4g}" if isinstance(default, float) else default
     return click.option(
         flag,
         variable,
         type=Choice(meta["choices"]) if meta["choices"] else type(default),
         default=None,
         help=f"{meta['doc']}{f' [{unit}]' if (unit := meta['unit']) else ''} "
-        f"Default: {'none' if shown == '' else shown}.",
+        f"Default: {'none' if default_text == '' else default_text}.",
     )
 
 
@@ -158,7 +162,7 @@ def pointnet(request: TrainingRequest, params: PointNetTraining) -> None:
 @train.command()
 @path_option("--weights", "Checkpoint or exported network (.onnx) of PointPillars. Default: the shipped one.")
 @path_option("--classifier", "Checkpoint of PointNet. Default: the shipped one.")
-@out_file("--out", "File to write (.json), for --weights and `fused.weights`.", required=True)
+@out_file_option("--out", "File to write (.json), for --weights and `fused.weights`.", required=True)
 @click.option("--force", is_flag=True, help="Replace --out.")
 @make_jobs_option("Processes that evaluate scans.", 1)
 @training_options(FusedTraining())
@@ -188,12 +192,12 @@ def fused(
         raise InputError(f"{out} exists already; give another name, or --force")
     from lidar_perception.training.fusion_curves import fit_fusion
 
-    print_fused(fit_fusion(weights, classifier, out, params, jobs))
+    print_fusion_fits(fit_fusion(weights, classifier, out, params, jobs))
     console.print(f"use {out} with --weights of commands, or as fused.weights of the node")
 
 
 def run(request: TrainingRequest, params: PointPillarsTraining | PointNetTraining) -> None:
-    """Train, and print the result."""
+    """Train a network and print the result."""
     from lidar_perception.training.start import start_training
     from lidar_perception.training.trainers import make_trainer
 
@@ -202,13 +206,11 @@ def run(request: TrainingRequest, params: PointPillarsTraining | PointNetTrainin
         print_result(*result, request.out)
 
 
-def print_fused(fits: Any) -> None:
-    """Print the fit of each class."""
+def print_fusion_fits(fits: Any) -> None:
+    """Print the fitted curves of each class, compared with the packaged ones."""
     from lidar_perception.scoring.tables import make_table
 
-    table = make_table(
-        "Curves, on scans that they were not fitted to", "", "proposals", "right", ">= 0.4", "right", "log loss"
-    )
+    table = make_table("Fitted curves on held-out scans", "", "proposals", "correct", ">= 0.4", "correct", "log loss")
     unfitted = []
     for name, fit in fits.items():
         rows = [("package", fit.before)]
@@ -231,20 +233,18 @@ def print_fused(fits: Any) -> None:
 
 
 def print_result(progress: Any, steps: int, batches: Any, out: Path) -> None:
-    """Print how a run ended. A run that was stopped ends the process with code 130."""
+    """Print the result of a run. If it was stopped, exit with code 130."""
     if batches.skipped:
-        console.print(f"{len(batches.skipped)} scenes could not be used, such as: {next(iter(batches.skipped))}")
+        console.print(f"{len(batches.skipped)} scenes were skipped, such as: {next(iter(batches.skipped))}")
     if progress.skipped:
-        console.print(
-            f"{progress.skipped} of {progress.step} steps were skipped because of values that were not finite"
-        )
+        console.print(f"{progress.skipped} of {progress.step} steps were skipped because of non-finite values")
     if progress.best is not None:
         console.print(f"{out / 'best.safetensors'}: score {progress.best:.2f} at step {progress.best_step}")
     if progress.left_out:
         console.print(f"{progress.left_out:.0f} of {steps} planned steps were skipped to end within the budget")
     if progress.late:
         console.print(
-            "the budget is spent before the learning rate has decayed: "
+            "the budget ran out before the learning rate decayed: "
             f"{steps - progress.step - progress.left_out:.0f} of {steps} steps are "
             "missing; continue with --resume"
         )
@@ -254,7 +254,7 @@ def print_result(progress: Any, steps: int, batches: Any, out: Path) -> None:
 
 
 def find_commit() -> str:
-    """Return the commit of this checkout, with + if files are changed, or else the version."""
+    """Return the commit of this checkout, with + if files are changed; the version if unknown."""
     folder = Path(__file__).resolve().parents[2]
     try:
         head, changes = (

@@ -1,4 +1,4 @@
-"""import-weights and export: networks from other projects, and for other runtimes."""
+"""import-weights and export: import networks of other projects, and export to other runtimes."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.command import Command, Group
-from lidar_perception.cli.data import out_file
+from lidar_perception.cli.data import out_file_option
 from lidar_perception.runs.terminal import console
 
 
 @click.command("import-weights", cls=Command)
 @click.argument("source", type=click.Path(path_type=Path), metavar="FILE.pth")
-@out_file("--out", "Checkpoint to write (.safetensors).", required=True)
+@out_file_option("--out", "Checkpoint to write (.safetensors).", required=True)
 @click.option(
     "--classes",
     metavar="A,B,C",
@@ -22,10 +22,10 @@ from lidar_perception.runs.terminal import console
 )
 @click.option("--half", is_flag=True, help="Store the weights of layers as float16.")
 def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:
-    """Turn PointPillars weights of OpenPCDet or mmdetection3d (1.x) into a checkpoint.
+    """Convert PointPillars weights of OpenPCDet or mmdetection3d (1.x) to a checkpoint.
 
-    Networks for KITTI with pillars of 0.16 m. The file is read as weights only; nothing in it is
-    run. What the projects define differently (anchors, headings, points of a pillar) is converted.
+    Supports networks for KITTI with pillars of 0.16 m. The file is loaded as weights only; no code
+    in it is run. Different conventions (anchors, headings, points of a pillar) are converted.
 
     \b
     Examples:
@@ -33,10 +33,10 @@ def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:
       lidar-perception import-weights car.pth --classes Car --out car.safetensors
     """
     from lidar_perception.detectors.checkpoint import Header, save_checkpoint
-    from lidar_perception.detectors.pointpillars.import_weights import import_weights as converted
+    from lidar_perception.detectors.pointpillars.import_weights import import_weights as convert_weights
 
     names = tuple(name.strip() for name in classes.split(",") if name.strip())
-    config, network, project = converted(source, names)
+    config, network, project = convert_weights(source, names)
     save_checkpoint(out, network, Header(config, {"imported from": project, "file": source.name}), half)
     console.print(f"{out}: PointPillars of {project} for {', '.join(config.classes)}")
 
@@ -48,13 +48,13 @@ def export() -> None:
 
 @export.command()
 @click.argument("weights", type=click.Path(path_type=Path), metavar="WEIGHTS")
-@out_file("--out", "File to write (.onnx).", required=True)
+@out_file_option("--out", "File to write (.onnx).", required=True)
 def onnx(weights: Path, out: Path) -> None:
     """Write a checkpoint of PointPillars or PointNet as ONNX (needs the extra [onnx]).
 
     Any version, size and classes can be exported. The graph of PointPillars takes points sorted
-    into pillars and gives the raw outputs at every anchor; that of PointNet takes the points of
-    clusters. The metadata holds the rest. The detector takes the file instead of a checkpoint.
+    into pillars and returns the raw outputs at every anchor; that of PointNet takes the points of
+    clusters. The metadata has the configuration. Detectors accept the file as a checkpoint.
 
     \b
     Examples:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import browser_option, data_argument, open_and_describe, out_folder, port_option
+from lidar_perception.cli.data import browser_option, data_argument, open_and_describe, out_folder_option, port_option
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.runs.terminal import console, errors, show_scanning
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @click.command(cls=Command)
 @data_argument()
 @click.option("--sequence", metavar="NAME", help="The drive of DATA to label, if it has several.")
-@out_folder("Folder of the journal; an existing one is continued. Default: out/label/NAME OF THE DRIVE.")
+@out_folder_option("Folder of the journal; an existing one is continued. Default: out/label/NAME OF THE DRIVE.")
 @port_option
 @browser_option
 @detector_options()

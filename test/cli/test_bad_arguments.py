@@ -154,7 +154,7 @@ def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch,
         (["detect", "b", "--out", "o", "--set", "input.intensity_max=255"], "read by nodes"),
         (["demo", "b", "--frames", "4"], "--frames applies to the simulated drive"),
         (["evaluate", "detection", "b", "--results", "r", "--min-score", "0.1"], "--min-score requires --weights"),
-        (["evaluate", "detection", "b", "--errors-from", "0.1"], "--errors-from goes with --errors"),
+        (["evaluate", "detection", "b", "--errors-from", "0.1"], "--errors-from requires --errors"),
         (["evaluate", "detection", "--data", "b", "--set", "scores=1"], "unknown parameter 'scores'"),
         (
             ["evaluate", "detection", "--data", "b", "--results", "r", "--set", "fused.amp=auto"],

@@ -118,7 +118,7 @@ def test_kitti_and_simulated_scenes_mix_and_broken_ones_count(tmp_path, cache, t
         0,
     )
     assert result.exit_code == 0, result.output
-    assert "1 scenes could not be used" in result.output and "000002.txt" in result.output
+    assert "1 scenes were skipped" in result.output and "000002.txt" in result.output
     header = read_header(tmp_path / "run/best.safetensors")
     assert header.training["scenes"] == 5 + 1 and header.training["scenes_skipped"] == 1
     assert header.metrics["Pedestrian_3d"] is not None

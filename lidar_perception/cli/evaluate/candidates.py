@@ -1,4 +1,4 @@
-"""evaluate candidates: paper A's protocol, without ROS."""
+"""evaluate candidates: score pedestrian candidates by the STM-CPA paper's protocol, without ROS."""
 
 from __future__ import annotations
 
@@ -11,16 +11,22 @@ import click
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import ScoringOptions, no_labels_error, out_file, scoring_options, with_recorded_height
+from lidar_perception.cli.data import (
+    ScoringOptions,
+    no_labels_error,
+    out_file_option,
+    scoring_options,
+    with_recorded_height,
+)
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.terminal import console, errors
 
 
 def with_recorded_setup(recording: Any, params: PipelineParams) -> PipelineParams:
-    """Return params with the sensor height of the recording, see with_recorded_height.
+    """Return params with the sensor height of the recording (see with_recorded_height).
 
-    If the recording has no camera, the crop to its view is turned off and a note is printed.
+    Without a camera calibration, turns off the crop to the camera's view and prints a note.
     """
     from lidar_perception.data.frame import CAMERA
 
@@ -33,7 +39,7 @@ def with_recorded_setup(recording: Any, params: PipelineParams) -> PipelineParam
 
 @click.command(cls=Command)
 @scoring_options()
-@out_file("--png", "Draw a bird's-eye view of the frame with the most pedestrians.")
+@out_file_option("--png", "Draw a bird's-eye view of the frame with the most pedestrians.")
 @parameter_options(PAPER)
 def candidates(options: ScoringOptions, png: Path | None, params: PipelineParams) -> None:
     """Score the pedestrian candidates of the STM-CPA paper against Pedestrian labels.
@@ -53,7 +59,7 @@ def candidates(options: ScoringOptions, png: Path | None, params: PipelineParams
     recording = options.open_recording(BOXES)
     params = with_recorded_setup(recording, params)
     if params.seed.source == "click":
-        raise click.UsageError("seed.source=click needs a person who clicks; use --set seed.source=file")
+        raise click.UsageError("seed.source=click requires user input; use --set seed.source=file")
     report = CandidateReport()
     options.fill(report, recording, partial(measure_candidates, params))
     if report.frames == 0:
@@ -66,7 +72,7 @@ def candidates(options: ScoringOptions, png: Path | None, params: PipelineParams
 
 
 def _draw_most_crowded(png: Path, recording: Any, report: Any, params: PipelineParams) -> None:
-    """Draw the frame with most pedestrians among those with candidates."""
+    """Draw the frame with the most pedestrians among those with candidates."""
     from lidar_perception.candidates.pipeline import find_candidates
     from lidar_perception.candidates.seeds import load_seeds
     from lidar_perception.rendering.colors import color_by_cluster

@@ -1,4 +1,4 @@
-"""evaluate clusters: classes assigned by PointNet against labels, without ROS."""
+"""evaluate clusters: score the classes that PointNet assigns, without ROS."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from lidar_perception.types import InputError
 
 
 def _find_checkpoint(weights: Path | None) -> Path:
-    """Return the checkpoint of --weights; InputError if it is not one of PointNet."""
+    """Return the checkpoint of --weights; InputError if it is not a PointNet checkpoint."""
     network, path = (POINTNET, None) if weights is None else resolve_weights(weights)
     if network != POINTNET:
-        raise InputError(f"{weights} is a detector {network}; give a checkpoint of {POINTNET}")
+        raise InputError(f"{weights} is a checkpoint of {network}; give one of {POINTNET}")
     return path or POINTNET_WEIGHTS
 
 
 def _make_runs(weights: Path | None) -> Runs:
-    """Return ground and clustering with the parameters that the network was trained with."""
+    """Return the ground and clustering parameters that the network was trained with."""
     fields = collect_fields(default_params(_find_checkpoint(weights)))
     return Runs(
         "ground and clustering",
@@ -42,11 +42,11 @@ def _make_runs(weights: Path | None) -> Runs:
 def clusters(options: ScoringOptions, weights: Path | None, settings: Settings) -> None:
     """Score the classes that PointNet assigns to clusters and points.
 
-    Clusters are made as in its training, unless --config or --set change this. A cluster is an
+    Clusters are computed as in training, unless --config or --set change this. A cluster is an
     object if at least half of its points are in the object's box, and background if less than 15
     percent are in any box. Other clusters are ignored, and so are Van, Truck, Tram, Person_sitting
-    and DontCare regions. Only points in the image count, because only those are labelled; without a
-    camera all points count.
+    and DontCare regions. With a camera, only points in the image are scored, because KITTI labels
+    only those.
 
     \b
     Example:

@@ -14,7 +14,7 @@ from lidar_perception.cli.data import (
     ScoringOptions,
     intervals_option,
     no_labels_error,
-    out_folder,
+    out_folder_option,
     path_option,
     scoring_options,
 )
@@ -28,8 +28,7 @@ from lidar_perception.types import InputError
 
 @dataclass(frozen=True)
 class DetectionRequest:
-    """A call of `evaluate detection`. The fields are its options; exactly one of `results` and
-    `detector` is not None."""
+    """Options of `evaluate detection`; exactly one of `results` and `detector` is not None."""
 
     options: ScoringOptions
     results: Path | None
@@ -48,9 +47,9 @@ class DetectionRequest:
         return str(self.results if self.detector is None else self.detector.weights)
 
     def check(self) -> None:
-        """Raise a UsageError or InputError for options that do not go together."""
+        """Raise a UsageError or InputError for options that cannot be combined."""
         if not self.errors:
-            refuse_options(("errors_from",), "goes with --errors")
+            refuse_options(("errors_from",), "requires --errors")
         if self.detector is None:
             refuse_options(("min_score", "device"), "requires --weights; --results DIR already contains the boxes")
             if self.write_results is not None:
@@ -99,7 +98,7 @@ class DetectionRequest:
         return partial(measure_detector, open_detector, self.keep, self.write_results)
 
     def compute(self, report: Any) -> dict[str, Any]:
-        """Return the scores of a report as JSON."""
+        """Return the scores of a report as a JSON-serialisable dict."""
         from lidar_perception.scoring.kitti.box_errors import measure_box_errors
         from lidar_perception.scoring.kitti.protocol import SCORED, Comparison
         from lidar_perception.scoring.kitti.reliability import measure_reliability
@@ -160,7 +159,7 @@ def _print_scores(content: dict[str, Any]) -> None:
     help="Height of the sensor above the ground. Default: the height in the recording, or measured on its first "
     "clouds.",
 )
-@out_folder(
+@out_folder_option(
     "Write the detections of --weights as KITTI result files, also for frames without labels.", "--write-results"
 )
 @click.option(

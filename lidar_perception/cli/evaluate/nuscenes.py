@@ -1,4 +1,4 @@
-"""evaluate nuscenes: boxes with scores against the labels of nuScenes."""
+"""evaluate nuscenes: score detections against the labels of nuScenes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import ScoringOptions, no_labels_error, out_file, path_option, scoring_options
+from lidar_perception.cli.data import ScoringOptions, no_labels_error, out_file_option, path_option, scoring_options
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.detectors.params import MIN_SCORE
@@ -20,8 +20,7 @@ from lidar_perception.types import InputError
 
 @dataclass(frozen=True)
 class NuscenesRequest:
-    """A call of `evaluate nuscenes`. The fields are its options; exactly one of `results` and
-    `detector` is not None."""
+    """Options of `evaluate nuscenes`; exactly one of `results` and `detector` is not None."""
 
     options: ScoringOptions
     results: Path | None
@@ -34,7 +33,7 @@ class NuscenesRequest:
         return str(self.results if self.detector is None else self.detector.weights)
 
     def check(self) -> None:
-        """Raise a UsageError for options that do not go together."""
+        """Raise a UsageError for options that cannot be combined."""
         if (self.results is None) == (self.detector is None):
             raise click.UsageError("give either --results JSON or --weights FILE")
         if self.write_results is not None and self.detector is None:
@@ -66,14 +65,16 @@ class NuscenesRequest:
 @scoring_options()
 @path_option("--results", "Result file of any detector, in the format of nuScenes' detection task.", "JSON")
 @detector_options(default=None)
-@out_file("--write-results", "Write the detections of --weights as a result file, also for frames without labels.")
+@out_file_option(
+    "--write-results", "Write the detections of --weights as a result file, also for frames without labels."
+)
 def nuscenes(options: ScoringOptions, **choices: Any) -> None:
     """Score boxes by the protocol of nuScenes' detection task.
 
     Average precision by centre distance at 0.5, 1, 2 and 4 m, the five errors of true positives and
-    NDS, over all ten classes, and over the three that our detectors know. Scores either a result
-    file, or a checkpoint, which is run on every key frame. DATA is the folder of nuScenes, or that
-    of one version in it; --split names scenes.
+    NDS, over all ten classes, and over the three that the detectors of this package support. Scores
+    either a result file, or a checkpoint, which is run on every key frame. DATA is the folder of
+    nuScenes, or of one of its versions; --split names scenes.
 
     \b
     Examples:

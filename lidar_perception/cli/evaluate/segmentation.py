@@ -11,11 +11,11 @@ import click
 
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import (
-    WHAT,
+    DATA_HELP,
     ScoringOptions,
     data_argument,
     no_labels_error,
-    out_file,
+    out_file_option,
     scoring_options,
     with_recorded_height,
 )
@@ -34,30 +34,30 @@ class MethodList(click.ParamType):
 
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple:
         names = value if isinstance(value, tuple) else tuple(str(value).split(","))
-        known = GROUND_METHODS + CLUSTERING_METHODS
-        if unknown := [name for name in names if name not in known]:
-            self.fail(f"unknown method {unknown[0]!r}{valid_names(unknown[0], known)}", param, ctx)
+        methods = GROUND_METHODS + CLUSTERING_METHODS
+        if unknown := [name for name in names if name not in methods]:
+            self.fail(f"unknown method {unknown[0]!r}{valid_names(unknown[0], methods)}", param, ctx)
         return names
 
 
 @click.command(cls=Command)
-@scoring_options(data_argument(f"{WHAT} May be repeated.", several=True))
+@scoring_options(data_argument(f"{DATA_HELP} May be repeated.", several=True))
 @click.option(
     "--methods",
     type=MethodList(),
     default=GROUND_METHODS + CLUSTERING_METHODS,
     help="Comma-separated ground and clustering methods to score. Default: all.",
 )
-@out_file("--png", "Draw a bird's-eye view of the ground of the first scan with labelled points.")
+@out_file_option("--png", "Draw a bird's-eye view of the ground of the first scan with labelled points.")
 @parameter_options(
     SegmentationParams(), "segmentation", ("perception", "ground_segmentation", "clustering"), "ground.method=patchwork"
 )
 def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, params: SegmentationParams) -> None:
-    """Score ground and clusters against labels.
+    """Score ground segmentation and clustering against labels.
 
-    Ground: each method against the classes of SemanticKITTI's points. Clusters: each method, on
-    what ground.method leaves, against SemanticKITTI's instances or labelled boxes; with boxes,
-    only the points in the camera's view where there is a calibration.
+    Ground methods are scored against the point classes of SemanticKITTI. Clustering methods run on
+    the points that ground.method does not remove, and are scored against SemanticKITTI's instances
+    or labelled boxes; with boxes and a camera calibration, only in the camera's view.
 
     \b
     Examples:
@@ -70,25 +70,30 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
     from lidar_perception.scoring.points.report import SegmentationReport, measure_methods
     from lidar_perception.scoring.points.tables import draw_ground, print_scores
 
-    grounds = tuple(name for name in GROUND_METHODS if name in methods)
-    clusterings = tuple(name for name in CLUSTERING_METHODS if name in methods)
+    ground_methods = tuple(name for name in GROUND_METHODS if name in methods)
+    clustering_methods = tuple(name for name in CLUSTERING_METHODS if name in methods)
     # Open everything first, so that a typo in the last path does not cost an hour.
     recordings = [options.open_recording(None, path) for path in options.data]
     labelled = [recording for recording in recordings if POINT_LABELS in recording.has]
     for recording in recordings:
         if recording not in labelled:
             recording.require(BOXES, "evaluate segmentation")
-    if png is not None and not (labelled and grounds):
+    if png is not None and not (labelled and ground_methods):
         raise click.UsageError("--png requires labelled points (SemanticKITTI) and a ground method")
-    if not (labelled or clusterings):
+    if not (labelled or clustering_methods):
         raise click.UsageError(
             "ground methods require labelled points: give SemanticKITTI, or choose a clustering method"
         )
     report = SegmentationReport()
     for recording in recordings:
         report.source = recording.layout
-        own = with_recorded_height(recording, params)
-        options.fill(report, recording, partial(measure_methods, own, grounds, clusterings), recording.layout)
+        recording_params = with_recorded_height(recording, params)
+        options.fill(
+            report,
+            recording,
+            partial(measure_methods, recording_params, ground_methods, clustering_methods),
+            recording.layout,
+        )
     if not (report.ground or report.clusters):
         raise no_labels_error(recordings[0], report.skipped)
     content = report.compute()
@@ -102,10 +107,10 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
     if png is not None:
         from lidar_perception.scoring.points.report import segment_by_methods
 
-        own = with_recorded_height(labelled[0], params)
+        recording_params = with_recorded_height(labelled[0], params)
         for frame in islice(labelled[0], options.limit):
-            scan, labels, found = segment_by_methods(frame, own, grounds)
+            scan, labels, ground_masks = segment_by_methods(frame, recording_params, ground_methods)
             if labels is not None:
-                draw_ground(png, frame.name, scan, labels.classes, found)
+                draw_ground(png, frame.name, scan, labels.classes, ground_masks)
                 break
         console.print(f"picture: {png}")

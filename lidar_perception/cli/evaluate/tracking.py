@@ -1,4 +1,4 @@
-"""evaluate tracking: tracks against labels with ids, without ROS."""
+"""evaluate tracking: score tracks against labels with ids, without ROS."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
 def tracking(options: ScoringOptions, detector: DetectorChoice, tracking: TrackingParams, ego: str) -> None:
     """Score tracks of Car, Pedestrian and Cyclist: HOTA, CLEAR MOT and AB3DMOT.
 
-    The labels need track ids, and the frames of a drive come one after the other, so this runs in
-    one process.
+    Requires labels with track ids. Runs in one process, because tracking needs the frames of a
+    drive in order.
 
     \b
     Examples:
