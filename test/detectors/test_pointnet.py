@@ -22,7 +22,12 @@ from lidar_perception.detectors.pointnet.clusters import (
 )
 from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS, make_pointnet_config
 from lidar_perception.detectors.pointnet.losses import cluster_loss
-from lidar_perception.detectors.pointnet.network import fuse_norms, make_pointnet, nearest, squared_distances
+from lidar_perception.detectors.pointnet.network import (
+    compute_squared_distances,
+    find_nearest,
+    fuse_norms,
+    make_pointnet,
+)
 from lidar_perception.detectors.pointnet.predict import compute_probabilities, predict, select_detections
 from lidar_perception.detectors.pointnet.torch_network import TorchPointNet, run_network
 from lidar_perception.geometry import wrap_angle
@@ -168,7 +173,7 @@ def test_nearest_equals_brute_force(rng):
     xyz = torch.from_numpy(rng.normal(size=(3, 20, 3)))
     valid = torch.from_numpy(rng.random((3, 20)) < 0.7)
     valid[:, :5] = True
-    squared, indices = nearest(squared_distances(xyz[:, :5], xyz, valid), 4)
+    squared, indices = find_nearest(compute_squared_distances(xyz[:, :5], xyz, valid), 4)
     for b in range(3):
         for c in range(5):
             apart = ((xyz[b] - xyz[b, c]) ** 2).sum(-1)

@@ -1,8 +1,10 @@
 """Encoding of boxes as network outputs, and decoding (paper C, Eq. 19).
 
-In the normalized frame of clusters.py, a box is: the centre of the object relative to the mean of
-its points, metres; the log of length, width and height relative to the mean of the class; yaw as a
-bin and a residual, -1..1, in units of half a bin.
+A box is encoded in the normalized frame of clusters.py as
+
+- the centre of the object relative to the mean of its points, metres;
+- the log of length, width and height relative to the mean of the class;
+- a yaw bin, and the residual -1..1 in units of half a bin.
 """
 
 from __future__ import annotations
@@ -19,8 +21,13 @@ Array = TypeVar("Array")  # NumPy array or torch tensor
 
 
 class Outputs(NamedTuple, Generic[Array]):
-    """Output of a network for B clusters: logits (B, K + 1) with the background last; centres
-    (B, 3), sizes (B, 3), yaw_bins (B, Y) and yaw_residuals (B, Y), with Y bins."""
+    """Output of a network for B clusters.
+
+    Attributes:
+        logits: (B, K + 1), background last.
+        centres, sizes: (B, 3).
+        yaw_bins, yaw_residuals: (B, Y) with Y bins.
+    """
 
     logits: Array
     centres: Array
@@ -30,8 +37,13 @@ class Outputs(NamedTuple, Generic[Array]):
 
 
 class BoxTargets(NamedTuple, Generic[Array]):
-    """Encoded boxes: centres (K, 3), sizes (K, 3) and yaw_residuals (K,) float32, yaw_bins (K,)
-    int64."""
+    """Encoded boxes of K objects.
+
+    Attributes:
+        centres, sizes: (K, 3) float32.
+        yaw_bins: (K,) int64.
+        yaw_residuals: (K,) float32.
+    """
 
     centres: Array
     sizes: Array
@@ -50,30 +62,36 @@ def encode(
     """
     offset = boxes[:, :3] - centres
     cos, sin = np.cos(azimuths), np.sin(azimuths)
-    turned = np.column_stack(
+    rotated = np.column_stack(
         [cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0], offset[:, 2]]
     )
     sizes = np.log(np.maximum(boxes[:, 3:6], 0.05) / np.array(config.sizes)[labels])
     width = 2 * np.pi / config.yaw_bins
     yaw = np.mod(boxes[:, 6] - azimuths, 2 * np.pi)
     bins = np.mod(np.round(yaw / width).astype(np.int64), config.yaw_bins)
-    rest = wrap_angle(yaw - bins * width) / (width / 2)
-    return BoxTargets(turned.astype(np.float32), sizes.astype(np.float32), bins, rest.astype(np.float32))
+    residuals = wrap_angle(yaw - bins * width) / (width / 2)
+    return BoxTargets(rotated.astype(np.float32), sizes.astype(np.float32), bins, residuals.astype(np.float32))
 
 
 def decode(
     outputs: Outputs[np.ndarray], inputs: ClusterInput, config: PointNetConfig, labels: np.ndarray
 ) -> np.ndarray:
-    """Return boxes (K, 7) float32 for classes labels (K,), the inverse of encode."""
-    centres, logs, residuals = (x.astype(np.float64) for x in (outputs.centres, outputs.sizes, outputs.yaw_residuals))
+    """Decode boxes (K, 7) float32, the inverse of encode.
+
+    Args:
+        labels: (K,) class of each box, indices into config.classes.
+    """
+    centres, log_sizes, residuals = (
+        x.astype(np.float64) for x in (outputs.centres, outputs.sizes, outputs.yaw_residuals)
+    )
     bins = outputs.yaw_bins.argmax(axis=1)
     cos, sin = np.cos(inputs.azimuths), np.sin(inputs.azimuths)
     boxes = np.empty((len(bins), 7))
     boxes[:, 0] = inputs.centres[:, 0] + cos * centres[:, 0] - sin * centres[:, 1]
     boxes[:, 1] = inputs.centres[:, 1] + sin * centres[:, 0] + cos * centres[:, 1]
     boxes[:, 2] = inputs.centres[:, 2] + centres[:, 2]
-    boxes[:, 3:6] = np.array(config.sizes)[labels] * np.exp(np.clip(logs, -2, 2))
+    boxes[:, 3:6] = np.array(config.sizes)[labels] * np.exp(np.clip(log_sizes, -2, 2))
     width = 2 * np.pi / config.yaw_bins
-    rest = np.clip(residuals[np.arange(len(bins)), bins], -1, 1)
-    boxes[:, 6] = wrap_angle(inputs.azimuths + (bins + rest / 2) * width)
+    residual = np.clip(residuals[np.arange(len(bins)), bins], -1, 1)
+    boxes[:, 6] = wrap_angle(inputs.azimuths + (bins + residual / 2) * width)
     return boxes.astype(np.float32)

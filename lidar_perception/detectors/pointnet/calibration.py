@@ -19,17 +19,17 @@ def calibrate(network: PointNet, logits: Tensor, labels: Tensor) -> None:
 
     Args:
         logits: (B, K + 1).
-        labels: (B,) int64; negative labels are ignored. Without other labels nothing changes.
+        labels: (B,) int64; negative labels are ignored. If all are negative, nothing changes.
     """
-    known = labels >= 0
-    if not known.any():
+    is_labelled = labels >= 0
+    if not is_labelled.any():
         return
-    logits, labels = logits[known].detach().double().cpu(), labels[known].cpu()
+    logits, labels = logits[is_labelled].detach().double().cpu(), labels[is_labelled].cpu()
     log_temperature = torch.zeros(1, dtype=torch.double, requires_grad=True)
     offsets = torch.zeros(logits.shape[1], dtype=torch.double, requires_grad=True)
     optimizer = torch.optim.LBFGS([log_temperature, offsets], max_iter=STEPS, line_search_fn="strong_wolfe")
 
-    def loss() -> Tensor:
+    def compute_loss() -> Tensor:
         optimizer.zero_grad()
         scaled = logits / log_temperature.clamp(-3, 3).exp() + offsets
         # Regularization: the offset of a class without examples would go to minus infinity.
@@ -37,22 +37,22 @@ def calibrate(network: PointNet, logits: Tensor, labels: Tensor) -> None:
         value.backward()
         return value
 
-    optimizer.step(loss)
+    optimizer.step(compute_loss)
     network.temperature.copy_(log_temperature.detach().clamp(-3, 3).exp())
     network.offsets.copy_(offsets.detach())
 
 
 def calibration_error(probabilities: np.ndarray, labels: np.ndarray, bins: int = 10) -> float:
-    """Return the expected calibration error, in bins of equal width.
+    """Return the expected calibration error, computed in bins of equal width.
 
-    It is the mean difference between the highest probability and the accuracy; 0 without examples.
+    This is the mean difference between the highest probability and the accuracy, or 0 without examples.
 
     Args:
         probabilities: (B, K).
         labels: (B,).
     """
-    best = probabilities.max(axis=1)
-    right = probabilities.argmax(axis=1) == labels
-    bin_of = np.minimum((best * bins).astype(int), bins - 1)
-    gap = sum(abs(best[bin_of == i].sum() - right[bin_of == i].sum()) for i in range(bins))
+    confidence = probabilities.max(axis=1)
+    is_correct = probabilities.argmax(axis=1) == labels
+    bin_index = np.minimum((confidence * bins).astype(int), bins - 1)
+    gap = sum(abs(confidence[bin_index == i].sum() - is_correct[bin_index == i].sum()) for i in range(bins))
     return float(gap / max(len(labels), 1))

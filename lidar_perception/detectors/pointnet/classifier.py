@@ -49,8 +49,8 @@ class PointNetClassifier(TrainedNetwork):
             both float64 and NaN for skipped proposals.
         """
         clusters = crop_boxes(proposals.boxes, obstacles, BOX_MARGIN_M)
-        index_of = {CLASSES.index(name): i for i, name in enumerate(self.classes)}
-        labels = np.array([index_of.get(int(i), -1) for i in proposals.class_ids], np.int64)
+        label_by_class_id = {CLASSES.index(name): i for i, name in enumerate(self.classes)}
+        labels = np.array([label_by_class_id.get(int(i), -1) for i in proposals.class_ids], np.int64)
         chosen = np.flatnonzero(selected & (clusters.sizes >= MIN_POINTS) & (labels >= 0))
         predictions = self.predict(clusters.take(chosen).with_ground(ground), labels[chosen], cpu_fallback)
         count = len(proposals)

@@ -54,21 +54,25 @@ class CompiledPointNet:
         assert LANES
         self.config = config
         weights = LayerWeights(tensors, NORM_EPS)
-        shallow, local, wide = (config.point_channels[-1], config.local_channels, config.global_channels)
+        shallow_width, local_width, global_width = (
+            config.point_channels[-1],
+            config.local_channels,
+            config.global_channels,
+        )
         self.points = _take_layers(weights, "points", POINT, *config.point_channels)
         self.raw = self.fine = self.local = self.coarse = None
-        found = (shallow + (local if config.groups else 0)) if config.skip else 0
+        feature_count = (shallow_width + (local_width if config.groups else 0)) if config.skip else 0
         if config.groups:
             self.local = _Local(config, weights)
-            self.fine = _take_layers(weights, "fine", local, wide)
-            found += wide
+            self.fine = _take_layers(weights, "fine", local_width, global_width)
+            feature_count += global_width
         if config.mrg:
             self.coarse = _Coarse(config, weights)
-            found += wide
+            feature_count += global_width
         if config.mrg or not config.groups:
-            self.raw = _take_layers(weights, "raw", shallow, wide)
-            found += wide
-        self.head = _take_layers(weights, "head", found + CONTEXT, *config.head_channels)
+            self.raw = _take_layers(weights, "raw", shallow_width, global_width)
+            feature_count += global_width
+        self.head = _take_layers(weights, "head", feature_count + CONTEXT, *config.head_channels)
         self.widths = [len(config.classes) + 1, 3, 3, config.yaw_bins, config.yaw_bins]
         outputs = [
             weights.take(name, (width, config.head_channels[-1]))
@@ -81,7 +85,7 @@ class CompiledPointNet:
         weights.finish()
 
     def to(self, device: str) -> None:
-        """Stay on the CPU."""
+        """Do nothing: the network stays on the CPU."""
 
     def __call__(self, inputs: ClusterInput) -> Outputs[np.ndarray]:
         """Return the outputs of the network for K clusters; K may be 0."""
@@ -101,24 +105,24 @@ class CompiledPointNet:
         first = np.concatenate([[0], np.cumsum(sizes)])
         rows = np.zeros((first[-1], pad_channels(POINT)), np.float32)
         rows[:, :POINT] = points[valid]
-        dense = (sizes / np.float32(self.config.points))[:, None].astype(np.float32)
+        density = (sizes / np.float32(self.config.points))[:, None].astype(np.float32)
         features = _apply_layers(self.points, rows)
-        found, shallow = [], [kernels.max_by_group(features, first, self.points[-1].channels)]
+        parts, shallow = [], [kernels.max_by_group(features, first, self.points[-1].channels)]
         if self.local is not None:
             assert self.fine is not None
             local, first_centre = self.local(rows, first, features, self.config.centroids)
             fine = _apply_layers(self.fine, local)
-            found.append(kernels.max_by_group(fine, first_centre, self.fine[-1].channels))
+            parts.append(kernels.max_by_group(fine, first_centre, self.fine[-1].channels))
             shallow.append(kernels.max_by_group(local, first_centre, self.local.join[-1].channels))
             if self.coarse is not None:
                 coarse = self.coarse(rows, first, local, first_centre, self.config.coarse)
-                found.append(coarse * (np.float32(0.5) + dense))
+                parts.append(coarse * (np.float32(0.5) + density))
         if self.raw is not None:
             raw = kernels.max_by_group(_apply_layers(self.raw, features), first, self.raw[-1].channels)
-            found.append(raw * (np.float32(1.5) - dense) if self.config.mrg else raw)
+            parts.append(raw * (np.float32(1.5) - density) if self.config.mrg else raw)
         if self.config.skip:
-            found += shallow
-        joined = _concatenate_padded([*found, context])
+            parts += shallow
+        joined = _concatenate_padded([*parts, context])
         return self.outputs(_apply_layers(self.head, joined))[:, : self.outputs.channels]
 
 
@@ -136,20 +140,20 @@ class _Local:
         )
 
     def __call__(
-        self, rows: np.ndarray, first: np.ndarray, features: np.ndarray, most: int
+        self, rows: np.ndarray, first: np.ndarray, features: np.ndarray, max_centres: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return features (R, C) of the centres of all clusters, and the first centre of each
         cluster (K + 1,)."""
         relative, starts, density, first_centre = kernels.group_neighbours(
-            rows, first, most, self.radii, self.counts, self.in_ball
+            rows, first, max_centres, self.radii, self.counts, self.in_ball
         )
         weights = density / density.sum(axis=1, keepdims=True) * np.float32(len(self.counts))
         scales = []
         for s, layers in enumerate(self.nets):
             values = _apply_layers(layers, relative[s, : starts[s, -1]])
             scales.append(kernels.max_by_group(values, starts[s], layers[-1].channels) * weights[:, s : s + 1])
-        own = np.repeat(first[:-1] - first_centre[:-1], np.diff(first_centre)) + np.arange(first_centre[-1])
-        scales.append(features[own, : self.shallow])
+        centre_rows = np.repeat(first[:-1] - first_centre[:-1], np.diff(first_centre)) + np.arange(first_centre[-1])
+        scales.append(features[centre_rows, : self.shallow])
         return _apply_layers(self.join, _concatenate_padded(scales)), first_centre
 
 
@@ -164,20 +168,20 @@ class _Coarse:
         self.position[:, : len(weight)] = weight[:, :3].T
 
     def __call__(
-        self, rows: np.ndarray, first: np.ndarray, local: np.ndarray, first_centre: np.ndarray, most: int
+        self, rows: np.ndarray, first: np.ndarray, local: np.ndarray, first_centre: np.ndarray, max_groups: int
     ) -> np.ndarray:
         """Return (K, C) from the features `local` (R, B) of the centres."""
-        greatest = kernels.coarse_maxima(
-            rows, first, self.features(local), first_centre, most, self.count, self.radius, self.position
+        maxima = kernels.coarse_maxima(
+            rows, first, self.features(local), first_centre, max_groups, self.count, self.radius, self.position
         )
-        return greatest[:, : self.features.channels]
+        return maxima[:, : self.features.channels]
 
 
 def _take_layers(weights: LayerWeights, name: str, *channels: int) -> list[Layer]:
-    """Take the layers of network.mlp(*channels)."""
+    """Take the layers of network.make_mlp(*channels)."""
     return [
-        _make_layer(*_take_norm_layer(weights, f"{name}.{i}", read, out), relu=True)
-        for i, (read, out) in enumerate(pairwise(channels))
+        _make_layer(*_take_norm_layer(weights, f"{name}.{i}", channels_in, channels_out), relu=True)
+        for i, (channels_in, channels_out) in enumerate(pairwise(channels))
     ]
 
 

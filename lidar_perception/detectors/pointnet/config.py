@@ -1,7 +1,7 @@
 """Configuration of paper C's improved PointNet, its ablations and baselines.
 
 Paper C (Zhang et al., PLOS One 2026, e0348581) defines the parts (Eq. 13 to 19) but gives no layer
-widths; docs/explanation/papers.md lists departures from its equations. The switches are those of
+widths; docs/explanation/papers.md lists deviations from its equations. The switches are those of
 its Table 5; PointNet and PointNet++ (SSG) are settings of the same network. A checkpoint contains
 the dataclass as JSON, so weights and architecture cannot get separated.
 """
@@ -32,11 +32,11 @@ class PointNetConfig:
         mrg: concatenate features of a coarser grouping and of single points, weighted by density
             (Eq. 15, 17).
         skip: concatenate shallow features with the deep ones (Eq. 16).
-        grouped: group points; without it, msg and mrg, points are processed one by one, as in
-            PointNet.
+        grouped: group points. If grouped, msg and mrg are all off, points are processed one by one,
+            as in PointNet.
         points: maximum number of points read from a cluster (Eq. 13).
         centroids, coarse: numbers of groups of points, and of groups of these centroids.
-        radii, coarse_radius: of the groups, metres.
+        radii, coarse_radius: radii of the groups, metres.
         neighbours, coarse_neighbours: maximum number of members of a group.
         sampling: choice of the centroids among the points. random: the first ones. farthest: by
             farthest point sampling (Eq. 15, 17).
@@ -75,7 +75,7 @@ class PointNetConfig:
     global_channels: int = 128
     head_channels: tuple[int, ...] = (256, 128)
     yaw_bins: int = 12
-    sizes: tuple[tuple[float, float, float], ...] = tuple(of.mean_size for of in DETECTED.values())
+    sizes: tuple[tuple[float, float, float], ...] = tuple(properties.mean_size for properties in DETECTED.values())
 
     def __post_init__(self) -> None:
         numbers = (

@@ -75,7 +75,7 @@ class PointNetDetector(NetworkDetector):
         t4 = self.classifier.now()
         predictions = self.classifier.predict(clusters, cpu_fallback=settings.cpu_fallback)
         t5 = self.classifier.now()
-        detections, best, broken = self._make_detections(predictions)
+        detections, best, output_problem = self._make_detections(predictions)
         boxes = move_cars_to_points(
             detections.boxes, detections.class_ids, view.frame.xyz.compress(~ground, axis=0), settings.on_points
         )
@@ -84,16 +84,16 @@ class PointNetDetector(NetworkDetector):
         timings = {
             step: seconds * 1e3 for step, seconds in zip(STEPS, (t1 - t0 + t4 - t3, t2 - t1, t3 - t2, t5 - t4, t6 - t5))
         }
-        problem = broken or self._find_problem(view, cluster_ids, clusters, dropped)
+        problem = output_problem or self._find_problem(view, cluster_ids, clusters, dropped)
         return DetectionResult(detections, timings, problem or self.fallback, best)
 
     def _make_detections(self, predicted: Predictions) -> tuple:
         """Return the detections, the best scores by class and a problem or None."""
-        broken = None
+        output_problem = None
         best: dict[str, float] = {}
         valid = np.isfinite(np.column_stack([predicted.probabilities, predicted.boxes])).all(axis=1)
         if not valid.all():
-            broken = (
+            output_problem = (
                 f"the network's outputs are NaN for {len(valid) - valid.sum()} of "
                 f"{len(valid)} clusters; check the weights and the intensity"
             )
@@ -106,9 +106,9 @@ class PointNetDetector(NetworkDetector):
         )
         if len(detections) == 0 and valid.any():
             highest = predicted.probabilities[:, : len(self.classes)].max(axis=0)
-            best, nan = self.classifier.find_best_scores(highest.tolist())
-            broken = nan or broken
-        return detections, best, broken
+            best, score_problem = self.classifier.find_best_scores(highest.tolist())
+            output_problem = score_problem or output_problem
+        return detections, best, output_problem
 
     def _find_problem(
         self, view: NormalizedView, cluster_ids: np.ndarray, clusters: Clusters, dropped: int

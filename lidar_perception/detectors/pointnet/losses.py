@@ -47,9 +47,9 @@ def cluster_loss(
         return Losses(classes + zero, classes, zero, zero)
     bins = targets.yaw_bins[has_box]
     residuals = outputs.yaw_residuals[has_box].gather(1, bins[:, None])[:, 0]
-    found = torch.cat([outputs.centres[has_box], outputs.sizes[has_box], residuals[:, None]], 1)
-    wanted = torch.cat([targets.centres[has_box], targets.sizes[has_box], targets.yaw_residuals[has_box][:, None]], 1)
-    boxes = functional.smooth_l1_loss(found.float(), wanted, beta=SMOOTH, reduction="none").sum(dim=1).mean()
+    predicted = torch.cat([outputs.centres[has_box], outputs.sizes[has_box], residuals[:, None]], 1)
+    expected = torch.cat([targets.centres[has_box], targets.sizes[has_box], targets.yaw_residuals[has_box][:, None]], 1)
+    boxes = functional.smooth_l1_loss(predicted.float(), expected, beta=SMOOTH, reduction="none").sum(dim=1).mean()
     yaw_bins = functional.cross_entropy(outputs.yaw_bins[has_box].float(), bins)
     total = classes + BOX_WEIGHT * boxes + YAW_BIN_WEIGHT * yaw_bins
     return Losses(total, classes, boxes, yaw_bins)

@@ -7,8 +7,8 @@ ablations and baselines.
                  shallow features, skipped over (Eq. 16) ----------------+
 
 B clusters, N points, M centroids, k neighbours, C channels. A cluster with fewer than N points is
-padded with copies of its points, which do not change a maximum. `valid` is False for copies, so
-they are not used as neighbours. Neighbours beyond the radius are replaced by the nearest one, the
+padded with copies of its points, which do not change a maximum. `valid` is False for copies, which
+are not used as neighbours. Neighbours beyond the radius are replaced by the nearest one, the
 centroid itself.
 """
 
@@ -39,7 +39,7 @@ class LinearNormRelu(nn.Sequential):
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(x.reshape(-1, x.shape[-1])).view(*x.shape[:-1], -1)
 
-    def grouped(self, own: Tensor, features: Tensor, indices: Tensor) -> Tensor:
+    def apply_to_groups(self, own: Tensor, features: Tensor, indices: Tensor) -> Tensor:
         """Apply the layer to own (B, M, k, c) concatenated with rows of features.
 
         Each row of features (B, N, C), selected by indices (B, M, k), is multiplied only once even
@@ -47,25 +47,30 @@ class LinearNormRelu(nn.Sequential):
         """
         linear, norm, relu = self
         assert isinstance(linear, nn.Linear)
-        of_own, of_rows = linear.weight.split([own.shape[-1], features.shape[-1]], dim=1)
-        x = functional.linear(own, of_own, linear.bias).add_(gather_rows(functional.linear(features, of_rows), indices))
+        own_weight, row_weight = linear.weight.split([own.shape[-1], features.shape[-1]], dim=1)
+        x = functional.linear(own, own_weight, linear.bias).add_(
+            gather_rows(functional.linear(features, row_weight), indices)
+        )
         return relu(norm(x.flatten(0, 2))).view(x.shape)
 
 
-def mlp(*channels: int) -> nn.Sequential:
-    """Return LinearNormRelu layers from each width to the next."""
+def make_mlp(*channels: int) -> nn.Sequential:
+    """Make one LinearNormRelu layer from each width to the next."""
     return nn.Sequential(*(LinearNormRelu(a, b) for a, b in pairwise(channels)))
 
 
-def squared_distances(centres: Tensor, xyz: Tensor, valid: Tensor) -> Tensor:
-    """Return (B, M, N) of centres (B, M, 3) to points xyz (B, N, 3); inf to points not valid."""
+def compute_squared_distances(centres: Tensor, xyz: Tensor, valid: Tensor) -> Tensor:
+    """Return the squared distances (B, M, N) of centres (B, M, 3) to points xyz (B, N, 3).
+
+    The distance to a point that is not valid is inf.
+    """
     # Differences instead of a matrix product keep the distance of a point to itself exactly 0.
     # Separate axes: a sum over an axis of length 3 takes four times as long.
     x, y, z = ((a[:, :, None] - b[:, None]).square() for a, b in zip(centres.unbind(-1), xyz.unbind(-1)))
     return (x + y + z).masked_fill(~valid[:, None], torch.inf)
 
 
-def nearest(squared: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def find_nearest(squared: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return the `count` nearest points to each centre by squared distances (B, M, N).
 
     Returns:
@@ -93,21 +98,21 @@ class LocalNet(nn.Module):
     ):
         super().__init__()
         self.groups, self.density = list(groups), density
-        self.nets = nn.ModuleList(mlp(POINT, *channels) for _ in groups)
-        self.join = mlp(len(groups) * channels[-1] + point_channels, out)
+        self.nets = nn.ModuleList(make_mlp(POINT, *channels) for _ in groups)
+        self.join = make_mlp(len(groups) * channels[-1] + point_channels, out)
 
     def forward(self, points: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
         xyz, centres = points[..., :3], points[:, :count, :3]
-        distances = squared_distances(centres, xyz, valid)  # (B, M, N)
-        squared, indices = nearest(distances, max(k for _, k in self.groups))
+        distances = compute_squared_distances(centres, xyz, valid)  # (B, M, N)
+        squared, indices = find_nearest(distances, max(k for _, k in self.groups))
         scales, density = [], []
         for (radius, k), net in zip(self.groups, self.nets):
-            within = squared[..., :k] <= radius * radius  # (B, M, k)
-            near = gather_rows(points, torch.where(within, indices[..., :k], indices[..., :1]))
-            around = (near[..., :3] - centres[:, :, None]) / radius  # (B, M, k, 3)
-            scales.append(net(torch.cat([around, near[..., 3:]], dim=-1)).amax(dim=2))
+            in_radius = squared[..., :k] <= radius * radius  # (B, M, k)
+            neighbours = gather_rows(points, torch.where(in_radius, indices[..., :k], indices[..., :1]))
+            relative = (neighbours[..., :3] - centres[:, :, None]) / radius  # (B, M, k, 3)
+            scales.append(net(torch.cat([relative, neighbours[..., 3:]], dim=-1)).amax(dim=2))
             density.append(
-                within.sum(dim=-1) / (k * radius)
+                in_radius.sum(dim=-1) / (k * radius)
                 if self.density == "neighbours"
                 else (distances <= radius * radius).sum(dim=-1) / radius**3
             )
@@ -127,17 +132,16 @@ class CoarseNet(nn.Module):
 
     def forward(self, xyz: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
         centres = xyz[:, :count]
-        squared, indices = nearest(squared_distances(centres, xyz, valid), self.neighbours)
+        squared, indices = find_nearest(compute_squared_distances(centres, xyz, valid), self.neighbours)
         indices = torch.where(squared <= self.radius**2, indices, indices[..., :1])
-        around = (gather_rows(xyz, indices) - centres[:, :, None]) / self.radius
+        relative = (gather_rows(xyz, indices) - centres[:, :, None]) / self.radius
         layer = self.net[0]
         assert isinstance(layer, LinearNormRelu)
-        return layer.grouped(around, features, indices).amax(dim=2)
+        return layer.apply_to_groups(relative, features, indices).amax(dim=2)
 
 
 class PointNet(nn.Module):
-    """Network for B clusters: points (B, N, 5), valid (B, N) bool and context (B, 6), see
-    ClusterInput, to Outputs."""
+    """Network for B clusters; points (B, N, 5), valid (B, N) and context (B, 6) are as in ClusterInput."""
 
     temperature: Tensor
     offsets: Tensor
@@ -145,53 +149,57 @@ class PointNet(nn.Module):
     def __init__(self, config: PointNetConfig):
         super().__init__()
         self.config = config
-        shallow, local, wide = (config.point_channels[-1], config.local_channels, config.global_channels)
-        self.points = mlp(POINT, *config.point_channels)
+        shallow_width, local_width, global_width = (
+            config.point_channels[-1],
+            config.local_channels,
+            config.global_channels,
+        )
+        self.points = make_mlp(POINT, *config.point_channels)
         self.local: LocalNet | None = None
         self.coarse: CoarseNet | None = None
         self.raw: nn.Module | None = None
         self.fine: nn.Module | None = None
-        found = 0
+        feature_count = 0
         if config.groups:
-            self.local = LocalNet(config.groups, config.group_channels, shallow, local, config.density)
-            self.fine = mlp(local, wide)
-            found += wide
+            self.local = LocalNet(config.groups, config.group_channels, shallow_width, local_width, config.density)
+            self.fine = make_mlp(local_width, global_width)
+            feature_count += global_width
         if config.mrg:
-            self.coarse = CoarseNet(local, wide, config.coarse_radius, config.coarse_neighbours)
-            found += wide
+            self.coarse = CoarseNet(local_width, global_width, config.coarse_radius, config.coarse_neighbours)
+            feature_count += global_width
         if config.mrg or not config.groups:
-            self.raw = mlp(shallow, wide)
-            found += wide
+            self.raw = make_mlp(shallow_width, global_width)
+            feature_count += global_width
         if config.skip:
-            found += shallow + (local if config.groups else 0)
+            feature_count += shallow_width + (local_width if config.groups else 0)
         classes, bins = len(config.classes), config.yaw_bins
-        self.head = mlp(found + CONTEXT, *config.head_channels)
+        self.head = make_mlp(feature_count + CONTEXT, *config.head_channels)
         self.classes = nn.Linear(config.head_channels[-1], classes + 1)
         self.box = nn.Linear(config.head_channels[-1], 6 + 2 * bins)
-        # Result of the calibration, see predict.probabilities.
+        # Result of the calibration, see predict.compute_probabilities.
         self.register_buffer("temperature", torch.ones(1))
         self.register_buffer("offsets", torch.zeros(classes + 1))
 
     def forward(self, points: Tensor, valid: Tensor, context: Tensor) -> Outputs[Tensor]:
         config = self.config
         features = self.points(points)  # (B, N, C)
-        found, shallow = [], [features.amax(dim=1)]
+        parts, shallow = [], [features.amax(dim=1)]
         # Grouped features get more weight in dense clusters, single points in sparse ones (Eq. 17).
-        dense = valid.sum(dim=1, keepdim=True) / config.points  # (B, 1)
+        density = valid.sum(dim=1, keepdim=True) / config.points  # (B, 1)
         if self.local is not None and self.fine is not None:
             local = self.local(points, features, valid, config.centroids)  # (B, M, C)
-            found.append(self.fine(local).amax(dim=1))  # (B, C)
+            parts.append(self.fine(local).amax(dim=1))  # (B, C)
             shallow.append(local.amax(dim=1))
         if self.coarse is not None:
-            centroids, real = points[:, : config.centroids, :3], valid[:, : config.centroids]
-            coarse = self.coarse(centroids, local, real, config.coarse)  # (B, M', C)
-            found.append(coarse.amax(dim=1) * (0.5 + dense))
+            centroids, valid_centroids = points[:, : config.centroids, :3], valid[:, : config.centroids]
+            coarse = self.coarse(centroids, local, valid_centroids, config.coarse)  # (B, M', C)
+            parts.append(coarse.amax(dim=1) * (0.5 + density))
         if self.raw is not None:
             raw = self.raw(features).amax(dim=1)
-            found.append(raw * (1.5 - dense) if config.mrg else raw)
+            parts.append(raw * (1.5 - density) if config.mrg else raw)
         if config.skip:
-            found += shallow
-        x = self.head(torch.cat([*found, context], dim=1))
+            parts += shallow
+        x = self.head(torch.cat([*parts, context], dim=1))
         box = self.box(x)
         bins = config.yaw_bins
         return Outputs(self.classes(x), box[:, :3], box[:, 3:6], box[:, 6 : 6 + bins], box[:, 6 + bins :])

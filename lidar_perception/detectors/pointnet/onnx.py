@@ -67,13 +67,13 @@ class OnnxPointNet:
     """An exported network in ONNX Runtime, on the CPU; a predict.Network."""
 
     def __init__(self, path: str | Path):
-        """Open a file. InputError if it cannot be used, see open_session."""
+        """Open an exported file; raises InputError if it cannot be used, see open_session."""
         self.session, text = open_session(path)
         self.source = str(path)
         self.header = Header.from_json(text, self.source, PointNetConfig)
         self.config: PointNetConfig = self.header.config
-        found = ({i.name for i in self.session.get_inputs()}, {o.name for o in self.session.get_outputs()})
-        if found != ({*INPUTS}, {*Outputs._fields}):
+        names = ({i.name for i in self.session.get_inputs()}, {o.name for o in self.session.get_outputs()})
+        if names != ({*INPUTS}, {*Outputs._fields}):
             raise InputError(f"{path} has inputs or outputs that do not match its header; export it again")
         self.temperature = np.ones(1, np.float32)  # 1 because the graph already calibrates
         self.offsets = np.zeros(len(self.config.classes) + 1, np.float32)

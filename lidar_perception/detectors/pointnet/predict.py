@@ -61,7 +61,7 @@ class Predictions:
 def select_detections(
     predictions: Predictions, config: PointNetConfig, min_scores: Sequence[float], nms: NmsParams = NmsParams()
 ) -> Detections:
-    """Apply NMS to the boxes whose score reaches the threshold of their class, min_scores (C,)."""
+    """Apply NMS to the boxes with a score of at least min_scores (C,) of their class."""
     chosen = np.flatnonzero(predictions.scores >= np.asarray(min_scores)[predictions.labels])
     chosen = chosen[np.argsort(-predictions.scores[chosen], kind="stable")][: nms.candidates]
     return apply_nms(
@@ -73,7 +73,7 @@ def predict(network: Network, clusters: Clusters, seed: int = 0, labels: np.ndar
     """Return the predictions for K clusters; K may be 0.
 
     Args:
-        labels: (K,) int64, the class to predict the box for; None: the likeliest class.
+        labels: (K,) int64, class for which each box is predicted; None: the likeliest class.
     """
     config, classes = network.config, len(network.config.classes)
     if len(clusters) == 0:

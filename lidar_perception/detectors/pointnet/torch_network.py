@@ -67,5 +67,5 @@ def run_network(network: PointNet, inputs: ClusterInput, chunk: int = CHUNK) -> 
                     )
                 )
             )
-    back = torch.from_numpy(np.argsort(order)).to(device)
-    return Outputs(*(torch.cat(column)[back] for column in zip(*parts)))
+    inverse_order = torch.from_numpy(np.argsort(order)).to(device)
+    return Outputs(*(torch.cat(column)[inverse_order] for column in zip(*parts)))
