@@ -1,6 +1,6 @@
 """Points sorted into cubic cells as wide as a search radius ("reach").
 
-Of each cell, the ranges of cells that contain all neighbours of its points are stored.
+Each cell stores the ranges of cells that contain all neighbours of its points.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ def mean_neighbourhood_size(cells: Cells) -> float:
 Sample = namedtuple("Sample", "xyz start weight")
 
 
-def sample_cells(cells: Cells, work: int) -> Sample:
-    """Choose at least one point per cell to represent it.
+def sample_cells(cells: Cells, max_work: int) -> Sample:
+    """Sample the points of each cell, at least one per cell.
 
-    The limit per cell is halved until the distances from all points to the sample of their
-    neighbourhoods number at most `work`. Points are chosen by a hash of their coordinates, so the
-    result does not depend on the order of the points or on the rest of the cloud.
+    The limit per cell is halved until there are at most `max_work` distances from all points to the
+    samples of their neighbourhoods. Points are chosen by a hash of their coordinates, so the result
+    does not depend on the order of the points or on the rest of the cloud.
     """
     sizes = np.diff(cells.start)
     limit = int(sizes.max())
-    while limit > 1 and _count_distances(cells, np.minimum(sizes, limit)) > work:
+    while limit > 1 and _count_distances(cells, np.minimum(sizes, limit)) > max_work:
         limit //= 2
-    kept = np.minimum(sizes, limit)
-    start = np.concatenate([[0], np.cumsum(kept)])
+    sample_sizes = np.minimum(sizes, limit)
+    start = np.concatenate([[0], np.cumsum(sample_sizes)])
     bits = cells.xyz[:3].astype(np.float32).view(np.uint32).astype(np.uint64)
-    return Sample(_take_sample(cells, _mix_bits(bits), start), start, sizes / kept)
+    return Sample(_take_sample(cells, _mix_bits(bits), start), start, sizes / sample_sizes)
 
 
 def _mix_bits(bits: np.ndarray) -> np.ndarray:
@@ -67,27 +67,32 @@ def _mix_bits(bits: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def _count_distances(cells, kept):
-    """Count the distances from all points to the kept points (C,) of the cells around them."""
-    before, total = np.zeros(len(kept) + 1), 0.0
-    for a in range(len(kept)):
-        before[a + 1] = before[a] + kept[a]
-    for a in range(len(kept)):
+def _count_distances(cells, sample_sizes):
+    """Count the distances from all points to the samples of the cells around them.
+
+    sample_sizes (C,) is the number of sampled points of each cell.
+    """
+    cumulative, total = np.zeros(len(sample_sizes) + 1), 0.0
+    for a in range(len(sample_sizes)):
+        cumulative[a + 1] = cumulative[a] + sample_sizes[a]
+    for a in range(len(sample_sizes)):
         for k in range(cells.ranges[a]):
-            total += (cells.start[a + 1] - cells.start[a]) * (before[cells.high[a, k]] - before[cells.low[a, k]])
+            total += (cells.start[a + 1] - cells.start[a]) * (
+                cumulative[cells.high[a, k]] - cumulative[cells.low[a, k]]
+            )
     return total
 
 
 @njit(cache=True, nogil=True)
 def _take_sample(cells, keys, start):
-    out = np.empty((len(cells.xyz), start[-1]))
+    points = np.empty((len(cells.xyz), start[-1]))
     for a in range(len(start) - 1):
         first = cells.start[a]
         rows = np.argsort(keys[first : cells.start[a + 1]], kind="mergesort")
-        kept = start[a + 1] - start[a]
-        for k in range(kept):  # evenly spaced, so that coincident points are not over-represented
-            out[:, start[a] + k] = cells.xyz[:, first + rows[k * len(rows) // kept]]
-    return out
+        count = start[a + 1] - start[a]
+        for k in range(count):  # evenly spaced, so that coincident points are not over-represented
+            points[:, start[a] + k] = cells.xyz[:, first + rows[k * len(rows) // count]]
+    return points
 
 
 @njit(cache=True, nogil=True)
@@ -96,13 +101,13 @@ def gather_sample(cells, sample, a):
     size = 0
     for k in range(cells.ranges[a]):
         size += sample.start[cells.high[a, k]] - sample.start[cells.low[a, k]]
-    near, weight, put = np.empty((len(sample.xyz), size)), np.empty(size), 0
+    points, weight, next_slot = np.empty((len(sample.xyz), size)), np.empty(size), 0
     for k in range(cells.ranges[a]):
         for b in range(cells.low[a, k], cells.high[a, k]):
             for j in range(sample.start[b], sample.start[b + 1]):
-                near[:, put], weight[put] = sample.xyz[:, j], sample.weight[b]
-                put += 1
-    return near, weight
+                points[:, next_slot], weight[next_slot] = sample.xyz[:, j], sample.weight[b]
+                next_slot += 1
+    return points, weight
 
 
 @njit(cache=True, nogil=True)
@@ -122,11 +127,11 @@ def _find_ranges(start, cell_z, column_start, neighbours):
 
 
 @njit(cache=True, nogil=True)
-def _add_ranges(start, cell_z, column_start, own, other, low, high, ranges, size):
-    """Add, for each cell of column `own`, the cells of column `other` at most one level apart."""
+def _add_ranges(start, cell_z, column_start, column, other, low, high, ranges, size):
+    """Add to each cell of `column` the range of cells of column `other` at most one level apart."""
     begin = end = column_start[other]
     last = column_start[other + 1]
-    for a in range(column_start[own], column_start[own + 1]):
+    for a in range(column_start[column], column_start[column + 1]):
         while begin < last and cell_z[begin] < cell_z[a] - 1:
             begin += 1
         end = max(end, begin)
@@ -140,46 +145,48 @@ def _add_ranges(start, cell_z, column_start, own, other, low, high, ranges, size
 
 @njit(cache=True, nogil=True)
 def gather_neighbourhood(cells, a, out):
-    """Copy the points around cell a into out (3, M), contiguously.
+    """Copy the points of the cells around cell a into the array out (3, M), contiguously.
 
-    Here and below, unsigned indices tell the compiler that no index is negative; it vectorises
-    the loops only then.
+    Here and below, the loops use unsigned indices because Numba vectorises them only if no index
+    can be negative.
     """
-    put = np.uint64(0)
+    next_slot = np.uint64(0)
     for k in range(cells.ranges[a]):
         for j in range(np.uint64(cells.start[cells.low[a, k]]), np.uint64(cells.start[cells.high[a, k]])):
             for axis in range(3):
-                out[axis, put] = cells.xyz[axis, j]
-            put += np.uint64(1)
+                out[axis, next_slot] = cells.xyz[axis, j]
+            next_slot += np.uint64(1)
 
 
 @njit(cache=True, nogil=True)
-def find_core_points(cells, reach2, min_points, work):
+def find_core_points(cells, reach2, min_points, budget):
     """Find the points with at least min_points points within reach, themselves included.
 
     Args:
-        reach2: (N,) squared reach of each point, in the order of the cells; at most the cells'.
-        min_points: float; need not be whole.
-        work: the number of distances that may be computed. The search stops when it is used up.
+        reach2: (N,) squared reach of each point, in the order of the cells; at most cells.reach
+            squared.
+        min_points: minimum number of points as a float, which can have a fraction.
+        budget: maximum number of distances, at which the search stops.
 
     Returns:
-        (N,) bool in the order of the cells, and the work that is left, negative if it stopped.
+        is_core (N,) bool in the order of the cells; the remaining budget, negative if the search
+        stopped early.
     """
-    is_core, near = np.zeros(len(reach2), np.bool_), np.empty((3, cells.size.max()))
+    is_core, neighbours = np.zeros(len(reach2), np.bool_), np.empty((3, cells.size.max()))
     for a in range(len(cells.size)):
-        if work < 0:
+        if budget < 0:
             break
-        work -= cells.size[a]
-        gather_neighbourhood(cells, a, near)
+        budget -= cells.size[a]
+        gather_neighbourhood(cells, a, neighbours)
         for i in range(cells.start[a], cells.start[a + 1]):
             px, py, pz = cells.xyz[0, i], cells.xyz[1, i], cells.xyz[2, i]
-            found, begin, size = 0, 0, cells.size[a]
-            while found < min_points and begin < size:
+            count, begin, size = 0, 0, cells.size[a]
+            while count < min_points and begin < size:
                 for j in range(np.uint64(begin), np.uint64(min(begin + BLOCK, size))):
-                    dx, dy, dz = px - near[0, j], py - near[1, j], pz - near[2, j]
-                    one = 1 if dx * dx + dy * dy + dz * dz <= reach2[i] else 0
-                    found += one
+                    dx, dy, dz = px - neighbours[0, j], py - neighbours[1, j], pz - neighbours[2, j]
+                    is_near = 1 if dx * dx + dy * dy + dz * dz <= reach2[i] else 0
+                    count += is_near
                 begin += BLOCK
-            work -= begin
-            is_core[i] = found >= min_points
-    return is_core, work
+            budget -= begin
+            is_core[i] = count >= min_points
+    return is_core, budget

@@ -19,15 +19,15 @@ def cluster(
 
     Args:
         cloud: a PointCloud, or an array (N, 3) or (N, 4) as PointCloud.of takes it.
-        density: points per square degree of view, which is compared with params.density; 0 applies
-            the parameters unchanged.
+        density: measured density of the cloud in points per square degree of view, compared with
+            params.density; 0 applies the parameters unchanged.
 
     Returns:
-        (N,) int32 ids, 0 for no cluster, 1..K for the clusters. Points that are not finite and
-        points at the origin have 0. An empty cloud gives (0,).
+        (N,) int32 ids: 1..K for the clusters, 0 for points without a cluster, at the origin or with
+        values that are not finite. An empty cloud gives (0,).
 
     Raises:
-        InputError: for an array of another shape or type.
+        InputError: the array has another shape or type.
     """
     xyz = as_point_cloud(cloud).xyz
     usable = usable_returns(xyz)
@@ -38,12 +38,14 @@ def cluster(
     return labels
 
 
-def _cluster_usable(xyz: np.ndarray, given: ClusteringParams, density: float) -> np.ndarray:
-    params = adapt_to_density(given, density)
-    if params.method == "dbscan":
-        return distance_aware_dbscan(xyz, params.dbscan)
-    radii = None if params is given else compute_radii(xyz, density, given.euclidean.radius, params.euclidean.radius)
-    return cluster_euclidean(xyz, params.euclidean, radii=radii)
+def _cluster_usable(xyz: np.ndarray, params: ClusteringParams, density: float) -> np.ndarray:
+    adapted = adapt_to_density(params, density)
+    if adapted.method == "dbscan":
+        return distance_aware_dbscan(xyz, adapted.dbscan)
+    radii = (
+        None if adapted is params else compute_radii(xyz, density, params.euclidean.radius, adapted.euclidean.radius)
+    )
+    return cluster_euclidean(xyz, adapted.euclidean, radii=radii)
 
 
 def cluster_obstacles(

@@ -23,7 +23,7 @@ def distance_aware_dbscan(xyz: np.ndarray, params: DbscanParams = DbscanParams()
     """Cluster each band of horizontal range with its own eps (paper A, Section 3.3).
 
     Band i is [range_limits[i-1], range_limits[i]). Ids continue from band to band. With join_bands,
-    clusters of neighbouring bands that have points within the smaller eps of each other become one.
+    clusters of neighbouring bands are merged if they have points within the smaller eps.
 
     Args:
         xyz: (N, 3) float32 finite points in the LiDAR frame.
@@ -35,20 +35,20 @@ def distance_aware_dbscan(xyz: np.ndarray, params: DbscanParams = DbscanParams()
     order, start = _sort_by_band(xyz, np.asarray(params.range_limits, np.float64))
     bands = [order[a:b] for a, b in pairwise(start)]
     labels = np.zeros(len(xyz), np.int32)
-    last = 0
+    count = 0
     # The compiled code releases the GIL, so each band runs in its own thread.
-    found = _thread_pool().map(
+    band_ids = _thread_pool().map(
         lambda members, eps: dbscan(xyz.take(members, axis=0), eps, params.min_samples), bands, params.eps
     )
-    for members, ids in zip(bands, found):
-        labels[members] = np.where(ids > 0, ids + last, 0)
-        last += int(ids.max(initial=0))
+    for members, ids in zip(bands, band_ids):
+        labels[members] = np.where(ids > 0, ids + count, 0)
+        count += int(ids.max(initial=0))
     return _join_bands(xyz, bands, labels, params.eps) if params.join_bands else labels
 
 
 @cache
 def _thread_pool() -> ThreadPoolExecutor:
-    """Return the threads, which are kept: starting them costs a quarter of a small cloud's time."""
+    """Return a cached pool: starting threads would take a quarter of the time of a small cloud."""
     return ThreadPoolExecutor(thread_name_prefix="dbscan")
 
 
@@ -58,7 +58,7 @@ os.register_at_fork(after_in_child=_thread_pool.cache_clear)
 
 @njit(cache=True, nogil=True)
 def _sort_by_band(xyz, limits):
-    """Sort points stably by band: order (N,), and start (B + 1,) of each band."""
+    """Sort points stably by band; return order (N,) and the start (B + 1,) of each band."""
     band = np.empty(len(xyz), np.int64)
     for i in range(len(xyz)):
         # In float32, as horizontal_range computes it.
@@ -70,9 +70,9 @@ def _sort_by_band(xyz, limits):
 
 
 def _join_bands(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray, eps: tuple[float, ...]) -> np.ndarray:
-    """Return labels (N,) with clusters joined across neighbouring bands and renumbered in order.
+    """Join clusters across neighbouring bands; return labels (N,), renumbered in order.
 
-    bands holds the indices of each band's points.
+    bands holds the indices of the points of each band.
     """
     parent = np.arange(int(labels.max(initial=0)) + 1, dtype=np.int32)
     ranges = horizontal_range(xyz)
@@ -91,14 +91,16 @@ def _join_bands(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray, ep
 @njit(cache=True, nogil=True)
 def _join_labels(parent, pairs):
     for k in range(len(pairs)):
-        one, other = find_root(parent, pairs[k, 0]), find_root(parent, pairs[k, 1])
-        parent[max(one, other)] = min(one, other)
+        first_root, second_root = find_root(parent, pairs[k, 0]), find_root(parent, pairs[k, 1])
+        parent[max(first_root, second_root)] = min(first_root, second_root)
 
 
 @njit(cache=True, nogil=True)
 def _number_roots(parent):
-    """Return (S,) int32 the number of each item's set in a forest whose roots are the least items:
-    0, 1, ... in the order of the roots."""
+    """Number the sets of a forest 0, 1, ... in the order of their roots.
+
+    Each root must be the lowest item of its set. Returns (S,) int32, the number of each item's set.
+    """
     number, count = np.empty(len(parent), np.int32), 0
     for i in range(len(parent)):
         root = find_root(parent, i)
@@ -113,32 +115,40 @@ def _number_roots(parent):
 def _find_touching_clusters(
     xyz: np.ndarray, labels: np.ndarray, inner: np.ndarray, outer: np.ndarray, reach: float
 ) -> np.ndarray:
-    """Return pairs of labels (P, 2) that connect all clusters with points within reach.
+    """Find the clusters of two neighbouring bands that have points within reach of each other.
 
-    inner and outer are the indices of points of two neighbouring bands that may be within reach,
-    at least one each. The pairs form a forest: they connect all clusters that touch, and P is less
-    than the number of labels.
+    Args:
+        inner: indices of the points of the inner band that may be within reach, at least one.
+        outer: the same of the outer band.
+        reach: distance in metres.
+
+    Returns:
+        (P, 2) pairs of labels. They form a forest that connects all touching clusters, so P is less
+        than the number of labels.
     """
     rows = np.concatenate([inner, outer])
-    names, label = np.unique(labels[rows], return_inverse=True)
+    distinct_labels, label = np.unique(labels[rows], return_inverse=True)
     side = (np.arange(len(rows)) >= len(inner)).astype(np.int64)
     tree = build_tree(xyz[rows])
     max_work = max_exact_distances(len(rows))
     pairs, work = find_touching_labels(tree, label[tree.order], side[tree.order], reach * reach, max_work)
     if work > max_work:
-        kept, _ = thin_points(xyz[rows], reach, label)
-        tree = build_tree(xyz[rows[kept]])
+        kept_rows, _ = thin_points(xyz[rows], reach, label)
+        tree = build_tree(xyz[rows[kept_rows]])
         pairs, _ = find_touching_labels(
-            tree, label[kept][tree.order], side[kept][tree.order], (reach * (1 + SLACK)) ** 2, np.inf
+            tree, label[kept_rows][tree.order], side[kept_rows][tree.order], (reach * (1 + SLACK)) ** 2, np.inf
         )
-    return names[pairs]
+    return distinct_labels[pairs]
 
 
 def dbscan(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray:
-    """Cluster finite points (N, 3) by DBSCAN; return (N,) int32 labels, 0 for noise, 1..K.
+    """Cluster finite points (N, 3) by DBSCAN.
 
-    The labels equal those of scikit-learn's DBSCAN plus one, border points included: clusters are
-    numbered by their first core point, and a border point between clusters joins the first.
+    Clusters are numbered by their first core point. A border point between clusters joins the first
+    one. All labels, including those of border points, are those of scikit-learn's DBSCAN plus one.
+
+    Returns:
+        (N,) int32 labels: 0 for noise, 1..K for the clusters.
     """
     if len(xyz) == 0:
         return np.zeros(0, np.int32)

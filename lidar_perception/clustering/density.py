@@ -21,13 +21,15 @@ LAST_BAND_FACTOR = 1.5  # assumed end of the last band, as a multiple of the las
 
 
 def measure_density(xyz: np.ndarray) -> float:
-    """Return the mean number of points per square degree around a point, seen from the sensor.
+    """Measure the angular density of a cloud: the mean number of points per square degree around a
+    point, as seen from the sensor.
 
     Args:
         xyz: (N, 3) float32 in sensor coordinates, metres; N may be 0.
 
     Returns:
-        0 if no two usable points share a cell of CELL_DEG. KITTI's HDL-64E has 13 to 16.
+        Points per square degree, 0 if no two usable points share a cell of CELL_DEG. KITTI's
+        HDL-64E has 13 to 16.
     """
     step = max(len(xyz) // MAX_SAMPLED, 1)
     sampled = np.ascontiguousarray(xyz[::step])
@@ -42,32 +44,37 @@ def measure_density(xyz: np.ndarray) -> float:
     row = np.floor((np.degrees(np.arctan2(z, distance)) + 90.0) / CELL_DEG)
     column = np.floor((np.degrees(np.arctan2(y, x)) + 180.0) / CELL_DEG)
     cell = (row * (360.0 // CELL_DEG + 1.0) + column).astype(np.int64)
-    others = np.bincount(cell).take(cell) - 1.0
+    other_count = np.bincount(cell).take(cell) - 1.0
     # Cells narrow towards the zenith and the nadir.
     slant = np.maximum(distance / np.hypot(distance, z), 0.05)
-    return step * float((others / (CELL_DEG**2 * slant)).mean())
+    return step * float((other_count / (CELL_DEG**2 * slant)).mean())
 
 
 def adapt_to_density(params: ClusteringParams, density: float) -> ClusteringParams:
-    """Return the parameters for a cloud with this many points per square degree.
+    """Adapt the parameters to the density of a cloud.
 
-    In a cloud sparser than params.density, neighbourhoods widen, at most in proportion to the
+    If the cloud is sparser than params.density, neighbourhoods widen, at most in proportion to the
     distance between points, and minimum sizes shrink in proportion to the number of points.
-    params itself is returned if the cloud is not sparser or either density is 0.
+
+    Args:
+        density: density of the cloud in points per square degree.
+
+    Returns:
+        The adapted parameters, or params itself if the cloud is not sparser or either density is 0.
     """
     if not 0.0 < density < params.density:
         return params
     widening = min((params.density / density) ** 0.5, MAX_WIDENING)
     dbscan, euclidean = params.dbscan, params.euclidean
-    limits = dbscan.range_limits
-    ends = [*limits, LAST_BAND_FACTOR * limits[-1] if limits else 1e6]
+    range_limits = dbscan.range_limits
+    band_ends = [*range_limits, LAST_BAND_FACTOR * range_limits[-1] if range_limits else 1e6]
     return replace(
         params,
         dbscan=replace(
             dbscan,
             eps=tuple(
                 min(max(eps, SPACINGS_PER_EPS * point_spacing(density) * end), widening * eps)
-                for eps, end in zip(dbscan.eps, ends)
+                for eps, end in zip(dbscan.eps, band_ends)
             ),
             min_samples=_reduce_count(dbscan.min_samples, widening**2, MIN_CLUSTER_POINTS - 1),
         ),
@@ -82,9 +89,9 @@ def adapt_to_density(params: ClusteringParams, density: float) -> ClusteringPara
 
 
 def point_spacing(density: float) -> float:
-    """Return the distance between neighbouring points on a surface 1 m from the sensor, in metres.
+    """Return the distance in metres between neighbouring points on a surface 1 m from the sensor.
 
-    The surface faces the sensor; density, in points per square degree, is above 0.
+    The surface faces the sensor. density is in points per square degree and above 0.
     """
     return float(np.radians(density**-0.5))
 
@@ -94,10 +101,18 @@ def _reduce_count(count: int, factor: float, minimum: int) -> int:
 
 
 def compute_radii(xyz: np.ndarray, density: float, low: float, high: float) -> np.ndarray:
-    """Return (N,) float64 the local threshold's radius for each of points (N, 3), in metres.
+    """Compute each point's radius for the local threshold.
 
-    It grows with the point's horizontal range and shrinks with the cloud's density, in points per
-    square degree, between low and high.
+    The radius grows with the point's horizontal range and shrinks with the density of the cloud.
+
+    Args:
+        xyz: (N, 3) points in metres.
+        density: points per square degree.
+        low: smallest radius in metres.
+        high: largest radius in metres.
+
+    Returns:
+        (N,) float64 radii in metres.
     """
     ranges = horizontal_range(xyz).astype(np.float64)
     return np.clip(SPACINGS_PER_RADIUS * point_spacing(density) * ranges, low, high)

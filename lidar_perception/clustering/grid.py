@@ -19,13 +19,15 @@ def build_grid(xyz, side, reach):
 
     Args:
         side: width of a cell in metres.
-        reach: distance of neighbouring columns, in cells.
+        reach: maximum distance of neighbouring columns, in cells.
 
     Returns:
-        order (N,), the rows of the points; cell_start (C + 1,), the first point of each cell;
-        cell_z (C,), the level of each cell; column_start (M + 1,), the first cell of each column;
-        neighbours (M, H), the column itself and half of the columns up to `reach` away, -1 if
-        empty. The other half list this column as their neighbour.
+        order (N,): row in xyz of each sorted point.
+        cell_start (C + 1,): index of the first point of each cell.
+        cell_z (C,): level of each cell.
+        column_start (M + 1,): index of the first cell of each column.
+        neighbours (M, H): the column itself and half of the columns up to `reach` away, -1 for
+            empty ones. The other half list this column as their neighbour.
     """
     n = len(xyz)
     size = 16
@@ -106,7 +108,7 @@ def _sort_by_height(z):
 
 @njit(cache=True, nogil=True)
 def take_columns(xyz, order):
-    """Return (3, N) float64: the coordinates of points (N, 3) in the given order."""
+    """Return the coordinates (3, N) float64 of points (N, 3), sorted by `order` (N,)."""
     out = np.empty((3, len(order)))
     for k in range(len(order)):
         i = order[k]
@@ -123,7 +125,7 @@ def is_near(x, y, z, i, j, eps2):
 
 @njit(cache=True, nogil=True)
 def find_root(parent, i):
-    """Return the representative of i in a union-find forest (path halving)."""
+    """Return the root of i in a union-find forest, with path halving."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]
@@ -133,9 +135,9 @@ def find_root(parent, i):
 @njit(cache=True, nogil=True)
 def enlarge_array(values, count, capacity):
     """Copy values[:count] into a new array of this capacity."""
-    new = np.empty(capacity, values.dtype)
-    new[:count] = values[:count]
-    return new
+    enlarged = np.empty(capacity, values.dtype)
+    enlarged[:count] = values[:count]
+    return enlarged
 
 
 @njit(cache=True, nogil=True)
@@ -143,24 +145,26 @@ def number_clusters(order, core, owner, parent):
     """Number the sets of a union-find forest 1..K by their first core point in input order.
 
     Args:
-        order, core, owner: (N,) input row, core flag and set of each point in grid order.
-        parent: (S,) the forest.
+        order: (N,) input row of each point, in grid order.
+        core: (N,) bool, True for core points, in grid order.
+        owner: (N,) set of each point, in grid order.
+        parent: (S,) forest of the sets.
 
     Returns:
-        (S,) int32 cluster of each set, 0 for sets without a core point.
+        (S,) int32 cluster of each set; 0 for sets without a core point.
     """
-    place = np.empty(len(order), np.int32)
+    grid_index = np.empty(len(order), np.int32)
     for k in range(len(order)):
-        place[order[k]] = k
+        grid_index[order[k]] = k
     cluster = np.zeros(len(parent), np.int32)
     count = 0
     for i in range(len(order)):
-        k = place[i]
+        k = grid_index[i]
         if core[k]:
-            top = find_root(parent, owner[k])
-            if cluster[top] == 0:
+            root = find_root(parent, owner[k])
+            if cluster[root] == 0:
                 count += 1
-                cluster[top] = count
+                cluster[root] = count
     for s in range(len(parent)):
         cluster[s] = cluster[find_root(parent, s)]
     return cluster

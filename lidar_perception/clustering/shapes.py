@@ -17,9 +17,16 @@ from lidar_perception.groups import count_clusters
 
 @njit(cache=True, nogil=True)
 def find_extents(xyz: np.ndarray, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return low (K, 3), high (K, 3) float32 and sizes (K,) int64 of clusters 1..K = count.
+    """Compute the extents and sizes of clusters.
 
-    A cluster without points has low = inf, high = -inf.
+    Args:
+        xyz: (N, 3) points in metres.
+        labels: (N,) cluster ids from 1 to count; 0 for points without a cluster.
+        count: number of clusters, K.
+
+    Returns:
+        low (K, 3) and high (K, 3) float32, the corners of the axis-aligned box in metres, inf and
+        -inf for a cluster without points; sizes (K,) int64, the number of points.
     """
     low = np.full((count, 3), np.inf, np.float32)
     high = np.full((count, 3), -np.inf, np.float32)
@@ -35,7 +42,7 @@ def find_extents(xyz: np.ndarray, labels: np.ndarray, count: int) -> tuple[np.nd
 
 
 def fit_boxes(xyz: np.ndarray, labels: np.ndarray, shape: str) -> np.ndarray:
-    """Fit a box to each of the clusters 1..K = labels.max().
+    """Fit a box to each cluster.
 
     Args:
         shape: one of BOX_SHAPES. axis_aligned: l along x, w along y, yaw 0. min_area: the exact
@@ -43,10 +50,10 @@ def fit_boxes(xyz: np.ndarray, labels: np.ndarray, shape: str) -> np.ndarray:
             points, to one degree.
 
     Returns:
-        (K, 7) float32 [x y z l w h yaw] in metres and radians. z and h come from the lowest and
-        the highest point. min_area and l_shape have l >= w and yaw in [-pi/2, pi/2). Points at one
-        place have l = w = yaw = 0; points on a line have w = 0 and yaw along it. The order of the
-        points does not matter.
+        (K, 7) float32 [x y z l w h yaw] in metres and radians, K = labels.max(). z and h span the
+        lowest and the highest point. min_area and l_shape have l >= w and yaw in [-pi/2, pi/2).
+        Coincident points have l = w = yaw = 0; collinear points have w = 0 and yaw along the line.
+        The result does not depend on the order of the points.
     """
     if shape not in BOX_SHAPES:
         raise ValueError(f"shape = {shape!r} must be one of {', '.join(BOX_SHAPES)}")
@@ -59,23 +66,22 @@ def fit_boxes(xyz: np.ndarray, labels: np.ndarray, shape: str) -> np.ndarray:
     boxes[:, 3:6] = high - low
     if shape != "axis_aligned" and count:
         x, y, start = sort_by_cluster(xyz, labels, sizes)
-        found = fit_rectangles(x, y, start, shape == "l_shape")
-        boxes[:, [0, 1, 3, 4]] = found[:, :4]
-        boxes[:, 6] = _fold_direction(found[:, 4])
+        rectangles = fit_rectangles(x, y, start, shape == "l_shape")
+        boxes[:, [0, 1, 3, 4]] = rectangles[:, :4]
+        boxes[:, 6] = _fold_direction(rectangles[:, 4])
     return boxes
 
 
 def fit_ellipses(xyz: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Fit an ellipse in x-y to each of the clusters 1..K = labels.max().
+    """Fit an ellipse in x-y to each cluster.
 
-    This is our reading of paper B's "fitted ellipse", for which it gives no formula: centre and
-    axes are those of the points' covariance, and a half axis is 2 standard deviations, which is
-    exact for an evenly filled ellipse. It covers most of a cluster; a few stray points may lie
-    outside.
+    Paper B gives no formula for its "fitted ellipse". Here, the centre is the mean of the points,
+    the axes are those of their covariance, and each semi-axis is 2 standard deviations, which is
+    exact for a uniformly filled ellipse. A few outliers may lie outside.
 
     Returns:
-        (K, 5) float32 [x y a b yaw]; a >= b >= 0 are half axes in metres, yaw is the direction of
-        the longer one in [-pi/2, pi/2).
+        (K, 5) float32 [x y a b yaw], K = labels.max(): a >= b >= 0 are the semi-axes in metres, yaw
+        is the direction of the longer one in [-pi/2, pi/2).
     """
     members = np.flatnonzero(labels > 0)
     cluster, count = labels[members] - 1, count_clusters(labels)
@@ -88,8 +94,8 @@ def fit_ellipses(xyz: np.ndarray, labels: np.ndarray) -> np.ndarray:
     centre_x, centre_y = mean(x), mean(y)
     x, y = x - centre_x[cluster], y - centre_y[cluster]
     xx, yy, xy = mean(x * x), mean(y * y), mean(x * y)
-    middle, root = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-    a, b = 2 * np.sqrt(middle + root), 2 * np.sqrt(np.maximum(middle - root, 0))
+    half_trace, half_gap = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    a, b = 2 * np.sqrt(half_trace + half_gap), 2 * np.sqrt(np.maximum(half_trace - half_gap, 0))
     yaw = _fold_direction(np.arctan2(2 * xy, xx - yy) / 2)
     return np.stack([centre_x, centre_y, a, b, yaw], axis=1).astype(np.float32)
 
@@ -98,8 +104,8 @@ def classify_by_diagonal(boxes: np.ndarray) -> np.ndarray:
     """Classify boxes (K, 7) by their diagonal hypot(l, w) (paper B, Table 2).
 
     Returns:
-        (K,) int32 ids into CLASSES: Pedestrian, Cyclist or Car, or -1 for a diagonal below 0.40 m
-        or above 6.40 m.
+        (K,) int32 indices into CLASSES: Pedestrian, Cyclist or Car; -1 if the diagonal is below
+        0.40 m or above 6.40 m.
     """
     sides = np.asarray(boxes, np.float32).reshape(-1, 7)[:, 3:5]
     diagonal = np.hypot(sides[:, 0], sides[:, 1])  # in float32, so that 6.40 is not above 6.40
@@ -110,7 +116,7 @@ def classify_by_diagonal(boxes: np.ndarray) -> np.ndarray:
 
 
 def _fold_direction(yaw: np.ndarray) -> np.ndarray:
-    """Return the directions of lines as float32 in [-pi/2, pi/2)."""
+    """Wrap the directions of lines to [-pi/2, pi/2) float32."""
     half = np.float32(np.pi / 2)
     folded = ((yaw + np.pi / 2) % np.pi - np.pi / 2).astype(np.float32)
     return np.where(folded >= half, -half, folded)  # values just below pi/2 round up to it

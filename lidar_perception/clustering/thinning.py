@@ -20,7 +20,7 @@ MIN_DISTANCES = 2**30  # minimum budget of a search in distances, about a second
 
 
 def max_exact_distances(count: int) -> float:
-    """Return how many distances an exact search of `count` points may compute."""
+    """Return the maximum number of distances for an exact search of `count` points."""
     return float(max(MAX_DISTANCES_PER_POINT * count, MIN_DISTANCES))
 
 
@@ -30,20 +30,20 @@ def thin_points(
     """Keep one point per cube and kind.
 
     Args:
-        xyz: (N, 3) points.
-        reach: (N,) or one for all; the cubes of a point are sized by its reach, rounded down to a
-            power of two.
-        kind: (N,) int; points of different kinds are never merged.
+        xyz: (N, 3) points in metres.
+        reach: (N,) reach of each point in metres, or one for all. Rounded down to a power of two,
+            it determines the size of the point's cube.
+        kind: (N,) int, or one for all; points of different kinds are never merged.
 
     Returns:
-        kept (K,), the indices of the points kept, and group (N,), the one of them, 0..K-1, that
-        represents each point.
+        kept (K,), the indices of the points that are kept; group (N,), the index into `kept` of the
+        point that represents each point.
     """
     octave = np.floor(np.log2(np.broadcast_to(np.maximum(reach, 1e-6), len(xyz))))
     cubes = np.floor(xyz / (2.0**octave / CUBES_PER_REACH)[:, None])
     keys = np.column_stack([cubes, octave, np.broadcast_to(kind, len(xyz))])
     order = np.lexsort(keys.T)
-    new = np.r_[True, (keys[order][1:] != keys[order][:-1]).any(axis=1)][: len(order)]
+    is_first = np.r_[True, (keys[order][1:] != keys[order][:-1]).any(axis=1)][: len(order)]
     group = np.empty(len(xyz), np.int64)
-    group[order] = np.cumsum(new) - 1
-    return order[new], group
+    group[order] = np.cumsum(is_first) - 1
+    return order[is_first], group
