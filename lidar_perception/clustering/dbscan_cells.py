@@ -22,7 +22,7 @@ from lidar_perception.clustering.thinning import SLACK, max_exact_distances, thi
 
 
 def dbscan_by_cells(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray:
-    """Cluster points (N, 3) float32, N > 0; return (N,) int32 labels as dbscan.dbscan does."""
+    """Cluster points (N, 3) float32, N > 0; return (N,) int32 labels as from dbscan.dbscan."""
     # Slightly less than eps / sqrt(3), so that rounding never puts two distant points into one cell
     side = eps / np.sqrt(3.0) * (1.0 - 1e-6)
     order, start, cell_z, column_start, neighbours = build_grid(xyz, side, 2)
@@ -32,16 +32,16 @@ def dbscan_by_cells(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray
     cells, max_work = (x, y, z, start, first, second), max_exact_distances(len(xyz))
     parent, work = _join_cells(*cells, core, eps * eps, max_work)
     if work > max_work:
-        rows, thinned = np.flatnonzero(core), np.zeros(len(core), bool)
-        kept, _ = thin_points(np.column_stack([x, y, z])[rows], eps, _list_cells(start)[rows])
-        thinned[rows[kept]] = True
-        parent, _ = _join_cells(*cells, thinned, (eps * (1 + SLACK)) ** 2, np.inf)
+        core_rows, kept_core = np.flatnonzero(core), np.zeros(len(core), bool)
+        kept_rows, _ = thin_points(np.column_stack([x, y, z])[core_rows], eps, _list_cells(start)[core_rows])
+        kept_core[core_rows[kept_rows]] = True
+        parent, _ = _join_cells(*cells, kept_core, (eps * (1 + SLACK)) ** 2, np.inf)
     return _label_points(*cells, order, core, parent, eps * eps)
 
 
 @njit(cache=True, nogil=True)
 def _find_neighbour_cells(cell_z, column_start, neighbours):
-    """Return first (P,), second (P,): all pairs of cells that may hold points within eps, once."""
+    """List each pair of cells that can hold points within eps once, as first (P,) and second (P,)."""
     capacity = 12 * len(cell_z) + 16
     first, second = np.empty(capacity, np.int32), np.empty(capacity, np.int32)
     count = 0
@@ -51,9 +51,9 @@ def _find_neighbour_cells(cell_z, column_start, neighbours):
             if other < 0:
                 continue
             begin, end = column_start[other], column_start[other + 1]
-            needed = count + 5 * (column_start[c + 1] - column_start[c])
-            if needed > capacity:
-                capacity = 2 * needed
+            required_capacity = count + 5 * (column_start[c + 1] - column_start[c])
+            if required_capacity > capacity:
+                capacity = 2 * required_capacity
                 first = enlarge_array(first, count, capacity)
                 second = enlarge_array(second, count, capacity)
             for a in range(column_start[c], column_start[c + 1]):
@@ -70,62 +70,65 @@ def _find_neighbour_cells(cell_z, column_start, neighbours):
 
 @njit(cache=True, nogil=True)
 def _find_core_points(x, y, z, start, first, second, eps2, min_samples):
-    """Return (N,) bool in grid order: at least min_samples points within eps, itself included."""
+    """Find the core points: those with at least min_samples points within eps, including themselves.
+
+    Returns (N,) bool in grid order.
+    """
     cells = len(start) - 1
-    found = np.empty(len(x), np.int32)
+    neighbour_counts = np.empty(len(x), np.int32)
     sparse = np.empty(cells, np.bool_)
     for c in range(cells):
         size = start[c + 1] - start[c]
         sparse[c] = size < min_samples
-        found[start[c] : start[c + 1]] = size
+        neighbour_counts[start[c] : start[c + 1]] = size
     for p in range(len(first)):
         a, b = first[p], second[p]
         if sparse[a] and sparse[b]:
             for i in range(start[a], start[a + 1]):
                 for j in range(start[b], start[b + 1]):
-                    within = is_near(x, y, z, i, j, eps2)
-                    found[i] += within
-                    found[j] += within
-            sparse[a] = _has_sparse_point(found, start[a], start[a + 1], min_samples)
-            sparse[b] = _has_sparse_point(found, start[b], start[b + 1], min_samples)
+                    is_neighbour = is_near(x, y, z, i, j, eps2)
+                    neighbour_counts[i] += is_neighbour
+                    neighbour_counts[j] += is_neighbour
+            sparse[a] = _has_sparse_point(neighbour_counts, start[a], start[a + 1], min_samples)
+            sparse[b] = _has_sparse_point(neighbour_counts, start[b], start[b + 1], min_samples)
         elif sparse[a]:
-            sparse[a] = _count_neighbours(x, y, z, start, a, b, eps2, min_samples, found)
+            sparse[a] = _count_neighbours(x, y, z, start, a, b, eps2, min_samples, neighbour_counts)
         elif sparse[b]:
-            sparse[b] = _count_neighbours(x, y, z, start, b, a, eps2, min_samples, found)
-    return found >= min_samples
+            sparse[b] = _count_neighbours(x, y, z, start, b, a, eps2, min_samples, neighbour_counts)
+    return neighbour_counts >= min_samples
 
 
 @njit(cache=True, nogil=True)
-def _has_sparse_point(found, begin, end, min_samples):
+def _has_sparse_point(neighbour_counts, begin, end, min_samples):
     for i in range(begin, end):
-        if found[i] < min_samples:
+        if neighbour_counts[i] < min_samples:
             return True
     return False
 
 
 @njit(cache=True, nogil=True)
-def _count_neighbours(x, y, z, start, a, b, eps2, min_samples, found):
-    """Add the neighbours in cell b to the counts `found` of the points of cell a.
+def _count_neighbours(x, y, z, start, a, b, eps2, min_samples, neighbour_counts):
+    """Add the neighbours in cell b to neighbour_counts (N,) for the points of cell a.
 
-    Counting stops at min_samples. Return True if a point of cell a still has fewer.
+    Counting stops at min_samples. Returns True if a point of cell a still has fewer.
     """
     sparse = False
     for i in range(start[a], start[a + 1]):
-        count = found[i]
+        count = neighbour_counts[i]
         if count < min_samples:
             for j in range(start[b], start[b + 1]):
                 if is_near(x, y, z, i, j, eps2):
                     count += 1
                     if count == min_samples:
                         break
-            found[i] = count
+            neighbour_counts[i] = count
             sparse |= count < min_samples
     return sparse
 
 
 @njit(cache=True, nogil=True)
 def _find_core_extents(x, y, z, start, core):
-    """Return (C, 6) the low and high corner of each cell's core points; inf, -inf without any."""
+    """Return the low and high corners (C, 6) of each cell's core points; inf and -inf if it has none."""
     extents = np.empty((len(start) - 1, 6))
     extents[:, :3], extents[:, 3:] = np.inf, -np.inf
     for c in range(len(start) - 1):
@@ -139,7 +142,10 @@ def _find_core_extents(x, y, z, start, core):
 
 @njit(cache=True, nogil=True)
 def _cells_touch(x, y, z, core, extents, start, a, b, eps2):
-    """Return True if core points of cells a and b are within eps, and the number of distances."""
+    """Check for core points of cells a and b within eps.
+
+    Returns True if there are any, and the number of distances computed.
+    """
     box, work = extents[b], start[a + 1] - start[a]
     for i in range(start[a], start[a + 1]):
         # A point far from the whole of cell b costs one distance, so that the time for two dense
@@ -157,7 +163,7 @@ def _cells_touch(x, y, z, core, extents, start, a, b, eps2):
 
 @njit(cache=True, nogil=True)
 def _list_cells(start):
-    """Return (N,) the cell of each point, in grid order."""
+    """Return the cell (N,) of each point, in grid order."""
     cell_of = np.empty(start[-1], np.int32)
     for c in range(len(start) - 1):
         cell_of[start[c] : start[c + 1]] = c
@@ -166,9 +172,10 @@ def _list_cells(start):
 
 @njit(cache=True, nogil=True)
 def _join_cells(x, y, z, start, first, second, core, eps2, max_work):
-    """Return the union-find forest of the cells, and the number of distances computed.
+    """Join the cells that share a cluster.
 
-    If that is more than max_work, the forest is not complete.
+    Returns the union-find forest of the cells and the number of distances computed. If that exceeds
+    max_work, the forest is incomplete.
     """
     parent, work = np.arange(len(start) - 1).astype(np.int32), 0
     extents = _find_core_extents(x, y, z, start, core)
@@ -178,8 +185,8 @@ def _join_cells(x, y, z, start, first, second, core, eps2, max_work):
         if extents[a, 0] <= extents[a, 3] and extents[b, 0] <= extents[b, 3]:
             root_a, root_b = find_root(parent, a), find_root(parent, b)
             if root_a != root_b:
-                found, distances = _cells_touch(x, y, z, core, extents, start, a, b, eps2)
-                if found:
+                touching, distances = _cells_touch(x, y, z, core, extents, start, a, b, eps2)
+                if touching:
                     parent[max(root_a, root_b)] = min(root_a, root_b)
                 work += distances
                 if work > max_work:
@@ -190,10 +197,10 @@ def _join_cells(x, y, z, start, first, second, core, eps2, max_work):
 @njit(cache=True, nogil=True)
 def _label_points(x, y, z, start, first, second, order, core, parent, eps2):
     n, cells = len(x), len(start) - 1
-    cores, cell_of = np.zeros(cells, np.int32), _list_cells(start)
+    core_counts, cell_of = np.zeros(cells, np.int32), _list_cells(start)
     for c in range(cells):
         for k in range(start[c], start[c + 1]):
-            cores[c] += core[k]
+            core_counts[c] += core[k]
 
     cluster = number_clusters(order, core, cell_of, parent)
     # A point of a cell with core points belongs to their cluster, unless it is a border point that
@@ -202,21 +209,21 @@ def _label_points(x, y, z, start, first, second, order, core, parent, eps2):
     for c in range(cells):
         for k in range(start[c], start[c + 1]):
             labels[order[k]] = cluster[c]
-    border = np.empty(cells, np.bool_)
+    has_border_points = np.empty(cells, np.bool_)
     for c in range(cells):
-        border[c] = cores[c] < start[c + 1] - start[c]
+        has_border_points[c] = core_counts[c] < start[c + 1] - start[c]
     for p in range(len(first)):
         a, b = first[p], second[p]
-        if border[a] and cluster[b] and cluster[a] != cluster[b]:
+        if has_border_points[a] and cluster[b] and cluster[a] != cluster[b]:
             _adopt_border_points(x, y, z, order, start, a, b, core, cluster[b], labels, eps2)
-        if border[b] and cluster[a] and cluster[a] != cluster[b]:
+        if has_border_points[b] and cluster[a] and cluster[a] != cluster[b]:
             _adopt_border_points(x, y, z, order, start, b, a, core, cluster[a], labels, eps2)
     return labels
 
 
 @njit(cache=True, nogil=True)
 def _adopt_border_points(x, y, z, order, start, a, b, core, label, labels, eps2):
-    """Give `label` to the border points of cell a near a core point of cell b, if it is lower."""
+    """Assign `label` to border points of cell a near a core point of cell b, unless theirs is lower."""
     for i in range(start[a], start[a + 1]):
         current = labels[order[i]]
         if not core[i] and (current == 0 or current > label):

@@ -1,8 +1,8 @@
 """Adaptive Euclidean clustering (paper C: Zhang et al., PLOS One 2026, e0348581).
 
-It implements Eq. 6 to 9 and 11. Eq. 10, an objective with a regularizer, is what the paper says the
-method minimises; no step of it uses it. The text of the paper lacks the equations. This is our
-reading of its description:
+It implements Eq. 6 to 9 and 11. Eq. 10 is the objective that the method is said to minimise; no
+step of the method uses it. The text of the paper lacks the equations, so they are reconstructed from
+its description:
 
 - Threshold d_i of point i. global: alpha times the mean distance of all N points to their nearest
   neighbour (Eq. 6). local: alpha times the mean distance to the other points within `radius`
@@ -11,16 +11,16 @@ reading of its description:
 - A point is a core point if at least beta ln N points (MinPts, Eq. 7), itself included, lie within
   its d_i.
 - Two core points are linked if their distance is within either threshold (Eq. 8). Clusters are the
-  connected sets. Any other point joins the nearest core point whose threshold reaches it (of
-  equally near ones that with the least x, then y, then z); without one it is in no cluster.
-- With `curvature`, core points on uneven surfaces are taken for other points, see curvature.py.
-- Clusters of fewer than min_size points are dropped. Then clusters are merged whose centres (means)
-  are nearer than gamma (D_i + D_j) / 2, where D is the diagonal of the axis-aligned box (Eq. 9).
-  All pairs are compared as they are before merging, and chains merge.
+  connected sets. Any other point joins the nearest core point whose threshold reaches it (if several
+  are equally near, the one with the least x, then y, then z); otherwise it is in no cluster.
+- With `curvature`, core points on uneven surfaces count as other points, see curvature.py.
+- Clusters of fewer than min_size points are dropped. Then clusters are merged if their centres
+  (means) are closer than gamma (D_i + D_j) / 2, where D is the diagonal of the axis-aligned box
+  (Eq. 9). All pairs are compared before merging, and merging is transitive.
 
-The clusters do not depend on the order of the points. No pairs are stored, so memory grows with the
-number of points only. Where the grid needs more than MAX_DISTANCES_PER_POINT, because many points
-share a neighbourhood but are out of reach of each other, a k-d tree finds the same clusters.
+The clusters do not depend on the order of the points. No pairs are stored, so memory is linear in
+the number of points. If the grid needs more than MAX_DISTANCES_PER_POINT, because many points share
+a neighbourhood but are out of reach of each other, a k-d tree finds the same clusters.
 
 Only the local threshold needs every pair. It is exact up to MAX_WORK_PER_POINT distances per point
 (scans of KITTI take less than 1,700, one of a Pandar64 among near surfaces 21,000) and MAX_WORK per
@@ -75,9 +75,9 @@ def cluster_euclidean(
 
     Args:
         xyz: (N, 3) float32 in metres; N may be 0. Distances are computed in float64.
-        max_distances: distances per point that the grid may take before the tree replaces it.
-        max_work: distances that the local threshold may take before it uses a sample.
-        radii: (N,) radius of each point for the local threshold, in place of params.radius.
+        max_distances: maximum distances per point on the grid; beyond it, the tree is used.
+        max_work: maximum distances for the local threshold; beyond it, a sample is used.
+        radii: (N,) radius of each point for the local threshold, instead of params.radius.
 
     Returns:
         (N,) int32 ids, 0 for no cluster, 1..K for the clusters, numbered by their first point.
@@ -94,57 +94,60 @@ def cluster_euclidean(
         cells, reach = sort_into_cells(xyz, params.distance), np.full(n, params.distance)
     else:
         cells, reach = sort_into_cells(xyz, float(radii.max())), np.empty(n)
-        radii2, exact = radii[cells.order] ** 2, mean_neighbourhood_size(cells) * n <= max_work
+        radii2, is_exact = radii[cells.order] ** 2, mean_neighbourhood_size(cells) * n <= max_work
         means = (
             _mean_distances(cells, radii2)
-            if exact
+            if is_exact
             else _mean_distances_to_sample(cells, sample_cells(cells, max_work), radii2)
         )
         reach[cells.order] = np.float32(params.alpha * means)
     if reach.max() > cells.reach:
         cells = sort_into_cells(xyz, reach.max())
     component, min_points = np.empty(n, np.int32), params.beta * np.log(n)
-    growing = find_consistent_points(xyz, radii, params.curvature, max_work) if params.curvature else np.ones(n, bool)
+    can_grow = find_consistent_points(xyz, radii, params.curvature, max_work) if params.curvature else np.ones(n, bool)
     reach2 = reach[cells.order] ** 2
-    is_core, left = find_core_points(cells, reach2, min_points, float(max_distances * n))
-    component[cells.order], left = _find_components(
-        cells, np.stack([*cells.xyz, reach2], axis=1), is_core & growing[cells.order], left
+    is_core, budget = find_core_points(cells, reach2, min_points, float(max_distances * n))
+    component[cells.order], budget = _find_components(
+        cells, np.stack([*cells.xyz, reach2], axis=1), is_core & can_grow[cells.order], budget
     )
-    if left < 0:
+    if budget < 0:
         tree = build_tree(xyz)
-        component[tree.order] = _find_components_by_tree(tree, reach[tree.order] ** 2, min_points, growing[tree.order])
+        component[tree.order] = _find_components_by_tree(tree, reach[tree.order] ** 2, min_points, can_grow[tree.order])
     size = np.bincount(component + 1)  # size[0] counts the points without a component
-    kept = (component >= 0) & (size[component + 1] >= params.min_size)
+    is_kept = (component >= 0) & (size[component + 1] >= params.min_size)
     parent, indices = np.arange(len(size), dtype=np.int32), np.arange(n)
-    labels = np.where(kept, number_clusters(indices, kept, component, parent)[component], 0)
+    labels = np.where(is_kept, number_clusters(indices, is_kept, component, parent)[component], 0)
     if params.gamma > 0.0:
         parent = _merge_clusters(xyz, labels, params.gamma)
-        labels = number_clusters(indices, kept, labels, parent)[labels]
+        labels = number_clusters(indices, is_kept, labels, parent)[labels]
     return labels.astype(np.int32)
 
 
 def _mean_nearest_distance(xyz: np.ndarray, max_distances: float) -> tuple[float, Cells]:
-    """Return the mean distance to the nearest other point, 0 for one point, and the cells used.
+    """Compute the mean distance to the nearest other point.
 
     Points without a neighbour within reach of the cells are searched again in larger cells.
+
+    Returns:
+        The mean distance in metres, 0 for a single point; the first cells used.
     """
-    n, columns = len(xyz), xyz.T.astype(np.float64, order="C")
+    n, coordinates = len(xyz), xyz.T.astype(np.float64, order="C")
     if n == 1:
         return 0.0, sort_into_cells(xyz, 0.0)
-    sample = [_nearest_squared_distance(columns, n, i) for i in range(0, n, -(-n // SAMPLE_SIZE))]
+    sample = [_nearest_squared_distance(coordinates, n, i) for i in range(0, n, -(-n // SAMPLE_SIZE))]
     median = float(np.sqrt(np.median(sample)))
-    first = cells = sort_into_cells(xyz, max(FIRST_CELL_MEDIANS * median, 1e-3))
+    first_cells = cells = sort_into_cells(xyz, max(FIRST_CELL_MEDIANS * median, 1e-3))
     squared = np.full(n, np.inf)
     while True:
-        if _search_cells(cells, squared, max_distances * n) < 0:
+        if _find_nearest_in_cells(cells, squared, max_distances * n) < 0:
             tree = build_tree(xyz)
             squared[tree.order] = find_nearest_distances(tree)[0]
-            return np.sqrt(squared).mean(), first
-        waiting = np.flatnonzero(squared > cells.reach**2)
-        squared[waiting] = np.inf  # a closer point may lie outside the searched cells
-        if len(waiting) * n <= MAX_BRUTE_FORCE:
-            squared[waiting] = [_nearest_squared_distance(columns, n, i) for i in waiting]
-            return np.sqrt(squared).mean(), first
+            return np.sqrt(squared).mean(), first_cells
+        unresolved = np.flatnonzero(squared > cells.reach**2)
+        squared[unresolved] = np.inf  # a closer point may lie outside the searched cells
+        if len(unresolved) * n <= MAX_BRUTE_FORCE:
+            squared[unresolved] = [_nearest_squared_distance(coordinates, n, i) for i in unresolved]
+            return np.sqrt(squared).mean(), first_cells
         cells = sort_into_cells(xyz, 4.0 * cells.reach)
 
 
@@ -152,50 +155,50 @@ def _mean_nearest_distance(xyz: np.ndarray, max_distances: float) -> tuple[float
 def _nearest_squared_distance(points, size, i):
     """Return the squared distance from point i to the nearest other one of points (3, >= size).
 
-    Non-negative floats sort as their bits do, and a minimum of integers is vectorised.
+    Non-negative floats sort like their bits, and the minimum of integers is vectorised.
     """
     px, py, pz = points[0, i], points[1, i], points[2, i]
     points[0, i] = np.inf  # excludes the point itself
-    least = np.int64(0x7FF0000000000000)  # inf
+    least_bits = np.int64(0x7FF0000000000000)  # inf
     for begin in range(0, size, 4096):
         for j in range(np.uint64(begin), np.uint64(min(begin + 4096, size))):
             dx, dy, dz = px - points[0, j], py - points[1, j], pz - points[2, j]
             squared = dx * dx + dy * dy + dz * dz
-            least = min(least, np.float64(squared).view(np.int64))
-        if least == 0:
+            least_bits = min(least_bits, np.float64(squared).view(np.int64))
+        if least_bits == 0:
             break  # bounds the time for many coincident points
     points[0, i] = px
-    return np.int64(least).view(np.float64)
+    return np.int64(least_bits).view(np.float64)
 
 
 @njit(cache=True, nogil=True)
-def _search_cells(cells, squared, work):
-    near = np.empty((3, cells.size.max()))
+def _find_nearest_in_cells(cells, squared, budget):
+    neighbours = np.empty((3, cells.size.max()))
     for a in range(len(cells.size)):
-        empty = True
+        needs_gathering = True
         for i in range(cells.start[a], cells.start[a + 1]):
             if squared[cells.order[i]] == np.inf:
-                work -= cells.size[a]
-                if work < 0:
-                    return work
-                if empty:
-                    gather_neighbourhood(cells, a, near)
-                    empty = False
-                own = i - cells.start[cells.low[a, 0]]
-                squared[cells.order[i]] = _nearest_squared_distance(near, cells.size[a], own)
-    return work
+                budget -= cells.size[a]
+                if budget < 0:
+                    return budget
+                if needs_gathering:
+                    gather_neighbourhood(cells, a, neighbours)
+                    needs_gathering = False
+                own_index = i - cells.start[cells.low[a, 0]]
+                squared[cells.order[i]] = _nearest_squared_distance(neighbours, cells.size[a], own_index)
+    return budget
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "nsz"})
 def _mean_distances(cells, radii2):
-    """Return (N,) the mean distance to the other points within each point's radius, in cell order.
+    """Compute the mean distance (N,) to the other points within each point's radius, in cell order.
 
-    Each pair is computed twice, which is faster than storing the result of one computation.
+    Each distance is computed twice, which is faster than storing it.
     """
-    means, near = np.zeros(len(cells.order)), np.empty((3, cells.size.max()))
+    means, neighbours = np.zeros(len(cells.order)), np.empty((3, cells.size.max()))
     x, y, z = cells.xyz[0], cells.xyz[1], cells.xyz[2]
     for a in range(len(cells.size)):
-        gather_neighbourhood(cells, a, near)
+        gather_neighbourhood(cells, a, neighbours)
         for i in range(cells.start[a], cells.start[a + 1]):
             if i > cells.start[a] and x[i] == x[i - 1] and y[i] == y[i - 1] and z[i] == z[i - 1]:
                 means[i] = means[i - 1]  # bounds the time for many coincident points
@@ -203,14 +206,14 @@ def _mean_distances(cells, radii2):
             px, py, pz, total, count = x[i], y[i], z[i], 0.0, 0.0
             radius2 = radii2[i]
             for j in range(np.uint64(cells.size[a])):
-                dx, dy, dz = px - near[0, j], py - near[1, j], pz - near[2, j]
+                dx, dy, dz = px - neighbours[0, j], py - neighbours[1, j], pz - neighbours[2, j]
                 squared = dx * dx + dy * dy + dz * dz
                 inside = squared <= radius2
                 # Without these two variables the loop is not vectorised.
                 distance = np.sqrt(squared) if inside else 0.0
-                one = 1.0 if inside else 0.0
+                increment = 1.0 if inside else 0.0
                 total += distance
-                count += one
+                count += increment
             means[i] = total / max(count - 1.0, 1.0)  # count includes the point itself
     return means
 
@@ -220,12 +223,12 @@ def _mean_distances_to_sample(cells, sample, radii2):
     """Estimate the result of _mean_distances from a sample of each cell."""
     means = np.zeros(len(cells.order))
     for a in range(len(cells.size)):
-        near, weight = gather_sample(cells, sample, a)
+        neighbours, weight = gather_sample(cells, sample, a)
         for i in range(cells.start[a], cells.start[a + 1]):
             px, py, pz, radius2 = cells.xyz[0, i], cells.xyz[1, i], cells.xyz[2, i], radii2[i]
             total, count = 0.0, 0.0
             for j in range(len(weight)):
-                dx, dy, dz = px - near[0, j], py - near[1, j], pz - near[2, j]
+                dx, dy, dz = px - neighbours[0, j], py - neighbours[1, j], pz - neighbours[2, j]
                 squared = dx * dx + dy * dy + dz * dz
                 inside = squared <= radius2
                 total += weight[j] * np.sqrt(squared) if inside else 0.0
@@ -234,76 +237,85 @@ def _mean_distances_to_sample(cells, sample, radii2):
     return means
 
 
-def _find_components_by_tree(tree: Tree, reach2: np.ndarray, min_points: float, growing: np.ndarray) -> np.ndarray:
+def _find_components_by_tree(tree: Tree, reach2: np.ndarray, min_points: float, can_grow: np.ndarray) -> np.ndarray:
     """Return the result of _find_components in the order of the tree."""
-    is_core = find_core_points_in_tree(tree, reach2, min_points)[0] & growing
+    is_core = find_core_points_in_tree(tree, reach2, min_points)[0] & can_grow
     max_work = max_exact_distances(len(is_core))
     component, work = find_components(tree, reach2, is_core, 0.0, max_work)
     if work > max_work:
-        kept, group = thin_points(tree.points[is_core], np.sqrt(reach2[is_core]))
-        widest = np.zeros(len(kept))
-        np.maximum.at(widest, group, reach2[is_core])
-        thinned = build_tree(tree.points[is_core][kept])
-        found = np.empty(len(kept), np.int64)
-        found[thinned.order] = find_components(
-            thinned, widest[thinned.order] * (1 + SLACK) ** 2, np.ones(len(kept), bool), 0.0, np.inf
+        kept_rows, group = thin_points(tree.points[is_core], np.sqrt(reach2[is_core]))
+        max_reach2 = np.zeros(len(kept_rows))
+        np.maximum.at(max_reach2, group, reach2[is_core])
+        thinned_tree = build_tree(tree.points[is_core][kept_rows])
+        thinned_component = np.empty(len(kept_rows), np.int64)
+        thinned_component[thinned_tree.order] = find_components(
+            thinned_tree, max_reach2[thinned_tree.order] * (1 + SLACK) ** 2, np.ones(len(kept_rows), bool), 0.0, np.inf
         )[0]
-        component[is_core] = found[group]
+        component[is_core] = thinned_component[group]
     core = find_nearest_core_points(tree, reach2, is_core)[0]
     return np.where(core >= 0, component[core], component)
 
 
 @njit(cache=True, nogil=True)
-def _find_components(cells, points, is_core, work):
-    """Return (N,) the connected set of each point, -1 for none, and the work that is left.
+def _find_components(cells, points, is_core, budget):
+    """Find the connected sets of the points on the grid.
 
-    points is (N, 4): x, y, z and the squared threshold; work is that of find_core_points. items
-    holds the points of each cell in three parts: core points that are not found yet, core points
-    that are found, and other points.
+    items holds the points of each cell in three parts: core points that are not visited yet (up to
+    new_end[a]), visited core points, and other points (from other_begin[a] on).
+
+    Args:
+        points: (N, 4) x, y, z and squared threshold of each point, in cell order.
+        is_core: (N,) bool.
+        budget: maximum number of distances.
+
+    Returns:
+        component (N,), the set of each point, -1 for none; the remaining budget, negative if the
+        search stopped early.
     """
-    n, start, left = len(points), cells.start, cells.start[1:].copy()
+    n, start, new_end = len(points), cells.start, cells.start[1:].copy()
     cell, items, stack = np.empty(n, np.int32), np.arange(n), np.empty(n, np.int64)
-    for a in range(len(left)):
+    for a in range(len(new_end)):
         cell[start[a] : start[a + 1]] = a
         for i in range(start[a + 1] - 1, start[a] - 1, -1):
             if not is_core[i]:
-                left[a] -= 1
-                items[i], items[left[a]] = items[left[a]], i
-    others, count = left.copy(), 0
-    component, nearest, least = np.full(n, -1), np.full(n, -1), np.full(n, np.inf)
-    for seed in range(len(left)):
-        while left[seed] > start[seed]:
-            left[seed] -= 1
-            stack[0], waiting = items[left[seed]], 1
+                new_end[a] -= 1
+                items[i], items[new_end[a]] = items[new_end[a]], i
+    other_begin, count = new_end.copy(), 0
+    component, nearest, least_squared = np.full(n, -1), np.full(n, -1), np.full(n, np.inf)
+    for seed in range(len(new_end)):
+        while new_end[seed] > start[seed]:
+            new_end[seed] -= 1
+            stack[0], stack_size = items[new_end[seed]], 1
             component[stack[0]] = count
-            while waiting:
-                if work < 0:
-                    return component, work
-                waiting -= 1
-                i = stack[waiting]
+            while stack_size:
+                if budget < 0:
+                    return component, budget
+                stack_size -= 1
+                i = stack[stack_size]
                 p, a = points[i], cell[i]
                 for k in range(cells.ranges[a]):
                     for b in range(cells.low[a, k], cells.high[a, k]):
-                        work -= left[b] - start[b] + start[b + 1] - others[b]
-                        for m in range(left[b] - 1, start[b] - 1, -1):
+                        budget -= new_end[b] - start[b] + start[b + 1] - other_begin[b]
+                        for m in range(new_end[b] - 1, start[b] - 1, -1):
                             j = items[m]
                             if squared_distance(p, points[j]) <= max(p[3], points[j, 3]):
-                                component[j], stack[waiting] = count, j
-                                left[b] -= 1
-                                waiting += 1
-                                items[m], items[left[b]] = items[left[b]], j
-                        for m in range(others[b], start[b + 1]):
+                                component[j], stack[stack_size] = count, j
+                                new_end[b] -= 1
+                                stack_size += 1
+                                items[m], items[new_end[b]] = items[new_end[b]], j
+                        for m in range(other_begin[b], start[b + 1]):
                             j = items[m]
                             squared, q = squared_distance(p, points[j]), points[nearest[j]]
                             if squared <= p[3] and (
-                                squared < least[j] or (squared == least[j] and (p[0], p[1], p[2]) < (q[0], q[1], q[2]))
+                                squared < least_squared[j]
+                                or (squared == least_squared[j] and (p[0], p[1], p[2]) < (q[0], q[1], q[2]))
                             ):
-                                least[j], nearest[j] = squared, i
+                                least_squared[j], nearest[j] = squared, i
             count += 1
     for i in range(n):
         if nearest[i] >= 0:
             component[i] = component[nearest[i]]
-    return component, work
+    return component, budget
 
 
 def _merge_clusters(xyz: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
@@ -313,25 +325,25 @@ def _merge_clusters(xyz: np.ndarray, labels: np.ndarray, gamma: float) -> np.nda
     if len(centre) > 2:
         tree = build_tree(centre[1:])
         selected = np.ones(len(tree.order), bool)
-        merged = find_components(tree, diameter[1:][tree.order], selected, gamma, np.inf)[0]
-        component = np.empty(len(merged), np.int64)
-        component[tree.order] = merged
+        tree_component = find_components(tree, diameter[1:][tree.order], selected, gamma, np.inf)[0]
+        component = np.empty(len(tree_component), np.int64)
+        component[tree.order] = tree_component
         parent[1:] = np.unique(component, return_index=True)[1][component] + 1
     return parent
 
 
 @njit(cache=True, nogil=True)
 def _compute_centres(xyz, labels):
-    """Return (K + 1, 3) means and (K + 1,) box diagonals by label; row 0 is of no cluster."""
+    """Return means (K + 1, 3) and box diagonals (K + 1,) by label; row 0 belongs to no cluster."""
     count = labels.max() + 1
     size, centre, diameter = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     for i in range(len(labels)):
         size[labels[i]] += 1
         for axis in range(3):
-            c, v = (labels[i], axis), np.float64(xyz[i, axis])
-            centre[c] += v
-            low[c], high[c] = min(low[c], v), max(high[c], v)
+            entry, value = (labels[i], axis), np.float64(xyz[i, axis])
+            centre[entry] += value
+            low[entry], high[entry] = min(low[entry], value), max(high[entry], value)
     for a in range(1, count):
         centre[a] /= size[a]
         diameter[a] = np.sqrt(squared_distance(low[a], high[a]))

@@ -23,14 +23,16 @@ def _to_sortable(value):
 def sort_by_cluster(
     xyz: np.ndarray, labels: np.ndarray, sizes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sort points (N, 3) by cluster, then x, then y, so that their order does not affect the boxes.
+    """Sort points by cluster, then x, then y, so that the boxes do not depend on their order.
 
     Args:
-        labels: (N,) int32, 0 for points without a cluster, 1..K.
+        xyz: (N, 3) float32 points in metres.
+        labels: (N,) int32 cluster ids 1..K; 0 for points without a cluster.
         sizes: (K,) number of points of each cluster.
 
     Returns:
-        x (M,), y (M,) float32 of the points with a cluster, and start (K + 1,) of each cluster.
+        x (M,) and y (M,) float32 of the points with a cluster; start (K + 1,), the index of the
+        first point of each cluster.
     """
     start = np.concatenate([[0], np.cumsum(sizes)])
     keys = _make_keys(xyz, labels, start)
@@ -42,37 +44,46 @@ def sort_by_cluster(
 
 @njit(cache=True, nogil=True)
 def _make_keys(xyz, labels, start):
-    """Return the points with a cluster by cluster, (M,) int64: x and y in one number, which sorts
-    faster than two."""
-    place = start[:-1].copy()
+    """Return (M,) int64 sort keys of the points with a cluster, cluster after cluster.
+
+    A key holds both x and y, because one number sorts faster than two.
+    """
+    next_slot = start[:-1].copy()
     keys = np.empty(start[-1], np.int64)
     bits = xyz.view(np.int32)
     for i in range(len(xyz)):
         k = labels[i] - 1
         if k >= 0:
-            keys[place[k]] = (_to_sortable(np.int64(bits[i, 0])) << 32) + _to_sortable(np.int64(bits[i, 1]))
-            place[k] += 1
+            keys[next_slot[k]] = (_to_sortable(np.int64(bits[i, 0])) << 32) + _to_sortable(np.int64(bits[i, 1]))
+            next_slot[k] += 1
     return keys
 
 
 @njit(cache=True, nogil=True)
 def _split_keys(keys):
-    flat = np.empty((2, len(keys)), np.int32)
+    xy_bits = np.empty((2, len(keys)), np.int32)
     for i in range(len(keys)):
         high = (keys[i] + (1 << 31)) >> 32
-        flat[0, i] = _to_sortable(high)
-        flat[1, i] = _to_sortable(keys[i] - (high << 32))
-    return flat[0].view(np.float32), flat[1].view(np.float32)
+        xy_bits[0, i] = _to_sortable(high)
+        xy_bits[1, i] = _to_sortable(keys[i] - (high << 32))
+    return xy_bits[0].view(np.float32), xy_bits[1].view(np.float32)
 
 
 @njit(cache=True, nogil=True)
 def fit_rectangles(x, y, start, l_shape):
-    """Fit rectangles (K, 5) float64 [x y l w yaw], l >= w, to clusters as sort_by_cluster returns.
+    """Fit a rectangle to each cluster.
 
-    l_shape: along the visible sides rather than of least area.
+    Args:
+        x: (M,) float32, see sort_by_cluster.
+        y: (M,) float32.
+        start: (K + 1,) index of the first point of each cluster.
+        l_shape: align the rectangles with the visible sides instead of minimising their area.
+
+    Returns:
+        (K, 5) float64 [x y l w yaw] in metres and radians, l >= w.
     """
-    rows = np.zeros((len(start) - 1, 5))
-    for k in range(len(rows)):
+    rectangles = np.zeros((len(start) - 1, 5))
+    for k in range(len(rectangles)):
         begin, end = start[k], start[k + 1]
         if begin == end:
             continue
@@ -87,28 +98,28 @@ def fit_rectangles(x, y, start, l_shape):
             low_u, high_u, low_v, high_v = _find_spans(hull, cos, sin)
         u, v = (low_u + high_u) / 2, (low_v + high_v) / 2
         length, width = high_u - low_u, high_v - low_v
-        rows[k, 0], rows[k, 1] = x0 + cos * u - sin * v, y0 + sin * u + cos * v
+        rectangles[k, 0], rectangles[k, 1] = x0 + cos * u - sin * v, y0 + sin * u + cos * v
         if width > length:
             length, width = width, length
             cos, sin = -sin, cos
-        rows[k, 2], rows[k, 3], rows[k, 4] = length, width, math.atan2(sin, cos)
-    return rows
+        rectangles[k, 2], rectangles[k, 3], rectangles[k, 4] = length, width, math.atan2(sin, cos)
+    return rectangles
 
 
 @njit(cache=True, nogil=True)
 def _convex_hull(x, y):
     """Return the corners (2, H) float64 of the convex hull, counter-clockwise (monotone chain).
 
-    The points ascend by x, then y. Points on a line give its two ends, equal points one corner.
+    The points must be sorted by x, then y. Collinear points give two corners, coincident points one.
     """
     n = len(x)
     corners = np.empty((2, n + 1))
-    count, floor = 0, 0
+    count, min_count = 0, 0
     for step in range(2 * n - 1):
         if step == n:
-            floor = count - 1  # the lower side is complete; continue with the upper side
+            min_count = count - 1  # the lower side is complete; continue with the upper side
         i = step if step < n else 2 * n - 2 - step
-        while count > floor + 1:
+        while count > min_count + 1:
             ax, ay = corners[0, count - 2], corners[1, count - 2]
             bx, by = corners[0, count - 1], corners[1, count - 1]
             if (bx - ax) * (y[i] - ay) - (by - ay) * (x[i] - ax) > 0:
@@ -135,12 +146,12 @@ def _find_spans(hull, cos, sin):
 
 @njit(cache=True, nogil=True)
 def _find_min_area_direction(hull):
-    """Return (cos, sin) of the rectangle of least area around a hull (rotating calipers).
+    """Find the direction (cos, sin) of the smallest rectangle around a hull (rotating calipers).
 
     One of its sides lies along an edge of the hull.
     """
     count = hull.shape[1]
-    best, best_cos, best_sin = np.inf, 1.0, 0.0
+    min_area, best_cos, best_sin = np.inf, 1.0, 0.0
     front = top = rear = 1 % count
     for i in range(count if count > 1 else 0):
         x, y = hull[0, i], hull[1, i]
@@ -149,10 +160,10 @@ def _find_min_area_direction(hull):
         front = _advance_corner(hull, front, cos, sin)
         top = _advance_corner(hull, top, -sin, cos)
         rear = _advance_corner(hull, rear if i else top, -cos, -sin)
-        along = cos * (hull[0, front] - hull[0, rear]) + sin * (hull[1, front] - hull[1, rear])
-        area = along * (cos * (hull[1, top] - y) - sin * (hull[0, top] - x))
-        if area < best:
-            best, best_cos, best_sin = area, cos, sin
+        length = cos * (hull[0, front] - hull[0, rear]) + sin * (hull[1, front] - hull[1, rear])
+        area = length * (cos * (hull[1, top] - y) - sin * (hull[0, top] - x))
+        if area < min_area:
+            min_area, best_cos, best_sin = area, cos, sin
     return best_cos, best_sin
 
 
@@ -161,18 +172,21 @@ def _advance_corner(hull, corner, cos, sin):
     """Return the first corner from `corner` on that is farthest along (cos, sin)."""
     height = cos * hull[0, corner] + sin * hull[1, corner]
     while True:
-        following = (corner + 1) % hull.shape[1]
-        next_height = cos * hull[0, following] + sin * hull[1, following]
+        next_corner = (corner + 1) % hull.shape[1]
+        next_height = cos * hull[0, next_corner] + sin * hull[1, next_corner]
         if next_height <= height:
             return corner
-        corner, height = following, next_height
+        corner, height = next_corner, next_height
 
 
 @njit(cache=True, nogil=True)
 def _find_closest_direction(x, y, hull):
-    """Return (cos, sin) of the rectangle whose sides are closest to points x, y (N,) float32."""
+    """Find the direction (cos, sin) of the rectangle whose sides are closest to the points.
+
+    x and y are (N,) float32.
+    """
     mean_x, mean_y = x.mean(), y.mean()
-    best, best_cos, best_sin = -np.inf, 1.0, 0.0
+    max_closeness, best_cos, best_sin = -np.inf, 1.0, 0.0
     for angle in ANGLES:
         cos, sin = math.cos(angle), math.sin(angle)
         low_u, high_u, low_v, high_v = _find_spans(hull, cos, sin)
@@ -180,14 +194,14 @@ def _find_closest_direction(x, y, hull):
         side_u = high_u if 2 * (cos * mean_x + sin * mean_y) > low_u + high_u else low_u
         side_v = high_v if 2 * (cos * mean_y - sin * mean_x) > low_v + high_v else low_v
         closeness = _compute_closeness(x, y, np.float32(cos), np.float32(sin), np.float32(side_u), np.float32(side_v))
-        if closeness > best:
-            best, best_cos, best_sin = closeness, cos, sin
+        if closeness > max_closeness:
+            max_closeness, best_cos, best_sin = closeness, cos, sin
     return best_cos, best_sin
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _compute_closeness(x, y, cos, sin, side_u, side_v):
-    """Sum 1 / distance to the nearer side; float32 and fastmath give eight points per step."""
+    """Sum 1 / distance to the nearer side. float32 and fastmath allow vectorisation."""
     total = np.float32(0)
     for i in range(len(x)):
         u = abs(cos * x[i] + sin * y[i] - side_u)

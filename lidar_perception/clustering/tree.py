@@ -1,11 +1,11 @@
 """A k-d tree for points of any density.
 
 In a dense cloud, one neighbourhood of a grid can hold all points. A search in the tree visits few
-boxes, and points that are found are removed and never visited again.
+boxes, and found points are removed and never visited again.
 
-Each box is halved by number of points, so the tree is balanced even where points coincide.
-Distances are float64 and computed as in the grid. Distances to boxes round the same way, so that a
-box is skipped, or taken whole, only if each of its points would be.
+Each box is split at the median, so the tree is balanced even if points coincide. Distances are
+float64 and computed as in the grid. Distances to boxes are rounded the same way, so that a box is
+skipped or accepted as a whole only if each of its points would be.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def _build(points):
 
 @njit(cache=True, nogil=True)
 def _partition(points, order, first, last, middle, axis):
-    """Reorder rows first..last so that none before `middle` is above one after it (Hoare)."""
+    """Reorder rows first..last so that none before `middle` exceeds one after it (Hoare)."""
     state = np.uint64(0x632BE59BD9B4E019)
     while first < last:
         state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
@@ -107,13 +107,13 @@ def _max_squared_distance(tree, k, p):
 
 
 @njit(cache=True, nogil=True)
-def _push_halves(tree, stack, waiting, k, p):
+def _push_halves(tree, stack, stack_size, k, p):
     """Push the halves of box k onto the stack, the nearer one on top."""
-    one, other = 2 * k, 2 * k + 1
-    if _min_squared_distance(tree, one, p) < _min_squared_distance(tree, other, p):
-        one, other = other, one
-    stack[waiting], stack[waiting + 1] = one, other
-    return waiting + 2
+    bottom, top = 2 * k, 2 * k + 1
+    if _min_squared_distance(tree, bottom, p) < _min_squared_distance(tree, top, p):
+        bottom, top = top, bottom
+    stack[stack_size], stack[stack_size + 1] = bottom, top
+    return stack_size + 2
 
 
 @njit(cache=True, nogil=True)
@@ -126,15 +126,15 @@ def find_nearest_distances(tree):
     """
     squared, stack, work = np.full(len(tree.points), np.inf), np.empty(STACK_SIZE, np.int64), 0
     for i in range(len(squared)):
-        p, best, waiting = tree.points[i], np.inf, 1
+        p, best, stack_size = tree.points[i], np.inf, 1
         stack[0] = 1
-        while waiting:
-            waiting -= 1
-            k = stack[waiting]
+        while stack_size:
+            stack_size -= 1
+            k = stack[stack_size]
             if _min_squared_distance(tree, k, p) >= best:
                 continue
             if k < tree.leaves:
-                waiting = _push_halves(tree, stack, waiting, k, p)
+                stack_size = _push_halves(tree, stack, stack_size, k, p)
                 continue
             for j in range(tree.begin[k], tree.end[k]):
                 if j != i:
@@ -148,22 +148,25 @@ def find_nearest_distances(tree):
 def find_core_points_in_tree(tree, reach2, min_points):
     """Find the points with at least min_points points within reach, themselves included.
 
-    reach2 (N,) is the squared reach of each point. Returns (N,) bool, both in the order of the
-    tree, and the number of distances computed.
+    Args:
+        reach2: (N,) squared reach of each point, in the order of the tree.
+
+    Returns:
+        (N,) bool in the order of the tree; the number of distances computed.
     """
     is_core, stack, work = np.zeros(len(tree.points), np.bool_), np.empty(STACK_SIZE, np.int64), 0
     for i in range(len(is_core)):
-        p, count, waiting = tree.points[i], 0, 1
+        p, count, stack_size = tree.points[i], 0, 1
         stack[0] = 1
-        while waiting and count < min_points:
-            waiting -= 1
-            k = stack[waiting]
+        while stack_size and count < min_points:
+            stack_size -= 1
+            k = stack[stack_size]
             if _min_squared_distance(tree, k, p) > reach2[i]:
                 continue
             if _max_squared_distance(tree, k, p) <= reach2[i]:
                 count += tree.end[k] - tree.begin[k]
             elif k < tree.leaves:
-                waiting = _push_halves(tree, stack, waiting, k, p)
+                stack_size = _push_halves(tree, stack, stack_size, k, p)
             else:
                 for j in range(tree.begin[k], tree.end[k]):
                     count += 1 if squared_distance(p, tree.points[j]) <= reach2[i] else 0
@@ -174,18 +177,18 @@ def find_core_points_in_tree(tree, reach2, min_points):
 
 @njit(cache=True, nogil=True)
 def _find_box_maxima(tree, values, selected):
-    """Return each box's largest value among its selected points (-1 without any), and their count."""
-    largest, left = np.full(2 * tree.leaves, -1.0), np.zeros(2 * tree.leaves, np.int64)
+    """Return the largest value of each box's selected points (-1 if it has none), and their count."""
+    max_values, counts = np.full(2 * tree.leaves, -1.0), np.zeros(2 * tree.leaves, np.int64)
     for k in range(2 * tree.leaves - 1, 0, -1):
         if k < tree.leaves:
-            largest[k] = max(largest[2 * k], largest[2 * k + 1])
-            left[k] = left[2 * k] + left[2 * k + 1]
+            max_values[k] = max(max_values[2 * k], max_values[2 * k + 1])
+            counts[k] = counts[2 * k] + counts[2 * k + 1]
         else:
             for i in range(tree.begin[k], tree.end[k]):
                 if selected[i]:
-                    largest[k] = max(largest[k], values[i])
-                    left[k] += 1
-    return largest, left
+                    max_values[k] = max(max_values[k], values[i])
+                    counts[k] += 1
+    return max_values, counts
 
 
 @njit(cache=True, nogil=True)
@@ -210,82 +213,99 @@ def _are_linked(squared, a, b, gamma):
 
 @njit(cache=True, nogil=True)
 def find_components(tree, size, selected, gamma, max_work):
-    """Find the connected sets of the selected points (N,) bool, linked by size (see _are_linked).
+    """Find the connected sets of the selected points.
 
-    All arrays are in the order of the tree. Returns (N,) the set of each point, -1 for points that
-    are not selected, and the number of distances computed. If that is more than max_work, the sets
-    are not complete.
+    All arrays are in the order of the tree.
+
+    Args:
+        size: (N,) squared reach or diameter of each point, see _are_linked.
+        selected: (N,) bool.
+        gamma: see _are_linked.
+        max_work: number of distances at which the search stops.
+
+    Returns:
+        component (N,), the set of each point, -1 for points that are not selected; the number of
+        distances computed. If that exceeds max_work, the sets are incomplete.
     """
-    largest, left = _find_box_maxima(tree, size, selected)
+    max_sizes, remaining = _find_box_maxima(tree, size, selected)
     leaf, component = _find_leaves(tree), np.full(len(tree.points), -1)
-    stack, found, count, work = np.empty(STACK_SIZE, np.int64), np.empty(len(leaf), np.int64), 0, 0
+    stack, pending, count, work = np.empty(STACK_SIZE, np.int64), np.empty(len(leaf), np.int64), 0, 0
     for seed in range(len(component)):
         if not selected[seed] or component[seed] >= 0:
             continue
-        _remove_point(left, leaf[seed])
-        component[seed], found[0], last = count, seed, 1
-        while last:
+        _remove_point(remaining, leaf[seed])
+        component[seed], pending[0], pending_count = count, seed, 1
+        while pending_count:
             # The point found last is the farthest and reaches most points that are not found yet.
-            last -= 1
-            i = found[last]
+            pending_count -= 1
+            i = pending[pending_count]
             if work > max_work:
                 return component, work
-            p, waiting = tree.points[i], 1
+            p, stack_size = tree.points[i], 1
             stack[0] = 1
-            while waiting:
-                waiting -= 1
-                k = stack[waiting]
-                if left[k] == 0 or not _are_linked(_min_squared_distance(tree, k, p), size[i], largest[k], gamma):
+            while stack_size:
+                stack_size -= 1
+                k = stack[stack_size]
+                if remaining[k] == 0 or not _are_linked(
+                    _min_squared_distance(tree, k, p), size[i], max_sizes[k], gamma
+                ):
                     continue
                 if k < tree.leaves:
-                    waiting = _push_halves(tree, stack, waiting, k, p)
+                    stack_size = _push_halves(tree, stack, stack_size, k, p)
                     continue
                 for j in range(tree.begin[k], tree.end[k]):
                     if selected[j] and component[j] < 0:
                         work += 1
                         if _are_linked(squared_distance(p, tree.points[j]), size[i], size[j], gamma):
-                            component[j], found[last] = count, j
-                            last += 1
-                            _remove_point(left, k)
+                            component[j], pending[pending_count] = count, j
+                            pending_count += 1
+                            _remove_point(remaining, k)
         count += 1
     return component, work
 
 
 @njit(cache=True, nogil=True)
-def _remove_point(left, k):
-    """Count one point less in box k and the boxes around it."""
+def _remove_point(remaining, k):
+    """Subtract one point from the counts of box k and of all boxes that contain it."""
     while k > 0:
-        left[k] -= 1
+        remaining[k] -= 1
         k //= 2
 
 
 @njit(cache=True, nogil=True)
 def find_nearest_core_points(tree, reach2, is_core):
-    """Find the nearest core point within whose reach each other point lies.
+    """Find, for each other point, the nearest core point whose reach includes it.
 
-    Of equally near core points, the one with the least x, then y, then z counts. reach2 (N,) is the
-    squared reach of each point, is_core (N,) bool, all in the order of the tree. Returns (N,) the
-    core point, -1 for none and for core points, and the number of distances computed.
+    Of equally near core points, the one with the least x, then y, then z is chosen. All arrays are
+    in the order of the tree.
+
+    Args:
+        reach2: (N,) squared reach of each point.
+        is_core: (N,) bool.
+
+    Returns:
+        nearest (N,), the core point of each point, -1 for none and for core points; the number of
+        distances computed.
     """
-    largest, left = _find_box_maxima(tree, reach2, is_core)
+    max_reach2, core_counts = _find_box_maxima(tree, reach2, is_core)
     nearest, stack, work = np.full(len(is_core), -1), np.empty(STACK_SIZE, np.int64), 0
     for i in range(len(is_core)):
         if is_core[i]:
             continue
-        p, best, waiting = tree.points[i], np.inf, 1
+        p, best, stack_size = tree.points[i], np.inf, 1
         stack[0] = 1
-        while waiting:
-            waiting -= 1
-            k = stack[waiting]
+        while stack_size:
+            stack_size -= 1
+            k = stack[stack_size]
             squared = _min_squared_distance(tree, k, p)
             if (
-                left[k] == 0
-                or squared > min(best, largest[k])
+                core_counts[k] == 0
+                or squared > min(best, max_reach2[k])
                 or (squared == best and not _precedes(tree.low[k], tree.points[nearest[i]]))
             ):
                 continue
             if k < tree.leaves:
-                waiting = _push_halves(tree, stack, waiting, k, p)
+                stack_size = _push_halves(tree, stack, stack_size, k, p)
                 continue
             for j in range(tree.begin[k], tree.end[k]):
                 if is_core[j]:
@@ -307,51 +327,57 @@ def _precedes(p, q):
 def find_touching_labels(tree, label, side, reach2, max_work):
     """Connect the labels that have points of opposite sides within reach of each other.
 
-    label (N,) is 0 or more, side (N,) is 0 or 1, in the order of the tree. Returns (P, 2) pairs of
-    labels that connect the same labels as all pairs of points would, with P less than the number
-    of labels; and the number of distances computed. If that is more than max_work, pairs are
-    missing.
+    Args:
+        label: (N,) labels from 0, in the order of the tree.
+        side: (N,) 0 or 1, in the order of the tree.
+        reach2: squared reach.
+        max_work: number of distances at which the search stops.
+
+    Returns:
+        (P, 2) pairs of labels that connect the same labels as all pairs of points within reach,
+        where P is less than the number of labels; the number of distances computed. If that exceeds
+        max_work, pairs are missing.
     """
     n = len(label)
-    sides = np.empty((2, 2 * tree.leaves), np.int64)
+    remaining = np.empty((2, 2 * tree.leaves), np.int64)
     for s in range(2):
-        sides[s] = _find_box_maxima(tree, reach2 + np.zeros(n), side == s)[1]
+        remaining[s] = _find_box_maxima(tree, reach2 + np.zeros(n), side == s)[1]
     by_label, start = counting_sort(label, label.max() + 1, np.arange(n))
     leaf, pairs, count = _find_leaves(tree), np.empty((len(start), 2), np.int64), 0
-    done, stack, work = np.zeros(len(start), np.bool_), np.empty(STACK_SIZE, np.int64), 0
+    is_reached, stack, work = np.zeros(len(start), np.bool_), np.empty(STACK_SIZE, np.int64), 0
     queue = np.empty(n, np.int64)
     for seed in range(len(start) - 1):
-        first = last = 0
-        arrived = seed
+        head = tail = 0
+        reached = seed
         while True:
-            if arrived >= 0 and not done[arrived]:
-                done[arrived] = True
-                for m in by_label[start[arrived] : start[arrived + 1]]:
-                    _remove_point(sides[side[m]], leaf[m])
-                    queue[last] = m
-                    last += 1
-            if first == last or work > max_work:
+            if reached >= 0 and not is_reached[reached]:
+                is_reached[reached] = True
+                for m in by_label[start[reached] : start[reached + 1]]:
+                    _remove_point(remaining[side[m]], leaf[m])
+                    queue[tail] = m
+                    tail += 1
+            if head == tail or work > max_work:
                 break
-            i, arrived = queue[first], -1
-            p, other, waiting = tree.points[i], sides[1 - side[i]], 1
+            i, reached = queue[head], -1
+            p, opposite, stack_size = tree.points[i], remaining[1 - side[i]], 1
             stack[0] = 1
-            while waiting and arrived < 0:
-                waiting -= 1
-                k = stack[waiting]
-                if other[k] == 0 or _min_squared_distance(tree, k, p) > reach2:
+            while stack_size and reached < 0:
+                stack_size -= 1
+                k = stack[stack_size]
+                if opposite[k] == 0 or _min_squared_distance(tree, k, p) > reach2:
                     continue
                 if k < tree.leaves:
-                    waiting = _push_halves(tree, stack, waiting, k, p)
+                    stack_size = _push_halves(tree, stack, stack_size, k, p)
                     continue
                 for j in range(tree.begin[k], tree.end[k]):
-                    if side[j] != side[i] and not done[label[j]]:
+                    if side[j] != side[i] and not is_reached[label[j]]:
                         work += 1
                         if squared_distance(p, tree.points[j]) <= reach2:
-                            arrived = label[j]
+                            reached = label[j]
                             break
-            if arrived < 0:
-                first += 1
+            if reached < 0:
+                head += 1
             else:
-                pairs[count] = label[i], arrived
+                pairs[count] = label[i], reached
                 count += 1
     return pairs[:count], work
