@@ -1,4 +1,4 @@
-"""Ground by cloth simulation (paper C, Eq. 2 and 3; Zhang et al., Remote Sensing 2016, 8, 501).
+"""Ground segmentation by cloth simulation (paper C, Eq. 2 and 3; Zhang et al., Remote Sensing 2016, 8, 501).
 
 In the paper, a cloth falls onto the inverted cloud, and the points near the cloth are ground. Only
 the final position of the cloth matters, so it is computed directly instead of simulating the fall:
@@ -27,9 +27,15 @@ SUNK_DEPTH_M = 0.4  # depth below the surroundings from which an isolated lowest
 class Cloth(NamedTuple):
     """Cloth at rest.
 
-    height (R, C) float32 are the particles' heights in metres; particle (r, c) is at
-    x = x0 + c * resolution, y = y0 + r * resolution. lowest (R, C) float32 is the lowest point of
-    the cell around each, inf for cells without points.
+    Particle (r, c) is at x = x0 + c * resolution, y = y0 + r * resolution.
+
+    Attributes:
+        height: (R, C) float32 height of each particle, in metres.
+        x0: x of the first column, in metres.
+        y0: y of the first row, in metres.
+        resolution: distance between neighbouring particles, in metres.
+        lowest: (R, C) float32 height of the lowest point in the cell around each particle, inf for
+            cells without points.
     """
 
     height: np.ndarray
@@ -50,34 +56,41 @@ def segment_by_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> np
     cloth = lay_cloth(xyz, params)
     if cloth is None:
         return np.zeros(len(xyz), bool)
-    climbed = np.full(cloth.height.shape, -UNOBSERVED, np.float32)
+    climbing_height = np.full(cloth.height.shape, -UNOBSERVED, np.float32)
     if params.slope > 0.0:
-        reached = find_climbing_cells(
+        is_climbing = find_climbing_cells(
             cloth.lowest, cloth.height, params.class_threshold, params.slope * cloth.resolution
         )
-        climbed[reached] = cloth.lowest[reached]
+        climbing_height[is_climbing] = cloth.lowest[is_climbing]
     return _select_near_cloth(
-        xyz, cloth.height, climbed, cloth.x0, cloth.y0, 1.0 / cloth.resolution, params.max_range, params.class_threshold
+        xyz,
+        cloth.height,
+        climbing_height,
+        cloth.x0,
+        cloth.y0,
+        1.0 / cloth.resolution,
+        params.max_range,
+        params.class_threshold,
     )
 
 
 def lay_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> Cloth | None:
-    """Return the cloth at rest under points (N, 3); None if no point is within max_range."""
+    """Compute the cloth at rest under points (N, 3); return None if no point is within max_range."""
     # Cells start at multiples of the coarsest size, so that a far point adds cells but moves none.
     block = 2 ** (GRID_LEVELS - 1)
     low_x, low_y, high_x, high_y = _find_bounds(xyz, params.max_range)
     if low_x > high_x:
         return None
-    size = params.resolution * block
-    first = np.floor([low_x / size, low_y / size])
-    columns, rows = ((np.floor([high_x / size, high_y / size]) - first + 1) * block).astype(int)
-    x0, y0 = first * size
+    block_size = params.resolution * block
+    first_block = np.floor([low_x / block_size, low_y / block_size])
+    columns, rows = ((np.floor([high_x / block_size, high_y / block_size]) - first_block + 1) * block).astype(int)
+    x0, y0 = first_block * block_size
     lowest = _find_lowest_points(xyz, params.max_range, x0, y0, 1.0 / params.resolution, rows, columns)
     _drop_sunk_cells(lowest, SUNK_DEPTH_M)
     lift = params.curvature * params.resolution**2 / 4
-    half = params.resolution / 2
+    half_cell = params.resolution / 2
     height = settle_sheet(lowest, lift, TOLERANCE_M, GRID_LEVELS)
-    return Cloth(height, float(x0) + half, float(y0) + half, params.resolution, lowest)
+    return Cloth(height, float(x0) + half_cell, float(y0) + half_cell, params.resolution, lowest)
 
 
 @njit(cache=True, nogil=True)
@@ -94,7 +107,7 @@ def _find_bounds(xyz, max_range):
 
 @njit(cache=True, nogil=True)
 def _find_lowest_points(xyz, max_range, x0, y0, scale, rows, columns):
-    """Return (rows, columns) z of the lowest point of each cell, UNOBSERVED without points."""
+    """Return the height (rows, columns) of the lowest point in each cell, UNOBSERVED without points."""
     lowest = np.full((rows, columns), UNOBSERVED, np.float32)
     for i in range(len(xyz)):
         x, y = np.float64(xyz[i, 0]), np.float64(xyz[i, 1])
@@ -107,46 +120,56 @@ def _find_lowest_points(xyz, max_range, x0, y0, scale, rows, columns):
 
 @njit(cache=True, nogil=True)
 def _drop_sunk_cells(lowest, depth):
-    """Mark cells as UNOBSERVED whose lowest point is deeper than those of all cells around but one.
+    """Mark cells with reflections below the ground as UNOBSERVED.
 
-    Reflections below the ground would pull the cloth down for metres around them. The wider window
-    is for large ranges, where few neighbouring cells have a point.
+    These are the cells whose lowest point is lower by `depth` than those of all cells around them
+    except at most one. They would pull the cloth down for metres around them. The wider window is
+    for large ranges, where few neighbouring cells have points.
     """
     rows, columns = lowest.shape
-    sunk = []
+    sunk_cells = []
     for r in range(rows):
         for c in range(columns):
             if lowest[r, c] == UNOBSERVED:
                 continue
             for reach in SUNK_WINDOWS:
-                higher = level = 0
+                higher_count = level_count = 0
                 for i in range(max(r - reach, 0), min(r + reach + 1, rows)):
                     for j in range(max(c - reach, 0), min(c + reach + 1, columns)):
                         if lowest[i, j] != UNOBSERVED:
                             if lowest[i, j] > lowest[r, c] + depth:
-                                higher += 1
+                                higher_count += 1
                             else:
-                                level += 1
-                    if level > 2:
+                                level_count += 1
+                    if level_count > 2:
                         break
-                if level > 2:
+                if level_count > 2:
                     break
-                if higher >= 4:  # all neighbours except at most one
-                    sunk.append((r, c))
+                if higher_count >= 4:  # all neighbours except at most one
+                    sunk_cells.append((r, c))
                     break
-    for r, c in sunk:
+    for r, c in sunk_cells:
         lowest[r, c] = UNOBSERVED
 
 
 @njit(cache=True, nogil=True)
-def _select_near_cloth(xyz, height, climbed, x0, y0, scale, max_range, threshold):
-    """Select the points within max_range and within threshold of the cloth or above `climbed`.
+def _select_near_cloth(xyz, height, climbing_height, x0, y0, scale, max_range, threshold):
+    """Select the points within max_range that are close to the cloth or to ground that climbs.
 
-    The cloth is interpolated bilinearly; climbed (R, C) is the lowest point of the cells that
-    continue the ground, -inf elsewhere. Returns (N,) bool.
+    The height of the cloth is interpolated bilinearly.
+
+    Args:
+        height: (R, C) height of the cloth in metres.
+        climbing_height: (R, C) height of the lowest point of cells that continue the ground
+            uphill, -inf for other cells.
+        threshold: maximum distance from the cloth along z and maximum height above
+            climbing_height, in metres.
+
+    Returns:
+        (N,) bool, True = ground.
     """
     rows, columns = height.shape
-    near = np.zeros(len(xyz), np.bool_)
+    is_ground = np.zeros(len(xyz), np.bool_)
     for i in range(len(xyz)):
         x, y = np.float64(xyz[i, 0]), np.float64(xyz[i, 1])
         if abs(x) <= max_range and abs(y) <= max_range:
@@ -154,10 +177,11 @@ def _select_near_cloth(xyz, height, climbed, x0, y0, scale, max_range, threshold
             v = min(max((y - y0) * scale, 0.0), rows - 1.0)
             c, r = min(int(u), columns - 2), min(int(v), rows - 2)
             a, b = u - c, v - r
-            cloth = (1 - b) * ((1 - a) * height[r, c] + a * height[r, c + 1]) + b * (
+            cloth_height = (1 - b) * ((1 - a) * height[r, c] + a * height[r, c + 1]) + b * (
                 (1 - a) * height[r + 1, c] + a * height[r + 1, c + 1]
             )
-            near[i] = (
-                abs(xyz[i, 2] - cloth) <= threshold or xyz[i, 2] - climbed[int(v + 0.5), int(u + 0.5)] <= threshold
+            is_ground[i] = (
+                abs(xyz[i, 2] - cloth_height) <= threshold
+                or xyz[i, 2] - climbing_height[int(v + 0.5), int(u + 0.5)] <= threshold
             )
-    return near
+    return is_ground

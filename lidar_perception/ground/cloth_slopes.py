@@ -1,4 +1,4 @@
-"""Ground that climbs faster than a cloth bends (after Zhang et al., Remote Sensing 2016, 2.5)."""
+"""Ground that climbs too steeply for the cloth (after Zhang et al., Remote Sensing 2016, 2.5)."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ NEIGHBOURS = np.array(
 def find_climbing_cells(lowest, height, threshold, slope):
     """Find the cells that continue the ground uphill from the cells that the cloth touches.
 
-    A cloth bends less than some roads and leaves them where they begin to climb, because it hangs
-    free between the rings of points. Objects on the road begin higher than the road's slope.
+    The cloth is too stiff to follow some roads where they begin to climb, because it hangs free
+    between the rings of points. Objects on the road begin above the slope of the road.
 
     A cell continues the ground if its lowest point is at most STEP_M plus `slope` per cell above
     the lowest point of the nearest ground cell, at most REACH_CELLS away (of equally near cells,
-    the lowest counts). All cells of a round use the result of the previous round, so the order of
-    the cells does not matter.
+    the lowest is used). All cells of a round use the result of the previous round, so the result
+    does not depend on the order of the cells.
 
     Args:
         lowest: (R, C) lowest point of each cell in metres, UNOBSERVED for cells without points.
@@ -37,41 +37,43 @@ def find_climbing_cells(lowest, height, threshold, slope):
         slope: rise per cell in metres.
 
     Returns:
-        (R, C) bool, without the cells that the cloth touches.
+        (R, C) bool: True for these cells, False for the cells that the cloth touches.
     """
     rows, columns = lowest.shape
-    touched, climbed = np.zeros(lowest.shape, np.bool_), np.zeros(lowest.shape, np.bool_)
-    queued = np.zeros(lowest.shape, np.int32)  # the last round in which a cell was queued
-    waiting = []
+    is_ground, is_climbing = np.zeros(lowest.shape, np.bool_), np.zeros(lowest.shape, np.bool_)
+    queued_round = np.zeros(lowest.shape, np.int32)  # the last round in which a cell was queued
+    candidates = []
     for r in range(rows):
         for c in range(columns):
             if lowest[r, c] != UNOBSERVED:
-                touched[r, c] = lowest[r, c] - height[r, c] <= threshold
-                if not touched[r, c]:
-                    waiting.append((r, c))
-    turn = 0
-    while len(waiting):
-        turn += 1
-        new = []
-        for r, c in waiting:
-            nearest, base = REACH_CELLS * REACH_CELLS + 1, 0.0
-            for away, down, right in NEIGHBOURS:
-                if away > nearest:
+                is_ground[r, c] = lowest[r, c] - height[r, c] <= threshold
+                if not is_ground[r, c]:
+                    candidates.append((r, c))
+    round_number = 0
+    while len(candidates):
+        round_number += 1
+        accepted = []
+        for r, c in candidates:
+            nearest2, base_height = REACH_CELLS * REACH_CELLS + 1, 0.0
+            for distance2, row_offset, column_offset in NEIGHBOURS:
+                if distance2 > nearest2:
                     break
-                i, j = r + down, c + right
-                if 0 <= i < rows and 0 <= j < columns and touched[i, j]:
-                    if away < nearest or lowest[i, j] < base:
-                        base = lowest[i, j]
-                    nearest = away
-            if nearest <= REACH_CELLS * REACH_CELLS and (lowest[r, c] - base <= STEP_M + slope * np.sqrt(nearest)):
-                new.append((r, c))
-        waiting.clear()
-        for r, c in new:
-            touched[r, c] = climbed[r, c] = True
-        for r, c in new:
+                i, j = r + row_offset, c + column_offset
+                if 0 <= i < rows and 0 <= j < columns and is_ground[i, j]:
+                    if distance2 < nearest2 or lowest[i, j] < base_height:
+                        base_height = lowest[i, j]
+                    nearest2 = distance2
+            if nearest2 <= REACH_CELLS * REACH_CELLS and (
+                lowest[r, c] - base_height <= STEP_M + slope * np.sqrt(nearest2)
+            ):
+                accepted.append((r, c))
+        candidates.clear()
+        for r, c in accepted:
+            is_ground[r, c] = is_climbing[r, c] = True
+        for r, c in accepted:
             for i in range(max(r - REACH_CELLS, 0), min(r + REACH_CELLS + 1, rows)):
                 for j in range(max(c - REACH_CELLS, 0), min(c + REACH_CELLS + 1, columns)):
-                    if lowest[i, j] != UNOBSERVED and not touched[i, j] and queued[i, j] < turn:
-                        queued[i, j] = turn
-                        waiting.append((i, j))
-    return climbed
+                    if lowest[i, j] != UNOBSERVED and not is_ground[i, j] and queued_round[i, j] < round_number:
+                        queued_round[i, j] = round_number
+                        candidates.append((i, j))
+    return is_climbing

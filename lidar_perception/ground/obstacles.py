@@ -24,22 +24,29 @@ def find_obstacles(
         ground: (N,) bool.
 
     Returns:
-        (N,) bool. Without any ground, heights are unknown and every point is an obstacle.
+        (N,) bool, True = obstacle. Without ground points, heights are unknown, so all points are
+        obstacles.
     """
-    chosen = ~ground
+    is_obstacle = ~ground
     if not (params.min_height or params.max_height) or not ground.any():
-        return chosen
+        return is_obstacle
     xyz = level_points(xyz, pose)
-    height = height_above_ground(xyz.compress(chosen, axis=0), xyz.compress(ground, axis=0))
-    chosen[chosen] = (height >= (params.min_height or -np.inf)) & (height <= (params.max_height or np.inf))
-    return chosen
+    height = height_above_ground(xyz.compress(is_obstacle, axis=0), xyz.compress(ground, axis=0))
+    is_obstacle[is_obstacle] = (height >= (params.min_height or -np.inf)) & (height <= (params.max_height or np.inf))
+    return is_obstacle
 
 
 def height_above_ground(xyz: np.ndarray, ground: np.ndarray) -> np.ndarray:
-    """Return (N,) float64 height of points (N, 3) above ground points (M, 3), in metres.
+    """Compute the height of points above the ground around them.
 
-    The height is above the mean of the ground points in the same cell, or in the cell with ground
-    points whose centre is nearest. Points are finite with z up; M > 0.
+    The ground height is the mean of the ground points in the nearest cell that has any.
+
+    Args:
+        xyz: (N, 3) finite points, z up, in metres.
+        ground: (M, 3) finite ground points, M > 0.
+
+    Returns:
+        (N,) float64 heights in metres.
     """
     cells = np.floor(ground[:, :2].astype(np.float64) / CELL_M)
     _, first, cell, count = np.unique(

@@ -11,8 +11,10 @@ from lidar_perception.types import SENSOR_HEIGHT
 
 @dataclass(frozen=True)
 class SensorPoseParams(Params):
-    """Mounting of the sensor. Algorithms use a levelled copy of the cloud; published points keep
-    their coordinates."""
+    """Mounting of the sensor.
+
+    Algorithms use a levelled copy of the cloud; published points keep their coordinates.
+    """
 
     height: float = param(
         SENSOR_HEIGHT,

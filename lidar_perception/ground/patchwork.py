@@ -1,8 +1,8 @@
-"""Ground by Patchwork++ (Lee, Lim, Myung, IROS 2022), as in paper B's V1.
+"""Ground segmentation by Patchwork++ (Lee, Lim, Myung, IROS 2022), as in paper B's V1.
 
 The labels are those of the authors' library (pypatchworkpp 1.4.1) for one cloud, except for a few
-points within rounding of a limit. Unlike the library, this code releases the GIL and prints
-nothing. The library adapts limits from cloud to cloud; this is left out, so a cloud always has the
+points whose distance from a limit is a rounding error. Unlike the library, this code releases the
+GIL, prints nothing and does not adapt limits from cloud to cloud, so the same cloud always has the
 same ground.
 """
 
@@ -35,7 +35,7 @@ OTHER, GROUND, REMOVED = 0, 1, 2  # states of a point in its patch
 
 
 class _Settings(NamedTuple):
-    """Parameters for compiled code; metres, least z of a normal."""
+    """Parameters for compiled code, in metres; uprightness is the minimum z of a unit normal."""
 
     sensor_height: float
     min_range: float
@@ -57,7 +57,7 @@ def segment_by_patchwork(
 
     Args:
         xyz: (N, 3) float32 with z up.
-        intensity: (N,) float32 0..1, by which reflections are removed; None skips that.
+        intensity: (N,) float32 0..1, used to remove reflections; None to keep them.
         sensor_height: height of the sensor above the ground in metres.
 
     Returns:
@@ -71,22 +71,24 @@ def segment_by_patchwork(
         float(params.seed_distance),
         float(params.uprightness),
     )
-    known = params.remove_reflections and intensity is not None
-    return _segment(np.array(xyz, np.float32, order="C"), np.array(intensity if known else (), np.float32), settings)
+    use_intensity = params.remove_reflections and intensity is not None
+    return _segment(
+        np.array(xyz, np.float32, order="C"), np.array(intensity if use_intensity else (), np.float32), settings
+    )
 
 
 @njit(cache=True, nogil=True)
 def _segment(xyz, intensity, settings):
     order, start = counting_sort(_find_patches(xyz, intensity, settings), PATCHES + 1, np.arange(len(xyz)))
-    largest = 0
+    max_size = 0
     for p in range(PATCHES):
-        largest = max(largest, start[p + 1] - start[p])
-    points, state = np.empty((3, largest), np.float32), np.empty(largest, np.int8)
+        max_size = max(max_size, start[p + 1] - start[p])
+    points, state = np.empty((3, max_size), np.float32), np.empty(max_size, np.int8)
     ground = np.zeros(len(xyz), np.bool_)
     plane = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     flatness = np.empty(PATCHES)
-    doubtful, sizes = np.empty(PATCHES, np.int64), np.empty(PATCHES, np.int64)
-    values = np.empty((PATCHES, 3))  # eigenvalues of doubtful patches
+    candidates, ground_counts = np.empty(PATCHES, np.int64), np.empty(PATCHES, np.int64)
+    eigenvalues = np.empty((PATCHES, 3))  # eigenvalues of these candidates
     p, ring = 0, 0
     for zone in range(len(RINGS)):
         for _ in range(RINGS[zone]):
@@ -101,28 +103,30 @@ def _segment(xyz, intensity, settings):
                         points[axis, i] = xyz[order[begin + i], axis]
                 _fit_ground(points, state, size, zone, plane, settings)
                 # Ground likelihood estimation (GLE)
-                near, low = ring < NEAR_RINGS, plane[MEAN_Z] < 0.0
+                is_near, is_low = ring < NEAR_RINGS, plane[MEAN_Z] < 0.0
                 if not plane[2] > settings.uprightness:
                     continue
-                if near and low:
+                if is_near and is_low:
                     flatness[flat_count] = plane[SMALLEST]
                     flat_count += 1
-                if near and not plane[OFFSET] > 0.0:
+                if is_near and not plane[OFFSET] > 0.0:
                     continue  # the sensor is below the plane
-                sizes[count] = 0
+                ground_counts[count] = 0
                 for i in range(size):
                     ground[order[begin + i]] = state[i] == GROUND
-                    sizes[count] += state[i] == GROUND
-                if near and not low:
-                    doubtful[count] = p - 1
+                    ground_counts[count] += state[i] == GROUND
+                if is_near and not is_low:
+                    candidates[count] = p - 1
                     for k in range(3):
-                        values[count, k] = plane[LARGEST + k]
+                        eigenvalues[count, k] = plane[LARGEST + k]
                     count += 1
-            limit = _flatness_limit(flatness, flat_count)
+            limit = _compute_flatness_limit(flatness, flat_count)
             for c in range(count):  # Temporal ground revert (TGR)
-                flat = values[c, 2] < limit or (sizes[c] > MANY_POINTS and values[c, 2] < settings.inlier_distance**2)
-                if not flat or values[c, 0] > MAX_LINE_RATIO * values[c, 1]:
-                    for i in range(start[doubtful[c]], start[doubtful[c] + 1]):
+                is_flat = eigenvalues[c, 2] < limit or (
+                    ground_counts[c] > MANY_POINTS and eigenvalues[c, 2] < settings.inlier_distance**2
+                )
+                if not is_flat or eigenvalues[c, 0] > MAX_LINE_RATIO * eigenvalues[c, 1]:
+                    for i in range(start[candidates[c]], start[candidates[c] + 1]):
                         ground[order[i]] = False
             ring += 1
     return ground
@@ -130,10 +134,18 @@ def _segment(xyz, intensity, settings):
 
 @njit(cache=True, nogil=True)
 def _find_patches(xyz, intensity, settings):
-    """Return the patch (N,) of each point in the concentric zones (CZM), ring by ring; PATCHES for
-    reflections (RNR) and for points out of range."""
-    nearest, farthest = settings.min_range, settings.max_range
-    limits = (nearest, (7 * nearest + farthest) / 8, (3 * nearest + farthest) / 4, (nearest + farthest) / 2, farthest)
+    """Return the patch (N,) of each point in the concentric zones (CZM), ring by ring.
+
+    Reflections (RNR) and points out of range have the value PATCHES.
+    """
+    min_range, max_range = settings.min_range, settings.max_range
+    limits = (
+        min_range,
+        (7 * min_range + max_range) / 8,
+        (3 * min_range + max_range) / 4,
+        (min_range + max_range) / 2,
+        max_range,
+    )
     patch = np.full(len(xyz), PATCHES)
     max_noise = math.tan(math.radians(MAX_NOISE_DEG))
     for i in range(len(xyz)):
@@ -145,26 +157,26 @@ def _find_patches(xyz, intensity, settings):
             and z < -settings.sensor_height - MIN_NOISE_DEPTH
         ):
             continue
-        if not nearest < distance <= farthest:
+        if not min_range < distance <= max_range:
             continue
         angle = math.atan2(y, x)
         angle = angle if angle > 0 else 2 * math.pi + angle
-        zone, first = 0, 0
+        zone, zone_offset = 0, 0
         while zone < 3 and distance >= limits[zone + 1]:
-            first += RINGS[zone] * SECTORS[zone]
+            zone_offset += RINGS[zone] * SECTORS[zone]
             zone += 1
         width = (limits[zone + 1] - limits[zone]) / RINGS[zone]
         ring = min(int((distance - limits[zone]) / width), RINGS[zone] - 1)
         sector = min(int(angle / (2 * math.pi / SECTORS[zone])), SECTORS[zone] - 1)
-        patch[i] = first + ring * SECTORS[zone] + sector
+        patch[i] = zone_offset + ring * SECTORS[zone] + sector
     return patch
 
 
 @njit(cache=True, nogil=True)
 def _fit_ground(points, state, size, zone, plane, settings):
-    """Fit the ground of a patch: set the states of its points (3, >= size), and the plane.
+    """Fit the ground of a patch: set the state of each of its points (3, >= size) and the plane.
 
-    Without points to fit, the plane keeps the values of the previous patch.
+    If there are no points to fit, the plane of the previous patch is kept.
     """
     for i in range(size):
         state[i] = OTHER
@@ -175,31 +187,31 @@ def _fit_ground(points, state, size, zone, plane, settings):
         if zone > 0 or not plane[2] < settings.uprightness:
             break
         for i in range(size):
-            if state[i] != REMOVED and abs(_distance(plane, points, i)) < VERTICAL_DISTANCE:
+            if state[i] != REMOVED and abs(_signed_distance(plane, points, i)) < VERTICAL_DISTANCE:
                 state[i] = REMOVED
     _mark_seeds(points, state, size, min_height, settings.seed_distance)
     _fit_plane(points, state, size, plane)
     for _ in range(ITERATIONS):  # Region-wise ground plane fitting (R-GPF)
         for i in range(size):
             if state[i] != REMOVED:
-                below = _distance(plane, points, i) < settings.inlier_distance
-                state[i] = GROUND if below else OTHER
+                is_ground = _signed_distance(plane, points, i) < settings.inlier_distance
+                state[i] = GROUND if is_ground else OTHER
         _fit_plane(points, state, size, plane)
 
 
 @njit(cache=True, nogil=True)
 def _mark_seeds(points, state, size, min_height, distance):
-    """Mark the points less than `distance` above the mean of the lowest ones."""
+    """Mark the points less than `distance` above the mean height of the lowest points."""
     lowest, count = np.empty(LOWEST_POINTS), 0  # kept in ascending order
     for i in range(size):
         z = points[2, i]
         if state[i] == REMOVED or z < min_height or (count == LOWEST_POINTS and z >= lowest[-1]):
             continue
-        at = count if count < LOWEST_POINTS else count - 1
-        while at > 0 and lowest[at - 1] > z:
-            lowest[at] = lowest[at - 1]
-            at -= 1
-        lowest[at] = z
+        position = count if count < LOWEST_POINTS else count - 1
+        while position > 0 and lowest[position - 1] > z:
+            lowest[position] = lowest[position - 1]
+            position -= 1
+        lowest[position] = z
         count = min(count + 1, LOWEST_POINTS)
     total = 0.0
     for k in range(count):
@@ -211,13 +223,13 @@ def _mark_seeds(points, state, size, min_height, distance):
 
 
 @njit(cache=True, nogil=True)
-def _distance(plane, points, i):
+def _signed_distance(plane, points, i):
     return np.float32(plane[0] * points[0, i] + plane[1] * points[1, i] + plane[2] * points[2, i]) + plane[OFFSET]
 
 
 @njit(cache=True, nogil=True)
 def _fit_plane(points, state, size, plane):
-    """Set the plane to that of the ground points of a patch, if there are any."""
+    """Fit the plane to the ground points of a patch, if there are any."""
     count, sx, sy, sz = 0, 0.0, 0.0, 0.0
     for i in range(size):
         if state[i] == GROUND:
@@ -248,11 +260,14 @@ def _fit_plane(points, state, size, plane):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _decompose(matrix, plane):
-    """Write the eigenvalues of a symmetric matrix (3, 3) float32 and the eigenvector of the least
-    one into a plane; the matrix is overwritten.
+    """Decompose the covariance of a patch: write eigenvalues and normal to the plane.
 
-    As in Eigen's SelfAdjointEigenSolver.computeDirect, whose result for planes through two points
-    decides about them. Also, it takes a third of the time of Jacobi rotations.
+    The method is that of Eigen's SelfAdjointEigenSolver.computeDirect, because the normal of a patch
+    with two points depends on the method. It takes a third of the time of Jacobi rotations.
+
+    Args:
+        matrix: (3, 3) float32 symmetric; overwritten.
+        plane: (8,); the normal becomes the eigenvector of the smallest eigenvalue.
     """
     m, epsilon = matrix, np.float32(2.0**-23)
     shift = (m[0, 0] + m[1, 1] + m[2, 2]) / np.float32(3.0)
@@ -265,7 +280,7 @@ def _decompose(matrix, plane):
         for k in range(3):
             for j in range(3):
                 m[k, j] /= scale
-    low, middle, high = _eigenvalues(m)
+    low, middle, high = _compute_eigenvalues(m)
     plane[LARGEST], plane[MIDDLE], plane[SMALLEST] = (high * scale + shift, middle * scale + shift, low * scale + shift)
     normal, column = np.zeros(3, np.float32), np.empty(3, np.float32)
     if high - low <= epsilon:
@@ -275,10 +290,10 @@ def _decompose(matrix, plane):
     else:
         _find_kernel(m, high, column, normal)
         if middle - low <= 0:  # the column found is close to the eigenvector
-            share = np.float32(1.0) - (column[0] * normal[0] + column[1] * normal[1] + column[2] * normal[2])
+            factor = np.float32(1.0) - (column[0] * normal[0] + column[1] * normal[1] + column[2] * normal[2])
             length = np.float32(0.0)
             for k in range(3):
-                normal[k] *= share
+                normal[k] *= factor
                 length += normal[k] * normal[k]
             for k in range(3):
                 normal[k] /= np.sqrt(length)
@@ -289,7 +304,7 @@ def _decompose(matrix, plane):
 
 
 @njit(cache=True, nogil=True)
-def _eigenvalues(m):
+def _compute_eigenvalues(m):
     """Return the eigenvalues of a symmetric matrix (3, 3) float32 with trace 0, ascending."""
     zero, half, two = np.float32(0.0), np.float32(0.5), np.float32(2.0)
     third, root = np.float32(1.0 / 3.0), np.float32(3.0**0.5)
@@ -319,8 +334,11 @@ def _eigenvalues(m):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_kernel(m, eigenvalue, kernel, column):
-    """Set kernel (3,) to the eigenvector of an eigenvalue of m (3, 3), and column (3,) to the
-    column of m - eigenvalue with the largest entry on the diagonal; all float32."""
+    """Find the eigenvector of an eigenvalue of m (3, 3); all arrays are float32.
+
+    Writes the eigenvector to kernel (3,), and to column (3,) the column of m - eigenvalue * I with
+    the largest diagonal entry.
+    """
     top = 0
     for k in range(1, 3):
         top = k if abs(m[k, k] - eigenvalue) > abs(m[top, top] - eigenvalue) else top
@@ -343,8 +361,8 @@ def _find_kernel(m, eigenvalue, kernel, column):
 
 
 @njit(cache=True, nogil=True)
-def _flatness_limit(flatness, count):
-    """Return the largest flatness of a patch that is reverted to ground; 0 for fewer than two."""
+def _compute_flatness_limit(flatness, count):
+    """Return the flatness below which a patch stays ground; 0 for fewer than two patches."""
     if count < 2:
         return 0.0
     total, squares = 0.0, 0.0

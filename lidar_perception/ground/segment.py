@@ -30,11 +30,11 @@ def segment_ground(cloud: PointCloud | ArrayLike, params: GroundParams = GroundP
             modified; sensor_pose levels a copy of the points.
 
     Returns:
-        (N,) bool, True = ground. Points that are not finite and points at the origin are not
-        ground. An empty cloud gives (0,).
+        (N,) bool, True = ground; False for points at the origin or with values that are not finite.
+        An empty cloud gives (0,).
 
     Raises:
-        InputError: for an array of another shape or type.
+        InputError: the array has another shape or type.
     """
     frame = as_point_cloud(cloud)
     usable = usable_returns(frame.xyz)
@@ -47,16 +47,16 @@ def segment_ground(cloud: PointCloud | ArrayLike, params: GroundParams = GroundP
 
 
 def _segment(xyz: np.ndarray, intensity: np.ndarray | None, params: GroundParams) -> np.ndarray:
-    if intensity is not None and (full := guess_scale(intensity)) != 1.0:
-        intensity = to_unit(intensity, full)
+    if intensity is not None and (full_scale := guess_scale(intensity)) != 1.0:
+        intensity = to_unit(intensity, full_scale)
     return METHODS[params.method](level_points(xyz, params.sensor_pose), intensity, params)
 
 
 def level_points(xyz: np.ndarray, pose: SensorPoseParams) -> np.ndarray:
     """Rotate points (N, 3) float32 into the frame of a level sensor at the same place.
 
-    The rotation is by roll about x, then by pitch about y, as in a URDF's rpy. If both are 0, xyz
-    itself is returned.
+    The rotation is roll about x, then pitch about y, like rpy in URDF. If both are 0, xyz itself is
+    returned.
     """
     if pose.roll == pose.pitch == 0.0:
         return xyz
@@ -64,5 +64,5 @@ def level_points(xyz: np.ndarray, pose: SensorPoseParams) -> np.ndarray:
 
 
 def crop_with_sensor_pose(frame: PointCloud, crop: CropParams, pose: SensorPoseParams) -> tuple[np.ndarray, PointCloud]:
-    """Crop a frame with robot.crop.crop_frame, with the sectors of a level sensor."""
+    """Crop a frame as robot.crop.crop_frame does, with sectors in the frame of a level sensor."""
     return crop_frame(frame, crop, level=find_level_transform(make_tilted_pose(pose.roll, pose.pitch)))

@@ -1,4 +1,4 @@
-"""A smooth surface through the ground points of a cloud."""
+"""Smooth surface through the ground points of a cloud."""
 
 from __future__ import annotations
 
@@ -33,42 +33,42 @@ class GroundSurface(NamedTuple):
 def fit_ground_surface(ground: np.ndarray, default: float) -> GroundSurface:
     """Fit a surface to ground points (G, 3).
 
-    The mean heights of cells are smoothed. Where there is no ground, under cars for example, the
-    surface continues that of the cells around, or else of the nearest cell.
+    The mean heights of cells are smoothed. Cells without ground points, for example under cars, get
+    the height of the cells around them, or otherwise of the nearest cell.
 
     Args:
-        ground: finite points of a limited area, as memory grows with the area.
+        ground: finite points of a limited area, because memory grows with the area.
         default: height in metres if no cell has MIN_POINTS points.
     """
     if not len(ground):
         return GroundSurface(np.full((1, 1), default), (0.0, 0.0))
     low, high = (
-        np.floor(np.array([limit(ground[:, 0]), limit(ground[:, 1])]) / CELL_M) for limit in (np.min, np.max)
+        np.floor(np.array([reduce(ground[:, 0]), reduce(ground[:, 1])]) / CELL_M) for reduce in (np.min, np.max)
     )  # by column, which is faster than along axis 0
     shape = (high - low).astype(np.int64) + 1
-    total, count = _sum_cells(ground, low, shape)
+    height_sum, count = _sum_cells(ground, low, shape)
     has_height = count >= MIN_POINTS
     if not has_height.any():
         return GroundSurface(np.full((1, 1), default), (0.0, 0.0))
-    mean = np.divide(total, count, out=np.zeros(shape), where=has_height)
+    mean = np.divide(height_sum, count, out=np.zeros(shape), where=has_height)
     sigma = SMOOTHING_M / CELL_M
     weight = ndimage.gaussian_filter(has_height.astype(np.float64), sigma, mode="constant")
-    smooth = ndimage.gaussian_filter(mean, sigma, mode="constant") / np.maximum(weight, MIN_WEIGHT)
-    nearest = ndimage.distance_transform_edt(weight < MIN_WEIGHT, return_distances=False, return_indices=True)
+    smoothed = ndimage.gaussian_filter(mean, sigma, mode="constant") / np.maximum(weight, MIN_WEIGHT)
+    nearest_cell = ndimage.distance_transform_edt(weight < MIN_WEIGHT, return_distances=False, return_indices=True)
     x, y = (low + 0.5) * CELL_M
-    return GroundSurface(smooth[tuple(nearest)], (float(x), float(y)))
+    return GroundSurface(smoothed[tuple(nearest_cell)], (float(x), float(y)))
 
 
 @njit(cache=True, nogil=True)
 def _sum_cells(ground, low, shape):
-    """Return, by cell, the sum of the heights and the number of ground points."""
-    total, count = np.zeros((shape[0], shape[1])), np.zeros((shape[0], shape[1]))
+    """Return the sum of the heights and the number of the ground points in each cell."""
+    height_sum, count = np.zeros((shape[0], shape[1])), np.zeros((shape[0], shape[1]))
     for k in range(len(ground)):
         i = int(np.floor(ground[k, 0] / CELL_M) - low[0])
         j = int(np.floor(ground[k, 1] / CELL_M) - low[1])
-        total[i, j] += ground[k, 2]
+        height_sum[i, j] += ground[k, 2]
         count[i, j] += 1.0
-    return total, count
+    return height_sum, count
 
 
 @njit(cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""Ground by height threshold and RANSAC plane (paper A, Sections 3.2 and 3.4).
+"""Ground segmentation by height threshold and RANSAC plane (paper A, Sections 3.2 and 3.4).
 
 A plane is (3,) float64 [a b c] with z = a x + b y + c, in the frame of the points.
 """
@@ -24,9 +24,9 @@ def segment_by_threshold(
     """Segment the ground of finite points (N, 3).
 
     Returns:
-        (N,) bool, True = ground. separate = "plane": points within inlier_distance of the plane of
-        most points lower than max_height above the ground at the sensor; all False if there is no
-        such plane (too few points, or too steep). separate = "height": these low points.
+        (N,) bool, True = ground. separate = "height": the low points, less than max_height above
+        the ground at the sensor. separate = "plane": the points within inlier_distance of the plane
+        with the most low points; all False if there is no such plane (too few points, or too steep).
     """
     if params.separate == "height":
         return _is_low(xyz, params, sensor_height)
@@ -39,9 +39,9 @@ def segment_by_threshold(
 def find_plane(
     xyz: np.ndarray, params: ThresholdParams = ThresholdParams(), sensor_height: float = SENSOR_HEIGHT
 ) -> np.ndarray | None:
-    """Find the plane of segment_by_threshold, None if there is none.
+    """Find the ground plane as in segment_by_threshold; return None if there is none.
 
-    It is found among the low points and fitted to all points near it.
+    RANSAC uses the low points; the plane is then fitted to all points within inlier_distance.
     """
     plane = _run_trials(xyz.compress(_is_low(xyz, params, sensor_height), axis=0), params)
     return None if plane is None else refine_plane(xyz, plane, params)
@@ -52,10 +52,10 @@ def _is_low(xyz: np.ndarray, params: ThresholdParams, sensor_height: float) -> n
 
 
 def fit_plane_by_ransac(xyz: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
-    """Find the plane with most points (M, 3) within inlier_distance, None if there is none.
+    """Find the plane with the most inliers among points (M, 3); return None if there is none.
 
     RANSAC (Fischler and Bolles, 1981) with an adaptive number of trials. The plane is then fitted
-    to its inliers until they no longer change, so that it does not depend on the triple found.
+    to its inliers until they no longer change, so that it does not depend on the sampled triple.
     """
     plane = _run_trials(xyz, params)
     return None if plane is None else refine_plane(xyz, plane, params)
@@ -73,9 +73,9 @@ def _run_trials(xyz: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
 
 
 def refine_plane(xyz: np.ndarray, plane: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
-    """Fit a plane to the points (N, 3) within inlier_distance until these no longer change.
+    """Fit a plane to its inliers among points (N, 3) until these no longer change.
 
-    None if they are on one line.
+    Returns None if the inliers are collinear.
     """
     max_gradient = np.tan(np.radians(params.max_slope))
     for _ in range(MAX_REFINEMENTS):
@@ -89,18 +89,18 @@ def refine_plane(xyz: np.ndarray, plane: np.ndarray, params: ThresholdParams) ->
 
 
 def fit_plane(xyz: np.ndarray) -> np.ndarray | None:
-    """Return the least-squares plane of points (M, 3) with errors along z.
+    """Fit a least-squares plane to points (M, 3) with errors along z.
 
-    None for fewer than 3 points or points on one line.
+    Returns None for fewer than 3 points or collinear points.
     """
     return _solve_plane(_compute_moments(xyz, np.zeros(3), np.inf))
 
 
 def compute_inlier_share(xyz: np.ndarray, plane: np.ndarray, params: ThresholdParams = ThresholdParams()) -> float:
-    """Return the share of points (N, 3) below max_height that are within inlier_distance.
+    """Return the fraction of the points (N, 3) below max_height that are within inlier_distance.
 
-    Both are measured from the plane. The share tells how well one plane describes the ground; it is
-    0 if no point is that low.
+    Both are measured from the plane. The fraction shows how well a plane describes the ground; it is
+    0 if no point is below max_height.
     """
     height = height_above_plane(xyz, plane)
     low = height < params.max_height
@@ -108,26 +108,26 @@ def compute_inlier_share(xyz: np.ndarray, plane: np.ndarray, params: ThresholdPa
 
 
 def height_above_plane(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Return (N,) float64 height of points (N, 3) above the plane along z, in metres."""
+    """Return the height (N,) float64 of points (N, 3) above the plane along z, in metres."""
     x, y, z = xyz.T.astype(np.float64)  # NumPy 1 would compute in float32
     return z - (plane[0] * x + plane[1] * y + plane[2])
 
 
 @njit(cache=True)
 def _find_best_trial(sample, triples, distance, max_gradient, confidence):
-    """Return the plane through a triple with most inliers in the sample; NaN if there is none."""
-    best, best_count = np.full(3, np.nan), 0
-    needed = float(len(triples))
+    """Return the plane through a triple with the most inliers in the sample; NaN if there is none."""
+    best_plane, best_count = np.full(3, np.nan), 0
+    required_trials = float(len(triples))
     for trial in range(len(triples)):
-        if trial >= needed:
+        if trial >= required_trials:
             break
         p, q, r = sample[triples[trial, 0]], sample[triples[trial, 1]], sample[triples[trial, 2]]
         ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
         vx, vy, vz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
         normal_x, normal_y, normal_z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        area = normal_x * normal_x + normal_y * normal_y + normal_z * normal_z
-        sides = (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz)
-        if area <= MIN_SINE * MIN_SINE * sides or normal_z == 0.0:
+        squared_area = normal_x * normal_x + normal_y * normal_y + normal_z * normal_z
+        side_product = (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz)
+        if squared_area <= MIN_SINE * MIN_SINE * side_product or normal_z == 0.0:
             continue  # points on a line, or a vertical plane
         a, b = -normal_x / normal_z, -normal_y / normal_z
         if a * a + b * b > max_gradient * max_gradient:
@@ -137,12 +137,12 @@ def _find_best_trial(sample, triples, distance, max_gradient, confidence):
         for i in range(len(sample)):
             count += abs(sample[i, 2] - (a * sample[i, 0] + b * sample[i, 1] + c)) <= distance
         if count > best_count:
-            best_count, best = count, np.array([a, b, c])
-            all_inliers = (count / len(sample)) ** 3  # probability for one triple
-            if all_inliers >= 1.0:
+            best_count, best_plane = count, np.array([a, b, c])
+            triple_probability = (count / len(sample)) ** 3  # probability for one triple
+            if triple_probability >= 1.0:
                 break
-            needed = min(needed, np.log(1 - confidence) / np.log1p(-all_inliers))
-    return best
+            required_trials = min(required_trials, np.log(1 - confidence) / np.log1p(-triple_probability))
+    return best_plane
 
 
 @njit(cache=True)
@@ -151,36 +151,36 @@ def _compute_moments(xyz, plane, distance):
 
     Returns [n, x, y, z, xx, xy, yy, xz, yz, x0, y0, z0].
     """
-    m = np.zeros(12)
+    moments = np.zeros(12)
     if len(xyz) == 0:
-        return m
+        return moments
     x0, y0, z0 = np.float64(xyz[0, 0]), np.float64(xyz[0, 1]), np.float64(xyz[0, 2])
     for i in range(len(xyz)):
         x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
         if abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= distance:
             x, y, z = x - x0, y - y0, z - z0
-            m[0] += 1
-            m[1] += x
-            m[2] += y
-            m[3] += z
-            m[4] += x * x
-            m[5] += x * y
-            m[6] += y * y
-            m[7] += x * z
-            m[8] += y * z
-    m[9], m[10], m[11] = x0, y0, z0
-    return m
+            moments[0] += 1
+            moments[1] += x
+            moments[2] += y
+            moments[3] += z
+            moments[4] += x * x
+            moments[5] += x * y
+            moments[6] += y * y
+            moments[7] += x * z
+            moments[8] += y * z
+    moments[9], moments[10], moments[11] = x0, y0, z0
+    return moments
 
 
-def _solve_plane(m: np.ndarray) -> np.ndarray | None:
-    n = m[0]
+def _solve_plane(moments: np.ndarray) -> np.ndarray | None:
+    n = moments[0]
     if n < MIN_POINTS:
         return None
-    mx, my, mz = m[1:4] / n
-    xx, xy, yy = m[4] / n - mx * mx, m[5] / n - mx * my, m[6] / n - my * my
-    xz, yz = m[7] / n - mx * mz, m[8] / n - my * mz
+    mx, my, mz = moments[1:4] / n
+    xx, xy, yy = moments[4] / n - mx * mx, moments[5] / n - mx * my, moments[6] / n - my * my
+    xz, yz = moments[7] / n - mx * mz, moments[8] / n - my * mz
     determinant = xx * yy - xy * xy
     if determinant <= 1e-9 * (xx + yy) ** 2:
         return None
     a, b = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
-    return np.array([a, b, mz + m[11] - a * (mx + m[9]) - b * (my + m[10])])
+    return np.array([a, b, mz + moments[11] - a * (mx + moments[9]) - b * (my + moments[10])])
