@@ -15,10 +15,12 @@ MAX_PIXELS = 1 << 20  # maximum width or height of an image
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera that sees points in the LiDAR frame.
+    """Pinhole camera for points in the LiDAR frame.
 
-    projection (3, 4) float64 maps homogeneous LiDAR points to pixels times depth; width and height
-    are those of the image in pixels.
+    Attributes:
+        projection: (3, 4) float64, maps homogeneous LiDAR points to pixels times depth.
+        width: width of the image in pixels.
+        height: height of the image in pixels.
     """
 
     projection: np.ndarray
@@ -36,10 +38,15 @@ class Camera:
     def from_camera_pose(
         intrinsics: np.ndarray, rotation: np.ndarray, translation: np.ndarray, width: int, height: int
     ) -> Camera:
-        """Make a camera of P (3, 4), as in CameraInfo or KITTI, and its pose in the LiDAR frame.
+        """Make a camera from its intrinsics and its pose in the LiDAR frame.
 
-        The pose is that of TF: rotation is a quaternion [x y z w], translation (3,) in metres. The
-        camera frame is optical: x right, y down, z forward.
+        Args:
+            intrinsics: (3, 4) matrix P, as in CameraInfo or KITTI.
+            rotation: quaternion [x y z w] of the optical frame (x right, y down, z forward), as in
+                TF.
+            translation: (3,) metres.
+            width: width of the image in pixels.
+            height: height of the image in pixels.
         """
         to_lidar = Rotation.from_quat(rotation)
         return Camera.from_lidar_pose(
@@ -50,7 +57,10 @@ class Camera:
     def from_lidar_pose(
         intrinsics: np.ndarray, rotation: np.ndarray, translation: np.ndarray, width: int, height: int
     ) -> Camera:
-        """Make a camera of P (3, 4) and the LiDAR's pose in the camera frame."""
+        """Make a camera from its intrinsics (3, 4) and the pose of the LiDAR in the camera frame.
+
+        For the arguments see from_camera_pose.
+        """
         lidar_to_camera = np.eye(4)
         lidar_to_camera[:3, :3] = Rotation.from_quat(rotation).as_matrix()
         lidar_to_camera[:3, 3] = translation
@@ -77,23 +87,26 @@ class Camera:
 @njit(cache=True)
 def _in_view(xyz, projection, width, height):
     p = projection
-    seen = np.empty(len(xyz), np.bool_)
+    in_view = np.empty(len(xyz), np.bool_)
     for i in range(len(xyz)):
         x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
         depth = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
         u = p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]
         v = p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]
-        seen[i] = 0 <= u < width * depth and 0 <= v < height * depth  # implies depth > 0
-    return seen
+        in_view[i] = 0 <= u < width * depth and 0 <= v < height * depth  # implies depth > 0
+    return in_view
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """Calibration of a camera.
 
-    intrinsics (3, 4) is P2 of KITTI; lidar_to_camera (4, 4) transforms LiDAR points to the
-    rectified camera frame (R0_rect Tr_velo_to_cam); width and height are those of the image in
-    pixels.
+    Attributes:
+        intrinsics: (3, 4), P2 in KITTI.
+        lidar_to_camera: (4, 4) transform of LiDAR points to the rectified camera frame
+            (R0_rect Tr_velo_to_cam in KITTI).
+        width: width of the image in pixels.
+        height: height of the image in pixels.
     """
 
     intrinsics: np.ndarray

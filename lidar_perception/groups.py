@@ -1,4 +1,4 @@
-"""Grouping of points by cluster, in time and memory that do not depend on the ids."""
+"""Grouping of points by cluster, with time and memory independent of the values of the ids."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from lidar_perception.types import InputError
 class Groups(NamedTuple):
     """Points of K clusters.
 
-    rows (M,) int64: rows of the points, cluster after cluster, each in the order of the input.
-    start (K + 1,) int64: cluster i has rows[start[i]:start[i + 1]].
-    numbers (K,) int64: ids of the clusters.
+    Attributes:
+        rows: (M,) int64 rows of the points, cluster after cluster, each in the order of the input.
+        start: (K + 1,) int64; cluster i has rows[start[i]:start[i + 1]].
+        numbers: (K,) int64 ids of the clusters.
     """
 
     rows: np.ndarray
@@ -28,26 +29,28 @@ class Groups(NamedTuple):
 
 
 def group_by_id(ids: np.ndarray, min_points: int = 1) -> Groups:
-    """Group points by id (N,) int, ascending; ids up to 0 mean no cluster.
+    """Group points by their ids (N,) int, in ascending order.
 
-    Clusters of fewer than min_points points are left out.
+    Points with ids <= 0 and clusters of fewer than min_points points are left out.
     """
     rows = np.flatnonzero(ids > 0)
     rows = rows[np.argsort(ids[rows], kind="stable")]
-    ordered = ids[rows]
-    cuts = np.flatnonzero(ordered[1:] != ordered[:-1]) + 1
+    sorted_ids = ids[rows]
+    cuts = np.flatnonzero(sorted_ids[1:] != sorted_ids[:-1]) + 1
     first = np.concatenate([[0], cuts]) if len(rows) else np.zeros(0, np.int64)
     sizes = np.diff(np.append(first, len(rows)))
-    kept = sizes >= min_points
-    return Groups(rows[np.repeat(kept, sizes)], _cumulate(sizes[kept]), ordered[first[kept]].astype(np.int64))
+    is_kept = sizes >= min_points
+    return Groups(
+        rows[np.repeat(is_kept, sizes)], _cumulate(sizes[is_kept]), sorted_ids[first[is_kept]].astype(np.int64)
+    )
 
 
 def count_clusters(labels: np.ndarray) -> int:
-    """Return K, the largest of labels (N,), which are 0 or 1..K.
+    """Return the number of clusters, K, of labels (N,) between 0 and K.
 
     Raises:
-        InputError: K is larger than N, so that arrays of K rows could exceed the memory.
-            renumber_ids() makes ids without gaps.
+        InputError: K is larger than N, so arrays of K rows could exceed the memory. Call
+            renumber_ids() first to close the gaps.
     """
     count = int(labels.max(initial=0))
     if count > len(labels):
@@ -59,15 +62,15 @@ def count_clusters(labels: np.ndarray) -> int:
 
 
 def group_points(xyz: np.ndarray, labels: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (M, 3) of clusters, cluster after cluster, and the start (K + 1,) of each.
+    """Return the points (M, 3) of some clusters, one cluster after the other, and their starts (K + 1,).
 
     Args:
         labels: (N,) ids, 0 for no cluster, at most N.
         wanted: (K,) ids of the clusters, without duplicates.
     """
-    place = np.full(count_clusters(labels) + 1, -1)
-    place[wanted] = np.arange(len(wanted))
-    group = place[labels]
+    group_of_id = np.full(count_clusters(labels) + 1, -1)
+    group_of_id[wanted] = np.arange(len(wanted))
+    group = group_of_id[labels]
     members = np.flatnonzero(group >= 0)
     members = members[np.argsort(group[members], kind="stable")]
     sizes = np.bincount(group[members], minlength=len(wanted))
@@ -75,20 +78,21 @@ def group_points(xyz: np.ndarray, labels: np.ndarray, wanted: np.ndarray) -> tup
 
 
 def renumber_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Renumber cluster ids of any source to 1..K without gaps.
+    """Renumber cluster ids from any source to 1..K without gaps.
 
-    Ids that are not finite or not above 0 mean no cluster, and so does 2^32 - 1 as uint32, which
-    some nodes write for -1.
+    Ids that are not finite or not above 0 mean no cluster. The same holds for 2^32 - 1 as uint32,
+    which some nodes write for -1.
 
     Args:
         ids: (N,) integers, or floats with integer values.
 
     Returns:
-        labels (N,) int32, 0 for no cluster, 1..K; and numbers (K,) int64, the original ids,
-        ascending.
+        labels (N,) int32: 1..K, 0 for no cluster.
+        numbers (K,) int64: the original ids, ascending.
 
     Raises:
-        InputError: for fractions, for values that float64 cannot hold exactly, and other types.
+        InputError: an id has a fraction or is too large for float64 to hold exactly, or the type of
+            the ids is not numeric.
     """
     ids = np.asarray(ids)
     if ids.dtype.kind == "u" and ids.dtype.itemsize == 4:
@@ -108,10 +112,10 @@ def renumber_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         is_used[0] = False
         labels = np.where(is_used, np.cumsum(is_used), 0).astype(np.int32)
         return labels[ids], np.flatnonzero(is_used)
-    found = group_by_id(ids)
+    groups = group_by_id(ids)
     labels = np.zeros(len(ids), np.int32)
-    labels[found.rows] = np.repeat(np.arange(1, len(found.numbers) + 1), found.sizes)
-    return labels, found.numbers
+    labels[groups.rows] = np.repeat(np.arange(1, len(groups.numbers) + 1), groups.sizes)
+    return labels, groups.numbers
 
 
 def _cumulate(sizes: np.ndarray) -> np.ndarray:

@@ -46,20 +46,24 @@ INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # a cloud's first one cou
 def infer_full_scale(values: np.ndarray, dtype: DTypeLike | None = None) -> float:
     """Infer the intensity of a full reflection from one cloud.
 
-    8-bit integers: the largest number of their type. Wider integers: the smallest of BITS that is
-    not exceeded. Floats: 1 if MAX_UNIT is not exceeded; 100 (percent) if 100 is not exceeded and
-    there are fractions; else as for integers. Without values above 0, the smallest scale of the
-    type.
+    The scale depends on the type of the values:
+
+    - 8-bit integers: the largest number of the type.
+    - Wider integers: the smallest of BITS that is not exceeded.
+    - Floats: 1 if MAX_UNIT is not exceeded, 100 (percent) if 100 is not exceeded and there are
+      fractions, otherwise as for integers.
+
+    Without values above 0, it is the smallest scale of the type.
 
     Args:
         values: (N,) intensities as the driver wrote them. NaN, infinite and negative values are
-            ignored, and a share of MAX_OUTLIERS may exceed the scale.
-        dtype: type in which the driver wrote them, if `values` were converted.
+            ignored, and a fraction of MAX_OUTLIERS may exceed the scale.
+        dtype: original type in the driver's message, if `values` were converted.
     """
-    kind = np.dtype(values.dtype if dtype is None else dtype)
-    if kind.kind in "iu" and kind.itemsize == 1:
-        return float(np.iinfo(kind).max)
-    if kind.kind not in "iu":
+    value_type = np.dtype(values.dtype if dtype is None else dtype)
+    if value_type.kind in "iu" and value_type.itemsize == 1:
+        return float(np.iinfo(value_type).max)
+    if value_type.kind not in "iu":
         if not _exceeds(values, MAX_UNIT):
             return 1.0
         sample = values[:: max(1, len(values) // WHOLE_SAMPLE)]
@@ -70,11 +74,11 @@ def infer_full_scale(values: np.ndarray, dtype: DTypeLike | None = None) -> floa
 
 
 def _exceeds(values: np.ndarray, limit: float) -> bool:
-    """Return True if more than a share of MAX_OUTLIERS is finite and above the limit."""
+    """Return True if more than a fraction MAX_OUTLIERS of the values is finite and above the limit."""
     if np.fmax.reduce(values, initial=0) <= limit:
         return False
-    beyond = np.count_nonzero((values > limit) & (values < np.inf))
-    return bool(beyond > MAX_OUTLIERS * len(values))
+    count = np.count_nonzero((values > limit) & (values < np.inf))
+    return bool(count > MAX_OUTLIERS * len(values))
 
 
 def to_unit(values: np.ndarray, full: float) -> np.ndarray:
@@ -102,36 +106,37 @@ def normalize_intensity(intensity: np.ndarray | None, indices: np.ndarray | None
         indices: (M,) points to return; None: all.
 
     Returns:
-        (N,) or (M,) float32; None without a usable intensity, see has_usable_intensity.
+        (N,) or (M,) float32; None if the intensity is not usable, see has_usable_intensity.
     """
     if intensity is None or not has_usable_intensity(intensity):
         return None
     knots = _compute_quantiles(intensity[intensity > 0], np.array(REFERENCE_SHARES))
     # np.interp needs ascending knots, so equal ones are replaced by their middle.
-    unique, inverse = np.unique(knots, return_inverse=True)
-    middles = np.bincount(inverse, REFERENCE_VALUES) / np.bincount(inverse)
+    distinct_knots, inverse = np.unique(knots, return_inverse=True)
+    mean_values = np.bincount(inverse, REFERENCE_VALUES) / np.bincount(inverse)
     if indices is not None:
         intensity = intensity.take(indices)
     positive = intensity > 0
     normalized = np.where(np.isnan(intensity), intensity, np.float32(0)).astype(np.float32)
-    normalized[positive] = np.interp(intensity[positive], unique, middles)
+    normalized[positive] = np.interp(intensity[positive], distinct_knots, mean_values)
     return normalized
 
 
-def _compute_quantiles(values: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return np.quantile(values, shares), (K,) float64; one sort is ten times as fast."""
+def _compute_quantiles(values: np.ndarray, fractions: np.ndarray) -> np.ndarray:
+    """Return np.quantile(values, fractions), (K,) float64; sorts once, ten times as fast as NumPy."""
     values = np.sort(values)
-    places = shares * (len(values) - 1)
-    low = places.astype(np.int64)
+    positions = fractions * (len(values) - 1)
+    low = positions.astype(np.int64)
     high = np.minimum(low + 1, len(values) - 1)
     below, above = values[low].astype(np.float64), values[high].astype(np.float64)
-    return below + (above - below) * (places - low)
+    return below + (above - below) * (positions - low)
 
 
 def has_usable_intensity(intensity: np.ndarray | None) -> bool:
-    """Return True if networks can read the intensities (N,) of a cloud.
+    """Return True if the intensities (N,) of a cloud are usable as input of a network.
 
-    At least a share of MIN_KNOWN must be positive, and positive ones must not be nearly all equal.
+    More than a fraction MIN_KNOWN must be positive, and the positive ones must not be nearly all
+    equal.
     """
     if intensity is None:
         return False
@@ -144,8 +149,9 @@ def has_usable_intensity(intensity: np.ndarray | None) -> bool:
 
 
 class StreamScale:
-    """Scale of a stream of clouds: the largest scale of a cloud so far, so that a dark cloud is not
-    read in another scale. `full` is 0 before the first cloud.
+    """Scale of a stream of clouds: the largest scale of any cloud so far.
+
+    A dark cloud is therefore not read with another scale. `full` is 0 before the first cloud.
     """
 
     def __init__(self) -> None:
@@ -158,16 +164,16 @@ class StreamScale:
 
 
 def find_scale_problem(intensity: np.ndarray | None) -> str | None:
-    """Describe a wrong scale of intensities (N,) that should be 0..1, with the remedy, or None."""
+    """Return a message with the remedy if intensities (N,) that should be 0..1 have a wrong scale."""
     if intensity is None:
         return None
-    greatest = float(np.fmax.reduce(intensity, initial=0))
+    max_value = float(np.fmax.reduce(intensity, initial=0))
     inferred = guess_scale(intensity)
-    if inferred == 1.0 and (greatest == 0.0 or greatest >= MIN_BRIGHT or len(intensity) < MIN_POINTS):
+    if inferred == 1.0 and (max_value == 0.0 or max_value >= MIN_BRIGHT or len(intensity) < MIN_POINTS):
         return None
-    guess = f", so it is divided by {inferred:g}, a guess" if inferred != 1.0 else ""
+    guess_text = f", so it is divided by {inferred:g}, a guess" if inferred != 1.0 else ""
     return (
-        f"intensity goes up to {greatest:.3g} where 1 is a full reflection{guess}; set "
+        f"intensity goes up to {max_value:.3g} where 1 is a full reflection{guess_text}; set "
         "input.intensity_max, or in Python intensity_max of PointCloud.of, to the value of a "
         "full reflection (1, 100 or 255 for most drivers; setup measures it)"
     )

@@ -48,19 +48,19 @@ class InputWarning(UserWarning):
 
 
 def closest_name(name: object, known: Iterable[str]) -> str | None:
-    """Return the known name that a misspelt or shortened name probably means, or None.
+    """Return the known name that is closest to a misspelt or shortened one, or None.
 
-    A name that begins with `name` comes first, then one with a similar spelling, then one with the
-    same first characters.
+    Names that begin with `name` are preferred, then names with a similar spelling, then names with
+    the same first characters.
     """
-    wanted, by_spelling = _normalise(str(name)), {_normalise(n): n for n in known}
-    same_prefix = [n for n in by_spelling if n[:MIN_PREFIX] == wanted[:MIN_PREFIX]]
-    found = (
-        [n for n in same_prefix if n.startswith(wanted)]
-        or get_close_matches(wanted, by_spelling, 1, MIN_NAME_SIMILARITY)
+    target, by_spelling = _normalise(str(name)), {_normalise(n): n for n in known}
+    same_prefix = [n for n in by_spelling if n[:MIN_PREFIX] == target[:MIN_PREFIX]]
+    matches = (
+        [n for n in same_prefix if n.startswith(target)]
+        or get_close_matches(target, by_spelling, 1, MIN_NAME_SIMILARITY)
         or same_prefix
     )
-    return by_spelling[found[0]] if found else None
+    return by_spelling[matches[0]] if matches else None
 
 
 def _normalise(name: str) -> str:
@@ -70,7 +70,10 @@ def _normalise(name: str) -> str:
 def unknown_name(what: str, name: object, known: Iterable[str]) -> InputError:
     """Return an error that lists the closest match and all valid names.
 
-    what: the kind of thing that is named, such as "sensor".
+    Args:
+        what: kind of the named thing, such as "sensor".
+        name: the unknown name.
+        known: all valid names.
     """
     return InputError(f"there is no {what} {str(name)[:80]!r}{valid_names(name, known)}")
 
@@ -92,8 +95,11 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 class PointCloud:
     """The usable points (see usable_returns) of one cloud.
 
-    xyz (N, 3) float32 metres in frame_id, C-contiguous; intensity (N,) float32 0..1 or None;
-    stamp_ns int.
+    Attributes:
+        xyz: (N, 3) float32, C-contiguous, metres in frame_id.
+        intensity: (N,) float32 0..1, or None.
+        stamp_ns: time stamp in nanoseconds.
+        frame_id: coordinate frame of the points.
     """
 
     xyz: np.ndarray
@@ -127,7 +133,7 @@ class PointCloud:
                 y left, z up. An empty sequence is a cloud without points.
             intensity: (N,) for points (N, 3). NaN, infinite and negative values become 0.
             intensity_max: value of a full reflection, by which intensities are divided. None: 255
-                for uint8, else 1. Detectors report intensities with an implausible scale.
+                for uint8, otherwise 1. Detectors report intensities with an implausible scale.
 
         Raises:
             InputError: wrong shape or type. The message names the shape and the allowed ones.
@@ -195,8 +201,8 @@ def as_point_cloud(
         else (None if intensity is None else _to_numbers(intensity, "intensity", "(N,) numbers"))
     )
     if values is not None:
-        full = intensity_max or (255.0 if values.dtype == np.uint8 else 1.0)
-        values = to_unit(values, full)
+        full_scale = intensity_max or (255.0 if values.dtype == np.uint8 else 1.0)
+        values = to_unit(values, full_scale)
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf, which is not usable
         xyz = np.ascontiguousarray(points[:, :3], np.float32)
     return PointCloud(xyz, values, stamp_ns, frame_id)
@@ -220,25 +226,30 @@ def check_columns(count: int, **columns: ArrayLike | None) -> None:
     for name, column in columns.items():
         if column is not None and np.shape(column) != (count,):
             size = np.size(column)
-            has = f"{size} values" if size != count else f"shape {np.shape(column)}"
-            raise InputError(f"{name} has {has} for {count} points")
+            actual = f"{size} values" if size != count else f"shape {np.shape(column)}"
+            raise InputError(f"{name} has {actual} for {count} points")
 
 
 def usable_returns(xyz: np.ndarray) -> np.ndarray:
-    """Return (N,) bool: True for points that are finite, within MAX_RANGE, and not at the origin,
-    where drivers put missing returns."""
+    """Return (N,) bool: True for points that are finite, within MAX_RANGE and not at the origin.
+
+    Drivers report missing returns as points at the origin.
+    """
     with np.errstate(invalid="ignore", over="ignore"):
-        square = np.einsum("ij,ij->i", xyz, xyz)  # NaN and inf survive
-        return (square > 0.0) & (square <= MAX_RANGE * MAX_RANGE)
+        squared_range = np.einsum("ij,ij->i", xyz, xyz)  # NaN and inf survive
+        return (squared_range > 0.0) & (squared_range <= MAX_RANGE * MAX_RANGE)
 
 
 @dataclass(frozen=True)
 class Detections:
     """K detected boxes; K = 0 without detections.
 
-    boxes (K, 7) float32 [x y z l w h yaw], class_ids (K,) int32 into CLASSES, scores (K,) float32.
-    sources: probabilities (K,) float32 by each part of a combined detector, by its name; NaN where
-        it has none. Empty for other detectors.
+    Attributes:
+        boxes: (K, 7) float32 [x y z l w h yaw].
+        class_ids: (K,) int32 indices into CLASSES.
+        scores: (K,) float32.
+        sources: of a combined detector, the probabilities (K,) float32 from each of its parts, by
+            name of the part; NaN for boxes without one. Empty for other detectors.
     """
 
     boxes: np.ndarray
@@ -291,7 +302,7 @@ class Detections:
         )
 
     def followed_by(self, others: Detections) -> Detections:
-        """Return these detections and then the others, without sources."""
+        """Return these detections followed by the others; sources are dropped."""
         return Detections(
             np.concatenate([self.boxes, others.boxes]),
             np.concatenate([self.class_ids, others.class_ids]),
@@ -310,7 +321,7 @@ def _to_class_ids(ids_or_names: ArrayLike) -> np.ndarray:
 
 
 def class_ids(names: Iterable[str]) -> list[int]:
-    """Return the indices into CLASSES of names in any spelling; that of Misc for unknown names."""
+    """Return the indices into CLASSES of names in any spelling; unknown names are Misc."""
     return [CLASSES.index(known if (known := class_name(name)) in CLASSES else "Misc") for name in names]
 
 
@@ -318,10 +329,12 @@ def class_ids(names: Iterable[str]) -> list[int]:
 class GroundTruth:
     """The K labelled objects of one frame, in the LiDAR frame.
 
-    boxes (K, 7) float64 [x y z l w h yaw], class_ids (K,) int into CLASSES.
-    extras: K dicts of optional fields: track_id, truncated, occluded, alpha, bbox [left top right
-        bottom] in pixels.
-    notes: (class, extras) of objects without a 3D box, such as KITTI's DontCare regions.
+    Attributes:
+        boxes: (K, 7) float64 [x y z l w h yaw].
+        class_ids: (K,) int indices into CLASSES.
+        extras: K dicts of optional fields: track_id, truncated, occluded, alpha, bbox [left top
+            right bottom] in pixels.
+        notes: (class, extras) of objects without a 3D box, such as KITTI's DontCare regions.
     """
 
     boxes: np.ndarray

@@ -22,8 +22,8 @@ NEIGHBOURS = np.array(
 def find_climbing_cells(lowest, height, threshold, slope):
     """Find the cells that continue the ground uphill from the cells that the cloth touches.
 
-    The cloth is too stiff to follow some roads where they begin to climb, because it hangs free
-    between the rings of points. Objects on the road begin above the slope of the road.
+    Some roads begin to climb more steeply than the cloth can bend between two rings of points.
+    Objects on the road begin above the slope of the road.
 
     A cell continues the ground if its lowest point is at most STEP_M plus `slope` per cell above
     the lowest point of the nearest ground cell, at most REACH_CELLS away (of equally near cells,
