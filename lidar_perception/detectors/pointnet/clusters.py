@@ -143,19 +143,19 @@ def find_ground_heights(xyz: np.ndarray, xy: np.ndarray) -> np.ndarray:
 def _find_ground_heights(xyz, xy):
     cell = np.empty(len(xyz), np.int64)
     for i in range(len(xyz)):
-        cell[i] = _cell(xyz[i, 0], 0) * CELLS + _cell(xyz[i, 1], 0)
+        cell[i] = _hash_axis(xyz[i, 0], 0) * CELLS + _hash_axis(xyz[i, 1], 0)
     order, start = counting_sort(cell, CELLS * CELLS, np.arange(len(xyz)))
     heights = np.full(len(xy), -SENSOR_HEIGHT)
     for k in range(len(xy)):
         x, y = xy[k]
-        for reach in RADII_M:
-            cells = int(np.ceil(reach / RADII_M[0]))
+        for radius in RADII_M:
+            cells = int(np.ceil(radius / RADII_M[0]))
             count, total = 0, 0.0
             for row in range(-cells, cells + 1):
                 for column in range(-cells, cells + 1):
-                    own = _cell(x, row) * CELLS + _cell(y, column)
-                    for j in order[start[own] : start[own + 1]]:
-                        if (xyz[j, 0] - x) ** 2 + (xyz[j, 1] - y) ** 2 <= reach * reach:
+                    cell_id = _hash_axis(x, row) * CELLS + _hash_axis(y, column)
+                    for j in order[start[cell_id] : start[cell_id + 1]]:
+                        if (xyz[j, 0] - x) ** 2 + (xyz[j, 1] - y) ** 2 <= radius * radius:
                             count += 1
                             total += xyz[j, 2]
             if count >= MIN_GROUND_POINTS:
@@ -165,8 +165,8 @@ def _find_ground_heights(xyz, xy):
 
 
 @njit(cache=True, nogil=True)
-def _cell(along, off):
-    return int((np.floor(along / RADII_M[0]) + off) % CELLS)
+def _hash_axis(coordinate, offset):
+    return int((np.floor(coordinate / RADII_M[0]) + offset) % CELLS)
 
 
 def compute_centroids(points: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -186,7 +186,7 @@ def make_network_input(clusters: Clusters, count: int, seed: int = 0, farthest: 
     """
     points, valid, low_high, centres = _sample_points(clusters.points, clusters.first, count, seed, farthest)
     azimuths = np.arctan2(centres[:, 1], centres[:, 0])
-    reach = np.maximum(np.hypot(centres[:, 0], centres[:, 1]), 1e-3)
+    ranges = np.maximum(np.hypot(centres[:, 0], centres[:, 1]), 1e-3)
     inputs = np.empty((*points.shape[:2], 5), np.float32)
     cos, sin = (f(azimuths)[:, None].astype(np.float32) for f in (np.cos, np.sin))
     x, y = points[..., 0], points[..., 1]
@@ -196,11 +196,11 @@ def make_network_input(clusters: Clusters, count: int, seed: int = 0, farthest: 
     inputs[..., 4] = points[..., 2] + (centres[:, 2] - floor)[:, None].astype(np.float32)
     context = np.column_stack(
         [
-            reach / 50,
+            ranges / 50,
             centres[:, 2] - floor,
             low_high - floor[:, None],
             np.log(np.maximum(clusters.sizes, 1)) / 5,
-            np.log(reach) / 4,
+            np.log(ranges) / 4,
         ]
     )
     return ClusterInput(inputs, valid, context.astype(np.float32), centres, azimuths)
@@ -209,51 +209,51 @@ def make_network_input(clusters: Clusters, count: int, seed: int = 0, farthest: 
 @njit(cache=True, nogil=True)
 def _sample_points(points, first, count, seed, farthest):
     clusters = len(first) - 1
-    out = np.zeros((clusters, count, 4), np.float32)
+    samples = np.zeros((clusters, count, 4), np.float32)
     valid = np.zeros((clusters, count), np.bool_)
     low_high, centres = np.zeros((clusters, 2)), np.zeros((clusters, 3))
     for k in range(clusters):
         begin, size = first[k], first[k + 1] - first[k]
         if size == 0:
             continue
-        own = points[begin : begin + size]
+        cluster_points = points[begin : begin + size]
         low, high = np.inf, -np.inf
         for i in range(size):
             for axis in range(3):
-                centres[k, axis] += own[i, axis]
-            low, high = min(low, own[i, 2]), max(high, own[i, 2])
+                centres[k, axis] += cluster_points[i, axis]
+            low, high = min(low, cluster_points[i, 2]), max(high, cluster_points[i, 2])
         centres[k] /= size
         low_high[k, 0], low_high[k, 1] = low, high
         indices = np.arange(size)
         state = np.uint64(seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019)
-        kept = min(size, count)
-        for i in range(kept):  # the first steps of a Fisher-Yates shuffle
+        sample_size = min(size, count)
+        for i in range(sample_size):  # the first steps of a Fisher-Yates shuffle
             state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
             j = i + int((state >> np.uint64(33)) % np.uint64(size - i))
             indices[i], indices[j] = indices[j], indices[i]
             valid[k, i] = True
         if farthest > 0:
-            _order_by_distance(own, indices[:kept], min(farthest, kept))
+            _order_by_distance(cluster_points, indices[:sample_size], min(farthest, sample_size))
         for i in range(count):
-            row = own[indices[i % kept]]
+            row = cluster_points[indices[i % sample_size]]
             for axis in range(3):
-                out[k, i, axis] = row[axis] - centres[k, axis]
-            out[k, i, 3] = row[3]
-    return out, valid, low_high, centres
+                samples[k, i, axis] = row[axis] - centres[k, axis]
+            samples[k, i, 3] = row[3]
+    return samples, valid, low_high, centres
 
 
 @njit(cache=True, nogil=True)
 def _order_by_distance(points, indices, count):
     """Reorder indices in place: each of the first `count` is the farthest from those before it."""
     nearest = np.full(len(indices), np.inf)
-    for done in range(1, count):
-        last, best = points[indices[done - 1]], done
-        for i in range(done, len(indices)):
+    for chosen_count in range(1, count):
+        last, best = points[indices[chosen_count - 1]], chosen_count
+        for i in range(chosen_count, len(indices)):
             squared = 0.0
             for axis in range(3):
                 squared += (np.float64(points[indices[i], axis]) - last[axis]) ** 2
             nearest[i] = min(nearest[i], squared)
             if nearest[i] > nearest[best]:
                 best = i
-        indices[done], indices[best] = indices[best], indices[done]
-        nearest[done], nearest[best] = nearest[best], nearest[done]
+        indices[chosen_count], indices[best] = indices[best], indices[chosen_count]
+        nearest[chosen_count], nearest[best] = nearest[best], nearest[chosen_count]

@@ -171,7 +171,7 @@ class _Coarse:
         self, rows: np.ndarray, first: np.ndarray, local: np.ndarray, first_centre: np.ndarray, max_groups: int
     ) -> np.ndarray:
         """Return (K, C) from the features `local` (R, B) of the centres."""
-        maxima = kernels.coarse_maxima(
+        maxima = kernels.compute_coarse_maxima(
             rows, first, self.features(local), first_centre, max_groups, self.count, self.radius, self.position
         )
         return maxima[:, : self.features.channels]

@@ -1,7 +1,7 @@
 """Compiled kernels of PointNet: grouping of points, and maxima.
 
-Rows of several clusters or groups are concatenated; number k has the rows first[k] to first[k + 1],
-with first (K + 1,) int64.
+Rows of several clusters or groups are concatenated: cluster k has the rows first[k] to
+first[k + 1], where first is (K + 1,) int64.
 """
 
 from __future__ import annotations
@@ -16,42 +16,43 @@ from lidar_perception.detectors.matrix_kernel import UNROLL
 def max_by_group(rows, first, columns):
     """Return the maximum of each group of rows over the first `columns` columns, (K, columns)
     float32; NaN if a value is NaN or the group is empty."""
-    greatest = np.full((len(first) - 1, columns), np.nan, np.float32)
-    for k in range(len(greatest)):
+    maxima = np.full((len(first) - 1, columns), np.nan, np.float32)
+    for k in range(len(maxima)):
         if first[k] < first[k + 1]:
-            greatest[k] = rows[first[k], :columns]
+            maxima[k] = rows[first[k], :columns]
         for i in range(first[k] + 1, first[k + 1]):
             for j in range(columns):
-                value, known = rows[i, j], greatest[k, j]
-                greatest[k, j] = value if value > known or value != value else known
-    return greatest
+                value, current = rows[i, j], maxima[k, j]
+                maxima[k, j] = value if value > current or value != value else current
+    return maxima
 
 
 @njit(cache=True, nogil=True)
 def _find_nearest(points, begin, end, centre, count, distances, indices):
-    """Write the squared distances, ascending, and the indices of the points among begin .. end that
-    are nearest to point number `centre`; return their number, at most `count`."""
-    found = 0
+    """Find up to `count` of the points begin to end that are nearest to the point `centre`.
+
+    Writes their squared distances, ascending, and their indices; returns their number.
+    """
+    neighbour_count = 0
     for i in range(begin, end):
         x = points[centre, 0] - points[i, 0]
         y = points[centre, 1] - points[i, 1]
         z = points[centre, 2] - points[i, 2]
         squared = x * x + y * y + z * z
-        if found == count and not squared < distances[found - 1]:
+        if neighbour_count == count and not squared < distances[neighbour_count - 1]:
             continue
-        place = min(found, count - 1)
-        while place > 0 and squared < distances[place - 1]:
-            distances[place], indices[place] = distances[place - 1], indices[place - 1]
-            place -= 1
-        distances[place], indices[place] = squared, i
-        found = min(found + 1, count)
-    return found
+        slot = min(neighbour_count, count - 1)
+        while slot > 0 and squared < distances[slot - 1]:
+            distances[slot], indices[slot] = distances[slot - 1], indices[slot - 1]
+            slot -= 1
+        distances[slot], indices[slot] = squared, i
+        neighbour_count = min(neighbour_count + 1, count)
+    return neighbour_count
 
 
 @njit(cache=True, nogil=True)
 def _count_within(points, begin, end, centre, squared_radius):
-    """Count the points among begin .. end whose squared distance from point number `centre` is at
-    most squared_radius."""
+    """Count the points begin to end within a radius of the point `centre`."""
     count = 0
     for i in range(begin, end):
         x = points[centre, 0] - points[i, 0]
@@ -62,8 +63,8 @@ def _count_within(points, begin, end, centre, squared_radius):
 
 
 @njit(cache=True, nogil=True)
-def group_neighbours(points, first, most, radii, counts, in_ball):
-    """Group points (P, 5 or more) around the first `most` points of each cluster.
+def group_neighbours(points, first, max_centres, radii, counts, in_ball):
+    """Group points (P, 5 or more) around the first `max_centres` points of each cluster.
 
     Args:
         radii, counts: (S,) float32 and int64, ascending radius and maximum size of the groups of
@@ -79,7 +80,7 @@ def group_neighbours(points, first, most, radii, counts, in_ball):
     clusters, scales = len(first) - 1, len(radii)
     first_centre = np.zeros(clusters + 1, np.int64)
     for k in range(clusters):
-        first_centre[k + 1] = first_centre[k] + min(most, first[k + 1] - first[k])
+        first_centre[k + 1] = first_centre[k] + min(max_centres, first[k + 1] - first[k])
     centres = first_centre[clusters]
     relative = np.zeros((scales, centres * counts.max(), 2 * UNROLL), np.float32)
     starts = np.zeros((scales, centres + 1), np.int64)
@@ -88,19 +89,19 @@ def group_neighbours(points, first, most, radii, counts, in_ball):
     for k in range(clusters):
         for c in range(first_centre[k], first_centre[k + 1]):
             centre = first[k] + c - first_centre[k]
-            found = _find_nearest(points, first[k], first[k + 1], centre, counts.max(), distances, indices)
+            neighbour_count = _find_nearest(points, first[k], first[k + 1], centre, counts.max(), distances, indices)
             for s in range(scales):
                 row, radius = starts[s, c], radii[s]
-                for i in range(min(found, counts[s])):
+                for i in range(min(neighbour_count, counts[s])):
                     if distances[i] <= radius * radius:
-                        near = points[indices[i]]
+                        neighbour = points[indices[i]]
                         for axis in range(3):
-                            relative[s, row, axis] = (near[axis] - points[centre, axis]) / radius
-                        relative[s, row, 3], relative[s, row, 4] = near[3], near[4]
+                            relative[s, row, axis] = (neighbour[axis] - points[centre, axis]) / radius
+                        relative[s, row, 3], relative[s, row, 4] = neighbour[3], neighbour[4]
                         row += 1
                 if in_ball:
-                    inside = _count_within(points, first[k], first[k + 1], centre, radius * radius)
-                    density[c, s] = inside / (radius * radius * radius)
+                    points_in_ball = _count_within(points, first[k], first[k + 1], centre, radius * radius)
+                    density[c, s] = points_in_ball / (radius * radius * radius)
                 else:
                     density[c, s] = (row - starts[s, c]) / (counts[s] * radius)
                 starts[s, c + 1] = row
@@ -108,27 +109,27 @@ def group_neighbours(points, first, most, radii, counts, in_ball):
 
 
 @njit(cache=True, nogil=True)
-def coarse_maxima(points, first, rows, first_row, most, count, radius, weights):
+def compute_coarse_maxima(points, first, rows, first_row, max_groups, count, radius, weights):
     """Return the maximum of a linear layer with ReLU over the coarse groups of each cluster, (K, C)
     float32.
 
     The centres of a cluster are its first points. A group consists of up to `count` centres within
-    `radius` of one of the first `most` centres.
+    `radius` of one of the first `max_groups` centres.
 
     Args:
         rows, first_row: (R, C) float32, output of the layer for the features of the centres, and
             (K + 1,) first row of each cluster.
         weights: (3, C) float32, weights of the relative position.
     """
-    greatest = np.zeros((len(first) - 1, rows.shape[1]), np.float32)
+    maxima = np.zeros((len(first) - 1, rows.shape[1]), np.float32)
     distances, indices = np.empty(count, np.float32), np.empty(count, np.int64)
-    for k in range(len(greatest)):
+    for k in range(len(maxima)):
         size = first_row[k + 1] - first_row[k]
         if size == 0:
-            greatest[k] = np.nan
-        for centre in range(first[k], first[k] + min(most, size)):
-            found = _find_nearest(points, first[k], first[k] + size, centre, count, distances, indices)
-            for i in range(found):
+            maxima[k] = np.nan
+        for centre in range(first[k], first[k] + min(max_groups, size)):
+            neighbour_count = _find_nearest(points, first[k], first[k] + size, centre, count, distances, indices)
+            for i in range(neighbour_count):
                 if distances[i] > radius * radius:
                     break
                 row = rows[first_row[k] + indices[i] - first[k]]
@@ -137,6 +138,6 @@ def coarse_maxima(points, first, rows, first_row, most, count, radius, weights):
                 z = (points[indices[i], 2] - points[centre, 2]) / radius
                 for j in range(rows.shape[1]):
                     value = row[j] + x * weights[0, j] + y * weights[1, j] + z * weights[2, j]
-                    if value > greatest[k, j] or value != value:
-                        greatest[k, j] = value
-    return greatest
+                    if value > maxima[k, j] or value != value:
+                        maxima[k, j] = value
+    return maxima

@@ -123,10 +123,10 @@ def _fill_ellipses(image, shapes, channels, low_x, low_y, cell):
         if channels[k] < 0:
             continue
         x, y, a, b, yaw = shapes[k]
-        layer = image[channels[k]]
+        channel = image[channels[k]]
         row, column = int(np.floor((y - low_y) / cell)), int(np.floor((x - low_x) / cell))
         if 0 <= row < height and 0 <= column < width:
-            layer[row, column] = 1
+            channel[row, column] = 1
         if b <= 0.0:
             continue
         cos, sin = np.cos(yaw), np.sin(yaw)
@@ -141,4 +141,4 @@ def _fill_ellipses(image, shapes, channels, low_x, low_y, cell):
                 dx = low_x + (j + 0.5) * cell - x
                 u, v = (cos * dx + sin * dy) / a, (cos * dy - sin * dx) / b
                 if u * u + v * v <= 1.0:
-                    layer[i, j] = 1
+                    channel[i, j] = 1

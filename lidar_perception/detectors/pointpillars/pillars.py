@@ -34,8 +34,8 @@ class Pillars(NamedTuple, Generic[Array]):
 def make_pillars(cloud: np.ndarray, config: NetworkConfig) -> Pillars[np.ndarray]:
     """Assign the points of a cloud (N, config.point_columns) float32 to pillars.
 
-    Points outside the range and points with NaN are dropped. If config.max_points is set, only
-    this many points of a pillar are kept.
+    Points outside the range and points with NaN are dropped. If config.max_points is set, at most
+    that many points of each pillar are kept.
     """
     points, offsets, cells = _make_pillars(
         np.ascontiguousarray(cloud),
@@ -69,24 +69,24 @@ def _make_pillars(cloud, low, high, cell, height, width, max_points, columns):
             continue
         column = min(int((point[0] - low[0]) / cell), width - 1)
         row = min(int((point[1] - low[1]) / cell), height - 1)
-        own = row * width + column
-        if max_points and sums[own, 3] >= max_points:
+        pillar = row * width + column
+        if max_points and sums[pillar, 3] >= max_points:
             continue
         points[count] = point
-        cells[count] = own
+        cells[count] = pillar
         offsets[count, 3] = point[0] - ((np.float32(column) + half) * cell + low[0])
         offsets[count, 4] = point[1] - ((np.float32(row) + half) * cell + low[1])
         offsets[count, 2] = point[2] - middle_z
-        sums[own, 0] += offsets[count, 3]
-        sums[own, 1] += offsets[count, 4]
-        sums[own, 2] += offsets[count, 2]
-        sums[own, 3] += np.float32(1)
+        sums[pillar, 0] += offsets[count, 3]
+        sums[pillar, 1] += offsets[count, 4]
+        sums[pillar, 2] += offsets[count, 2]
+        sums[pillar, 3] += np.float32(1)
         count += 1
     for i in range(count):
-        own = sums[cells[i]]
+        total = sums[cells[i]]
         if columns > 5:
             offsets[i, 5] = offsets[i, 2]
-        offsets[i, 0] = offsets[i, 3] - own[0] / own[3]
-        offsets[i, 1] = offsets[i, 4] - own[1] / own[3]
-        offsets[i, 2] -= own[2] / own[3]
+        offsets[i, 0] = offsets[i, 3] - total[0] / total[3]
+        offsets[i, 1] = offsets[i, 4] - total[1] / total[3]
+        offsets[i, 2] -= total[2] / total[3]
     return points[:count].copy(), offsets[:count].copy(), cells[:count].copy()

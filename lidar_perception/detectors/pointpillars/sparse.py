@@ -144,7 +144,7 @@ class SparseNetwork:
         occupied.ravel()[cells] = True
         numbers, index = kernels.number_cells(occupied, _make_blank_index(pillars.grid), 1)
         rows = np.zeros((1 + len(numbers), self.pillar_columns), np.float32)
-        kernels.pillar_rows(points, offsets, cells, index, self.pillar_weights, self.pillar_bias, rows)
+        kernels.write_pillar_maxima(points, offsets, cells, index, self.pillar_weights, self.pillar_bias, rows)
         return Map(index, rows)
 
     def _choose_cells(self, occupied: list[np.ndarray], reach: int | None) -> list[np.ndarray]:

@@ -21,7 +21,7 @@ def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, firs
 
     Args:
         index, rows: the map.
-        cells: (K,) numbers of cells in a map that is `width` wide and `stride` times coarser.
+        cells: (K,) flat indices of cells in a map that is `width` wide and `stride` times coarser.
         weights: (blocks, taps, channels, BLOCK) float32, 9 taps for a 3 x 3 or 1 for a 1 x 1
             convolution.
         bias: (C,) float32 with C = blocks x BLOCK, or empty.
@@ -32,11 +32,11 @@ def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, firs
     blocks, taps, channels, _ = weights.shape
     row_bytes, sum_bytes = 4 * rows.shape[1], 4 * sums.shape[1]
     inputs, outputs, weight = rows.ctypes.data, sums.ctypes.data, weights.ctypes.data
-    begun, start = len(bias) == 0, bias.ctypes.data
-    across = index.shape[1]
+    accumulate, start = len(bias) == 0, bias.ctypes.data
+    map_width = index.shape[1]
     numbers = index.ravel()
     addresses = np.empty((BATCH, taps, ROWS), np.int64)
-    places = np.empty((BATCH, ROWS), np.int64)
+    destinations = np.empty((BATCH, ROWS), np.int64)
     starts = np.empty(ROWS, np.int64)
     for begin in range(first, last, BATCH * ROWS):
         tiles = min(BATCH, (last - begin + ROWS - 1) // ROWS)
@@ -44,13 +44,13 @@ def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, firs
             for i in range(ROWS):
                 cell = min(begin + tile * ROWS + i, last - 1)  # the last cell is repeated
                 row, column = divmod(np.int64(cells[cell]), width)
-                corner = row * stride * across + column * stride
+                corner = row * stride * map_width + column * stride
                 if taps == 1:
-                    addresses[tile, 0, i] = inputs + row_bytes * numbers[corner + across + 1]
+                    addresses[tile, 0, i] = inputs + row_bytes * numbers[corner + map_width + 1]
                 else:
                     for tap in range(9):
-                        addresses[tile, tap, i] = inputs + row_bytes * numbers[corner + tap // 3 * across + tap % 3]
-                places[tile, i] = outputs + sum_bytes * cell
+                        addresses[tile, tap, i] = inputs + row_bytes * numbers[corner + tap // 3 * map_width + tap % 3]
+                destinations[tile, i] = outputs + sum_bytes * cell
         for block in range(blocks):
             starts[:] = start + 4 * BLOCK * block
             for tile in range(tiles):
@@ -59,31 +59,31 @@ def convolve(index, rows, cells, width, stride, weights, bias, sums, floor, firs
                     taps,
                     channels,
                     weight + 4 * block * taps * channels * BLOCK,
-                    places[tile].ctypes.data if begun else starts.ctypes.data,
-                    places[tile].ctypes.data,
+                    destinations[tile].ctypes.data if accumulate else starts.ctypes.data,
+                    destinations[tile].ctypes.data,
                     floor,
                 )
-            places[:tiles] += 4 * BLOCK
+            destinations[:tiles] += 4 * BLOCK
 
 
 @njit(cache=True, nogil=True)
 def upsample(index, rows, cells, width, scale, bias, sums, first, last):
-    """Write a bilinearly upsampled map plus bias to sums, as torch with align_corners=False.
+    """Write a bilinearly upsampled map plus bias to sums, like torch with align_corners=False.
 
     Args:
         index, rows: the map.
-        cells: (K,) numbers of cells in the upsampled map, which is `width` wide.
+        cells: (K,) flat indices of cells in the upsampled map, which is `width` wide.
         bias: (C,) float32.
         sums: (K, C) float32, the output.
         first, last: range of `cells` to compute.
     """
-    height, across = index.shape[0] - 2, index.shape[1] - 2
+    height, map_width = index.shape[0] - 2, index.shape[1] - 2
     for i in range(first, last):
         row, column = divmod(np.int64(cells[i]), width)
         y = max((row + np.float32(0.5)) / scale - np.float32(0.5), np.float32(0))
         x = max((column + np.float32(0.5)) / scale - np.float32(0.5), np.float32(0))
         top, left = int(y), int(x)
-        down, right = min(top + 1, height - 1), min(left + 1, across - 1)
+        down, right = min(top + 1, height - 1), min(left + 1, map_width - 1)
         y, x = np.float32(y - top), np.float32(x - left)
         a, b = index[top + 1, left + 1], index[top + 1, right + 1]
         c, d = index[down + 1, left + 1], index[down + 1, right + 1]
@@ -98,8 +98,8 @@ def number_cells(chosen, template, start):
     """Assign the rows start, start + 1, ... to the cells that are True in chosen (H, W).
 
     Returns:
-        Numbers (K,) int32 of these cells, and a copy of the index `template` (H + 2, W + 2) int32
-        with their rows.
+        Flat indices (K,) int32 of these cells, and a copy of `template` (H + 2, W + 2) int32, an
+        index, with the rows filled in.
     """
     height, width = chosen.shape
     cells, index = np.empty(height * width, np.int32), template.copy()
@@ -114,7 +114,7 @@ def number_cells(chosen, template, start):
 
 
 @njit(cache=True, nogil=True)
-def pillar_rows(points, offsets, cells, index, weights, bias, rows):
+def write_pillar_maxima(points, offsets, cells, index, weights, bias, rows):
     """Apply a linear layer with ReLU to each point and write the maximum per pillar to rows.
 
     Args:
@@ -123,19 +123,19 @@ def pillar_rows(points, offsets, cells, index, weights, bias, rows):
         index, rows: the map; rows (R, C) start at 0 and are raised to the maximum.
         weights, bias: as in multiply.
     """
-    width, read = index.shape[1] - 2, points.shape[1]
+    width, point_width = index.shape[1] - 2, points.shape[1]
     inputs = np.zeros((POINTS, weights.shape[2]), np.float32)
     for first in range(0, len(points), POINTS):
         count = min(POINTS, len(points) - first)
         for i in range(count):
-            for k in range(read):
+            for k in range(point_width):
                 inputs[i, k] = points[first + i, k]
             for k in range(offsets.shape[1]):
-                inputs[i, read + k] = offsets[first + i, k]
+                inputs[i, point_width + k] = offsets[first + i, k]
         values = multiply(inputs[:count], weights, bias, np.float32(0))
         for i in range(count):
             cell = cells[first + i]
             row = index[1 + cell // width, 1 + cell % width]
             for k in range(rows.shape[1]):
-                value, known = values[i, k], rows[row, k]
-                rows[row, k] = value if value > known or value != value else known  # propagates NaN
+                value, current = values[i, k], rows[row, k]
+                rows[row, k] = value if value > current or value != value else current  # propagates NaN
