@@ -1,4 +1,4 @@
-"""Results as a rosbag2 bag, with the topics of the nodes."""
+"""Results as a rosbag2 bag with the topics of the nodes."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from msg_utils.markers import MarkerRow, list_marker_keys
 
 
 class Bag:
-    """A bag, bag/, with detections, optional tracks, available labels, camera and odometry, and
-    optionally the clouds.
+    """Writes the bag bag/ with the results of a run.
 
-    Detections and tracks are MarkerArray and Detection3DArray messages on the topics of the nodes.
-    All messages have the stamp of their cloud.
+    It has detections, the labels, camera and odometry that the recording contains, and optionally
+    tracks and clouds. Detections and tracks are MarkerArray and Detection3DArray messages on the
+    topics of the nodes. All messages have the stamp of their cloud.
     """
 
     def __init__(self, run: Run, clouds: bool, tracked: bool) -> None:
@@ -49,7 +49,7 @@ class Bag:
         self.bag.__exit__(*error)
 
     def add(self, result: FrameResult) -> None:
-        """Write a frame, or add it to the skipped frames if a bag cannot represent it."""
+        """Write a frame, or list it as skipped if a bag cannot represent it."""
         frame = result.frame
         if not self.clouds:  # only the frame_id of the cloud is needed
             empty = PointCloud(np.zeros((0, 3), np.float32), frame_id=result.frame_id)
@@ -95,9 +95,9 @@ class Bag:
         self._shown[topic] = list_marker_keys(rows)
         self.bag.write(topic, stamp_ns, encode_markers(rows, header))
 
-    def _write_3d(self, topic: str, stamp_ns: int, header: Any, found: Detections, **more: Any) -> None:
+    def _write_3d(self, topic: str, stamp_ns: int, header: Any, detections: Detections, **options: Any) -> None:
         self.bag.write(
             f"{topic}_3d",
             stamp_ns,
-            encode_detection_array(found.boxes, found.labels, found.scores, header=header, **more),
+            encode_detection_array(detections.boxes, detections.labels, detections.scores, header=header, **options),
         )

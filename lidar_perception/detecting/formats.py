@@ -1,4 +1,4 @@
-"""Output formats: one class per format, which receives the frames in order of time."""
+"""Output formats: one class per format, which receives the frames in chronological order."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ class Run:
     Attributes:
         recording: input data.
         out: output folder.
-        header: a JSON object, see run.make_header.
+        header: JSON object, see run.make_header.
         count: number of frames to write.
         skipped: one line for each frame that could not be read or written.
-        remarks: lines about the results, grouped by their text without numbers.
+        remarks: notes on the results, grouped by their text without numbers.
     """
 
     recording: Recording
@@ -76,13 +76,13 @@ class Run:
 
 
 class Format(Protocol):
-    """A context manager that receives all results in order of time.
+    """Context manager that receives all results in chronological order.
 
-    An InputError is raised if results cannot be written.
+    It raises InputError if results cannot be written.
 
     Attributes:
-        path: file or folder of the results, complete after the context.
-        needs_scans: the format needs the points of the clouds.
+        path: file or folder of the results, complete on exit from the context.
+        needs_scans: True if the format needs the points of the clouds.
     """
 
     path: Path
@@ -118,9 +118,12 @@ class BufferedFormat:
 
 
 class Kitti(BufferedFormat):
-    """Result files of KITTI's object benchmark, kitti/FRAME.txt, or with tracks of its tracking
+    """Result files in the formats of the KITTI benchmarks.
+
+    Detections are written as for the object benchmark, kitti/FRAME.txt, tracks as for the tracking
     benchmark, kitti/SEQUENCE.txt. Drives without a name are numbered 0000, 0001, ..., and their
-    frames are counted from 0."""
+    frames are counted from 0.
+    """
 
     def __init__(self, run: Run) -> None:
         super().__init__(run, run.out / FOLDER)
@@ -129,7 +132,7 @@ class Kitti(BufferedFormat):
         self.cameras: dict[str, Calibration] = {}
 
     def add(self, result: FrameResult) -> None:
-        """Write the file of a frame, or keep its tracks for the file of the drive."""
+        """Write the file of a frame, or with tracking, keep its tracks for the file of the drive."""
         frame = result.frame
         calibration, nominal = choose_calibration(frame)
         if nominal:
@@ -148,16 +151,16 @@ class Kitti(BufferedFormat):
     def finish(self) -> None:
         for drive, frames in self.drives.items():
             name = self.names[drive]
-            first = 0 if name == drive else frames[0][0]  # unnamed drives start at 0
+            first_number = 0 if name == drive else frames[0][0]  # unnamed drives start at 0
             write_tracking_results(
                 self.path / f"{name}.txt",
-                [(number - first, ids, found) for number, ids, found in frames],
+                [(number - first_number, ids, detections) for number, ids, detections in frames],
                 self.cameras[drive],
             )
 
 
 class Json(BufferedFormat):
-    """One JSON document, detections.json: a header, then one frame on each line."""
+    """One JSON document, detections.json: a header, then one frame per line."""
 
     def __init__(self, run: Run) -> None:
         super().__init__(run, run.out / "detections.json")
@@ -191,7 +194,7 @@ class Json(BufferedFormat):
 
 
 class Csv(BufferedFormat):
-    """One table, detections.csv, with a row for each object; see COLUMNS."""
+    """One table, detections.csv, with one row per object; see COLUMNS."""
 
     def __init__(self, run: Run) -> None:
         super().__init__(run, run.out / "detections.csv")
@@ -223,8 +226,11 @@ class Csv(BufferedFormat):
 
 
 class OpenLabel(BufferedFormat):
-    """ASAM OpenLABEL, openlabel/SEQUENCE.json, for `convert` and `label`; 0000.json without
-    sequences. The velocity of a track is an attribute of its cuboid."""
+    """ASAM OpenLABEL files, openlabel/SEQUENCE.json, for `convert` and `label`.
+
+    A recording without sequences has one file, 0000.json. The velocity of a track is an attribute
+    of its cuboid.
+    """
 
     def __init__(self, run: Run) -> None:
         super().__init__(run, run.out / "openlabel")
@@ -232,15 +238,15 @@ class OpenLabel(BufferedFormat):
 
     def add(self, result: FrameResult) -> None:
         """Keep the labels of a frame."""
-        frame, found = result.frame, make_rows(result)
+        frame, rows = result.frame, make_rows(result)
         self.labels[frame.name] = FrameLabels.of(
             frame.name,
             frame.stamp_ns,
             result.objects.boxes,
-            [row["class"] for row in found],
-            [-1 if row["id"] is None else row["id"] for row in found],
-            [row["score"] for row in found],
-            [{"velocity": row["velocity"]} if row["velocity"] else {} for row in found],
+            [row["class"] for row in rows],
+            [-1 if row["id"] is None else row["id"] for row in rows],
+            [row["score"] for row in rows],
+            [{"velocity": row["velocity"]} if row["velocity"] else {} for row in rows],
         )
 
     def finish(self) -> None:
@@ -258,14 +264,17 @@ def mask_numbers(line: str) -> str:
 
 
 def make_rows(result: FrameResult) -> list[dict[str, Any]]:
-    """Return the objects of a frame as JSON objects with id, velocity (both None without tracks),
-    class, score, and the numbers of the box named as in BOX."""
-    found, tracks = result.objects, result.tracks
+    """Return the objects of a frame as JSON objects.
+
+    They have id and velocity (both None without tracks), class, score, and the values of the box
+    with the names in BOX.
+    """
+    objects, tracks = result.objects, result.tracks
     ids = repeat(None) if tracks is None else tracks.ids.tolist()
     velocities = repeat(None) if tracks is None else to_short_floats(tracks.velocities)
     return [
-        {"id": number, "class": CLASSES[c], "score": score, **dict(zip(BOX, box)), "velocity": velocity}
-        for number, velocity, c, score, box in zip(
-            ids, velocities, found.class_ids, to_short_floats(found.scores), to_short_floats(found.boxes)
+        {"id": track_id, "class": CLASSES[class_id], "score": score, **dict(zip(BOX, box)), "velocity": velocity}
+        for track_id, velocity, class_id, score, box in zip(
+            ids, velocities, objects.class_ids, to_short_floats(objects.scores), to_short_floats(objects.boxes)
         )
     ]

@@ -21,10 +21,10 @@ MIN_DATE_NS = 10**18  # stamps from September 2001 on are dates; smaller ones ar
 
 
 class FrameDrawer:
-    """Draw results; all pictures of a run show the same area.
+    """Draws results; all pictures of a run show the same area.
 
     Args:
-        color: colours of the points, "height" or "intensity".
+        color: value that determines the colours of the points, "height" or "intensity".
         size: width and height in pixels.
     """
 
@@ -35,7 +35,7 @@ class FrameDrawer:
         self._drawn: tuple[str, np.ndarray] | None = None
 
     def get_stage(self, result: FrameResult) -> Stage:
-        """Return the stage of the run, determined by the first result."""
+        """Return the stage of the run, which is created from the first result."""
         if self.stage is None:
             self._first_ns = result.frame.stamp_ns
             self.stage = Stage.of(
@@ -69,7 +69,7 @@ class FrameDrawer:
         return self._drawn[1]
 
     def title(self, result: FrameResult) -> str:
-        """Return a title with recording, frame and detector."""
+        """Return the title of a picture, with recording, frame and detector."""
         frame = result.frame
         name = f"#{frame.index}" if frame.name.startswith(str(frame.stamp_ns)) else frame.name
         path = self.run.recording.path
@@ -84,17 +84,17 @@ class FrameDrawer:
 
 
 def make_labelled_boxes(result: FrameResult) -> Boxes:
-    """Return the boxes of a result with texts: id and speed of tracks, otherwise the score."""
-    found, tracks = result.objects, result.tracks
+    """Return the boxes of a result with their texts: id and speed of tracks, otherwise the score."""
+    objects, tracks = result.objects, result.tracks
     if tracks is None:
-        return Boxes(found.boxes, found.class_ids, [f"{score:.2f}" for score in found.scores])
-    moving = tracks.moving >= MIN_MOVING
-    velocities = np.where(moving[:, None], tracks.velocities, 0.0)
+        return Boxes(objects.boxes, objects.class_ids, [f"{score:.2f}" for score in objects.scores])
+    is_moving = tracks.moving >= MIN_MOVING
+    velocities = np.where(is_moving[:, None], tracks.velocities, 0.0)
     texts = [
-        f"{number}  {np.hypot(*velocity):.1f} m/s" if moves else str(number)
-        for number, velocity, moves in zip(tracks.ids.tolist(), velocities, moving)
+        f"{track_id}  {np.hypot(*velocity):.1f} m/s" if moves else str(track_id)
+        for track_id, velocity, moves in zip(tracks.ids.tolist(), velocities, is_moving)
     ]
-    return Boxes(found.boxes, found.class_ids, texts, result.trails, velocities)
+    return Boxes(objects.boxes, objects.class_ids, texts, result.trails, velocities)
 
 
 class PictureWriter:
@@ -120,7 +120,7 @@ class PictureWriter:
 
 
 class VideoWriter:
-    """Writes a video of all frames, timed as in the recording."""
+    """Writes a video of all frames with the timing of the recording."""
 
     needs_scans = True
 

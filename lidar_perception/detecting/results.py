@@ -26,8 +26,9 @@ class FrameResult:
     """The result of one frame.
 
     Attributes:
-        detections: detections that reach their threshold.
-        frame_id: that of the cloud.
+        frame: the frame of the recording.
+        detections: detections that reach the threshold of their class.
+        frame_id: coordinate frame of the cloud.
         ms: duration of detection in milliseconds.
         problem: problem reported by the detector, or None.
         tracks: None without tracking.
@@ -53,18 +54,21 @@ class FrameResult:
 
 
 def measure_records(open_: Callable[[], Detector], recording: Recording) -> Callable[[Frame], str]:
-    """Return a function that runs the detector of open_() and returns its record, a JSON text.
+    """Return a function that runs the detector on a frame and returns the record as a JSON string.
 
     partial(measure_records, open_) is a StartMeasurement of scoring.run.
+
+    Args:
+        open_: opens the detector.
     """
     detector = open_()
 
     def measure(frame: Frame) -> str:
         scan = frame.load()
         begin = perf_counter()
-        found = detector(scan)
+        output = detector(scan)
         ms = (perf_counter() - begin) * 1e3
-        objects = found.detections
+        objects = output.detections
         if not (np.isfinite(objects.boxes).all() and np.isfinite(objects.scores).all()):
             raise InputError(f"{frame.name}: the detector returned numbers that are not finite; check its weights")
         return json.dumps(
@@ -72,7 +76,7 @@ def measure_records(open_: Callable[[], Detector], recording: Recording) -> Call
                 "frame": frame.name,
                 "frame_id": scan.frame_id,
                 "ms": round(ms, 3),
-                "problem": found.problem,
+                "problem": output.problem,
                 "classes": [CLASSES[i] for i in objects.class_ids],
                 "boxes": to_short_floats(objects.boxes),
                 "scores": to_short_floats(objects.scores),
@@ -84,16 +88,19 @@ def measure_records(open_: Callable[[], Detector], recording: Recording) -> Call
 
 
 def read_detections(record: Mapping[str, Any]) -> Detections:
-    """Return the detections of a record, bit for bit."""
-    found = Detections.of(record["boxes"], class_ids(record["classes"]), record["scores"])
+    """Restore the detections of a record without rounding errors."""
+    detections = Detections.of(record["boxes"], class_ids(record["classes"]), record["scores"])
     return replace(
-        found, sources={name: np.array(probabilities, np.float32) for name, probabilities in record["sources"].items()}
+        detections,
+        sources={name: np.array(probabilities, np.float32) for name, probabilities in record["sources"].items()},
     )
 
 
 def to_short_floats(values: np.ndarray) -> Any:
-    """Convert an array to nested lists with the fewest digits that give the same float32; NaN
-    becomes None."""
+    """Convert an array to nested lists, with the fewest digits that give the same float32.
+
+    NaN becomes None.
+    """
     values = np.asarray(values, np.float32)
     if values.ndim > 1:
         return [to_short_floats(row) for row in values]
@@ -134,16 +141,17 @@ def make_results(
 ) -> Callable[[Frame], FrameResult]:
     """Return a function that makes the FrameResult of a frame from its record.
 
-    Frames must be processed in order of time, in one process. With all arguments but the last,
-    partial() makes this a StartMeasurement of scoring.run.
+    Frames must be processed in chronological order, in one process. partial() with all arguments
+    except the last one gives a StartMeasurement of scoring.run.
 
     Args:
         read_record: returns the record of a frame by its name.
         min_scores: threshold of each class.
-        make_tracker: returns the tracker for a recording, which also uses weak detections; None: no
-            tracks.
+        make_tracker: returns the tracker for a recording, which also uses detections below the
+            thresholds; None: no tracks.
         report: see with_optional_parts.
         scans: also read the scans; frames whose scan cannot be read are skipped.
+        recording: the recording of the frames.
     """
     thresholds = np.array([min_scores.get(name, 0.0) for name in CLASSES], np.float32)
     tracker = None if make_tracker is None else make_tracker(recording)
@@ -153,25 +161,25 @@ def make_results(
         record = read_record(frame.name)
         if (reason := record.get("skipped")) is not None:
             raise InputError(reason)
-        frame, found = with_optional_parts(frame, report), read_detections(record)
+        frame, detections = with_optional_parts(frame, report), read_detections(record)
         if scans:
             frame.load()
         result = FrameResult(
             frame,
-            found[found.scores >= thresholds[found.class_ids]],
+            detections[detections.scores >= thresholds[detections.class_ids]],
             record["frame_id"],
             record["ms"],
             record["problem"],
         )
         if tracker is None:
             return result
-        tracks, inner = tracker(frame, found), tracker.tracker
+        tracks, inner_tracker = tracker(frame, detections), tracker.tracker
         return replace(
             result,
             tracks=tracks,
             drive=tracker.drive,
-            trails=tuple(trails(tracks, inner.pose, frame.stamp_ns, TRAIL_S)),
-            tracking_problem=inner.problem,
+            trails=tuple(trails(tracks, inner_tracker.pose, frame.stamp_ns, TRAIL_S)),
+            tracking_problem=inner_tracker.problem,
         )
 
     return measure

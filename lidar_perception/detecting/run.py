@@ -1,4 +1,4 @@
-"""A run: the detector on all frames of a recording, then the output formats in order of time."""
+"""Run a detector on all frames of a recording and write the results in chronological order."""
 
 from __future__ import annotations
 
@@ -34,14 +34,15 @@ OUTPUT_PATTERNS = ("kitti/**/*.txt", "detections.json", "detections.csv", "openl
 
 @dataclass
 class Summary:
-    """Statistics of the results of a run. It also passes the results on to the formats.
+    """Statistics of the results of a run; also forwards the results to the output formats.
 
     Attributes:
+        formats: the output formats.
         frames: number of results.
-        boxes: number of boxes by class.
-        tracks: ids of tracks.
-        ms: durations of detection.
-        problems: problems of detector and tracker with their numbers of frames.
+        boxes: number of boxes of each class.
+        tracks: ids of the tracks.
+        ms: duration of each detection in milliseconds.
+        problems: number of frames with each problem of the detector or tracker.
         skipped: one line for each frame without a result.
     """
 
@@ -62,16 +63,16 @@ class Summary:
         self.ms.append(result.ms)
         for problem in filter(None, (result.problem, result.tracking_problem)):
             self.problems[self._first.setdefault(mask_numbers(problem), problem)] += 1
-        for each in self.formats:
-            each.add(result)
+        for output in self.formats:
+            output.add(result)
 
     @property
     def paths(self) -> list[Path]:
         """Paths of the results that exist."""
-        return [each.path for each in self.formats if each.path.exists()]
+        return [output.path for output in self.formats if output.path.exists()]
 
     def compute(self) -> dict[str, Any]:
-        """Return the statistics as JSON; ms is the median, None without frames."""
+        """Return the statistics as a JSON object; ms is the median, None without frames."""
         return {
             "frames": self.frames,
             "boxes": dict(self.boxes),
@@ -89,26 +90,27 @@ def make_header(
     *,
     tracking: TrackingParams | None = None,
     ego: str | None = None,
-    **more: Any,
+    **settings: Any,
 ) -> dict[str, Any]:
     """Return a JSON object with everything that determines the results of a run.
 
     Two runs with the same header have the same results.
 
     Args:
-        weights: a file or a name.
-        detector: opened from `weights`, with the thresholds of the written boxes.
-        ego: source of poses for the tracks.
-        more: other settings.
+        weights: file or name of the weights.
+        detector: detector opened from `weights`, with the thresholds for the written boxes.
+        tracking: parameters of the tracker; None without tracking.
+        ego: source of the sensor poses for tracking.
+        settings: other settings that affect the results.
     """
-    kind, file = resolve_weights(weights)
-    digest = None if file is None else hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+    kind, weights_file = resolve_weights(weights)
+    digest = None if weights_file is None else hashlib.sha256(weights_file.read_bytes()).hexdigest()[:16]
     return {
         "version": __version__,
         "data": str(recording.path.absolute()),
         "layout": recording.layout,
         "frames_in_data": len(recording),
-        **more,
+        **settings,
         "detector": kind,
         "weights": weights,
         "weights_sha256": digest,
@@ -135,43 +137,51 @@ def detect(
     """Run a detector on the first run.count frames of a recording and write the results.
 
     Detections are written if they reach the min_scores of run.header. With tracking, the tracks of
-    all detections are written instead. Finished frames are saved in run.out at once. A stopped run
-    with the same header is resumed, and other formats are added without detecting again. Except for
-    durations, results do not depend on resuming, jobs or dask, see scoring.run.measure_frames.
+    all detections are written instead. Each finished frame is saved in run.out immediately. An
+    interrupted run with the same header is resumed, and further formats can be added without
+    detecting again. Except for durations, results do not depend on resuming, jobs or dask, see
+    scoring.run.measure_frames.
 
     Args:
         open_: opens the detector.
-        force: start over if run.out has other results.
+        formats: constructors of the output formats.
+        tracking: parameters of the tracker; None: no tracks.
+        ego: source of the sensor poses for tracking.
+        jobs: number of parallel processes.
+        dask: address of a Dask scheduler; None: run on this machine.
+        force: start over if run.out has the results of another run.
 
     Raises:
-        InputError: run.out has other results, results cannot be written, or a process or the
-            cluster fails.
+        InputError: run.out has the results of another run, results cannot be written, or a process
+            or the cluster fails.
     """
     recording = run.recording
     tracker = None if tracking is None else partial(DriveTracker, params=tracking, ego=ego)
-    with open_journal(run.out, run.header, force=force, list_files=list_outputs) as done:
+    with open_journal(run.out, run.header, force=force, list_files=list_outputs) as journal:
         names = [frame.name for frame in islice(recording, run.count)]
-        fill_journal(done, recording, partial(measure_records, open_), names, jobs=jobs, dask=dask, title="detecting")
-        done.sort(names)
+        fill_journal(
+            journal, recording, partial(measure_records, open_), names, jobs=jobs, dask=dask, title="detecting"
+        )
+        journal.sort(names)
 
         def read_record(name: str) -> Any:
-            return json.loads(done.lines[name])
+            return json.loads(journal.lines[name])
 
         with ExitStack() as stack:
-            made = [stack.enter_context(make(run)) for make in formats]
-            start = partial(
+            open_formats = [stack.enter_context(make(run)) for make in formats]
+            start_results = partial(
                 make_results,
                 read_record,
                 run.header["min_scores"],
                 tracker,
                 run.add_remark,
-                any(each.needs_scans for each in made),
+                any(output.needs_scans for output in open_formats),
             )
-            summary = Summary(made, skipped=run.skipped)
-            fill_report(summary, recording, start, limit=run.count, title="writing")
+            summary = Summary(open_formats, skipped=run.skipped)
+            fill_report(summary, recording, start_results, limit=run.count, title="writing")
     return summary
 
 
 def list_outputs(folder: Path) -> list[Path]:
-    """List the output files of runs in a folder, without the journal."""
+    """List the output files of runs in a folder, except the journal and the bag."""
     return [path for pattern in OUTPUT_PATTERNS for path in folder.glob(pattern)]
