@@ -22,7 +22,7 @@ from rosbags.interfaces import Qos
 
 from lidar_perception.data.bag_metadata import (
     LATCHED_QOS,
-    NAME,
+    METADATA_FILE,
     SENSOR_QOS,
     add_differences,
     complete_profile,
@@ -68,14 +68,14 @@ def _to_yaml(content: Any) -> str:
 class BagWriter:
     """Writer of a rosbag2 folder with one MCAP file, checksums and metadata.yaml.
 
-    A context manager. The folder is named NAME.incomplete until it is complete, and only one
-    process can write it. After an exception, it stays as a valid bag with the messages written so
-    far. InputError if the disk is full.
+    Use it as a context manager. The folder is named NAME.incomplete until it is complete, and only
+    one process can write it. After an exception, it remains as a valid bag with the messages
+    written so far. Raises InputError if the disk is full.
 
     Args:
         path: folder of the bag.
         force: replace an existing bag.
-        compression: of the chunks, a key of COMPRESSIONS.
+        compression: compression of the chunks, a key of COMPRESSIONS.
     """
 
     def __init__(self, path: str | Path, *, force: bool = False, compression: str = "zstd"):
@@ -139,7 +139,11 @@ class BagWriter:
         )
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Append a message: an object of make_bag_message, or CDR bytes."""
+        """Append a message.
+
+        Args:
+            message: object made by make_bag_message, or CDR bytes.
+        """
         channel = self.channels[topic]
         raw = message if isinstance(message, bytes) else encode(message)
         with self._name_write_error():
@@ -147,7 +151,7 @@ class BagWriter:
         self.topics[list(self.channels).index(topic)]["message_count"] += 1
         self.times.append(stamp_ns)
 
-    def __exit__(self, kind, error, trace) -> None:
+    def __exit__(self, error_type, error, traceback) -> None:
         with self.open, self._name_write_error():
             try:
                 self._finish()
@@ -155,10 +159,10 @@ class BagWriter:
                 # A bag without an index and without metadata.yaml is still valid.
                 self.file.close_with(NO_INDEX)
                 (self.partial / "metadata.yaml").unlink(missing_ok=True)
-                if kind is None:
+                if error_type is None:
                     raise
                 return  # the exception that ended the context propagates
-            if kind is None:
+            if error_type is None:
                 if self.path.exists():
                     shutil.rmtree(self.path)
                 self.partial.rename(self.path)
@@ -194,7 +198,7 @@ class BagWriter:
 
 
 class Bag:
-    """A bag open for reading; a context manager.
+    """A bag open for reading. Use it as a context manager.
 
     A bag is a rosbag2 folder, a folder of ROS 1 bags, or one storage file. Topics, counts and times
     come from its files; an InputWarning lists differences to metadata.yaml.
@@ -228,14 +232,14 @@ class Bag:
             self.end_ns = max((last + 1 for _, last in times), default=0)
             add_differences(metadata, recorded, self.start_ns, self.end_ns - self.start_ns - 1)
             self._offered = metadata.qos
-            for topic, (kind, _) in metadata.topics.items():
+            for topic, (type_name, _) in metadata.topics.items():
                 if topic not in self.unreadable:
-                    self.topics.setdefault(topic, kind)
+                    self.topics.setdefault(topic, type_name)
                     self.counts.setdefault(topic, 0)
             if metadata.problems:
                 shown, more = metadata.problems[:MAX_SHOWN], len(metadata.problems) - MAX_SHOWN
                 problems.append(
-                    f"{self.path / NAME} does not match the bag: {'; '.join(shown)}"
+                    f"{self.path / METADATA_FILE} does not match the bag: {'; '.join(shown)}"
                     f"{f', and {more} more' if more > 0 else ''}. The contents of the "
                     "storage files are used"
                 )
@@ -262,7 +266,7 @@ class Bag:
         for name, counts_by_type in counts_by_topic.items():
             self.unreadable.pop(name, None)
             (self.topics[name], self.counts[name]), *others = counts_by_type.most_common()
-            if left_out := [f"{count} of {kind}" for kind, count in others if count]:
+            if left_out := [f"{count} of {type_name}" for type_name, count in others if count]:
                 problems.append(
                     f"{self.path}: {name} has messages of several types; only "
                     f"{self.topics[name]} is read, not {', '.join(left_out)}"
@@ -280,19 +284,22 @@ class Bag:
 
     @property
     def layout(self) -> str:
-        """Kind of bag: "rosbag2 bag" or "ROS 1 bag"."""
+        """Bag format: "rosbag2 bag" or "ROS 1 bag"."""
         return f"{'ROS 1' if isinstance(self.files[0][1], Ros1File) else 'rosbag2'} bag"
 
     @property
     def content(self) -> str:
         """Topics with their types, as text."""
         others = {name: f"{topic.type} as {topic.encoding}" for name, topic in self.unreadable.items()}
-        return ", ".join(f"{topic} ({kind})" for topic, kind in sorted({**others, **self.topics}.items())) or "nothing"
+        return (
+            ", ".join(f"{topic} ({type_name})" for topic, type_name in sorted({**others, **self.topics}.items()))
+            or "nothing"
+        )
 
     def qos(self, topic: str) -> list[Qos]:
-        """Return the recorded QoS profiles of a topic, those of metadata.yaml first; [] if unknown.
+        """Return the recorded QoS profiles of a topic; [] if unknown.
 
-        People edit metadata.yaml for `ros2 bag play`.
+        Profiles in metadata.yaml take precedence, because people edit it for `ros2 bag play`.
         """
         return parse_profiles(self._offered.get(topic)) or list(
             dict.fromkeys(
@@ -320,39 +327,41 @@ class Bag:
         """Yield (topic, time in ns, CDR bytes) in order of time.
 
         Args:
-            topics: default all.
+            topics: names of topics; None: all.
             start_ns, stop_ns: only messages with start_ns <= time < stop_ns.
 
         Raises:
             InputError: the bag is damaged. A wrong number of messages is detected at the end of a
                 file.
         """
-        wanted = self.topics.keys() & (self.topics if topics is None else {*topics})
+        selected_topics = self.topics.keys() & (self.topics if topics is None else {*topics})
         start, stop = START if start_ns is None else start_ns, END if stop_ns is None else stop_ns
         return merge_streams(
-            (file.times[0], partial(self._read_file, path, file, wanted, start, stop))
+            (file.times[0], partial(self._read_file, path, file, selected_topics, start, stop))
             for path, file in self.files
             if file.times and file.times[0] < stop and start <= file.times[1]
         )
 
     def _read_file(
-        self, path: Path, file: StorageFile, wanted: set[str], start: int, stop: int
+        self, path: Path, file: StorageFile, selected_topics: set[str], start: int, stop: int
     ) -> Iterator[tuple[str, int, bytes]]:
-        names = {
+        name_by_id = {
             topic.id: topic.name
             for topic in file.topics
-            if topic.name in wanted and topic.encoding == "cdr" and topic.type == self.topics[topic.name]
+            if topic.name in selected_topics and topic.encoding == "cdr" and topic.type == self.topics[topic.name]
         }
-        if not names:
+        if not name_by_id:
             return
-        found = Counter[int]()
+        message_counts = Counter[int]()
         try:
-            for topic_id, time, data in file.messages(names, start, stop):
-                found[topic_id] += 1
-                yield names[topic_id], time, decompress_message(data)
+            for topic_id, time, data in file.messages(name_by_id, start, stop):
+                message_counts[topic_id] += 1
+                yield name_by_id[topic_id], time, decompress_message(data)
             for topic in file.topics if start <= self.start_ns and stop == END else ():
-                if topic.id in names and topic.messages != found[topic.id]:
-                    raise ValueError(f"it declares {topic.messages} messages on {topic.name} and has {found[topic.id]}")
+                if topic.id in name_by_id and topic.messages != message_counts[topic.id]:
+                    raise ValueError(
+                        f"it declares {topic.messages} messages on {topic.name} and has {message_counts[topic.id]}"
+                    )
         except Exception as error:  # zstd, struct, SQLite and rosbags raise their own types
             raise InputError(describe_damage(path, error)) from None
 
@@ -368,8 +377,8 @@ class Bag:
 class BagHandle:
     """A bag that stays open, for reading single messages without reading its index again.
 
-    Each process and each thread has its own open bag, as SQLite requires; it is closed with the
-    thread, or when the handle is deleted. Only the first one warns.
+    Each process and each thread opens its own bag, because SQLite requires it. The bag is closed
+    with the thread, or when the handle is deleted. Only the first one emits warnings.
     """
 
     def __init__(self, path: Path, warn: bool = True):

@@ -17,7 +17,7 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import Bag, BagHandle
-from lidar_perception.data.bag_metadata import NAME
+from lidar_perception.data.bag_metadata import METADATA_FILE
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.cloud_files import is_cloud
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES, Frame, PointTruth, Recording
@@ -38,11 +38,11 @@ def is_layout(path: Path) -> bool:
     """Return True for a bag file, or a folder with one."""
     if path.is_file():
         return not is_cloud(path)  # the only other single files are clouds
-    return (path / NAME).is_file() or bool(list_storage_files(path))
+    return (path / METADATA_FILE).is_file() or bool(list_storage_files(path))
 
 
 def choose_cloud_topic(bag: Bag, points: str = "") -> str:
-    """Choose the topic of the clouds: `points` if given, else /points, else the only one.
+    """Choose the topic of the clouds: `points` if given, otherwise /points, otherwise the only one.
 
     Raises InputError if there is no such topic, or if the choice is ambiguous.
     """
@@ -79,7 +79,7 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     frames.check_readable()
     with suppress(InputError):  # a damaged cloud is reported when it is read
         has_point_labels = frames.first is not None and frames.decode_labelled(frames.first[1]) is not None
-    has = frozenset(kind for kind, needed in TOPICS_BY_CONTENT.items() if needed <= topics) | {
+    has = frozenset(content for content, required in TOPICS_BY_CONTENT.items() if required <= topics) | {
         *[POINT_LABELS] * has_point_labels,
         *[POSES] * frames.poses.available,
     }
@@ -112,12 +112,12 @@ class BagFrames(Sequence):
         return self.clouds
 
     def __iter__(self) -> Iterator[Frame]:
-        names: Counter[int] = Counter()
+        stamp_counts: Counter[int] = Counter()
         with Bag(self.path, warn=False) as bag:
             for i, (_, time, data) in enumerate(bag.raw_messages({self.points})):
                 stamp = self._stamp(data, time)
-                names[stamp] += 1
-                yield self._make_frame(i, time, stamp, names[stamp], partial(bytes, data))
+                stamp_counts[stamp] += 1
+                yield self._make_frame(i, time, stamp, stamp_counts[stamp], partial(bytes, data))
 
     def stamps(self) -> np.ndarray:
         """Return the stamps (count,) int64 ns of all clouds; the whole bag is read once."""
@@ -125,8 +125,8 @@ class BagFrames(Sequence):
 
     def message(self, i: int) -> Any:
         """Return cloud i as a PointCloud2 with all recorded columns."""
-        time, before, *_ = self._index[i]
-        return decode_cloud(self._read(time, before), self.kind)
+        time, earlier_count, *_ = self._index[i]
+        return decode_cloud(self._read(time, earlier_count), self.kind)
 
     def __getitem__(self, i):
         if isinstance(i, slice):
@@ -137,26 +137,26 @@ class BagFrames(Sequence):
         if i == 0 and self.first is not None:
             time, data = self.first
             return self._make_frame(0, time, self._stamp(data, time), 1, lambda: data)
-        time, before, stamp, occurrence = self._index[i]
-        return self._make_frame(i, time, stamp, occurrence, partial(self._read, time, before))
+        time, earlier_count, stamp, occurrence = self._index[i]
+        return self._make_frame(i, time, stamp, occurrence, partial(self._read, time, earlier_count))
 
     @cached_property
     def _index(self) -> list[tuple[int, int, int, int]]:
-        """Time, number of earlier clouds of this time, stamp, and number of clouds of this stamp so
-        far, for each cloud."""
-        times: Counter[int] = Counter()
-        names: Counter[int] = Counter()
+        """For each cloud: log time, number of earlier clouds with this time, stamp, and number of
+        clouds with this stamp so far."""
+        time_counts: Counter[int] = Counter()
+        stamp_counts: Counter[int] = Counter()
         rows = []
         for _, time, data in self.handle.bag().raw_messages({self.points}):
             stamp = self._stamp(data, time)
-            names[stamp] += 1
-            rows.append((time, times[time], stamp, names[stamp]))
-            times[time] += 1
+            stamp_counts[stamp] += 1
+            rows.append((time, time_counts[time], stamp, stamp_counts[stamp]))
+            time_counts[time] += 1
         return rows
 
-    def _read(self, time: int, before: int) -> bytes:
+    def _read(self, time: int, earlier_count: int) -> bytes:
         messages = self.handle.bag().raw_messages({self.points}, time, time + 1)
-        return next(islice(messages, before, None))[2]
+        return next(islice(messages, earlier_count, None))[2]
 
     @cached_property
     def _annotations(self) -> tuple[dict[int, GroundTruth], list, list]:
@@ -192,15 +192,17 @@ class BagFrames(Sequence):
         return next(((time, bytes(data)) for _, time, data in raw), None)
 
     def _stamp(self, data: bytes, time: int) -> int:
-        """Return header.stamp of a serialized cloud in ns; its time in the bag if all clouds lack a
-        stamp, or if the message is too short."""
+        """Return header.stamp of a serialized cloud in ns.
+
+        The log time is used if all clouds lack a stamp, or if the message is too short.
+        """
         if (stamp := _read_header_stamp(data)) == 0 and self._has_no_stamps:
             stamp = None
         return time if stamp is None else stamp
 
     @cached_property
     def _has_no_stamps(self) -> bool:
-        """True if all stamps are 0; a few are at the start of simulated time."""
+        """True if all stamps are 0; at the start of simulated time only a few are."""
         messages = self.handle.bag().raw_messages({self.points})
         return not any(_read_header_stamp(data) for *_, data in messages)
 
@@ -208,7 +210,7 @@ class BagFrames(Sequence):
     def full_scale(self) -> float:
         """Intensity of a full reflection, the same for all frames.
 
-        It is inferred from the first clouds, as others would require reading the whole bag.
+        It is inferred from the first clouds, because others would require reading the whole bag.
         """
         return infer_scale(self._first_clouds(), lambda data: read_raw_intensity(decode_cloud(data, self.kind)))
 
@@ -294,6 +296,6 @@ def _read_frame_id(data: bytes) -> str:
 
 
 def _find_latest(messages: list, time: int) -> Any:
-    """Return the last message up to a time, else the first one, as for latched topics."""
+    """Return the last message up to a time; the first message if all are later."""
     after = bisect_right(messages, time, key=itemgetter(0))
     return messages[max(after - 1, 0)][1] if messages else None

@@ -1,8 +1,8 @@
 """Reading of rosbag2's metadata.yaml, versions 1 to 9, and of QoS profiles.
 
 The file is often incomplete or wrong: people edit it, `ros2 bag reindex` recreates it, and it may
-belong to other files. So only file names and QoS are taken from it; the rest is compared with the
-files.
+belong to other files. Therefore only file names and QoS are read from it, and the rest is compared
+with the files.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rosbags.rosbag2.metadata import parse_qos
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
-NAME = "metadata.yaml"
+METADATA_FILE = "metadata.yaml"
 MAX_BYTES = 2**26
 TOLERANCE_NS = 10**6  # maximum difference between times in metadata.yaml and in the files
 
@@ -62,7 +62,7 @@ class Metadata:
 
 def read_metadata(folder: Path) -> Metadata:
     """Read the metadata.yaml of a bag folder; empty if there is none, or if `folder` is a file."""
-    metadata, path = Metadata(), folder / NAME
+    metadata, path = Metadata(), folder / METADATA_FILE
     if not path.is_file():
         return metadata
     try:
@@ -74,11 +74,11 @@ def read_metadata(folder: Path) -> Metadata:
         metadata.start_ns = _read_number(info, "starting_time", "nanoseconds_since_epoch")
         metadata.duration_ns = _read_number(info, "duration", "nanoseconds")
         for topic in info["topics_with_message_count"] or ():
-            about = topic["topic_metadata"]
-            if not isinstance(about["name"], str) or not isinstance(about["type"], str):
-                raise ValueError(f"topic {about['name']!r} has the type {about['type']!r}")
-            metadata.topics[about["name"]] = about["type"], _read_number(topic, "message_count")
-            metadata.qos[about["name"]] = about.get("offered_qos_profiles")
+            topic_info = topic["topic_metadata"]
+            if not isinstance(topic_info["name"], str) or not isinstance(topic_info["type"], str):
+                raise ValueError(f"topic {topic_info['name']!r} has the type {topic_info['type']!r}")
+            metadata.topics[topic_info["name"]] = topic_info["type"], _read_number(topic, "message_count")
+            metadata.qos[topic_info["name"]] = topic_info.get("offered_qos_profiles")
     except (InputError, yaml.YAMLError, LookupError, TypeError, ValueError, AttributeError) as error:
         line = " ".join(str(error).split())
         metadata.problems.append(f"it cannot be parsed ({type(error).__name__}: {line})")

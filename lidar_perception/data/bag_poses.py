@@ -24,29 +24,30 @@ MAX_POSE_GAP_S = 0.5  # maximum gap between two poses, and before the first and 
 
 
 def choose_odometry_topic(topics: Mapping[str, str]) -> str:
-    """Choose the odometry topic: /odom, else /odometry/filtered, else the only one, else "".
+    """Choose the odometry topic: /odom, /odometry/filtered, or the only one; "" without any.
 
-    topics: types by name.
+    Args:
+        topics: {topic: type}.
     """
-    odometry_topics = [name for name, kind in topics.items() if kind == ODOMETRY_MESSAGE]
-    usual = [name for name in (ODOMETRY, FILTERED) if name in odometry_topics]
-    return usual[0] if usual else odometry_topics[0] if len(odometry_topics) == 1 else ""
+    odometry_topics = [name for name, type_name in topics.items() if type_name == ODOMETRY_MESSAGE]
+    preferred = [name for name in (ODOMETRY, FILTERED) if name in odometry_topics]
+    return preferred[0] if preferred else odometry_topics[0] if len(odometry_topics) == 1 else ""
 
 
 class BagPoses:
     """Poses of the clouds' frame in a fixed frame, interpolated at any time.
 
-    The source is chosen as by the tracker with ego.source auto. With odometry, it is the odometry
-    and TF from its child frame to the sensor; if TF does not connect the two, they are assumed to
-    coincide. Without odometry, it is TF, in odom if that is above the sensor, else in the topmost
-    frame in which the sensor moves.
+    The source is chosen like in the tracker with ego.source auto. With odometry, poses come from
+    the odometry and the TF from its child frame to the sensor; if TF does not connect the two, they
+    are assumed to coincide. Without odometry, poses come from TF: in odom if that is an ancestor of
+    the sensor, otherwise in the topmost frame in which the sensor moves.
     """
 
     def __init__(self, handle: BagHandle, frame_id: str):
         self.handle, self.path, self.frame_id = handle, handle.path, frame_id.lstrip("/")
         self.invalid_count = 0  # transforms and odometry messages without a valid pose
         bag = self.handle.bag()
-        topics = {name: kind for name, kind in bag.topics.items() if bag.counts[name]}
+        topics = {name: type_name for name, type_name in bag.topics.items() if bag.counts[name]}
         self.transforms = {name for name in (TF, TF_STATIC) if topics.get(name) == TF_MESSAGE}
         self.odometry = choose_odometry_topic(topics)
 
@@ -79,7 +80,7 @@ class BagPoses:
 
     @property
     def needs_no_tf(self) -> bool:
-        """True if nodes need no TF, as there are no poses or /odom is the sensor's own odometry."""
+        """True if nodes need no TF: there are no poses, or /odom is the sensor's own odometry."""
         return not self.available or (self.odometry == ODOMETRY and self.odometry_child == self.frame_id)
 
     @cached_property
@@ -94,7 +95,7 @@ class BagPoses:
 
     @cached_property
     def fixed(self) -> str:
-        """TF frame in which the sensor moves; "" if nothing above the sensor moves."""
+        """TF frame in which the sensor moves; "" if no ancestor of the sensor moves."""
         moving = [
             self._above[i + 1] for i, frame in enumerate(self._above[:-1]) if not self._first_transforms.is_fixed(frame)
         ]
@@ -115,8 +116,8 @@ class BagPoses:
 
     @property
     def base(self) -> str:
-        """Frame of the robot: the odometry's child frame, else the topmost frame in which the
-        sensor is fixed; "" without TF."""
+        """Frame of the robot: the odometry's child frame, or without odometry the topmost frame in
+        which the sensor is fixed; "" without TF."""
         if self.odometry_child and self.odometry_child != self.frame_id:
             return self.odometry_child
         # Stop at the first moving link, because odom may be static in a map above it.
@@ -158,8 +159,11 @@ class BagPoses:
         return self._odometry.lookup_many(FIXED, MOVING, times, MAX_POSE_GAP_S)
 
     def _sensor_in_odometry_child(self, times: np.ndarray) -> np.ndarray:
-        """Return the pose of the sensor in the child frame of the odometry: (4, 4) if it is fixed,
-        else (M, 4, 4) at times (M,) ns; identity without TF."""
+        """Return the pose of the sensor in the odometry's child frame.
+
+        Returns:
+            (4, 4) if it is fixed, otherwise (M, 4, 4) at times (M,) ns; identity without TF.
+        """
         if not {*self._above} & {*self._list_parents(self.odometry_child)}:
             return np.eye(4)
         if (pose := self.find_mount(self.odometry_child)) is not None:
@@ -178,7 +182,7 @@ class BagPoses:
 
     @cached_property
     def _first_transforms(self) -> TransformTree:
-        """Static transforms, and moving ones until a frame above the sensor moves."""
+        """Static transforms, and moving ones until an ancestor of the sensor moves."""
         tree = TransformTree(keeps_all=True)
         bag = self.handle.bag()
         for _, _, msg in bag.messages({TF_STATIC} & self.transforms):
@@ -218,8 +222,7 @@ class BagPoses:
 
 
 def _find_chain(tree: TransformTree, frame: str) -> list[str]:
-    """Return a frame, its parent, and so on to the root; the frame alone if the tree has a
-    cycle."""
+    """Return the frame and its ancestors up to the root; only the frame if the tree has a cycle."""
     try:
         return tree.find_chain(frame)
     except MissingTransform:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.data.nuscenes.folder import SWEEP
+from lidar_perception.data.nuscenes.folder import SWEEP_COLUMNS
 from lidar_perception.data.pcd import read_pcd
 from lidar_perception.data.ply import read_ply
 from lidar_perception.data.recorded_scale import make_scale_reader
@@ -21,7 +21,7 @@ from lidar_perception.wire.messages import read_raw_intensity, to_point_cloud
 from msg_utils.point_cloud2 import from_array, read_xyz
 from msg_utils.stamps import make_header
 
-KITTI = "x y z intensity"
+KITTI_COLUMNS = "x y z intensity"
 MAX_COLUMNS = 16  # maximum columns of a .npy file; an array with more is probably transposed
 MAX_RING = 256
 SAMPLE_SIZE = 2000  # number of points from which the columns of a .bin file are inferred
@@ -40,11 +40,14 @@ def make_cloud_scale_reader(files: Sequence[Path]) -> Callable[[], float]:
 
 
 def load_points(file: Path, stamp_ns: int, frame_id: str = "", *, scale: Callable[[], float]) -> PointCloud:
-    """Read the usable points of a file of SUFFIXES.
+    """Read the usable points of a file with one of SUFFIXES.
 
-    scale: returns the intensity of a full reflection, see make_cloud_scale_reader.
-    Raises InputError if the file is malformed, or if all points are beyond MAX_RANGE, as in map
-    coordinates (UTM).
+    Args:
+        scale: returns the intensity of a full reflection (see make_cloud_scale_reader).
+
+    Raises:
+        InputError: the file is malformed, or all points are beyond MAX_RANGE, for example in map
+            coordinates (UTM).
     """
     try:
         message = to_message(file, stamp_ns, frame_id)
@@ -56,21 +59,21 @@ def load_points(file: Path, stamp_ns: int, frame_id: str = "", *, scale: Callabl
     return frame
 
 
-def check_range(points: np.ndarray, where: object) -> None:
-    """Raise InputError, which names `where`, if all finite points are beyond MAX_RANGE."""
+def check_range(points: np.ndarray, source: object) -> None:
+    """Raise InputError, which names `source`, if all finite points are beyond MAX_RANGE."""
     coordinates = read_xyz(points)
-    far = np.abs(coordinates[np.isfinite(coordinates).all(axis=1)]).max(axis=1, initial=0)
-    if len(far) and far.min() > MAX_RANGE / 2:
+    max_coordinates = np.abs(coordinates[np.isfinite(coordinates).all(axis=1)]).max(axis=1, initial=0)
+    if len(max_coordinates) and max_coordinates.min() > MAX_RANGE / 2:
         x, y = (round(float(points[axis][0]), -3) for axis in "xy")
         raise InputError(
-            f"{where}: all points are beyond {MAX_RANGE / 1000:g} km, probably in "
+            f"{source}: all points are beyond {MAX_RANGE / 1000:g} km, probably in "
             f"map coordinates (UTM); subtract an offset, such as {x:.0f} {y:.0f}, "
             "from x y and save it again"
         )
 
 
 def to_message(file: Path, stamp_ns: int = 0, frame_id: str = "") -> Any:
-    """Read a file as a PointCloud2 of rosbags' class with all its columns."""
+    """Read a file as a PointCloud2 (class of rosbags) with all its columns."""
     points = read_points(file)
     # PointCloud2 has no 64-bit integers; as float64, times keep their microseconds.
     fields = [
@@ -84,7 +87,7 @@ def to_message(file: Path, stamp_ns: int = 0, frame_id: str = "") -> Any:
 
 
 def read_points(file: Path) -> np.ndarray:
-    """Read a file of SUFFIXES as structured array (N,) with all columns.
+    """Read a file with one of SUFFIXES as a structured array (N,) with all columns.
 
     Names are converted to lower case, CloudCompare's prefix "scalar_" is removed, and REFLECTANCE
     becomes "intensity". Raises InputError if the file cannot be read, or has no x, y or z.
@@ -148,27 +151,29 @@ def read_npy(file: Path) -> np.ndarray:
             f"{file} has an array {array.shape} of {array.dtype}; expected (N, 3) "
             "x y z or (N, 4) x y z intensity as float32"
         )
-    kind = np.float64 if array.dtype.itemsize == 8 else np.float32
-    return _to_structured(array[:, :4].astype(kind), KITTI)
+    dtype = np.float64 if array.dtype.itemsize == 8 else np.float32
+    return _to_structured(array[:, :4].astype(dtype), KITTI_COLUMNS)
 
 
 def _read_bin(file: Path) -> np.ndarray:
-    """Read a .bin file of float32: KITTI's four columns, or nuScenes' five, of which the last is
-    the ring. The number of columns is inferred from the values; InputError if neither fits."""
+    """Read a .bin file of float32 with KITTI's four columns, or nuScenes' five (the last is ring).
+
+    The number of columns is inferred from the values. Raises InputError if neither fits.
+    """
     if file.stat().st_size % 20 == 0:
-        cloud = read_records(file, SWEEP)
+        cloud = read_records(file, SWEEP_COLUMNS)
         ring = cloud[:SAMPLE_SIZE, 4]
         with np.errstate(invalid="ignore"):
             if ((ring >= 0) & (ring < MAX_RING) & (ring == np.floor(ring))).all():
-                return _to_structured(cloud, SWEEP)
-    cloud = read_records(file, KITTI)
+                return _to_structured(cloud, SWEEP_COLUMNS)
+    cloud = read_records(file, KITTI_COLUMNS)
     intensity = cloud[:SAMPLE_SIZE, 3]
     if np.count_nonzero(intensity < 0) > MAX_NEGATIVE_SHARE * len(intensity):
         raise InputError(
-            f"{file} does not have the columns {KITTI} or {SWEEP} as float32: many "
+            f"{file} does not have the columns {KITTI_COLUMNS} or {SWEEP_COLUMNS} as float32: many "
             "intensities would be negative; save it as .pcd, which names its columns"
         )
-    return _to_structured(cloud, KITTI)
+    return _to_structured(cloud, KITTI_COLUMNS)
 
 
 def _to_structured(cloud: np.ndarray, columns: str) -> np.ndarray:

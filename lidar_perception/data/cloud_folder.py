@@ -18,8 +18,10 @@ NANOSECOND_DIGITS = 9
 
 
 def list_cloud_files(path: Path) -> list[Path]:
-    """Return the point cloud file at a path, or those in a folder, by the times or numbers in their
-    names (2 before 10)."""
+    """Return the point cloud file at a path, or all in a folder.
+
+    They are sorted by the times or numbers in their names (2 before 10).
+    """
     files = [file for file in ([path] if path.is_file() else path.glob("*")) if is_cloud(file)]
     if stamps := _parse_stamps(files):
         return [file for _, file in sorted(zip(stamps, files))]
@@ -68,13 +70,13 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
 
 
 def parse_times(files: list[Path]) -> list[int]:
-    """Return the times in the names of files in ns; [] unless all have one and they ascend."""
+    """Return the timestamps in the file names, in ns; [] unless every name has one and they ascend."""
     stamps = _parse_stamps(files)
     return stamps if all(a < b for a, b in pairwise(stamps)) else []
 
 
 def _parse_stamps(files: list[Path]) -> list[int]:
-    """Return the times in the names of files in ns; [] unless all have one."""
+    """Return the timestamps in the file names, in ns; [] unless every name has one."""
     parts = [part for file in files if (part := _split_name(file)) is not None]
     if len(parts) < len(files):
         return []
@@ -97,9 +99,10 @@ def _parse_stamps(files: list[Path]) -> list[int]:
 
 
 def _split_name(file: Path) -> tuple[int, str] | None:
-    """Return the whole part of the time in a file name in ns, and the digits after the point.
+    """Return the integer part of the timestamp in a file name, in ns, and its fractional digits.
 
-    None if it is not a time; frames of KITTI's raw drives also have ten digits, but start with 0.
+    None if it is not a timestamp; frames of KITTI's raw drives also have ten digits, but start
+    with 0.
     """
     seconds, _, fraction = file.name.removesuffix(file.suffix).partition(".")
     if (

@@ -94,7 +94,7 @@ class Frame:
         scan: PointCloud,
         truth: GroundTruth | None = None,
         calibration: Calibration | None = None,
-        **more: Any,
+        **attributes: Any,
     ) -> Frame:
         """Make a frame from data in memory."""
         return Frame(
@@ -103,7 +103,7 @@ class Frame:
             partial(_identity, scan),
             partial(_identity, truth),
             calibration=partial(_identity, calibration),
-            **more,
+            **attributes,
         )
 
 
@@ -127,7 +127,7 @@ class ComputedFrames(Sequence[Frame]):
 
     @abstractmethod
     def compute_frame(self, number: int) -> Frame:
-        """Return the frame of a number from 0 to len(self) - 1."""
+        """Return frame `number` (0 <= number < len(self))."""
 
     @overload
     def __getitem__(self, index: int) -> Frame: ...
@@ -150,7 +150,7 @@ class Recording:
         layout: description of the recognised layout.
         has: content of at least some frames: BOXES, POINT_LABELS, CAMERA and POSES.
         missing_scans: (name, reason) of labels without a scan.
-        reopen: opens the recording again, also in another process; its arguments are those of
+        reopen: opens the recording again, also in another process; it has the arguments of
             data.open.open_recording.
         has_sensor_height: the recording states the sensor height; otherwise that of KITTI is
             assumed.
@@ -180,7 +180,7 @@ class Recording:
         return ", ".join((f"{self.path}: {self.layout}", count, *sorted(self.has)))
 
     def require(self, content: str, verb: str) -> None:
-        """Raise InputError if no frame has a content such as BOXES, which `verb` needs."""
+        """Raise InputError if no frame has the content, such as BOXES, that `verb` needs."""
         if content not in self.has:
             raise InputError(f"{self.path} ({self.layout}) has no {content.removeprefix('a ')}, which {verb} needs")
 

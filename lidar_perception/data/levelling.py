@@ -1,4 +1,4 @@
-"""Conversion of frames of a sensor in any mounting to those of a level one, x ahead, cropped."""
+"""Conversion of frames of a tilted or turned sensor to those of a level one with x ahead."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 
 @dataclass(frozen=True)
 class SensorMount:
-    """Mounting of a sensor, and parameters for reading its clouds, as of the nodes.
+    """Mounting of a sensor, and the parameters that nodes use to read its clouds.
 
     Attributes:
         height: metres above the ground; None: as in the recording.
-        roll, pitch: of the sensor, radians, as in a URDF's rpy.
+        roll, pitch: orientation of the sensor in radians, as in a URDF's rpy.
         ahead: direction of travel, counter-clockwise from the sensor's x axis, radians.
         crop: the robot's body in sensor coordinates.
         intensity_max: intensity of a full reflection; 0: as in the recording.
@@ -40,15 +40,16 @@ class SensorMount:
 
 
 def level_frame(frame: Frame, mount: SensorMount, poses: PoseLookup | None = None) -> Frame:
-    """Convert a frame of a bag or file to that of a level sensor at the same place, x ahead.
+    """Convert a frame of a bag or file to that of a level sensor at the same place, with x ahead.
 
-    Labels, camera and pose are transformed, too; boxes stay upright. If the cloud is rotated,
+    Labels, camera and pose are transformed too; boxes stay upright. If the cloud is rotated,
     "_level" is appended to its frame_id.
 
     Args:
-        frame: native() returns its message.
-        poses: returns the poses (M, 4, 4) of the sensor at times (M,) ns, for motion correction as
-            by input.deskew; load() raises InputError if a pose or the time column is missing.
+        frame: frame whose native() returns its message.
+        poses: returns the poses (M, 4, 4) of the sensor at times (M,) ns, for the same motion
+            correction as input.deskew. load() raises InputError if a pose or the time column is
+            missing.
     """
     rotation = find_level_transform(make_tilted_pose(mount.roll, mount.pitch), mount.ahead)
     inverse_rotation = np.eye(4) if rotation is None else invert_pose(rotation)
@@ -56,10 +57,10 @@ def level_frame(frame: Frame, mount: SensorMount, poses: PoseLookup | None = Non
     def read() -> tuple[np.ndarray, PointCloud]:
         message = frame.native()
         scan, indices = to_point_cloud(message, mount.intensity_max or frame.intensity_max())
-        kept, scan = crop_frame(scan, mount.crop, level=rotation)
+        kept_points, scan = crop_frame(scan, mount.crop, level=rotation)
         if poses is not None:
-            scan = deskew_frame(message, scan, indices.take(kept), poses)
-        return kept, scan
+            scan = deskew_frame(message, scan, indices.take(kept_points), poses)
+        return kept_points, scan
 
     def load() -> PointCloud:
         scan = read()[1]
@@ -75,8 +76,8 @@ def level_frame(frame: Frame, mount: SensorMount, poses: PoseLookup | None = Non
         labels = frame.point_truth()
         if labels is None or not mount.crop.enabled:
             return labels
-        kept, _ = read()
-        return PointTruth(labels.classes[kept], labels.instances[kept])
+        kept_points, _ = read()
+        return PointTruth(labels.classes[kept_points], labels.instances[kept_points])
 
     def truth() -> GroundTruth | None:
         labels = frame.truth()

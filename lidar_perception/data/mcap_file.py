@@ -63,7 +63,7 @@ class McapFile:
     chunks without a message index, and those that define channels which the summary lacks.
 
     Attributes:
-        profile: kind of messages as stated by the writer: ros2, ros1, or "".
+        profile: message format as stated by the writer: ros2, ros1, or "".
 
     Raises:
         ValueError: the file is damaged.
@@ -89,8 +89,7 @@ class McapFile:
         self.file.close()
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
-        """Yield (channel id, log time, data) of channels with start <= time < stop, in order of
-        time."""
+        """Yield (channel id, log time, data) of these channels for start <= time < stop, by time."""
         channels = {*ids}
         sources: list[tuple[int, Callable[[], Stream]]] = [
             (chunk.start, partial(self._messages_in_chunk, chunk, channels, start, stop))
@@ -105,8 +104,8 @@ class McapFile:
 
     def _messages_in_chunk(self, chunk: Chunk, channels: set[int], start: int, stop: int) -> Stream:
         data, messages = self._read_chunk(chunk), []
-        for kind, at, length in _iterate_records(partial(_slice, data), 0, len(data)):
-            if kind == MESSAGE:
+        for record_type, at, length in _iterate_records(partial(_slice, data), 0, len(data)):
+            if record_type == MESSAGE:
                 channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, at)
                 if not chunk.start <= time <= chunk.end:
                     raise ValueError("a chunk has messages outside its time range")
@@ -154,22 +153,22 @@ class McapFile:
             The messages outside of chunks, (M,) LOCATION with ascending times.
         """
         locations, end_of_last = [], len(MAGIC)
-        for kind, at, length in _iterate_records(self._read, len(MAGIC), end):
+        for record_type, at, length in _iterate_records(self._read, len(MAGIC), end):
             end_of_last = at + length
-            if kind == HEADER:
+            if record_type == HEADER:
                 self.profile = _parse_string(self._read(at, length), 0)[0].decode(errors="replace")
-            elif kind == MESSAGE:
+            elif record_type == MESSAGE:
                 channel, _, time, _ = MESSAGE_HEAD.unpack(self._read(at, MESSAGE_HEAD.size))
                 locations.append((_check_time(time), channel, at + MESSAGE_HEAD.size, length - MESSAGE_HEAD.size))
-            elif kind == CHUNK:
+            elif record_type == CHUNK:
                 self.chunks.append(_parse_chunk(self._read(at, HEAD_BYTES), at, length))
-            elif kind == MESSAGE_INDEX and self.chunks:
+            elif record_type == MESSAGE_INDEX and self.chunks:
                 channel, size = struct.unpack("<HI", self._read(at, 6))
                 if size:
                     self.chunks[-1].counts[channel] = size // ENTRY_BYTES
-            elif kind in (SCHEMA, CHANNEL):
-                self._add_definition(kind, self._read(at, length))
-            elif kind == DATA_END:
+            elif record_type in (SCHEMA, CHANNEL):
+                self._add_definition(record_type, self._read(at, length))
+            elif record_type == DATA_END:
                 break
         if end_of_last != end:
             raise ValueError("the data section does not end where the index begins")
@@ -178,18 +177,18 @@ class McapFile:
 
     def _check_summary(self, summary: bytes) -> None:
         indexed = []
-        for kind, at, length in _iterate_records(partial(_slice, summary), 0, len(summary)):
-            if kind in (SCHEMA, CHANNEL):
-                self._add_definition(kind, summary[at : at + length])
-            elif kind == CHUNK_INDEX:
+        for record_type, at, length in _iterate_records(partial(_slice, summary), 0, len(summary)):
+            if record_type in (SCHEMA, CHANNEL):
+                self._add_definition(record_type, summary[at : at + length])
+            elif record_type == CHUNK_INDEX:
                 indexed.append(_parse_chunk_index(summary[at : at + length]))
         if indexed and sorted(indexed) != sorted(chunk.index_entry for chunk in self.chunks):
             raise ValueError("the index does not match the data")
 
-    def _add_definition(self, kind: int, content: bytes) -> None:
-        """Add the definition of a schema or channel; the first one of an id counts."""
+    def _add_definition(self, record_type: int, content: bytes) -> None:
+        """Add the definition of a schema or channel, unless its id is already defined."""
         stream = ReadDataStream(BytesIO(content))
-        if kind == SCHEMA:
+        if record_type == SCHEMA:
             schema = Schema.read(stream)
             self.schemas.setdefault(schema.id, schema)
         else:
@@ -197,7 +196,7 @@ class McapFile:
             self.channels.setdefault(channel.id, channel)
 
     def _complete_definitions(self) -> None:
-        """Decompress the chunks without a message index, and first chunks until all channels with
+        """Decompress chunks without a message index, and earlier chunks until all channels with
         messages are defined."""
         earlier_chunks = iter(self.chunks)
         for chunk in self.chunks:
@@ -214,37 +213,37 @@ class McapFile:
 
     def _scan_chunk(self, chunk: Chunk) -> None:
         data, counts = self._read_chunk(chunk), dict[int, int]()
-        for kind, at, length in _iterate_records(partial(_slice, data), 0, len(data)):
-            if kind in (SCHEMA, CHANNEL):
-                self._add_definition(kind, data[at : at + length])
-            elif kind == MESSAGE:
+        for record_type, at, length in _iterate_records(partial(_slice, data), 0, len(data)):
+            if record_type in (SCHEMA, CHANNEL):
+                self._add_definition(record_type, data[at : at + length])
+            elif record_type == MESSAGE:
                 (channel,) = struct.unpack_from("<H", data, at)
                 counts[channel] = counts.get(channel, 0) + 1
         chunk.counts = chunk.counts or counts
 
     def _read_chunk(self, chunk: Chunk) -> bytes:
-        *_, packing, packed, size = chunk.index_entry
-        data = decompress(self._read(chunk.at, packed), packing.decode(), size)
+        *_, compression, compressed_size, size = chunk.index_entry
+        data = decompress(self._read(chunk.at, compressed_size), compression.decode(), size)
         if chunk.crc and crc32(data) != chunk.crc:
             raise ValueError("the checksum of a chunk is wrong")
         return data
 
     def _make_topics(self) -> list[Topic]:
-        numbers, message_counts = np.unique(self.locations["channel"], return_counts=True)
-        counts = dict(zip(numbers.tolist(), message_counts.tolist()))
+        channel_ids, message_counts = np.unique(self.locations["channel"], return_counts=True)
+        counts = dict(zip(channel_ids.tolist(), message_counts.tolist()))
         for chunk in self.chunks:
             for channel, count in chunk.counts.items():
                 counts[channel] = counts.get(channel, 0) + count
         return [
             Topic(
-                number,
+                channel_id,
                 channel.topic,
                 getattr(self.schemas.get(channel.schema_id), "name", ""),
                 channel.message_encoding,
                 channel.metadata.get("offered_qos_profiles", ""),
-                counts.get(number, 0),
+                counts.get(channel_id, 0),
             )
-            for number, channel in sorted(self.channels.items())
+            for channel_id, channel in sorted(self.channels.items())
         ]
 
     def _find_times(self) -> tuple[int, int] | None:
@@ -254,18 +253,18 @@ class McapFile:
         return (min(s for s, _ in spans), max(e for _, e in spans)) if spans else None
 
 
-def _iterate_records(read: Callable[[int, int], bytes], at: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """Yield the kind, the offset of the content, and the length of each record.
+def _iterate_records(read: Callable[[int, int], bytes], offset: int, end: int) -> Iterator[tuple[int, int, int]]:
+    """Yield the type, the offset of the content, and the length of each record.
 
     Raises ValueError if the last one extends beyond `end`.
     """
-    while at < end:
-        kind, length = RECORD.unpack(read(at, RECORD.size))
-        at += RECORD.size
-        if at + length > end:
+    while offset < end:
+        record_type, length = RECORD.unpack(read(offset, RECORD.size))
+        offset += RECORD.size
+        if offset + length > end:
             raise ValueError("the last record is truncated")
-        yield kind, at, length
-        at += length
+        yield record_type, offset, length
+        offset += length
 
 
 def _slice(data: bytes, at: int, size: int) -> bytes:

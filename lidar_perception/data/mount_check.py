@@ -29,8 +29,8 @@ def measure_sensor_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPosePa
     """Measure the height of the sensor above the ground around it, in metres.
 
     The ground is the plane through most of the lowest points of the cells of a grid, so that dense
-    walls or vehicles do not outweigh it. The height is negative for a plane overhead, as of a
-    sensor mounted upside down. None without such a plane.
+    walls or vehicles do not outweigh it. The height is negative if the plane is overhead, which
+    happens if the sensor is upside down. None without such a plane.
     """
     plane = _find_floor(level_points(xyz, pose))
     return None if plane is None else -float(plane[2])
@@ -91,10 +91,10 @@ def find_mount_problem(recording: Recording, clouds: Sequence[PointCloud]) -> st
     finding = (
         f"its sensor leans by {lean:.0f} degrees against the ground"
         if height >= 0
-        else f"the ground seems to be {-height:.2f} m above its sensor: it is upside down"
+        else f"the ground seems to be {-height:.2f} m above its sensor, so it is mounted upside down"
     )
     return (
-        f"{finding}, where detectors take z as up; measure it with setup, and make a level bag "
+        f"{finding}, but detectors expect z to point up; measure it with setup, and make a level bag "
         f"with convert {recording.path} --robot robot/robot.param.yaml --out level.bag"
     )
 
@@ -113,8 +113,8 @@ def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.nd
 
 def _find_lowest_points(xyz: np.ndarray) -> np.ndarray:
     """Return the lowest points (K, 3) of the cells around the sensor."""
-    square = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
-    nearby = xyz.compress((square >= MIN_RANGE_M**2) & (square <= MAX_RANGE_M**2), axis=0)
+    squared_range = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
+    nearby = xyz.compress((squared_range >= MIN_RANGE_M**2) & (squared_range <= MAX_RANGE_M**2), axis=0)
     side = 2 * round(MAX_RANGE_M / CELL_M) + 1
     column, row = np.floor((nearby[:, :2] + MAX_RANGE_M) / CELL_M).astype(np.int64).T
     cell = row * side + column

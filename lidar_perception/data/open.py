@@ -79,7 +79,7 @@ def open_recording(
     Args:
         path: a bag (rosbag2 or ROS 1), a folder in one of LAYOUTS or one of its inner folders, a
             .pcd, .ply, .npy or .bin file, or a folder of such files. The path of a bag may end with
-            a topic, see split_topic.
+            a topic (see split_topic).
         split: file with names of frames or sequences, one per line; only these are read, in its
             order.
         points: topic of the clouds of a bag, if it is neither /points nor the only one.
@@ -147,7 +147,7 @@ def split_topic(path: str | Path) -> tuple[Path, str]:
 
 
 def _select_split(recording: Recording, split: Path) -> Recording:
-    """Return the frames that a split file names by frame or sequence, without duplicates."""
+    """Return the frames or sequences listed in a split file, without duplicates."""
     names = read_text(split, noun="the split").split()
     sequences: dict[str, list[str]] = {}
     frames: dict[str, None] = {}
@@ -177,9 +177,9 @@ def write_height(folder: Path, height: float) -> None:
 
 
 def read_height(path: Path) -> float | None:
-    """Return the sensor height in metres that `convert` or `simulate` stored in a folder or above.
+    """Return the sensor height in metres that `convert` or `simulate` stored, or None.
 
-    None if there is none.
+    Searches the folder and its parents up to MAX_DEPTH levels.
     """
     for folder in (path, *path.absolute().parents[:MAX_DEPTH]):
         for name in (HEIGHT_FILE, RECORD_NAME, INCOMPLETE_NAME):

@@ -12,7 +12,7 @@ from pathlib import Path
 import zstandard
 
 from lidar_perception.data import mcap_file, ros1_bag, sqlite_file
-from lidar_perception.data.bag_metadata import NAME, Metadata
+from lidar_perception.data.bag_metadata import METADATA_FILE, Metadata
 from lidar_perception.data.mcap_file import McapFile
 from lidar_perception.data.ros1_bag import Ros1File
 from lidar_perception.data.sqlite_file import SqliteFile
@@ -39,8 +39,10 @@ def list_storage_files(folder: Path) -> list[Path]:
 
 
 def find_files(path: Path, metadata: Metadata) -> list[Path]:
-    """Return the storage files of a bag: those in metadata.yaml, or without it, those whose names
-    belong together. Differences are added to metadata.problems.
+    """Return the storage files of a bag.
+
+    These are the files listed in metadata.yaml, or without it, files whose names show that they are
+    parts of one bag. Differences are added to metadata.problems.
 
     Raises:
         InputError: there is no bag, or there are several.
@@ -57,7 +59,7 @@ def find_files(path: Path, metadata: Metadata) -> list[Path]:
     for file in path.iterdir():
         check_regular(file)
     existing = list_storage_files(path)
-    if not (path / NAME).exists():
+    if not (path / METADATA_FILE).exists():
         if len(existing) == 1 or (existing and _are_parts_of_one_bag(existing)):
             return existing
         raise InputError(
@@ -134,7 +136,7 @@ def _are_parts_of_one_bag(files: list[Path]) -> bool:
 
 
 def _decompress(path: Path, stack: ExitStack) -> Path:
-    """Return a decompressed copy of a file, which is removed when the stack is closed."""
+    """Decompress a file to a temporary copy that is removed when the stack is closed; return it."""
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
     target = folder / path.name.removesuffix(COMPRESSED_SUFFIX)
     try:

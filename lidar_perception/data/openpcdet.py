@@ -29,9 +29,9 @@ def _list_scans(path: Path) -> list[Path]:
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the clouds in order of their names; they may be unrelated. Only file lists are read.
+    """Open the clouds in order of their names; only file lists are read.
 
-    The files in ImageSets/ can be used as split files.
+    The clouds may be unrelated. The files in ImageSets/ can be used as split files.
     """
     files = _list_scans(path)
     scale = make_cloud_scale_reader(files)
@@ -50,14 +50,16 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
                 intensity_max=scale,
             )
         )
-    known = {frame.name for frame in frames}
-    lost = {label.stem: label for label in sorted(path.glob("labels/*.txt")) if label.stem not in known}
+    scan_names = {frame.name for frame in frames}
+    labels_without_scan = {
+        label.stem: label for label in sorted(path.glob("labels/*.txt")) if label.stem not in scan_names
+    }
     return Recording(
         path,
         "OpenPCDet custom data",
         frames,
         frozenset({BOXES} if any(path.glob("labels/*.txt")) else set()),
-        tuple((name, f"{label} has no points/{name}.npy; add this file") for name, label in lost.items())
+        tuple((name, f"{label} has no points/{name}.npy; add this file") for name, label in labels_without_scan.items())
         if scans
         else (),
         has_sensor_height=False,

@@ -20,9 +20,9 @@ def read_pcd(path: Path) -> np.ndarray:
     """Read the points of a PCD file.
 
     Returns:
-        (N,) structured array with the fields of the file, in their types; a field of several
-        numbers is an array. Fields named "_" are padding and left out, as are those of COUNT 0. An
-        integer field whose text has fractions is float32.
+        (N,) structured array with the fields and types of the file; a field with COUNT > 1 is an
+        array. Fields named "_" are padding and left out, like those with COUNT 0. An integer field
+        whose text has fractions becomes float32.
 
     Raises:
         InputError: the file is not a PCD file, or truncated.
@@ -51,89 +51,91 @@ def _parse_points(content: bytes) -> np.ndarray:
     if not names:
         raise ValueError("the line FIELDS is missing")
     types, sizes, counts = (
-        header.get(key, [usual] * len(names)) for key, usual in (("TYPE", "F"), ("SIZE", "4"), ("COUNT", "1"))
+        header.get(key, [default] * len(names)) for key, default in (("TYPE", "F"), ("SIZE", "4"), ("COUNT", "1"))
     )
     if not len(names) == len(types) == len(sizes) == len(counts):
         raise ValueError("FIELDS, TYPE, SIZE and COUNT differ in length")
     names = [name if name != "_" else f"_{i}" for i, name in enumerate(names)]
     layout = np.dtype(
         [
-            (name, f"<{KIND_CODES[kind[0].upper()]}{int(size)}", () if int(n) == 1 else (int(n),))
-            for name, kind, size, n in zip(names, types, sizes, counts)
+            (name, f"<{KIND_CODES[data_format[0].upper()]}{int(size)}", () if int(n) == 1 else (int(n),))
+            for name, data_format, size, n in zip(names, types, sizes, counts)
         ]
     )
-    number = int(
+    point_count = int(
         header["POINTS"][0] if "POINTS" in header else int(header["WIDTH"][0]) * int(header.get("HEIGHT", ["1"])[0])
     )
-    if not 0 <= number * layout.itemsize <= MAX_CLOUD_BYTES:
-        raise ValueError(f"it declares {number} points")
-    data, kind = content[start:], header["DATA"][0].lower()
-    if kind == "ascii":
-        points = parse_text_points(data, layout, number)
-    elif kind == "binary":
-        points = parse_binary_points(data, layout, number)
-    elif kind == "binary_compressed":
-        points = _parse_compressed_points(data, layout, number)
+    if not 0 <= point_count * layout.itemsize <= MAX_CLOUD_BYTES:
+        raise ValueError(f"it declares {point_count} points")
+    data, data_format = content[start:], header["DATA"][0].lower()
+    if data_format == "ascii":
+        points = parse_text_points(data, layout, point_count)
+    elif data_format == "binary":
+        points = parse_binary_points(data, layout, point_count)
+    elif data_format == "binary_compressed":
+        points = _parse_compressed_points(data, layout, point_count)
     else:
-        raise ValueError(f"unknown kind of DATA: {kind}")
-    kept = [name for name in names if not name.startswith("_") and layout[name].itemsize]
-    return points if len(kept) == len(names) else points[kept]
+        raise ValueError(f"unknown kind of DATA: {data_format}")
+    used_fields = [name for name in names if not name.startswith("_") and layout[name].itemsize]
+    return points if len(used_fields) == len(names) else points[used_fields]
 
 
-def parse_binary_points(data: bytes, layout: np.dtype, number: int) -> np.ndarray:
-    """Return `number` records of the given dtype. Raises ValueError if data are too short."""
-    if len(data) < number * layout.itemsize:
-        raise ValueError(f"it is truncated: {len(data)} of {number * layout.itemsize} bytes")
-    return np.frombuffer(data, layout, number)
+def parse_binary_points(data: bytes, layout: np.dtype, point_count: int) -> np.ndarray:
+    """Return `point_count` records of type `layout`. Raises ValueError if the data are too short."""
+    if len(data) < point_count * layout.itemsize:
+        raise ValueError(f"it is truncated: {len(data)} of {point_count * layout.itemsize} bytes")
+    return np.frombuffer(data, layout, point_count)
 
 
-def parse_text_points(data: bytes, layout: np.dtype, number: int) -> np.ndarray:
+def parse_text_points(data: bytes, layout: np.dtype, point_count: int) -> np.ndarray:
     """Parse numbers given point by point as text.
 
     Returns:
-        (number,) structured array in the types of the layout. An integer field whose text has
-        fractions becomes float32.
+        (point_count,) structured array with the types of the layout. An integer field whose text
+        has fractions becomes float32.
 
     Raises:
         ValueError: the text is too short, or a number does not fit its type.
     """
     width = sum(int(np.prod(layout[name].shape, dtype=int)) for name in layout.names or ())
     words = np.array(data.split())
-    if len(words) < number * width:
-        raise ValueError(f"it is truncated: {len(words)} of {number * width} numbers")
-    rows = words[: number * width].reshape(number, width)
-    columns, at = {}, 0
+    if len(words) < point_count * width:
+        raise ValueError(f"it is truncated: {len(words)} of {point_count * width} numbers")
+    rows = words[: point_count * width].reshape(point_count, width)
+    columns, first_column = {}, 0
     for name in layout.names or ():
         shape = layout[name].shape
-        n = int(np.prod(shape, dtype=int))
-        columns[name] = _parse_numbers(rows[:, at : at + n], layout[name].base, name).reshape((number, *shape))
-        at += n
-    points = np.empty(number, [(name, values.dtype, values.shape[1:]) for name, values in columns.items()])
+        field_width = int(np.prod(shape, dtype=int))
+        columns[name] = _parse_numbers(
+            rows[:, first_column : first_column + field_width], layout[name].base, name
+        ).reshape((point_count, *shape))
+        first_column += field_width
+    points = np.empty(point_count, [(name, values.dtype, values.shape[1:]) for name, values in columns.items()])
     for name, values in columns.items():
         points[name] = values
     return points
 
 
-def _parse_numbers(words: np.ndarray, kind: np.dtype, name: str) -> np.ndarray:
+def _parse_numbers(words: np.ndarray, dtype: np.dtype, name: str) -> np.ndarray:
     """Return words as numbers of the given type, or as float32 if they have fractions."""
-    if kind.kind == "f":
-        return words.astype("f8").astype(kind)
+    if dtype.kind == "f":
+        return words.astype("f8").astype(dtype)
     try:
-        numbers = words.astype(kind.kind + "8")  # float64 would lose the last digits of 64-bit times
+        numbers = words.astype(dtype.kind + "8")  # float64 would lose the last digits of 64-bit times
     except ValueError:
         numbers = words.astype("f8")  # some writers write 12.000000 or 0.35 for a uint8
         if not np.array_equal(numbers, np.floor(numbers)):
             return numbers.astype("<f4")
-    limits = np.iinfo(kind)
+    limits = np.iinfo(dtype)
     if numbers.size and not (limits.min <= numbers.min().item() and numbers.max().item() <= limits.max):
-        raise ValueError(f"a number of the field '{name}' does not fit into {kind}")
-    return numbers.astype(kind)
+        raise ValueError(f"a number of the field '{name}' does not fit into {dtype}")
+    return numbers.astype(dtype)
 
 
-def _parse_compressed_points(data: bytes, layout: np.dtype, number: int) -> np.ndarray:
+def _parse_compressed_points(data: bytes, layout: np.dtype, point_count: int) -> np.ndarray:
     """Parse binary_compressed: LZF (or plain if LZF saved nothing), field by field."""
     compressed_size, size = struct.unpack_from("<II", data)
-    if size != number * layout.itemsize or len(data) < 8 + compressed_size:
+    if size != point_count * layout.itemsize or len(data) < 8 + compressed_size:
         raise ValueError("it is truncated: the sizes of the compressed points do not match")
     plain = data[8 : 8 + compressed_size]
     try:
@@ -141,14 +143,14 @@ def _parse_compressed_points(data: bytes, layout: np.dtype, number: int) -> np.n
     except (ValueError, IndexError):
         if compressed_size != size:
             raise
-    points, at = np.empty(number, layout), 0
+    points, offset = np.empty(point_count, layout), 0
     for name in layout.names or ():
-        part = layout[name]
-        if part.itemsize:
-            points[name] = np.frombuffer(plain, part.base, number * part.itemsize // part.base.itemsize, at).reshape(
-                (number, *part.shape)
-            )
-        at += number * part.itemsize
+        field = layout[name]
+        if field.itemsize:
+            points[name] = np.frombuffer(
+                plain, field.base, point_count * field.itemsize // field.base.itemsize, offset
+            ).reshape((point_count, *field.shape))
+        offset += point_count * field.itemsize
     return points
 
 

@@ -29,7 +29,7 @@ DTYPE_CODES = {
     "float64": "f8",
 }
 BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
-LIST = "list"
+LIST_TYPE = "list"
 
 
 def read_ply(path: Path) -> np.ndarray:
@@ -55,7 +55,7 @@ def read_ply(path: Path) -> np.ndarray:
 def _parse_vertices(content: bytes) -> np.ndarray:
     if not content.startswith(b"ply"):
         raise ValueError("it does not start with ply")
-    order, text, start = "", False, 0
+    order, is_text, start = "", False, 0
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
     while True:
         end = content.find(b"\n", start, MAX_HEADER_BYTES)
@@ -64,7 +64,7 @@ def _parse_vertices(content: bytes) -> np.ndarray:
         words = content[start:end].decode("ascii", "replace").split()
         start = end + 1
         if words[:1] == ["format"]:
-            order, text = BYTE_ORDERS[words[1]], words[1] == "ascii"
+            order, is_text = BYTE_ORDERS[words[1]], words[1] == "ascii"
         elif words[:1] == ["element"]:
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
@@ -74,18 +74,18 @@ def _parse_vertices(content: bytes) -> np.ndarray:
     if not order:
         raise ValueError("the line format is missing")
     data = content[start:]
-    for name, number, properties in elements:
-        if name != "vertex" and text:
-            data = data.split(b"\n", number)[-1]
+    for name, element_count, properties in elements:
+        if name != "vertex" and is_text:
+            data = data.split(b"\n", element_count)[-1]
             continue
-        if lists := [what for what, kind in properties if kind == LIST]:
+        if lists := [property_name for property_name, type_name in properties if type_name == LIST_TYPE]:
             raise ValueError(f"the property {lists[0]} of {name} elements is a list")
-        layout = np.dtype([(what, order + DTYPE_CODES[kind]) for what, kind in properties])
-        if not 0 <= number * layout.itemsize <= MAX_CLOUD_BYTES:
-            raise ValueError(f"it declares {number} points")
+        layout = np.dtype([(property_name, order + DTYPE_CODES[type_name]) for property_name, type_name in properties])
+        if not 0 <= element_count * layout.itemsize <= MAX_CLOUD_BYTES:
+            raise ValueError(f"it declares {element_count} points")
         if name == "vertex":
-            parse = parse_text_points if text else parse_binary_points
-            points = parse(data, layout, number)
+            parse = parse_text_points if is_text else parse_binary_points
+            points = parse(data, layout, element_count)
             return points.astype(points.dtype.newbyteorder("<"))
-        data = data[number * layout.itemsize :]
+        data = data[element_count * layout.itemsize :]
     raise ValueError("the element vertex is missing")

@@ -1,4 +1,4 @@
-"""Clouds of any recording with all columns that their driver wrote."""
+"""Clouds of any recording with all columns that the driver wrote."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ class RawClouds:
     Attributes:
         layout: description of the recognised layout.
         stamps_ns: stamps of all clouds; None if they were not recorded.
-        load: load(i) returns cloud i as PointCloud2 of rosbags' class; InputError if damaged.
-        poses, topic: those of the clouds of a bag.
+        load: load(i) returns cloud i as a PointCloud2 (class of rosbags), or raises InputError.
+        poses: poses of the clouds of a bag.
+        topic: topic of the clouds of a bag.
     """
 
     path: Path
@@ -102,15 +103,16 @@ def _to_message(frame: Frame) -> Any:
     return from_array(to_point_array(scan), header, make_bag_message)
 
 
-def choose_clouds(count: int, wanted: int) -> list[int]:
-    """Choose up to `wanted` of `count` clouds, in pairs that are spread evenly; return the numbers.
+def choose_clouds(count: int, max_count: int) -> list[int]:
+    """Choose up to `max_count` of `count` clouds, in evenly spread pairs; return their numbers.
 
-    A pair shows motion, and pairs are at different places. The clouds of a pair are neighbours, for
-    fast robots, or PAIR_DISTANCE apart, for slow ones.
+    The two clouds of a pair show the robot's motion, and the pairs cover different places. The
+    clouds of a pair are alternately adjacent, for fast robots, and PAIR_DISTANCE apart, for slow
+    ones.
     """
-    if count <= wanted or wanted < 2:
-        return list(range(min(count, wanted)))
-    pairs = wanted // 2
+    if count <= max_count or max_count < 2:
+        return list(range(min(count, max_count)))
+    pairs = max_count // 2
     gaps = np.where(np.arange(pairs) % 2 == 1, min(PAIR_DISTANCE, count - 1), 1)
     starts = np.linspace(0, count - 1 - gaps[-1], pairs).astype(int)
     return sorted({*starts.tolist(), *np.minimum(starts + gaps, count - 1).tolist()})

@@ -9,7 +9,7 @@ from typing import Any
 
 
 class RecordFile:
-    """Output stream; a context manager.
+    """Output stream. Use it as a context manager.
 
     Each write() is a record. If a record does not fit on the disk, no part of it remains in the
     file; this and all later calls raise OSError.
@@ -33,10 +33,10 @@ class RecordFile:
     def write(self, record: bytes) -> int:
         if self.failure:
             raise self.failure
-        left = memoryview(record)
+        remaining = memoryview(record)
         try:
-            while left:
-                left = left[self.file.write(left) :]
+            while remaining:
+                remaining = remaining[self.file.write(remaining) :]
         except OSError as error:
             self.failure = error
             self._truncate(self.tell())
@@ -53,13 +53,13 @@ class RecordFile:
         os.fsync(self.file.fileno())
 
     def close_with(self, end: bytes) -> None:
-        """Write a final record, after removing as many of the last records as it needs space.
+        """Write a final record, removing as many of the last records as needed to make space.
 
         An existing final record of the same kind is replaced.
         """
-        kinds = [kind for kind, _ in self.records]
-        if end[0] in kinds:
-            del self.records[kinds.index(end[0]) :]
+        first_bytes = [first_byte for first_byte, _ in self.records]
+        if end[0] in first_bytes:
+            del self.records[first_bytes.index(end[0]) :]
         while len(self.records) > 1:
             self.failure = None
             self._truncate(self.tell())

@@ -34,9 +34,9 @@ def make_scale_reader(items: Sequence[Item], read: Callable[[Item], Column]) -> 
 
 
 def infer_scale(items: Iterable[Item], read: Callable[[Item], Column]) -> float:
-    """Infer the scale from the first SAMPLE_SIZE clouds; 1 without any. See make_scale_reader.
+    """Infer the scale from the first SAMPLE_SIZE clouds (see make_scale_reader); 1 without any.
 
-    Empty clouds and clouds of zeros, which drivers publish at their start, do not count.
+    Empty clouds and clouds of zeros, which drivers publish at startup, are ignored.
     """
     scale, count = StreamScale(), 0
     for item in items:

@@ -1,4 +1,4 @@
-"""Reader of ROS 1 bags that converts messages to CDR of Jazzy's types."""
+"""Reader of ROS 1 bags that converts messages to CDR with the message types of ROS 2 Jazzy."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ SUFFIX = ".bag"
 class Ros1File:
     """A .bag file open for reading, see StorageFile.
 
-    Topics of types that Jazzy lacks cannot be read; their encoding is "ros1". Fields that are new
-    since ROS 1 are empty.
+    Topics whose type does not exist in Jazzy cannot be read; their encoding is "ros1". Fields that
+    ROS 1 does not have are empty.
     """
 
     def __init__(self, path: Path):
@@ -32,18 +32,18 @@ class Ros1File:
 
         self.reader = AnyReader([path])
         self.reader.open()
-        self.recorded = {c.id: c for c in self.reader.connections}
+        self.recorded = {connection.id: connection for connection in self.reader.connections}
         self.topics = []
-        for c in self.reader.connections:
-            kind = STATIC_MSGTYPE_RENAMES.get(c.msgtype, c.msgtype)
+        for connection in self.reader.connections:
+            type_name = STATIC_MSGTYPE_RENAMES.get(connection.msgtype, connection.msgtype)
             self.topics.append(
                 Topic(
-                    c.id,
-                    c.topic,
-                    kind,
-                    "cdr" if kind in load_typestore().fielddefs else "ros1",
-                    [LATCHED_QOS] if getattr(c.ext, "latching", 0) else [],
-                    c.msgcount,
+                    connection.id,
+                    connection.topic,
+                    type_name,
+                    "cdr" if type_name in load_typestore().fielddefs else "ros1",
+                    [LATCHED_QOS] if getattr(connection.ext, "latching", 0) else [],
+                    connection.msgcount,
                 )
             )
         cache: dict[str, object] = {}
@@ -61,17 +61,23 @@ class Ros1File:
         self.reader.close()
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
-        """Yield (topic id, time, CDR bytes) of topics with start <= time < stop, in order of
-        time."""
-        connections = [self.recorded[number] for number in ids]
+        """Yield (topic id, time, CDR bytes) of these topics for start <= time < stop, by time."""
+        connections = [self.recorded[topic_id] for topic_id in ids]
         for connection, time, data in self.reader.messages(connections, start, stop):
             yield connection.id, time, bytes(self.converters[connection.id](data))
 
-    def _make_converter(self, recorded: str, wanted: str, cache: dict[str, object]) -> Callable[[Any], Any]:
+    def _make_converter(self, recorded_type: str, target_type: str, cache: dict[str, object]) -> Callable[[Any], Any]:
         from rosbags.convert.converter import is_same_wireformat, migrate_bytes
 
-        if is_same_wireformat(self.reader.typestore, load_typestore(), recorded, wanted):
-            return partial(load_typestore().ros1_to_cdr, typename=wanted)
+        if is_same_wireformat(self.reader.typestore, load_typestore(), recorded_type, target_type):
+            return partial(load_typestore().ros1_to_cdr, typename=target_type)
         return partial(
-            migrate_bytes, self.reader.typestore, load_typestore(), recorded, wanted, cache, src_is2=False, dst_is2=True
+            migrate_bytes,
+            self.reader.typestore,
+            load_typestore(),
+            recorded_type,
+            target_type,
+            cache,
+            src_is2=False,
+            dst_is2=True,
         )

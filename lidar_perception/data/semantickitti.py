@@ -1,4 +1,4 @@
-"""SemanticKITTI folders: scans of KITTI odometry with a class and an instance for each point."""
+"""SemanticKITTI folders: KITTI odometry scans with a class and an instance for each point."""
 
 from __future__ import annotations
 
@@ -59,19 +59,19 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
             f"{path} has labels but no SemanticKITTI scans: expected "
             "sequences/00/velodyne/*.bin and sequences/00/labels/*.label"
         )
-    frames, timed = odometry.make_frames(sequences)
-    posed = any(map(odometry.find_pose_file, sequences))
+    frames, has_times = odometry.make_frames(sequences)
+    has_poses = any(map(odometry.find_pose_file, sequences))
     return Recording(
         path,
         "SemanticKITTI",
         [_add_point_truth(frame) for frame in frames],
-        frozenset({POINT_LABELS} | ({POSES} if posed else set())),
-        has_times=timed,
+        frozenset({POINT_LABELS} | ({POSES} if has_poses else set())),
+        has_times=has_times,
     )
 
 
 def _add_point_truth(frame: Frame) -> Frame:
-    """Add the point labels to a frame, and remove its camera, as all points are scored."""
+    """Add the point labels to a frame, and remove its camera because all points are scored."""
     scan = frame.points
     assert scan is not None
     label = scan.parents[1] / f"labels/{scan.stem}.label"
@@ -107,7 +107,7 @@ def format_pose(pose: np.ndarray, calibration: Calibration) -> str:
     """Return the line of poses.txt for a scan.
 
     Args:
-        pose: (4, 4) of the LiDAR in the frame of the first scan; the file has that of the camera.
+        pose: (4, 4) pose of the LiDAR in the frame of the first scan; the file stores the camera's.
     """
     to_camera = calibration.lidar_to_camera
     camera_pose = to_camera @ pose @ np.linalg.inv(to_camera)

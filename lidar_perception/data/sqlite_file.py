@@ -1,4 +1,4 @@
-"""Reader of rosbag2's SQLite files (.db3) of all ROS 2 distributions, also of killed recorders."""
+"""Reader of rosbag2's SQLite files (.db3) of all ROS 2 distributions, even if recording was killed."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class SqliteFile:
             for table in REQUIRED_COLUMNS
         }
         if any(REQUIRED_COLUMNS[table] - columns[table] for table in REQUIRED_COLUMNS):
-            raise ValueError("the tables of topics and messages are missing")
+            raise ValueError("the tables 'topics' or 'messages' are missing or incomplete")
         # The first distributions stored neither encoding nor QoS.
         encoding, qos = (
             name if name in columns["topics"] else "''" for name in ("serialization_format", "offered_qos_profiles")
@@ -68,8 +68,8 @@ class SqliteFile:
         }
         rows = self.database.execute(f"SELECT id, name, type, {encoding}, {qos} FROM topics ORDER BY id")
         self.topics = [
-            Topic(number, name, kind, encoding, qos, spans.get(number, (0,))[0])
-            for number, name, kind, encoding, qos in rows
+            Topic(topic_id, name, type_name, encoding, qos, spans.get(topic_id, (0,))[0])
+            for topic_id, name, type_name, encoding, qos in rows
         ]
         with_messages = [spans[topic.id] for topic in self.topics if topic.id in spans]
         self.times = (

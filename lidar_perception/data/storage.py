@@ -54,19 +54,22 @@ class StorageFile(Protocol):
 def merge_streams(sources: Iterable[tuple[int, Callable[[], Stream]]]) -> Stream:
     """Merge streams in order of time.
 
-    Streams are opened at their start time, so that few are open at the same time.
+    Each stream is opened at its start time, so that few are open at the same time.
 
-    sources: start time of each stream, and the function that opens it.
+    Args:
+        sources: start time of each stream, and the function that opens it.
     """
     open_streams: list[tuple[int, int, Message, Stream]] = []
-    for number, (start, begin) in enumerate([*sorted(sources, key=lambda source: source[0]), (END, lambda: iter(()))]):
+    for start_number, (start, open_stream) in enumerate(
+        [*sorted(sources, key=lambda source: source[0]), (END, lambda: iter(()))]
+    ):
         while open_streams and open_streams[0][0] < start:
-            _, which, message, stream = open_streams[0]
+            _, stream_number, message, stream = open_streams[0]
             yield message
             if (next_message := next(stream, None)) is None:
                 heappop(open_streams)
             else:
-                heapreplace(open_streams, (next_message[1], which, next_message, stream))
-        stream = begin()
+                heapreplace(open_streams, (next_message[1], stream_number, next_message, stream))
+        stream = open_stream()
         if (first := next(stream, None)) is not None:
-            heappush(open_streams, (first[1], number, first, stream))
+            heappush(open_streams, (first[1], start_number, first, stream))

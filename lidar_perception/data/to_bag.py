@@ -57,11 +57,11 @@ def write_bag(
     labels as columns of their cloud.
 
     Args:
-        images: write the PNG files of the camera.
-        skipped: list to which the errors of unreadable frames are added; without it, the first
-            error is raised.
+        images: True to write the PNG files of the camera.
+        skipped: list to which the errors of unreadable frames are added; if None, the first error
+            is raised.
         clouds: False to write everything except clouds.
-        detections_3d: write the labelled boxes also as Detection3DArray.
+        detections_3d: True to write the labelled boxes as Detection3DArray as well.
 
     Raises:
         InputError: the bag cannot be written, or a frame cannot be read.
@@ -172,17 +172,17 @@ def to_point_array(scan: PointCloud, labels: PointTruth | None = None) -> np.nda
 
 
 def _make_detections(markers: Any, header: Any) -> Any:
-    """Return the Detection3DArray of label markers; ids are those of the tracks, if unique."""
+    """Convert label markers to a Detection3DArray; track ids are kept if they are unique."""
     objects = from_marker_array(markers)
     tracks = [track for extra in objects.extras if (track := extra.get("track_id")) is not None]
-    numbered = len(set(tracks)) == len(objects)
+    has_unique_ids = len(set(tracks)) == len(objects)
     return to_detection_array(
         objects.boxes,
         objects.labels,
         objects.scores.tolist(),
         header=header,
         make=make_bag_message,
-        ids=tracks if numbered else None,
+        ids=tracks if has_unique_ids else None,
     )
 
 

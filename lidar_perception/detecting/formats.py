@@ -17,7 +17,7 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Recording
-from lidar_perception.data.kitti.results import FOLDER, choose_calibration, write_results, write_tracking_results
+from lidar_perception.data.kitti.results import RESULT_FOLDER, choose_calibration, write_results, write_tracking_results
 from lidar_perception.detecting.results import FrameResult, to_short_floats, with_optional_parts
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
 from lidar_perception.labels.exchange import export_labels
@@ -126,7 +126,7 @@ class Kitti(BufferedFormat):
     """
 
     def __init__(self, run: Run) -> None:
-        super().__init__(run, run.out / FOLDER)
+        super().__init__(run, run.out / RESULT_FOLDER)
         self.drives: dict[str, list[tuple[int, np.ndarray, Detections]]] = {}
         self.names: dict[str, str] = {}
         self.cameras: dict[str, Calibration] = {}

@@ -25,7 +25,7 @@ from lidar_perception.data.nuscenes.boxes import (
     to_global_boxes,
     to_quaternions,
 )
-from lidar_perception.data.nuscenes.folder import CHANNEL, FULL_REFLECTION
+from lidar_perception.data.nuscenes.folder import FULL_REFLECTION, LIDAR_CHANNEL
 from lidar_perception.data.nuscenes.results import format_boxes
 from lidar_perception.geometry import points_in_boxes
 from lidar_perception.labels.drive_labels import NO_TRACK, FrameLabels
@@ -65,7 +65,7 @@ class NuscenesTables:
     def __init__(self, folder: Path):
         self.folder = folder
         self.rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
-        self.rows["sensor"] = [{"token": make_token(CHANNEL), "channel": CHANNEL, "modality": "lidar"}]
+        self.rows["sensor"] = [{"token": make_token(LIDAR_CHANNEL), "channel": LIDAR_CHANNEL, "modality": "lidar"}]
         self.rows["log"] = [
             {"token": make_token("log"), "logfile": "", "vehicle": "", "location": "", "date_captured": ""}
         ]
@@ -90,7 +90,7 @@ class NuscenesTables:
         """
         scene = f"scene-{drive + 1:04}"
         sample = make_token(scene, len(self.rows["sample"]))
-        file = f"samples/{CHANNEL}/{scene}__{CHANNEL}__{frame.stamp_ns // 1000}.pcd.bin"
+        file = f"samples/{LIDAR_CHANNEL}/{scene}__{LIDAR_CHANNEL}__{frame.stamp_ns // 1000}.pcd.bin"
         if (self.folder / file).exists():  # some drivers give two scans the same stamp
             file = file.replace(".pcd.bin", f"-{len(self.rows['sample'])}.pcd.bin")
         self._write_sweep(self.folder / file, cloud)
@@ -102,7 +102,7 @@ class NuscenesTables:
             self._add(
                 "calibrated_sensor",
                 mount,
-                sensor_token=make_token(CHANNEL),
+                sensor_token=make_token(LIDAR_CHANNEL),
                 translation=[0.0, 0.0, frame.sensor_height],
                 rotation=_to_quaternion(TO_SENSOR.T),
                 camera_intrinsic=[],

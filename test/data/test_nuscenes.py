@@ -23,7 +23,7 @@ from lidar_perception.data.nuscenes.boxes import (
     to_global_boxes,
     to_local_boxes,
 )
-from lidar_perception.data.nuscenes.folder import EGO_RADIUS_M, SWEEP, open_nuscenes
+from lidar_perception.data.nuscenes.folder import EGO_RADIUS_M, SWEEP_COLUMNS, open_nuscenes
 from lidar_perception.data.nuscenes.tables import Tables
 from lidar_perception.data.records import read_records
 from lidar_perception.geometry import box_corners, points_in_box, wrap_angle
@@ -109,12 +109,12 @@ def test_sensor_axes_are_rotated_to_those_of_the_vehicle(changed):
     np.testing.assert_allclose(scan.xyz, [[10, 0, -1], [5, -3, 0], [-1.5, 0, 0]], atol=1e-6)
     np.testing.assert_allclose(scan.intensity, [0.2, 1, 0], atol=1e-7)
     assert scan.xyz.dtype == scan.intensity.dtype == np.float32
-    assert read_records(frame.points, SWEEP).shape == (6, 5) and scan.stamp_ns == frame.stamp_ns
+    assert read_records(frame.points, SWEEP_COLUMNS).shape == (6, 5) and scan.stamp_ns == frame.stamp_ns
 
 
 def test_returns_of_the_vehicle_itself_are_dropped(root):
     frame = open_nuscenes(root)[0]
-    cloud, scan = read_records(frame.points, SWEEP), frame.load()
+    cloud, scan = read_records(frame.points, SWEEP_COLUMNS), frame.load()
     own = (np.abs(cloud[:, :2]) < EGO_RADIUS_M).all(axis=1)
     assert own.sum() >= 50 and len(scan) == len(cloud) - own.sum()
 
@@ -348,7 +348,7 @@ def test_real_sweep_is_read(data, changed):
     frame.points.parent.mkdir(parents=True)
     frame.points.symlink_to(path)
     scan = frame.load()
-    assert len(read_records(path, SWEEP)) == 34688 and 25_000 < len(scan) < 34688
+    assert len(read_records(path, SWEEP_COLUMNS)) == 34688 and 25_000 < len(scan) < 34688
     assert 0 <= scan.intensity.min() and 0.5 < scan.intensity.max() <= 1
     # The ground is at the height given by the calibration.
     near = np.hypot(scan.xyz[:, 0], scan.xyz[:, 1]) < 12

@@ -34,7 +34,7 @@ def read_calibration(path: Path, image: Path | None = None) -> Calibration:
         image: PNG file that gives the image size, if it exists.
 
     Raises:
-        InputError: names the file and the missing matrix.
+        InputError: a matrix is missing; the message names it and the file.
     """
     values = read_matrices(path)
     intrinsics = get_matrix(values, path, "P2", (3, 4))
@@ -83,7 +83,7 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
 
 
 def get_matrix(values: dict, path: Path, name: str, shape: tuple[int, ...], alternative: str = "") -> np.ndarray:
-    """Return the matrix called `name`, else `other`. InputError if it is missing."""
+    """Return the matrix called `name` or `alternative`. InputError if both are missing."""
     matrix = values.get(name, values.get(alternative))
     if matrix is None or matrix.size != np.prod(shape) or not np.isfinite(matrix).all():
         raise InputError(

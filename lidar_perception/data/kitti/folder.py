@@ -23,7 +23,7 @@ START_NS = 1_316_995_200 * 10**9  # 26 September 2011, the first day of KITTI's 
 PERIOD_NS = 10**8  # the sensor rotates at 10 Hz
 GAP_NS = 10 * 10**9  # time inserted between the drives of a recording
 OBJECT_DATA = "object data"  # name of the layout with unrelated frames
-SCANS = ("velodyne_reduced", "velodyne")  # folder names; the last one, with full scans, is preferred
+SCAN_FOLDERS = ("velodyne_reduced", "velodyne")  # folder names; the last one, with full scans, is preferred
 
 
 def read_velodyne(path: Path) -> np.ndarray:
@@ -46,7 +46,7 @@ def make_velodyne_scale_reader(scans: Sequence[Path]) -> Callable[[], float]:
 
 def is_layout(path: Path) -> bool:
     """Return True for a folder in the object or tracking layout, even without scans."""
-    return any((folder / name).is_dir() for folder in (path / "training", path) for name in (*SCANS, "label_2"))
+    return any((folder / name).is_dir() for folder in (path / "training", path) for name in (*SCAN_FOLDERS, "label_2"))
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
@@ -61,11 +61,11 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     Raises:
         InputError: there are no scans; the message names the expected folders.
     """
-    names = SCANS if scans else (*SCANS, "label_2")
+    names = SCAN_FOLDERS if scans else (*SCAN_FOLDERS, "label_2")
     folder = next(
         (folder for folder in (path / "training", path) if any((folder / name).is_dir() for name in names)), path
     )
-    tracking = (folder / "label_02").is_dir() or any(any(folder.glob(f"{name}/*/")) for name in SCANS)
+    tracking = (folder / "label_02").is_dir() or any(any(folder.glob(f"{name}/*/")) for name in SCAN_FOLDERS)
     frames = _make_tracking_frames(folder) if tracking else _make_object_frames(folder, scans)
     if not frames:
         raise InputError(
@@ -79,7 +79,7 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
         else [
             (label.stem, str(label))
             for label in sorted(folder.glob("label_2/*.txt"))
-            if not any((folder / name / f"{label.stem}.bin").exists() for name in SCANS)
+            if not any((folder / name / f"{label.stem}.bin").exists() for name in SCAN_FOLDERS)
         ]
     )
     return Recording(
@@ -111,7 +111,7 @@ def _find_missing_tracking_scans(folder: Path, frames: list[Frame]) -> list[tupl
 
 def _make_object_frames(folder: Path, scans: bool) -> list[Frame]:
     files = {} if scans else {p.stem: folder / f"velodyne/{p.stem}.bin" for p in folder.glob("label_2/*.txt")}
-    files |= {p.stem: p for name in SCANS for p in folder.glob(f"{name}/*.bin")}
+    files |= {p.stem: p for name in SCAN_FOLDERS for p in folder.glob(f"{name}/*.bin")}
     frames, scale = [], make_velodyne_scale_reader([points for _, points in sorted(files.items())])
     for i, (name, points) in enumerate(sorted(files.items())):
         image, label = folder / f"image_2/{name}.png", folder / f"label_2/{name}.txt"
@@ -141,7 +141,9 @@ def _read_object_truth(label: Path, calibration: Callable[[], Calibration]) -> G
 
 def _make_tracking_frames(folder: Path) -> list[Frame]:
     frames, start = [], START_NS
-    drives = {drive.name: sorted(drive.glob("*.bin")) for name in SCANS for drive in sorted(folder.glob(f"{name}/*/"))}
+    drives = {
+        drive.name: sorted(drive.glob("*.bin")) for name in SCAN_FOLDERS for drive in sorted(folder.glob(f"{name}/*/"))
+    }
     scale = make_velodyne_scale_reader([scan for _, scans in sorted(drives.items()) for scan in scans])
     for name, scans in sorted(drives.items()):
         images = folder / "image_02" / name

@@ -20,7 +20,7 @@ from lidar_perception.data.kitti.calibration import check_pose, get_matrix, read
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
-SCANS, CALIBRATION, POSE_FILES = "data_3d_raw", "calibration", ("cam0_to_world.txt", "poses.txt")
+SCAN_FOLDER, CALIBRATION_FOLDER, POSE_FILES = "data_3d_raw", "calibration", ("cam0_to_world.txt", "poses.txt")
 
 
 def is_layout(path: Path) -> bool:
@@ -34,7 +34,7 @@ def _find_root(path: Path) -> Path | None:
         (
             folder
             for folder in (path, *path.parents[:2])
-            if (folder / SCANS).is_dir() and (folder == path or path.relative_to(folder).parts[0] == SCANS)
+            if (folder / SCAN_FOLDER).is_dir() and (folder == path or path.relative_to(folder).parts[0] == SCAN_FOLDER)
         ),
         None,
     )
@@ -49,12 +49,14 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     assert root is not None
     opened = path.absolute()
     drives = sorted(
-        data.parents[1] for data in (root / SCANS).glob(f"*/{raw.DATA}") if opened in (*data.parents, root / SCANS)
+        data.parents[1]
+        for data in (root / SCAN_FOLDER).glob(f"*/{raw.SCAN_FOLDER}")
+        if opened in (*data.parents, root / SCAN_FOLDER)
     )
     frames, has_times = raw.make_frames(drives)
     if not frames:
-        raise InputError(f"{path} has no KITTI-360 scans: expected {SCANS}/DRIVE/{raw.DATA}/*.bin")
-    has_calibration = (root / CALIBRATION).is_dir()
+        raise InputError(f"{path} has no KITTI-360 scans: expected {SCAN_FOLDER}/DRIVE/{raw.SCAN_FOLDER}/*.bin")
+    has_calibration = (root / CALIBRATION_FOLDER).is_dir()
     poses = {drive.name: cache(partial(_read_poses, root, drive.name)) for drive in drives}
     has_poses = has_calibration and any(_find_pose_file(root, name) for name in poses)
     calibration = cache(partial(_read_calibration, root)) if has_calibration else return_none
@@ -79,7 +81,7 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
 
 def _read_calibration(root: Path) -> Calibration:
     """Return the calibration of the rectified left camera."""
-    path = root / CALIBRATION / "perspective.txt"
+    path = root / CALIBRATION_FOLDER / "perspective.txt"
     values = read_matrices(path)
     width, height = get_matrix(values, path, "S_rect_00", (2,)).astype(int).tolist()
     lidar_to_camera = _read_rectification(root) @ np.linalg.inv(_read_camera_to_lidar(root))
@@ -88,14 +90,14 @@ def _read_calibration(root: Path) -> Calibration:
 
 def _read_rectification(root: Path) -> np.ndarray:
     """Return the transform (4, 4) from the left camera to the rectified one."""
-    path = root / CALIBRATION / "perspective.txt"
+    path = root / CALIBRATION_FOLDER / "perspective.txt"
     rotation = get_matrix(read_matrices(path), path, "R_rect_00", (3, 3))
     return check_pose(to_homogeneous(rotation), path)
 
 
 def _read_camera_to_lidar(root: Path) -> np.ndarray:
     """Return the transform (4, 4) from the left camera to the LiDAR."""
-    path = root / CALIBRATION / "calib_cam_to_velo.txt"
+    path = root / CALIBRATION_FOLDER / "calib_cam_to_velo.txt"
     return check_pose(to_homogeneous(_read_rows(path, 12)[0].reshape(3, 4)), path)
 
 
@@ -115,7 +117,7 @@ def _read_poses(root: Path, drive: str) -> dict[int, np.ndarray]:
         return {
             int(row[0]): check_pose(row[1:].reshape(4, 4), path) @ rectify @ to_camera for row in _read_rows(path, 17)
         }
-    mount = root / CALIBRATION / "calib_cam_to_pose.txt"
+    mount = root / CALIBRATION_FOLDER / "calib_cam_to_pose.txt"
     camera_mount = get_matrix(read_matrices(mount), mount, "image_00", (3, 4))
     to_vehicle = check_pose(to_homogeneous(camera_mount), mount)
     return {
@@ -132,9 +134,9 @@ def _read_rows(path: Path, columns: int) -> np.ndarray:
     """Read rows of numbers, (N, columns). Raises InputError if the file has other contents."""
     rows = [line.split() for line in read_text(path, noun="the matrices").splitlines()]
     try:
-        found = np.array([row for row in rows if row], float).reshape(-1, columns)
+        matrix = np.array([row for row in rows if row], float).reshape(-1, columns)
     except ValueError:
-        found = np.full((0, columns), np.nan)
-    if not (len(found) and np.isfinite(found).all()):
+        matrix = np.full((0, columns), np.nan)
+    if not (len(matrix) and np.isfinite(matrix).all()):
         raise InputError(f"{path} has a line without {columns} finite numbers; download it again")
-    return found
+    return matrix

@@ -211,7 +211,7 @@ def format_label(label: dict, decimals: int = 2, whole: bool = True) -> str:
 
 
 def read_tracklets(path: Path) -> dict[int, GroundTruth]:
-    """Read tracklet_labels.xml of a raw drive, of KITTI or exported by CVAT or Datumaro.
+    """Read tracklet_labels.xml of a raw drive of KITTI, or exported by CVAT or Datumaro.
 
     Returns:
         The objects in the LiDAR frame by frame number. Unknown classes become Misc, with their name
@@ -240,7 +240,7 @@ def read_tracklets(path: Path) -> dict[int, GroundTruth]:
                     boxes.append(([x, y, z + h / 2, length, w, h, yaw], text, extra))
     except (OSError, ElementTree.ParseError, ValueError, OverflowError) as error:
         raise InputError(f"cannot read the tracklets {path}: {error}") from None
-    return {number: _to_tracklet_truth(*found) for number, found in frames.items()}
+    return {number: _to_tracklet_truth(*content) for number, content in frames.items()}
 
 
 def _to_tracklet_truth(rows: list, notes: list) -> GroundTruth:
@@ -252,7 +252,7 @@ def _to_tracklet_truth(rows: list, notes: list) -> GroundTruth:
 
 
 def _parse_state(pose: ElementTree.Element, name: str) -> float | None:
-    """Return the number of a pose's state, 0 if it has none.
+    """Return the occlusion or truncation of a pose; 0 if it has none.
 
     None for boxes with which Datumaro fills the gaps of a track; their states are names.
     https://github.com/openvinotoolkit/datumaro/blob/develop/src/datumaro/plugins/data_formats/kitti_raw/exporter.py
@@ -262,10 +262,10 @@ def _parse_state(pose: ElementTree.Element, name: str) -> float | None:
 
 
 def _find_child(element: ElementTree.Element, name: str) -> ElementTree.Element:
-    found = element.find(name)
-    if found is None:
+    child = element.find(name)
+    if child is None:
         raise ValueError(f"<{element.tag}> has no <{name}>")
-    return found
+    return child
 
 
 def _find_text(element: ElementTree.Element, name: str) -> str:

@@ -28,7 +28,7 @@ from lidar_perception.data.kitti.folder import (
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
-CALIBRATION, TIMES, POSES_FILE = FILES = ("calib.txt", "times.txt", "poses.txt")
+CALIBRATION_FILE, TIMES_FILE, POSES_FILE = SEQUENCE_FILES = ("calib.txt", "times.txt", "poses.txt")
 SINCE_1970 = 10**9  # in seconds; larger times are Unix times, others count from the start of the sequence
 
 
@@ -42,7 +42,7 @@ def is_layout(path: Path) -> bool:
 
 def _is_sequence(path: Path) -> bool:
     return (path / "velodyne").is_dir() and (
-        (path / "labels").is_dir() or any((path / name).is_file() for name in FILES)
+        (path / "labels").is_dir() or any((path / name).is_file() for name in SEQUENCE_FILES)
     )
 
 
@@ -73,7 +73,7 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
         )
     frames, has_times = make_frames(sequences)
     has = {POSES} if any(find_pose_file(s) for s in sequences) else set()
-    if any((s / CALIBRATION).is_file() for s in sequences):
+    if any((s / CALIBRATION_FILE).is_file() for s in sequences):
         has.add(CAMERA)
     return Recording(path, "KITTI odometry", frames, frozenset(has), has_times=has_times)
 
@@ -90,9 +90,9 @@ def make_frames(sequences: list[Path]) -> tuple[list[Frame], bool]:
     scale = make_velodyne_scale_reader([file for files in scans.values() for file in files])
     for sequence, files in scans.items():
         start = frames[-1].stamp_ns + GAP_NS if frames else START_NS
-        times = _read_times(sequence / TIMES)
+        times = _read_times(sequence / TIMES_FILE)
         has_times = has_times and bool(times)
-        poses, calib = cache(partial(_read_poses, sequence)), sequence / CALIBRATION
+        poses, calib = cache(partial(_read_poses, sequence)), sequence / CALIBRATION_FILE
         image = sequence / "image_2"
         calibration = (
             cache(partial(read_odometry_calibration, calib, image / f"{files[0].stem}.png"))
@@ -105,7 +105,8 @@ def make_frames(sequences: list[Path]) -> tuple[list[Frame], bool]:
             number = parse_scan_number(scan)
             if times and number >= len(times):
                 raise InputError(
-                    f"{sequence / TIMES} has only {len(times)} lines, but there is a scan {number}; download it again"
+                    f"{sequence / TIMES_FILE} has only {len(times)} lines, but there is a scan {number}; "
+                    "download it again"
                 )
             stamp = start + (times[number] if times else (number - parse_scan_number(files[0])) * PERIOD_NS)
             frames.append(
@@ -150,7 +151,7 @@ def _read_poses(sequence: Path) -> tuple[np.ndarray, Path, list[str]] | None:
     """
     if (poses := find_pose_file(sequence)) is None:
         return None
-    calibration = sequence / CALIBRATION
+    calibration = sequence / CALIBRATION_FILE
     to_camera = to_homogeneous(get_matrix(read_matrices(calibration), calibration, "Tr", (3, 4)))
     lines = read_text(poses, noun="the poses").splitlines()
     return check_pose(to_camera, calibration), poses, lines

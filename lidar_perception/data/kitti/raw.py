@@ -28,7 +28,7 @@ from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.topics import LIDAR_FRAME
 
-DATA = "velodyne_points/data"
+SCAN_FOLDER = "velodyne_points/data"
 TRACKLETS, FRAME_LIST = "tracklet_labels.xml", "frame_list.txt"
 
 
@@ -39,7 +39,7 @@ def is_layout(path: Path) -> bool:
 
 def list_drives(path: Path) -> list[Path]:
     """Return the drives at a path, sorted."""
-    return sorted(data.parents[1] for days in ("", "*/", "*/*/") for data in path.glob(days + DATA))
+    return sorted(data.parents[1] for days in ("", "*/", "*/*/") for data in path.glob(days + SCAN_FOLDER))
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
@@ -49,7 +49,7 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     # A drive with a calibration comes from KITTI and has time stamps.
     frames, has_times = make_frames(drives, need_stamps=with_camera)
     if not frames:
-        raise InputError(f"{path} has no KITTI scans: expected DATE/DRIVE_sync/{DATA}/*.bin")
+        raise InputError(f"{path} has no KITTI scans: expected DATE/DRIVE_sync/{SCAN_FOLDER}/*.bin")
     labels = {drive: make_truth_reader(drive / TRACKLETS, read_tracklets) for drive in drives}
     calibrations = {
         drive: functools.cache(partial(read_raw_calibration, drive.parent)) if with_camera[drive] else return_none
@@ -75,14 +75,14 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
 
 
 def make_frames(drives: Sequence[Path], need_stamps: dict[Path, bool] | None = None) -> tuple[list[Frame], bool]:
-    """Make the frames of drives with scans in DATA, in order of time, without labels and camera.
+    """Make the frames of drives with scans in SCAN_FOLDER, in order of time, without labels and camera.
 
     Args:
         need_stamps: drives that must have time stamps, as {drive: True}.
 
     Returns:
-        The frames, with the folder of the drive as `native`, and False if 10 Hz is assumed for one
-        of the drives, which has no times.
+        The frames, with the folder of the drive as `native`, and False if 10 Hz is assumed for a
+        drive without times.
 
     Raises:
         InputError: required time stamps are missing.
@@ -116,11 +116,11 @@ def make_frames(drives: Sequence[Path], need_stamps: dict[Path, bool] | None = N
 
 
 def list_scans(drive: Path) -> list[Path]:
-    """Return the scans of a drive by name, one of each name if there are several suffixes."""
+    """Return the scans of a drive by name; one per name if it exists with several suffixes."""
     files = {
         file.stem: file
         for suffix in SUFFIXES
-        for file in (drive / DATA).glob("*")
+        for file in (drive / SCAN_FOLDER).glob("*")
         if file.suffix.lower() == suffix and is_cloud(file)
     }
     return [file for _, file in sorted(files.items())]
@@ -189,5 +189,5 @@ def _read_stamps(drive: Path, numbers: Sequence[int], required: bool) -> list[in
 
 def _parse_stamp(line: str) -> int:
     seconds, _, fraction = line.partition(".")
-    when = datetime.strptime(seconds, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-    return int(when.timestamp()) * 10**9 + int(f"{fraction:0<9}"[:9])
+    time = datetime.strptime(seconds, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+    return int(time.timestamp()) * 10**9 + int(f"{fraction:0<9}"[:9])

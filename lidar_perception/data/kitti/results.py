@@ -19,23 +19,26 @@ from lidar_perception.runs import journal
 from lidar_perception.runs.files import write_text
 from lidar_perception.types import Detections, GroundTruth, InputError
 
-FOLDER = "kitti"  # subfolder for result files in the folder of a run
+RESULT_FOLDER = "kitti"  # subfolder for result files in the folder of a run
 DECIMALS = 6  # with fewer, the order of weak scores and overlaps would change
 
 
 def find_result_folder(folder: Path) -> Path:
-    """Return the folder of result files: `folder`, or its kitti/ if it is a run of `detect`."""
-    return folder / FOLDER if (folder / journal.JOURNAL_NAME).is_file() and (folder / FOLDER).is_dir() else folder
+    """Return the folder of result files: `folder`, or its kitti/ if `detect` wrote it."""
+    return (
+        folder / RESULT_FOLDER
+        if (folder / journal.JOURNAL_NAME).is_file() and (folder / RESULT_FOLDER).is_dir()
+        else folder
+    )
 
 
 def choose_calibration(frame: Frame) -> tuple[Calibration, bool]:
-    """Return the calibration of a frame for its result file, else that of a nominal camera and
-    True."""
+    """Return the calibration for the result file of a frame, and True if it is a nominal one."""
     try:
-        own = frame.calibration()
+        calibration = frame.calibration()
     except InputError:
-        own = None
-    return (FORWARD_CAMERA, True) if own is None else (own, False)
+        calibration = None
+    return (FORWARD_CAMERA, True) if calibration is None else (calibration, False)
 
 
 def read_results(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
@@ -63,7 +66,7 @@ def read_results(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
 def write_results(path: Path, detections: Detections, calibration: Calibration) -> None:
     """Write the result file of one frame. InputError if it cannot be written.
 
-    Truncation and occlusion are -1. The 2D box is projected, and 0 outside the image.
+    Truncation and occlusion are -1. The 2D box is the projected box; it is 0 outside the image.
     """
     write_text(
         path, "".join(format_label(label, DECIMALS) + "\n" for label in _to_result_labels(detections, calibration))

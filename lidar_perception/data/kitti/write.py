@@ -32,9 +32,9 @@ def project_boxes(boxes: np.ndarray, calibration: Calibration) -> tuple[np.ndarr
     """Project LiDAR boxes (K, 7) to 2D boxes.
 
     Returns:
-        2D boxes (K, 4) [left top right bottom] in pixels, clipped to the image, and the share (K,)
-        of each unclipped 2D box that is outside the image. NaN and 1 for a box that is not in the
-        image.
+        2D boxes (K, 4) [left top right bottom] in pixels, clipped to the image, and the fraction
+        (K,) of each unclipped 2D box that is outside the image. NaN and 1 for a box that is not in
+        the image.
     """
     corners = np.concatenate([box_corners(boxes), np.ones((len(boxes), 8, 1))], axis=2)
     ends = (corners @ calibration.lidar_to_camera.T)[:, EDGES]  # (K, 12, 2, 4)
@@ -73,7 +73,7 @@ def format_object_labels(truth: GroundTruth, calibration: Calibration) -> str:
 def format_tracking_labels(number: int, truth: GroundTruth, calibration: Calibration) -> str:
     """Return the lines of a frame in a label_02 file, with six decimals; each extra has a track_id.
 
-    Truncation is a level here: 0, 1 or 2 for a share of about none, half or all.
+    Truncation is a level here: 0, 1 or 2 for a fraction of about 0, 0.5 or 1.
     """
     return "".join(
         format_tracking_line(
@@ -116,7 +116,7 @@ def write_object(root: Path, number: int, cloud: np.ndarray, truth: GroundTruth,
 
 
 def write_object_text(root: Path, number: int, cloud: np.ndarray, labels: str, calibration: Calibration) -> None:
-    """Write the same as write_object, with the given text of the label_2 file."""
+    """Write the same files as write_object, with `labels` as the text of the label_2 file."""
     folder, name = root / "training", f"{number:06}"
     write_velodyne(folder / f"velodyne/{name}.bin", cloud)
     write_bytes(folder / f"calib/{name}.txt", format_calibration(calibration).encode())

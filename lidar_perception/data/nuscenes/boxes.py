@@ -89,8 +89,8 @@ class GlobalBoxes:
         centres = np.asarray(centres, np.float64).reshape(-1, 3)
         count = len(centres)
 
-        def column(values, kind, *shape):
-            return np.broadcast_to(np.asarray(values, kind), (count, *shape)).copy()
+        def column(values, dtype, *shape):
+            return np.broadcast_to(np.asarray(values, dtype), (count, *shape)).copy()
 
         return GlobalBoxes(
             centres,

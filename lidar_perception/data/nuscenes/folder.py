@@ -24,8 +24,8 @@ from lidar_perception.intensity import to_unit
 from lidar_perception.types import GroundTruth, InputError, PointCloud, usable_returns
 from lidar_perception.wire.topics import LIDAR_FRAME
 
-CHANNEL = "LIDAR_TOP"
-SWEEP = "x y z intensity ring"  # columns of a .pcd.bin file, float32
+LIDAR_CHANNEL = "LIDAR_TOP"
+SWEEP_COLUMNS = "x y z intensity ring"  # columns of a .pcd.bin file, float32
 EGO_RADIUS_M = 1.0  # points closer than this in both x and y are on the vehicle itself
 FULL_REFLECTION = 255  # maximum value of the intensity column
 
@@ -36,7 +36,7 @@ class KeyFrame:
 
     Attributes:
         token: token of the sample.
-        pose: (4, 4) of the frame in the global frame.
+        pose: (4, 4) pose of the frame in the global frame.
         ego: (3,) position of the vehicle in the global frame.
         labels: returns the labels in the global frame; None if the version has none.
     """
@@ -50,9 +50,10 @@ class KeyFrame:
 def load_sweep(path: Path, rotation: np.ndarray, stamp_ns: int) -> PointCloud:
     """Load the usable points of a .pcd.bin file that are not on the vehicle itself.
 
-    rotation: (3, 3) from the sensor's axes to those of the frame.
+    Args:
+        rotation: (3, 3) rotation from the sensor's axes to those of the frame.
     """
-    cloud = read_records(path, SWEEP)
+    cloud = read_records(path, SWEEP_COLUMNS)
     off_vehicle = (np.abs(cloud[:, :2]) >= EGO_RADIUS_M).any(axis=1)
     cloud = cloud.compress(off_vehicle & usable_returns(cloud[:, :3]), axis=0)
     xyz = (cloud[:, :3].astype(np.float64) @ rotation.T).astype(np.float32)
@@ -98,15 +99,15 @@ def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
     """
     tables = Tables(root, version)
     names = dict(tables.rows("scene", "token", "name"))
-    rank = {name: i for i, name in enumerate(names.values())}
+    scene_order = {name: i for i, name in enumerate(names.values())}
     samples = sorted(
-        (rank[names[scene]], time, token)
+        (scene_order[names[scene]], time, token)
         for token, time, scene in tables.rows("sample", "token", "timestamp", "scene_token")
-        if names.get(scene) in rank
+        if names.get(scene) in scene_order
     )
     if not samples:
         raise InputError(f"{tables.folder} has no key frames; download it again")
-    scene_names, times = list(rank), {token: time for _, time, token in samples}
+    scene_names, times = list(scene_order), {token: time for _, time, token in samples}
     if len(times) < len(samples):
         raise InputError(f"{tables.path('sample')} has rows with the same token; download it again")
     sweeps = _read_sweeps(tables, times)
@@ -114,7 +115,7 @@ def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
     poses = _read_poses(tables, "ego_pose", {pose for _, _, pose, _ in sweeps.values()})
     all_labels = functools.cache(partial(read_labels, tables, times))
     label_files = tuple(tables.path(name) for name in ("sample_annotation", "calibrated_sensor", "ego_pose"))
-    frames, counts = [], dict.fromkeys(rank.values(), 0)
+    frames, counts = [], dict.fromkeys(scene_order.values(), 0)
     for number, (scene, _, token) in enumerate(samples):
         file, time, pose, mount = sweeps[token]
         sensor_pose, rotation = _make_sensor_pose(poses[pose], mounts[mount]), mounts[mount][:3, :3]
@@ -144,7 +145,7 @@ def _get_frame_labels(all_labels: Callable, number: int) -> NuscenesLabels | Non
 
 
 def _make_sensor_pose(ego: np.ndarray, mount: np.ndarray) -> np.ndarray:
-    """Return the pose (4, 4) of the sensor's position with the vehicle's axes."""
+    """Return the pose (4, 4) with the sensor's position and the vehicle's axes."""
     pose = ego.copy()
     pose[:3, 3] += ego[:3, :3] @ mount[:3, 3]
     return pose
@@ -153,7 +154,7 @@ def _make_sensor_pose(ego: np.ndarray, mount: np.ndarray) -> np.ndarray:
 def _read_sweeps(tables: Tables, times: dict[str, int]) -> dict[str, tuple[str, int, str, str]]:
     """Return file, time in us, ego pose token and calibration token of the sweep of each key
     frame."""
-    sensors = {token for token, channel in tables.rows("sensor", "token", "channel") if channel == CHANNEL}
+    sensors = {token for token, channel in tables.rows("sensor", "token", "channel") if channel == LIDAR_CHANNEL}
     mounts = {token for token, sensor in tables.rows("calibrated_sensor", "token", "sensor_token") if sensor in sensors}
     sweeps = {
         sample: (file, time, pose, mount)
@@ -170,16 +171,16 @@ def _read_sweeps(tables: Tables, times: dict[str, int]) -> dict[str, tuple[str, 
     }
     if missing := times.keys() - sweeps.keys():
         raise InputError(
-            f"{tables.path('sample_data')} has no {CHANNEL} for {len(missing)} of "
+            f"{tables.path('sample_data')} has no {LIDAR_CHANNEL} for {len(missing)} of "
             f"{len(times)} key frames, such as {min(missing)}; download it again"
         )
     return sweeps
 
 
-def _read_poses(tables: Tables, table: str, wanted: set[str]) -> dict[str, np.ndarray]:
+def _read_poses(tables: Tables, table: str, tokens: set[str]) -> dict[str, np.ndarray]:
     """Return the poses (4, 4) in a table by token: sensor to vehicle, or vehicle to global."""
-    rows = {token: row for token, *row in tables.rows(table, "token", "translation", "rotation") if token in wanted}
-    if missing := wanted - rows.keys():
+    rows = {token: row for token, *row in tables.rows(table, "token", "translation", "rotation") if token in tokens}
+    if missing := tokens - rows.keys():
         raise InputError(
             f"{tables.path(table)} has no row {min(missing)} ({len(missing)} missing rows); download it again"
         )

@@ -19,7 +19,7 @@ from lidar_perception.data.nuscenes.boxes import (
 from lidar_perception.data.nuscenes.tables import Tables
 from lidar_perception.types import CLASSES, GroundTruth, InputError
 
-TABLE = "sample_annotation"
+LABEL_TABLE = "sample_annotation"
 BLOCK_SIZE = 4096  # number of labels converted to columns at a time
 BIKE_RACK = "static_object.bicycle_rack"
 MAX_TIME_S = 1.5  # maximum time between two labels to derive a velocity; doubled with a label in between
@@ -70,7 +70,7 @@ class NuscenesLabels:
         track_id, and for a tilted box rotation (4,) [w x y z] in the global frame.
 
         Args:
-            pose: (4, 4) of the frame in the global frame.
+            pose: (4, 4) pose of the frame in the global frame.
         """
         boxes, extras, ids = self.boxes, [], []
         tilted = are_tilted(boxes, pose)
@@ -97,7 +97,7 @@ class NuscenesLabels:
 def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] | None:
     """Read the labels of key frames.
 
-    All frames of a scene must be given, as velocities are computed from neighbouring frames.
+    All frames of a scene must be given, because velocities are computed from adjacent frames.
 
     Args:
         times: time in us of each key frame, by its sample token.
@@ -109,25 +109,25 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
     Raises:
         InputError: a table is invalid.
     """
-    if tables.version.endswith("test") and not tables.path(TABLE).exists():
+    if tables.version.endswith("test") and not tables.path(LABEL_TABLE).exists():
         return None
-    frame_of = {token: number for number, token in enumerate(times)}
+    frame_by_token = {token: number for number, token in enumerate(times)}
     names = dict(tables.rows("category", "token", "name"))
-    number_of = {token: number for number, token in enumerate(names)}
+    category_by_token = {token: number for number, token in enumerate(names)}
     attributes = {
         token: ATTRIBUTES.index(name) if name in ATTRIBUTES else -1
         for token, name in tables.rows("attribute", "token", "name")
     }
     instances = {
-        token: (number, number_of.get(category, -1))
+        token: (number, category_by_token.get(category, -1))
         for number, (token, category) in enumerate(tables.rows("instance", "token", "category_token"))
     }
     own_links, links, in_frames, of_objects, of_categories = (array("q") for _ in range(5))
     tokens: dict[str, int] = {}  # token -> number of the label, in order of first occurrence
     fields = ("translation", "size", "rotation")
     block, blocks = [], []
-    for token, sample, instance, before, after, lidar, radar, labels, *box in tables.rows(
-        TABLE,
+    for token, sample, instance, previous_token, next_token, lidar, radar, labels, *box in tables.rows(
+        LABEL_TABLE,
         "token",
         "sample_token",
         "instance_token",
@@ -138,18 +138,18 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
         "attribute_tokens",
         *fields,
     ):
-        if sample not in frame_of:
+        if sample not in frame_by_token:
             continue
         number, category = instances.get(instance, (-1, -1))
         if category < 0:
             raise InputError(
-                f"{tables.path(TABLE)}: the instance {instance} of {token} is not in "
+                f"{tables.path(LABEL_TABLE)}: the instance {instance} of {token} is not in "
                 "the table of instances, or has no category; download the tables "
                 "again"
             )
         own_links.append(tokens.setdefault(token, len(tokens)))
-        links.extend([tokens.setdefault(other, len(tokens)) if other else -1 for other in (before, after)])
-        in_frames.append(frame_of[sample])
+        links.extend([tokens.setdefault(other, len(tokens)) if other else -1 for other in (previous_token, next_token)])
+        in_frames.append(frame_by_token[sample])
         of_objects.append(number)
         of_categories.append(category)
         block.append((*box, (lidar, radar, attributes.get(str(labels[0]), -1) if labels else -1)))
@@ -181,22 +181,22 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
     return [all_labels[rows] for rows in np.split(order, bounds)]
 
 
-def _link_neighbours(tables: Tables, tokens: dict[str, int], own: array, links: array) -> np.ndarray:
+def _link_neighbours(tables: Tables, tokens: dict[str, int], numbers: array, links: array) -> np.ndarray:
     """Return the rows (K, 2) of the previous and next label of the same object, -1 = none.
 
     Args:
         tokens: number of each label, by its token.
-        own: (K,) numbers of the labels.
+        numbers: (K,) numbers of the labels.
         links: (2 K,) numbers of the previous and next labels, -1 = none.
     """
-    linked = np.array(links).reshape(-1, 2)
+    link_pairs = np.array(links).reshape(-1, 2)
     row_of = np.full(len(tokens) + 1, -1)  # the last element serves link -1 (no label)
-    row_of[own] = np.arange(len(own))
-    neighbours = row_of[linked]
-    if (missing := (neighbours < 0) & (linked >= 0)).any():
-        token = next(token for token, number in tokens.items() if number == linked[missing][0])
+    row_of[numbers] = np.arange(len(numbers))
+    neighbours = row_of[link_pairs]
+    if (missing := (neighbours < 0) & (link_pairs >= 0)).any():
+        token = next(token for token, number in tokens.items() if number == link_pairs[missing][0])
         raise InputError(
-            f"{tables.path(TABLE)}: the label {token}, which another one links to, is missing; download it again"
+            f"{tables.path(LABEL_TABLE)}: the label {token}, which another one links to, is missing; download it again"
         )
     return neighbours
 
@@ -206,7 +206,7 @@ def _to_columns(tables: Tables, block: list[tuple]) -> np.ndarray:
     attribute."""
     fields = (("translation", 3), ("size", 3), ("rotation", 4), ("count of points", 3))
     return np.hstack(
-        [tables.numbers(TABLE, name, [row[i] for row in block], width) for i, (name, width) in enumerate(fields)]
+        [tables.numbers(LABEL_TABLE, name, [row[i] for row in block], width) for i, (name, width) in enumerate(fields)]
     )
 
 
@@ -216,8 +216,8 @@ def _compute_velocities(centres: np.ndarray, seconds: np.ndarray, neighbours: np
     Without a previous or next label, the label itself is used. NaN if there is neither, or if they
     are too far apart in time.
     """
-    own = np.arange(len(centres))
-    first, last = (np.where(rows >= 0, rows, own) for rows in neighbours.T)
+    indices = np.arange(len(centres))
+    first, last = (np.where(rows >= 0, rows, indices) for rows in neighbours.T)
     time = seconds[last] - seconds[first]
     max_time = np.where((neighbours >= 0).all(axis=1), 2 * MAX_TIME_S, MAX_TIME_S)
     valid = (time > 0) & (time <= max_time)

@@ -23,8 +23,8 @@ META = {"use_camera": False, "use_lidar": True, "use_radar": False, "use_map": F
 def to_results(detections: Detections, frame: Frame) -> GlobalBoxes:
     """Convert detections of a frame to global boxes, without velocity and attribute.
 
-    Only classes in NAME_BY_CLASS are kept, and the best MAX_BOXES. Raises InputError if a number is
-    not finite.
+    Keeps only classes in NAME_BY_CLASS, and at most the MAX_BOXES boxes with the highest scores.
+    Raises InputError if a number is not finite.
     """
     if not (np.isfinite(detections.boxes).all() and np.isfinite(detections.scores).all()):
         raise InputError(
@@ -67,7 +67,7 @@ def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:
 
 
 def format_boxes(token: str, centres: np.ndarray, sizes: np.ndarray, rotations: np.ndarray) -> list[dict[str, Any]]:
-    """Convert K boxes of a sample, as of to_global_boxes, to nuScenes' format (sizes [w l h])."""
+    """Convert the K global boxes of a sample to nuScenes' format (sizes [w l h])."""
     return [
         {"sample_token": token, "translation": centre, "size": [width, length, height], "rotation": rotation}
         for centre, (length, width, height), rotation in zip(centres.tolist(), sizes.tolist(), rotations.tolist())

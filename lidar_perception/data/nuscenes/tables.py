@@ -1,7 +1,7 @@
 """Tables of nuScenes: JSON lists of rows.
 
-LiDAR frames need one percent of the tables of trainval, which have more than a gigabyte. So rows
-are decoded one by one, and only the required fields are kept.
+The tables of trainval have more than a gigabyte, of which LiDAR frames need one percent. Therefore
+rows are decoded one by one, and only the required fields are kept.
 """
 
 from __future__ import annotations
@@ -73,7 +73,9 @@ class Tables:
         Raises InputError if the table is missing, truncated or damaged, and if a field of a row is
         missing or has another type.
         """
-        kinds = [(column, TYPE_BY_FIELD[field]) for column, field in enumerate(fields) if field in TYPE_BY_FIELD]
+        typed_columns = [
+            (column, TYPE_BY_FIELD[field]) for column, field in enumerate(fields) if field in TYPE_BY_FIELD
+        ]
         for number, row in enumerate(self._decode_rows(table)):
             try:
                 values = tuple([row[field] for field in fields])
@@ -82,11 +84,11 @@ class Tables:
                 raise InputError(
                     f"{self.path(table)}: row {number} has no {missing}; is it a table of nuScenes? download it again"
                 ) from None
-            for column, kind in kinds:
-                if not isinstance(values[column], kind) or (kind is int and not 0 <= values[column] < MAX_TIME_US):
+            for column, type_ in typed_columns:
+                if not isinstance(values[column], type_) or (type_ is int and not 0 <= values[column] < MAX_TIME_US):
                     raise InputError(
                         f"{self.path(table)}: row {number}: {fields[column]} is "
-                        f"{PROBLEM_BY_TYPE[kind]}; download it again"
+                        f"{PROBLEM_BY_TYPE[type_]}; download it again"
                     )
             yield values
 
@@ -97,23 +99,23 @@ class Tables:
                 text = stream.read(CHUNK_SIZE).lstrip()
                 if text[:1] != "[":
                     raise InputError(f"{path} is not a list of rows; download the tables of {self.version} again")
-                text, at, ended = text[1:], 0, False
+                text, offset, at_end = text[1:], 0, False
                 while True:
-                    while at < len(text) and text[at] in SEPARATORS:
-                        at += 1
-                    if at < len(text) and text[at] == "]":
+                    while offset < len(text) and text[offset] in SEPARATORS:
+                        offset += 1
+                    if offset < len(text) and text[offset] == "]":
                         return
                     try:
-                        row, at = decode(text, at)
+                        row, offset = decode(text, offset)
                         yield row
                         continue
                     except ValueError as error:  # the row ends in the next chunk, or is damaged
-                        if ended or len(text) - at > 2 * CHUNK_SIZE:
+                        if at_end or len(text) - offset > 2 * CHUNK_SIZE:
                             raise InputError(
                                 f"{path} is truncated or damaged ({error}); download the tables of {self.version} again"
                             ) from None
-                    more = stream.read(CHUNK_SIZE)
-                    text, at, ended = text[at:] + more, 0, not more
+                    chunk = stream.read(CHUNK_SIZE)
+                    text, offset, at_end = text[offset:] + chunk, 0, not chunk
         except OSError as error:
             raise InputError(
                 f"cannot read the table {path}: {error.strerror}; unpack the metadata of {self.version} there"
@@ -139,6 +141,6 @@ class Tables:
             or not (np.abs(column) <= MAX_NUMBER).all()
             or (field == "rotation" and not are_valid_rotations(column).all())
         ):
-            wanted = "a quaternion" if field == "rotation" else f"{width} finite numbers within {MAX_NUMBER:g}"
-            raise InputError(f"{self.path(table)}: a {field} is not {wanted}; download it again")
+            expected = "a quaternion" if field == "rotation" else f"{width} finite numbers within {MAX_NUMBER:g}"
+            raise InputError(f"{self.path(table)}: a {field} is not {expected}; download it again")
         return column
