@@ -95,7 +95,7 @@ def counting_sort(keys, count, first):
 
     Args:
         keys: (N,) int.
-        count: number of different keys.
+        count: number of possible keys.
         first: (N,) indices 0..N-1 in their initial order, which is kept among equal keys.
 
     Returns:
@@ -228,7 +228,7 @@ def box_corners(boxes: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([x, y, below], -1), np.stack([x, y, above], -1)], axis=1)
 
 
-MAX_CORNERS = 8  # of the overlap of two rectangles: clipping at four sides adds one corner each
+MAX_CORNERS = 8  # maximum corners where two rectangles overlap: clipping at four sides adds one corner each
 
 
 def bev_and_3d_iou(boxes: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

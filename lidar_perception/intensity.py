@@ -13,13 +13,13 @@ MAX_UNIT = 1.5  # noise and calibration make intensities of 0..1 exceed 1, but n
 PERCENT = 100.0
 BITS = (255.0, 1023.0, 4095.0, 65535.0)  # 8, 10, 12 and 16 bits
 TOLERANCE = 1.001  # factor by which rounding lets a value exceed its scale
-MAX_OUTLIERS = 1e-4  # share of the values of a cloud that may exceed its scale
+MAX_OUTLIERS = 1e-4  # maximum fraction of the values of a cloud that exceed its scale
 WHOLE_SAMPLE = 10_000  # number of values that are checked for being whole numbers
-MIN_BRIGHT = 0.05  # of the highest intensity in a cloud of at least MIN_POINTS points
-MIN_POINTS = 1000
-MIN_KNOWN = 0.1  # share of the points that must have an intensity for it to be usable
-# Distribution of positive intensities that networks read, as of an HDL-64E in towns: shares of the
-# points, and the intensity that each share does not exceed.
+MIN_BRIGHT = 0.05  # expected minimum of the highest intensity in a cloud
+MIN_POINTS = 1000  # number of points from which MIN_BRIGHT applies
+MIN_KNOWN = 0.1  # fraction of the points that must have an intensity for it to be usable
+# Distribution of positive intensities in the input of networks, like that of an HDL-64E in towns:
+# quantile levels, and the intensity at each level.
 REFERENCE_SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 1.0)
 REFERENCE_VALUES = (
     0.01,
@@ -40,7 +40,7 @@ REFERENCE_VALUES = (
     0.71,
     0.99,
 )
-INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # a cloud's first one counts
+INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # the first one present is used
 
 
 def infer_full_scale(values: np.ndarray, dtype: DTypeLike | None = None) -> float:

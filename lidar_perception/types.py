@@ -28,11 +28,11 @@ __all__ = [
     "usable_returns",
 ]
 
-MAX_RANGE = 1e5  # metres; points beyond are broken returns
-MIN_NAME_SIMILARITY = 0.6  # of a misspelt name, 0..1 as in difflib
+MAX_RANGE = 1e5  # metres; points beyond this range are invalid returns
+MIN_NAME_SIMILARITY = 0.6  # minimum similarity of a misspelt name to the right one, 0..1 as in difflib
 MIN_PREFIX = 3  # characters that a misspelt name shares with the right one
-MAX_NUMBER = 1e9  # larger numbers in labels are damaged
-SENSOR_HEIGHT = 1.73  # metres, of KITTI's sensor above the road; default of anchors and simulation
+MAX_NUMBER = 1e9  # larger numbers in labels are corrupt
+SENSOR_HEIGHT = 1.73  # height of KITTI's sensor above the road in metres; default of anchors and simulation
 
 
 class InputError(ValueError):

@@ -15,7 +15,7 @@ from lidar_perception.clustering.grid import build_grid, take_columns
 BLOCK = 32  # distances per block: few enough to stop early, many enough for vectorised loops
 
 # N points sorted into C cells. order (N,) are their rows in the input, xyz (3, N) their float64
-# coordinates, start (C + 1,) the index of the first point of each cell. All neighbours within
+# coordinates; start (C + 1,) is the index of the first point of each cell. All neighbours within
 # `reach` of cell a are in the cells low[a, k] .. high[a, k] - 1 for k < ranges[a]; k = 0 is the
 # cell's own column. size[a] is the number of points in these cells.
 Cells = namedtuple("Cells", "reach order xyz start ranges size low high")
@@ -34,9 +34,9 @@ def mean_neighbourhood_size(cells: Cells) -> float:
     return float(np.diff(cells.start) @ cells.size) / len(cells.order)
 
 
-# S points that represent the points of C cells: xyz (3, S) float64, start (C + 1,) the first of
-# each cell, and weight (C,) the number of points that each of them represents. If the cells' xyz
-# has more rows, values of the points, then so has the sample's.
+# S points that represent the points of C cells. xyz (3, S) float64 are their coordinates, start
+# (C + 1,) is the index of the first point of each cell, weight (C,) the number of points that each
+# sampled point of a cell represents. Further rows in the cells' xyz are sampled too.
 Sample = namedtuple("Sample", "xyz start weight")
 
 
@@ -112,13 +112,13 @@ def gather_sample(cells, sample, a):
 
 @njit(cache=True, nogil=True)
 def _find_ranges(start, cell_z, column_start, neighbours):
-    columns, half = neighbours.shape
-    low = np.empty((len(cell_z), 2 * half - 1), np.int32)
+    columns, half_count = neighbours.shape
+    low = np.empty((len(cell_z), 2 * half_count - 1), np.int32)
     high, ranges, size = np.empty_like(low), np.zeros_like(cell_z), np.zeros_like(cell_z)
     for c in range(columns):
         _add_ranges(start, cell_z, column_start, c, c, low, high, ranges, size)
     for c in range(columns):
-        for k in range(1, half):
+        for k in range(1, half_count):
             other = neighbours[c, k]
             if other >= 0:
                 _add_ranges(start, cell_z, column_start, c, other, low, high, ranges, size)

@@ -223,7 +223,10 @@ def _label_points(x, y, z, start, first, second, order, core, parent, eps2):
 
 @njit(cache=True, nogil=True)
 def _adopt_border_points(x, y, z, order, start, a, b, core, label, labels, eps2):
-    """Assign `label` to border points of cell a near a core point of cell b, unless theirs is lower."""
+    """Assign `label` to border points of cell a near a core point of cell b.
+
+    Border points that already have a lower label keep it.
+    """
     for i in range(start[a], start[a + 1]):
         current = labels[order[i]]
         if not core[i] and (current == 0 or current > label):

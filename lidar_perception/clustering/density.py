@@ -13,7 +13,7 @@ from lidar_perception.types import usable_returns
 CELL_DEG = 2.0  # the gap between the beams of a VLP-16
 MAX_SAMPLED = 30_000  # number of points to sample from a larger cloud
 MAX_WIDENING = 4.0  # maximum factor by which neighbourhoods widen
-MIN_CLUSTER_POINTS = 3  # lower limit of min_size; the one of min_samples is one less
+MIN_CLUSTER_POINTS = 3  # lower limit of min_size; that of min_samples is one less
 # A widened radius of the local threshold, and a widened eps at the end of its band, in multiples of
 # the distance between neighbouring points on a surface that faces the sensor.
 SPACINGS_PER_RADIUS, SPACINGS_PER_EPS = 4.0, 2.5
@@ -21,8 +21,9 @@ LAST_BAND_FACTOR = 1.5  # assumed end of the last band, as a multiple of the las
 
 
 def measure_density(xyz: np.ndarray) -> float:
-    """Measure the angular density of a cloud: the mean number of points per square degree around a
-    point, as seen from the sensor.
+    """Measure the angular density of a cloud as seen from the sensor.
+
+    It is the mean number of points per square degree around a point.
 
     Args:
         xyz: (N, 3) float32 in sensor coordinates, metres; N may be 0.
