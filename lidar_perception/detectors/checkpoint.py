@@ -112,7 +112,7 @@ class Header:
 
         Args:
             source: name of the file, for messages.
-            kind: expected class of the config; None: any.
+            config_class: expected class of the config; None: any.
 
         Raises:
             InputError: the text is not a header, or its config is of another class.
@@ -120,8 +120,8 @@ class Header:
         content = _parse_header(text, source)
         title, use, config = NETWORKS[content["network"]]
         if config_class is not None and content["network"] != config_class.network:
-            expected_title, own_use, _ = NETWORKS[config_class.network]
-            raise InputError(f"{source} contains a {title} for {use}; {own_use} require a {expected_title}")
+            expected_title, expected_use, _ = NETWORKS[config_class.network]
+            raise InputError(f"{source} contains a {title} for {use}; {expected_use} require a {expected_title}")
         return Header(
             parse_config(config, content["config"], source),
             content["training"],
@@ -141,7 +141,7 @@ def _parse_header(text: str | None, source: str) -> dict[str, Any]:
         parts = {name: content[name] for name in ("format", *PARTS)}
         network = content.get("network", POINTPILLARS)  # files of early versions lack this key
         calibration = content.get("calibration", {})
-        if not all(isinstance(parts[name], config_class) for name, config_class in PARTS.items()):
+        if not all(isinstance(parts[name], part_type) for name, part_type in PARTS.items()):
             raise TypeError
     except (TypeError, ValueError, KeyError, AttributeError, RecursionError):
         raise InputError(
@@ -206,7 +206,7 @@ def read_header(path: str | Path, config_class: type[Config] | None = None) -> H
     """Read the header of a checkpoint.
 
     Args:
-        kind: expected class of the config; None: any.
+        config_class: expected class of the config; None: any.
 
     Raises:
         InputError: the file is missing or broken, has no header, or has a config of another class.
@@ -240,7 +240,7 @@ def load_checkpoint(
     """Load the header and the network of a checkpoint, in float32, on the CPU and in training mode.
 
     Args:
-        kind: class of the config.
+        config_class: class of the config.
         make: make(config) returns the network without weights.
         expected: config that the checkpoint must have; None: any.
 
@@ -268,8 +268,8 @@ def load_checkpoint(
 def _describe_tensor(value: torch.Tensor | None) -> str:
     if value is None:
         return "missing"
-    config_class = "floats" if value.is_floating_point() else str(value.dtype).removeprefix("torch.")
-    return f"{config_class} of shape {tuple(value.shape)}"
+    number_type = "floats" if value.is_floating_point() else str(value.dtype).removeprefix("torch.")
+    return f"{number_type} of shape {tuple(value.shape)}"
 
 
 def copy_matching_weights(network: torch.nn.Module, path: str | Path, config_class: type[Config]) -> tuple[int, int]:
@@ -279,7 +279,7 @@ def copy_matching_weights(network: torch.nn.Module, path: str | Path, config_cla
     common inputs are copied and the new ones are set to 0. All other tensors remain unchanged.
 
     Args:
-        kind: class of the config.
+        config_class: class of the config.
 
     Returns:
         Number of copied tensors and total number of tensors of the network.

@@ -41,11 +41,11 @@ class LayerWeights:
         Raises:
             WeightsMismatch: the layer is missing or has another shape.
         """
-        weight = self.array(f"{name}.weight", shape)
+        weight = self.take_array(f"{name}.weight", shape)
         if norm is None or f"{norm}.weight" not in self.tensors:
-            return Weights(weight, self.array(f"{name}.bias", shape[:1]))
+            return Weights(weight, self.take_array(f"{name}.bias", shape[:1]))
         scale, shift, mean, variance = (
-            self.array(f"{norm}.{part}", shape[:1]) for part in ("weight", "bias", "running_mean", "running_var")
+            self.take_array(f"{norm}.{part}", shape[:1]) for part in ("weight", "bias", "running_mean", "running_var")
         )
         count = self.tensors.pop(f"{norm}.num_batches_tracked", None)
         if count is None or count.shape or count.dtype != np.int64:
@@ -53,7 +53,7 @@ class LayerWeights:
         scale = scale / np.sqrt(variance + np.float32(self.eps))
         return Weights(weight * scale.reshape(-1, *[1] * (len(shape) - 1)), shift - mean * scale)
 
-    def array(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    def take_array(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """Remove a floating point tensor and return it as float32. WeightsMismatch if it does not fit."""
         tensor = self.tensors.pop(name, None)
         if tensor is None or tensor.shape != shape or not np.issubdtype(tensor.dtype, np.floating):

@@ -1,4 +1,4 @@
-"""Clouds transformed to the input of the networks: as from a level sensor at SENSOR_HEIGHT."""
+"""Clouds as seen from a level sensor at SENSOR_HEIGHT, the input of the networks."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class NormalizedView:
         shift = np.array([0, 0, pose.height - SENSOR_HEIGHT], np.float32)
         xyz, indices, frame = level_points(source.xyz, pose), np.arange(len(source)), source
         if low is not None and high is not None:
-            indices = _indices_in_range(xyz, np.array(low, np.float32) - shift, np.array(high, np.float32) - shift)
+            indices = _find_indices_in_range(xyz, np.array(low, np.float32) - shift, np.array(high, np.float32) - shift)
             frame, xyz = source.take(indices), xyz.take(indices, axis=0)
         intensity = (
             normalize_intensity(source.intensity, None if frame is source else indices) if use_intensity else None
@@ -81,7 +81,7 @@ class NormalizedView:
         return replace(self, frame=replace(self.frame, xyz=xyz))
 
     def take(self, column: np.ndarray | None) -> np.ndarray | None:
-        """Select the values (M,) of this view from a column (N,) of the source; None for None."""
+        """Select the values (M,) of this view from a column (N,) of the source; return None for None."""
         return None if column is None else column.take(self.indices)
 
     def convert(self, column: np.ndarray | None, other: NormalizedView) -> np.ndarray | None:
@@ -96,7 +96,7 @@ class NormalizedView:
         values[self.indices] = column
         return values.take(other.indices)
 
-    def intensity_problem(self) -> str | None:
+    def find_intensity_problem(self) -> str | None:
         """Describe why the intensity is unusable; None if it is usable or the view ignores it."""
         intensity = self.source.intensity
         if (
@@ -117,7 +117,7 @@ class NormalizedView:
         )
 
 
-def _indices_in_range(xyz: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _find_indices_in_range(xyz: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         inside = np.ones(len(xyz), bool)
         for axis in range(3):
@@ -127,7 +127,7 @@ def _indices_in_range(xyz: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.
 
 def crop_to_range(frame: PointCloud, low: Corner, high: Corner) -> tuple[np.ndarray, PointCloud]:
     """Crop a frame to low <= x y z < high; return the indices (M,) int64 and the cropped frame."""
-    indices = _indices_in_range(frame.xyz, np.array(low, np.float32), np.array(high, np.float32))
+    indices = _find_indices_in_range(frame.xyz, np.array(low, np.float32), np.array(high, np.float32))
     return indices, frame.take(indices)
 
 
@@ -156,21 +156,21 @@ def to_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detection
 def drop_ego_vehicle(detections: Detections, height: float) -> Detections:
     """Remove detections of the ego vehicle, in the coordinates of a NormalizedView.
 
-    These are boxes that contain the sensor or are less than MAX_MAST_M above or below it. The roof
+    Boxes that contain the sensor, or are less than MAX_MAST_M above or below it, are removed. The roof
     is only partly visible, so cars below the sensor at a horizontal distance of less than
-    MAX_ROOF_GAP_M are dropped too.
+    MAX_ROOF_GAP_M are removed too.
 
     Args:
         height: actual height of the sensor above the ground in metres.
     """
     x, y, z, length, width, box_height, yaw = detections.boxes.astype(np.float64).T
     z = z - (height - SENSOR_HEIGHT)
-    along = np.abs(np.cos(yaw) * x + np.sin(yaw) * y) - length / 2
-    across = np.abs(np.cos(yaw) * y - np.sin(yaw) * x) - width / 2
-    distance = np.hypot(along.clip(0), across.clip(0))
+    gap_x = np.abs(np.cos(yaw) * x + np.sin(yaw) * y) - length / 2
+    gap_y = np.abs(np.cos(yaw) * y - np.sin(yaw) * x) - width / 2
+    distance = np.hypot(gap_x.clip(0), gap_y.clip(0))
     is_roof = (detections.class_ids == CAR) & (z + box_height / 2 < 0) & (distance < MAX_ROOF_GAP_M)
-    is_carrier = ((distance == 0) | is_roof) & (np.abs(z) <= box_height / 2 + MAX_MAST_M)
-    return detections[~is_carrier] if is_carrier.any() else detections
+    is_ego_vehicle = ((distance == 0) | is_roof) & (np.abs(z) <= box_height / 2 + MAX_MAST_M)
+    return detections[~is_ego_vehicle] if is_ego_vehicle.any() else detections
 
 
 def rotate_half_turn(frame: PointCloud) -> PointCloud:

@@ -106,9 +106,9 @@ def open_detector(
         elif kind in PARAMS:
             weights_param = settings.get("pointnet.weights") if kind == POINTNET else None
             params = with_values(default_params(weights_param or weights), {**arguments, **settings})
-            detector = _loader(kind)(path or "", getattr(params, kind).device, params)
+            detector = _find_loader(kind)(path or "", getattr(params, kind).device, params)
         else:
-            detector = _loader(kind)(path or "", device)
+            detector = _find_loader(kind)(path or "", device)
         if reference is None and range != "auto" and f"{kind}.range" not in settings:
             detector = detector.with_range(range)
         if sensor_height is not None:
@@ -137,24 +137,24 @@ def default_params(weights: str | Path) -> Any:
         return CustomDetectorParams()
     if kind not in PARAMS:
         return open_detector(weights).params
-    params = _attribute(PARAMS[kind])()
-    return _as_trained(params, path) if kind == POINTNET else params
+    params = _import_attribute(PARAMS[kind])()
+    return _apply_training_params(params, path) if kind == POINTNET else params
 
 
-def _loader(kind: str) -> Callable[..., ConfigurableDetector]:
-    return _attribute(LOAD[kind])
+def _find_loader(kind: str) -> Callable[..., ConfigurableDetector]:
+    return _import_attribute(LOAD[kind])
 
 
-def _attribute(path: str) -> Any:
+def _import_attribute(path: str) -> Any:
     """Return the attribute `module.name` of a module in this folder."""
-    return getattr(importlib.import_module(_module_name(path)), path.rpartition(".")[2])
+    return getattr(importlib.import_module(_get_module_name(path)), path.rpartition(".")[2])
 
 
-def _module_name(path: str) -> str:
+def _get_module_name(path: str) -> str:
     return f"lidar_perception.detectors.{path.rpartition('.')[0]}"
 
 
-def _as_trained(params: Any, path: Path | None) -> Any:
+def _apply_training_params(params: Any, path: Path | None) -> Any:
     from lidar_perception.detectors.checkpoint import read_header
     from lidar_perception.detectors.pointnet.config import PointNetConfig
     from lidar_perception.detectors.weights_file import find_pointnet_weights
@@ -205,8 +205,8 @@ def find_kind(path: Path) -> str:
 def check_weights(path: Path, height: float) -> list[str]:
     """Return warnings about a file of weights, for a sensor `height` metres above the ground.
 
-    Reasons: another sensor height in training, uncalibrated scores, classes that are never
-    detected. Exported networks are not checked.
+    The warnings are about another sensor height in training, uncalibrated scores, and classes that
+    are never detected. Exported networks are not checked.
     """
     if DETECTOR_BY_SUFFIX.get(path.suffix) == FUSED:
         from lidar_perception.detectors.fused.fusion import read_fusion
@@ -244,7 +244,7 @@ class DetectorChoice:
     def later_imports(self) -> tuple[str, ...]:
         """Modules that open() imports; preload them before forking, since importing torch is slow."""
         loader = LOAD.get(resolve_weights(self.weights)[0])
-        return () if loader is None else (_module_name(loader),)
+        return () if loader is None else (_get_module_name(loader),)
 
     def open(self, *, sensor_height: float | None = None, min_score: float | None = None) -> ConfigurableDetector:
         """Open the detector, see open_detector."""

@@ -1,4 +1,4 @@
-"""Compiled code on several threads."""
+"""Parallel execution of compiled code on several threads."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def run_in_parts(compute: Callable[[int, int], None], count: int, max_parts: int
 
     Args:
         compute: function that releases the GIL.
-        max_parts: maximum number of parts; small amounts of work need few.
+        max_parts: maximum number of parts; use few parts for small amounts of work.
     """
     threads = get_thread_count()
     parts = min(max_parts, threads * PARTS_PER_THREAD, count)
@@ -30,7 +30,7 @@ def run_in_parts(compute: Callable[[int, int], None], count: int, max_parts: int
         for begin, end in queue:
             compute(begin, end)
 
-    helpers = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
+    helpers = [_get_pool(threads - 1).submit(work) for _ in range(threads - 1)]
     work()
     for helper in helpers:
         if not helper.cancel():  # False if it has already started
@@ -38,5 +38,5 @@ def run_in_parts(compute: Callable[[int, int], None], count: int, max_parts: int
 
 
 @cache
-def _pool(threads: int) -> ThreadPoolExecutor:
+def _get_pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "run_in_parts")

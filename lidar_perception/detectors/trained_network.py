@@ -115,7 +115,7 @@ class TrainedNetwork:
     def find_best_scores(self, scores: Iterable[float]) -> tuple[dict[str, float], str | None]:
         """Return the highest scores by class, and a problem if one of them is NaN.
 
-        For clouds without detections.
+        Used for clouds without detections.
         """
         best = dict(zip(self.classes, scores))
         return best, (

@@ -48,7 +48,7 @@ ALL = "kitti,json,csv,mcap,openlabel"
 def made(monkeypatch):
     """Register MadeDetector under NAME, and return the list of its calls."""
     monkeypatch.setitem(LOAD, NAME, "")
-    monkeypatch.setattr(opening, "_loader", lambda kind: detect_samples.opened)
+    monkeypatch.setattr(opening, "_find_loader", lambda kind: detect_samples.opened)
     monkeypatch.setattr(MadeDetector, "calls", [])
     return MadeDetector.calls
 

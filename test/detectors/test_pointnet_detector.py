@@ -330,7 +330,7 @@ def test_weights_of_other_network_or_classes_are_refused(saved, tmp_path):
     config = json.loads(header.to_json())["config"]
     for change, words in (
         (dict(classes=two.classes, sizes=two.sizes), "do not fit its header"),
-        (dict(classes=("Car", "Dog", "Cyclist")), "no class 'Dog'"),
+        (dict(classes=("Car", "Dog", "Cyclist")), "unknown class 'Dog'"),
         (dict(colour=1), "'colour'"),
     ):
         changed = with_header(path, tmp_path / "c.safetensors", config={**config, **change})

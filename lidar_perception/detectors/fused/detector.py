@@ -120,9 +120,9 @@ class FusedDetector(NetworkDetector):
 
     def detect(self, frame: PointCloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None) -> DetectionResult:
         begin = perf_counter()
-        wide = self._make_view(frame)
+        extended_view = self._make_view(frame)
         preprocess = perf_counter() - begin
-        proposals = self._propose(wide, ground, cluster_ids, self.settings.scores)
+        proposals = self._propose(extended_view, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
         detections, best = self.decide(proposals)
         detections = restore_detections(detections, self.params.ground.sensor_pose)
@@ -146,7 +146,7 @@ class FusedDetector(NetworkDetector):
 
     def _propose(
         self,
-        wide: NormalizedView,
+        extended_view: NormalizedView,
         ground: np.ndarray | None = None,
         cluster_ids: np.ndarray | None = None,
         min_scores: ScoreParams = ScoreParams.for_all_classes(0.0),
@@ -158,40 +158,48 @@ class FusedDetector(NetworkDetector):
         """
         times = [perf_counter()]
         settings, params, config = self.settings, self.params, self.proposer.config
-        models = self.models_without_intensity if wide.frame.intensity is None else self.models
-        view = wide.crop(config.low, config.high)
+        models = self.models_without_intensity if extended_view.frame.intensity is None else self.models
+        view = extended_view.crop(config.low, config.high)
         is_ground = segment_view_ground(view.frame, params.ground) if ground is None else ground.take(view.indices)
         surface = fit_ground_surface(view.frame.xyz.compress(is_ground, axis=0), -SENSOR_HEIGHT)
-        flat = wide.flatten(surface).crop(config.low, config.high)
-        flat_ground = view.convert(is_ground, flat)
-        assert flat_ground is not None
-        obstacles = flat.frame.take(np.flatnonzero(~flat_ground))
-        floor = flat.frame.xyz.compress(flat_ground, axis=0)
+        flat_view = extended_view.flatten(surface).crop(config.low, config.high)
+        is_flat_ground = view.convert(is_ground, flat_view)
+        assert is_flat_ground is not None
+        obstacles = flat_view.frame.take(np.flatnonzero(~is_flat_ground))
+        ground_points = flat_view.frame.xyz.compress(is_flat_ground, axis=0)
         times.append(perf_counter())
         # Clustering runs in parallel: it releases the GIL, and much of PointPillars is single-threaded.
         with ThreadPoolExecutor(1) as pool:
-            clusters = pool.submit(cluster_obstacles, flat.frame.xyz, flat_ground, params.people, wide.source.xyz)
+            clusters = pool.submit(
+                cluster_obstacles, flat_view.frame.xyz, is_flat_ground, params.people, extended_view.source.xyz
+            )
             _, cluster_ids = run_experts(
                 view.frame, config, is_ground, view.take(cluster_ids), params.ground, params.clustering
             )
             proposal = self.proposer.propose(
-                flat,
-                flat_ground,
-                view.convert(cluster_ids, flat),
+                flat_view,
+                is_flat_ground,
+                view.convert(cluster_ids, flat_view),
                 ScoreParams.for_all_classes(settings.proposals),
                 replace(settings.nms, max_boxes=settings.max_proposals),
                 settings.cpu_fallback,
             )
-            people = clusters.result()[~flat_ground]
+            people_ids = clusters.result()[~is_flat_ground]
         times.append(perf_counter())
         proposed = drop_ego_vehicle(proposal.detections, view.pose.height)
         evidence = {
             "network": to_log_odds(proposed.scores),
-            "silhouette": to_log_odds(find_silhouette_confidence(proposed.boxes, obstacles.xyz, floor, people)),
+            "silhouette": to_log_odds(
+                find_silhouette_confidence(proposed.boxes, obstacles.xyz, ground_points, people_ids)
+            ),
         }
-        limits = compute_max_probabilities(models, proposed.class_ids, evidence, "classifier")
+        max_scores = compute_max_probabilities(models, proposed.class_ids, evidence, "classifier")
         probability, boxes = self.classifier.classify(
-            proposed, obstacles, floor, min_scores.passes(replace(proposed, scores=limits)), settings.cpu_fallback
+            proposed,
+            obstacles,
+            ground_points,
+            min_scores.passes(replace(proposed, scores=max_scores)),
+            settings.cpu_fallback,
         )
         evidence["classifier"] = to_log_odds(probability)
         boxes = move_towards(proposed.boxes, boxes, settings.classifier_box).astype(np.float32)

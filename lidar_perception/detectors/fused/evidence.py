@@ -91,12 +91,12 @@ def compute_max_probabilities(models: Models, class_ids: np.ndarray, evidence: E
     A curve is piecewise linear and constant beyond its knots, so its maximum is at a knot or is its
     value for missing evidence.
     """
-    best = np.full(len(class_ids), np.nan)
+    best_evidence = np.full(len(class_ids), np.nan)
     for class_id in np.unique(class_ids):
         curve = models.get(CLASSES[class_id], {"curves": {}})["curves"].get(source)
         if curve is not None and max(curve["values"]) > curve.get("unknown", 0.0):
-            best[class_ids == class_id] = curve["knots"][int(np.argmax(curve["values"]))]
-    return compute_probabilities(models, class_ids, {**evidence, source: best})
+            best_evidence[class_ids == class_id] = curve["knots"][int(np.argmax(curve["values"]))]
+    return compute_probabilities(models, class_ids, {**evidence, source: best_evidence})
 
 
 def compute_source_probabilities(models: Models, class_ids: np.ndarray, evidence: Evidence) -> dict[str, np.ndarray]:
@@ -104,11 +104,11 @@ def compute_source_probabilities(models: Models, class_ids: np.ndarray, evidence
 
     NaN: the source gives no evidence, or the model of the class does not use it.
     """
-    used_for = {
+    class_ids_by_source = {
         source: [i for i, name in enumerate(CLASSES) if source in models.get(name, {"curves": {}})["curves"]]
         for source in evidence
     }
     return {
-        source: np.where(np.isin(class_ids, used_for[source]), expit(odds), np.nan).astype(np.float32)
+        source: np.where(np.isin(class_ids, class_ids_by_source[source]), expit(odds), np.nan).astype(np.float32)
         for source, odds in evidence.items()
     }

@@ -145,13 +145,15 @@ def read_fusion(path: Path) -> Fusion:
         networks, models = [content[name] for name in NETWORKS], content["classes"]
         files, digests = ([str(part[key]) for part in networks] for key in ("file", "sha256"))
         fitted_to, models_without_intensity = dict(content["fitted_to"]), content.get(WITHOUT_INTENSITY)
-        _check(models)
-        _check(models_without_intensity or {})
+        _check_models(models)
+        _check_models(models_without_intensity or {})
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path} was not written by `lidar-perception train fused` ({shorten_error(error)})") from None
-    proposer, classifier = (path.parent / file if file else default for file, default in zip(files, _shipped()))
+    proposer, classifier = (
+        path.parent / file if file else default for file, default in zip(files, _find_shipped_weights())
+    )
     for part in (proposer, classifier):
         if not part.is_file():
             raise InputError(
@@ -177,33 +179,33 @@ def write_fusion(
         InputError: the file cannot be written.
     """
     parts = {}
-    for name, file, default in zip(NETWORKS, weights, _shipped()):
+    for name, file, default in zip(NETWORKS, weights, _find_shipped_weights()):
         parts[name] = {"file": relpath(file, path.parent) if file else "", "sha256": compute_digest(file or default)}
-    more = {WITHOUT_INTENSITY: models_without_intensity} if models_without_intensity else {}
-    write_text(path, json.dumps({**parts, "fitted_to": fitted_to, "classes": models, **more}, indent=1))
+    optional_parts = {WITHOUT_INTENSITY: models_without_intensity} if models_without_intensity else {}
+    write_text(path, json.dumps({**parts, "fitted_to": fitted_to, "classes": models, **optional_parts}, indent=1))
 
 
-def _shipped() -> tuple[Path, Path]:
+def _find_shipped_weights() -> tuple[Path, Path]:
     """Return the paths of the shipped weights of both networks. InputError if they are missing."""
     return find_proposer_weights(), find_judge_weights()
 
 
-def _check(models: Any) -> None:
+def _check_models(models: Any) -> None:
     """Raise a ValueError, TypeError or KeyError for invalid models."""
     for name, model in models.items():
         if name not in DETECTED:
             raise ValueError(f"unknown class {name[:40]!r}")
-        _numbers([model["bias"]])
+        _parse_log_odds([model["bias"]])
         for source, curve in model["curves"].items():
             if source not in KNOTS:
                 raise ValueError(f"unknown source {source[:40]!r}")
-            knots, values = _numbers(curve["knots"]), _numbers(curve["values"])
-            _numbers([curve.get("unknown", 0.0)])
+            knots, values = _parse_log_odds(curve["knots"]), _parse_log_odds(curve["values"])
+            _parse_log_odds([curve.get("unknown", 0.0)])
             if len(knots) != len(values) or not (np.diff(knots) > 0).all() or not (np.diff(values) >= 0).all():
                 raise ValueError(f"the curve of {source} is not increasing")
 
 
-def _numbers(values: Any) -> np.ndarray:
+def _parse_log_odds(values: Any) -> np.ndarray:
     """Convert log-odds to (K,) float64. ValueError if they are invalid or above MAX_LOG_ODDS."""
     if not all(type(value) in (int, float) for value in values):
         raise ValueError("log-odds must be numbers")

@@ -80,8 +80,8 @@ class CompiledPointNet:
         ]
         weight, bias = map(np.concatenate, zip(*outputs))
         self.outputs = _make_layer(weight, bias, relu=False)
-        self.temperature = weights.array("temperature", (1,))
-        self.offsets = weights.array("offsets", (self.widths[0],))
+        self.temperature = weights.take_array("temperature", (1,))
+        self.offsets = weights.take_array("offsets", (self.widths[0],))
         weights.finish()
 
     def to(self, device: str) -> None:

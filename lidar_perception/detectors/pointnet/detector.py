@@ -126,7 +126,7 @@ class PointNetDetector(NetworkDetector):
                 f"the farthest {dropped} of {len(clusters) + dropped} clusters are ignored; "
                 "raise clustering's min_size or pointnet.max_clusters"
             )
-        return view.intensity_problem()
+        return view.find_intensity_problem()
 
     def warm_up(self) -> None:
         """Run every step once on synthetic points to trigger JIT compilation."""

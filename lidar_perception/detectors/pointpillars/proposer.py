@@ -214,7 +214,7 @@ class PointPillarsProposer(TrainedNetwork):
                 "every point in the network's range is ground; is the sensor mounted at "
                 "another height or angle? set ground.sensor_pose"
             )
-        return view.intensity_problem()
+        return view.find_intensity_problem()
 
 
 def _logit(score: float) -> float:
