@@ -1,1 +1,1 @@
-"""Experiments over the frames of a recording: measuring, statistics, and the report."""
+"""Framework for experiments over the frames of a recording: measurement, statistics, report."""

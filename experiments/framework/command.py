@@ -1,4 +1,4 @@
-"""The verb reproduce: runs the experiments of the papers."""
+"""Command reproduce: run the experiments of the papers."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ EXPERIMENTS = {  # name -> "module:attribute" of an Experiment; the first is the
 }
 
 
-def _list_parameters(given: Mapping[str, Any]) -> list[Runs]:
-    """Return the training parameters of the experiment that is named, for --set help."""
-    names = [word for word in given.get("words", ()) if word in EXPERIMENTS]
+def _list_parameters(options: Mapping[str, Any]) -> list[Runs]:
+    """Return the training parameters of the selected experiment, for --set help."""
+    names = [word for word in options.get("words", ()) if word in EXPERIMENTS]
     training = load_experiment(names[0]).training if names else None
     return [] if training is None else [Runs(names[0], collect_fields(training), None)]
 
@@ -100,12 +100,15 @@ def reproduce(
 ) -> None:
     """Run an experiment of a paper and report each value next to the paper's.
 
-    EXPERIMENT is stm-cpa (default: every table of the STM-CPA paper), stm-cpa-configurations
-    (the configurations `paper` and `best`, with and without a labelled seed), eg-pointpillars
-    (the versions of EG-PointPillars, trained first), eg-pointpillars-shipped (the versions with the
-    shipped weights, without training), clusters (adaptive clustering and improved PointNet: every
-    table), clusters-segmentation (its tables without a network) or clusters-shipped (its tables of
-    detection with the shipped weights).
+    \b
+    EXPERIMENT is one of:
+      stm-cpa                  every table of the STM-CPA paper (default)
+      stm-cpa-configurations   configurations `paper` and `best`, with and without a labelled seed
+      eg-pointpillars          the versions of EG-PointPillars, trained first
+      eg-pointpillars-shipped  the versions with the shipped weights, without training
+      clusters                 every table of adaptive clustering and improved PointNet
+      clusters-segmentation    its tables without a network
+      clusters-shipped         its detection tables with the shipped weights
 
     FOLDER gets report.html, report.md, report.json, the tables as CSV and the figures as PNG, and
     frames.jsonl with the record of every frame. Trained networks are in models/. Workers of --dask
@@ -127,7 +130,7 @@ def reproduce(
     from lidar_perception.runs.terminal import console
 
     experiment = load_experiment(name)
-    started, before = datetime.now().astimezone(), perf_counter()
+    start_time, start_s = datetime.now().astimezone(), perf_counter()
     workers = jobs or count_cores()
     if experiment.training is None:
         refuse_options(
@@ -140,24 +143,24 @@ def reproduce(
         request = _make_request(experiment, data, split, out, budget, seeds, device, workers, limit, settings)
         recording = request.scenes.open_test_recording(request.params, out / "scans")
         experiment, records = run_with_models(experiment, request, recording, dask=dask, force=force, limit=limit)
-    seconds = perf_counter() - before
+    seconds = perf_counter() - start_s
     sections = experiment.make_sections(records)
     if experiment.illustrate is not None:
         sections = [*sections, *experiment.illustrate(records, recording.frames)]
-    about = {
+    run_info = {
         "data": ("simulated scans" if str(data) == SIM else str(data.resolve()))
         + (f", the first {limit} scans" if limit else ""),
-        "started": started.isoformat(" ", "seconds"),
+        "started": start_time.isoformat(" ", "seconds"),
         "duration of this run": f"{seconds:.0f} s"
         + (f" on the cluster at {dask}" if dask else f", processes: {workers}"),
         "machine": f"{read_cpu_name()}, {os.cpu_count()} cores; Python {platform.python_version()}",
         "version": f"lidar_perception {__version__}",
     }
-    page = write_report(out, experiment, records, sections, about)
+    report_page = write_report(out, experiment, records, sections, run_info)
     if all("skipped" in record for record in records):
         raise InputError(f"{data}: no frame could be measured ({records[0]['skipped']})")
     print_report(sections, group_skipped_frames(records), console)
-    console.print(f"report: {page}")
+    console.print(f"report: {report_page}")
 
 
 def _open_recording(data: Path, split: Path | None, out: Path) -> Recording:
@@ -189,19 +192,19 @@ def _make_request(
     """Return the request for the models of an experiment.
 
     Raises:
-        InputError: A parameter is unknown or wrong, or the frames cannot be split.
+        InputError: A parameter is unknown or invalid, or the frames cannot be split.
     """
     from experiments.framework.scenes import TEST_SCANS, ExperimentScenes
     from experiments.framework.trained_models import DEFAULT_BUDGET_H, ModelRequest
 
     assert experiment.training is not None and experiment.models is not None
     scenes = ExperimentScenes.split(str(data), split)
-    given = settings.values(Runs(experiment.name, collect_fields(experiment.training), None))[0]
-    has_steps = any(given.get(name) for name in ("steps", "epochs"))
+    values = settings.values(Runs(experiment.name, collect_fields(experiment.training), None))[0]
+    has_steps = any(values.get(name) for name in ("steps", "epochs"))
     if scenes.is_simulated and not has_steps:
         budget = budget or DEFAULT_BUDGET_H
     protocol = experiment.protocol if budget is None and not has_steps else {}
-    params = checked(experiment.training, {**protocol, **given})
+    params = checked(experiment.training, {**protocol, **values})
     frames = TEST_SCANS if scenes.is_simulated else len(scenes.test)
     return ModelRequest(
         experiment.models, params, scenes, out, budget, seeds, device, jobs, min(frames, limit or frames)
@@ -215,20 +218,20 @@ def load_experiment(name: str) -> Experiment:
 
 
 def _split_words(words: tuple[str, ...], data: Path | None) -> tuple[str, Path]:
-    """Return the name of the experiment, which may be left out, and DATA.
+    """Return the name of the experiment (the default if not given) and DATA.
 
     Raises:
-        UsageError: DATA is missing, or something is given twice.
+        UsageError: DATA is missing or given twice.
     """
     first = words[0] if words else ""
     is_experiment = first in EXPERIMENTS or len(words) > 1 or (first and data is not None and not Path(first).exists())
-    given = first if is_experiment else None
-    rest = words[given is not None :]
-    name = Choice(EXPERIMENTS).convert(given or next(iter(EXPERIMENTS)), None, None)
-    if len(rest) + (data is not None) > 1:
+    experiment_name = first if is_experiment else None
+    paths = words[experiment_name is not None :]
+    name = Choice(EXPERIMENTS).convert(experiment_name or next(iter(EXPERIMENTS)), None, None)
+    if len(paths) + (data is not None) > 1:
         raise click.UsageError(
-            f"DATA is given twice, {' '.join(rest)}" + (f" and --data {data}" if data else "") + "; give one"
+            f"DATA is given twice, {' '.join(paths)}" + (f" and --data {data}" if data else "") + "; give one"
         )
-    if not rest and data is None:
+    if not paths and data is None:
         raise click.UsageError("DATA is missing: give the path of a recording, or `sim`")
-    return name, data or Path(rest[0])
+    return name, data or Path(paths[0])

@@ -15,10 +15,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cell:
-    """A measured value, its 95 % interval and the paper's value; None where there is none.
+    """A measured value, its 95 % interval and the paper's value; None for unknown values.
+
+    Values are in the unit of their column, such as percent.
 
     Attributes:
-        digits: Decimals shown. Values are in the unit of their column, such as percent.
+        digits: Number of decimals to show.
     """
 
     value: float | None
@@ -36,7 +38,7 @@ class Table:
     """A table of the report.
 
     Attributes:
-        name: Name of the CSV file, without its ending.
+        name: Name of the CSV file without suffix.
         header: Names of the columns, with units.
     """
 
@@ -76,7 +78,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of the report; name is the name of the PNG file, without its ending."""
+    """A figure of the report; `name` is the name of the PNG file without suffix."""
 
     name: str
     title: str
@@ -85,7 +87,7 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture in the report, pixels (height, width, 3) uint8; name is as in Figure."""
+    """A picture in the report: pixels (height, width, 3) uint8; `name` is as in Figure."""
 
     name: str
     title: str
@@ -104,26 +106,26 @@ class Section:
 
 @dataclass(frozen=True)
 class Experiment:
-    """An experiment: each frame gives a record, and all records give the report.
+    """An experiment: measures a record per frame, and makes a report from all records.
 
     Attributes:
-        measure: measure(frames, i) returns the record of frame i, a dict that JSON can hold. It
-            may read the frames before i. It raises InputError to skip the frame; the report counts
-            and names skipped frames.
-        make_sections: make_sections(records) returns the report of the records of all frames, in
-            their order. It is also called with the records of unfinished runs, and with none.
+        measure: measure(frames, i) returns the record of frame i, a JSON-serialisable dict. It may
+            read earlier frames. It raises InputError to skip the frame; the report counts and lists
+            skipped frames.
+        make_sections: make_sections(records) returns the report for the records of all frames, in
+            order. It is also called with the records of unfinished runs, and with an empty list.
         settings: Everything that the records depend on. A run resumes only with equal settings.
-        training: Parameters of the detectors that the experiment trains; None: it trains none.
-            Otherwise measure() and make_sections() also get models=, the trained models by name.
-        protocol: Training parameters of the paper, by dotted name. They hold for recorded frames
-            without a budget.
+        training: Parameters of the detectors that the experiment trains; None: it trains none. With
+            training, measure() and make_sections() also get models=, the trained models by name.
+        protocol: Training parameters of the paper, by dotted name. They are used for recorded
+            frames without a budget.
         models: models(params, seed) returns the detectors to train for a seed, in order of
             importance.
         illustrate: illustrate(records, frames) returns sections with pictures of frames. It gets
             models= too.
-        has_models: The functions have their models already, see with_models().
+        has_models: True if the functions already have their models, see with_models().
 
-    The functions belong to a module, so that worker processes can import them.
+    The functions are defined at module level, so that worker processes can import them.
     """
 
     name: str

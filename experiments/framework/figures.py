@@ -45,16 +45,16 @@ def draw_figure(figure: Figure, kind: str = "svg", *, dark: bool = False) -> byt
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as Canvas
 
-    back, front, grid = ("#16181c", "#d8dade", "#34383f") if dark else ("white", "black", "#e3e3e3")
+    background, foreground, grid = ("#16181c", "#d8dade", "#34383f") if dark else ("white", "black", "#e3e3e3")
     style: Any = {
-        "figure.facecolor": back,
-        "axes.facecolor": back,
-        "savefig.facecolor": back,
-        "text.color": front,
-        "axes.labelcolor": front,
+        "figure.facecolor": background,
+        "axes.facecolor": background,
+        "savefig.facecolor": background,
+        "text.color": foreground,
+        "axes.labelcolor": foreground,
         "axes.edgecolor": GREY,
-        "xtick.color": front,
-        "ytick.color": front,
+        "xtick.color": foreground,
+        "ytick.color": foreground,
         "grid.color": grid,
         "font.size": 9,
         "legend.frameon": False,
@@ -93,9 +93,11 @@ def draw_figure(figure: Figure, kind: str = "svg", *, dark: bool = False) -> byt
 
 def _choose_colors(lines: tuple[Line, ...]) -> list[str]:
     """Return a colour for each line; a dashed line "a, paper" has the colour of the line "a"."""
-    solid = [line.label for line in lines if not line.dashed]
-    by_label = {label: COLORS[i % len(COLORS)] for i, label in enumerate(solid)}
-    return [next((color for label, color in by_label.items() if line.label.startswith(label)), GREY) for line in lines]
+    solid_labels = [line.label for line in lines if not line.dashed]
+    color_by_label = {label: COLORS[i % len(COLORS)] for i, label in enumerate(solid_labels)}
+    return [
+        next((color for label, color in color_by_label.items() if line.label.startswith(label)), GREY) for line in lines
+    ]
 
 
 def _plot_line(axes, line: Line, color: str):

@@ -1,8 +1,8 @@
 """KITTI's average precision of several detectors on the same frames, with intervals.
 
-measure() of an experiment stores the objects of a frame with to_record(). The report reads them
-back and samples the frames (Efron, 1979), the same ones for all detectors, so that differences are
-paired.
+measure() of an experiment stores the objects of a frame with to_record(). The report reads them and
+resamples the frames (bootstrap; Efron, 1979). The samples are the same for all detectors, so that
+differences are paired.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ WIDTHS = {"boxes": 7, "regions": 4}
 
 
 def to_record(objects: CameraObjects) -> dict[str, Any]:
-    """Return objects as a dict that JSON can hold, without their observation angles."""
+    """Convert objects to a JSON-serialisable dict, without their observation angles."""
     record = {name: np.round(getattr(objects, name), 4).tolist() for name in COLUMNS}
     if np.isfinite(objects.image_boxes).all():
         record["image_boxes"] = np.round(objects.image_boxes, 2).tolist()
@@ -43,7 +43,7 @@ def to_record(objects: CameraObjects) -> dict[str, Any]:
 
 
 def from_record(record: Mapping[str, Any]) -> CameraObjects:
-    """Return the objects of a record; their observation angles are NaN."""
+    """Convert a record to objects; their observation angles are NaN."""
     count = len(record["class_ids"])
     columns = {
         name: np.array(record[name], float).reshape(-1, WIDTHS[name])
@@ -64,24 +64,27 @@ def from_record(record: Mapping[str, Any]) -> CameraObjects:
     )
 
 
-def compare_records(true: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]]) -> list[ComparedFrame]:
-    """Return the comparison of the records of labels and of detections of the same frames."""
-    return [compare_objects(from_record(t), from_record(f)) for t, f in zip(true, found)]
+def compare_records(
+    label_records: Sequence[Mapping[str, Any]], detection_records: Sequence[Mapping[str, Any]]
+) -> list[ComparedFrame]:
+    """Compare the records of labels and of detections of the same frames."""
+    return [compare_objects(from_record(t), from_record(f)) for t, f in zip(label_records, detection_records)]
 
 
 def compute_cells(frames: list[ComparedFrame]) -> np.ndarray:
-    """Return the average precision (R40, percent) by PROTOCOLS and CELLS, then its mean, (2, 10).
+    """Compute the average precision (R40, percent) by PROTOCOLS and CELLS, and its mean.
 
-    NaN without counted labels.
+    Returns:
+        (2, 10): one column per cell, and the mean in the last one; NaN for cells without labels.
     """
     cells = np.full((len(PROTOCOLS), len(CELLS) + 1), np.nan)
     if not frames:
         return cells
-    compared = Comparison.of(frames)
+    comparison = Comparison.of(frames)
     for i, (metric, overlaps) in enumerate(PROTOCOLS):
         for j, (name, level) in enumerate(CELLS):
-            found = compute_precision(compared, name, metric, overlaps[name], level)
-            cells[i, j] = np.nan if found is None else found.r40
+            curve = compute_precision(comparison, name, metric, overlaps[name], level)
+            cells[i, j] = np.nan if curve is None else curve.r40
         if not np.isnan(cells[i]).all():
             cells[i, -1] = np.nanmean(cells[i])
     return cells
@@ -94,11 +97,11 @@ def draw_cells(
 
     Args:
         names: Names of the frames; frames of one drive are drawn together.
-        detectors: The compared frames of each detector, in the order of the names.
+        detectors: Compared frames of each detector, in the order of `names`.
 
     Returns:
-        Name of a detector -> (1 + R, 2, 10), see compute_cells() and statistics.estimate(). R is 0
-        for frames that cannot be divided.
+        {detector: (1 + R, 2, 10)}, see compute_cells() and statistics.estimate(). R is 0 for frames
+        that cannot be divided into groups.
     """
     samples = [np.arange(len(names)), *draw_samples(group_frames(names), replicates)]
     return {

@@ -83,7 +83,7 @@ def group_skipped_frames(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def format_cell(cell: Cell) -> tuple[str, str, str]:
-    """Return value, interval and the paper's value as text; "" where there is none."""
+    """Return the value, the interval and the paper's value as text; "" for unknown ones."""
     value, low, high, paper = (
         None if number is None else f"{number:.{cell.digits}f}"
         for number in (cell.value, cell.low, cell.high, cell.paper)
@@ -92,7 +92,7 @@ def format_cell(cell: Cell) -> tuple[str, str, str]:
 
 
 def is_number(cell: str | Cell) -> bool:
-    """Return True for a cell that is aligned at the right."""
+    """Return True for a numeric cell, which is right-aligned."""
     return isinstance(cell, Cell) or re.fullmatch(r"[-\d.]+", cell) is not None
 
 
@@ -205,7 +205,7 @@ def to_csv(table: Table) -> str:
 def to_json_data(value: Any) -> Any:
     """Convert dataclasses to dicts, arrays and tuples to lists, and NaN to None.
 
-    The pixels of pictures are left out; a PNG file has them.
+    The pixels of pictures are left out, because they are in PNG files.
     """
     if isinstance(value, Picture):
         return {"name": value.name, "title": value.title}
@@ -223,7 +223,7 @@ def to_json_data(value: Any) -> Any:
 
 
 def print_report(sections: list[Section], skipped: list[dict[str, Any]], console: Console, max_rows: int = 20) -> None:
-    """Print the tables of at most max_rows rows, without intervals, and the skipped frames."""
+    """Print tables with at most max_rows rows, without intervals, and the skipped frames."""
     for table in (table for section in sections for table in section.tables):
         if len(table.rows) <= max_rows:
             console.print(_make_grid(table))
@@ -235,8 +235,8 @@ def print_report(sections: list[Section], skipped: list[dict[str, Any]], console
 def _make_grid(table: Table) -> Grid:
     grid = Grid(title=table.title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for i, name in enumerate(table.header):
-        right = i > 0 and all(is_number(row[i]) for row in table.rows)
-        grid.add_column(name, justify="right" if right else "left", overflow="fold")
+        is_numeric = i > 0 and all(is_number(row[i]) for row in table.rows)
+        grid.add_column(name, justify="right" if is_numeric else "left", overflow="fold")
     for row in table.rows:
         grid.add_row(*map(_format_brief, row))
     return grid

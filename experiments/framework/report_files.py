@@ -20,9 +20,9 @@ def list_report_files(folder: Path) -> list[Path]:
     with suppress(OSError, ValueError, KeyError, TypeError):  # the report is missing, or not one of ours
         report = json.loads((folder / REPORT).read_text())
         names = [
-            f"{kind}/{Path(item['name']).name}{ending}"
+            f"{folder_name}/{Path(item['name']).name}{suffix}"
             for section in report["sections"]
-            for kind, ending in FOLDERS.items()
-            for item in section[kind]
+            for folder_name, suffix in FOLDERS.items()
+            for item in section[folder_name]
         ]
     return [folder / name for name in (*names, *PAGES)]

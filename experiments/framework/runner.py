@@ -34,9 +34,8 @@ def run_experiment(
 ) -> list[dict[str, Any]]:
     """Measure the first `limit` frames of a recording, or all, and return their records in order.
 
-    Every record is written to out/frames.jsonl as soon as it is measured, and a run that was
-    stopped resumes there. Apart from measured times, the records depend neither on jobs nor on
-    dask.
+    Every record is written to out/frames.jsonl as soon as it is measured, and an interrupted run
+    resumes there. Apart from measured times, the records do not depend on jobs or dask.
 
     Args:
         jobs, dask: See scoring.run.results.
@@ -62,10 +61,9 @@ def run_with_models(
     force: bool = False,
     limit: int | None = None,
 ) -> tuple[Experiment, list[dict[str, Any]]]:
-    """Train the models of an experiment, then measure frames as run_experiment() does.
+    """Train the models of an experiment, then measure frames like run_experiment().
 
-    Models that were trained in request.out before, with the same configuration, are not trained
-    again, even with `force`.
+    Models already trained in request.out with the same configuration are reused, even with `force`.
 
     Returns:
         The experiment with its models, and the records.
@@ -75,8 +73,8 @@ def run_with_models(
         KeyboardInterrupt: The training was stopped.
     """
     with _open_run(experiment, recording, request.out, force, request.settings()) as journal:
-        trained = experiment.with_models(train_models(request, plan_training(request)))
-        return trained, _measure(trained, recording, journal, request.jobs, dask, limit)
+        trained_experiment = experiment.with_models(train_models(request, plan_training(request)))
+        return trained_experiment, _measure(trained_experiment, recording, journal, request.jobs, dask, limit)
 
 
 @contextmanager
@@ -116,18 +114,18 @@ def _measure(
         )
     journal.sort(names)
     records = [json.loads(journal.lines[name]) for name in names[:limit]]
-    lost = recording.missing_scans if limit is None else ()
-    return records + [{"frame": name, "skipped": reason} for name, reason in lost]
+    missing_scans = recording.missing_scans if limit is None else ()
+    return records + [{"frame": name, "skipped": reason} for name, reason in missing_scans]
 
 
 def _make_measure(experiment: Experiment, recording: Recording) -> Callable[[Frame], str]:
     """Return a function that measures a frame and returns its record as JSON."""
     if not experiment.has_models:  # trained detectors warm up when opened
         warm_up()
-    number = {frame.name: i for i, frame in enumerate(recording)}
+    frame_numbers = {frame.name: i for i, frame in enumerate(recording)}
 
     def measure(frame: Frame) -> str:
-        record = experiment.measure(recording.frames, number[frame.name])
+        record = experiment.measure(recording.frames, frame_numbers[frame.name])
         return json.dumps({"frame": frame.name, **record}, allow_nan=False)
 
     return measure

@@ -1,4 +1,4 @@
-"""Scenes of an experiment: to train on, to validate on, and to measure on, which share none.
+"""Disjoint scenes of an experiment for training, validation and test.
 
 The scenes are simulated, or the frames of a labelled recording.
 """
@@ -37,7 +37,7 @@ class ExperimentScenes:
     Attributes:
         data: Path of a recording, or "sim".
         train, val, test: Names of the frames; empty for simulated scenes.
-        height: Height of the sensor above the ground in metres; None: as the recording says.
+        height: Height of the sensor above the ground in metres; None: as in the recording.
     """
 
     data: str
@@ -52,8 +52,8 @@ class ExperimentScenes:
 
         Args:
             data: Path of a recording, or "sim".
-            test: File that names the frames to measure on; None: as large a share as is validated
-                on. KITTI's own test frames have no public labels.
+            test: File that lists the test frames; None: the same fraction as for validation.
+                KITTI's own test frames have no public labels.
 
         Raises:
             InputError: There are fewer than three labelled frames, a name is unknown, or simulated
@@ -66,34 +66,35 @@ class ExperimentScenes:
         path = Path(data)
         frames = open_labelled_frames(path)
         if test is None:
-            rest, measured = frames.split(PAPER_SHARE, SPLIT_SEED)
+            training_frames, test_frames = frames.split(PAPER_SHARE, SPLIT_SEED)
         else:
-            measured = open_labelled_frames(path, test)
-            rest = frames.exclude([measured], "train on")
-        train, val = rest.split(PAPER_SHARE * len(frames.frames) / len(rest.frames), SPLIT_SEED)
-        return ExperimentScenes(data, _list_names(train), _list_names(val), _list_names(measured), frames.height)
+            test_frames = open_labelled_frames(path, test)
+            training_frames = frames.exclude([test_frames], "train on")
+        train, val = training_frames.split(PAPER_SHARE * len(frames.frames) / len(training_frames.frames), SPLIT_SEED)
+        return ExperimentScenes(data, _list_names(train), _list_names(val), _list_names(test_frames), frames.height)
 
     @property
     def is_simulated(self) -> bool:
         return self.data == SIM
 
     def settings(self) -> dict[str, Any]:
-        """Return what identifies these scenes, for the settings of a run."""
+        """Return the identity of these scenes, for the settings of a run."""
         return {
             "data": self.data if self.is_simulated else str(Path(self.data).resolve()),
             **{name: hash_names(getattr(self, name)) for name in ("train", "val", "test")},
         }
 
     def select_labelled(self, share: float) -> tuple[str, ...]:
-        """Return a share of the frames to train on. Smaller shares are part of larger ones."""
+        """Return a fraction of the training frames; smaller fractions are subsets of larger ones."""
         order = np.random.default_rng(SPLIT_SEED).permutation(len(self.train))
         count = max(1, round(share * len(self.train)))
         return tuple(self.train[i] for i in np.sort(order[:count]))
 
     def write_splits(self, folder: Path, share: float) -> tuple[Path, Path] | tuple[None, None]:
-        """Write files that name a share of the frames to train on, and those to validate on.
+        """Write files that list a fraction of the training frames, and the validation frames.
 
-        Returns the files; None for simulated scenes.
+        Returns:
+            The two files; None for simulated scenes.
         """
         if self.is_simulated:
             return None, None
@@ -103,12 +104,12 @@ class ExperimentScenes:
         return files
 
     def open_test_recording(self, params: Any, cache: Path, count: int = TEST_SCANS) -> Recording:
-        """Open the frames to measure on.
+        """Open the test frames.
 
         Args:
-            params: Training parameters, whose sensor and scenes are simulated.
+            params: Training parameters, which define the simulated sensor and scenes.
             cache: Folder of simulated scans.
-            count: Number of simulated scans, each of another scene.
+            count: Number of simulated scans, each in a different scene.
         """
         if self.is_simulated:
             return open_simulated(params, cache, count)
@@ -120,7 +121,7 @@ def _list_names(frames: LabelledFrames) -> tuple[str, ...]:
 
 
 def open_selected(path: Path, names: Sequence[str], height: float | None) -> Recording:
-    """Open the frames of a recording that have these names."""
+    """Open the frames of a recording with these names."""
     recording = open_recording(path, sensor_height=height)
     frames = {frame.name: frame for frame in recording.frames[:]}
     return replace(
@@ -132,7 +133,7 @@ def open_selected(path: Path, names: Sequence[str], height: float | None) -> Rec
 
 
 def open_simulated(params: Any, folder: Path, count: int) -> Recording:
-    """Return simulated scans to measure on as a recording; each is computed once and kept."""
+    """Return simulated test scans as a recording; each is computed once and cached on disk."""
     scenes = Scenes(None, params.data.val_people, params.scene)
     source = SimulatedScenes(
         FIRST_TEST_SCENE,

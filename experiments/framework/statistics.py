@@ -1,4 +1,4 @@
-"""Rates with intervals, by a bootstrap over frames (Efron, 1979; percentile method)."""
+"""Rates with intervals from a bootstrap over frames (Efron, 1979; percentile method)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class BootstrapParams:
     """Parameters of the intervals.
 
     Attributes:
-        replicates: Number of times that as many frames as there are, are drawn with replacement.
-        level: Share of the replicates within the interval.
+        replicates: Number of bootstrap samples.
+        level: Fraction of the replicates within the interval.
     """
 
     replicates: int = 2000
@@ -29,16 +29,16 @@ class BootstrapParams:
 def bootstrap(
     counts: np.ndarray, compute: Callable[[np.ndarray], np.ndarray], params: BootstrapParams = BootstrapParams()
 ) -> np.ndarray:
-    """Return values computed from counts, with their intervals.
+    """Compute values from counts, with their intervals.
 
     Args:
         counts: (F, *C) counts of F frames.
-        compute: Takes sums of counts over frames (..., *C) to values (..., *V), NaN where a value
-            has no cases.
+        compute: Converts sums of counts over frames (..., *C) to values (..., *V); NaN for a value
+            without cases.
 
     Returns:
-        (3, *V) float64: the value for all frames, and the low and high end of its interval. NaN
-        where there is none. Replicates without cases are left out.
+        (3, *V) float64: the value for all frames, and the low and high end of its interval; NaN if
+        undefined. Replicates without cases are ignored.
     """
     counts = np.asarray(counts, np.float64)
     frames, shape = len(counts), counts.shape[1:]
@@ -47,9 +47,9 @@ def bootstrap(
     if frames == 0:
         return np.stack([value, np.full(value.shape, np.nan), np.full(value.shape, np.nan)])
     rng, replicates = np.random.default_rng(params.seed), []
-    step = max(1, MAX_DRAWS // frames)
-    for first in range(0, params.replicates, step):
-        rows = min(step, params.replicates - first)
+    batch_size = max(1, MAX_DRAWS // frames)
+    for start in range(0, params.replicates, batch_size):
+        rows = min(batch_size, params.replicates - start)
         # Number of times each frame was drawn, used as the weight of its counts.
         indices = rng.integers(frames, size=(rows, frames)) + frames * np.arange(rows)[:, None]
         weights = np.bincount(indices.ravel(), minlength=rows * frames).reshape(rows, frames)
@@ -61,18 +61,18 @@ def bootstrap(
 def compute_paired_p(
     counts: np.ndarray, compute: Callable[[np.ndarray], np.ndarray], params: BootstrapParams = BootstrapParams()
 ) -> np.ndarray:
-    """Return p values of the differences between two methods on the same frames.
+    """Compute p values of the differences between two methods on the same frames.
 
-    A paired permutation test: under the hypothesis that the methods are equal, the counts of each
-    frame may be swapped. p is the share of random swaps, and of the counts as they are, with a
-    difference at least as large in absolute value (Phipson and Smyth, 2010).
+    This is a paired permutation test: if the methods are equal, the counts of each frame may be
+    swapped. p is the fraction of permutations, including the original one, with a difference at
+    least as large in absolute value (Phipson and Smyth, 2010).
 
     Args:
         counts: (F, 2, *C) counts of both methods.
         compute: see bootstrap().
 
     Returns:
-        (*V) float64; NaN where a value has no cases, and without frames.
+        (*V) float64; NaN for values without cases, and without frames.
     """
     counts = np.asarray(counts, np.float64)
     frames, shape = len(counts), counts.shape[2:]
@@ -86,21 +86,21 @@ def compute_paired_p(
     observed = np.abs(difference(flat[:, 0].sum(axis=0)))
     if frames == 0:
         return np.full(observed.shape, np.nan)
-    rng, above = np.random.default_rng(params.seed), np.ones(observed.shape)
+    rng, count_at_least = np.random.default_rng(params.seed), np.ones(observed.shape)
     step = max(1, MAX_DRAWS // frames)
     for first in range(0, params.replicates, step):
-        swapped = rng.random((min(step, params.replicates - first), frames)) < 0.5
-        found = np.abs(difference(flat[:, 0].sum(axis=0) - swapped @ change))
-        above += (found >= observed - 1e-12).sum(axis=0)
-    return np.where(np.isnan(observed), np.nan, above / (params.replicates + 1))
+        is_swapped = rng.random((min(step, params.replicates - first), frames)) < 0.5
+        differences = np.abs(difference(flat[:, 0].sum(axis=0) - is_swapped @ change))
+        count_at_least += (differences >= observed - 1e-12).sum(axis=0)
+    return np.where(np.isnan(observed), np.nan, count_at_least / (params.replicates + 1))
 
 
 def estimate(draws: np.ndarray, level: float = BootstrapParams.level) -> np.ndarray:
-    """Return values with their intervals (3, *V), as bootstrap() does, of values computed already.
+    """Return values with their intervals (3, *V), like bootstrap(), from replicates.
 
     Args:
-        draws: (1 + R, *V): the values of all frames, then those of R samples of the frames. NaN
-            where there is no value.
+        draws: (1 + R, *V): the values of all frames, then those of R samples of the frames; NaN if
+            undefined.
     """
     if len(draws) == 1:
         return np.stack([draws[0], *np.full((2, *draws[0].shape), np.nan)])
@@ -110,7 +110,7 @@ def estimate(draws: np.ndarray, level: float = BootstrapParams.level) -> np.ndar
 def compute_sampled_p(draws: np.ndarray) -> float:
     """Return the two-sided p value of a difference, for the hypothesis that it is 0.
 
-    It is twice the share of the samples on the other side of 0, at least 2 / (R + 1).
+    It is twice the fraction of the samples on the other side of 0, at least 2 / (R + 1).
 
     Args:
         draws: (1 + R,) differences, see estimate(). Both parts of a difference come from the same
@@ -122,8 +122,8 @@ def compute_sampled_p(draws: np.ndarray) -> float:
     samples = draws[1:][~np.isnan(draws[1:])]
     if len(samples) == 0 or np.isnan(draws[0]):
         return np.nan
-    beyond = min((samples <= 0).sum(), (samples >= 0).sum())
-    return float(min(1.0, 2 * (beyond + 1) / (len(samples) + 1)))
+    smaller_side = min((samples <= 0).sum(), (samples >= 0).sum())
+    return float(min(1.0, 2 * (smaller_side + 1) / (len(samples) + 1)))
 
 
 def _compute_limits(replicates: np.ndarray, level: float) -> np.ndarray:
@@ -137,43 +137,43 @@ def _compute_limits(replicates: np.ndarray, level: float) -> np.ndarray:
     return np.where(empty, np.nan, ends)
 
 
-def divide(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Return part / whole; NaN where whole is 0."""
-    part, whole = np.broadcast_arrays(np.asarray(part, float), np.asarray(whole, float))
-    return np.divide(part, whole, out=np.full(part.shape, np.nan), where=whole != 0)
+def divide(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
+    """Return numerator / denominator; NaN where the denominator is 0."""
+    numerator, denominator = np.broadcast_arrays(np.asarray(numerator, float), np.asarray(denominator, float))
+    return np.divide(numerator, denominator, out=np.full(numerator.shape, np.nan), where=denominator != 0)
 
 
 def compute_rates(tp: np.ndarray, fp: np.ndarray, fn: np.ndarray) -> np.ndarray:
-    """Return recall, precision and F1 (..., 3) in percent of counts (...,); NaN without cases."""
+    """Compute recall, precision and F1 (..., 3), in percent, from counts (...,); NaN without cases."""
     return 100 * np.stack([divide(tp, tp + fn), divide(tp, tp + fp), divide(2 * tp, 2 * tp + fp + fn)], axis=-1)
 
 
 def make_cells(
     estimates: np.ndarray, paper: Iterable[float | None] = (), digits: int | Iterable[int] = 1
 ) -> tuple[Cell, ...]:
-    """Return the cells of estimates (3, V) of bootstrap().
+    """Convert the estimates (3, V) of bootstrap() to cells.
 
     Args:
-        paper: The paper's values in the same order, or none.
-        digits: Decimals of each value, or of all.
+        paper: The paper's values in the same order; empty if unknown.
+        digits: Number of decimals of each value, or of all.
     """
     count = estimates.shape[1]
     paper = [*paper] or [None] * count
     digits = [digits] * count if isinstance(digits, int) else [*digits]
     return tuple(
-        Cell(value, low, high, published, shown)
-        for (value, low, high), published, shown in zip(map(nan_to_none, estimates.T), paper, digits, strict=True)
+        Cell(value, low, high, paper_value, decimals)
+        for (value, low, high), paper_value, decimals in zip(map(nan_to_none, estimates.T), paper, digits, strict=True)
     )
 
 
 def make_line(label: str, x: Iterable[float], estimates: np.ndarray) -> Line:
-    """Return the curve of estimates (3, X) of bootstrap(), with its interval."""
+    """Convert the estimates (3, X) of bootstrap() to a curve with its interval."""
     value, low, high = map(nan_to_none, estimates)
     return Line(label, tuple(x), value, low, high)
 
 
 def stack_counts(rows: list, *shape: int) -> np.ndarray:
-    """Return (F, *shape) float64 of one entry for each frame; F may be 0."""
+    """Stack one entry per frame to (F, *shape) float64; F may be 0."""
     return np.array(rows, np.float64).reshape(len(rows), *shape)
 
 

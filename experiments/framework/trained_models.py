@@ -1,10 +1,10 @@
-"""Detectors that an experiment trains: on the same scenes, within one budget, each only once.
+"""Training of an experiment's detectors: on the same scenes, within one budget, each only once.
 
     plan = plan_training(models, request)           # measured once, then read from a file
     trained = train_models(models, request, plan)   # a finished model is not trained again
 
-Every model has a folder out/models/NAME-HASH, where the hash is that of its configuration. A run
-that was stopped resumes there.
+Every model has a folder out/models/NAME-HASH with the hash of its configuration. An interrupted run
+resumes there.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class Model:
 
     Attributes:
         name: Unique name in the experiment, such as "v4, seed 1".
-        params: Its training. The numbers of scenes and steps come from the common plan.
-        label_share: Share of the labelled scenes that it is trained on, above 0 to 1.
-        required: Train it even if the budget is short.
+        params: Training parameters. The numbers of scenes and steps come from the common plan.
+        label_share: Fraction of the labelled scenes to train on, above 0 and up to 1.
+        required: True to train it even if the budget is short.
     """
 
     name: str
@@ -58,11 +58,11 @@ class TrainedModel:
     """A trained detector.
 
     Attributes:
-        weights: The checkpoint with the best validation score.
-        steps, seconds: Length of its training.
+        weights: Checkpoint with the best validation score.
+        steps, seconds: Length of the training.
         best_step: Step of the checkpoint.
-        scenes: Number of scenes that it was trained on.
-        parameters: Number of parameters that were learnt.
+        scenes: Number of training scenes.
+        parameters: Number of learned parameters.
     """
 
     model: Model
@@ -84,8 +84,9 @@ class ModelRequest:
         scenes: The scenes.
         out: Folder of the experiment.
         budget: Hours for everything; None: no limit, the parameters give the number of steps.
-        seeds: Number of seeds; None: as many, up to MAX_SEEDS, as leave each STEPS_PER_SEED steps.
-        test_frames: Number of frames that are measured afterwards.
+        seeds: Number of seeds; None: up to MAX_SEEDS, so that each gets at least STEPS_PER_SEED
+            steps.
+        test_frames: Number of frames to measure afterwards.
     """
 
     models: Callable[[Any, int], Sequence[Model]]
@@ -104,7 +105,7 @@ class ModelRequest:
         return self.out / "models"
 
     def settings(self) -> dict[str, Any]:
-        """Return everything that the trained models depend on, apart from this machine's speed."""
+        """Return everything that the trained models depend on, except this machine's speed."""
         return {
             "params": self.params.fixed_settings(),
             "scenes": self.scenes.settings(),
@@ -114,7 +115,7 @@ class ModelRequest:
         }
 
     def to_training(self, model: Model, folder: Path) -> TrainingRequest:
-        """Return the request for the training of one model."""
+        """Return the training request for one model."""
         split, val_split = self.scenes.write_splits(self.folder, model.label_share)
         return TrainingRequest(
             (self.scenes.data,),
@@ -131,12 +132,13 @@ class ModelRequest:
 
 @dataclass(frozen=True)
 class SharedPlan:
-    """Numbers that all models have in common.
+    """Training plan that is shared by all models.
 
     Attributes:
         values: Training parameters by dotted name.
         seeds: Number of seeds.
-        durations: Expected seconds of the training of each model, by name. Other models are left out.
+        durations: Expected training time of each model in seconds, by name; models that are not
+            trained are missing.
         speeds: Measured durations of these models, by name.
     """
 
@@ -157,10 +159,10 @@ class SharedPlan:
 
 
 def plan_training(request: ModelRequest) -> SharedPlan:
-    """Return the plan of an experiment, which is measured once and then read from a file.
+    """Return the plan of an experiment; it is measured once and then read from a file.
 
     Raises:
-        InputError: The budget is too short, or no scene can be used.
+        InputError: The budget is too short, or no scene is usable.
     """
     file = request.folder / f"plan-{_hash(request.settings())}.json"
     if file.exists():
@@ -183,12 +185,12 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
     params, device = request.params, torch.device(find_device(request.device))
     errors.print("measuring this machine with a few scenes of each network ...")
     models = request.models(params, 0)
-    known: dict[Any, Speed] = {}
+    speed_by_params: dict[Any, Speed] = {}
     reduced: dict[str, Any] = {}
     data = None
     for model in models:
         key = replace(model.params, seed=0)
-        if key not in known:
+        if key not in speed_by_params:
             trainer = make_trainer(model.params)
             planner = Planner(
                 trainer,
@@ -198,22 +200,22 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
                 device,
             )
             sources = planner.open_few_scenes()
-            known[key] = planner.measure_speed(*sources)
+            speed_by_params[key] = planner.measure_speed(*sources)
             if model.label_share == 1.0 and data is None:
                 data, reduced = planner.count_scenes(*sources), trainer.reduced_range(params)
     assert data is not None, "an experiment needs a model with all labels"
-    speeds = {model.name: known[replace(model.params, seed=0)] for model in models}
-    given = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps, bool(reduced))
+    speeds = {model.name: speed_by_params[replace(model.params, seed=0)] for model in models}
+    requested = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps, bool(reduced))
 
     def fit(seeds: int) -> Plan:
         hours = request.budget or DEFAULT_BUDGET_H
-        measuring = request.test_frames * sum(s.frame for s in speeds.values()) / request.jobs
+        measuring_s = request.test_frames * sum(s.frame for s in speeds.values()) / request.jobs
         return fit_plan(
-            max(0.1 * hours, hours - seeds * measuring / 3600),
+            max(0.1 * hours, hours - seeds * measuring_s / 3600),
             request.jobs,
             _add_speeds(list(speeds.values()) * seeds),
             data,
-            given,
+            requested,
             params.epochs,
         )
 
@@ -252,7 +254,7 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
 
 
 def _add_speeds(speeds: Sequence[Speed]) -> Speed:
-    """Return the speed of a training of several networks at once, on the same scans."""
+    """Return the combined speed of training several networks on the same scans."""
     return Speed(
         speeds[0].scan,
         max(s.cut for s in speeds),
@@ -273,21 +275,21 @@ def train_models(request: ModelRequest, plan: SharedPlan) -> dict[str, TrainedMo
     limit = math.inf if request.budget is None else 3600 * request.budget
     trained: dict[str, TrainedModel] = {}
     for seed in range(plan.seeds):
-        for first, model in zip(request.models(request.params, 0), request.models(request.params, seed)):
-            if first.name not in plan.durations:
-                errors.print(f"{model.name} is left out, as the budget is too short for it")
+        for first_model, model in zip(request.models(request.params, 0), request.models(request.params, seed)):
+            if first_model.name not in plan.durations:
+                errors.print(f"{model.name} is left out because the budget is too short for it")
                 continue
-            planned = plan.apply(model)
-            folder = request.folder / _name_folder(planned, request.scenes)
+            planned_model = plan.apply(model)
+            folder = request.folder / _name_folder(planned_model, request.scenes)
             if not (folder / "last.safetensors").exists():
-                spent = sum(done.seconds for done in trained.values())
+                spent_s = sum(done.seconds for done in trained.values())
                 optional = seed > 0 or not model.required
-                if optional and spent + plan.durations[first.name] > limit:
-                    errors.print(f"{model.name} is skipped because the budget is spent")
+                if optional and spent_s + plan.durations[first_model.name] > limit:
+                    errors.print(f"{model.name} is skipped because the budget is used up")
                     continue
                 errors.print(f"training {model.name}", style="bold")
-                _train(planned, request, folder, plan.speeds[first.name])
-            trained[model.name] = read_trained(planned, folder)
+                _train(planned_model, request, folder, plan.speeds[first_model.name])
+            trained[model.name] = read_trained(planned_model, folder)
     return trained
 
 
@@ -304,7 +306,7 @@ def _train(model: Model, request: ModelRequest, folder: Path, speed: Speed) -> N
 
 
 def read_trained(model: Model, folder: Path) -> TrainedModel:
-    """Read a finished training."""
+    """Read the result of a finished training."""
     from lidar_perception.detectors.checkpoint import read_header
 
     best, last = folder / "best.safetensors", folder / "last.safetensors"
@@ -321,7 +323,7 @@ def read_trained(model: Model, folder: Path) -> TrainedModel:
 
 
 def count_parameters(weights: Path) -> int:
-    """Count the parameters in a checkpoint that were learnt."""
+    """Count the learned parameters in a checkpoint."""
     from safetensors import safe_open
 
     with safe_open(weights, "np") as tensors:
@@ -333,14 +335,14 @@ def count_parameters(weights: Path) -> int:
 
 
 def _name_folder(model: Model, scenes: ExperimentScenes) -> str:
-    """Return the name of a model's folder, which depends on everything that it is trained with."""
-    chosen = {
+    """Return the name of a model's folder, which depends on its entire training configuration."""
+    settings = {
         "params": model.params.fixed_settings(),
         "scenes": scenes.settings(),
         "labelled": model.label_share,
         "version": __version__,
     }
-    return f"{re.sub(r'[^a-z0-9]+', '-', model.name.lower()).strip('-')}-{_hash(chosen)}"
+    return f"{re.sub(r'[^a-z0-9]+', '-', model.name.lower()).strip('-')}-{_hash(settings)}"
 
 
 def _hash(settings: dict[str, Any]) -> str:
