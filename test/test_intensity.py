@@ -104,7 +104,7 @@ def test_a_node_reads_dark_clouds_in_the_scale_of_its_stream():
     transforms = SimpleNamespace(
         find_placement=lambda header: placement, with_mounting=lambda params, placement: params
     )
-    node = SimpleNamespace(params=params, transforms=transforms, counts={})
+    node = SimpleNamespace(params=params, transforms=transforms, diagnostics=SimpleNamespace(counts={}))
     check, other = SensorCheck(node), SensorCheck(node)
     bright, dark = WHOLE[255], np.float32([0, 1, 1])
     assert np.array_equal(check.read_frame(message(bright, 1), True)[0].intensity, bright / np.float32(255))

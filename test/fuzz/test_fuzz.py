@@ -83,7 +83,7 @@ def test_commands_survive_or_refuse_damaged_files():
 
 def test_node_warns_about_curves_of_other_weights(nodes):
     fused = nodes["fused_detector"].node
-    assert "not fitted to" in fused.counts["doubt"] == fused.detector.warning
+    assert "not fitted to" in fused.diagnostics.counts["doubt"] == fused.detector.warning
 
 
 @pytest.mark.no_cover

@@ -31,7 +31,7 @@ def test_no_id_switches_on_real_drive(data, detector, ego):
     """The drive has no poses, so auto uses KISS-ICP."""
     from lidar_perception.data.frame import POSES
     from lidar_perception.data.open import open_recording
-    from lidar_perception.scoring.run import fill
+    from lidar_perception.scoring.run import fill_report
     from lidar_perception.scoring.tracking.report import TrackingReport, measure_tracking
     from lidar_perception.tracking.drive_tracker import choose_ego_source
     from lidar_perception.tracking.ego import has_odometry
@@ -40,6 +40,6 @@ def test_no_id_switches_on_real_drive(data, detector, ego):
     report, drive = TrackingReport(), open_recording(data / "kitti_tracking")
     if ego == "auto" and POSES not in drive.has:
         assert choose_ego_source(drive) == ("kiss_icp" if has_odometry() else "none")
-    fill(report, drive, partial(measure_tracking, lambda: detector, TrackingParams(), ego), limit=FRAMES)
+    fill_report(report, drive, partial(measure_tracking, lambda: detector, TrackingParams(), ego), limit=FRAMES)
     cars = report.compute()["classes"]["Car"]
     assert cars["switches"] == 0 and cars["HOTA"] > 0.7
