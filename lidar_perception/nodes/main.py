@@ -129,9 +129,11 @@ def _find_misspelt_sections(arguments: list[str], node: str) -> list[str]:
 def _exit_process(nodes: list[LidarNode]) -> None:
     """End the process while its work, such as a compilation, still runs."""
     import rclpy
+    from rclpy.logging import LoggingSeverity
 
     with suppress(Exception):
         for node in nodes:
+            node.get_logger().set_level(LoggingSeverity.FATAL)  # the running work fails without its node
             node.destroy_node()
         rclpy.try_shutdown()
     os._exit(0)
