@@ -257,7 +257,7 @@ def test_resume_names_every_difference(tmp_path, monkeypatch):
         (["--people", "nan"], "people = nan"),
         (["--people", "101"], "101.0 is not in the range"),
         (["--streets-of", "201"], "1 .. 200"),
-        (["--resume", "--force"], "one of them"),
+        (["--resume", "--force"], "cannot be combined"),
         (["--format", "mcap", "--resume"], "with 'convert'"),
     ],
 )
