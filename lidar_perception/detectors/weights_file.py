@@ -10,7 +10,7 @@ from lidar_perception.types import InputError
 
 POINTPILLARS_WEIGHTS = Path(__file__).parent / "pointpillars" / "weights"  # folder with one file per version and size
 POINTNET_WEIGHTS = Path(__file__).parent / "pointnet" / "weights" / "pointnet.safetensors"
-PROPOSER = "pointpillars_v4_compact_nine_sensors.safetensors"
+PROPOSER = "pointpillars_v4_compact_nine_sensors.safetensors"  # weights of fused, in POINTPILLARS_WEIGHTS
 JUDGE = "judge.safetensors"  # file name of the weights that classify boxes of other detectors, beside POINTNET_WEIGHTS
 
 

@@ -42,6 +42,8 @@ from lidar_perception.detectors.weights_file import (
 from lidar_perception.param_fields import with_values
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.training.fusion_curves import MIN_SAMPLES, Samples, collect_samples, fit_classes
+from lidar_perception.training.params import PointNetTraining
+from lidar_perception.training.pointnet.trainer import find_proposer
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -145,6 +147,18 @@ def test_fusion_file_round_trip_in_moved_folder(others, tmp_path, monkeypatch):
     again.classifier.unlink()
     with pytest.raises(InputError, match=r"needs .*pointnet.safetensors, which does not exist"):
         read_fusion(moved / "fused.json")
+
+
+@pytest.mark.parametrize("curves", [[], 0, "", {}, {"Car": {}}])
+def test_invalid_curves_for_clouds_without_intensity_are_refused(curves, tmp_path):
+    path = tmp_path / "fused.json"
+    path.write_text(json.dumps({**json.loads(PACKAGE.read_text()), "classes_without_intensity": curves}))
+    with pytest.raises(InputError, match=r"fused.json was not written by"):
+        read_fusion(path)
+
+
+def test_package_proposer_of_pointnet_is_that_of_fused():
+    assert find_proposer(PointNetTraining(proposer="package")) == find_fusion().proposer
 
 
 def test_package_curves_warn_about_other_weights(others):

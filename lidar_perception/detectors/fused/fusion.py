@@ -146,7 +146,10 @@ def read_fusion(path: Path) -> Fusion:
         files, digests = ([str(part[key]) for part in networks] for key in ("file", "sha256"))
         fitted_to, models_without_intensity = dict(content["fitted_to"]), content.get(WITHOUT_INTENSITY)
         _check_models(models)
-        _check_models(models_without_intensity or {})
+        if models_without_intensity is not None:
+            _check_models(models_without_intensity)
+            if set(models_without_intensity) != set(models):
+                raise ValueError(f"{WITHOUT_INTENSITY} has other classes")
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         if isinstance(error, InputError):
             raise

@@ -15,8 +15,7 @@ from lidar_perception.detectors.checkpoint import POINTPILLARS, read_network_nam
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetParams
-from lidar_perception.detectors.pointpillars.params import PointPillarsParams
-from lidar_perception.detectors.weights_file import find_pointnet_weights, find_pointpillars_weights, require_weights
+from lidar_perception.detectors.weights_file import find_pointnet_weights, find_proposer_weights, require_weights
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.data import Batches, Item, SceneReader, Stream, load_items
 from lidar_perception.training.params import PointNetTraining
@@ -45,7 +44,7 @@ def find_proposer(params: PointNetTraining) -> Path | None:
         InputError: The file is missing, or is not a PointPillars checkpoint.
     """
     if params.proposer in ("", str(PACKAGE)):
-        return find_pointpillars_weights(PointPillarsParams()) if params.proposer else None
+        return find_proposer_weights() if params.proposer else None
     path = require_weights(params.proposer, "proposer")
     if read_network_name(path) != POINTPILLARS:
         raise InputError(f"{path} is not a PointPillars checkpoint; give one with --proposer")
