@@ -43,14 +43,14 @@ class NearestBox:
         return lp.Detections.of([*nearest, 0.6, 0.6, 1.7, 0.0], scores=0.5)
 
 
-def test_public_names_are_listed_and_all_exist():
+def test_public_names_exist():
     assert sorted(lp.__all__) == NAMES and set(dir(lp)) == {*NAMES, "__version__"}
     assert all(getattr(lp, name).__doc__ for name in NAMES)
     with pytest.raises(AttributeError, match="'segment_grund'"):
         lp.segment_grund  # noqa: B018
 
 
-def test_type_checker_sees_the_same_objects():
+def test_type_checking_imports_match_the_objects():
     tree = ast.parse(Path(lp.__file__).read_text())
     block = next(node for node in tree.body if ast.unparse(node).startswith("if TYPE_CHECKING"))
     imported = {
@@ -93,13 +93,13 @@ def test_ground_and_clusters_equal_those_of_the_core():
         (lambda xyz: lp.evaluate(NearestBox(), "nowhere"), "nowhere does not exist"),
     ],
 )
-def test_bad_argument_is_named_in_one_line(call, words):
+def test_error_names_the_bad_argument_in_one_line(call, words):
     with pytest.raises(InputError, match=words) as error:
         call(np.ones((4, 3), np.float32))
     assert "\n" not in str(error.value)
 
 
-def test_candidates_are_pedestrians_at_the_click():
+def test_candidate_is_the_clicked_pedestrian():
     xyz = scene(1)[:, :3]
     automatic = lp.find_candidates(xyz)
     assert set(automatic.class_ids.tolist()) <= {3, 4} or len(automatic) == 0
@@ -116,7 +116,7 @@ def test_candidates_are_pedestrians_at_the_click():
     assert isinstance(clicked, lp.Detections) and len(clicked) >= len(automatic)
 
 
-def test_evaluate_takes_own_detector_and_simulated_frames():
+def test_evaluate_accepts_own_detector_and_simulated_frames():
     drive = lp.simulate(2, seed=3, sensor=TINY)
     frames = list(drive)
     assert [frame.name for frame in frames] == ["0000/000000", "0000/000001"]
@@ -132,13 +132,13 @@ def test_evaluate_opens_names_and_paths(tmp_path):
     assert result["frames"] == len(lp.open_recording(folder))
 
 
-def test_evaluate_refuses_recording_without_labels(tmp_path):
+def test_evaluate_rejects_recording_without_labels(tmp_path):
     np.save(tmp_path / "cloud.npy", scene(0))
     with pytest.raises(InputError, match="labelled boxes"):
         lp.evaluate(NearestBox(), tmp_path / "cloud.npy")
 
 
-def test_detections_take_names_of_classes():
+def test_detections_accept_class_names():
     boxes = np.zeros((2, 7))
     assert lp.Detections.of(boxes, "car").labels == ["Car", "Car"]
     assert lp.Detections.of(boxes, ["Cyclist", "Pedestrian"]).labels == ["Cyclist", "Pedestrian"]
@@ -146,7 +146,7 @@ def test_detections_take_names_of_classes():
         lp.Detections.of(boxes, "Pedestrain")
 
 
-def test_tracker_follows_detections():
+def test_tracker_keeps_ids_of_moving_detections():
     tracker, detections = lp.Tracker(), lp.Detections.of([5, 0, 0, 4, 2, 1.5, 0], 0, 0.9)
     for i in range(5):
         tracks = tracker(detections, i * 10**8 + 1)

@@ -148,7 +148,7 @@ def public_functions(tree):
     ]
 
 
-def test_every_layer_is_found():
+def test_every_module_belongs_to_a_layer():
     assert len(list_files("msg_utils")) >= 5
     assert {n.split("/")[1].removesuffix(".py") for n in SOURCES if n.startswith("lidar_perception/")} == {
         *LAYERS,

@@ -58,7 +58,7 @@ def test_contenders_run_in_turn_after_untimed_warm_up():
 
 
 @pytest.mark.parametrize("place", range(len(peers.DBSCANS)))
-def test_dbscan_peers_give_our_clusters(place):
+def test_dbscan_peers_give_the_same_clusters(place):
     peer = peers.DBSCANS[place]
     if peer.find_problem():
         pytest.skip(f"{peer.package} is {peer.find_problem()}")
@@ -68,7 +68,7 @@ def test_dbscan_peers_give_our_clusters(place):
 
 
 @pytest.mark.parametrize("threshold", ["local", "global"])
-def test_plain_euclidean_gives_our_clusters(threshold):
+def test_plain_euclidean_gives_the_same_clusters(threshold):
     params = EuclideanParams(threshold=threshold)
     ours = cluster_euclidean(cloud(), params)
     assert ours.max() > 0
@@ -108,7 +108,7 @@ def test_missing_peers_are_reported(nothing_installed, capsys):
             assert (r["name"] in SKLEARN) == (r["note"] == "") == (r["value"] is not None)
 
 
-def test_ground_scores_do_without_the_libraries(nothing_installed, capsys):
+def test_ground_is_scored_without_the_peer_libraries(nothing_installed, capsys):
     points = scene()
     semantic = np.where(points[:, 2] < -1.6, 40, 30).astype(np.uint16)
     scan = Frame.of(

@@ -43,11 +43,11 @@ def test_pages_match_the_code(generate, name):
     assert page.read_text() == generate.make_page(name), "run: python docs/generate.py"
 
 
-def test_tables_of_the_papers_are_made_from_the_code(generate):
+def test_tables_of_the_papers_match_the_code(generate):
     assert generate.PAPERS.read_text() == generate.update_papers_page(), "run: python docs/generate.py"
 
 
-def test_options_for_readings_of_the_papers_exist():
+def test_options_named_in_the_departures_table_exist():
     from experiments.departures import DEPARTURES
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.detectors.pointpillars.config import make_config
@@ -122,7 +122,7 @@ def test_link_targets_exist(page):
             assert (page.parent / target).exists(), target
 
 
-def test_parameter_file_of_best_matches_the_code(generate):
+def test_parameter_file_best_matches_the_code(generate):
     from lidar_perception.candidates.configurations import BEST_VALUES
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
@@ -136,7 +136,7 @@ def test_parameter_file_of_best_matches_the_code(generate):
 
 
 @pytest.mark.parametrize("network", ["pointpillars", "pointnet", "fused"])
-def test_nodes_of_a_detector_graph_share_its_parameters(generate, network):
+def test_nodes_of_a_detector_graph_share_parameters(generate, network):
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
     from lidar_perception.param_fields import with_values

@@ -66,7 +66,7 @@ def test_example_runs_on_simulated_scans(run, name, words):
     assert words in run(name)
 
 
-def test_example_takes_your_data(run, tmp_path):
+def test_example_accepts_a_recording(run, tmp_path):
     np.save(tmp_path / "cloud.npy", scene(0))
     assert "patchwork: " in run("ground_and_clusters.py", tmp_path / "cloud.npy")
     output = run("evaluate.py", object_folder(tmp_path / "kitti"), "pointnet")
@@ -79,7 +79,7 @@ def test_example_writes_simulated_clouds(run, tmp_path):
     assert all(len(each["box"]) == 7 for each in boxes)
 
 
-def test_cells_of_notebook_run(monkeypatch):
+def test_notebook_runs(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "Agg")
     import matplotlib.pyplot as plt
 

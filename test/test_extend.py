@@ -83,11 +83,11 @@ def run(copy: Path, *arguments, folder: Path | None = None) -> str:
 
 
 @pytest.mark.parametrize("name, files", EXAMPLES.items())
-def test_example_changes_as_many_files_as_stated(name, files):
+def test_example_changes_the_stated_number_of_files(name, files):
     assert len(find_parts(name)) == files
 
 
-def test_data_format_is_one_file_and_one_entry(copy, tmp_path):
+def test_data_format_needs_one_file_and_one_entry(copy, tmp_path):
     apply_example(copy, "npy")
     (tmp_path / "clouds").mkdir()
     for i in range(2):
@@ -124,13 +124,13 @@ def test_detector_is_a_class_in_your_own_file(tmp_path):
     assert "Pedestrian" in (tmp_path / "results" / "detections.json").read_text()
 
 
-def test_detector_is_one_folder_and_one_entry(copy, tmp_path):
+def test_detector_needs_one_folder_and_one_entry(copy, tmp_path):
     apply_example(copy, "sizes")
     output = run(copy, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"), "--weights", "sizes")
     assert "2 frames" in output
 
 
-def test_ground_method_is_one_file_and_two_entries(copy, tmp_path):
+def test_ground_method_needs_one_file_and_two_entries(copy, tmp_path):
     apply_example(copy, "lowest")
     output = run(
         copy,
@@ -146,7 +146,7 @@ def test_ground_method_is_one_file_and_two_entries(copy, tmp_path):
     assert "ground by lowest" in output
 
 
-def test_class_is_one_row_and_shipped_networks_still_work(copy, tmp_path):
+def test_class_needs_one_row_and_shipped_networks_still_work(copy, tmp_path):
     file = copy / "lidar_perception" / "classes.py"
     known, row = file.read_text(), '    ObjectClass("Truck", vehicle=True),\n'
     assert row in known

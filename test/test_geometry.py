@@ -58,7 +58,7 @@ def test_to_box_frame_inverts_a_rotation_and_translation(box, seed):
     np.testing.assert_allclose(to_box_frame(placed, box), local, rtol=0, atol=1e-10)
 
 
-def test_corners_of_many_boxes_equal_those_of_each():
+def test_corners_of_many_boxes_equal_those_of_single_boxes():
     many = np.random.default_rng(0).uniform(0.1, 5, (7, 7))
     np.testing.assert_allclose(box_corners(many), [box_corners(b[None])[0] for b in many])
     assert box_corners(np.zeros((0, 7))).shape == (0, 8, 3)
@@ -110,7 +110,7 @@ def test_half_and_quarter_turns_of_a_box_keep_its_points(box, seed):
     np.testing.assert_array_equal(points_in_box(xyz, quarter), inside)
 
 
-def test_points_in_box_of_no_points_or_negative_size():
+def test_points_in_box_accepts_no_points_and_negative_sizes():
     box = np.array([1, 2, 3, 1, 1, 1, 0.5])
     assert points_in_box(np.zeros((0, 3), np.float32), box).shape == (0,)
     assert not points_in_box(np.float32([[1, 2, 3]]), box, margin=-0.6).any()
@@ -128,7 +128,7 @@ def test_wrapped_angles_are_equal_and_in_the_interval(angle):
     assert abs(half_turns - round(half_turns)) < 1e-9
 
 
-def test_wrap_angle_at_the_ends_of_the_interval():
+def test_wrap_angle_includes_one_end_of_the_interval():
     below = np.nextafter(-np.pi, -4)
     assert wrap_angle(np.array([np.pi, -np.pi, 3 * np.pi, 0.0])).tolist() == [-np.pi, -np.pi, -np.pi, 0.0]
     assert -np.pi <= wrap_angle(below) < np.pi
@@ -173,7 +173,7 @@ def test_usable_returns_are_finite_near_and_not_the_origin(point, usable, dtype)
     assert found.dtype == bool and found.tolist() == [True, usable, True]
 
 
-def test_usable_returns_takes_strided_and_empty_arrays():
+def test_usable_returns_accepts_strided_and_empty_arrays():
     assert usable_returns(np.zeros((0, 3), np.float32)).shape == (0,)
     wide = np.zeros((4, 6), np.float32)
     wide[2, 1] = 5

@@ -45,7 +45,7 @@ def test_ids_that_are_not_finite_mean_no_cluster():
 
 
 @pytest.mark.parametrize("value", [1.5, 1e30, 2.0**53 + 2])
-def test_ids_that_are_not_whole_numbers_are_refused(value):
+def test_ids_that_are_not_integers_are_rejected(value):
     with pytest.raises(InputError, match="not whole numbers"):
         renumber_ids(np.array([value]))
 
@@ -103,7 +103,7 @@ def test_cluster_column_reads_the_given_rows(make):
     ],
     ids=["count_clusters", "fit_boxes", "fit_ellipses", "group_points"],
 )
-def test_a_huge_id_is_refused_before_memory_is_allocated(size_by_id):
+def test_huge_id_is_rejected_before_memory_is_allocated(size_by_id):
     size_by_id(np.array([0, 1, 2, 3, 3], np.int32))
     tracemalloc.start()
     with pytest.raises(InputError, match="without gaps"):

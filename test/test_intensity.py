@@ -64,14 +64,14 @@ WHOLE = {full: np.round(UNIT * full) for full in (100, 255, 1023, 4095, 65535)}
         (-UNIT, "f4", 1),
     ],
 )
-def test_full_scale_follows_values_and_type(values, kind, full):
+def test_full_scale_depends_on_values_and_type(values, kind, full):
     values = np.asarray(values)
     assert infer_full_scale(values.astype(kind)) == full
     if np.isfinite(values).all():
         assert infer_full_scale(values.astype(kind).astype(np.float32), kind) == full
 
 
-def test_a_few_broken_values_do_not_change_the_scale():
+def test_few_broken_values_do_not_change_the_scale():
     many = np.tile(UNIT, 10)
     many[:2] = 1e30, 40000.0
     assert infer_full_scale(many) == 1.0 and find_scale_problem(many) is None
@@ -93,7 +93,7 @@ def test_the_scale_of_a_stream_never_falls(order):
     assert found == sorted(found) and scale.full == 255.0
 
 
-def test_a_node_reads_dark_clouds_in_the_scale_of_its_stream():
+def test_dark_clouds_have_the_scale_of_their_stream():
     """The scale of one node does not affect another node."""
 
     def message(values, stamp):
@@ -146,7 +146,7 @@ def test_normalized_intensity_ignores_gain_and_gamma(change):
     np.testing.assert_allclose(np.quantile(positive, REFERENCE_SHARES), REFERENCE_VALUES, atol=0.02)
 
 
-def test_an_unusable_intensity_normalizes_to_none():
+def test_unusable_intensity_is_normalized_to_none():
     few = np.where(np.arange(1000) % 20, 0, 0.5)
     same = np.where(np.arange(1000) % 20, 0.5, 0.7)
     for intensity in (None, few, same, np.zeros(9), np.zeros(0), np.full(9, np.nan)):
@@ -177,7 +177,7 @@ CLOUD = np.random.default_rng(1).uniform([2, -9, -2, 0], [30, 9, 1, 1], (400, 4)
         (7.0, r"shape \(\)"),
     ],
 )
-def test_every_entry_point_refuses_invalid_clouds(points, remedy):
+def test_every_entry_point_rejects_invalid_clouds(points, remedy):
     for function in (PointCloud.of, segment_ground, cluster, lambda cloud: cluster_obstacles(cloud, np.zeros(9, bool))):
         with pytest.raises(InputError, match=f"a cloud .*{remedy}") as error:
             function(points)

@@ -40,7 +40,7 @@ def test_version_is_the_same_everywhere(metadata):
     assert metadata(URL)["version"] == lidar_perception.__version__ == package.findtext("version")
 
 
-def test_readme_on_a_package_index_has_no_relative_link(metadata):
+def test_readme_of_the_wheel_has_no_relative_links(metadata):
     links = re.findall(r"\]\(([^)]*)\)", metadata(URL + ".git")["long_description"])
     assert len(links) > 5
     assert [link for link in links if not link.startswith(("https://", "#"))] == []
@@ -56,7 +56,7 @@ def test_project_urls_follow_the_repository(metadata):
     assert all(page.startswith(URL) for page in arguments["project_urls"].values())
 
 
-def test_both_packages_ship_their_types(metadata):
+def test_both_packages_ship_type_information(metadata):
     for name in ("lidar_perception", "msg_utils"):
         assert "py.typed" in metadata(URL)["package_data"][name]
         assert (ROOT / name / "py.typed").is_file()
@@ -84,7 +84,7 @@ def test_release_sets_the_version_in_both_files(tmp_path):
     assert "<version>7.8.9</version>" in (tmp_path / "package.xml").read_text()
 
 
-def test_citation_names_the_three_papers():
+def test_citation_file_lists_the_three_papers():
     import yaml
 
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())

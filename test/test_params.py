@@ -127,7 +127,7 @@ def test_every_parameter_group_is_tested():
 
 
 @each_params
-def test_defaults_pass_their_own_checks_unchanged(kind):
+def test_defaults_are_valid(kind):
     made = kind()
     assert flatten(made) == {n: f.default for n, f in collect_fields(made).items()}
 
@@ -191,14 +191,14 @@ def test_error_of_a_wrong_type_names_field_and_type(group, f):
 
 
 @for_all([p for p in FIELDS if p.values[1].metadata["item"]])
-def test_a_scalar_for_a_list_is_refused(group, f):
+def test_scalar_for_a_list_is_rejected(group, f):
     for value in ("text", 1.0, None):
         with pytest.raises(ValueError, match=f"^{f.name} = .*must be a list"):
             group(**{f.name: value})
 
 
 @for_all([p for p in FIELDS if kind_of(p.values[1]) is float])
-def test_nan_is_refused(group, f):
+def test_nan_is_rejected(group, f):
     with pytest.raises(ValueError, match=f"^{f.name} is not a number"):
         group(**{f.name: as_field(f, math.nan)})
 
@@ -210,7 +210,7 @@ def test_error_of_a_wrong_choice_lists_the_choices(group, f):
     assert all(choice in str(error.value) for choice in f.metadata["choices"])
 
 
-def test_whole_numbers_become_floats():
+def test_integers_become_floats():
     made = ThresholdParams(max_height=2)
     assert made.max_height == 2.0 and isinstance(made.max_height, float)
     eps = DbscanParams(eps=[1, 2, 3]).eps
@@ -236,7 +236,7 @@ def test_eps_has_one_value_more_than_range_limits():
 
 
 @pytest.mark.parametrize("limits", [(30.0, 15.0), (15.0, 15.0)])
-def test_range_limits_ascend(limits):
+def test_range_limits_must_ascend(limits):
     with pytest.raises(ValueError, match=r"range_limits = \[.*must ascend"):
         DbscanParams(range_limits=limits)
 

@@ -125,7 +125,7 @@ def test_freed_memory_is_reused_unless_the_user_sets_malloc(user):
 
 
 @pytest.mark.parametrize("count", [1, 5, 57, 1001])
-def test_processes_get_runs_of_items_and_equal_shares(count):
+def test_processes_get_consecutive_items_of_equal_number(count):
     """Consecutive items share work: scans of one street, clouds of one chunk."""
     items = list(range(count))
     shares = [processes.deal_items(items, 3, job) for job in range(3)]

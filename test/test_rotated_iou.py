@@ -58,7 +58,7 @@ def by_shapely(boxes, others):
 
 
 @given(seeds)
-def test_overlaps_are_those_of_shapely(seed):
+def test_overlaps_equal_shapely(seed):
     rng = np.random.default_rng(seed)
     boxes, others = some_boxes(rng, 12), some_boxes(rng, 12)
     others[:4] = boxes[:4]  # identical
@@ -70,7 +70,7 @@ def test_overlaps_are_those_of_shapely(seed):
 
 
 @given(seeds, st.floats(-7, 7), st.floats(-80, 80), st.floats(-80, 80))
-def test_moving_and_turning_both_changes_nothing(seed, yaw, x, y):
+def test_shifting_and_rotating_both_boxes_changes_nothing(seed, yaw, x, y):
     rng = np.random.default_rng(seed)
     boxes, others = some_boxes(rng, 8), some_boxes(rng, 5)
     before = bev_and_3d_iou(boxes, others)
@@ -91,7 +91,7 @@ def test_overlap_is_symmetric_and_between_0_and_1(seed):
 
 
 @given(seeds)
-def test_a_box_is_the_same_turned_by_half_and_with_sides_swapped(seed):
+def test_half_turn_and_swapped_sides_give_the_same_box(seed):
     rng = np.random.default_rng(seed)
     boxes, others = some_boxes(rng, 8), some_boxes(rng, 5)
     before = bev_and_3d_iou(boxes, others)
@@ -124,13 +124,13 @@ def test_a_box_is_the_same_turned_by_half_and_with_sides_swapped(seed):
         ("far away", [1e6, 0, 0, 4, 2, 2, 0], [0, 0, 0, 4, 2, 2, 0], 0, 0),
     ],
 )
-def test_overlaps_worked_out_by_hand(name, box, other, bev, space):
+def test_overlaps_equal_hand_computed_values(name, box, other, bev, space):
     for a, b in ((box, other), (other, box)):
         found = bev_and_3d_iou(np.array([a], float), np.array([b], float))
         assert (found[0].item(), found[1].item()) == pytest.approx((bev, space), abs=1e-12)
 
 
-def test_shapes_dtypes_and_layouts():
+def test_any_shape_dtype_and_layout_is_accepted():
     boxes = some_boxes(np.random.default_rng(0), 6)
     for rows, columns in ((0, 6), (6, 0), (0, 0), (2, 6)):
         for matrix in bev_and_3d_iou(boxes[:rows], boxes[:columns]):

@@ -126,7 +126,7 @@ def test_the_threshold_applies_to_each_stages_own_scores():
             assert rows(stage) == rows(unfiltered[unfiltered.scores >= threshold])
 
 
-def test_people_are_found_and_other_objects_are_not():
+def test_pedestrians_are_candidates_and_other_objects_are_not():
     _, found = find_candidates(PointCloud(scene()), make_truth_source(boxes_at(PEOPLE)), params=with_threshold(0.75))
     order = np.argsort(found.final.boxes[:, 0])
     np.testing.assert_allclose(found.final.boxes[order, :2], PEOPLE + [0.05, 0], atol=0.1)
@@ -185,7 +185,7 @@ def test_candidates_keep_the_ids_of_a_foreign_clustering():
         with_values(BEST, {"view.enabled": False, "confidence.threshold": 0.0, "height.tolerance": 0.3}),
     ],
 )
-def test_bank_of_seeds_takes_the_best_score_of_each_cluster(params):
+def test_seed_bank_gives_each_cluster_its_best_score(params):
     s = segment_cloud(PointCloud(scene()), params=params)
     sizes = np.bincount(s.cluster_ids)[1:]
     seeds = [seed_from_points(s.xyz[s.cluster_ids == k + 1], s.boxes[k]) for k in np.argsort(-sizes)[:4]]

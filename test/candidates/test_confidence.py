@@ -68,7 +68,7 @@ def make_box(distance, width=0.5, height=1.7):
 
 @pytest.mark.parametrize("distance", [6.0, 15.0, 30.0])
 @pytest.mark.parametrize("width, height", [(0.5, 1.7), (0.9, 1.2), (1.2, 2.2)])
-def test_a_board_has_its_size_at_every_range(distance, width, height):
+def test_size_of_a_board_does_not_depend_on_range(distance, width, height):
     pixels = to_pixels(draw(board(distance, width, height)))
     rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
     cell = distance * STEP
@@ -77,7 +77,7 @@ def test_a_board_has_its_size_at_every_range(distance, width, height):
     assert pixels[np.ix_(rows, columns)].mean() > 0.99  # no gaps
 
 
-def test_spread_makes_silhouettes_independent_of_the_range():
+def test_spreading_points_makes_silhouettes_independent_of_range():
     near, far = board(7.0), board(26.0)
     bare = PipelineParams()
     assert compute_similarity(draw(far, bare)[None], draw(near, bare))[0] < 0.75
@@ -104,7 +104,7 @@ def test_points_outside_the_window_are_not_drawn():
 
 
 @given(seeds, st.integers(0, 6))
-def test_shifts_take_the_best_of_the_shifted_images(seed, shifts):
+def test_shifts_return_the_best_score_of_the_shifted_images(seed, shifts):
     rng = np.random.default_rng(seed)
     pixels, template = (rng.random((ROWS, COLUMNS)) < 0.2 for _ in range(2))
     best = 0.0
@@ -119,7 +119,7 @@ def test_shifts_take_the_best_of_the_shifted_images(seed, shifts):
     assert found[0] == pytest.approx(best, abs=1e-12)
 
 
-def test_hidden_legs_do_not_matter_with_seen_only():
+def test_seen_only_ignores_hidden_legs():
     whole = board(12.0, width=0.4)
     legs = whole[:, 2] < FLOOR + 0.8
     head = whole[~legs]
@@ -198,7 +198,7 @@ def test_a_single_point_has_finite_features():
     assert all(np.isfinite(v).all() for v in shape.values()) and np.isfinite(compute_confidence(shape))[0]
 
 
-def test_models_have_every_curve_and_rise_with_similarity():
+def test_every_curve_exists_and_rises_with_similarity():
     models = _load_models()
     assert set(models["shape"]["curves"]) == set(SHAPE_KNOTS)
     assert set(models["seed"]["curves"]) == set(SHAPE_KNOTS) | set(SEED_KNOTS)
@@ -229,7 +229,7 @@ def test_seed_cluster_is_found_by_the_seeds_points():
 
 
 @pytest.mark.parametrize("certain", [True, False])
-def test_seed_confidence_is_1_if_certain_else_by_shape(certain):
+def test_seed_confidence_is_1_if_certain(certain):
     xyz, start, boxes = two_people()
     boxes[1, 1] += 3.0
     ids = np.repeat(np.int32([1, 2]), np.diff(start))
@@ -249,7 +249,7 @@ def test_seed_confidence_is_1_if_certain_else_by_shape(certain):
 # --- the configuration ---------------------------------------------------------------------
 
 
-def test_stages_of_best_are_accepted_by_confidence():
+def test_configuration_best_accepts_clusters_by_confidence():
     people = [board(8.0), board(16.0), board(11.0, width=1.8)]
     xyz = np.concatenate([p + np.float32([0, 6 * i - 6, 0]) for i, p in enumerate(people)])
     rng = np.random.default_rng(0)
@@ -267,7 +267,7 @@ def test_stages_of_best_are_accepted_by_confidence():
     assert sorted(some.scores) == sorted(all_.scores[all_.scores >= np.float32(limit)])
 
 
-def test_automatic_seed_is_the_likeliest_cluster_or_template():
+def test_automatic_seed_is_most_likely_cluster_or_template():
     template = load_seed()
     params = with_values(BEST, {"view.enabled": False})
     empty = segment_cloud(PointCloud(np.zeros((0, 3), np.float32)), params=params)

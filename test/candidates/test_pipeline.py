@@ -44,7 +44,7 @@ def test_clouds_without_objects_give_empty_results(xyz):
     assert tuple(found.ms) == STEPS
 
 
-def test_a_cloud_without_a_seed_is_an_input_error():
+def test_cloud_without_a_seed_raises_input_error():
     with pytest.raises(InputError, match="no Pedestrian"):
         find_candidates(PointCloud(scene()), make_truth_source(np.zeros((0, 7))))
     with pytest.raises(InputError, match="no clusters"):
@@ -59,7 +59,7 @@ def test_error_of_a_view_without_a_camera_names_the_remedy():
         find_candidates(PointCloud(scene()), template(), params=WITH_VIEW)
 
 
-def test_the_view_equals_the_pipeline_on_the_points_in_view():
+def test_restricted_view_equals_pipeline_on_cropped_points():
     # A camera at the sensor, looking along x: its x is -y, its y is -z, its z is x.
     axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     intrinsics = np.array([[600, 0, 500], [0, 600, 300], [0, 0, 1]])

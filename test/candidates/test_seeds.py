@@ -27,7 +27,7 @@ from lidar_perception.types import InputError
 seeds = st.integers(0, 2**32 - 1)
 
 
-def test_seed_from_truth_has_the_nearest_pedestrians_points():
+def test_seed_from_labels_is_the_nearest_pedestrian():
     xyz = scene()
     ground = xyz[:, 2] < GROUND_Z + 0.4  # includes the feet
     boxes = boxes_at(PEOPLE[[2, 0, 1]])
@@ -40,7 +40,7 @@ def test_seed_from_truth_has_the_nearest_pedestrians_points():
     assert (with_ground.silhouette() != seed.silhouette()).any()
 
 
-def test_seed_from_truth_needs_a_pedestrian_with_ten_points():
+def test_seed_from_labels_needs_a_pedestrian_with_ten_points():
     xyz = person(6, 0, count=9).astype(np.float32)
     none = np.zeros(9, bool)
     with pytest.raises(InputError, match="no Pedestrian"):
@@ -88,7 +88,7 @@ def test_seed_from_click_needs_a_cluster_within_the_radius():
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
-def test_a_click_that_is_not_finite_or_far_is_refused(axis, value):
+def test_click_that_is_far_away_or_not_finite_is_rejected(axis, value):
     xyz, labels, boxes = clicked_scene()
     click = np.array([6, 0.2, -1.0])
     click[axis] = value
@@ -165,7 +165,7 @@ def test_error_of_a_bad_template_names_the_file(tmp_path, text):
     assert "\n" not in str(error.value) and len(str(error.value)) < 1000
 
 
-def test_a_pipe_as_template_is_refused(tmp_path):
+def test_named_pipe_as_template_is_rejected(tmp_path):
     os.mkfifo(tmp_path / "pipe.json")
     with pytest.raises(InputError, match=r"pipe\.json is not a regular file"):
         load_seed(tmp_path / "pipe.json")

@@ -75,7 +75,7 @@ def radial_alignment(xyz):
 
 
 @given(seeds)
-def test_silhouettes_of_random_clusters_equal_the_plain_ones(seed):
+def test_silhouettes_of_random_clusters_equal_plain_ones(seed):
     rng = np.random.default_rng(seed)
     clusters = [make_cluster(rng) for _ in range(4)]
     scales = np.column_stack([np.ones(4), rng.uniform(0, 1, (4, 3))])
@@ -88,7 +88,7 @@ def test_silhouettes_of_random_clusters_equal_the_plain_ones(seed):
 
 
 @needs_data
-def test_silhouettes_of_real_clusters_equal_the_plain_ones():
+def test_silhouettes_of_real_clusters_equal_plain_ones():
     raw = np.fromfile(sorted(SCANS.glob("*.bin"))[4], np.float32).reshape(-1, 4)
     found = segment_cloud(PointCloud(np.ascontiguousarray(raw[:, :3])))
     ids = range(1, found.cluster_ids.max() + 1)
@@ -193,7 +193,7 @@ def test_augmentation_only_adds_pixels(seed, steps):
         np.testing.assert_array_equal(augmented, plain)
 
 
-def test_scales_are_the_papers_from_15_to_30_metres_else_1():
+def test_scales_are_those_of_the_paper():
     ranges = np.array([0, 14.999, 15, 22, 29.999, 30, 31, 1e5])
     inside = [False, False, True, True, True, False, False, False]
     scales = compute_cpa_scales(ranges, CpaParams())
@@ -202,7 +202,7 @@ def test_scales_are_the_papers_from_15_to_30_metres_else_1():
     assert (scales[np.logical_not(inside)] == 1).all()
 
 
-def test_scales_fall_by_the_decrement_down_to_min_scale():
+def test_scale_decreases_in_steps_down_to_min_scale():
     scales = compute_cpa_scales(np.array([20.0]), CpaParams(steps=11))[0]
     np.testing.assert_allclose(scales, [1, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.2, 0.2, 0.2], rtol=0, atol=1e-12)
     np.testing.assert_allclose(
@@ -213,7 +213,7 @@ def test_scales_fall_by_the_decrement_down_to_min_scale():
     )
 
 
-def test_no_steps_and_no_clusters_give_the_right_shapes():
+def test_zero_steps_or_clusters_give_empty_arrays_of_right_shape():
     np.testing.assert_array_equal(compute_cpa_scales(np.array([5.0, 20.0]), CpaParams(steps=0)), np.ones((2, 1)))
     assert compute_cpa_scales(np.zeros(0), CpaParams()).shape == (0, 3)
     none = draw_silhouettes(np.zeros((0, 3), np.float32), np.array([0]), np.ones((0, 3)))

@@ -81,7 +81,7 @@ needs_numba = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="Numba c
 
 @needs_numba
 @pytest.mark.parametrize("detector", ["fused", "pointpillars", "pointnet"])
-def test_dense_cloud_compiles_nothing_after_loading_a_detector(detector):
+def test_dense_cloud_compiles_nothing_once_a_detector_is_loaded(detector):
     subprocess.run([sys.executable, "-c", DETECTOR, detector], check=True)
 
 

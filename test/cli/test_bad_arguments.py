@@ -44,7 +44,7 @@ from lidar_perception.wire.topics import POINTS
         "seed {kitti} --frame 9",
     ],
 )
-def test_nothing_is_made_for_a_command_that_cannot_be_used(words, kitti, tmp_path, monkeypatch, capsys):
+def test_invalid_command_creates_no_files(words, kitti, tmp_path, monkeypatch, capsys):
     option = "--write-results" if words.startswith("evaluate") else "--out"
     assert exit_of(monkeypatch, *words.format(kitti=kitti).split(), option, tmp_path / "not/there") == 2
     assert "Error: " in capsys.readouterr().err
@@ -99,7 +99,7 @@ BAD_INPUTS = {
 
 
 @pytest.mark.parametrize("case", BAD_INPUTS)
-def test_bad_input_is_one_line_on_stderr_and_exit_code_2(case, kitti, bag, tmp_path, monkeypatch, capsys):
+def test_bad_input_prints_one_line_to_stderr_and_exits_with_2(case, kitti, bag, tmp_path, monkeypatch, capsys):
     def fill(text):
         return text.format(tmp=tmp_path, kitti=kitti, bag=bag)
 
@@ -108,7 +108,7 @@ def test_bad_input_is_one_line_on_stderr_and_exit_code_2(case, kitti, bag, tmp_p
     assert fill(words) in error_line(capsys)
 
 
-def test_a_bag_without_a_cloud_is_bad_input(tmp_path, monkeypatch, capsys):
+def test_bag_without_clouds_is_bad_input(tmp_path, monkeypatch, capsys):
     with BagWriter(tmp_path / "bag") as made:
         made.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
     for command in "nuscenes", "detection":
@@ -129,7 +129,7 @@ def test_a_bag_without_a_cloud_is_bad_input(tmp_path, monkeypatch, capsys):
         assert "has no frames" in error_line(capsys)
 
 
-def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch, capsys):
+def test_missing_pedestrian_is_reported_and_old_scores_are_kept(tmp_path, monkeypatch, capsys):
     root = object_folder(tmp_path / "kitti", "")
     write(tmp_path / "s.json", "those from before")
     assert exit_of(monkeypatch, "evaluate", "candidates", "--data", root, "--json", tmp_path / "s.json") == 2
@@ -172,7 +172,7 @@ def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch,
         (["run", "bogus"], "'bogus'"),
     ],
 )
-def test_a_command_that_cannot_be_used_is_exit_code_2(arguments, words, monkeypatch, capsys):
+def test_invalid_command_exits_with_2(arguments, words, monkeypatch, capsys):
     assert exit_of(monkeypatch, *arguments) == 2
     assert words in capsys.readouterr().err.splitlines()[-1]
 
@@ -189,14 +189,14 @@ def test_a_command_that_cannot_be_used_is_exit_code_2(arguments, words, monkeypa
         (None, ["x"], None),
     ],
 )
-def test_the_closest_name_is_found_where_there_is_one(name, known, closest):
+def test_error_suggests_the_closest_name(name, known, closest):
     assert closest_name(name, known) == closest
 
 
 @pytest.mark.parametrize(
     "arguments, code, words", [(["--version"], 0, ""), (["info", "none"], 2, "Error: the bag none does not exist\n")]
 )
-def test_the_process_ends_with_the_code(arguments, code, words, tmp_path):
+def test_process_returns_the_exit_code(arguments, code, words, tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "lidar_perception.cli.main", *arguments], cwd=tmp_path, capture_output=True, text=True
     )

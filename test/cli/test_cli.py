@@ -48,7 +48,7 @@ LEAVES = commands(cli)
 
 
 @pytest.mark.parametrize("words", [words for words, _ in LEAVES], ids=" ".join)
-def test_every_command_explains_itself_with_an_example(words):
+def test_help_of_every_command_has_an_example(words):
     text = run(*words, "--help")
     assert "Usage: " in text and "Example" in text and f"lidar-perception {' '.join(words)}" in text
 
@@ -66,19 +66,19 @@ def test_every_command_has_a_docstring(name):
     assert cli.get_command(click.Context(cli), name).help
 
 
-def test_convert_makes_a_bag_of_every_scan(kitti, bag):
+def test_convert_writes_every_scan_to_the_bag(kitti, bag):
     with Bag(bag) as opened:
         assert opened.counts[POINTS] == opened.counts[TRUTH] == 2
 
 
-def test_convert_takes_as_many_frames_as_asked_for(kitti, tmp_path):
+def test_convert_limit_restricts_the_number_of_frames(kitti, tmp_path):
     text = run("convert", kitti, "--out", tmp_path / "bag", "--limit", 1)
     assert "1 scans of 1" in text.replace("\n", "")
     with Bag(tmp_path / "bag") as opened:
         assert opened.counts[POINTS] == 1
 
 
-def test_convert_leaves_out_what_is_broken_and_says_so(tmp_path, monkeypatch, capsys):
+def test_convert_skips_and_reports_broken_frames(tmp_path, monkeypatch, capsys):
     root = object_folder(tmp_path / "kitti", LABELS)
     broken = write(root / "training/velodyne/000000.bin", b"123")
     assert exit_of(monkeypatch, "convert", root, "--out", tmp_path / "bag") == 1
@@ -88,7 +88,7 @@ def test_convert_leaves_out_what_is_broken_and_says_so(tmp_path, monkeypatch, ca
         assert opened.counts[POINTS] == 1
 
 
-def test_convert_replaces_a_bag_only_by_force(kitti, tmp_path, monkeypatch, capsys):
+def test_convert_replaces_a_bag_only_with_force(kitti, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "300")
     out = tmp_path / "run [/final]"  # which is no markup
     command = ("convert", kitti, "--out", out, "--limit", 1)
@@ -123,7 +123,7 @@ def test_info_folds_names_on_narrow_terminals_only(bag, monkeypatch):
 
 
 @pytest.mark.parametrize("wide", [False, True])
-def test_a_table_in_a_pipe_is_not_cut_whatever_its_width(wide, monkeypatch):
+def test_piped_table_is_never_truncated(wide, monkeypatch):
     monkeypatch.setenv("COLUMNS", "20")
     table = make_table(
         "a title that is wider than its table" * (1 + 20 * wide), "", "score", "another" * (1 + 30 * wide)
@@ -136,7 +136,7 @@ def test_a_table_in_a_pipe_is_not_cut_whatever_its_width(wide, monkeypatch):
     assert rows[-2].split() == "a name of a detector 100.0 200.0".split()
 
 
-def test_info_as_json_has_what_the_table_has(bag, kitti):
+def test_info_json_has_the_content_of_the_table(bag, kitti):
     content = json.loads(run("info", "--json", bag))
     with Bag(bag) as opened:
         assert {row["topic"]: (row["type"], row["messages"]) for row in content["topics"]} == {
@@ -148,7 +148,7 @@ def test_info_as_json_has_what_the_table_has(bag, kitti):
     assert folder["first_cloud"]["labels"] == ["Pedestrian"]
 
 
-def test_bag_problem_is_one_line_and_command_continues(bag, tmp_path):
+def test_bag_problem_is_reported_and_command_continues(bag, tmp_path):
     shutil.copytree(bag, tmp_path / "bag")
     text = (bag / "metadata.yaml").read_text().replace("message_count: 2", "message_count: 9")
     (tmp_path / "bag/metadata.yaml").write_text(text)
@@ -171,7 +171,7 @@ def test_info_lists_topics_that_are_not_read(tmp_path):
     assert [row["topic"] for row in content["unreadable"]] == ["/Log"]
 
 
-def test_info_describes_a_recording_that_is_no_bag(kitti):
+def test_info_describes_a_recording_that_is_not_a_bag(kitti):
     text = run("info", kitti)
     assert f"{kitti}: KITTI object data, 2 frames, a camera, labelled boxes" in text
     assert "10 Hz assumed" in text and "first cloud: 000000, " in text and "labels: " in text
@@ -189,7 +189,7 @@ def test_info_shows_topics_types_counts_and_length(bag):
     assert "0.1 s" in text
 
 
-def test_the_scores_are_those_of_the_two_pedestrians(kitti, tmp_path):
+def test_scores_are_those_of_the_two_pedestrians(kitti, tmp_path):
     content = evaluate(tmp_path, "--data", kitti)
     assert (content["frames"], content["ground_truth"], content["skipped"]) == (2, 2, [])
     assert content["ground_truth_by_range"] == {r: 2 if r == "0-15" else 0 for r in RANGES}
@@ -206,11 +206,11 @@ def test_the_scores_are_those_of_the_two_pedestrians(kitti, tmp_path):
     assert content["ms"]["total"] > 0 and all(ms >= 0 for ms in content["ms"].values())
 
 
-def test_a_bag_has_the_scores_of_the_folder_it_was_made_of(kitti, bag, tmp_path):
+def test_converted_bag_scores_like_its_folder(kitti, bag, tmp_path):
     assert scores(evaluate(tmp_path, "--data", bag)) == scores(evaluate(tmp_path, "--data", kitti))
 
 
-def test_evaluate_prints_what_it_writes(bag, tmp_path, monkeypatch):
+def test_evaluate_prints_the_scores_that_it_writes(bag, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     text = run("evaluate", "candidates", "--data", bag, "--png", tmp_path / "a/picture.png")
     assert "2 pedestrians in 2 frames" in text
@@ -244,14 +244,14 @@ def test_data_is_an_argument_and_data_option_is_the_same(words, tmp_path, monkey
 
 
 @pytest.mark.parametrize("name", ["kitti", "KITTI", "kitti-object", "kitti_object"])
-def test_names_of_formats_are_taken_in_any_spelling(kitti, tmp_path, name):
+def test_format_names_are_accepted_in_any_spelling(kitti, tmp_path, name):
     run("convert", "--data", kitti, "--to", name, "--limit", 1, "--out", tmp_path / "k")
     assert (tmp_path / "k/training/velodyne").is_dir()
     run("simulate", "--to", name, "--frames", 1, "--out", tmp_path / "s")
     assert (tmp_path / "s/training/velodyne").is_dir()
 
 
-def test_without_core_points_there_are_no_candidates(bag, tmp_path):
+def test_cloud_without_core_points_has_no_candidates(bag, tmp_path):
     content = evaluate(tmp_path, "--data", bag, *given("clustering.dbscan.min_samples=100000"))
     for stage in STAGES:
         row = content[stage]["all"]
@@ -269,7 +269,7 @@ def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
 
 
 @pytest.mark.no_cover
-def test_real_scans_are_scored_alike_from_folder_and_bag(data, tmp_path):
+def test_real_scans_score_the_same_from_folder_and_bag(data, tmp_path):
     root = data / "kitti_object"
     run("convert", root, "--out", tmp_path / "bag", "--limit", 6)
     content = evaluate(tmp_path, "--data", tmp_path / "bag")
@@ -280,7 +280,7 @@ def test_real_scans_are_scored_alike_from_folder_and_bag(data, tmp_path):
 
 
 @pytest.mark.parametrize("command", [["demo"], ["run", "perception"]])
-def test_without_rclpy_the_remedy_is_said_before_any_work(command, tmp_path):
+def test_missing_rclpy_is_reported_before_any_work(command, tmp_path):
     write(tmp_path / "rclpy/__init__.py", "raise ImportError('not for this Python')")
     end = subprocess.run(
         [sys.executable, "-m", "lidar_perception.cli.main", *command],

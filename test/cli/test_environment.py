@@ -39,7 +39,7 @@ needs_pip = pytest.mark.skipif(not INSTALLED.is_dir(), reason="needs the package
 
 
 @needs_pip
-def test_only_the_command_is_on_the_path():
+def test_path_gets_only_the_lidar_command():
     """The nodes lie where ros2 run and ros2 launch look: others have a `tracker` too."""
     assert {path.name for path in INSTALLED.iterdir()} == set(NODES)
     assert {path.name for path in (PREFIX / "bin").iterdir()}.isdisjoint(NODES)
@@ -57,7 +57,7 @@ def test_executable_starts_the_node_of_its_name(name, tmp_path):
     assert done.stdout.startswith(f"Usage: {name} --ros-args")
 
 
-def test_a_reader_of_the_help_may_stop_reading():
+def test_closed_pipe_ends_help_without_error():
     command = [sys.executable, "-m", "lidar_perception.nodes.main", "perception", "--help"]
     with subprocess.Popen(
         command, env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -68,7 +68,7 @@ def test_a_reader_of_the_help_may_stop_reading():
 
 
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
-def test_concurrent_first_calls_make_one_environment(tmp_path):
+def test_concurrent_first_calls_create_one_environment(tmp_path):
     venv = tmp_path / "venv"
     write(venv / "bin/lidar-perception", "#!/bin/sh\necho ran $1\n").chmod(0o755)
     with open(venv / "lidar-lock", "w") as lock:  # the one
@@ -86,7 +86,7 @@ def test_concurrent_first_calls_make_one_environment(tmp_path):
 
 
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
-def test_a_sourced_ros_is_not_seen_while_the_environment_is_made(tmp_path):
+def test_sourced_ros_does_not_affect_the_new_environment(tmp_path):
     """pip does not install packages that it finds on PYTHONPATH."""
     seen = tmp_path / "seen"
     python = write(tmp_path / "python", f"#!/bin/sh\necho ${{PYTHONPATH-unset}} >>{seen}\n")
@@ -161,7 +161,7 @@ def test_lidar_installs_what_a_command_needs(words, before, after, environment, 
     assert not log.exists() if after == before else log.read_text() == (f"python {ROOT}/scripts/set_up.py {after}\n")
 
 
-def test_uv_gets_the_configuration_of_pip(tmp_path, monkeypatch):
+def test_pip_configuration_is_passed_to_uv(tmp_path, monkeypatch):
     set_up = runpy.run_path(str(ROOT / "scripts/set_up.py"))
     write(
         tmp_path / "pip.conf",

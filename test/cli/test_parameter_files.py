@@ -30,7 +30,7 @@ from lidar_perception.types import InputError
     ],
     ids=str,
 )
-def test_set_help_lists_the_parameters_of_what_runs(words, names):
+def test_set_help_lists_the_parameters_of_the_command(words, names):
     for spelling in ["--set", "help"], ["--set=help"]:
         text = run(*words, *spelling)
         assert all(name in text for name in names), text
@@ -54,14 +54,14 @@ def test_set_help_of_candidates_describes_every_parameter():
         ("view.enabled=false", "ground.threshold.max_height:=-10", "clustering.dbscan.range_limits=[5, 7]"),
     ],
 )
-def test_parameters_reach_the_pipeline(bag, tmp_path, flags):
+def test_set_changes_parameters_of_the_pipeline(bag, tmp_path, flags):
     changed = scores(evaluate(tmp_path, "--data", bag, *given(*flags)))
     assert changed["ground_truth"] == 2
     assert changed != scores(evaluate(tmp_path, "--data", bag))
 
 
 @pytest.mark.no_cover
-def test_a_config_says_the_same_as_set_and_set_wins(bag, tmp_path):
+def test_config_equals_set_and_set_takes_precedence(bag, tmp_path):
     few, many = (given(f"clustering.dbscan.min_samples={n}") for n in (10, 100_000))
     file = write(tmp_path / "p.yaml", "/**:\n  ros__parameters:\n    clustering.dbscan.min_samples: 100000\n")
     no_clusters = scores(evaluate(tmp_path, "--data", bag, *many))
@@ -92,14 +92,14 @@ def test_a_config_says_the_same_as_set_and_set_wins(bag, tmp_path):
     ],
     ids=range(9),
 )
-def test_a_parameter_file_says_nothing_that_is_passed_over(tmp_path, section, words):
+def test_ignored_entries_of_a_parameter_file_are_reported(tmp_path, section, words):
     file = write(tmp_path / "p.yaml", f"/**:\n  ros__parameters:\n    {section}\n")
     with pytest.raises(InputError) as error:
         read_config(file, PipelineParams())
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_value_that_is_refused_is_shown_as_far_as_a_line_goes(tmp_path):
+def test_long_invalid_value_is_abbreviated_in_the_error(tmp_path):
     lists = ["a0: &a0 [1, 1]", *(f"a{i + 1}: &a{i + 1} [*a{i}, *a{i}]" for i in range(40))]
     file = write(
         tmp_path / "p.yaml",
@@ -111,12 +111,12 @@ def test_a_value_that_is_refused_is_shown_as_far_as_a_line_goes(tmp_path):
 
 
 @pytest.mark.parametrize("file", sorted(Path(__file__).parents[2].glob("config/*.yaml")), ids=lambda path: path.name)
-def test_our_parameter_files_are_read_whatever_the_command(file, capsys):
+def test_shipped_parameter_files_load_without_warnings(file, capsys):
     read_config(file, PipelineParams())
     assert not capsys.readouterr().err
 
 
-def test_misspelt_parameter_is_reported(tmp_path, capsys):
+def test_misspelled_parameter_is_reported(tmp_path, capsys):
     file = write(
         tmp_path / "p.yaml",
         "/**:\n  ros__parameters:\n    other: {ground: 1}\n"
@@ -154,7 +154,7 @@ def chosen(*arguments, tracking=False) -> dict:
     return made
 
 
-def test_only_the_sections_of_what_runs_are_read(tmp_path, capsys):
+def test_only_sections_of_the_command_are_read(tmp_path, capsys):
     file = write(tmp_path / "p.yaml", SECTIONS)
     made = chosen("--config", file, "--set", "crop.min_range=3", tracking=True)
     assert made["detector"].settings == {"ground.method": "threshold", "fused.scores.car": 0.7, "crop.min_range": 3.0}
@@ -172,13 +172,13 @@ def test_only_the_sections_of_what_runs_are_read(tmp_path, capsys):
         ("/**: {ros__parameters: {a: 1}}", "p.yaml has no parameter of fused"),
     ],
 )
-def test_what_may_be_misspelt_in_a_parameter_file_is_said(text, said, tmp_path, capsys):
+def test_probable_typos_in_a_parameter_file_are_reported(text, said, tmp_path, capsys):
     file = write(tmp_path / "p.yaml", text)
     assert chosen("--config", file)["detector"].settings == {}
     assert said in capsys.readouterr().err
 
 
-def test_settings_of_a_detector_take_effect_and_win():
+def test_detector_settings_take_effect_and_precedence():
     made = chosen(
         "--weights",
         "pointpillars",
@@ -196,7 +196,7 @@ def test_settings_of_a_detector_take_effect_and_win():
         DetectorChoice("f.json", settings={"fused.weights": "a"}).open()
 
 
-def test_a_pipe_is_no_parameter_file_and_is_not_waited_for(tmp_path):
+def test_named_pipe_as_parameter_file_is_rejected_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="is not a regular file"):
         read_config(tmp_path / "pipe", PipelineParams())

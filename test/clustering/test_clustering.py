@@ -68,7 +68,7 @@ def test_labels_equal_sklearn_on_random_points(seed, count, eps, min_samples, of
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 500), st.integers(1, 4), st.integers(1, 30))
-def test_labels_equal_sklearn_where_most_distances_tie(seed, count, reach, min_samples):
+def test_labels_equal_sklearn_with_many_equal_distances(seed, count, reach, min_samples):
     # Multiples of 1/4, so that distances are exact and many equal eps.
     xyz = np.random.default_rng(seed).integers(-6, 7, (count, 3)).astype(np.float32) / 4
     assert_same(xyz, reach / 4, min_samples)
@@ -310,7 +310,7 @@ def test_a_million_equal_points_are_one_cluster():
     assert (dbscan(np.full((1_000_000, 3), 1.7, np.float32), 0.15, 10) == 1).all()
 
 
-def test_two_dense_places_within_eps_are_one_cluster():
+def test_dense_groups_within_eps_are_one_cluster():
     xyz = np.zeros((400_000, 3), np.float32)
     xyz[::2, 1] = 0.14
     assert (dbscan(xyz, 0.15, 10) == 1).all()
@@ -333,7 +333,7 @@ def test_both_implementations_equal_sklearn(seed, n, scale, eps, min_samples):
     np.testing.assert_array_equal(dbscan_by_growing(xyz, eps, min_samples), expected)
 
 
-def test_dbscan_by_growing_refuses_dense_points():
+def test_dbscan_by_growing_rejects_dense_points():
     assert dbscan_by_growing(np.zeros((100_000, 3), np.float32), 0.5, 10) is None
 
 

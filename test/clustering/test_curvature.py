@@ -53,6 +53,6 @@ def test_growing_stops_where_the_curvature_changes(max_distances):
     assert (labels[:2000] == of_wall).mean() > 0.7 and (labels[2000:] == of_bush).mean() > 0.9
 
 
-def test_every_point_of_an_even_surface_grows():
+def test_smooth_surface_is_one_region():
     assert find_consistent_points(wall_and_bush()[0], np.full(2000, 0.5), 1e-6, MAX_WORK).all()
     assert find_consistent_points(np.ones((5, 3), np.float32), np.ones(5), 0.0, MAX_WORK).all()

@@ -61,7 +61,7 @@ def make_scan(elevation_step, azimuth_step, rng):
 @pytest.mark.parametrize(
     "elevation_step, azimuth_step", [(0.4, 0.17), (0.5, 0.5), (1.33, 0.33), (2.0, 0.2), (2.0, 2.0)]
 )
-def test_density_is_that_of_the_sensors_steps(elevation_step, azimuth_step):
+def test_density_matches_angular_resolution(elevation_step, azimuth_step):
     # Each beam has 1 / azimuth_step returns per degree of azimuth, at every elevation.
     slant = np.cos(np.radians(np.arange(-25.0, 5.0, elevation_step))).mean()
     expected = 1 / (elevation_step * azimuth_step * slant)
@@ -81,7 +81,7 @@ def full_density(scan):
 
 @settings(max_examples=10, database=None)
 @given(st.floats(0.05, 1.0), st.integers(0, 99))
-def test_density_falls_with_the_share_of_points_kept(scan, full_density, share, seed):
+def test_density_falls_when_points_are_removed(scan, full_density, share, seed):
     xyz = scan.frame.xyz
     kept = np.random.default_rng(seed).random(len(xyz)) < share
     assert measure_density(xyz[kept]) == pytest.approx(share * full_density, rel=0.08)
@@ -93,7 +93,7 @@ def test_cropping_and_scaling_keep_the_density(scan):
     assert measure_density(xyz * np.float32(0.1)) == pytest.approx(measure_density(xyz), rel=1e-3)
 
 
-def test_unknown_or_full_density_changes_no_parameter():
+def test_unknown_or_full_density_keeps_the_parameters():
     lonely = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
     unusable = np.array([[0, 0, 0], [np.nan, 1, 1], [np.inf, 0, 0]], np.float32)
     for xyz in (np.zeros((0, 3), np.float32), lonely, unusable):
@@ -155,7 +155,7 @@ def test_no_real_scan_of_an_hdl_64e_counts_as_sparse(layout):
 
 
 @pytest.mark.parametrize("params", ADAPTIVE[::2], ids=["PointNet", "people"])
-def test_objects_stay_whole_with_a_tenth_of_the_points(params, scan):
+def test_objects_are_not_split_with_a_tenth_of_the_points(params, scan):
     kept = np.random.default_rng(1).random(len(scan.frame)) < 0.1
     xyz = scan.frame.xyz[kept]
     ground = np.isin(scan.semantic[kept], (40, 44, 48, 49, 60, 72))

@@ -130,7 +130,7 @@ def test_min_area_has_the_least_area(seed, angle):
 
 
 @given(seeds, st.integers(3, 400), st.floats(0.5, 2000))
-def test_min_area_of_points_that_are_all_corners(seed, count, radius):
+def test_min_area_accepts_only_corner_points(seed, count, radius):
     angles = np.random.default_rng(seed).uniform(0, 2 * np.pi, count)
     xyz = np.column_stack([np.cos(angles), 0.7 * np.sin(angles), angles]) * radius
     xyz = xyz.astype(np.float32)
@@ -188,7 +188,7 @@ def test_the_order_of_the_points_does_not_matter(shape, seed):
 
 
 @each_shape
-def test_a_cluster_has_the_same_box_alone(shape):
+def test_box_of_a_cluster_does_not_depend_on_others(shape):
     xyz, labels = make_clusters(5)
     boxes, rounds = fit_boxes(xyz, labels, shape), fit_ellipses(xyz, labels)
     for k, (box, ellipse) in enumerate(zip(boxes, rounds), 1):
@@ -210,7 +210,7 @@ def test_a_cluster_has_the_same_box_alone(shape):
         ("slanted back", np.outer(np.linspace(0, 7, 333), [0.6, -0.8, 0]), 7, np.arctan2(-4, 3)),
     ],
 )
-def test_points_at_one_place_or_on_a_line(name, xyz, length, yaw):
+def test_coincident_or_collinear_points_have_a_box(name, xyz, length, yaw):
     for shape in ("min_area", "l_shape"):
         box = apply_to_one(fit_boxes, xyz, shape)
         np.testing.assert_allclose(box[3:5], [length, 0], atol=2e-6)
@@ -221,7 +221,7 @@ def test_points_at_one_place_or_on_a_line(name, xyz, length, yaw):
 
 
 @each_shape
-def test_no_clusters_give_no_boxes_and_unused_ids_zeros(shape):
+def test_unused_cluster_ids_have_boxes_of_zeros(shape):
     empty = np.zeros((0, 3), np.float32), np.zeros(0, np.int32)
     noise = np.ones((5, 3), np.float32), np.zeros(5, np.int32)
     for cloud in (empty, noise):
@@ -274,7 +274,7 @@ def test_an_evenly_filled_ellipse_is_recovered(seed, yaw, ratio):
         (np.nan, None),
     ],
 )
-def test_class_by_diagonal_at_the_limits(diagonal, name):
+def test_class_by_diagonal_includes_the_limits(diagonal, name):
     boxes = np.array([[0, 0, 0, diagonal, 0, 9, 1], [0, 0, 0, 0, diagonal, 9, 1]])
     expected = -1 if name is None else CLASSES.index(name)
     for same in (boxes, boxes.astype(np.float32)):

@@ -45,14 +45,14 @@ def always_thin(monkeypatch):
 
 
 @each_method
-def test_points_slightly_out_of_reach_are_separate_clusters(method):
+def test_points_slightly_farther_than_eps_are_separate_clusters(method):
     assert METHODS[method](shell(3000, 0.001)).max() == 2
     assert METHODS[method](shell(3000, -0.001)).max() == 1
 
 
 @each_method
 @pytest.mark.parametrize("seed", range(3))
-def test_thinning_connects_no_less_and_little_more(method, seed, always_thin):
+def test_thinning_connects_at_least_the_same_points_and_few_more(method, seed, always_thin):
     """Thinned clusters lie between those of the reach and those of the longer reach."""
     rng = np.random.default_rng(seed)
     blobs = rng.uniform(-2.5, 2.5, (12, 3)) + [15, 0, 0]

@@ -63,7 +63,7 @@ def draw_lattice(data):
 
 
 @given(st.data())
-def test_every_search_agrees_with_all_pairs(data):
+def test_every_search_equals_brute_force(data):
     tree = build_tree(draw_lattice(data))
     n = len(tree.points)
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
@@ -94,7 +94,7 @@ def test_every_search_agrees_with_all_pairs(data):
 
 
 @given(st.data())
-def test_touching_labels_are_those_of_all_pairs(data):
+def test_touching_labels_equal_brute_force(data):
     tree = build_tree(draw_lattice(data))
     n = len(tree.points)
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))

@@ -128,7 +128,7 @@ def test_zstd_chunks_hold_several_clouds(tmp_path):
     ("compression", "pack"),
     [("zstd", lambda data: zstandard.compress(data, level=1)), ("lz4", lz4.frame.compress), ("none", bytes)],
 )
-def test_bag_is_compressed_as_asked(tmp_path, compression, pack):
+def test_bag_has_the_requested_compression(tmp_path, compression, pack):
     cloud = np.random.default_rng(0).normal(size=(2000, 4)).astype(np.float32)
     data = encode(make_cloud_message(cloud))
     with BagWriter(tmp_path / "bag", compression=compression) as bag:

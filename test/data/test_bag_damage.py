@@ -121,7 +121,7 @@ def test_second_writer_of_the_same_bag_is_rejected(tmp_path):
     assert len(open_recording(path)) == 2
 
 
-def test_bag_written_meanwhile_is_kept(tmp_path):
+def test_bag_written_by_another_process_is_kept(tmp_path):
     late = BagWriter(tmp_path / "bag")
     write_bag(tmp_path / "bag", scans(2))
     with pytest.raises(InputError, match="exists already"), late:

@@ -42,7 +42,7 @@ def test_poses_come_from_odometry_and_tf_at_cloud_times(tmp_path, parts):
     check(recorded(tmp_path / "bag", *map(list, parts)))
 
 
-def test_odometry_is_that_of_the_sensor_if_tf_says_nothing_else(tmp_path):
+def test_odometry_without_tf_is_the_pose_of_the_sensor(tmp_path):
     own = recorded(tmp_path / "own", moving(ODOMETRY, "lidar"), mount())
     unknown = recorded(tmp_path / "unknown", moving(ODOMETRY, "chassis"), mount())
     check(own, np.eye(4))
@@ -72,7 +72,7 @@ def test_converted_bag_has_sensor_odometry(tmp_path):
     assert ours.frames.poses.needs_no_tf and ours.frames.poses.odometry == ODOMETRY
 
 
-def test_sensor_that_turns_on_the_robot_has_correct_poses(tmp_path):
+def test_sensor_that_rotates_on_the_robot_has_correct_poses(tmp_path):
     def turning():
         for i in range(-5, 60):
             stamp = START + i * SECOND_NS // 100

@@ -222,7 +222,7 @@ FIRST = 1_741_286_117
         ([f"{FIRST}.1", f"{FIRST}.2", f"{FIRST}.300000001"], [10**8, 2 * 10**8, 300_000_001]),
     ],
 )
-def test_times_in_file_names_may_lack_leading_zeros(tmp_path, names, expected):
+def test_times_in_file_names_need_no_leading_zeros(tmp_path, names, expected):
     for name in names:
         write(tmp_path / f"{name}.BIN", CLOUD.tobytes())
     recording = open_recording(tmp_path)

@@ -63,7 +63,7 @@ def make_tilted_frames():
         )
 
 
-def test_bag_of_tilted_sensor_is_converted_to_level(tmp_path, monkeypatch):
+def test_bag_of_tilted_sensor_is_levelled(tmp_path, monkeypatch):
     write_bag(tmp_path / "leaning", make_tilted_frames())
     (tmp_path / "robot.yaml").write_text(MOUNT)
     assert (

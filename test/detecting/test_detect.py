@@ -69,7 +69,7 @@ def drives(tmp_path):
 
 
 @pytest.mark.parametrize("kind", MADE)
-def test_any_recording_gives_a_result_of_every_frame(kind, tmp_path, monkeypatch, made):
+def test_every_frame_of_any_recording_has_a_result(kind, tmp_path, monkeypatch, made):
     data, out = MADE[kind][0](tmp_path / "in/bag"), tmp_path / "out"
     assert detect(monkeypatch, data, "--out", out, "--format", "json,csv,kitti") == 0
     names = [frame.name for frame in open_recording(data)]
@@ -100,7 +100,7 @@ def test_any_recording_gives_a_result_of_every_frame(kind, tmp_path, monkeypatch
         assert [float(row[k]) for k in ("score", "x", "yaw")] == [found[row["frame"]][0][k] for k in (1, 2, 8)]
 
 
-def test_all_formats_of_one_run_hold_the_same_boxes(drives, tmp_path, monkeypatch):
+def test_all_formats_of_a_run_have_the_same_boxes(drives, tmp_path, monkeypatch):
     out = tmp_path / "out"
     assert detect(monkeypatch, drives, "--out", out, "--format", ALL, "--min-score", 0.1) == 0
     found = objects(read_json(out))
@@ -127,7 +127,7 @@ def seen_by_view(path):
 
 
 @pytest.mark.parametrize("clouds", [True, False])
-def test_a_bag_holds_what_the_nodes_publish(drives, tmp_path, monkeypatch, clouds):
+def test_output_bag_has_the_messages_of_the_nodes(drives, tmp_path, monkeypatch, clouds):
     out = tmp_path / "out"
     assert (
         detect(
@@ -201,7 +201,7 @@ def numbers_in(content):
 # Tracks
 
 
-def test_tracks_have_ids_and_velocities_that_never_mix(drives, tmp_path, monkeypatch):
+def test_tracks_of_different_drives_have_different_ids(drives, tmp_path, monkeypatch):
     out = tmp_path / "out"
     assert detect(monkeypatch, drives, "--out", out, "--format", ALL, "--track", "--ego", "none") == 0
     content = read_json(out)
@@ -242,7 +242,7 @@ def test_written_tracks_score_like_the_tracker(drives, tmp_path, monkeypatch):
     assert numbers_in(scores[0]) == pytest.approx(numbers_in(scores[1]), abs=1e-3)
 
 
-def test_drives_of_a_bag_are_tracked_apart(tmp_path, monkeypatch):
+def test_drives_of_a_bag_are_tracked_separately(tmp_path, monkeypatch):
     """Drives of a bag have no names, so their files are numbered."""
     stamps = [STAMP + s * 10**8 for s in (0, 1, 100, 101)]
     write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(scene(i), stamp)) for i, stamp in enumerate(stamps)])
@@ -262,7 +262,7 @@ class Stopped(Exception):
     """Stop a run in the middle."""
 
 
-def test_a_run_that_was_stopped_is_resumed(drives, tmp_path, made):
+def test_stopped_run_is_resumed(drives, tmp_path, made):
     def stop(scan):
         if len(made) == 3:
             raise Stopped
@@ -288,7 +288,7 @@ def test_the_number_of_processes_does_not_change_the_result(drives, tmp_path):
     assert read_json(tmp_path / "one") == read_json(tmp_path / "two")
 
 
-def test_other_run_in_folder_is_refused_without_force(kitti, tmp_path, monkeypatch, capsys, made):
+def test_folder_of_another_run_needs_force(kitti, tmp_path, monkeypatch, capsys, made):
     out = tmp_path / "out"
     assert detect(monkeypatch, kitti, "--out", out, "--format", "kitti,csv", "--limit", 2) == 0
     assert detect(monkeypatch, kitti, "--out", out) == 0  # more frames, another format
@@ -307,7 +307,7 @@ def test_other_run_in_folder_is_refused_without_force(kitti, tmp_path, monkeypat
 # What cannot be used
 
 
-def test_unreadable_frames_are_named_and_others_written(kitti, tmp_path, monkeypatch, capsys, made):
+def test_unreadable_frames_are_reported_and_others_written(kitti, tmp_path, monkeypatch, capsys, made):
     cut, out = kitti / "training/velodyne/000001.bin", tmp_path / "out"
     whole = cut.read_bytes()
     write(cut, b"123")
@@ -347,7 +347,7 @@ def test_equal_problems_are_reported_once_with_count(kitti, tmp_path, monkeypatc
     assert said.count("are not much") == 1 and "in 4 frames" in said
 
 
-def test_numbers_that_are_not_finite_are_not_written(kitti, tmp_path, monkeypatch, capsys):
+def test_non_finite_numbers_are_not_written(kitti, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         MadeDetector, "__call__", lambda self, frame: DetectionResult(Detections.of(np.full((1, 7), np.nan)))
     )
@@ -364,7 +364,7 @@ def test_numbers_that_are_not_finite_are_not_written(kitti, tmp_path, monkeypatc
         (["--min-score", 2], "2"),
     ],
 )
-def test_options_that_cannot_be_used_are_refused(arguments, words, kitti, tmp_path, monkeypatch, capsys, made):
+def test_unusable_options_are_rejected(arguments, words, kitti, tmp_path, monkeypatch, capsys, made):
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out", *arguments) == 2
     assert words in capsys.readouterr().err and made == [] and not (tmp_path / "out").exists()
 
@@ -372,7 +372,7 @@ def test_options_that_cannot_be_used_are_refused(arguments, words, kitti, tmp_pa
 # PictureWriter and films
 
 
-def test_pictures_and_a_film_of_every_frame(drives, tmp_path, monkeypatch, made):
+def test_pictures_and_video_show_every_frame(drives, tmp_path, monkeypatch, made):
     out, film = tmp_path / "out", tmp_path / "films/drive.gif"
     assert detect(monkeypatch, drives, "--out", out, "--png", "--video", film, "--track", "--ego", "none") == 0
     names = [frame.name for frame in open_recording(drives)]
@@ -388,7 +388,7 @@ def test_pictures_and_a_film_of_every_frame(drives, tmp_path, monkeypatch, made)
     assert len(made) == len(names)
 
 
-def test_impossible_video_is_refused_before_any_work(drives, tmp_path, monkeypatch, capsys, made):
+def test_unsupported_video_is_rejected_before_any_work(drives, tmp_path, monkeypatch, capsys, made):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "av" else find(name, *more))
     for name, words in ("a.mp4", "lidar_perception[video]"), ("a.avi", "is not a video"):

@@ -47,7 +47,7 @@ def street(streets):
 
 
 @pytest.mark.parametrize("version", ["v0", "v4"])
-def test_a_turned_cloud_has_the_turned_boxes(version, street):
+def test_rotated_cloud_has_rotated_boxes(version, street):
     detector = shipped(version, "around")
     columns = columns_of(street.frame)
     found = detector(street.frame, **columns).detections
@@ -92,7 +92,7 @@ def test_range_can_be_changed_and_restored(street):
     assert trained.with_range("around") is trained and len(trained.proposer.half_turns) == 1
 
 
-def test_around_with_empty_half_or_empty_cloud(street):
+def test_around_accepts_empty_half_and_empty_cloud(street):
     detector = shipped(range="around")
     ahead = detector(street.frame.take(np.flatnonzero(street.frame.xyz[:, 0] > 6)))
     assert len(ahead.detections) and ahead.problem is None
@@ -100,7 +100,7 @@ def test_around_with_empty_half_or_empty_cloud(street):
     assert len(nothing.detections) == 0 and "empty" in nothing.problem
 
 
-def test_unsupported_range_is_refused():
+def test_unsupported_range_is_rejected():
     config = pointnet_samples.small()
     pointnet = PointNetDetector(pointnet_samples.make_classifier(pointnet_samples.lively(config), Header(config)))
     assert pointnet.with_range("around") is pointnet

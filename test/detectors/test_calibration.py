@@ -73,7 +73,7 @@ def test_calibrated_detector_finds_same_boxes(make):
         {"Car": ["a", 0]},
     ],
 )
-def test_lines_that_do_not_rise_are_refused(tmp_path, broken):
+def test_calibration_that_does_not_rise_is_rejected(tmp_path, broken):
     header = Header(tiny("v0"), calibration=broken)
     save_checkpoint(tmp_path / "w.safetensors", lively(tiny("v0")), header)
     with pytest.raises(InputError, match="invalid calibration"):

@@ -51,7 +51,7 @@ def detectors(frame, tmp_path_factory):
     return {contender.name: contender.make_detector(frame) for contender in contenders}
 
 
-def test_these_are_all(detectors):
+def test_every_detector_is_tested(detectors):
     assert list(detectors) == NAMES
 
 
@@ -69,7 +69,7 @@ def test_detector_has_classes_and_thresholds(detectors, name):
 
 
 @each_name
-def test_an_array_is_taken_like_its_frame(detectors, frame, name):
+def test_array_gives_the_detections_of_its_frame(detectors, frame, name):
     """Columns have a value for each row, also for unusable points."""
     scan, detector = frame.load(), detectors[name]
     cloud, ground = scan.points(), scan.xyz[:, 2] < -1.5
@@ -175,7 +175,7 @@ def test_with_min_score_returns_a_copy(detectors, frame, name):
 
 
 @each_name
-def test_columns_of_another_length_are_refused_by_name(detectors, frame, name):
+def test_column_of_wrong_length_is_named_in_the_error(detectors, frame, name):
     scan = frame.load()
     for column, values in dict(
         ground=np.zeros(len(scan) - 1, bool), cluster_ids=np.zeros(len(scan) + 1, np.int32)

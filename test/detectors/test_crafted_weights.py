@@ -113,7 +113,7 @@ SMALL = {
 
 
 @pytest.mark.parametrize("kind", SMALL)
-def test_a_mutated_header_is_used_or_refused_with_one_line(kind, tmp_path):
+def test_mutated_header_is_used_or_rejected_in_one_line(kind, tmp_path):
     """Accepted headers have the shapes of the tensors, so memory use is bounded by the file."""
     make_header, make, load, params = SMALL[kind]
     header = make_header()
@@ -166,7 +166,7 @@ def test_constant_scores_are_reported_as_broken_weights():
         assert len(found.detections) == 0 and "same scores" in found.problem
 
 
-def test_onnx_files_with_other_inputs_are_refused(tmp_path):
+def test_onnx_files_with_other_inputs_are_rejected(tmp_path):
     """Inputs are renamed, of another type or rank, or missing."""
     onnx = pytest.importorskip("onnx", reason="needs the extra [onnx]")
     pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
@@ -213,7 +213,7 @@ def test_onnx_files_with_other_inputs_are_refused(tmp_path):
         assert "\n" not in str(error.value)
 
 
-def test_tensors_of_other_types_are_refused(tmp_path):
+def test_tensors_of_other_types_are_rejected(tmp_path):
     config = tiny("v4")
     path, state = tmp_path / "w.safetensors", lively(config).state_dict()
     for dtype in torch.bool, torch.int8, torch.complex64:

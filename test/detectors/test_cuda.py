@@ -41,14 +41,14 @@ def assert_alike(a: Detections, b: Detections, metres: float = 0.05, score: floa
 
 
 @pytest.mark.parametrize("weights", DETECTORS, ids=lambda path: getattr(path, "stem", path))
-def test_a_detector_finds_on_cuda_what_it_finds_on_the_cpu(weights, scan):
+def test_detections_on_cuda_equal_those_on_cpu(weights, scan):
     here, there = (open_detector(weights, device) for device in ("cpu", "cuda"))
     found = there(scan)
     assert found.problem is None and there.device == "cuda"
     assert_alike(here(scan).detections, found.detections)
 
 
-def test_all_around_too(scan):
+def test_detections_all_around_on_cuda_equal_those_on_cpu(scan):
     here, there = (open_detector(device=device, range="around") for device in ("cpu", "cuda"))
     assert_alike(here(scan).detections, there(scan).detections)
 

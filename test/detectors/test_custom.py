@@ -72,7 +72,7 @@ def test_scores_below_threshold_are_dropped(module):
     assert chosen(scene(0)).detections.class_ids.tolist() == [0]
 
 
-def test_cloud_holds_usable_cropped_points(module):
+def test_detector_gets_usable_cropped_points(module):
     cloud = scene(0)
     cloud[:5] = np.nan
     whole = open_detector(f"{module}:Fixed")(cloud).detections.boxes[1, 5]
@@ -93,13 +93,13 @@ def test_cloud_holds_usable_cropped_points(module):
         ("{}_absent:Fixed", "there is no module"),
     ],
 )
-def test_unusable_class_is_refused_in_one_line(module, reference, words):
+def test_unusable_class_is_rejected_in_one_line(module, reference, words):
     with pytest.raises(InputError, match=words) as error:
         open_detector(reference.format(module))
     assert "\n" not in str(error.value)
 
 
-def test_range_is_refused_where_class_takes_none(module):
+def test_range_is_rejected_if_the_class_has_no_such_argument(module):
     with pytest.raises(InputError, match="has no argument `range`"):
         open_detector(f"{module}:Fixed", range="around")
 

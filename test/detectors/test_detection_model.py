@@ -94,12 +94,12 @@ def test_full_v0_has_as_many_weights_as_pointpillars():
         (dict(zero_row=True), "max_points"),
     ],
 )
-def test_a_config_that_cannot_be_is_refused(change, words):
+def test_invalid_config_is_rejected(change, words):
     with pytest.raises(InputError, match=words):
         make_config(**{"version": "v1", **change})
 
 
-def test_another_network_is_refused_with_both_values():
+def test_error_for_another_network_shows_both_values():
     with pytest.raises(InputError, match=r"f\.st .*version is v4, expected v2"):
         require_same_config(make_config("v4"), make_config("v2"), "f.st")
 
@@ -107,7 +107,7 @@ def test_another_network_is_refused_with_both_values():
 # pillars
 
 
-def test_pillars_know_their_points():
+def test_pillars_contain_their_points():
     config = tiny("v0")
     points = some_points(config, margin=1.0)
     points[3, 0], points[4, 2], points[5, 3] = torch.nan, torch.inf, torch.nan
@@ -146,7 +146,7 @@ def test_the_order_of_the_points_makes_no_difference():
     assert image.max() > 0
 
 
-def test_points_keep_float32_precision_with_amp():
+def test_points_stay_float32_in_mixed_precision():
     config = tiny()
     network = lively(config)
     pillars = make_pillar_batch([some_points(config)], config)
@@ -192,7 +192,7 @@ def test_smaller_x_and_y_need_larger_weights():
 
 
 @pytest.mark.parametrize("middle_z", [False, True])
-def test_limited_pillars_equal_padded_pillars(middle_z):
+def test_limited_number_of_pillars_equals_padding(middle_z):
     config = tiny("v0", max_points=2, zero_row=True, middle_z=middle_z, xy_scale=1.0)
     network, points = lively(config), some_points(config, 900)
     net, low = network.pillar_net, torch.tensor(config.low)
@@ -231,7 +231,7 @@ def test_every_version_has_outputs_for_all_anchors(version, changes):
 
 
 @each_version
-def test_a_batch_of_two_is_two_clouds(version):
+def test_batch_of_two_equals_two_single_clouds(version):
     config = tiny(version)
     network = lively(config)
     clouds = [some_points(config, 300, 1), some_points(config, 500, 2)]

@@ -119,7 +119,7 @@ def test_targets_equal_a_plain_implementation():
 
 
 @given(seeds)
-def test_anchors_that_are_not_near_overlap_nothing(seed):
+def test_distant_anchors_overlap_nothing(seed):
     config = tiny()
     anchors, kinds = anchor_tensors(config)
     boxes = torch.from_numpy(some_boxes(seed, 6, 12.0)).float()
@@ -203,7 +203,7 @@ def test_sparse_targets_round_trip():
         assert torch.equal(whole, torch.cat(parts))
 
 
-def test_loss_of_doubled_batch_is_equal_and_skips_ignored():
+def test_loss_of_doubled_batch_is_equal():
     config = tiny("v0")
     anchors, kinds = anchor_tensors(config)
     targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors)
@@ -245,7 +245,7 @@ def reference_iou(a, b):
 
 
 @given(seeds, st.booleans())
-def test_suppression_is_that_of_a_slow_loop(seed, across):
+def test_suppression_equals_a_slow_loop(seed, across):
     rng = np.random.default_rng(seed)
     boxes = some_boxes(seed, 30, spread=4)
     scores, labels, limit = rng.permutation(30) / 30, rng.integers(0, 3, 30), 0.2

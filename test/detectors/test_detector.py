@@ -51,7 +51,7 @@ def test_given_columns_equal_computed_columns(version):
         assert same(detector(scan, ground=ground, cluster_ids=cluster_ids), computed)
 
 
-def test_versions_see_what_the_paper_says():
+def test_versions_have_the_inputs_of_the_paper():
     scan = frame()
     inputs = {}
     for version in VERSIONS:
@@ -154,7 +154,7 @@ def test_sensor_height_only_shifts_boxes():
 
 
 @pytest.mark.parametrize("roll, pitch", [(3.1416, 0.0), (0.0, 0.2), (0.1, -0.1)])
-def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch):
+def test_tilted_sensor_gives_the_same_boxes_in_its_frame(roll, pitch):
     pose = SensorPoseParams(roll=roll, pitch=pitch)
     turn = level_points(np.eye(3, dtype=np.float32), pose)  # rows: the sensor's axes when level
     found = Detections.of([[8, 2, -1, 4, 2, 1.5, 0.7]], scores=[0.5])
@@ -235,7 +235,7 @@ def test_huge_and_non_finite_clouds_are_handled():
     assert found.problem is None
 
 
-def test_columns_of_another_length_are_refused():
+def test_columns_of_wrong_length_are_rejected():
     with pytest.raises(InputError, match="ground has 3 values"):
         random_detector()(frame(), ground=np.zeros(3, bool))
     with pytest.raises(TypeError):  # columns are named, so that none is taken for the other
@@ -277,14 +277,14 @@ def test_cpu_fallback_after_out_of_memory_is_reported():
 @pytest.mark.parametrize(
     "name, words", [("tpu", "no device 'tpu'"), ("mps", "no device 'mps'"), ("cuda:99", "CUDA device")]
 )
-def test_missing_device_is_refused(name, words):
+def test_missing_device_is_rejected(name, words):
     with pytest.raises(InputError, match=words):
         find_device(name)
     assert find_device("cpu") == CPU
     assert find_device() == ("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def test_real_scans_of_any_version_go_through(data):
+def test_every_version_detects_cars_in_real_scans(data):
     from lidar_perception.data.open import open_recording
 
     scan = open_recording(data / "kitti_object").frames[0].load()

@@ -62,7 +62,7 @@ def random_boxes(rng, count: int) -> np.ndarray:
 
 
 @given(SEEDS, st.integers(0, 2000), st.integers(0, 30), st.floats(0, 0.5))
-def test_points_in_boxes_equals_points_in_box(seed, count, boxes, margin):
+def test_points_in_boxes_equals_points_in_each_box(seed, count, boxes, margin):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform([-22, -22, -2], [22, 22, 2], (count, 3)).astype(np.float32)
     xyz[::50, rng.integers(3)] = rng.choice([np.nan, np.inf, -np.inf, 1e30])
@@ -216,7 +216,7 @@ def detector():
     return FusedDetector(random_detector("v4").proposer, random_classifier().classifier, eager)
 
 
-def test_fused_fulfils_the_detector_contract(detector):
+def test_fused_fulfills_the_detector_contract(detector):
     scan = frame()
     found = detector(scan)
     assert len(found.detections) > 3 and tuple(found.timings) == STEPS
@@ -340,14 +340,14 @@ def test_nearby_car_that_is_not_ego_vehicle_is_kept(detector, monkeypatch, heigh
     assert len(detector.with_sensor_height(height).propose(frame()).detections) == stays
 
 
-def test_fallback_of_a_part_is_reported(detector):
+def test_cpu_fallback_of_one_network_is_reported(detector):
     other = copy.copy(detector)
     other.classifier = copy.copy(detector.classifier)
     other.classifier.placement = Placement(CPU, "cuda is out of memory")
     assert other(frame()).problem == "cuda is out of memory" and detector(frame()).problem is None
 
 
-def test_no_fallback_if_cpu_fallback_is_off(detector, monkeypatch):
+def test_without_cpu_fallback_the_error_is_raised(detector, monkeypatch):
     """The parameter of the node applies to both networks."""
 
     def predict(*_, **__):

@@ -169,7 +169,7 @@ def test_network_input_does_not_depend_on_azimuth(rng):
 # the network
 
 
-def test_nearest_equals_brute_force(rng):
+def test_nearest_neighbours_equal_brute_force(rng):
     xyz = torch.from_numpy(rng.normal(size=(3, 20, 3)))
     valid = torch.from_numpy(rng.random((3, 20)) < 0.7)
     valid[:, :5] = True
@@ -229,7 +229,7 @@ def test_padding_points_change_nothing(rng, name):
     assert np.allclose(again.boxes, predict(engine, clusters).boxes[[2, 0]], atol=1e-4)
 
 
-def test_norms_go_into_the_layers_before_them(rng):
+def test_batch_norms_are_folded_into_the_layers_before_them(rng):
     clusters = blobs(rng, [40, 9, 3])
     before = called(network(), clusters)
     for mine, theirs in zip(before, called(fuse_norms(network()), clusters)):

@@ -46,7 +46,7 @@ def test_clusters_are_points_in_each_box(frame, proposals):
     assert len(crop_boxes(proposals.boxes[:0], frame, 0.2)) == 0
 
 
-def test_classifier_judges_each_proposal_by_itself(frame, proposals):
+def test_class_of_a_proposal_does_not_depend_on_others(frame, proposals):
     classifier, ground = random_detector().classifier, np.zeros((0, 3), np.float32)
     every = np.ones(len(proposals), bool)
     probabilities, boxes = classifier.classify(proposals, frame, ground, every)

@@ -73,7 +73,7 @@ def test_other_widths_equal_torch(changes):
     assert_equal(make_pointnet_config(**changes), blobs(rng, SIZES))
 
 
-def test_clusters_do_not_depend_on_those_around_them(monkeypatch):
+def test_result_of_a_cluster_does_not_depend_on_the_batch(monkeypatch):
     network = compiled_network(lively(small()))
     clusters = blobs(np.random.default_rng(2), SIZES * 3)
     whole = predict(network, clusters)
@@ -101,7 +101,7 @@ def test_nan_weights_give_nan_logits(name):
 
 
 @pytest.mark.parametrize("weights", ["fused", "pointnet"])
-def test_engine_torch_compiles_nothing(weights):
+def test_torch_engine_compiles_nothing(weights):
     for engine in "auto", "torch":
         detector = open_detector(weights, "cpu", settings={f"{weights}.warm_up": False, f"{weights}.engine": engine})
         assert isinstance(detector.classifier.network, CompiledPointNet) == (engine == "auto")

@@ -92,7 +92,7 @@ def test_given_columns_equal_computed_columns(ids):
         assert same(detector(scan, **columns), computed)
 
 
-def test_the_numbers_of_clusters_do_not_matter(ids):
+def test_cluster_ids_do_not_matter(ids):
     detector, scan = random_detector(), frame()
     found = detector(scan, cluster_ids=ids).detections
     assert same(detector(scan, cluster_ids=np.where(ids > 0, ids + 100_000, 0)), found)
@@ -104,7 +104,7 @@ def test_the_numbers_of_clusters_do_not_matter(ids):
     assert not np.array_equal(permuted, ids) and alike(detector(scan, cluster_ids=permuted), found)
 
 
-def test_clusters_do_not_know_of_each_other(ids):
+def test_result_of_a_cluster_does_not_depend_on_others(ids):
     detector, scan = random_detector(), frame()
     everything = detector(scan, cluster_ids=ids).detections
     alone = [detector(scan, cluster_ids=np.where(ids == i, ids, 0)).detections for i in range(1, ids.max() + 1)]
@@ -160,7 +160,7 @@ def test_sensor_height_only_shifts_boxes(ids):
 
 
 @pytest.mark.parametrize("roll, pitch", [(3.1416, 0.0), (0.0, 0.2)])
-def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch, ids):
+def test_tilted_sensor_gives_the_same_boxes_in_its_frame(roll, pitch, ids):
     pose = SensorPoseParams(roll=roll, pitch=pitch)
     detector, scan = random_detector(), frame()
     found = detector(scan, cluster_ids=ids).detections
@@ -241,7 +241,7 @@ def test_intensity_is_normalized_and_may_be_left_out(ids):
         assert same(found, without) and found.problem is None
 
 
-def test_columns_of_another_length_are_refused():
+def test_columns_of_wrong_length_are_rejected():
     for name in "cluster_ids", "ground":
         with pytest.raises(InputError, match=f"{name} has 3 values"):
             random_detector()(frame(), **{name: np.zeros(3, int)})
@@ -298,7 +298,7 @@ def with_header(path, out, **changes):
     return out
 
 
-def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
+def test_checkpoint_round_trip(saved, tmp_path):
     path, other, header = saved
     assert read_header(path) == header and read_network_name(path) == "pointnet"
     loaded_header, loaded = load_pointnet(path, header.config)
@@ -314,7 +314,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
     assert load_network(first)[0] == load_network(other)[0]
 
 
-def test_weights_of_other_network_or_classes_are_refused(saved, tmp_path):
+def test_weights_of_another_network_or_classes_are_rejected(saved, tmp_path):
     path, other, header = saved
     with pytest.raises(InputError, match=r"contains a PointNet .*pointnet_detector.*PointPillars"):
         load_network(path)
@@ -347,7 +347,7 @@ def test_network_with_one_class_keeps_its_class_id(ids):
     assert len(found) > 3 and {*found.class_ids} == {CLASSES.index("Pedestrian")}
 
 
-def test_one_function_opens_both(saved, tmp_path):
+def test_load_detector_opens_both_networks(saved, tmp_path):
     path, other, _ = saved
     pointnet, pointpillars = open_detector(path, "cpu"), open_detector(other, "cpu")
     assert isinstance(pointnet, PointNetDetector) and isinstance(pointpillars, PointPillarsDetector)
@@ -367,14 +367,14 @@ def test_one_function_opens_both(saved, tmp_path):
         open_detector(tmp_path / "text")
 
 
-def test_evaluation_runs_either_network(saved, tmp_path):
+def test_evaluate_runs_both_networks(saved, tmp_path):
     kitti = object_folder(tmp_path / "kitti")
     for path in saved[:2]:
         content, _ = evaluate(tmp_path, "--data", kitti, "--weights", path, "--device", "cpu")
         assert content["frames"] == 2 and content["ms"] > 0 and not content["skipped"]
 
 
-def test_missing_shipped_weights_are_requested(saved, tmp_path, monkeypatch):
+def test_error_for_missing_weights_explains_how_to_get_them(saved, tmp_path, monkeypatch):
     path, _, _ = saved
     monkeypatch.setattr(weights_file, "POINTNET_WEIGHTS", tmp_path / "own.safetensors")
     with pytest.raises(InputError, match="the package has no weights for PointNet"):
@@ -390,7 +390,7 @@ def test_missing_shipped_weights_are_requested(saved, tmp_path, monkeypatch):
         load_pointnet_detector("", "tpu")
 
 
-def test_real_scans_of_any_network_go_through(data):
+def test_every_network_runs_on_real_scans(data):
     from lidar_perception.data.open import open_recording
 
     scan = open_recording(data / "kitti_object").frames[0].load()

@@ -23,7 +23,7 @@ FILES = [*sorted(POINTPILLARS_WEIGHTS.glob("*.safetensors")), POINTNET_WEIGHTS, 
 MOST = {"pointpillars": 30e6, "pointnet": 6e6}  # bytes of all files
 
 
-def test_they_are_small_enough_and_there():
+def test_shipped_weights_exist_and_are_small():
     assert (POINTPILLARS_WEIGHTS / "pointpillars_v4_compact.safetensors") in FILES  # the default
     for network, most in MOST.items():
         assert 0 < sum(f.stat().st_size for f in FILES if read_network_name(f) == network) < most

@@ -208,7 +208,7 @@ def test_nan_weights_are_reported(layer):
         (tiny("v4"), {}, "AVX2"),
     ],
 )
-def test_networks_that_torch_must_run(config, settings, words, tmp_path, monkeypatch):
+def test_unsupported_networks_run_in_torch(config, settings, words, tmp_path, monkeypatch):
     path = tmp_path / "a.safetensors"
     save_checkpoint(path, lively(config), Header(config))
     if words == "AVX2":
@@ -221,7 +221,7 @@ def test_networks_that_torch_must_run(config, settings, words, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("weights", ["fused", "pointpillars"])
-def test_engine_is_a_parameter(weights):
+def test_parameter_selects_the_engine(weights):
     quick = {f"{weights}.warm_up": False}
     for engine, expected in ("auto", True), ("sparse", True), ("torch", False):
         detector = open_detector(weights, "cpu", settings={**quick, f"{weights}.engine": engine})
@@ -311,7 +311,7 @@ for cell, found in zip(cells, sums):
 """
 
 
-def test_kernel_of_avx2_on_a_wider_processor():
+def test_avx2_kernel_runs_on_avx512_processors():
     if LANES != 16:
         pytest.skip("the other tests have run it")
     features = "+sse,+sse2,+sse3,+ssse3,+sse4.1,+sse4.2,+popcnt,+avx,+avx2,+fma,+bmi,+bmi2,+lzcnt"
@@ -320,7 +320,7 @@ def test_kernel_of_avx2_on_a_wider_processor():
 
 
 @pytest.mark.parametrize("variable", ["NUMBA_DISABLE_JIT=1", "NUMBA_ENABLE_AVX=0"])
-def test_without_vectors_torch_runs_the_network(variable):
+def test_processor_without_vector_kernel_uses_torch(variable):
     name, value = variable.split("=")
     code = "from lidar_perception.detectors.matrix_kernel import LANES; assert LANES == 0"
     subprocess.run([sys.executable, "-c", code], env={**os.environ, name: value}, check=True)

@@ -48,7 +48,7 @@ def saved(tmp_path):
     return tmp_path / "w.safetensors", header, network
 
 
-def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
+def test_checkpoint_round_trip(saved, tmp_path):
     path, header, network = saved
     assert read_header(path) == header
     loaded_header, loaded = load_network(path, header.config)
@@ -64,7 +64,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
     assert len(found.detections) and same(found, expected)
 
 
-def test_other_config_is_refused_with_both_values(saved):
+def test_error_for_another_config_shows_both_values(saved):
     path, _, _ = saved
     with pytest.raises(InputError, match=r"version is v4, expected v2"):
         load_network(path, tiny("v2"))
@@ -105,7 +105,7 @@ def test_matching_weights_of_another_network_are_copied(saved):
         copy_matching_weights(torch.nn.Linear(2, 3), path, NetworkConfig)
 
 
-def test_invalid_checkpoint_files_are_refused(saved, tmp_path):
+def test_invalid_checkpoint_files_are_rejected(saved, tmp_path):
     path, _, _ = saved
     content = path.read_bytes()
     length = struct.unpack("<Q", content[:8])[0]
@@ -137,7 +137,7 @@ def test_invalid_checkpoint_files_are_refused(saved, tmp_path):
         assert "\n" not in str(error.value) and name in str(error.value)
 
 
-def test_a_full_disk_leaves_the_last_checkpoint(saved, monkeypatch):
+def test_full_disk_keeps_the_last_checkpoint(saved, monkeypatch):
     path, header, network = saved
     before = path.read_bytes()
 
@@ -150,7 +150,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(saved, monkeypatch):
     assert path.read_bytes() == before and [*path.parent.iterdir()] == [path]
 
 
-def test_missing_shipped_weights_are_requested(tmp_path, monkeypatch):
+def test_error_for_missing_weights_explains_how_to_get_them(tmp_path, monkeypatch):
     monkeypatch.setattr(weights_file, "POINTPILLARS_WEIGHTS", tmp_path)
     with pytest.raises(InputError, match="no weights for v4 compact"):
         load_detector("", "cpu")
@@ -171,7 +171,7 @@ def test_missing_shipped_weights_are_requested(tmp_path, monkeypatch):
 
 @needs_onnx
 @pytest.mark.no_cover
-def test_an_exported_network_finds_the_same(tmp_path):
+def test_exported_network_gives_the_same_detections(tmp_path):
     """v0 is exported here, v4 by the command; the others have parts of both."""
     from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork, export_onnx
 
@@ -186,7 +186,7 @@ def test_an_exported_network_finds_the_same(tmp_path):
 
 
 @needs_onnx
-def test_export_reads_checkpoints_and_refuses_bad_files(saved, tmp_path, monkeypatch):
+def test_export_reads_checkpoints_and_rejects_bad_files(saved, tmp_path, monkeypatch):
     path, _, _ = saved
     out = tmp_path / "o/w.onnx"
     done = CliRunner().invoke(cli, ["export", "onnx", str(path), "--out", str(out)])
@@ -208,7 +208,7 @@ def test_export_reads_checkpoints_and_refuses_bad_files(saved, tmp_path, monkeyp
 
 @needs_onnx
 @pytest.mark.parametrize("name", ["improved", "farthest-ball-density", "pointnet"])
-def test_exported_pointnet_finds_the_same(tmp_path, name):
+def test_exported_pointnet_gives_the_same_detections(tmp_path, name):
     config = pointnet_samples.small(name)
     network, clusters = (
         pointnet_samples.lively(config),
@@ -336,7 +336,7 @@ class Code:
         return print, ("run",)
 
 
-def test_files_with_other_content_are_refused(big, tmp_path, capsys):
+def test_files_with_other_content_are_rejected(big, tmp_path, capsys):
     good = theirs(big, "OpenPCDet")
     points = "vfe.pfn_layers.0.linear.weight"
     cases = [

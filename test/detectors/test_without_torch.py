@@ -48,7 +48,7 @@ def test_detecting_does_not_load_torch():
         lambda tensors: tensors.update({"head.scores.bias": np.zeros(18, np.int64)}),
     ],
 )
-def test_tensors_of_another_network_are_refused(change):
+def test_tensors_of_another_network_are_rejected(change):
     config = tiny("v4")
     tensors = to_arrays(lively(config))
     SparseNetwork(config, tensors)

@@ -37,7 +37,7 @@ def test_perfect_clusters_score_100_with_any_numbers():
     assert found == [100] * 5 and counts["hits"] == counts["objects"] == 2
 
 
-def test_points_of_a_case_by_hand():
+def test_point_counts_equal_hand_computed_values():
     # Object 1 is cut in two; its larger part also has 5 background points. Object 2 is ground.
     owner = np.repeat([1, 1, 0, 2, 0, 0], [12, 8, 5, 10, 15, 40])
     ids = np.repeat([4, 5, 4, 0, 6, 0], [12, 8, 5, 10, 15, 40])
@@ -76,7 +76,7 @@ def panel(x, y, width=1.0):
     return np.stack([np.full(len(z), x), y + side, z], axis=1).astype(np.float32)
 
 
-def test_range_image_parts_what_stands_in_front():
+def test_range_image_separates_an_object_from_the_one_behind():
     xyz = np.concatenate([panel(10, 0), panel(14, 1.43), panel(10, 4), panel(-10, 0)])
     ids = cluster_range_image(xyz)
     sizes = [len(panel(10, 0))] * 4
@@ -87,7 +87,7 @@ def test_range_image_parts_what_stands_in_front():
     assert (ids[xyz[:, 0] > 0][:3] > 0).all() and ids.dtype == np.int32
 
 
-def test_range_image_joins_across_the_back_and_drops_small_ones():
+def test_range_image_joins_clusters_across_180_degrees():
     behind = panel(-10, -0.5)  # the azimuth jumps from 180 to -180 degrees there
     assert len(np.unique(cluster_range_image(behind))) == 1
     assert (cluster_range_image(panel(10, 0)[:5]) == 0).all()
@@ -118,7 +118,7 @@ def test_frame_without_objects_is_skipped_with_a_reason(frames):
         SEGMENTATION.measure([type(frames[0]).of("x", frames[0].load())], 0)
 
 
-def test_paired_p_is_small_only_for_a_steady_difference():
+def test_paired_p_is_small_only_for_a_consistent_difference():
     rng = np.random.default_rng(0)
     base = rng.integers(0, 50, (30, 1))
 

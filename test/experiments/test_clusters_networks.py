@@ -173,7 +173,7 @@ def test_tiny_budget_runs_end_to_end(tmp_path, coarse, monkeypatch):
     assert report["measured"] == 1 and "Table 8" in (tmp_path / "out/report.md").read_text()
 
 
-def test_changed_clouds_are_reproducible_and_as_asked(frames):
+def test_thinned_and_noisy_clouds_are_reproducible(frames):
     cloud = frames[0].load()
     half, again = (change_cloud(cloud, Change(share=0.5), "a") for _ in range(2))
     assert len(half) == pytest.approx(len(cloud) / 2, rel=0.2)
@@ -206,7 +206,7 @@ def test_only_the_first_frame_of_a_scene_begins_a_drive(coarse, frames):
     assert [len(list_drive(key_frames, i)) for i in range(4)] == [2, 0, 2, 0]
 
 
-def test_detections_get_the_velocity_of_the_track_on_them():
+def test_detections_get_the_velocity_of_their_track():
     tracker, pose = Tracker(), np.eye(4)
     pose[:2, :2] = [[0, -1], [1, 0]]  # the sensor's x axis is the global y axis
     for i in range(12):

@@ -141,7 +141,7 @@ def test_perfect_detector_scores_100_and_failing_one_continues(tmp_path):
     assert len(nan["failed"]) == 3 and nan["ap"]["Pedestrian"]["3d"]["moderate"] == 100
 
 
-def test_pedestrians_count_from_default_threshold(tmp_path):
+def test_pedestrians_below_the_default_threshold_do_not_count(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=1)
 
     (row,) = compute_report(root, make_fake(lambda frame: copy_labels(frame, 0.2)))["rows"].values()
@@ -182,7 +182,7 @@ def test_mean_ignores_classes_without_labels(tmp_path):
     assert [row["ap"][name]["3d"]["moderate"] for name in SCORED] == [None, 0.0, None]
 
 
-def test_names_in_figure_do_not_overlap():
+def test_labels_in_figure_do_not_overlap():
     rng = np.random.default_rng(0)
     for count in (1, 2, 5, 20, 60):
         values = rng.choice([rng.uniform(0, 100), 0, 50, 100], count) + rng.normal(0, 2, count)
@@ -197,7 +197,7 @@ def test_names_in_figure_do_not_overlap():
 
 
 @pytest.mark.parametrize("case", ["labels", "weights", "folder"])
-def test_bad_input_is_one_line(case, bare, tmp_path, monkeypatch, capsys):
+def test_bad_input_is_reported_in_one_line(case, bare, tmp_path, monkeypatch, capsys):
     root = object_folder(tmp_path / "kitti")
     arguments = ["--data", root]
     if case == "labels":

@@ -47,7 +47,7 @@ def make_record(
 
 
 @pytest.mark.parametrize("calibration", [FORWARD_CAMERA, None])
-def test_objects_survive_their_record(calibration):
+def test_record_round_trip_keeps_objects(calibration):
     objects = to_camera_objects(
         to_scored_labels(Detections(BOXES, np.full(2, CAR, np.int32), np.array([0.9, 0.2], np.float32))), calibration
     )
@@ -57,7 +57,7 @@ def test_objects_survive_their_record(calibration):
     assert len(from_record(make_record(np.zeros((0, 7), np.float32), np.zeros(0)))) == 0
 
 
-def test_cells_and_paired_samples():
+def test_cells_equal_scores_and_samples_are_paired():
     true = [make_record(BOXES)] * 12
     perfect = [make_record(BOXES, np.array([0.9, 0.8]))] * 12
     half = [make_record(BOXES[:1], np.array([0.9]))] * 12
@@ -85,7 +85,7 @@ def make_models() -> dict[str, TrainedModel]:
     }
 
 
-def test_report_has_values_of_the_paper_and_each_share():
+def test_report_has_paper_values_and_every_label_fraction():
     models = make_models()
     boxes = {name: BOXES if name.startswith("V4") else BOXES[:1] for name in models}
     record = {
@@ -116,7 +116,7 @@ def test_report_has_values_of_the_paper_and_each_share():
     assert all(len(row) == len(table.header) for table in by_name.values() for row in table.rows)
 
 
-def test_shipped_weights_are_compared_without_labels_study():
+def test_shipped_weights_are_compared_without_label_study():
     models = SHIPPED.measure.keywords["models"]
     assert [*models] == ["V0", "V1", "V2", "V3", "V4"] and all(m.weights.is_file() for m in models.values())
     assert len({m.parameters for m in models.values()}) == 4  # V2 and V3 have the same inputs

@@ -43,7 +43,7 @@ def test_report_escapes_text(few, tmp_path):
     assert "| frame | points |" in markdown
 
 
-def test_cells_show_their_decimals():
+def test_cells_show_the_given_number_of_decimals():
     assert format_cell(Cell(1.25, 1.0, 2.0, 3.0, 2)) == ("1.25", "[1.00, 2.00]", "3.00")
     assert format_cell(Cell(None)) == ("–", "", "")
     assert format_cell(Cell(0.0, digits=0)) == ("0", "", "")
@@ -95,7 +95,7 @@ def test_experiment_runs_by_its_name(few, tmp_path, monkeypatch):
         (["none"], "'none'"),
     ],
 )
-def test_bad_arguments_are_named_and_nothing_is_written(tmp_path, arguments, words):
+def test_invalid_arguments_are_reported_before_writing(tmp_path, arguments, words):
     result = CliRunner().invoke(cli, ["reproduce", "--data", str(tmp_path), "--out", str(tmp_path / "out"), *arguments])
     assert result.exit_code == 2 and words in result.output
     assert not (tmp_path / "out").exists()
@@ -111,7 +111,7 @@ def test_data_is_argument_or_option_but_not_both(tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_every_experiment_loads_and_is_in_the_help():
+def test_every_experiment_loads_and_is_listed_in_the_help():
     text = " ".join(CliRunner().invoke(cli, ["reproduce", "--help"]).output.split())
     for name in EXPERIMENTS:
         assert load_experiment(name).name == name

@@ -78,7 +78,7 @@ def test_dask_cluster_gives_the_same_records(crowds, whole, tmp_path):
     assert untimed(tmp_path / "out") == untimed(whole)
 
 
-def test_unreachable_scheduler_is_named(few, tmp_path, monkeypatch):
+def test_error_names_the_unreachable_scheduler(few, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra [distributed]")
     monkeypatch.setattr(scoring_run, "CONNECT_S", 0.2)
     with pytest.raises(InputError, match="cannot reach a Dask scheduler"):
@@ -157,7 +157,7 @@ def test_skipped_frame_is_tried_again(few, tmp_path):
 # Obstacles in the folder
 
 
-def test_other_settings_are_refused_by_name(few, tmp_path):
+def test_error_names_the_changed_settings(few, tmp_path):
     out = tmp_path / "out"
     run_experiment(small(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(few), out)
     before = (out / journal.JOURNAL_NAME).read_bytes()
@@ -172,7 +172,7 @@ def test_other_settings_are_refused_by_name(few, tmp_path):
     assert len(run_experiment(SMALL, open_recording(other), out)) == 4
 
 
-def test_foreign_folder_is_left_alone(few, tmp_path):
+def test_folder_with_other_files_is_not_touched(few, tmp_path):
     out = tmp_path / "mine"
     write(out / "letter.txt", "dear")
     write(out / "figures/photo.png", "me")
@@ -209,7 +209,7 @@ def test_folder_is_locked_by_a_run(few, tmp_path):
         run_experiment(SMALL, open_recording(few), tmp_path / "out", force=True)
 
 
-def test_full_disk_is_one_line_and_run_resumes(few, tmp_path, monkeypatch):
+def test_full_disk_is_reported_in_one_line_and_run_resumes(few, tmp_path, monkeypatch):
     def raise_disk_full(self):
         raise OSError(28, "No space left on device")
 
@@ -222,7 +222,7 @@ def test_full_disk_is_one_line_and_run_resumes(few, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_bug_in_experiment_is_not_a_skipped_frame(few, tmp_path, jobs, capfd):
+def test_bug_in_experiment_ends_the_run(few, tmp_path, jobs, capfd):
     if jobs > 1:
         forkserver._forkserver._stop()  # processes say it where their server was started
     with pytest.raises((ZeroDivisionError, InputError)) as error:
@@ -294,7 +294,7 @@ def test_split_selects_frames(few, tmp_path):
     assert [r["frame"] for r in run_experiment(SMALL, whole, tmp_path / "all")][-1] == "000004"
 
 
-def test_folder_without_scans_or_pedestrians_is_refused(tmp_path):
+def test_folder_without_scans_or_pedestrians_is_rejected(tmp_path):
     for argument, words in (
         (tmp_path / "none", "does not exist"),
         (tmp_path, "is not a recording in a supported format"),
@@ -368,7 +368,7 @@ def test_page_is_self_contained_and_describes_the_run(whole, crowds):
     assert [r["frame"] for r in report["skipped_frames"]] == ["000011"]
 
 
-def test_summary_shows_scores_next_to_the_papers(whole):
+def test_summary_shows_scores_next_to_those_of_the_paper(whole):
     text = (whole.parent / "said").read_text()
     report = json.loads((whole / "report.json").read_text())
     row = next(t for s in report["sections"] for t in s["tables"] if t["name"] == "table_3_6")["rows"][2]

@@ -40,7 +40,7 @@ def test_interval_contains_the_value(seed, frames, rate):
 
 
 @given(seeds, st.floats(0.2, 0.8))
-def test_interval_of_share_agrees_with_binomial(seed, rate):
+def test_interval_of_a_fraction_agrees_with_binomial(seed, rate):
     counts = hits(1000, rate, np.random.default_rng(seed))
     (value,), (low,), (high,) = bootstrap(counts, share)
     expected = 2 * 1.96 * np.sqrt(value * (1 - value) / 1000)
@@ -81,7 +81,7 @@ def test_weights_are_draws_with_replacement():
 
 
 @pytest.mark.parametrize("counts", [np.full((50, 2), 3), [[7, 2]], [[0, 0], [4, 4], [0, 0]]])
-def test_equal_frames_give_zero_width(counts):
+def test_equal_frames_give_an_interval_of_zero_width(counts):
     value, low, high = bootstrap(np.array(counts), share)
     assert value == low == high == pytest.approx(np.sum(counts, axis=0)[0] / np.sum(counts))
 
@@ -102,7 +102,7 @@ def test_interval_depends_on_seed_and_not_on_block_size(monkeypatch):
     np.testing.assert_array_equal(first, bootstrap(counts, share))
 
 
-def test_values_of_any_shape_equal_their_columns():
+def test_interval_of_an_array_equals_that_of_each_element():
     counts = np.random.default_rng(2).poisson(2, (60, 3, 4))
     together = bootstrap(counts, lambda sums: compute_rates(*np.moveaxis(sums, -2, 0)))
     assert together.shape == (3, 4, 3)

@@ -123,7 +123,7 @@ def test_ground_is_found_below_a_low_sensor():
         np.testing.assert_array_equal(measured.rows[curve], street().rows[curve])
 
 
-def test_half_the_points_change_counts_and_not_sizes():
+def test_removing_points_changes_counts_and_not_sizes():
     def half(frame, rng):
         return frame.take(np.flatnonzero(rng.random(len(frame)) < 0.5))
 
@@ -136,7 +136,7 @@ def test_half_the_points_change_counts_and_not_sizes():
     assert all(b["within"] for b in list_judged_bins(content, LIGHT))
 
 
-def test_half_the_intensity_changes_intensities_only():
+def test_halving_the_intensity_changes_intensities_only():
     content = compare_scans(
         street(), measure_scans(change_scans(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PAPER)
     )
@@ -176,7 +176,7 @@ def test_bins_with_few_real_samples_are_not_judged():
             assert (b["within"] is None) == few, (name, b)
 
 
-def test_missing_simulated_samples_are_wrong():
+def test_missing_simulated_samples_count_as_a_difference():
     content = compare_scans(street(), measure_scans([], PAPER))
     assert content["within"] == 0
     assert content["judged"] == compare_scans(street(), street())["judged"]
@@ -325,7 +325,7 @@ def test_object_and_tracking_folders_are_read(tmp_path, make):
     assert (measured.scans, measured.whole_scans, measured.skipped) == (1, 1, [])
 
 
-def test_folders_without_labels_are_refused(tmp_path):
+def test_folders_without_labels_are_rejected(tmp_path):
     object_folder(tmp_path)
     for label in tmp_path.rglob("label_2/*.txt"):
         label.unlink()

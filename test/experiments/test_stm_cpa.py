@@ -93,7 +93,7 @@ def untimed(record):
     return {key: value for key, value in record.items() if key != "ms"}
 
 
-def test_sample_has_hits_and_misses(measured):
+def test_sample_frames_have_hits_and_misses(measured):
     for stage in STAGES:
         counts = {k: add_up(measured, "stages", stage, k).sum() for k in ("tp", "fp", "fn")}
         assert min(counts.values()) > 0 or (stage == "stage1" and counts["fn"] == 0)
@@ -178,7 +178,7 @@ def test_two_cpa_steps_equal_final_stage_at_15_to_30_m(refined):
     assert compared > 3
 
 
-def test_readings_and_detector_are_measured_on_the_same_pedestrians(measured):
+def test_readings_and_detector_share_their_pedestrians(measured):
     for record in measured:
         assert record["readings"]["window stretched, yaw"] == record["stages"]["final"]
         for counts in (*record["readings"].values(), record["pointpillars"]):
@@ -255,7 +255,7 @@ def test_overlaps_of_known_boxes():
         ),
     ],
 )
-def test_bad_seed_gives_misses_and_reason(kitti, tmp_path, change, words):
+def test_frame_with_a_bad_seed_has_misses_and_a_reason(kitti, tmp_path, change, words):
     shutil.copytree(kitti, tmp_path / "kitti")
     label = tmp_path / "kitti/training/label_2/000002.txt"
     label.write_text(change(label.read_text()))
@@ -311,7 +311,7 @@ def test_tables_without_records_are_empty():
             assert not any(cell.value for row in table.rows for cell in row if isinstance(cell, Cell))
 
 
-def test_protocol_is_table_2_of_the_paper():
+def test_protocol_equals_table_2_of_the_paper():
     assert PAPER.clustering.dbscan == DbscanParams((15, 30), (0.15, 0.30, 0.50), 10)
     assert PAPER.stm == StmParams(0.40) and PAPER.height.tolerance == 0.2
     assert (PAPER.cpa.min_range, PAPER.cpa.max_range, PAPER.cpa.steps) == (15, 30, 2)

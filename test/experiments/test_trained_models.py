@@ -99,7 +99,7 @@ def test_plan_leaves_out_optional_models_for_more_steps(tmp_path, monkeypatch, l
     assert [*plan.durations] == [*plan.speeds] == planned
 
 
-def test_budget_that_is_too_short_names_a_longer_one(tmp_path):
+def test_error_for_short_budget_suggests_a_larger_one(tmp_path):
     with pytest.raises(InputError, match=r"too short for 20 steps.*--budget"):
         plan_training(make_request(tmp_path, budget=1e-4, params={"steps": 0}))
 
@@ -160,6 +160,6 @@ def test_frames_of_a_recording_are_used_once(tmp_path, listed):
 
 
 @pytest.mark.parametrize("option", [("--budget", "1"), ("--seeds", "2"), ("--set", "steps=1")])
-def test_options_of_training_are_refused_without_training(tmp_path, option):
+def test_training_options_are_rejected_without_training(tmp_path, option):
     result = CliRunner().invoke(cli, ["reproduce", "stm-cpa", "sim", "--out", str(tmp_path / "o"), *option])
     assert result.exit_code == 2 and "trains none" in result.output

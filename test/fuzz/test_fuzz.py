@@ -62,7 +62,7 @@ def test_every_input_of_a_node_is_fuzzed(nodes):
 
 @pytest.mark.no_cover
 @pytest.mark.parametrize("part, cases", [(messages, 150), (parameters, 150)])
-def test_nodes_survive_or_refuse_each_case(part, cases, nodes, tmp_path):
+def test_nodes_process_or_reject_each_case(part, cases, nodes, tmp_path):
     attempt = part.Attempt(tmp_path, nodes)
     outcomes = [outcome for _, _, outcome, _ in run_cases(part.make_case, attempt, 1, range(cases), 500.0, np.inf)]
     assert [outcome for outcome in outcomes if outcome.verdict == FAILED] == []
@@ -71,7 +71,7 @@ def test_nodes_survive_or_refuse_each_case(part, cases, nodes, tmp_path):
 
 
 @pytest.mark.no_cover
-def test_commands_survive_or_refuse_damaged_files():
+def test_commands_process_or_reject_damaged_files():
     done = subprocess.run(
         [sys.executable, "-m", "fuzz", "files", "--cases", "16"],
         text=True,
@@ -89,7 +89,7 @@ def test_node_warns_about_curves_of_other_weights(nodes):
 
 @pytest.mark.no_cover
 @pytest.mark.parametrize("name", WITH_CLOUDS)
-def test_extreme_columns_cost_no_memory(nodes, name):
+def test_extreme_columns_allocate_no_memory(nodes, name):
     plain, node, params = make_cloud("columns"), nodes[name], INPUTS[name][2][0]
     turn = np.arange(len(to_array(plain))) % 7
     assert node.attempt("input/points", encode(plain), params, False).reason == ""
@@ -114,7 +114,7 @@ def test_extreme_columns_cost_no_memory(nodes, name):
         ("cluster_id", {"candidate_refinement", "pointnet_detector"}),
     ],
 )
-def test_column_with_count_above_1_is_refused(nodes, column, reading):
+def test_column_with_count_above_1_is_rejected(nodes, column, reading):
     plain = make_cloud("columns")
     plain.fields = [f for f in plain.fields if f.name in ("x", "y", "z", column)]
     plain.fields[-1].offset, plain.fields[-1].datatype, plain.fields[-1].count = 12, 2, 2  # uint8
@@ -141,7 +141,7 @@ def test_mutation_changes_a_copy(seed):
     assert mutate_valid_message(CLOUD, rng)[0] != data == make_valid_message(CLOUD)
 
 
-def test_command_outcome_needs_result_or_reason():
+def test_command_passes_with_a_result_or_a_reason():
     assert judge_command(0, "", "").verdict == SURVIVED
     assert judge_command(2, "", "3 frames\nError: cannot read it\n").verdict == REFUSED
     assert judge_command(1, "left out: a frame\n", "").verdict == REFUSED
@@ -153,7 +153,7 @@ def test_command_outcome_needs_result_or_reason():
     assert {outcome.verdict for outcome in bad} == {FAILED}
 
 
-def test_exceptions_and_memory_are_failures():
+def test_exceptions_and_memory_growth_are_failures():
     def attempt(case):
         if case.name == "1":
             raise ValueError("planted")

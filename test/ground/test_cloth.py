@@ -86,7 +86,7 @@ def climbing_road(seed=0):
     return xyz.astype(np.float32), np.arange(len(xyz)) < len(road)
 
 
-def test_a_climbing_road_is_ground_and_cars_on_it_are_not():
+def test_climbing_road_is_ground_and_cars_on_it_are_not():
     xyz, road = climbing_road()
     found = segment_by_cloth(xyz)
     assert found[road].mean() > 0.97 and found[~road].mean() < 0.1
@@ -204,19 +204,19 @@ def test_points_beyond_max_range_are_ignored():
     ],
     ids=["empty", "one point", "far", "all equal", "column"],
 )
-def test_small_clouds_are_segmented(xyz, expected):
+def test_clouds_of_few_points_are_segmented(xyz, expected):
     found = segment_by_cloth(np.asarray(xyz, np.float32).reshape(-1, 3))
     assert found.dtype == bool and found.tolist() == expected
 
 
-def test_resolution_of_the_cloth_hardly_matters():
+def test_ground_hardly_depends_on_cloth_resolution():
     xyz, road = street(7, count=120_000)
     for resolution in (0.3, 0.5, 1.0):
         assert f1(segment_by_cloth(xyz, ClothParams(resolution=resolution)), road) > 0.985
 
 
 @needs_data
-def test_a_real_scan_is_segmented_as_well_as_by_csf():
+def test_real_scan_scores_as_well_as_with_the_csf_library():
     CSF = pytest.importorskip("CSF")
     labelled = open_recording(DATA / "semantickitti").frames[0]
     frame, semantic = labelled.load(), labelled.point_truth().classes

@@ -66,7 +66,7 @@ def test_obstacles_are_non_ground_points_within_the_band():
         )
 
 
-def test_a_tilted_sensor_finds_the_same_obstacles():
+def test_tilted_sensor_gives_the_same_obstacles():
     rng = np.random.default_rng(1)
     xyz, ground = make_cloud(rng, 2000), rng.random(2000) < 0.5
     tilted = SensorPoseParams(roll=0.2, pitch=-0.3)
@@ -84,6 +84,6 @@ def test_without_ground_every_point_is_an_obstacle():
     assert find_obstacles(xyz[:0], np.zeros(0, bool), ObstacleParams(0.2, 2.0)).shape == (0,)
 
 
-def test_an_empty_height_band_is_refused():
+def test_empty_height_band_is_rejected():
     with pytest.raises(ValueError, match="must not be below min_height"):
         ObstacleParams(min_height=2.0, max_height=1.0)

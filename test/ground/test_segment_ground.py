@@ -20,7 +20,7 @@ def segment(xyz, method, intensity=None, **params):
     return segment_ground(PointCloud(np.asarray(xyz, np.float32), intensity), GroundParams(method=method, **params))
 
 
-def test_every_method_of_the_parameters_exists():
+def test_every_method_name_has_a_function():
     assert tuple(METHODS) == GROUND_METHODS
 
 
@@ -47,7 +47,7 @@ BAD = {
 
 @each_method
 @pytest.mark.parametrize("name", BAD)
-def test_bad_clouds_give_a_mask_of_their_length(method, name):
+def test_mask_has_the_length_of_any_invalid_cloud(method, name):
     xyz = np.asarray(BAD[name], np.float32)
     for intensity in (None, np.zeros(len(xyz), np.float32)):
         found = segment(xyz, method, intensity)
@@ -86,7 +86,7 @@ def test_every_method_uses_the_height_of_the_sensor(method, height):
 
 @each_method
 @pytest.mark.parametrize("roll, pitch", [(0.05, 0.0), (0.0, 0.2), (-0.1, 0.3), (np.pi, 0.0), (np.pi, -0.1)])
-def test_a_tilted_sensor_finds_the_ground_of_a_level_one(method, roll, pitch):
+def test_tilted_sensor_gives_the_ground_of_a_level_one(method, roll, pitch):
     xyz, _ = street(4)
     pose = SensorPoseParams(roll=float(np.float32(roll)), pitch=pitch)
     axes = level_points(np.eye(3, dtype=np.float32), pose)  # rows: the levelled axes

@@ -25,7 +25,7 @@ def test_surface_of_a_plane_is_the_plane(seed, along, across):
 
 
 @given(SEEDS, st.floats(-300, 300), st.floats(-300, 300))
-def test_surface_moves_with_the_points(seed, z, cells):
+def test_shifting_points_shifts_the_surface(seed, z, cells):
     rng = np.random.default_rng(seed)
     ground = rng.uniform([-20, -20, -2], [20, 20, -1], (3000, 3))
     shift = np.array([round(cells) * CELL_M, -round(cells) * CELL_M, z])

@@ -31,7 +31,7 @@ def test_exported_labels_are_imported_again(format, name, tmp_path):
 
 @pytest.mark.parametrize("format", FORMATS)
 @pytest.mark.parametrize("name", DRIVES)
-def test_second_export_changes_nothing(format, name, tmp_path):
+def test_second_export_is_identical(format, name, tmp_path):
     frames = drive(name)
     export_labels(make_labels(frames, format), format, tmp_path / "first", frames)
     read = import_labels(tmp_path / "first", format, frames)

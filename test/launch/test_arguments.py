@@ -25,7 +25,7 @@ NOTHING_STARTS = {"detectors": "dream"}
         ("fused", {"launch-prefix": ""}, "'dream' is unknown"),
     ],
 )
-def test_argument_that_a_launch_file_does_not_have_is_refused(name, given, words, capfd):
+def test_unknown_launch_argument_is_rejected(name, given, words, capfd):
     """Launch configurations of the file that includes ours are not its arguments."""
     service = LaunchService(noninteractive=True)
     service.include_launch_description(

@@ -35,7 +35,7 @@ def generate_test_description():
 
 
 class TestDriver(unittest.TestCase):
-    def test_every_cloud_is_accounted_for(self):
+    def test_every_cloud_is_processed_or_counted_as_dropped(self):
         environment = {k: v for k, v in os.environ.items() if k not in PROFILE_VARIABLES}
         numbers = map(str, (COUNT, 10, POINTS, 1))
         driver = subprocess.Popen(
@@ -59,6 +59,6 @@ class TestDriver(unittest.TestCase):
 
 @launch_testing.post_shutdown_test()
 class TestAfterwards(unittest.TestCase):
-    def test_all_nodes_ended_with_code_0(self, proc_info):
+    def test_all_nodes_exit_with_0(self, proc_info):
         launch_testing.asserts.assertExitCodes(proc_info)
         assert [name.split("-")[0] for name in proc_info.process_names()] == ["perception"]

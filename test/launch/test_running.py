@@ -65,7 +65,7 @@ def street():
         ),
     ],
 )
-def test_detectors_answer_a_cloud(name, arguments, detectors, launch, peer):
+def test_detectors_publish_a_result_for_a_cloud(name, arguments, detectors, launch, peer):
     launch(name, points="/lidar/points", **arguments)
     single = arguments.get("single") == "true"
     results = [
@@ -80,7 +80,7 @@ def test_detectors_answer_a_cloud(name, arguments, detectors, launch, peer):
     assert {m.header.frame_id for found in results for a in found for m in a.markers} == {"lidar"}
 
 
-def test_two_lidars_have_results_of_their_own(launch, peer):
+def test_two_lidars_have_separate_results(launch, peer):
     launch("two_lidars", left="/lidar_left", detectors="candidates")
     results = {
         side: peer.listen(f"/{side}/candidate_refinement/output/detections", MARKERS) for side in ("left", "right")

@@ -59,7 +59,7 @@ def same_boxes(a, b) -> bool:
 
 @each_make
 @given(rows=objects, remarks=notes)
-def test_from_marker_array_inverts_to_marker_array(make, rows, remarks):
+def test_marker_array_round_trip(make, rows, remarks):
     got = from_marker_array(
         array(
             make,
@@ -80,7 +80,7 @@ def test_from_marker_array_inverts_to_marker_array(make, rows, remarks):
 
 
 @given(rows=objects, remarks=notes)
-def test_markers_survive_the_wire(rows, remarks):
+def test_markers_survive_serialization(rows, remarks):
     sent = array(codec.make_bag_message, rows, scores=[r[2] for r in rows], extras=[r[3] for r in rows], notes=remarks)
     raw = codec.encode(sent)
     read = codec.decode(raw, "visualization_msgs/msg/MarkerArray")
@@ -92,7 +92,7 @@ def test_markers_survive_the_wire(rows, remarks):
 
 @each_make
 @given(yaw=yaws)
-def test_the_quaternion_is_a_unit_and_turns_about_z_only(make, yaw):
+def test_quaternion_is_normalized_and_rotates_about_z_only(make, yaw):
     pose = make_box_pose(np.array([1.0, 2, 3, 4, 5, 6, yaw]), make)
     q = pose.orientation
     assert q.x == q.y == 0 and math.hypot(q.z, q.w) == pytest.approx(1, abs=1e-15)
@@ -104,7 +104,7 @@ def test_the_quaternion_is_a_unit_and_turns_about_z_only(make, yaw):
 
 @each_make
 @given(before=objects, after=objects)
-def test_what_is_gone_is_deleted_and_nothing_else(make, before, after):
+def test_only_outdated_markers_are_deleted(make, before, after):
     first = array(make, before)
     second = array(make, after, previous=list_marker_keys(first))
     assert list_marker_keys(first) == {*keys(before)}
@@ -116,7 +116,7 @@ def test_what_is_gone_is_deleted_and_nothing_else(make, before, after):
 
 
 @each_make
-def test_an_empty_array_says_which_frame_was_empty(make):
+def test_empty_array_keeps_frame_and_stamp(make):
     msg = array(make, [])
     got = from_marker_array(msg)
     assert len(got) == 0 and got.boxes.shape == (0, 7) and got.notes == []
@@ -171,7 +171,7 @@ def test_cubes_of_other_nodes_are_read(make, text, score, extra):
 
 
 @each_make
-def test_lengths_that_differ_are_refused(make):
+def test_arrays_of_different_length_are_rejected(make):
     with pytest.raises(ValueError):
         to_marker_array(np.zeros((2, 7)), ["Car"], header=header(make), make=make)
 
@@ -187,7 +187,7 @@ def test_lifetime_and_color_reach_every_cube(make):
 
 @each_make
 @pytest.mark.parametrize("tracks, ids", [([4, 9], [4, 9]), ([4, None], [0, 1]), ([4, 4], [0, 1]), ([], [])])
-def test_labels_keep_their_track_where_it_tells_them_apart(make, tracks, ids):
+def test_track_id_is_kept_if_it_distinguishes_labels(make, tracks, ids):
     extras = [{} if t is None else {"track_id": t} for t in tracks]
     truth = GroundTruth.of(np.ones((len(tracks), 7)), [0] * len(tracks), extras, [("DontCare", {"track_id": -1})])
     got = from_marker_array(make_truth_markers(truth, header(make), make))
@@ -196,7 +196,7 @@ def test_labels_keep_their_track_where_it_tells_them_apart(make, tracks, ids):
 
 
 @given(rows=objects)
-def test_from_detection_array_inverts_to_detection_array(rows):
+def test_detection_array_round_trip(rows):
     msg = to_detection_array(
         np.array([r[0] for r in rows]),
         [r[1] for r in rows],
@@ -215,7 +215,7 @@ def test_from_detection_array_inverts_to_detection_array(rows):
         assert (got.stamp_ns, got.frame_id) == (STAMP, "velodyne")
 
 
-def test_a_detection_is_of_its_most_likely_class():
+def test_detection_has_its_most_likely_class():
     msg = to_detection_array(
         np.ones((2, 7)), ["Car", "Van"], [0.3, 0.5], header=header(codec.make_bag_message), make=codec.make_bag_message
     )

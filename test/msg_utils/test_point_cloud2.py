@@ -119,7 +119,7 @@ def same(a: np.ndarray, b: np.ndarray) -> bool:
 
 @each_make
 @given(cloud=points())
-def test_to_array_inverts_from_array(make, cloud):
+def test_array_round_trip(make, cloud):
     got = to_array(from_array(cloud, header(make), make))
     assert got.dtype == cloud.dtype
     assert got.tobytes() == cloud.tobytes()
@@ -127,7 +127,7 @@ def test_to_array_inverts_from_array(make, cloud):
 
 @each_make
 @given(cloud=points(), height=st.integers(1, 3))
-def test_from_array_fills_in_the_message(make, cloud, height):
+def test_from_array_sets_all_fields_of_the_message(make, cloud, height):
     cloud = stacked(cloud, height)
     msg = from_array(cloud, header(make), make, height=height, is_dense=False)
     assert (msg.height, msg.height * msg.width) == (height, len(cloud))
@@ -139,14 +139,14 @@ def test_from_array_fills_in_the_message(make, cloud, height):
 
 @each_make
 @given(cloud=points(st.integers(1, 6)))
-def test_a_view_of_some_rows_makes_the_same_cloud_as_its_copy(make, cloud):
+def test_strided_view_gives_the_same_cloud_as_its_copy(make, cloud):
     wide = np.repeat(cloud, 2)
     assert same(to_array(from_array(wide[::2], header(make), make)), cloud)
 
 
 @each_make
 @given(cloud=points(st.integers(1, 6)), height=st.integers(1, 3), pad=st.integers(0, 9))
-def test_the_end_of_a_row_is_not_read(make, cloud, height, pad):
+def test_padding_at_the_end_of_a_row_is_not_read(make, cloud, height, pad):
     cloud = stacked(cloud, height)
     assert same(to_array(padded(make, cloud, height, pad)), cloud)
 
@@ -174,7 +174,7 @@ def test_a_count_of_zero_is_one_number(make):
 
 
 @each_make
-def test_arrays_of_a_cloud_cannot_be_written(make):
+def test_arrays_of_a_cloud_are_read_only(make):
     cloud = to_array(from_array(np.zeros(3, XYZ), header(make), make))
     with pytest.raises(ValueError):
         cloud["x"] = 1
@@ -182,7 +182,7 @@ def test_arrays_of_a_cloud_cannot_be_written(make):
 
 @each_make
 @given(cloud=points(), height=st.integers(1, 3), pad=st.integers(0, 9))
-def test_add_columns_keeps_every_old_byte_and_field(make, cloud, height, pad):
+def test_add_columns_keeps_existing_bytes_and_fields(make, cloud, height, pad):
     cloud = stacked(cloud, height)
     step = cloud.dtype.itemsize
     old = padded(make, cloud, height, pad, unnamed=[0])
@@ -205,7 +205,7 @@ def test_add_columns_keeps_every_old_byte_and_field(make, cloud, height, pad):
 
 @each_make
 @given(cloud=points())
-def test_a_column_twice_is_the_last_one(make, cloud):
+def test_last_of_two_equal_columns_is_used(make, cloud):
     first = np.arange(len(cloud), dtype=np.int32)
     once = add_columns(from_array(cloud, header(make), make), make, label=first)
     twice = add_columns(once, make, label=first[::-1])
@@ -246,12 +246,12 @@ def test_xyz_reads_any_floating_point_cloud(make, kind):
     np.testing.assert_array_equal(got, [[1, 3, 5], [np.nan, np.inf, 6]])
 
 
-def test_columns_come_in_the_order_they_are_asked_for():
+def test_columns_are_returned_in_the_requested_order():
     cloud = np.arange(6, dtype="<f4").view(XYZ)
     assert read_columns(cloud, ("z", "x")).tolist() == [[2, 0], [5, 3]]
 
 
-def test_xyz_beyond_float32_is_infinite_and_not_a_warning():
+def test_xyz_beyond_float32_is_infinite_without_a_warning():
     assert np.isinf(read_xyz(np.array([(1e300, 0, 0)], [(n, "<f8") for n in "xyz"]))[0, 0])
 
 
@@ -264,7 +264,7 @@ def test_xyz_beyond_float32_is_infinite_and_not_a_warning():
         ([("x", "f4"), ("y", "f4"), ("z", "u1")], "field 'z' is of type uint8"),
     ],
 )
-def test_a_cloud_without_metres_names_the_field(dtype, words):
+def test_error_names_the_field_that_is_not_a_float(dtype, words):
     with pytest.raises(CloudError, match=words):
         read_xyz(np.zeros(2, dtype))
 
@@ -273,7 +273,7 @@ def test_a_cloud_without_metres_names_the_field(dtype, words):
 @pytest.mark.parametrize("height, width", [(3, 1), (1, 3), (2, 3), (31, 16)])
 @pytest.mark.parametrize("step", [lambda h, w: 0, lambda h, w: h * w * 8, lambda h, w: w * 8])
 @pytest.mark.parametrize("more", [0, 4])
-def test_row_step_0_or_of_the_whole_cloud_is_that_of_a_row(make, height, width, step, more):
+def test_row_step_of_0_or_of_the_whole_cloud_is_accepted(make, height, width, step, more):
     cloud = np.arange(height * width * 2, dtype="f4").view([("a", "f4"), ("b", "f4")])
     data = np.pad(cloud.view(np.uint8), (0, more))
     msg = message(
@@ -306,7 +306,7 @@ def test_row_step_0_or_of_the_whole_cloud_is_that_of_a_row(make, height, width, 
         (dict(count=2), "field 'b' at offset 4 reaches past point_step = 8"),
     ],
 )
-def test_a_broken_cloud_names_what_is_broken(make, change, words):
+def test_error_names_the_broken_part_of_a_cloud(make, change, words):
     with pytest.raises(CloudError, match=words) as error:
         to_array(two_fields(make, **change))
     assert "\n" not in str(error.value)
@@ -316,13 +316,13 @@ def test_a_broken_cloud_names_what_is_broken(make, change, words):
 @pytest.mark.parametrize(
     "dtype", [[("x", "<f4"), ("y", ">f4")], [("x", "f2")], [("x", "i8")], [("x", "?")], [("x", "S4")]]
 )
-def test_what_point_cloud2_cannot_say_is_refused(make, dtype):
+def test_types_that_point_cloud2_lacks_are_rejected(make, dtype):
     with pytest.raises(ValueError):
         from_array(np.zeros(2, dtype), header(make), make)
 
 
 @each_make
-def test_rows_of_different_length_are_refused(make):
+def test_points_that_do_not_fill_the_rows_are_rejected(make):
     with pytest.raises(ValueError, match="5 points cannot be split into 2 rows"):
         from_array(np.zeros(5, XYZ), header(make), make, height=2)
 
@@ -338,7 +338,7 @@ def test_huge_point_step_is_reported_with_and_without_points(make, height, width
 
 
 @each_make
-def test_a_cloud_of_no_rows_gets_columns_whatever_its_width(make):
+def test_columns_can_be_added_to_a_cloud_without_rows(make):
     fields = [field(make, name, 4 * i) for i, name in enumerate("xyz")]
     msg = message(make, fields, np.zeros(0, np.uint8), height=0, width=2**32 - 1, point_step=12, row_step=0)
     more = add_columns(msg, make, ground=np.zeros(0, "u1"))

@@ -174,7 +174,7 @@ def test_failed_or_empty_video_leaves_no_file(tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
-def test_unsupported_videos_are_refused(tmp_path, monkeypatch):
+def test_unsupported_videos_are_rejected(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"a.avi is not a video: .*\.mp4"):
         check_video(tmp_path / "a.avi", 1)
     with pytest.raises(InputError, match=f"would have {MAX_ANIMATED + 1} pictures.*--limit"):

@@ -98,7 +98,7 @@ def test_given_point_colours_are_not_modified():
 
 
 @pytest.mark.parametrize("far, reach", [(0.5, 6.0), (20.0, 20.0), (500.0, 55.0)])
-def test_stage_covers_range_of_first_cloud(far, reach):
+def test_view_covers_the_range_of_the_first_cloud(far, reach):
     angles = np.linspace(0, 2 * np.pi, 200)
     scan = PointCloud(np.stack([far * np.cos(angles), far * np.sin(angles), 0 * angles], axis=1).astype(np.float32))
     stage = Stage.of(scan, 1.0, True, size=SIZE)

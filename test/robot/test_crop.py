@@ -106,7 +106,7 @@ def test_disabled_crop_returns_same_frame():
     assert same is frame and indices.tolist() == list(range(len(frame)))
 
 
-def test_cropping_in_and_before_pipeline_is_same():
+def test_cropping_before_or_inside_the_pipeline_is_equivalent():
     """Indices refer to the given cloud, and a second crop removes nothing."""
     frame = PointCloud(np.ascontiguousarray(scene()[:, :3]))
     params = with_values(PipelineParams(), {"crop.min_range": 4.0, "crop.sectors": (90.0, 270.0)})
@@ -140,6 +140,6 @@ def test_cropped_message_has_points_of_cropped_frame():
         ({"min_range": 5.0, "max_range": 4.0}, "at least min_range"),
     ],
 )
-def test_invalid_crop_is_refused_with_remedy(values, words):
+def test_error_for_invalid_crop_names_the_remedy(values, words):
     with pytest.raises(ValueError, match=words):
         CropParams(**values)

@@ -69,7 +69,7 @@ def test_poses_are_looked_up_once_and_for_few_times(count):
     assert calls == [MAX_POSES + 1]
 
 
-def test_constant_motion_of_car_is_circle():
+def test_car_with_constant_motion_drives_a_circle():
     """At 10 m/s and 0.5 rad/s, the radius is 20 m."""
     at = np.linspace(-1, 1, 21)
     poses = make_constant_motion([10.0, 0, 0], [0, 0, 0.5])(at)

@@ -37,7 +37,7 @@ def make_objects(count=24):
     )
 
 
-def test_deskewed_points_are_where_they_were_measured():
+def test_deskewed_points_lie_on_the_measured_surfaces():
     """Odometry at 20 Hz, of a car at 15 m/s in a curve of 25 m radius."""
     pole, solids = make_objects()
     hits = cast_rays(solids, Ground(), np.array([0.0, 0.0, 1.73]), SENSOR, MOTION)

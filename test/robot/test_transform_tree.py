@@ -61,7 +61,7 @@ def test_lookup_equals_composition_by_scipy(seed, seconds):
 
 
 @given(seeds)
-def test_inverse_lookups_and_detours_agree(seed):
+def test_inverse_and_chained_lookups_agree(seed):
     tree, _, _ = make_tree(seed)
     stamp = START + SECOND_NS // 3
     pose, inverse = tree.lookup("map", "lidar", stamp), tree.lookup("lidar", "map", stamp)
@@ -137,7 +137,7 @@ def test_gaps_longer_than_max_gap_are_not_bridged():
     assert tree.lookup("odom", "base", START + SECOND_NS // 10, 0.0)[0, 3] == 1
 
 
-def test_unconnected_frames_are_named():
+def test_error_names_unconnected_frames():
     tree, _, _ = make_tree()
     tree.set("world", "tower", 0, [0, 0, 0], [0, 0, 0, 1], static=True)
     with pytest.raises(MissingTransform, match="'lidar' with 'radar': 'lidar' is below 'map', 'radar' is not in TF"):
@@ -146,7 +146,7 @@ def test_unconnected_frames_are_named():
         tree.lookup("map", "tower", START)
 
 
-def test_loop_is_error():
+def test_loop_of_transforms_is_an_error():
     tree = TransformTree()
     for parent, child in (("a", "b"), ("b", "c"), ("c", "a")):
         tree.set(parent, child, 0, [0, 0, 0], [0, 0, 0, 1], static=True)
@@ -220,7 +220,7 @@ def test_memory_is_bounded(monkeypatch):
         (dict(child=""), "two frames with names"),
     ],
 )
-def test_invalid_transform_is_refused_and_not_stored(change, words):
+def test_invalid_transform_is_rejected_and_not_stored(change, words):
     tree = TransformTree()
     good = dict(parent="a", child="b", stamp_ns=0, translation=[1, 2, 3], quaternion=[0, 0, 0, 1.001], static=True)
     tree.set(**good)

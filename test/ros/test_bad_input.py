@@ -57,7 +57,7 @@ def process(send, results):
 
 
 @pytest.mark.parametrize("node", ["ground_segmentation", "perception"])
-def test_bad_clouds_become_diagnostics_and_node_continues(node, send, process, peer, good_cloud):
+def test_bad_clouds_are_reported_and_node_continues(node, send, process, peer, good_cloud):
     for name, (msg, words) in BAD.items():
         peer.diagnostics.clear()
         send(node, msg, lambda w=words: w in peer.get_message(node), f"'{words}': {name}")

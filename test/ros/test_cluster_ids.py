@@ -21,7 +21,7 @@ from msg_utils.markers import from_marker_array
 FILE = {"view.enabled": False, "seed.source": "file"}
 
 
-def test_boxes_and_candidates_have_the_ids_of_the_cloud(processes, peer, drive_bag):
+def test_boxes_and_candidates_keep_the_ids_of_the_cloud(processes, peer, drive_bag):
     """Foreign ids with gaps, most of them beyond a marker's 32 bits: candidate_refinement says them
     in the text of its candidates; clustering replaces them by its own, in the cloud and the boxes
     alike."""

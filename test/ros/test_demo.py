@@ -29,7 +29,7 @@ from lidar_perception.types import InputError
 FRAMES = 4  # tracks are confirmed
 
 
-def test_demo_scores_the_offline_result_in_one_process_and_in_many(drive_bag, make_bag, tmp_path):
+def test_demo_scores_like_offline_in_one_or_many_processes(drive_bag, make_bag, tmp_path):
     """Tracks are equal to the byte."""
     bag = make_bag(open_recording(drive_bag).frames[:FRAMES])
     frames = {frame.stamp_ns: frame for frame in open_recording(bag)}
@@ -57,7 +57,7 @@ def test_demo_scores_the_offline_result_in_one_process_and_in_many(drive_bag, ma
 
 
 @pytest.mark.parametrize(("real_time", "waiting"), [(False, graph_replay.AHEAD), (True, None)])
-def test_in_real_time_as_many_clouds_wait_as_on_a_robot(drive_bag, tmp_path, monkeypatch, real_time, waiting):
+def test_real_time_demo_uses_the_input_queue_of_a_robot(drive_bag, tmp_path, monkeypatch, real_time, waiting):
     class Enough(Exception):
         pass
 
@@ -100,7 +100,7 @@ def test_parameters_reach_the_nodes(drive_bag, tmp_path, monkeypatch, arguments,
     assert expected.items() <= given[node].items()
 
 
-def test_what_demo_did_not_make_stays(drive_bag, make_bag, tmp_path):
+def test_demo_keeps_files_that_it_did_not_create(drive_bag, make_bag, tmp_path):
     out = tmp_path / "out"
     bag = make_bag(open_recording(drive_bag).frames[:1])
     mine = shutil.copytree(bag, out / "drive")
@@ -121,6 +121,6 @@ def test_what_demo_did_not_make_stays(drive_bag, make_bag, tmp_path):
         (["--detector", "candidates", "--set", "fused.proposals=0.1"], "of candidates"),
     ],
 )
-def test_demo_refuses_parameters_of_another_detector(tmp_path, monkeypatch, capsys, arguments, words):
+def test_demo_rejects_parameters_of_another_detector(tmp_path, monkeypatch, capsys, arguments, words):
     assert exit_of(monkeypatch, "demo", *arguments, "--out", tmp_path / "out") == 2
     assert words in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -85,7 +85,7 @@ def test_cloud_of_moving_sensor_is_compensated(start, source):
     assert make_time(START, make_bag_message).sec == after.header.stamp.sec and len(frame_)
 
 
-def test_first_cloud_waits_for_odometry_of_its_whole_turn(start):
+def test_first_cloud_waits_for_odometry_of_its_sweep(start):
     rng = np.random.default_rng(0)
     xyz = (rng.uniform(-30, 30, (2000, 3)) * [1, 1, 0.001] - [0, 0, 1.8]).astype(np.float32)
     msg = message(xyz, t=np.linspace(0, 1e8, len(xyz)).astype("<u4"))
@@ -104,7 +104,7 @@ def test_first_cloud_waits_for_odometry_of_its_whole_turn(start):
 
 
 @pytest.mark.parametrize("first, begin, sectors", [(0.3, 0.0, ()), (1.0, -1.0, (120.0, 240.0))])
-def test_later_clouds_wait_for_the_end_of_their_turn(start, first, begin, sectors):
+def test_later_clouds_wait_for_the_end_of_their_sweep(start, first, begin, sectors):
     """The first turn is partial, or the stamp is at the end of a turn, with cropped points there.
     Odometry comes every 0.02 s."""
     node = start(GroundSegmentation, **{"input.deskew": "odometry", "crop.sectors": sectors})

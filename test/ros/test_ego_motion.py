@@ -101,7 +101,7 @@ def test_missing_odometry_to_sensor_transform_is_reported(start):
     assert min(tracked(node).ids) > 6  # the poses are others from here on: all tracks ended
 
 
-def test_missing_transform_is_named(start):
+def test_error_names_the_missing_transform(start):
     node = start(TrackerNode, **{"ego.source": "tf", "input.fixed_frame": "map"})
     node.on_markers(make_detection_markers(next(crowd()), header(START), make_bag_message))
     assert "TF does not connect 'lidar' with 'map'" in node.diagnostics.state[1]
@@ -162,7 +162,7 @@ def test_detector_cloud_waits_for_its_pose_with_timeout(start):
     assert len(node.sent["tracks"]) == 4
 
 
-def test_empty_cloud_is_answered_and_scan_poses_continue(start):
+def test_empty_cloud_has_a_result_and_scan_poses_continue(start):
     if not has_odometry():
         pytest.skip("needs kiss-icp, the extra [odometry]")
     node = start(Perception, **{"tracking.enabled": True, "ego.source": "kiss_icp"})
@@ -210,7 +210,7 @@ def test_stopped_or_foreign_clock_odometry_is_reported(start, monkeypatch):
 
 
 @pytest.mark.parametrize("source, lag", [("odometry", 3.0), ("tf", 0.7)])
-def test_source_that_is_always_late_is_named(start, source, lag):
+def test_source_that_is_always_late_is_reported(start, source, lag):
     """The lag is longer than ego.max_gap and too short for a different clock."""
     node = start(TrackerNode, **{"ego.source": source})
     for i in range(15):

@@ -152,6 +152,6 @@ def test_all_classes_are_scored_and_precision_at_the_end(with_camera, start, tmp
         ({"timing": ["foo"]}, "does not have the form"),
     ],
 )
-def test_unusable_parameters_are_refused(start, values, words):
+def test_unusable_parameters_are_rejected(start, values, words):
     with pytest.raises(InputError, match=words):
         start(Evaluator, **values)

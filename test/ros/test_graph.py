@@ -67,13 +67,13 @@ def offline(setting, drive_bag):
     return results, report
 
 
-def test_no_frame_is_lost_between_the_processes(run):
+def test_no_frame_is_lost_between_processes(run):
     _, content, _ = run
     assert content["results"] == content["clouds"] == content["frames"]
     assert content["lost_frames"] == 0
 
 
-def test_candidates_over_dds_are_those_of_the_offline_path(run, offline):
+def test_candidates_over_dds_equal_offline_candidates(run, offline):
     single, _, out = run
     for stage, topic in list_result_topics(single).items():
         with Bag(out / "result") as bag:
@@ -107,7 +107,7 @@ def test_published_cloud_has_all_fields_and_offline_columns(run, offline, drive_
         assert msg.header.frame_id == "velodyne"
 
 
-def test_the_evaluator_scores_as_the_offline_evaluation(run, offline):
+def test_evaluator_scores_equal_offline_scores(run, offline):
     _, content, out = run
     expected = json.loads(json.dumps(offline[1].compute()))
     for key in ("frames", "ground_truth", "ground_truth_by_range", "stage1", "stage2", "final"):

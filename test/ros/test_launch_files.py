@@ -234,7 +234,7 @@ def test_section_of_unknown_node_is_a_warning(section, words, launched, tmp_path
         ("two_lidars", "lft", "did you mean 'left'"),
     ],
 )
-def test_unknown_launch_argument_is_refused(name, given, words, launched, drive_bag):
+def test_unknown_launch_argument_is_rejected(name, given, words, launched, drive_bag):
     with pytest.raises(InputError, match=re.escape(words)):
         launched(name)(**{given: "1"}, **({"bag": str(drive_bag)} if name == "replay" else {}))
 
@@ -371,13 +371,13 @@ def test_replay_connects_player_nodes_and_evaluator(detectors, single, launched,
         ({"experts": "pointnets"}, "pointnets is neither a parameter file nor a detector"),
     ],
 )
-def test_unusable_launch_argument_is_refused(given, words, launched):
+def test_unusable_launch_argument_is_rejected(given, words, launched):
     with pytest.raises(InputError, match=words):
         launched("detectors")(**given)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "test/launch").glob("*.py")), ids=lambda p: p.stem)
-def test_imports_of_the_launch_tests_exist(path):
+def test_modules_imported_by_launch_tests_exist(path):
     """They run only where launch_testing is installed."""
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     for node in ast.walk(ast.parse(path.read_text())):

@@ -76,7 +76,7 @@ def test_linked_nodes_pass_messages_without_dds(graph, monkeypatch):
     assert graph.reception.values() == {"lost": 0, "dropped": 0, "reliability": "in this process"}
 
 
-def test_newest_linked_message_wins_and_others_count_as_dropped(graph, monkeypatch):
+def test_newest_linked_message_is_kept_and_others_dropped(graph, monkeypatch):
     received = []
     monkeypatch.setattr(graph.reception, "deliver", lambda msg, _: received.append(msg))
     graph.ground.on_points(make_cloud(10**18))
@@ -98,7 +98,7 @@ def test_second_publisher_ends_the_link(graph, monkeypatch):
     assert graph.reception.subscription is None and graph.ground.points.receivers
 
 
-def test_link_ends_with_the_nodes_that_made_it(graph):
+def test_link_ends_with_its_nodes(graph):
     assert graph.ground.points.receivers
     graph.clustering.trigger_deactivate()
     assert not graph.ground.points.receivers
@@ -149,7 +149,7 @@ def start_together(processes, **params):
             processes.start(node, build_graph(["pointnet"], tracking=True)[node], params.get(node, {}))
 
 
-def test_nodes_of_one_process_have_their_own_parameters_and_end_at_a_signal(processes, peer):
+def test_nodes_of_one_process_have_own_parameters_and_signals(processes, peer):
     start_together(processes, clustering={"input.queu": 5}, tracker={"autostart": False})
     peer.wait(lambda: set(NODES) <= set(peer.diagnostics), "all nodes")
     assert peer.get_message("tracker") == "not configured"

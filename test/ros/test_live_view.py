@@ -192,6 +192,6 @@ def test_boxes_in_another_frame_are_shown_where_tf_says(view, received, shared_p
     shared_peer.wait(same, "boxes of both, in one place")
 
 
-def test_it_ends_cleanly_at_sigint(view, received, shared_processes):
+def test_live_view_ends_cleanly_at_sigint(view, received, shared_processes):
     assert shared_processes.end("view", 60.0) == 0
     assert "Traceback" not in shared_processes.read_log("view")

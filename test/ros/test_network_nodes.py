@@ -226,7 +226,7 @@ UNUSABLE = {  # by detector: parameters made in a folder, level, words; more in 
 }
 
 
-def test_unusable_weights_are_a_diagnostic(tested, shared_processes, peer, tmp_path):
+def test_unusable_weights_are_reported_in_diagnostics(tested, shared_processes, peer, tmp_path):
     cases = UNUSABLE[tested.node]
     for i, (make, _, words) in enumerate(cases):
         shared_processes.fresh = words == MISSING

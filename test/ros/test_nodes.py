@@ -33,7 +33,7 @@ CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerAr
 SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
-def test_every_node_ends_with_code_0(processes, peer, tmp_path, drive_bag):
+def test_every_node_exits_with_0(processes, peer, tmp_path, drive_bag):
     """SIGINT and SIGTERM in turn; test_stopping.py sends them in each phase."""
     arguments = {
         "bag_player": {"bag": str(drive_bag), "loop": True, "wait_timeout": 0.0},
@@ -158,7 +158,7 @@ for given in sys.argv[1:]:
         assert words in fatal and "[left.front]: " in fatal and "Traceback" not in said
 
 
-def test_parameter_that_a_node_does_not_have_is_named(start):
+def test_unknown_parameter_is_reported(start):
     """The message of rclpy would be: undeclared parameter(s): []."""
     node = start(GroundSegmentation)
     for name, words in (
@@ -169,7 +169,7 @@ def test_parameter_that_a_node_does_not_have_is_named(start):
             node.set_parameters_atomically([Parameter(name, value=1)])
 
 
-def test_bad_parameter_files_are_refused_in_one_line(processes):
+def test_bad_parameter_files_are_rejected_in_one_line(processes):
     for i, (name, value, words) in enumerate(
         [("stm.threshold", 7.0, "stm.threshold"), ("clustering.dbscan.eps", [0.1], "range_limits")]
     ):
@@ -259,7 +259,7 @@ def test_clouds_wait_for_the_partner_with_their_stamp():
     assert len(delivered) == 15 and all(p is None for _, p in delivered)
 
 
-def test_misspelt_parameter_file_section_is_reported(processes, tmp_path):
+def test_misspelled_section_of_a_parameter_file_is_reported(processes, tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text(
         "trackr: {ros__parameters: {autostart: false}}\n"

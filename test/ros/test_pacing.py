@@ -59,7 +59,7 @@ def test_late_answer_counts_earlier_clouds_as_missed():
     assert pace.unanswered == 1 and not pace.waiting
 
 
-def test_silent_graph_is_awaited_once_then_briefly(monkeypatch):
+def test_player_waits_long_for_a_silent_graph_only_once(monkeypatch):
     now = 0.0
     monkeypatch.setattr(pacing, "monotonic", lambda: now)
 
@@ -77,7 +77,7 @@ def test_silent_graph_is_awaited_once_then_briefly(monkeypatch):
     assert pace.unanswered == 5 and not pace.waiting and pace.held == held
 
 
-def test_the_clouds_of_a_bag_are_found_or_those_it_has_are_named():
+def test_cloud_topics_are_found_or_the_existing_ones_are_listed():
     cloud = "sensor_msgs/msg/PointCloud2"
     types = {"/velodyne": cloud, "/note": "std_msgs/msg/String"}
     assert choose_cloud_topic("bag", types) == "/velodyne"
@@ -91,7 +91,7 @@ def test_the_clouds_of_a_bag_are_found_or_those_it_has_are_named():
 
 
 @pytest.mark.parametrize("own", [{}, {"OMP_WAIT_POLICY": "active"}], ids=["ours", "the user's"])
-def test_threads_wait_asleep_unless_the_user_says_otherwise(own):
+def test_waiting_threads_sleep_unless_configured_otherwise(own):
     """The command sets it before torch is loaded, which reads it then."""
     program = (
         "import atexit, os, sys; sys.argv[1:] = ['--version']; "

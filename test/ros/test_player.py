@@ -53,7 +53,7 @@ def start(processes, bag, **params):
 
 
 @pytest.mark.parametrize("ros", [2, 1])
-def test_bytes_of_the_bag_arrive_unchanged(processes, peer, drive_bag, tmp_path, ros):
+def test_bytes_of_the_bag_are_published_unchanged(processes, peer, drive_bag, tmp_path, ros):
     played = drive_bag if ros == 2 else as_ros1(drive_bag, tmp_path / "drive.bag")
     with Bag(drive_bag) as bag:
         expected = {t: [d for topic, _, d in bag.raw_messages({t})] for t in (POINTS, TRUTH)}
@@ -72,7 +72,7 @@ def test_bytes_of_the_bag_arrive_unchanged(processes, peer, drive_bag, tmp_path,
     assert len(info) == 1 and info[0].width == 1242
 
 
-def test_offset_duration_topics_and_remapping(processes, peer, text_bag):
+def test_offset_duration_topics_and_remapping_take_effect(processes, peer, text_bag):
     heard, note = peer.listen("/renamed", TEXT), peer.listen("/note", TEXT, LATCHED)
     start(
         processes, text_bag, start_offset=0.5, duration=1.0, remap=["/text:=renamed"], wait_for=["/renamed"], rate=10.0
@@ -179,7 +179,7 @@ def test_topic_of_several_publishers_offers_best_qos():
         )
 
 
-def test_pause_step_resume_and_rate(processes, peer, text_bag):
+def test_pause_step_resume_and_rate_take_effect(processes, peer, text_bag):
     heard = peer.listen("/text", TEXT)
     start(processes, text_bag, start_paused=True, rate=0.02)  # the rest takes 85 s
     request = Trigger.Request()
@@ -194,7 +194,7 @@ def test_pause_step_resume_and_rate(processes, peer, text_bag):
     assert texts(heard) == [str(i) for i in range(20)]
 
 
-def test_bag_time_runs_at_the_rate_and_stands_still_while_paused(monkeypatch):
+def test_bag_time_follows_the_rate_and_stops_while_paused(monkeypatch):
     from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams
 
@@ -254,7 +254,7 @@ def test_player_waits_for_subscribers(processes, peer, text_bag):
     peer.wait(lambda: len(first) == 20 and len(second) == 20, "all messages at both")
 
 
-def test_player_waits_until_a_node_has_matched_its_subscriber(processes, peer, text_bag):
+def test_player_waits_until_a_subscriber_is_matched(processes, peer, text_bag):
     """The player discovers a subscriber before the publishing node does, whose messages until then
     would be lost."""
     me = peer.node.get_name()
@@ -312,7 +312,7 @@ def refused(shared_processes, text_bag, drive_bag, tmp_path_factory):
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_unplayable_bag_is_one_line_and_exit_code_2(refused, shared_processes, case):
+def test_unplayable_bag_logs_one_line_and_exits_with_2(refused, shared_processes, case):
     assert shared_processes.running[f"{case}.bag_player"].wait(timeout=60) == 2
     log = shared_processes.read_log(f"{case}.bag_player")
     assert BAD[case][1] in log.splitlines()[-1] and "Traceback" not in log
@@ -337,7 +337,7 @@ def test_recorder_writes_the_played_messages(processes, peer, text_bag, tmp_path
         assert {c.compression for c in make_reader(stream).get_summary().chunk_indexes} == {"lz4"}
 
 
-def test_looped_single_message_bag_does_not_flood(monkeypatch, tmp_path):
+def test_looped_single_message_bag_is_not_played_in_a_busy_loop(monkeypatch, tmp_path):
     from lidar_perception.nodes.replay import bag_player
     from lidar_perception.params import PlayerParams
 

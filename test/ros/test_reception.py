@@ -62,7 +62,7 @@ def driver(peer, reliability, count, points=KITTI, first=1, hz=10):
     assert process.returncode == 0
 
 
-def test_clouds_of_a_driver_without_our_profile(processes, peer):
+def test_clouds_of_drivers_with_other_qos_are_received(processes, peer):
     """A RELIABLE driver loses nothing. A BEST_EFFORT one loses little where a socket buffer holds a
     cloud, and losses are reported with a remedy. Its end is an ERROR, then STALE."""
 
@@ -108,7 +108,7 @@ def test_clouds_of_a_driver_without_our_profile(processes, peer):
     processes.check()
 
 
-def test_newest_cloud_wins_and_others_are_counted(processes, peer):
+def test_newest_cloud_is_used_and_dropped_ones_are_counted(processes, peer):
     """A burst arrives while a node processes a large cloud. A second publisher is reported."""
     processes.start(NODE, {"~/input/points": "/in"}, {"ground.method": "patchwork"})
     talker, rng = peer.advertise("/in", CLOUD), np.random.default_rng(0)
@@ -144,7 +144,7 @@ def two_sensors(shared_processes):
     return shared_processes
 
 
-def test_two_sensors_in_namespaces(two_sensors, shared_peer):
+def test_sensors_in_two_namespaces_are_separate(two_sensors, shared_peer):
     """Two equal graphs share no topic, and the diagnostics name the sensor."""
     peer = shared_peer
     talkers = {side: peer.advertise(f"/{side}/points", CLOUD) for side in SIDES}
@@ -170,7 +170,7 @@ def test_two_sensors_in_namespaces(two_sensors, shared_peer):
     two_sensors.check()
 
 
-def test_two_nodes_of_one_name_are_reported(two_sensors, shared_peer, processes):
+def test_two_nodes_with_the_same_name_are_reported(two_sensors, shared_peer, processes):
     processes.start("clustering", {}, {}, namespace="left")
     shared_peer.wait_for_diagnostics("left/clustering", "another node is also called /left/clustering", WARN)
 
@@ -179,7 +179,7 @@ def infos(numbers, period=10**8):
     return [{"publication_sequence_number": n, "source_timestamp": n * period} for n in numbers]
 
 
-def test_every_cloud_is_accounted_for():
+def test_every_cloud_is_processed_or_counted_as_dropped():
     """sent = received + dropped + lost, in any mixture of losses and full queues."""
     rng = np.random.default_rng(0)
     for _ in range(100):
@@ -207,7 +207,7 @@ def test_cloud_dropped_from_full_queue_is_not_lost():
     assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (2, 11, 16)
 
 
-def test_restarted_or_second_driver_loses_nothing():
+def test_restarted_or_second_driver_loses_no_cloud():
     arrivals = Arrivals(5)
     for number in (7, 8, 1, 2):
         arrivals.add(infos([number]), 0)
@@ -257,7 +257,7 @@ def test_incompatible_publisher_is_reported_with_remedy(start, monkeypatch, valu
         assert bool(said) == (remedy != "" and BEST_EFFORT in offered)
 
 
-def test_middleware_queue_holds_input_queue_clouds(start):
+def test_middleware_queue_has_the_length_of_the_input_queue(start):
     for queue, depth in (1, 5), (20, 20):
         (reception,) = start(GroundSegmentation, **{"input.queue": queue}).inputs.receptions
         assert reception.subscription.qos_profile.depth == reception.arrivals.depth == depth
@@ -310,7 +310,7 @@ def test_source_of_losses_is_named_after_it_has_ended(start, monkeypatch):
         ("/boxes", "array", "", "is the detector running", "is the detector overloaded"),
     ],
 )
-def test_problem_names_the_kind_of_publisher(monkeypatch, topic, what, publisher, silent, slow):
+def test_problem_names_the_type_of_publisher(monkeypatch, topic, what, publisher, silent, slow):
     late = Late(monkeypatch, lambda stamp: 0.0, rate=10.0)
     late.reception.topic, late.reception.what = topic, what
     late.reception.last_publishers = [SimpleNamespace(node_namespace="/", node_name=publisher)] * bool(publisher)

@@ -17,7 +17,7 @@ from lidar_perception.wire.codec import encode, make_bag_message
 TEXT, INFO = "std_msgs/msg/String", "sensor_msgs/msg/CameraInfo"
 
 
-def test_the_recorder_has_what_each_of_several_publishers_latched(processes, peer, tmp_path):
+def test_recorder_stores_latched_messages_of_every_publisher(processes, peer, tmp_path):
     for i in range(6):  # as each node with a fixed sensor does on /tf_static
         peer.advertise("/note", TEXT, LATCHED).publish(encode(make_bag_message(TEXT, data=str(i))))
     processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["/note"]})
@@ -43,7 +43,7 @@ def test_late_publisher_with_weaker_qos_is_recorded(processes, peer, tmp_path):
         assert {m.data for _, _, m in bag.messages({"/robot/text"})} == {"first", "later"}
 
 
-def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start, tmp_path):
+def test_recording_continues_if_a_type_is_not_installed(monkeypatch, peer, start, tmp_path):
     from lidar_perception.nodes.replay import bag_recorder
 
     known = bag_recorder.load_message_class
@@ -63,7 +63,7 @@ def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start
         assert list(bag.topics) == ["/text"]
 
 
-def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tmp_path):
+def test_slow_recorder_drops_and_reports_messages(monkeypatch, start, tmp_path):
     """Also while simulated time does not advance."""
     from lidar_perception.nodes.replay import bag_recorder
 

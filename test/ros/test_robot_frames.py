@@ -139,7 +139,7 @@ def test_detections_of_tilted_and_level_sensor_are_equal(start, weights):
 
 
 @pytest.mark.parametrize("by", ["hand", "TF", "nothing"])
-def test_parameter_ahead_turns_the_view_of_the_detectors(start, weights, by):
+def test_parameter_ahead_rotates_the_view_of_the_detectors(start, weights, by):
     """A turned and tilted sensor gives the boxes of a level one, and points behind are cropped."""
     scan, ahead = frame(), 150.0
     weights = {**weights, "crop.sectors": [100.0, 260.0]}
@@ -189,7 +189,7 @@ def test_click_and_candidates_in_rotated_cloud(start):
     assert np.linalg.norm(detections.boxes[0, :2] - at[:2]) < 0.3
 
 
-def test_missing_frames_are_named_and_parameters_used(start):
+def test_missing_frames_are_reported_and_parameters_used(start):
     """Columns and boxes are bit for bit those of a node without frame parameters."""
     xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     plain = start(Perception)

@@ -157,7 +157,7 @@ def test_nav2_recipes_match_the_published_obstacles(graph):
             assert compatible(offered[topic], NAV2_QOS)[0] != QoSCompatibility.ERROR
 
 
-def test_a_costmap_gets_the_obstacles_of_each_cloud(processes, peer, drive_bag):
+def test_costmap_gets_the_obstacles_of_each_cloud(processes, peer, drive_bag):
     """Obstacles of both nodes equal the offline ones, with the cloud's header and Nav2's layout."""
     with Bag(drive_bag) as bag:
         cloud = next(m for _, _, m in bag.messages({POINTS}))

@@ -67,7 +67,7 @@ def ended():
 
 
 @pytest.mark.parametrize("name", list(CASES))
-def test_node_ends_whatever_hangs(ended, name):
+def test_node_ends_although_a_callback_hangs(ended, name):
     _, _, code, output = CASES[name]
     assert ended[name] == (output, code)
 

@@ -231,7 +231,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     assert "Traceback" not in (processes.logs / f"{NODE}.log").read_text()
 
 
-def test_detection_arrays_are_tracked_as_markers_are(start):
+def test_detection_arrays_are_tracked_like_markers(start):
     """The node runs in this process, because vision_msgs may be missing."""
     node, tracker = start(TrackerNode), Tracker()
     node.transforms.on_odometry(

@@ -17,7 +17,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 @few
 @given(seeds, st.integers(41, 400))
-def test_thresholds_are_scores_of_hits_at_evenly_spaced_recall(seed, objects):
+def test_thresholds_are_scores_at_evenly_spaced_recall(seed, objects):
     rng = np.random.default_rng(seed)
     hits = rng.uniform(0, 1, rng.integers(1, objects + 1))
     chosen = choose_thresholds(hits, objects)
@@ -29,7 +29,7 @@ def test_thresholds_are_scores_of_hits_at_evenly_spaced_recall(seed, objects):
 
 
 @pytest.mark.parametrize("objects", [1, 2, 7, 40, 41, 1000])
-def test_perfect_curve_averages_to_100_with_few_objects(objects):
+def test_perfect_detections_of_few_objects_have_ap_100(objects):
     thresholds = choose_thresholds(np.linspace(1, 0, objects), objects)
     right = np.ones(len(thresholds))
     assert average_curve(sample_curve(right, objects)) == pytest.approx((100, 100))

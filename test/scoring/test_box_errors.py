@@ -51,7 +51,7 @@ def moved(boxes: np.ndarray, away=0.0, aside=0.0, **sizes) -> np.ndarray:
 
 @settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1))
-def test_scores_equal_to_share_of_right_boxes_are_reliable(seed):
+def test_scores_equal_to_the_precision_are_reliable(seed):
     rng = np.random.default_rng(seed)
     true = cars(400, rng)
     true[:, :2] *= 20  # far apart

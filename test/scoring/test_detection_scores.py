@@ -150,7 +150,7 @@ def test_average_precision_equals_hand_computed_value():
         ("found twice", None, car(score=0.95), "easy", 100, 100),
     ],
 )
-def test_what_counts_as_wrong(case, other_truth, other_found, level, image, space):
+def test_false_positives_follow_the_kitti_rules(case, other_truth, other_found, level, image, space):
     truth = concatenate(car(), *([other_truth] if other_truth else []))
     rows = ap([(truth, concatenate(car(score=0.9), other_found))])["Car"]
     assert rows["3d"][level]["objects"] == 1
@@ -179,12 +179,12 @@ def test_what_counts_as_wrong(case, other_truth, other_found, level, image, spac
         (dict(kind="Truck"), (0, 0, 0)),
     ],
 )
-def test_what_must_be_found(change, counted):
+def test_required_objects_follow_the_kitti_rules(change, counted):
     rows = ap([(car(**change), "")])["Car"]["3d"]
     assert tuple(rows[level]["objects"] if rows[level] else 0 for level in DIFFICULTIES) == counted
 
 
-def test_truncation_level_of_tracks_is_not_a_share():
+def test_truncation_level_of_tracks_is_not_a_fraction():
     inside = np.array([20.0, 0, -0.9, 3.9, 1.6, 1.5, 0.2])
     across = np.array([7.0, 6.3, -0.9, 3.9, 1.6, 1.5, 0.2])
     share = project_boxes(across[None], CALIBRATION)[1][0]
@@ -218,7 +218,7 @@ def test_missing_label_fields_are_computed_from_the_box():
 
 @few
 @given(seeds)
-def test_the_truth_scores_100_in_everything(seed):
+def test_labels_as_detections_score_100_everywhere(seed):
     rng = np.random.default_rng(seed)
     # Objects far apart: where labels overlap one another one may be found by another's box.
     truths = [
@@ -369,7 +369,7 @@ def brute_best(scores):
 
 
 @given(seeds)
-def test_the_best_score_is_the_best_of_all_scores(seed):
+def test_best_score_is_the_maximum_of_all_scores(seed):
     rng = np.random.default_rng(seed)
     scores = CentreScores()
     for _ in range(6):
@@ -382,7 +382,7 @@ def test_the_best_score_is_the_best_of_all_scores(seed):
     )
 
 
-def test_detections_of_equal_score_are_kept_together():
+def test_detections_of_equal_score_share_a_threshold():
     # From 0.9 on: 2 * 1 / (1 + 2). From 0.5 on: 2 * 2 / (5 + 2). The hit alone is no choice.
     scores, person, wrong = CentreScores(), np.array([[10.0, 0, 0, 1, 1, 1, 0]]), np.ones((3, 7))
     scores.update(person, person, np.array([0.9]))

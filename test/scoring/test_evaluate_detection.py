@@ -141,7 +141,7 @@ def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
             assert cell["r40"] == 100
 
 
-def test_kept_share_of_points_is_repeatable(kitti, detector, tmp_path):
+def test_thinning_to_a_fraction_is_repeatable(kitti, detector, tmp_path):
     kept = {}
     for share in (1, 0.1, 0.1):
         detector.scans.clear()
@@ -158,7 +158,7 @@ def test_kept_share_of_points_is_repeatable(kitti, detector, tmp_path):
     assert len(kept[0.1][0]) != len(kept[0.1][1])  # each frame draws its own
 
 
-def test_a_smaller_share_is_part_of_a_larger_one(kitti):
+def test_smaller_fraction_is_a_subset_of_a_larger_one(kitti):
     frame = open_recording(kitti).frames[0].load()
     before = frame
     for share in (1.0, 0.5, 0.2, 0.1, 0.0):
@@ -182,7 +182,7 @@ def test_written_results_score_like_the_detections(kitti, detector, tmp_path):
         assert cells(read)[key] == pytest.approx(cell, abs=1e-3)
 
 
-def test_result_files_hold_what_was_found(tmp_path):
+def test_result_files_have_the_detections(tmp_path):
     rng = np.random.default_rng(3)
     boxes = np.column_stack(
         [
@@ -265,7 +265,7 @@ def test_results_that_cannot_be_written_end_the_run(kitti, detector, monkeypatch
     assert line.startswith("Error: cannot write") and not detector.scans
 
 
-def test_a_split_says_which_frames_are_scored(kitti, found, tmp_path):
+def test_split_selects_the_scored_frames(kitti, found, tmp_path):
     (found / "000000.txt").unlink()
     split = write(tmp_path / "val.txt", "000001\n000001\n")
     content, _ = evaluate(tmp_path, "--data", kitti, "--results", found, "--split", split)
@@ -284,14 +284,14 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_result_file_is_named_with_its_line(case, kitti, found, monkeypatch, capsys):
+def test_error_names_the_bad_result_file_and_line(case, kitti, found, monkeypatch, capsys):
     content, words = BAD[case]
     write(found / "000000.txt", content)
     line = error_of(monkeypatch, capsys, "--data", kitti, "--results", found)
     assert line.startswith("Error: ") and words in line and str(found) in line
 
 
-def test_missing_files_and_labels_are_named(kitti, found, tmp_path, monkeypatch, capsys):
+def test_missing_files_and_labels_are_reported(kitti, found, tmp_path, monkeypatch, capsys):
     def error(*arguments):
         return error_of(monkeypatch, capsys, "--data", kitti, *arguments)
 
@@ -318,7 +318,7 @@ def test_missing_files_and_labels_are_named(kitti, found, tmp_path, monkeypatch,
         (["--data", "a", "--results", "b", "--write-results", "c"], "already contains result files"),
     ],
 )
-def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):
+def test_contradictory_options_are_rejected(arguments, words, monkeypatch, capsys):
     assert exit_of(monkeypatch, "evaluate", "detection", *arguments) == 2
     assert words in capsys.readouterr().err
 
@@ -357,7 +357,7 @@ def test_real_boxes_project_onto_their_2d_labels(data, detector, tmp_path):
         assert cell["r40"] > (80 if name == "Pedestrian" and row in ("image", "aos") else 99.99)
 
 
-def test_real_tracks_are_scored_by_what_is_outside_the_image(data, tmp_path):
+def test_real_tracks_use_the_truncation_by_the_image_border(data, tmp_path):
     root = data / "kitti_tracking"
     frames = open_recording(root).frames
     for frame in frames:

@@ -99,7 +99,7 @@ def test_a_checkpoint_is_run_and_its_results_score_the_same(root, detector, tmp_
     assert max(len(line) for line in text.splitlines() if str(out) not in line) <= 80
 
 
-def test_scenes_are_chosen_by_a_file(root, tmp_path):
+def test_file_selects_the_scenes(root, tmp_path):
     scenes, path = tmp_path / "val.txt", tmp_path / "r.json"
     scenes.write_text("scene-0916\nscene-0916\n")
     write_results(path, {f.native.token: GlobalBoxes.none() for f in open_nuscenes(root)})
@@ -107,7 +107,7 @@ def test_scenes_are_chosen_by_a_file(root, tmp_path):
     assert content["frames"] == 4 and content["all"]["map"] == content["all"]["nds"] == 0
 
 
-def test_boxes_go_to_the_file_and_back(root, tmp_path):
+def test_result_file_round_trip(root, tmp_path):
     frames, rng = open_nuscenes(root), np.random.default_rng(0)
     written = {}
     for frame in frames:
@@ -183,7 +183,7 @@ def test_a_version_without_labels_is_written_and_not_scored(tmp_path, detector, 
         ('{"results": []}', "has no 'results'"),
     ],
 )
-def test_files_that_are_no_results_are_named(root, tmp_path, monkeypatch, capsys, text, words):
+def test_files_without_results_are_reported(root, tmp_path, monkeypatch, capsys, text, words):
     path = tmp_path / "r.json"
     if text is not None:
         path.write_text(text)
@@ -199,12 +199,12 @@ def test_files_that_are_no_results_are_named(root, tmp_path, monkeypatch, capsys
         (["--data", "a", "--results", "b", "--write-results", "c"], "already is a result file"),
     ],
 )
-def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):
+def test_contradictory_options_are_rejected(arguments, words, monkeypatch, capsys):
     assert exit_of(monkeypatch, "evaluate", "nuscenes", *arguments) == 2
     assert words in capsys.readouterr().err
 
 
-def test_scene_files_that_are_wrong_are_named(root, tmp_path, monkeypatch, capsys):
+def test_invalid_scene_files_are_reported(root, tmp_path, monkeypatch, capsys):
     def error(path):
         return error_of(monkeypatch, capsys, "--data", root, "--weights", "w", "--split", path)
 

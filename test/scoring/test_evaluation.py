@@ -64,7 +64,7 @@ def distances(found, truth, pairs):
 
 
 @given(seeds, small, small, st.sampled_from([0.3, 1.0, 5.0]))
-def test_matching_is_the_best_of_all_pairings(seed, found_count, truth_count, limit):
+def test_matching_is_the_best_of_all_assignments(seed, found_count, truth_count, limit):
     rng = np.random.default_rng(seed)
     found, truth = some(rng, found_count), some(rng, truth_count)
     pairs = match_centres(found, truth, limit)
@@ -136,7 +136,7 @@ def test_hits_misses_and_false_positives_add_up(seed, frames):
         assert row["f1"] == pytest.approx(2 * p * r / (p + r) if p + r else 0.0)
 
 
-def test_a_case_by_hand():
+def test_scores_equal_hand_computed_values():
     score = Score()
     score.update(
         boxes([10.3, 0, 0], [20, 0, 0.5], [14.5, 14.5, 0], [61, 0, 0]), boxes([10, 0, 0], [20, 0, 0], [40, 0, 0])
@@ -173,7 +173,7 @@ def test_a_range_begins_at_its_lower_limit():
     assert [RANGE_NAMES[i] for i in find_range_bins(at)] == ["0-15", "0-15", "15-30", "30-45", "45-60", "60+", "60+"]
 
 
-def test_nothing_found_and_nothing_to_find_have_ratios_of_0():
+def test_ratios_are_0_without_detections_or_labels():
     empty = Score().make_rows()["all"]
     assert empty == dict(tp=0, fp=0, fn=0, precision=0.0, recall=0.0, f1=0.0, centre_error_m=None)
 

@@ -47,7 +47,7 @@ def scored(truth, found, kind="car", true_frames=None, found_frames=None):
 ROW = [(10.0 * i, 0.0) for i in range(20)]
 
 
-def test_everything_found_scores_one():
+def test_perfect_detections_score_1():
     s = scored(
         boxes(*ROW, velocities=1.0, attributes=6),
         boxes(*ROW, scores=np.linspace(1, 0.1, 20), velocities=1.0, attributes=6),
@@ -87,7 +87,7 @@ def test_a_hit_is_nearer_than_the_distance():
     assert s.ap == pytest.approx({0.5: 0, 1.0: 0, 2.0: 1, 4.0: 1})
 
 
-def test_an_object_is_found_once_and_by_the_better_score():
+def test_object_matches_once_with_the_better_score():
     """The second detection is a false positive, so precision at recall 1 is 0.5."""
     truth = boxes((0, 0))
     for first, other in ((0.2, 0.0), (0.0, 0.2)):
@@ -96,14 +96,14 @@ def test_an_object_is_found_once_and_by_the_better_score():
         assert s.errors["ate"] == pytest.approx(first)
 
 
-def test_a_detection_takes_what_is_left():
+def test_detection_matches_the_nearest_unmatched_object():
     """The first takes the nearer object; the other takes the farther one, or is a false
     positive."""
     s = scored(boxes((0, 0), (3, 0)), boxes((0.1, 0), (0.5, 0), scores=[0.9, 0.8]))
     assert s.ap == pytest.approx({**dict.fromkeys((0.5, 1.0, 2.0), (39 + 0.4 / 0.9) / 90), 4.0: 1})
 
 
-def test_objects_of_other_frames_are_not_found():
+def test_objects_of_other_frames_are_not_matched():
     truth, found = boxes((0, 0), (0, 0)), boxes((0, 0), (0, 0), scores=[0.9, 0.8])
     assert scored(truth, found, true_frames=[0, 1], found_frames=[1, 0]).mean_ap == pytest.approx(1)
     assert scored(truth, found, true_frames=[0, 3], found_frames=[1, 2]).mean_ap == 0
@@ -117,7 +117,7 @@ def test_no_detections_or_labels_give_ap_0_and_errors_1():
     assert [k for k, v in cone.errors.items() if math.isnan(v)] == ["aoe", "ave", "aae"]
 
 
-def test_errors_of_a_pair():
+def test_errors_of_a_match_equal_hand_computed_values():
     truth = boxes((0, 0), velocities=[3.0, 0.0], attributes=5)
     found = boxes((0.3, 0.4), yaw=math.pi - 0.1, velocities=[0.0, 4.0], attributes=6)
     larger = GlobalBoxes.of(found.centres, 2 * found.sizes, found.rotations, found.class_ids)
@@ -148,7 +148,7 @@ def test_a_class_counts_within_its_range_of_the_vehicle(kind):
     assert (RANGES["car"], RANGES["pedestrian"], RANGES["barrier"]) == (50, 40, 30)
 
 
-def test_labels_without_points_and_cycles_in_racks_do_not_count():
+def test_empty_labels_and_bicycles_in_racks_do_not_count():
     rack = boxes((0, 0), yaw=math.pi / 2)  # 2 m along x, 4 m along y
     for kind, inside in ("bicycle", False), ("motorcycle", False), ("pedestrian", True):
         kept = select_counted(boxes((0.9, 1.9), (1.9, 0.9), kind=kind), np.zeros(3), rack)
@@ -191,7 +191,7 @@ def close_to_reference(content, by_class, over):
     "seed, frames, objects, noise", [(0, 2, 20, 0.1), (1, 3, 60, 0.4), (2, 5, 150, 0.4), (3, 4, 90, 1.0)]
 )
 @pytest.mark.no_cover
-def test_the_same_as_a_second_reading(tmp_path, seed, frames, objects, noise):
+def test_scores_equal_an_independent_implementation(tmp_path, seed, frames, objects, noise):
     tables = folder.make_tables(seed, frames, objects)
     results = folder.make_results(tables, CATEGORIES, seed + 10, noise)
     by_class, over = reference.evaluate(tables, results, CATEGORIES)
@@ -201,7 +201,7 @@ def test_the_same_as_a_second_reading(tmp_path, seed, frames, objects, noise):
 
 
 @pytest.mark.parametrize("seed, ties", [(4, False), (5, False), (4, True)])
-def test_the_same_as_nuscenes_devkit(tmp_path, seed, ties):
+def test_scores_equal_the_nuscenes_devkit(tmp_path, seed, ties):
     module = pytest.importorskip("nuscenes.eval.detection.evaluate", reason="needs nuscenes-devkit")
     from nuscenes import NuScenes
     from nuscenes.eval.common.config import config_factory
@@ -238,7 +238,7 @@ def test_the_same_as_nuscenes_devkit(tmp_path, seed, ties):
         )
 
 
-def test_turning_and_moving_the_world_changes_nothing(tmp_path):
+def test_rotating_and_shifting_the_world_changes_nothing(tmp_path):
     results = folder.make_results(TABLES, CATEGORIES)
     before = reported(folder.save(tmp_path / "a", TABLES, sweeps=False), results)
     tables, turn = copy.deepcopy(TABLES), folder.Rotation.from_euler("z", 1.1)
@@ -293,7 +293,7 @@ def spoil(**values):
         (spoil(rotation=[1e308, 0, 0, 0]), "a quaternion"),
     ],
 )
-def test_results_that_are_wrong_are_named(tmp_path, change, words):
+def test_invalid_results_are_reported(tmp_path, change, words):
     results = folder.make_results(TABLES, CATEGORIES)
     change(results)
     with pytest.raises(InputError) as caught:

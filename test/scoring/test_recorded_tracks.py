@@ -76,6 +76,6 @@ def test_recorded_tracks_are_scored_if_labels_have_ids(recorded):
     assert read_results(path, "/nothing")[0] == []
 
 
-def test_the_recorded_tracks_have_their_trails(recorded):
+def test_recorded_tracks_have_trails(recorded):
     trails = read_trails(recorded[2])
     assert {*trails} == {1, 2, 3, 4, 5, 6} and all(len(way) > 5 for way in trails.values())

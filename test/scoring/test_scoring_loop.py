@@ -139,7 +139,7 @@ def test_limit_reads_no_other_frames(root, limit, expected):
     assert touched == [f"00000{i}" for i in range(min(limit or COUNT, COUNT))]
 
 
-def test_start_and_each_measurement_run_once_and_lazily(root):
+def test_setup_and_measurements_run_once_and_lazily(root):
     called = []
 
     def start(recording):

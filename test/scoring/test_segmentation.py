@@ -104,13 +104,13 @@ def test_half_and_merged_objects_are_no_hits():
         assert (content["mean_iou"], content["hits"], content["f1"]) == (0.5, 0, 0)
 
 
-def test_a_piece_has_a_tenth_of_the_object():
+def test_fragments_need_a_tenth_of_the_object():
     for small, pieces in ((9, 1), (10, 2)):
         score = score_clusters(np.repeat([3, 1], [100 - small, small]), objects(np.ones(100)))
         assert score.pieces.tolist() == [pieces]
 
 
-def test_a_case_by_hand():
+def test_scores_equal_hand_computed_values():
     # Of object a 8 of 10 points are in cluster 1, beside 2 others; of b none is found. Cluster 2
     # is half near an object, so not judged; cluster 3 is far from all; 4 is judged, and no hit.
     owner = np.repeat([1, 1, 2, 0, 0, 0, 0], [8, 2, 10, 2, 4, 6, 3])
@@ -129,7 +129,7 @@ def test_a_case_by_hand():
     assert (content["frames"], content["ms"], content["clusters_per_frame"]) == (1, 2.0, 4.0)
 
 
-def test_neutral_points_are_neutral_for_their_object_only():
+def test_neutral_points_count_for_other_objects():
     owner, region = np.repeat([1, 0, 2], [10, 10, 10]), np.repeat([1, 1, 2], [10, 10, 10])
     clean = score_clusters(np.repeat([1, 0, 2], [10, 10, 10]), objects(owner, region))
     with_road = score_clusters(np.repeat([1, 1, 2], [10, 10, 10]), objects(owner, region))
@@ -139,7 +139,7 @@ def test_neutral_points_are_neutral_for_their_object_only():
 
 
 @pytest.mark.parametrize("counted", [0, 10, 20])
-def test_clusters_of_uncounted_points_are_not_judged(counted):
+def test_clusters_of_ignored_points_are_not_scored(counted):
     """Most points of a frame can be unlabelled."""
     truth = objects(np.repeat([1, 0, 2], 10), near=np.ones(30), counted=np.arange(30) < counted)
     assert score_clusters(np.repeat([1, 2, 3], 10), truth).judged == counted / 10
@@ -178,7 +178,7 @@ def test_scores_equal_a_plain_loop_over_sets(seed):
     assert score.judged >= np.sum(score.iou > 0.5)  # so that no ratio is above 1
 
 
-def test_nothing_found_and_nothing_to_find():
+def test_no_clusters_or_no_objects_have_scores():
     nothing = report_of(np.zeros(20), objects(np.ones(20)))
     assert (nothing["recall"], nothing["precision"], nothing["mean_iou"]) == (0, 0, 0)
     for found in (np.zeros(20), np.ones(20), np.zeros(0)):
@@ -251,7 +251,7 @@ def test_instances_include_moving_points():
     assert set(MOVING) == set(range(252, 260)) and set(MOVING.values()) <= set(THINGS)
 
 
-def test_each_protocol_by_hand():
+def test_scores_of_each_protocol_equal_hand_computed_values():
     semantic = np.array([40, 44, 48, 49, 60, 72, 70, 70, 70, 0, 1, 10, 50], np.uint16)
     z = np.full(len(semantic), -1.7)
     z[7:9] = [-1.3, -1.2]  # at the limit is not low
@@ -267,7 +267,7 @@ def test_each_protocol_by_hand():
 
 
 @pytest.mark.parametrize("height", [0.7, SENSOR_HEIGHT, 3.0])
-def test_low_vegetation_is_low_over_the_road_of_any_sensor(height):
+def test_low_vegetation_is_measured_from_the_road(height):
     xyz = np.random.default_rng(0).uniform(-9, 9, (450, 3)).astype(np.float32)
     xyz[:, 2] = np.repeat([0.0, 0.4, 0.5], [400, 30, 20]) - height
     truth = PointTruth(np.repeat([40, 70], [400, 50]).astype(np.uint16), np.zeros(450, np.uint16))
@@ -277,7 +277,7 @@ def test_low_vegetation_is_low_over_the_road_of_any_sensor(height):
     assert (tp + fn, fp + tn) == (430, 20)
 
 
-def test_counts_and_ratios_of_ground_by_hand():
+def test_ground_scores_equal_hand_computed_values():
     found = np.array([1, 1, 1, 0, 0, 0, 0, 1, 0], bool)
     ground = np.array([1, 1, 0, 1, 0, 0, 0, 1, 0], bool)
     counted = np.array([1, 1, 1, 1, 1, 1, 1, 0, 0], bool)
@@ -332,7 +332,7 @@ def test_a_folder_is_read_in_order_without_unusable_returns(tmp_path):
         ("kitti", "velodyne/000000.bin", bytes(41), "not a multiple of 16"),
     ],
 )
-def test_a_broken_folder_gives_one_line_with_a_remedy(tmp_path, root, file, content, text):
+def test_error_for_broken_folder_names_the_remedy(tmp_path, root, file, content, text):
     semantic_folder(tmp_path / "kitti", ["00/000000"])
     if file:
         write(tmp_path / root / "sequences/00" / file, content)
@@ -387,7 +387,7 @@ def test_methods_and_frames_can_be_chosen(tmp_path):
     assert png.read_bytes().startswith(b"\x89PNG")
 
 
-def test_invalid_calls_name_the_reason(tmp_path):
+def test_error_for_invalid_call_names_the_reason(tmp_path):
     root = semantic_folder(tmp_path / "semantic", ["00/000000"])
     kitti = object_folder(tmp_path / "kitti")
     for arguments, text in (

@@ -78,7 +78,7 @@ def counted(sequences):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_fast_scores_equal_a_slow_reading(seed):
+def test_fast_scores_equal_a_slow_implementation(seed):
     sequences = random_sequences(seed)
     hota, clear = counted(sequences)
     assert [hota[k] for k in ("HOTA", "DetA", "AssA")] == pytest.approx(slow.hota(plainly(sequences)), abs=1e-12)
@@ -89,7 +89,7 @@ def test_fast_scores_equal_a_slow_reading(seed):
     )
 
 
-def test_names_of_ids_do_not_matter():
+def test_renaming_ids_changes_nothing():
     sequences = random_sequences(7)
     renamed = [
         [replace(f, track_ids=1000 - f.track_ids, true_ids=f.true_ids * 7 + 3) for f in frames] for frames in sequences
@@ -130,7 +130,7 @@ def test_swapped_ids_are_two_switches():
     assert score["AssA"] == pytest.approx(1 / 3)  # each pair 5 of 10 + 10 - 5
 
 
-def test_the_order_in_which_frames_come_does_not_matter():
+def test_order_of_frames_does_not_matter():
     frames = drive(switch_at=4)
     assert scored(frames, order=[9, 3, 1, 0, 2, 8, 7, 4, 5, 6]) == scored(frames)
 
@@ -238,7 +238,7 @@ def test_no_tracks_are_misses_and_no_labels_false_positives():
     assert scored([(nothing, nothing)]) is None
 
 
-def test_what_cannot_be_scored_says_why():
+def test_error_explains_why_tracks_cannot_be_scored():
     truth, tracks = drive(frames=1)[0]
     twice = to_tracked_labels(np.array([3, 3]), Detections.of(tracks.boxes, CAR))
     with pytest.raises(InputError, match="a/0: a frame has the track id 3 twice"):
@@ -255,7 +255,7 @@ def test_what_cannot_be_scored_says_why():
         make_pairs(truth, tracks, None, "image")
 
 
-def test_result_files_come_back_as_they_were(tmp_path):
+def test_result_file_round_trip(tmp_path):
     frames = [
         (i, np.array([4, 9]), Detections.of(tracks.boxes, [CAR, 4], [0.25, 0.75]))
         for i, (_, tracks) in enumerate(drive(frames=3))

@@ -86,7 +86,7 @@ def test_slice_of_wall_is_not_ground_of_upside_down_sensor():
     assert not measure_mount(indoors).upside_down
 
 
-def test_partly_seen_model_gets_all_its_beams(tmp_path):
+def test_known_model_gets_all_beams_from_a_partial_view(tmp_path):
     seen = tuple(
         s._make(column[s.ring > 1] if isinstance(column, np.ndarray) else column for column in s)
         for s in scans("vlp-16")
@@ -127,7 +127,7 @@ def test_beams_by_ring_and_by_elevation_agree():
     assert len(one_label_each) == 16
 
 
-def test_lines_of_non_repeating_pattern_are_not_beams():
+def test_scan_lines_of_non_repeating_pattern_are_not_beams():
     """The four lines of a Livox scan the whole view; here all returns are from a ceiling."""
     rng = np.random.default_rng(0)
     changed = []

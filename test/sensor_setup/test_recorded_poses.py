@@ -58,7 +58,7 @@ def record(poses, actual, mount=None, height=None):
 
 
 @pytest.mark.parametrize("yaw", [0, pytest.param(-150, marks=pytest.mark.no_cover)])
-def test_heading_is_x_of_base_even_when_reversing(yaw):
+def test_heading_is_the_x_axis_of_the_base_even_when_reversing(yaw):
     """The sensor's x is at yaw in the base, so the base's x is at -yaw in the sensor."""
     _, poses = drive()
     mount = make_mount(yaw)

@@ -225,7 +225,7 @@ def test_tilted_sensor_has_no_blind_sky_and_nearest_ground(roll, pitch):
     assert choose_params(m)["ground.patchwork.min_range"][0] <= nearest
 
 
-def test_sector_without_returns_ends_view():
+def test_sector_without_returns_limits_the_field_of_view():
     m = measure(change_scans(lambda p: p[np.abs(np.arctan2(p["y"], p["x"])) < np.radians(60)]))
     start, end = m.view.coverage.view
     assert abs(start - 300) <= 1 and abs(end - 60) <= 1
@@ -326,7 +326,7 @@ def test_mount_is_unknown_without_ground():
     assert m.mounting.mount is None and warns(m, "no ground in view", "sensor_pose")
 
 
-def test_unusable_clouds_are_refused():
+def test_unusable_clouds_are_rejected():
     def in_millimetres(points):
         for axis in "xyz":
             points[axis] *= 1000
@@ -380,7 +380,7 @@ def test_mixed_frames_gaps_and_jumping_stamps_are_reported():
         (np.arange(60000.0), 65535.0, True),
     ],
 )
-def test_intensity_scale(values, full, sure):
+def test_intensity_scale_is_measured(values, full, sure):
     scan = replace_intensity(change_scans(None)[0], values)
     found = measure_intensity([scan])
     assert (found.full_scale, found.is_certain) == (full, sure)

@@ -118,7 +118,7 @@ def test_nearest_of_single_casts_equals_joint_cast(motion):
         assert np.array_equal(getattr(hits, name), nearest[name]), name
 
 
-def test_wall_is_flat_only_after_compensation():
+def test_wall_is_flat_only_after_motion_compensation():
     wall = make_solids(BOX, (10, 0, 0), (1, 40, 8))
     exact = replace(SENSOR, range_noise=0.0, dropout=0.0)
     hits = cast_rays(wall, Ground(), NO_GROUND, exact, DRIVE)
@@ -183,7 +183,7 @@ def test_rays_from_inside_are_stopped_only_by_foliage(even_leaves):
     assert abs((inside[1] < 1).mean() - (1 - np.exp(-1))) < 0.03 and inside[1].min() > 0
 
 
-def test_glass_passes_its_share_of_rays():
+def test_glass_transmits_the_given_fraction_of_rays():
     panes = make_solids([BOX, BOX], [(8, 0, 0), (12, 0, 0)], (0.01, 3, 2), [1, 2], transmission=0.7)
     panes = replace(panes, transmission=np.array([0.7, 0.0]))
     fine = make_generic_sensor(32, -5.0, 5.0, 0.1, 10.0, divergence=0.0)
@@ -195,7 +195,7 @@ def test_glass_passes_its_share_of_rays():
     assert set(np.unique(hits.owner[front])) == {1, 2}
 
 
-def test_nearest_solid_wins_and_reached_counts_hidden_rays():
+def test_nearest_solid_is_hit_and_occluded_rays_are_counted():
     both = make_solids([BOX, BOX], [(9, 0, 0), (5, 0, 0)], (0.5, 0.5, 1.0), [2, 1])
     hits = cast_rays(both, Ground(), OVER_ROAD, SENSOR)
     hit_counts = np.bincount(hits.owner.ravel(), minlength=3)
@@ -203,7 +203,7 @@ def test_nearest_solid_wins_and_reached_counts_hidden_rays():
     assert hit_counts[1] == hits.reached[1] and hit_counts[2] < 0.4 * hits.reached[2]
 
 
-def test_edge_beams_return_from_between_or_one_side():
+def test_beam_on_an_edge_returns_one_side_or_a_range_between():
     near, far = (BOX, (5, 0, 0), (0.2, 1, 1)), (BOX, (5.7, 0, 0), (0.2, 9, 4))
     objects = make_solids(*zip(near, far), [1, 2])
     fine = make_generic_sensor(64, -10.0, 10.0, 0.2, 10.0, divergence=3e-3)

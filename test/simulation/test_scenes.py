@@ -114,7 +114,7 @@ def test_points_and_boxes_agree_with_world(scene, kind):
             assert far.max() < np.hypot(*box[3:5]) / 2 + 0.6 + speed / TINY.rate
 
 
-def test_robots_have_labels_all_around_and_no_camera(tmp_path):
+def test_robot_scenes_have_labels_all_around_and_no_camera(tmp_path):
     frames = list(simulate_frames(3, 2, TINY, 1, Scenes(None, 3.0, "campus")))
     for number, frame in enumerate(frames):
         truth = frame.truth()
@@ -125,7 +125,7 @@ def test_robots_have_labels_all_around_and_no_camera(tmp_path):
     assert next(simulate_frames(3, 1, TINY, 1)).camera() is not None
 
 
-def test_mixed_scenes_alternate():
+def test_mixture_alternates_between_kinds_of_scenes():
     mixed = Scenes(None, 1.0, "street,indoor")
     assert make_cached_scene("indoor", None, 3).kind == make_scene(3, None, 2.0, mixed.scene).kind
     assert make_scene(4, None, 1.0, mixed.scene).kind == make_scene(4).kind
@@ -213,7 +213,7 @@ def test_command_writes_every_layout_for_robots(layout, tmp_path):
         (Scenes(people=1e25), "people = 1e.25 must be 0 .. 100"),
     ],
 )
-def test_unknown_scenes_are_named(scenes, message):
+def test_unknown_scene_raises_input_error(scenes, message):
     with pytest.raises(InputError, match=message):
         next(simulate_frames(0, 1, TINY, 1, scenes))
 

@@ -47,7 +47,7 @@ def make_measurement(sensor, distance, brightness=0.3, motion=NO_MOTION, seed=0,
 
 
 @pytest.mark.parametrize("name", SENSOR_NAMES)
-def test_presets_are_sensible(name):
+def test_presets_have_plausible_values(name):
     sensor = find_sensor(name)
     direction = sensor.directions()
     assert direction.shape == (sensor.columns, sensor.rings, 3)
@@ -92,13 +92,13 @@ def test_hdl64e_agrees_with_kitti():
         ({"fade": (np.nan, 0)}, "fade"),
     ],
 )
-def test_impossible_sensors_are_refused(change, named):
+def test_impossible_sensors_are_rejected(change, named):
     with pytest.raises(InputError, match=named) as error:
         replace(SMALL, **change)
     assert "\n" not in str(error.value)
 
 
-def test_bad_generic_sensors_and_unknown_names_are_refused():
+def test_bad_generic_sensors_and_unknown_names_are_rejected():
     for wrong in ((0, -10, 10), (16, 10, -10), (16, -95, 10)):
         with pytest.raises(InputError):
             make_generic_sensor(*wrong, 0.2, 10.0)
@@ -106,7 +106,7 @@ def test_bad_generic_sensors_and_unknown_names_are_refused():
         find_sensor("hdl128")
 
 
-def test_names_are_found_in_any_spelling():
+def test_sensor_names_are_accepted_in_any_spelling():
     assert find_sensor("os1_64") == find_sensor("OS1-64") != find_sensor("os1-128")
     assert find_sensor("hdl64e") == find_sensor("HDL-64E") == HDL64E
 
@@ -156,7 +156,7 @@ def test_file_in_degrees_gives_sensor_in_radians(tmp_path):
         ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [[0.5, 0, 10]]", "blocked"),
     ],
 )
-def test_bad_sensor_file_is_named_with_reason(tmp_path, text, named):
+def test_error_names_the_bad_sensor_file_and_the_reason(tmp_path, text, named):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=named) as error:
@@ -173,7 +173,7 @@ def test_wandering_beams_fill_gaps_evenly():
     assert np.diff(lower).max() < np.radians(2.0) / 50 * 2.7
 
 
-def test_rays_turn_and_move_with_the_sensor():
+def test_rays_rotate_and_move_with_the_sensor():
     motion = Motion((3.0, -2.0, 0.5), 0.7, stamp=0.25)
     still, turn = make_rays(SMALL), make_rays(SMALL, motion)
     assert np.allclose(turn.since, SMALL.times() - 0.025)
@@ -302,7 +302,7 @@ def test_vehicle_blocks_its_sectors():
 @pytest.mark.parametrize(
     "start, end, degrees", [(0, 360, 360), (-180, 180, 360), (-10, 370, 360), (350, 10, 20), (-10, 10, 20), (10, 10, 0)]
 )
-def test_blocked_sector_may_be_whole_turn(start, end, degrees):
+def test_blocked_sector_may_cover_360_degrees(start, end, degrees):
     shut = ~replace(SMALL, blocked=((4, start, end),)).open_rays()
     assert (shut[:, 4:].sum(axis=0) == 2 * degrees).all() and not shut[:, :4].any()
 
@@ -326,7 +326,7 @@ def test_blocked_sector_may_be_whole_turn(start, end, degrees):
         "generic:nan,-25,15,0.2,10",
     ],
 )
-def test_bad_generic_sensor_is_refused_in_one_line(name):
+def test_bad_generic_sensor_is_rejected_in_one_line(name):
     with pytest.raises(InputError) as error:
         find_sensor(name)
     assert "\n" not in str(error.value) and "must" in str(error.value)

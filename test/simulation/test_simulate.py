@@ -135,7 +135,7 @@ def test_data_set_is_locked_and_ctrl_c_ends_processes(start, tmp_path):
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_full_disk_is_one_line_error(made, tmp_path, monkeypatch, call):
+def test_full_disk_is_reported_in_one_line(made, tmp_path, monkeypatch, call):
     out, calls, real = tmp_path / "set", itertools.count(), getattr(os, call)
 
     def full(*args, **others):
@@ -153,7 +153,7 @@ def test_full_disk_is_one_line_error(made, tmp_path, monkeypatch, call):
     assert content(out) == content(made / "kitti")
 
 
-def test_unwritable_file_ends_work(tmp_path):
+def test_unwritable_file_ends_the_run(tmp_path):
     blocked = tmp_path / "set/training/velodyne/000003.bin"
     run(tmp_path / "set", "kitti", 5, 1, "--streets-of", 5)
     (tmp_path / "set/dataset.json").rename(tmp_path / "set/INCOMPLETE")  # .parts is gone already
@@ -164,7 +164,7 @@ def test_unwritable_file_ends_work(tmp_path):
     assert (tmp_path / "set/INCOMPLETE").exists()
 
 
-def test_existing_files_are_not_touched_without_option(made, tmp_path):
+def test_existing_files_are_kept_without_force(made, tmp_path):
     out = tmp_path / "set"
     assert run(out, "kitti", 2).exit_code == 0
     before = content(out)
@@ -233,7 +233,7 @@ def test_other_sensor_of_same_name_is_not_resumed(tmp_path):
         invoke([*options, "--resume"])
 
 
-def test_resume_names_every_difference(tmp_path, monkeypatch):
+def test_error_of_resume_names_every_difference(tmp_path, monkeypatch):
     out = tmp_path / "set"
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
         patch.setattr(dataset, "simulate_scan", lambda *_: 1 / 0)
@@ -261,7 +261,7 @@ def test_resume_names_every_difference(tmp_path, monkeypatch):
         (["--format", "mcap", "--resume"], "with 'convert'"),
     ],
 )
-def test_bad_arguments_are_named(tmp_path, options, message):
+def test_error_names_bad_arguments(tmp_path, options, message):
     arguments = ["--out", str(tmp_path / "set"), "--format", "kitti", *options]
     result = CliRunner().invoke(simulate, arguments)
     text = result.output + str(result.exception)

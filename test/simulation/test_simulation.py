@@ -33,7 +33,7 @@ def scan(seed, t, sensor=COARSE):
     return scene, moment, hits, xyz, owner
 
 
-def test_same_seed_same_bytes():
+def test_same_seed_gives_same_bytes():
     def content(seed):
         return [
             (
@@ -88,7 +88,7 @@ def test_points_of_object_are_in_its_box(seed, t):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_boxes_stand_on_the_ground_and_apart(seed):
+def test_boxes_stand_on_ground_without_overlap(seed):
     scene = street(seed)
     for t in (0.0, 2.0, 10.0, 19.9):
         moment = scene.at(t, 1.73)
@@ -102,7 +102,7 @@ def test_boxes_stand_on_the_ground_and_apart(seed):
             assert not points_in_box(np.delete(marks, i, axis=0).reshape(-1, 3), box).any()
 
 
-def test_pedestrians_walk_in_view_all_the_time():
+def test_pedestrians_are_always_in_view():
     for scan in simulate_drive(33, 11, replace(COARSE, rate=2.5), CROWDED_ZONES):
         boxes = scan.truth.of_class(PEDESTRIAN)
         distance, bearing = np.hypot(boxes[:, 0], boxes[:, 1]), np.arctan2(boxes[:, 1], boxes[:, 0])
@@ -133,7 +133,7 @@ def test_scans_resemble_those_of_real_sensor():
     "arguments, named",
     [({"frames": 0}, "frames = 0"), ({"frames": 10_000}, "frames = 10000"), ({"seed": -1}, "seed = -1")],
 )
-def test_bad_input_is_named_at_the_call(arguments, named):
+def test_invalid_arguments_raise_at_the_call(arguments, named):
     with pytest.raises(ValueError, match=named) as error:
         simulate_drive(**arguments)
     assert "\n" not in str(error.value)

@@ -83,7 +83,7 @@ def find_stride(obj):
 
 
 @pytest.mark.parametrize("name", [*LABELLED, *SCENERY])
-def test_parts_are_valid(name):
+def test_solids_of_every_shape_are_valid(name):
     make, most = {**LABELLED, **SCENERY}[name]
     for seed in SEEDS:
         parts = draw_parts(make, seed)
@@ -116,7 +116,7 @@ def test_box_covers_body_of_labelled_object(name):
 
 
 @pytest.mark.parametrize("name", ["walker", "child", "stander", "backpack"])
-def test_box_of_pedestrian_holds_for_whole_stride(name):
+def test_box_contains_pedestrian_during_the_entire_stride(name):
     make, _ = LABELLED[name]
     for seed in SEEDS:
         obj = make(np.random.default_rng(seed))
@@ -174,7 +174,7 @@ def test_faster_walkers_take_longer_steps():
 
 
 @pytest.mark.parametrize("carried", people.CARRIED[1:])
-def test_load_does_not_change_width_or_height_of_box(carried):
+def test_baggage_does_not_change_width_or_height_of_box(carried):
     plain = people.make_pedestrian(np.random.default_rng(2), 1.2)
     loaded = people.make_pedestrian(np.random.default_rng(2), 1.2, carried=carried)
     assert len(loaded.parts(0.0)) > len(plain.parts(0.0))
@@ -223,7 +223,7 @@ def scan_object(obj, distance, yaw, seed):
     return xyz + np.array([0.0, 0.0, 1.73])
 
 
-def test_low_share_of_cyclist_agrees_with_kitti():
+def test_fraction_of_low_points_of_cyclist_agrees_with_kitti():
     """46 % of the points of 10 KITTI cyclists are below 0.42 of their height."""
     shares = []
     for seed in SEEDS:
@@ -234,7 +234,7 @@ def test_low_share_of_cyclist_agrees_with_kitti():
 
 
 @pytest.mark.parametrize("distance, low, high", [(20.0, 0.22, 0.32), (33.0, 0.20, 0.32), (48.0, 0.08, 0.25)])
-def test_share_above_belt_of_car_falls_with_range(distance, low, high):
+def test_fraction_of_points_above_car_windows_falls_with_range(distance, low, high):
     """On KITTI 38, 31 and 16 % of the points are above 0.65 of the height, of 22, 17 and 15 cars
     seen from behind at 12 to 25, 25 to 40 and 40 to 70 m, whose lower parts are often hidden."""
     shares = []
@@ -256,7 +256,7 @@ def scan_cars_from_front():
 @pytest.mark.parametrize(
     "zone, low, high", [((0.15, 0.35), 0.04, 0.10), ((0.35, 0.55), 0.12, 0.24), ((0.55, 0.65), 0.45, 0.75)]
 )
-def test_only_bumper_reaches_front_of_box(zone, low, high):
+def test_only_the_bumper_touches_the_front_of_the_box(zone, low, high):
     """A quarter of the points of a zone of heights are within 0.07, 0.17 and 0.60 m of the end of
     the box: medians of 42 to 59 cars of KITTI seen from the front."""
     depths = []
@@ -275,7 +275,7 @@ def test_seats_do_not_reveal_length_of_car(length):
 
 
 @pytest.mark.parametrize("label", SIZES)
-def test_sizes_have_spread_of_table(label):
+def test_sizes_have_the_deviation_of_the_table(label):
     rng = np.random.default_rng(0)
     sizes = np.array([draw_size(rng, label) for _ in range(4000)])
     mean, spread, together = SIZES[label]

@@ -175,7 +175,7 @@ def test_moment_without_objects_has_empty_arrays():
         ({"kind": "moon"}, "kind = 'moon' must be one of city"),
     ],
 )
-def test_impossible_arguments_are_named(arguments, named):
+def test_error_names_impossible_arguments(arguments, named):
     with pytest.raises(InputError, match=named) as error:
         make_scene(**arguments)
     assert "\n" not in str(error.value)

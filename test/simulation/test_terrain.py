@@ -62,7 +62,7 @@ def test_no_ray_passes_through_ground():
         assert (z - surface_height(FULL, x, y)).min() > -2e-3
 
 
-def test_ground_classes_are_in_place():
+def test_road_sidewalk_and_grass_have_their_classes():
     at, semantic, _, _ = cast_on_ground(FULL, sensor=replace(SENSOR, azimuth_step=np.radians(0.25)))
     x, y, _ = at.T
     crossing = ((x > 8) & (x < 15)) | ((x > -30) & (x < -22))
@@ -126,7 +126,7 @@ def test_tuft_hits_equal_slow_march():
 
 
 @pytest.mark.parametrize("height, least", [(0.3, 0.0), (0.02, -1e-9)])
-def test_no_hit_behind_low_sensor(height, least):
+def test_low_sensor_has_no_hits_at_its_origin(height, least):
     """Next to a meadow whose tufts are higher than the sensor, and among bumps of the road."""
     meadow = Ground(curb_left=1.0, curb_right=-1.0, walk=0.0, rough=0.8)
     low = replace(SENSOR, height=height, lifts=())

@@ -224,7 +224,7 @@ def replace_kind(box):
     return Box(box.values, KEY)
 
 
-def test_frame_emptied_by_a_person_stays_empty():
+def test_frame_emptied_by_the_user_stays_empty():
     true = walking((5.0, 3.0), (1.0, 0.0), STANDING, PROPOSED)
     state = State({1: Track(1, "Pedestrian", boxes=true)}, next_id=2)
     state, _ = done(

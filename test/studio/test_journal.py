@@ -77,7 +77,7 @@ def test_kill_while_writing_loses_no_confirmed_action(tmp_path):
             assert [line["seq"] for line in journal.lines] == list(range(1, len(journal.lines) + 1))
 
 
-def test_second_process_is_refused_until_the_first_is_killed(tmp_path):
+def test_second_process_is_rejected_until_the_first_is_killed(tmp_path):
     with subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], text=True, stdout=subprocess.PIPE) as process:
         process.stdout.readline()
         with pytest.raises(InputError, match="another process"), open_journal(tmp_path, HEAD):
@@ -97,7 +97,7 @@ def test_second_process_is_refused_until_the_first_is_killed(tmp_path):
         make_journal_header("drive", ["a", "b c"], [1, 3]),
     ],
 )
-def test_journal_of_another_drive_is_refused_and_kept(tmp_path, other):
+def test_journal_of_another_drive_is_rejected_and_kept(tmp_path, other):
     content = filled(tmp_path, 2)
     with pytest.raises(InputError, match="another drive"), open_journal(tmp_path, other):
         pass
@@ -105,14 +105,14 @@ def test_journal_of_another_drive_is_refused_and_kept(tmp_path, other):
 
 
 @pytest.mark.parametrize("broken", [b"\x00\x01", b"[1]\n", b"{}\n", b"no journal"])
-def test_invalid_journal_is_refused_and_kept(tmp_path, broken):
+def test_invalid_journal_is_rejected_and_kept(tmp_path, broken):
     (tmp_path / JOURNAL_NAME).write_bytes(broken)
     with pytest.raises(InputError), open_journal(tmp_path, HEAD):
         pass
     assert (tmp_path / JOURNAL_NAME).read_bytes() == broken
 
 
-def test_missing_or_broken_line_is_refused(tmp_path):
+def test_missing_or_broken_line_is_rejected(tmp_path):
     content = filled(tmp_path, 3).splitlines(keepends=True)
     for wrong in (content[:2] + content[3:], [*content[:2], b"{\n", *content[3:]]):
         (tmp_path / JOURNAL_NAME).write_bytes(b"".join(wrong))

@@ -67,7 +67,7 @@ def test_old_journal_is_identified_by_the_drive_name(tmp_path):
         pass
 
 
-def test_journal_that_grew_meanwhile_is_not_overwritten(tmp_path, monkeypatch):
+def test_journal_changed_by_another_process_is_not_overwritten(tmp_path, monkeypatch):
     def no_locks(*_):
         raise OSError(9, "Bad file descriptor")
 
@@ -142,7 +142,7 @@ def test_concurrent_exports_are_complete(tmp_path):
         assert not [n for n in os.listdir(tmp_path) if n.endswith(".tmp")]
 
 
-def test_journal_is_refused_if_poses_appear_or_disappear(tmp_path):
+def test_journal_is_rejected_if_poses_appear_or_disappear(tmp_path):
     bare, posed = (
         drive(),
         Drive(
@@ -168,7 +168,7 @@ def test_export_does_not_overwrite_the_journal(tmp_path, name):
             session.export("nuscenes-detection", name, force=True)
 
 
-def test_nan_is_null_in_the_journal():
+def test_nan_is_written_as_null_in_the_journal():
     none, box = float("nan"), np.array([BOX])
     labels = DriveLabels(
         [

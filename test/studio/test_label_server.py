@@ -205,7 +205,7 @@ def test_invalid_request_is_reported_and_changes_nothing(server_url, wrong):
     run_on_page(server_url, questions)
 
 
-def test_requests_from_elsewhere_are_refused(server_url):
+def test_requests_from_other_origins_are_rejected(server_url):
     base, _, token = server_url.partition("/?token=")
     port = int(base.rpartition(":")[2])
 

@@ -191,7 +191,7 @@ def test_boxes_in_another_frame_are_transformed_once_tf_arrives(live, monkeypatc
     assert list_shown_frames(live)[-1] == 2  # shown without
 
 
-def test_two_trackers_have_distinct_ids_and_misses_are_known(live):
+def test_two_trackers_have_distinct_ids_and_misses_are_counted(live):
     live.expect_topic(TRACKED, TRACKS)
     live.expect_topic("/b/tracker/output/tracks", TRACKS)
     live.expect_topic("/ground_truth/detections", LABELS)

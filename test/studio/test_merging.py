@@ -28,7 +28,7 @@ def with_id(track, number, **more):
     return replace(track, id=number, **more)
 
 
-def test_proposals_keep_ids_and_edits_of_a_person():
+def test_proposals_keep_ids_and_edits_of_the_user():
     old = {
         1: with_id(straight(5, 0, range(8)), 1),
         2: with_id(straight(9, 0, range(8)), 2, state="rejected"),
@@ -64,7 +64,7 @@ def test_single_boxes_without_a_click_are_not_tracked():
 @pytest.mark.parametrize(
     "work", [{"do": "class", "track": 1, "class": "Cyclist"}, {"do": "split", "track": 1, "frame": 4}]
 )
-def test_proposals_leave_tracks_that_a_person_edited(work):
+def test_proposals_do_not_change_edited_tracks(work):
     state, _ = apply(State({1: with_id(straight(5, 0, range(8)), 1)}, next_id=2), work, MOTION)
     assert merge_proposals(state, [straight(5, 0, range(8))], MOTION) == ([], [])
 

@@ -11,7 +11,7 @@ from labeling_pages import boxes_of, opened
 pytestmark = pytest.mark.no_cover  # others run these lines
 
 
-def test_typed_number_changes_only_itself_and_escape_nothing(page, labels, person):
+def test_typed_number_changes_one_value_and_escape_cancels(page, labels, person):
     number = labels.chosen(page, person)
     page.click("[data-filter=all]")
     before, lines = labels.box(number), len(labels.lines())
@@ -97,7 +97,7 @@ def test_arrow_moves_the_box_after_a_class_was_chosen_by_mouse(page, labels, per
     page.click("#errors .toast button")
 
 
-def test_late_state_reverts_nothing(browser, page, labels, person):
+def test_outdated_server_state_reverts_nothing(browser, page, labels, person):
     number, states = labels.chosen(page, person), []
 
     def reply(route):

@@ -244,7 +244,7 @@ def test_seed_corrected_before_tracking_is_tracked(drive, tmp_path, monkeypatch,
     assert [f for f, b in found.boxes.items() if b.kind == KEY] == [0, 1]
 
 
-def test_undoing_a_correction_after_tracking_leaves_it_tracked(session, monkeypatch):
+def test_undoing_a_correction_keeps_the_track(session, monkeypatch):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
     session.propose()
     begun, start = [], session._start

@@ -192,7 +192,7 @@ def test_sources_have_unique_short_names():
     ]
 
 
-def test_missing_result_folder_is_named(tmp_path):
+def test_error_names_the_missing_result_folder(tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
         make_file_source(tmp_path / "none")
 
@@ -204,7 +204,7 @@ def test_missing_frame_is_reported(drive_bag):
 
 @pytest.mark.parametrize("verb", ["view", "label"])
 @pytest.mark.parametrize("content", [b"no cloud\n", b"", b"# .PCD v0.7\nDATA ascii\n"])
-def test_file_without_a_cloud_is_refused_before_serving(verb, content, tmp_path, monkeypatch, capsys):
+def test_file_without_a_cloud_is_rejected_before_serving(verb, content, tmp_path, monkeypatch, capsys):
     file = tmp_path / "text.pcd"
     file.write_bytes(content)
     monkeypatch.chdir(tmp_path)

@@ -41,7 +41,7 @@ def pairs_of(objects):
 
 
 @each_make
-def test_every_kind_of_detections_says_the_same(make):
+def test_every_type_of_detections_gives_the_same_message(make):
     found = some(np.random.default_rng(0), 7)
     expected = to_objects(found)
     truth = GroundTruth.of(found.boxes, found.class_ids)
@@ -63,7 +63,7 @@ def test_every_kind_of_detections_says_the_same(make):
 
 
 @pytest.mark.parametrize("limit", [{"max_distance": 0.5}, {"min_iou": 0.3}])
-def test_order_does_not_matter_and_what_was_taken_away_is_missing(limit):
+def test_order_does_not_matter_and_removed_detection_is_missing(limit):
     """Objects that are missing in one direction are extra in the other."""
     rng = np.random.default_rng(1)
     for _ in range(30):
@@ -85,7 +85,7 @@ def test_order_does_not_matter_and_what_was_taken_away_is_missing(limit):
             assert len(assert_detections(a, b, **limit, **{allowed: 1})) == len(fewer)
 
 
-def test_as_many_pairs_as_possible_and_a_class_is_a_class():
+def test_matching_maximizes_pairs_of_equal_class():
     """The nearest of the first would leave the second without any."""
     found = [("Car", [0, 0, 0]), ("Car", [0.9, 0, 0])]
     assert assert_detections(found, [("Car", [0.8, 0, 0]), ("Car", [1.7, 0, 0])]) == [(0, 0), (1, 1)]
@@ -105,7 +105,7 @@ def test_as_many_pairs_as_possible_and_a_class_is_a_class():
         (["Car"], "is not a MarkerArray"),
     ],
 )
-def test_what_is_no_detection_is_refused(found, words):
+def test_invalid_detections_are_rejected(found, words):
     with pytest.raises(InputError, match=words):
         assert_detections(found, [])
     with pytest.raises(InputError, match="min_iou needs complete boxes"):
@@ -113,7 +113,7 @@ def test_what_is_no_detection_is_refused(found, words):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_bag_gives_back_its_arrays(make_bag, storage):
+def test_bag_round_trip_of_arrays(make_bag, storage):
     truths = [walker_truth(), None, [("Pedestrian", walker_truth().boxes[0])]]
     path = make_bag([scene(i) for i in range(3)], truths, storage=storage, points="/front", hz=5.0)
     assert [p.suffix for p in path.iterdir() if p.name != "metadata.yaml"] == [
@@ -140,12 +140,12 @@ def test_a_bag_gives_back_its_arrays(make_bag, storage):
         (make_frames([scene()]), [None], {"hz": 5.0}, "they take no labels and no hz"),
     ],
 )
-def test_a_bag_that_cannot_be_made_is_refused_by_name(make_bag, clouds, labels, options, words):
+def test_error_names_the_bag_that_cannot_be_written(make_bag, clouds, labels, options, words):
     with pytest.raises(InputError, match=words):
         make_bag(clouds, labels, **options)
 
 
-def test_a_cloud_message_holds_its_columns():
+def test_cloud_message_has_the_given_columns():
     ring = np.arange(3400, dtype=np.uint16) % 64
     points = to_array(make_cloud_message(scene(), 7, ring=ring))
     assert np.array_equal(points["ring"], ring) and points.dtype["ring"] == np.uint16
@@ -154,7 +154,7 @@ def test_a_cloud_message_holds_its_columns():
         make_cloud_message(np.zeros(3))
 
 
-def test_without_launch_it_says_what_is_missing(monkeypatch):
+def test_missing_launch_package_is_reported(monkeypatch):
     for module in ("launch", "launch.actions", "launch.launch_description", "launch_testing"):
         monkeypatch.setitem(__import__("sys").modules, module, None)
     for call in make_description, include_launch_file:
@@ -162,5 +162,5 @@ def test_without_launch_it_says_what_is_missing(monkeypatch):
             call()
 
 
-def test_a_reserved_domain_stays_private_while_nothing_runs_there():
+def test_reserved_domain_stays_private_without_processes():
     assert len({reserve_domain() for _ in range(5)}) == 5

@@ -48,7 +48,7 @@ def run(folder: Path, *command: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, "-m", *command], cwd=folder, env=environment, capture_output=True, text=True)
 
 
-def test_the_page_has_its_files():
+def test_page_contains_the_example_files():
     assert [name for name, _ in FILES] == [
         "emergency_stop.py",
         "conftest.py",
@@ -57,7 +57,7 @@ def test_the_page_has_its_files():
     ]
 
 
-def test_the_whole_test_passes_and_a_failure_says_what_was_seen(folder):
+def test_example_test_passes_and_failure_shows_the_detections(folder):
     (folder / "test_broken.py").write_text(BROKEN)
     done = run(folder, "pytest", "-q", "-p", "no:cacheprovider", "test_emergency_stop.py", "test_broken.py")
     said = " ".join(done.stdout.split())
@@ -74,6 +74,6 @@ def test_the_whole_test_passes_and_a_failure_says_what_was_seen(folder):
 @pytest.mark.skipif(
     importlib.util.find_spec("launch_testing") is None, reason="needs launch_testing, which comes with ROS 2"
 )
-def test_the_launch_test_passes(folder):
+def test_launch_test_passes(folder):
     done = run(folder, "launch_testing.launch_test", "test_stop_launch.py")
     assert done.returncode == 0, done.stdout + done.stderr

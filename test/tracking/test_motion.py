@@ -76,7 +76,7 @@ def test_opposite_headings_give_same_update(heading, off):
     assert wrap_angle(ends[0][0, 4] - ends[1][0, 4]) == pytest.approx(0, abs=1e-7)
 
 
-def test_lateral_speed_shrinks_and_reversed_heading_flips():
+def test_lateral_speed_decays_and_reversed_heading_flips():
     means = np.array([[0.0, 0, 5, 1, 0, 0]])
     kept, p = constrain_to_heading(means, np.eye(6)[None], np.array([0.1]))
     across = [np.cos(m[4]) * m[3] - np.sin(m[4]) * m[2] for m in (means[0], kept[0])]

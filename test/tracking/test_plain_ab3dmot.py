@@ -18,7 +18,7 @@ def one(x):
     return Detections.of([[x, 0, -1, 4, 1.8, 1.5, 0]], CAR, 0.9)
 
 
-def test_three_hits_make_a_track_and_two_misses_end_it():
+def test_track_starts_after_three_hits_and_ends_after_two_misses():
     tracker, none = PlainAb3dmot(), Detections.none()
     for _ in range(4):
         tracker(none)

@@ -91,7 +91,7 @@ def test_velocities_are_relative_without_poses():
     assert known.velocities[0] == pytest.approx([0, 0], abs=0.2) and known.moving[0] < 0.4
 
 
-def test_turn_rate_of_car_on_circle():
+def test_turn_rate_of_car_on_circle_is_correct():
     angle = np.arange(40) * 0.04  # 0.4 rad/s, 4 m/s
     tracks = track([cars(car(10 * np.sin(a), 10 - 10 * np.cos(a), a)) for a in angle])
     last = tracks[-1]
@@ -150,7 +150,7 @@ def test_correlated_observations_are_discounted():
     np.testing.assert_allclose(discount_observations(looks, 0.0), looks)
 
 
-def test_constantly_doubtful_object_stays_doubtful():
+def test_constantly_low_scores_keep_a_track_at_low_score():
     """A neutral score adds no evidence, however often it is seen."""
     neutral = TrackingParams().existence.neutral
     tracker = Tracker(with_values(TrackingParams(), {"report": 0.0}))
@@ -181,7 +181,7 @@ def test_moving_object_heading_follows_motion():
     assert [wrap_angle(t.detections.boxes[0, 6]) for t in tracks[6:]] == pytest.approx([0.0] * 34, abs=0.1)
 
 
-def test_alternating_class_is_one_track_of_better_class():
+def test_alternating_classes_are_one_track_of_the_better_class():
     frames = [
         cars(person(10 + 0.1 * i), kind=[CYCLIST, PEDESTRIAN][i % 2], scores=[0.6, 0.9][i % 2]) for i in range(30)
     ]
@@ -203,7 +203,7 @@ def test_lost_frame_is_predicted():
     assert len(tracker.predict(0)) == 1 and len(Tracker().predict(5)) == 0
 
 
-def test_missing_equal_late_and_jumping_stamps():
+def test_missing_equal_late_and_jumping_stamps_are_handled():
     tracker, found = Tracker(), cars(car(10))
     for _ in range(3):
         tracker(found, 0)
@@ -331,7 +331,7 @@ def test_parked_cars_keep_ids_from_turning_car_without_poses():
         np.testing.assert_allclose(t.detections.boxes[:, :2], found.boxes[:, :2], atol=0.3)
 
 
-def test_fast_object_is_unlikely_a_pedestrian():
+def test_fast_object_is_probably_not_a_pedestrian():
     """Only with poses: relative to a moving sensor everything is fast."""
 
     def score(speed, at):

@@ -50,7 +50,7 @@ def tracks():
     return [tracker(found, START + i * TENTH) for i, found in enumerate(crowd())][-1]
 
 
-def test_pose_covariances_contain_position_and_heading(tracks):
+def test_pose_covariances_include_position_and_heading(tracks):
     square = tracks.to_pose_covariances()
     assert square.shape == (len(tracks), 6, 6)
     np.testing.assert_array_equal(square, square.transpose(0, 2, 1))

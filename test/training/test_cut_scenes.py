@@ -257,7 +257,7 @@ def test_clusters_equal_those_of_detector_at_scene_height(rng):
     assert sum(read) == (~cut.is_box_crop).sum() > 3
 
 
-def test_share_of_scenes_is_sparse_and_always_the_same(rng, tmp_path):
+def test_fraction_of_sparse_scenes_is_reproducible(rng, tmp_path):
     scene, count = make_scene(rng), 40
     none, half, all_ = (
         CutScenes(RepeatedScene(scene, count), CONFIG, 5, tmp_path, sparse=sparse) for sparse in (0.0, 0.5, 1.0)
@@ -360,7 +360,7 @@ def test_network_learns_to_classify_clusters(rng):
     assert parts["classes"].item() < 0.5 * first
 
 
-def test_validation_calibrates_and_names_broken_scenes(rng):
+def test_validation_calibrates_and_reports_broken_scenes(rng):
     scene = sample_scene(rng, 4)
     truth = GroundTruth.of(
         BOXES[:3], to_class_ids("Car", "Pedestrian", "Cyclist"), [{"truncated": 0.0, "occluded": 0}] * 3

@@ -93,7 +93,7 @@ def test_curves_are_not_fitted_to_too_few_samples():
 
 
 @pytest.mark.parametrize("camera", [None, FORWARD_CAMERA], ids=["all around", "in an image"])
-def test_object_counts_once_and_van_does_not_count(camera: Camera | None):
+def test_objects_count_once_and_vans_do_not_count(camera: Camera | None):
     car, person = [10, 0, -0.9, 4, 1.7, 1.5, 0], [12, 4, -0.8, 0.6, 0.6, 1.8, 0]
     behind, van = [-10, 0, -0.9, 4, 1.7, 1.5, 0], [10, 5, -0.7, 4.7, 1.9, 2.0, 0]
     nearly = np.add(person, [0.3, 0.2, 0, 0, 0, 0, 0])
@@ -150,7 +150,7 @@ def test_fusion_file_round_trip_in_moved_folder(others, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("curves", [[], 0, "", {}, {"Car": {}}])
-def test_invalid_curves_for_clouds_without_intensity_are_refused(curves, tmp_path):
+def test_invalid_curves_without_intensity_are_rejected(curves, tmp_path):
     path = tmp_path / "fused.json"
     path.write_text(json.dumps({**json.loads(PACKAGE.read_text()), "classes_without_intensity": curves}))
     with pytest.raises(InputError, match=r"fused.json was not written by"):
@@ -188,7 +188,7 @@ def test_missing_class_and_foreign_sensor_are_reported(others):
     assert open_detector(path, "cpu").warning == never
 
 
-def test_detector_uses_its_own_curves_at_any_range(others):
+def test_detector_uses_curves_of_its_file_at_any_range(others):
     path, models = others
     loaded, package = load_fused_detector(path, "cpu"), load_fused_detector("", "cpu")
     mine = FusedDetector(random_detector("v4").proposer, loaded.classifier, loaded.params, models)
@@ -202,7 +202,7 @@ def test_detector_uses_its_own_curves_at_any_range(others):
     assert load_fused_detector(path, "cpu", half).proposer.network.amp == "bf16"
 
 
-def test_damaged_file_is_used_or_refused_in_one_line(tmp_path):
+def test_damaged_file_is_used_or_rejected_in_one_line(tmp_path):
     rng, path, refused = np.random.default_rng(0), tmp_path / "damaged.json", 0
     evidence = {name: np.array([-9.0, 0.0, np.nan, np.inf]) for name in KNOTS}
     for _ in range(100):

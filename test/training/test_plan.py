@@ -50,7 +50,7 @@ data = st.one_of(
 
 
 @given(speeds, data, st.floats(0.3, 100), st.integers(1, 64))
-def test_plan_fits_budget_or_error_names_sufficient_budget(speed, data, hours, cores):
+def test_plan_fits_budget_or_error_suggests_a_larger_one(speed, data, hours, cores):
     try:
         plan = fit_plan(hours, cores, speed, data)
     except InputError as error:
@@ -80,7 +80,7 @@ def test_more_time_or_cores_give_larger_plan():
     assert slow.scans < fit_plan(1.0, 4, SPEED, SIM).scans
 
 
-def test_fixed_numbers_are_kept():
+def test_plan_keeps_numbers_given_by_the_user():
     plan = fit_plan(1.0, 2, SPEED, SIM, Plan(scans=30, val_scans=7, steps=5000, validate_steps=11, part=False))
     assert plan == Plan(30, 7, 30, 5000, 11, False)  # it takes longer than the budget
     assert fit_plan(1.0, 2, SPEED, SIM, Plan(scans=100), epochs=3).steps == 75
@@ -113,6 +113,6 @@ def test_pace_counts_steps_that_fit_between_validations(monkeypatch):
 
 
 @pytest.mark.parametrize("hours", [1e-4, 0.01])
-def test_too_short_budget_names_sufficient_one(hours):
+def test_error_for_short_budget_suggests_larger_one(hours):
     with pytest.raises(InputError, match="give --budget"):
         fit_plan(hours, 2, SPEED, SIM)

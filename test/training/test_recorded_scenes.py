@@ -28,7 +28,7 @@ from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, GroundTruth, Input
 seeds = st.integers(0, 2**32 - 1)
 
 
-def test_broken_scenes_are_named_skipped_and_counted(tmp_path, capsys):
+def test_broken_scenes_are_skipped_reported_and_counted(tmp_path, capsys):
     root = broken_folder(tmp_path)
     stream = Stream((open_labelled_frames(root).to_scenes(),), prepare_all)
     batches = Batches(stream, 5)
@@ -44,14 +44,14 @@ def test_broken_scenes_are_named_skipped_and_counted(tmp_path, capsys):
         broken[0]
 
 
-def test_frame_without_labels_is_refused(tmp_path):
+def test_frame_without_labels_is_rejected(tmp_path):
     root = object_folder(tmp_path, count=2)
     (root / "training/label_2/000001.txt").unlink()
     with pytest.raises(InputError, match=r"000001\.bin has no labels"):
         RecordedScenes(root, ("000001",)).scene(0)
 
 
-def test_kitti_scenes_end_with_image_if_view(tmp_path):
+def test_kitti_scenes_are_cropped_to_the_image(tmp_path):
     root = object_folder(tmp_path, walker_label() + "\n", 1)
     ahead, whole = (RecordedScenes(root, ("000000",), view).scene(0) for view in (True, False))
     assert 0 < len(ahead.points) < len(whole.points)
@@ -97,7 +97,7 @@ def test_split_file_selects_frames(tmp_path):
 
 
 @given(st.lists(st.integers(1, 60), min_size=1, max_size=8).filter(lambda n: sum(n) > 1), st.floats(0, 1), seeds)
-def test_share_is_held_out_as_whole_drives_and_one_end(lengths, share, seed):
+def test_held_out_frames_are_complete_drives_and_one_end(lengths, share, seed):
     ends = np.cumsum(lengths)
     drives = [range(end - length, end) for end, length in zip(ends, lengths)]
     for draw, items in (draw_items, range(ends[-1])), (draw_drives, drives):

@@ -85,7 +85,7 @@ def read_tensors(out: Path) -> bytes:
     return content[8 + int.from_bytes(content[:8], "little") :]
 
 
-def test_run_killed_twice_equals_unbroken_run(tmp_path, one_thread):
+def test_run_killed_twice_equals_uninterrupted_run(tmp_path, one_thread):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     unbroken = CliRunner().invoke(cli, small_training(whole, "--jobs", "2"))
     assert unbroken.exit_code == 0, unbroken.exception
@@ -140,7 +140,7 @@ def test_only_temporary_files_of_killed_run_are_removed(tmp_path):
 
 
 @pytest.mark.parametrize("hours", ["0", "-1", "nan", "inf"])
-def test_bad_budget_is_refused(hours, tmp_path):
+def test_bad_budget_is_rejected(hours, tmp_path):
     assert "--budget" in refuse(tmp_path, "--budget", hours)
 
 
@@ -152,23 +152,23 @@ def test_bad_budget_is_refused(hours, tmp_path):
         ("beams: 4\n", "beams"),
     ],
 )
-def test_bad_sensor_file_is_refused(content, reason, tmp_path):
+def test_bad_sensor_file_is_rejected(content, reason, tmp_path):
     path = write(tmp_path / "robot.yaml", content)
     assert reason in refuse(tmp_path, "--sensor", str(path))
 
 
-def test_bad_mount_height_is_refused(tmp_path):
+def test_bad_mount_height_is_rejected(tmp_path):
     assert "mount_height" in refuse(tmp_path, "--mount-height", "-1")
 
 
-def test_full_disk_is_refused_before_simulation(tmp_path, monkeypatch):
+def test_full_disk_is_reported_before_simulation(tmp_path, monkeypatch):
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(planning.shutil, "disk_usage", lambda _: usage._replace(free=5 * 10**8))
     line = refuse(tmp_path, "--sensor", SENSOR, "--data-scans", "1000", "--steps", "1")
     assert "GB are free" in line and "--data-scans" in line
 
 
-def test_resumed_run_keeps_plan_and_refuses_other_settings(tmp_path, one_thread):
+def test_resumed_run_keeps_plan_and_rejects_other_settings(tmp_path, one_thread):
     out = tmp_path / "run"
     sensor = write(
         tmp_path / "robot.yaml", "elevations: [2, -3, -8, -13, -18]\nazimuth_step: 1.5\nrate: 10\nheight: 0.9\n"
@@ -305,7 +305,7 @@ def test_run_is_not_resumed_with_changed_split_or_weights(tmp_path, monkeypatch)
     assert "init_weights" in resume() and "frame" not in resume()
 
 
-def test_progress_without_terminal_prints_lines(monkeypatch, capsys):
+def test_progress_is_printed_in_lines_without_a_terminal(monkeypatch, capsys):
     monkeypatch.setattr(terminal, "LOG_INTERVAL_S", 0.0)
     assert list(terminal.show_progress(iter("abc"), "cutting", 3)) == ["a", "b", "c"]
     lines = capsys.readouterr().err.splitlines()

@@ -86,6 +86,6 @@ def test_proposer_is_recorded_and_must_be_pointpillars(cache, tmp_path):
         assert not (tmp_path / "bad").exists()
 
 
-def test_option_network_offers_every_network():
+def test_network_option_lists_every_network():
     metadata = PointNetTraining.__dataclass_fields__["network"].metadata
     assert set(NETWORKS) == set(metadata["choices"])

@@ -35,14 +35,14 @@ def unbroken(tmp_path_factory):
     return folder, toy
 
 
-def test_seed_determines_run(unbroken, tmp_path):
+def test_seed_determines_the_run(unbroken, tmp_path):
     train(Toy().task(), PARAMS, tmp_path / "again")
     assert equals(tmp_path / "again", unbroken[0])
     train(Toy().task(), LoopParams(**{**vars(PARAMS), "seed": 4}), tmp_path / "other")
     assert rows(tmp_path / "other") != rows(unbroken[0])
 
 
-def test_average_is_validated_and_best_is_saved(unbroken):
+def test_averaged_weights_are_validated_and_best_are_saved(unbroken):
     folder, toy = unbroken
     validated = rows(folder, "validation.csv")
     assert [int(row["step"]) for row in validated] == [4, 8, 12, 13]
@@ -59,7 +59,7 @@ def test_average_is_validated_and_best_is_saved(unbroken):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("step", [0, 6, 11])
-def test_stopped_and_resumed_run_equals_unbroken_run(unbroken, tmp_path, number, step):
+def test_stopped_and_resumed_run_equals_uninterrupted_run(unbroken, tmp_path, number, step):
     def stop(now):
         if now == step:
             signal.raise_signal(number)
@@ -73,7 +73,7 @@ def test_stopped_and_resumed_run_equals_unbroken_run(unbroken, tmp_path, number,
     assert equals(tmp_path, unbroken[0])
 
 
-def test_second_signal_ends_run_and_saved_state_stays(unbroken, tmp_path):
+def test_second_signal_ends_run_and_keeps_saved_state(unbroken, tmp_path):
     # Background processes of a shell ignore SIGINT.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -253,7 +253,7 @@ def test_two_processes_with_half_batch_equal_one(tmp_path):
     assert [row["step"] for row in rows(tmp_path / "two")] == [row["step"] for row in rows(tmp_path / "one")]
 
 
-def test_one_process_without_torchrun():
+def test_training_without_torchrun_is_one_process():
     with join_process_group(CPU) as device:
         assert (device, get_rank(), get_world_size()) == (CPU, 0, 1)
 

@@ -110,7 +110,7 @@ def test_slope_keeps_heights_above_ground(seed, ahead, aside):
 
 
 @given(seeds, st.floats(-7, 7))
-def test_inverse_changes_restore_scene(seed, angle):
+def test_inverse_augmentations_restore_the_scene(seed, angle):
     scene = make_random_scene(seed)
     for back in (
         flip_scene(flip_scene(scene)),
@@ -123,7 +123,7 @@ def test_inverse_changes_restore_scene(seed, angle):
         np.testing.assert_allclose(wrap_angle(back.boxes[:, 6] - scene.boxes[:, 6]), 0, atol=1e-9)
 
 
-def test_turn_is_counter_clockwise():
+def test_positive_rotation_is_counterclockwise():
     scene = TrainingScene(
         np.array([[5, 0, 1, 0.5]], np.float32), np.array([[5.0, 0, 1, 4, 2, 1, 0.1]]), np.array([CAR]), np.ones(1, bool)
     )
@@ -133,7 +133,7 @@ def test_turn_is_counter_clockwise():
 
 
 @given(seeds, st.floats(0, 0.99))
-def test_drop_points_keeps_share_and_order(seed, share):
+def test_drop_points_keeps_fraction_and_order(seed, share):
     scene = make_random_scene(seed)
     left = drop_points(scene, share, np.random.default_rng(seed))
     assert (len(left.points) == len(scene.points)) or share > 0
@@ -152,7 +152,7 @@ def test_intensity_stays_within_0_and_1_and_0_stays_0(seed):
     assert (change_intensity(scene, 1.4, 0.2).points[::2, 3] == 0).all()
 
 
-def test_intensity_of_whole_scans_is_removed_or_distorted():
+def test_intensity_of_a_scan_is_removed_or_distorted():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(2, 60, (4000, 3)), rng.uniform(0.1, 0.4, 4000)])
     points[::4, 3] = 0
@@ -168,7 +168,7 @@ def test_intensity_of_whole_scans_is_removed_or_distorted():
 
 
 @given(seeds, st.booleans())
-def test_augmentation_is_deterministic_and_zeros_do_nothing(seed, around):
+def test_augmentation_is_deterministic_and_zero_is_identity(seed, around):
     scene = make_random_scene(seed, around)
     kept = scene.points.copy(), scene.boxes.copy()
     once, twice = (augment_scene(scene, AugmentParams(), np.random.default_rng(seed)) for _ in "ab")
@@ -311,7 +311,7 @@ def test_reflector_spans_range_of_heights(seed):
 
 
 @given(seeds)
-def test_stretched_background_keeps_its_foot(seed):
+def test_stretched_background_stays_on_the_ground(seed):
     scene, rng = make_random_scene(seed), np.random.default_rng(seed)
     changes = replace(STILL_THINGS, things_stretch=0.5, things_intensity=0.4)
     for box in scene.boxes:
@@ -327,7 +327,7 @@ def test_stretched_background_keeps_its_foot(seed):
 
 
 @given(seeds, st.sampled_from([-1, 1]), st.sampled_from([-1, 1]))
-def test_early_crop_keeps_everything_that_may_move_into_range(seed, larger, higher):
+def test_early_crop_keeps_points_that_may_move_into_range(seed, larger, higher):
     scene, params = make_random_scene(seed), AugmentParams(turn=0, scale=0.1, height=0.3, tilt=0.1)
     low, high = np.array([0, -10, -1.8]), np.array([10.0, 10, 0.5])
 
@@ -347,7 +347,7 @@ def test_early_crop_keeps_everything_that_may_move_into_range(seed, larger, high
     assert np.array_equal(cropped.class_ids, expected.class_ids)
 
 
-def test_scenes_labelled_all_around_turn_by_any_angle():
+def test_scenes_labelled_all_around_rotate_by_any_angle():
     def bearings(around: bool) -> np.ndarray:
         scene = TrainingScene(
             np.array([[5, 0, -1, 0.5]], np.float32), np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool), around
@@ -363,7 +363,7 @@ def test_scenes_labelled_all_around_turn_by_any_angle():
     assert bearings(True).max() > 2.5 and 0.6 < bearings(False).max() <= AugmentParams().turn
 
 
-def test_database_file_round_trip_and_broken_file_is_named(tmp_path):
+def test_database_file_round_trip_and_error_names_broken_file(tmp_path):
     database = join_databases([cut_objects(make_random_scene(k), ("Car", "Pedestrian"), 5) for k in range(4)])
     assert len(database) > 0 and set(database.class_ids) <= {CAR, PEDESTRIAN}
     database.save(tmp_path / "objects.npz")

@@ -190,7 +190,7 @@ def test_training_and_validation_share_no_frame_by_any_path(tmp_path, monkeypatc
         (["--data", "sim", "--init", "missing.safetensors"], "missing.safetensors"),
     ],
 )
-def test_bad_input_is_refused_at_once(tmp_path, tiny_size, arguments, reason):
+def test_bad_input_is_rejected_at_once(tmp_path, tiny_size, arguments, reason):
     result = train(
         *arguments,
         "--out",
@@ -212,7 +212,7 @@ def test_bad_input_is_refused_at_once(tmp_path, tiny_size, arguments, reason):
     assert not (tmp_path / "run" / "last.pt").exists()
 
 
-def test_share_of_paper_is_held_out_by_default():
+def test_fraction_of_the_paper_is_held_out_by_default():
     assert round(PAPER_SHARE * 7518) == 751
     text = train("--help").output
     for group in PointPillarsTraining, DataParams:
@@ -220,7 +220,7 @@ def test_share_of_paper_is_held_out_by_default():
             assert "--" in text and f.name.replace("_", "-") in text
 
 
-def test_file_as_out_is_refused_before_simulation(tmp_path, monkeypatch):
+def test_file_as_out_is_rejected_before_simulation(tmp_path, monkeypatch):
     def never(*_):
         raise AssertionError("data was prepared")
 

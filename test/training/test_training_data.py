@@ -153,7 +153,7 @@ def test_samples_have_inputs_of_version(version):
     assert torch.isfinite(total) and set(parts) == {"classes", "boxes", "directions"}
 
 
-def test_share_of_scenes_gets_pasted_objects(tmp_path):
+def test_fraction_of_scenes_gets_pasted_objects(tmp_path):
     cut_objects(make_scene(), tiny().classes, 1).save(tmp_path / "objects.npz")
     rng, scene = np.random.default_rng(0), make_scene()
     scene = replace(scene, boxes=scene.boxes[:1], class_ids=scene.class_ids[:1], detectable=scene.detectable[:1])
@@ -189,7 +189,7 @@ def test_anchors_on_hidden_objects_are_ignored():
     assert not few_points.is_target.any()
 
 
-def test_scene_without_points_in_range_is_refused():
+def test_scene_without_points_in_range_is_rejected():
     behind = make_scene(points=two_objects() * np.array([-1, 1, 1, 1], np.float32))
     with pytest.raises(InputError, match="no point"):
         ScenePreparation(tiny(), STILL)(behind, np.random.default_rng(0))
@@ -200,7 +200,7 @@ def test_scene_without_points_in_range_is_refused():
     assert (to_labels(far, anchor_tensors(tiny())[0]) == BACKGROUND).all()
 
 
-def test_validation_scores_perfect_and_blind_detectors(tmp_path):
+def test_validation_scores_of_perfect_and_empty_detections(tmp_path):
     root = broken_folder(tmp_path)
     scenes = SceneReader((open_labelled_frames(root).to_scenes(),), partial(load_validation_frame, tiny()))
     right = validate_detector(lambda frame: DetectionResult(Detections.of([WALKER])), scenes)
@@ -294,7 +294,7 @@ def test_samples_do_not_depend_on_sensor_height():
 
 
 @pytest.mark.parametrize("quarter", range(4))
-def test_labels_in_turned_camera_equal_those_of_turned_scene(quarter):
+def test_labels_in_rotated_camera_equal_those_of_rotated_scene(quarter):
     _, truth = SimulatedScenes(7, 1, SENSOR).scan(0)
     yaw = quarter * np.pi / 2
     cos, sin = np.cos(-yaw), np.sin(-yaw)

@@ -76,7 +76,7 @@ def test_average_includes_norm_statistics():
     assert not any(p.requires_grad for p in average.module.parameters())
 
 
-def test_norm_statistics_begin_as_mean_over_steps():
+def test_norm_statistics_start_as_mean_over_steps():
     toy = Toy()
     run, norm = Run(toy.task(), PARAMS, torch.device("cpu")), toy.module[1]
     norm.momentum = 0.0
@@ -132,7 +132,7 @@ def test_slow_run_ends_in_time_with_final_learning_rate(seconds, fits, planned, 
     assert set(toy.saved) == {"best", "last"}
 
 
-def test_sufficient_budget_changes_nothing(planned, tmp_path, monkeypatch):
+def test_sufficient_budget_keeps_the_plan(planned, tmp_path, monkeypatch):
     _, progress = run_timed(lambda _: 1.0, 30.0, tmp_path, monkeypatch, until=600.0)
     assert progress.left_out == 0 and equals(tmp_path, planned)
 

@@ -59,12 +59,12 @@ def assert_equal_cdr(got: bytes, rows, stamp_ns=START, frame_id="velodyne", life
 
 
 @given(rows=rows, stamp_ns=st.integers(0, 2**60), frame_id=texts, lifetime_ns=st.integers(0, 2**60))
-def test_markers_have_the_bytes_of_the_message(rows, stamp_ns, frame_id, lifetime_ns):
+def test_encoded_markers_equal_the_serialized_message(rows, stamp_ns, frame_id, lifetime_ns):
     head = header(make_bag_message, stamp_ns, frame_id)
     assert_equal_cdr(encode_markers(rows, head, lifetime_ns), rows, stamp_ns, frame_id, lifetime_ns)
 
 
-def test_tracks_and_detections_have_the_bytes_of_the_message():
+def test_encoded_tracks_equal_the_serialized_message():
     tracker, trails, shown = Tracker(), Trails(), ()
     for i, found in enumerate(crowd(4, 15)):
         stamp = START + i * TENTH
@@ -83,13 +83,13 @@ def test_tracks_and_detections_have_the_bytes_of_the_message():
     assert shown
 
 
-def test_array_without_boxes_has_the_bytes_of_the_message():
+def test_encoded_empty_array_equals_the_serialized_message():
     rows = make_marker_rows(np.zeros((0, 7)), [])
     assert_equal_cdr(encode_markers(rows, header(make_bag_message, START)), rows)
 
 
 @given(boxes=st.lists(st.tuples(*6 * [numbers], st.floats(-4, 4)), max_size=3), frame_id=texts, seed=st.integers(0, 9))
-def test_detection_array_has_the_bytes_of_the_message(boxes, frame_id, seed):
+def test_encoded_detection_array_equals_the_serialized_message(boxes, frame_id, seed):
     """vision_msgs is not in the wheels of ROS, so the reference is rosbags alone."""
     rng, count, boxes = np.random.default_rng(seed), len(boxes), np.reshape(boxes, (-1, 7))
     given = dict(

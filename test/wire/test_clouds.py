@@ -126,7 +126,7 @@ def test_damaged_or_huge_compressed_cloud_is_reported(packing, monkeypatch):
             to_point_cloud(decode_cloud(encode(message), COMPRESSED))
 
 
-def test_compressed_copy_of_a_topic_is_left_out():
+def test_compressed_copy_of_a_topic_is_ignored():
     topics = {
         "/a": POINT_CLOUD,
         "/a/zlib": COMPRESSED,

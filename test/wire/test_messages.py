@@ -58,7 +58,7 @@ def test_extrinsics_are_read_in_either_direction(make):
         (lambda info, tf: setattr(info, "width", 2**32 - 1), "4294967295 x 375 pixels"),
     ],
 )
-def test_unusable_camera_is_an_input_error(make, change, words):
+def test_unusable_camera_raises_input_error(make, change, words):
     info = make_camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
     transform = make_extrinsics(CALIBRATION, header(make), make)
     change(info, transform)
@@ -122,12 +122,12 @@ def test_message_fields_default_to_zero_as_in_ros(name):
     assert got == theirs
 
 
-def test_unknown_field_is_a_type_error():
+def test_unknown_field_raises_type_error():
     with pytest.raises(TypeError, match="has no field 'colour'"):
         make_bag_message("visualization_msgs/msg/Marker", colour=1)
 
 
-def test_truncated_message_is_an_input_error():
+def test_truncated_message_raises_input_error():
     raw = encode(MESSAGES["markers"](make_bag_message))
     for size in range(0, len(raw), 7):
         with pytest.raises(InputError, match=f"^{size} bytes are not a valid visualization_msgs"):
