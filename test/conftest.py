@@ -37,8 +37,8 @@ def pytest_itemcollected(item):
 def pytest_collection_finish():
     """Initialize autograd before all tests, and exclude imported objects from garbage collection.
 
-    Autograd counts its devices at the first backward pass. After an ONNX export, a torch built for
-    CUDA counts a missing device and then fails in forked processes, which tests use.
+    Autograd counts its devices at the first backward pass. After an ONNX export, a CUDA build of torch counts a
+    missing device and then fails in the forked processes of tests.
     """
     if (torch := sys.modules.get("torch")) is not None:
         torch.ones((), requires_grad=True).backward()
@@ -49,8 +49,8 @@ def pytest_collection_finish():
 def pytest_runtest_call(item):
     """Apply no_cover to processes that a test starts, too.
 
-    coverage wraps os._exit at each start; without restoring it, processes that are forked later
-    would save their lines many times.
+    coverage wraps os._exit at each start. Unless it is restored, processes that are forked later save their data
+    several times.
     """
     with pytest.MonkeyPatch.context() as patch:
         if item.get_closest_marker("no_cover"):
@@ -82,7 +82,7 @@ def data() -> Path:
 
 @pytest.fixture
 def carrier_too(monkeypatch):
-    """Keep detections at the ego vehicle, where networks with random weights find objects, too."""
+    """Keep detections at the ego vehicle, where networks with random weights also find objects."""
     from lidar_perception.detectors import normalized_view
 
     monkeypatch.setattr(normalized_view, "drop_ego_vehicle", lambda detections, height: detections)
@@ -90,7 +90,7 @@ def carrier_too(monkeypatch):
 
 @pytest.fixture
 def one_thread():
-    """Use one thread of torch, as small networks are slower with more threads on busy cores."""
+    """Use one thread of torch, because small networks are slower with more threads on busy cores."""
     import torch
 
     from lidar_perception.runs.threads import set_thread_count
@@ -197,7 +197,7 @@ def crowds(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def whole(crowds, tmp_path_factory) -> Path:
-    """Folder of a complete run of the paper's experiment on `crowds`; its output is in ../said."""
+    """Folder of a complete run of the paper's experiment on `crowds`; its printed output is in ../said."""
     from experiment_samples import command
     from samples import write
 

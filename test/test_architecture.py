@@ -32,7 +32,7 @@ ROS = {
 }
 MAX_LINES = 400
 
-# The packages and modules from the lowest layer up. Each imports only itself and lower ones.
+# Packages and modules from the lowest layer up; each imports only itself and lower layers.
 LAYERS = (
     "classes",
     "intensity",
@@ -89,7 +89,7 @@ LIBRARIES = {
 }
 
 
-@cache  # not parsed on import, as each test process imports this file
+@cache  # not parsed on import, because every test process imports this file
 def parse_source(name):
     return ast.parse((ROOT / name).read_text(encoding="utf-8"), name)
 
@@ -160,7 +160,7 @@ def test_every_module_belongs_to_a_layer():
 
 @for_all(list_files("msg_utils"))
 def test_msg_utils_needs_only_numpy(name):
-    # messages.py imports ROS's message classes by name; those of rosbags work, too.
+    # messages.py imports ROS message classes by name; those of rosbags work as well.
     assert find_foreign_imports(name, ["numpy", "msg_utils"]) == []
 
 
@@ -384,7 +384,7 @@ def test_no_source_has_more_than_the_maximum_of_lines(name):
 
 
 def test_constants_of_clustering_have_unique_names():
-    """Modules import constants from each other, so equal names would be confusing."""
+    """Modules import constants from each other, so equal names would be ambiguous."""
     files_by_name = {}
     for name in list_files("lidar_perception/clustering"):
         for node in parse_source(name).body:
@@ -394,8 +394,8 @@ def test_constants_of_clustering_have_unique_names():
     assert len(files_by_name) > 10 and {n: w for n, w in files_by_name.items() if len(w) > 1} == {}
 
 
-# Modules, and libraries that they must not load. One interpreter imports those of a list one after
-# the other, as each start takes a second; so a module must not load what the later ones exclude.
+# Modules, and libraries that they must not load. Starting Python takes a second, so one interpreter imports all
+# modules of a list in order. A module must therefore not load libraries that a later one excludes.
 LIGHT = (
     [
         ("msg_utils.point_cloud2", "numba torch matplotlib scipy rosbags lidar_perception"),

@@ -42,7 +42,7 @@ def cloud(seed=0):
 @pytest.fixture
 def nothing_installed(monkeypatch):
     for name in OPTIONAL:
-        monkeypatch.setitem(sys.modules, name, None)  # import fails as if it were not there
+        monkeypatch.setitem(sys.modules, name, None)  # the import fails as if the package were missing
 
 
 def test_contenders_run_in_turn_after_untimed_warm_up():
@@ -78,10 +78,10 @@ def test_plain_euclidean_gives_the_same_clusters(threshold):
 def test_same_clusters_compares_noise_and_core_partition():
     core = np.array([True, True, True, False, False])
     ours = np.array([1, 1, 2, 2, 0])
-    assert have_same_clusters(np.array([7, 7, 3, 7, 0]), ours, core)  # numbers, and a border point
-    assert not have_same_clusters(np.array([7, 7, 3, 3, 4]), ours, core)  # noise
-    assert not have_same_clusters(np.array([7, 7, 7, 7, 0]), ours, core)  # joined
-    assert not have_same_clusters(np.array([7, 8, 3, 3, 0]), ours, core)  # cut
+    assert have_same_clusters(np.array([7, 7, 3, 7, 0]), ours, core)  # other ids, another border point
+    assert not have_same_clusters(np.array([7, 7, 3, 3, 4]), ours, core)  # a point is noise
+    assert not have_same_clusters(np.array([7, 7, 7, 7, 0]), ours, core)  # merged clusters
+    assert not have_same_clusters(np.array([7, 8, 3, 3, 0]), ours, core)  # a split cluster
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsy
         assert found["ms"]["network"] > 0 and found["ms"]["postprocess"] > 0
         assert name in shown and found["to_v0"] == found["total_ms"] / versions["v0"]["total_ms"]
         assert found["ms"]["experts"] >= 0
-    # What a version has no use for is not part of its time.
+    # Steps that a version does not need are not timed.
     assert ran == {"v0": (False, False), "v1": (True, False), **dict.fromkeys(("v2", "v3", "v4"), (True, True))}
 
 
@@ -169,7 +169,7 @@ def test_pointnet_is_timed_against_a_plain_network(one_thread, capsys):
     shown = capsys.readouterr().out
     assert all(name in shown for name in ("improved PointNet", "plain PointNet++", "clustering"))
     assert content["clusters"] >= 1 and all(value > 0 for value in content["ms"].values())
-    # The plain PointNet++ samples distant points and groups near ones.
+    # The plain PointNet++ uses farthest point sampling and ball queries.
     xyz = torch.tensor([[[0.0, 0, 0], [5, 0, 0], [0.1, 0, 0], [0, 0.3, 0]]])
     assert sample_farthest(xyz, 3).tolist()[0][:2] == [0, 1]
     assert query_ball(0.2, 2, xyz, xyz[:, :1]).tolist() == [[[0, 2]]]
@@ -183,7 +183,7 @@ def test_command_writes_the_measurements(nothing_installed, monkeypatch, tmp_pat
     monkeypatch.setattr(
         benchmark,
         "measure_startup",
-        lambda repeat: {  # compiles for minutes
+        lambda repeat: {  # compiling takes minutes
             "title": "start",
             "frames": 0,
             "points": 0,

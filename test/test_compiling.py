@@ -43,7 +43,7 @@ def test_calls_of_compiled_code_are_not_reported(monkeypatch):
     monkeypatch.setattr(compiling, "POLL_INTERVAL_S", 0.001)
     with report_compilation(pytest.fail):
         assert function(1) == 2
-        threading.Event().wait(0.01)  # lets the reporter poll
+        threading.Event().wait(0.01)  # time for the reporter to poll
 
 
 def test_wait_for_another_process_is_reported(report_all, tmp_path, monkeypatch):
@@ -72,7 +72,7 @@ def test_empty_cache_is_reported_before_anything_is_compiled(cached, monkeypatch
 
 
 def test_cache_is_found_where_numba_keeps_it(tmp_path):
-    """In a process of its own, as the folder is chosen when a function is compiled."""
+    """Runs in a separate process, because the folder is chosen when a function is compiled."""
     code = (
         "from lidar_perception.runs.compiling import _is_cached; print(_is_cached());"
         "import numpy, lidar_perception.geometry as g;"
@@ -104,4 +104,4 @@ def test_block_waits_for_another_process_that_compiles(tmp_path, monkeypatch):
         pytest.raises(ZeroDivisionError),
         compiling.compile_in_background("import time; time.sleep(60)", log, lines.append),
     ):
-        raise ZeroDivisionError  # which does not wait
+        raise ZeroDivisionError  # an exception does not wait

@@ -14,7 +14,7 @@ from lidar_perception.nodes.main import help_text
 from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.param_fields import collect_fields
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -55,7 +55,7 @@ def test_options_named_in_the_departures_table_exist():
     from lidar_perception.training.params import PointNetTraining
 
     for option in re.findall("`([^`]*)`", " ".join(row.option for row in DEPARTURES)):
-        if match := re.fullmatch(r"([a-z_]+)='?([^']*)'?", option):  # of make_config
+        if match := re.fullmatch(r"([a-z_]+)='?([^']*)'?", option):  # argument of make_config
             kind = type(getattr(make_config(), match[1]))
             make_config(**{match[1]: kind(match[2])})
         elif match := re.fullmatch(r"train pointnet --network (\S+)", option):
@@ -108,7 +108,7 @@ def test_documented_topics_are_those_of_the_node(generate, name, domain):
             documented |= {
                 ("" if n[0] in "~/" else "/") + n.replace("~", f"/{name}").replace("STAGE", "final") for n in names
             }
-    listed = {t for t in listed if not t.endswith("_ms") or "processing" in t}  # one row for all
+    listed = {t for t in listed if not t.endswith("_ms") or "processing" in t}  # one row covers all times
     standard = {"/parameter_events", "/rosout", "/clock", "/tf_static"}
     assert listed - standard == documented
 

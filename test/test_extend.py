@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from samples import object_folder, scene
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "how-to" / "extend.md").read_text()
@@ -22,7 +22,7 @@ EXAMPLES = {"npy": 2, "sizes": 2, "lowest": 3}  # number of changed files by nam
 
 
 def find_parts(name: str) -> list[tuple[str, str, str]]:
-    """Return the parts of an example: from its new file up to that of the next example."""
+    """Return the parts of an example, from its new file to that of the next example."""
     own = [i for i, (_, kind, _) in enumerate(PARTS) if kind == "python"]
     first = next(i for i in own if name in PARTS[i][0])
     return PARTS[first : next((i for i in own if i > first), len(PARTS))]
@@ -51,14 +51,14 @@ def apply_example(copy: Path, name: str) -> list[str]:
             file.write_text(text)
             continue
         lines = file.read_text().splitlines()
-        file.unlink()  # it is a link to the original
+        file.unlink()  # a hard link to the original
         after = None
         for line in text.splitlines():
             if line.startswith("-"):
                 after = lines.index(line[1:])
                 del lines[after]
             elif line.startswith("+"):
-                if after is None:  # an import: anywhere among them
+                if after is None:  # an import line, inserted anywhere among the imports
                     after = next(i for i, old in enumerate(lines) if old.startswith("from lidar"))
                 lines.insert(after, line[1:])
                 after = None
@@ -150,7 +150,7 @@ def test_class_needs_one_row_and_shipped_networks_still_work(copy, tmp_path):
     file = copy / "lidar_perception" / "classes.py"
     known, row = file.read_text(), '    ObjectClass("Truck", vehicle=True),\n'
     assert row in known
-    file.unlink()  # it is a link to the original
+    file.unlink()  # a hard link to the original
     numbers = "DetectionNumbers((8.0, 2.5, 3.2), 0.6, 0.45, (8.0, 2.5, 3.2), 5.0, 0.7, 0.5)"
     file.write_text(known.replace(row, row.replace("vehicle", f"{numbers}, vehicle")))
     output = run(copy, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"))

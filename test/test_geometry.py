@@ -29,7 +29,7 @@ places = st.floats(-80, 80)
 sizes = st.floats(0.01, 20)
 some_boxes = st.tuples(places, places, places, sizes, sizes, sizes, angles).map(np.array)
 
-# Front left, rear left, rear right, front right: counter-clockwise seen from above.
+# Front left, rear left, rear right, front right: counterclockwise from above.
 SIGNS = (
     np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1], [1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]]) / 2
 )

@@ -20,7 +20,7 @@ ids = st.lists(st.sampled_from([-(2**31), -1, 0, 1, 2, 3, 7, 2**31, 2**32 - 1]),
 
 
 def plain(values):
-    """Return labels and numbers by a plain implementation."""
+    """Return labels and counts of a plain implementation."""
     numbers = sorted({int(v) for v in values if np.isfinite(v) and v > 0})
     return [numbers.index(v) + 1 if v in numbers else 0 for v in values], numbers
 

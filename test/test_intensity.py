@@ -112,7 +112,7 @@ def test_dark_clouds_have_the_scale_of_their_stream():
     assert np.array_equal(other.read_frame(message(dark, 2), True)[0].intensity, dark)
     node.params.input = InputParams(intensity_max=2.0)
     assert np.array_equal(check.read_frame(message(dark, 3), True)[0].intensity, dark / 2)
-    assert check.read_frame(message(dark, 4))[0].intensity is None  # no reader
+    assert check.read_frame(message(dark, 4))[0].intensity is None  # nobody uses the intensity
 
 
 @pytest.mark.parametrize("full", [100, 255, 1023, 4095, 65535])

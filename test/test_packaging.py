@@ -1,4 +1,4 @@
-"""The metadata that setup.py gives to pip, colcon and a package index."""
+"""Metadata of setup.py for pip, colcon and a package index."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_citation_file_lists_the_three_papers():
 
 
 def test_each_node_has_one_executable_in_lib(metadata):
-    """Not in bin, so that names such as `tracker` are not on the PATH of users."""
+    """They are not in bin, so that names such as `tracker` are not on the PATH of users."""
     arguments = metadata(URL)
     files = dict(arguments["data_files"])["lib/lidar_perception"]
     assert sorted(Path(file).name for file in files) == sorted(NODES)

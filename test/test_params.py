@@ -1,4 +1,4 @@
-"""Parameters: values in range are kept, others are refused by name."""
+"""Parameters: values in range are kept, others are rejected by name."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def kind_of(f: dataclasses.Field) -> type:
 
 
 def as_field(f: dataclasses.Field, value):
-    """Return value for a scalar field; else a list as long as the default, with value first."""
+    """Return the value for a scalar field, or a list as long as the default that starts with it."""
     return (value, *f.default[1:]) if f.metadata["item"] else value
 
 
@@ -98,7 +98,7 @@ def other_value(f: dataclasses.Field):
     """Return a value in range that is not the default."""
     if f.metadata["choices"]:
         return next(c for c in f.metadata["choices"] if c != f.default)
-    if f.name in ("body", "sectors"):  # a box, or pairs; empty by default
+    if f.name in ("body", "sectors"):  # lists of six numbers or of pairs; empty by default
         return (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
     if f.metadata["item"]:
         return (*f.default, "/more") if kind_of(f) is str else tuple(v + 1.0 for v in f.default)
@@ -151,7 +151,7 @@ def test_with_values_inverts_flatten(kind):
 def test_with_values_keeps_other_values(kind):
     for name, f in collect_fields(kind()).items():
         if name.endswith(("eps", "range_limits")):
-            continue  # their lengths depend on each other
+            continue  # the lengths of these fields depend on each other
         assert flatten(with_values(kind(), {name: other_value(f)})) == {**flatten(kind()), name: other_value(f)}
 
 

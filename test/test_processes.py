@@ -55,7 +55,7 @@ def run_script(script: str, **environment: str) -> subprocess.CompletedProcess:
 
 @pytest.mark.skipif(os.cpu_count() == 1, reason="has one core")
 def test_processes_that_share_cores_use_one_thread_each():
-    """Threads of linear algebra libraries spin while they wait."""
+    """Waiting threads of linear algebra libraries use CPU time."""
     script = (
         "from lidar_perception.runs.processes import run_in_order, run_in_processes\n"
         "from test_processes import count_threads\n"
@@ -126,7 +126,7 @@ def test_freed_memory_is_reused_unless_the_user_sets_malloc(user):
 
 @pytest.mark.parametrize("count", [1, 5, 57, 1001])
 def test_processes_get_consecutive_items_of_equal_number(count):
-    """Consecutive items share work: scans of one street, clouds of one chunk."""
+    """Consecutive items share work, such as scans of one street or clouds of one chunk."""
     items = list(range(count))
     shares = [processes.deal_items(items, 3, job) for job in range(3)]
     assert sorted(itertools.chain(*shares)) == items

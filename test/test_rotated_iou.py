@@ -47,7 +47,7 @@ def moved(boxes, shift, yaw):
 def by_shapely(boxes, others):
     shapely = pytest.importorskip("shapely", reason="needs shapely, of the extra [test]")
     a, b = (shapely.polygons(box_corners(x)[:, :4, :2]) for x in (boxes, others))
-    # On a fine grid: without one GEOS sometimes finds nothing where edges all but coincide.
+    # Use a fine grid, because GEOS sometimes misses the overlap of almost coincident edges.
     shared = shapely.area(shapely.intersection(a[:, None], b[None], grid_size=1e-9))
     area = shapely.area(a)[:, None] + shapely.area(b)
     (low_a, high_a), (low_b, high_b) = ((x[:, 2] - x[:, 5] / 2, x[:, 2] + x[:, 5] / 2) for x in (boxes, others))
@@ -105,16 +105,16 @@ def test_half_turn_and_swapped_sides_give_the_same_box(seed):
     [
         # a = 4 x 2 x 2 around the origin: area 8, volume 16
         ("itself", [0, 0, 0, 4, 2, 2, 0.7], [0, 0, 0, 4, 2, 2, 0.7], 1, 1),
-        # shared 2 x 2: 4 / (8 + 8 - 4)
+        # overlap 2 x 2: 4 / (8 + 8 - 4)
         ("a quarter turn", [0, 0, 0, 4, 2, 2, 0], [0, 0, 0, 4, 2, 2, QUARTER], 1 / 3, 1 / 3),
         ("sides touch", [0, 0, 0, 4, 2, 2, 0], [4, 0, 0, 4, 2, 2, 0], 0, 0),
         ("corners touch", [0, 0, 0, 4, 2, 2, 0], [4, 2, 0, 4, 2, 2, 0], 0, 0),
         ("one on top of the other", [0, 0, 0, 4, 2, 2, 0], [0, 0, 2, 4, 2, 2, 0], 1, 0),
         # inside: 1 / 8; 1 / 16
         ("contained", [0, 0, 0, 4, 2, 2, 0], [0.5, 0.2, 0.1, 1, 1, 1, 0], 1 / 8, 1 / 16),
-        # half of the length: 4 / 12; and of the height: 4 / 28
+        # half of the length: 4 / 12; also half of the height: 4 / 28
         ("moved by half", [0, 0, 0, 4, 2, 2, 0], [2, 0, 1, 4, 2, 2, 0], 1 / 3, 1 / 7),
-        # square of side 2 and its turn by 45 degrees: an octagon, 8 (sqrt 2 - 1) = 3.3137 of 8 - 3.3137
+        # square of side 2 rotated by 45 degrees: octagon of area 8 (sqrt 2 - 1) = 3.3137, union 8 - 3.3137
         ("an octagon", [5, 5, 0, 2, 2, 1, 0], [5, 5, 0, 2, 2, 1, np.pi / 4], 2**-0.5, 2**-0.5),
         ("no length", [0, 0, 0, 0, 2, 2, 0], [0, 0, 0, 0, 2, 2, 0], 0, 0),
         ("no height", [0, 0, 0, 4, 2, 0, 0], [0, 0, 0, 4, 2, 0, 0], 1, 0),

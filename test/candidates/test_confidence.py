@@ -1,4 +1,4 @@
-"""The parts that `best` adds: metric silhouettes, confidence and automatic seeds."""
+"""Metric silhouettes, confidence and automatic seeds, which the configuration `best` adds."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_seen_only_ignores_hidden_legs():
     alike = [compute_similarity(draw(head)[None], draw(whole), params.stm)[0] for params in (METRIC, seen)]
     assert alike[0] < 0.85 and alike[1] > 0.99
     again = compute_similarity(draw(whole)[None], draw(head), seen.stm)[0]
-    assert again == pytest.approx(alike[1], abs=1e-12)  # whichever of the two is hidden
+    assert again == pytest.approx(alike[1], abs=1e-12)  # symmetric in the hidden image
 
 
 def test_pca_axis_corrects_a_tilt_and_yaw_does_not():

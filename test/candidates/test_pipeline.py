@@ -1,4 +1,4 @@
-"""The whole candidate pipeline."""
+"""The complete candidate pipeline."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_error_of_a_view_without_a_camera_names_the_remedy():
 
 
 def test_restricted_view_equals_pipeline_on_cropped_points():
-    # A camera at the sensor, looking along x: its x is -y, its y is -z, its z is x.
+    # Camera at the sensor, looking along x: image x = -y, image y = -z, depth = x.
     axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
     intrinsics = np.array([[600, 0, 500], [0, 600, 300], [0, 0, 1]])
     camera = Camera(np.column_stack([intrinsics @ axes, np.zeros(3)]), 1000, 600)

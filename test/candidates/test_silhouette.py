@@ -68,7 +68,7 @@ def rotate(xyz, angle, rng=None):
 
 
 def radial_alignment(xyz):
-    """Return |cos| of the angle from the widest direction to the ray; at 1, left is undefined."""
+    """Return |cos| of the angle between the widest direction and the ray; at 1, "left" is undefined."""
     centre = xyz.mean(axis=0)[:2].astype(float)
     widest = np.linalg.eigh(np.cov(xyz[:, :2].T.astype(float)))[1][:, -1]
     return abs(widest @ centre) / np.linalg.norm(centre)
@@ -119,7 +119,7 @@ def test_to_pixels_and_from_pixels_are_inverse(seed):
 
 
 @given(seeds)
-@example(40877)  # one of its images is blank
+@example(40877)  # contains a blank image
 def test_similarity_is_the_cosine_of_flattened_images(seed):
     rng = np.random.default_rng(seed)
     pixels = rng.random((5, ROWS, COLUMNS)) < rng.random((5, 1, 1))
@@ -184,7 +184,7 @@ def test_order_of_points_and_other_clusters_do_not_matter(seed):
 
 @given(seeds, st.integers(0, 9))
 def test_augmentation_only_adds_pixels(seed, steps):
-    # Closing and dilation are increasing, so an inclusion before them holds after them.
+    # Closing and dilation are monotonic, so a subset stays a subset.
     xyz = make_cluster(np.random.default_rng(seed))
     scales = compute_cpa_scales(np.array([20.0]), CpaParams(steps=steps))[0]
     plain, augmented = to_pixels(silhouette(xyz)), to_pixels(silhouette(xyz, scales))
@@ -223,7 +223,7 @@ def test_zero_steps_or_clusters_give_empty_arrays_of_right_shape():
 @pytest.mark.parametrize("at", [[8, 1, -1], [0, 0, 1], [0.3, -70, -1.2], [-7e4, 7e4, 3]])
 @pytest.mark.parametrize("scales", [(1.0,), (1.0, 0.9, 0.8), (1.0, 0.0)])
 def test_coincident_points_set_the_top_left_pixel(at, scales):
-    # Without an extent, the point falls into the first pixel of the window.
+    # A point without extent falls into the first pixel of the window.
     for count in (1, 2, 7, 100):
         pixels = to_pixels(silhouette(np.full((count, 3), at, np.float32), scales))
         assert pixels[:2, :2].all() and pixels.sum() == 4

@@ -1,4 +1,4 @@
-"""Warm-up compiles the code that a node runs, and no other."""
+"""Warm-up compiles exactly the code that a node runs."""
 
 from __future__ import annotations
 

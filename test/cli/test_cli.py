@@ -90,7 +90,7 @@ def test_convert_skips_and_reports_broken_frames(tmp_path, monkeypatch, capsys):
 
 def test_convert_replaces_a_bag_only_with_force(kitti, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "300")
-    out = tmp_path / "run [/final]"  # which is no markup
+    out = tmp_path / "run [/final]"  # looks like rich markup
     command = ("convert", kitti, "--out", out, "--limit", 1)
     assert [
         exit_of(monkeypatch, *command),

@@ -1,4 +1,4 @@
-"""./lidar and the environment that it makes."""
+"""The script ./lidar and the environment that it creates."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TEST = f"{BASE} test docs benchmark distributed onnx video"
 
 
 def stamp(extras=TEST):
-    """Return the text by which ./lidar knows that its environment is up to date."""
+    """Return the text that marks an environment as up to date."""
     return (
         subprocess.run(
             ["cksum"],
@@ -40,7 +40,8 @@ needs_pip = pytest.mark.skipif(not INSTALLED.is_dir(), reason="needs the package
 
 @needs_pip
 def test_path_gets_only_the_lidar_command():
-    """The nodes lie where ros2 run and ros2 launch look: others have a `tracker` too."""
+    """Node executables are in lib/, where ros2 run and ros2 launch look, because names such as `tracker` are
+    common."""
     assert {path.name for path in INSTALLED.iterdir()} == set(NODES)
     assert {path.name for path in (PREFIX / "bin").iterdir()}.isdisjoint(NODES)
     assert (PREFIX / "bin/lidar-perception").is_file()
@@ -49,7 +50,7 @@ def test_path_gets_only_the_lidar_command():
 @needs_pip
 @pytest.mark.parametrize("name", ["tracker", "bag_recorder"])
 def test_executable_starts_the_node_of_its_name(name, tmp_path):
-    """Also in a folder with modules of the same names as ours."""
+    """Also in a folder with modules of the same names as those of the package."""
     for module in "numpy", "signal", "lidar_perception":
         write(tmp_path / f"{module}.py", "raise SystemExit(3)")
     done = subprocess.run([INSTALLED / name, "--help"], cwd=tmp_path, capture_output=True, text=True)
@@ -71,7 +72,7 @@ def test_closed_pipe_ends_help_without_error():
 def test_concurrent_first_calls_create_one_environment(tmp_path):
     venv = tmp_path / "venv"
     write(venv / "bin/lidar-perception", "#!/bin/sh\necho ran $1\n").chmod(0o755)
-    with open(venv / "lidar-lock", "w") as lock:  # the one
+    with open(venv / "lidar-lock", "w") as lock:  # the lock of ./lidar
         fcntl.flock(lock, fcntl.LOCK_EX)
         other = subprocess.Popen(
             [ROOT / "lidar", "info"],
@@ -102,7 +103,7 @@ def test_sourced_ros_does_not_affect_the_new_environment(tmp_path):
             "LIDAR_PYTHON": str(python),
         },
     )
-    assert done.returncode == 1 and "installing failed" in done.stderr  # this python makes none
+    assert done.returncode == 1 and "installing failed" in done.stderr  # this Python cannot create environments
     assert seen.read_text().split() == ["unset", "unset"]
 
 
@@ -127,7 +128,7 @@ def test_help_of_lidar_mentions_test_and_benchmark(environment):
 
 @pytest.fixture
 def environment(tmp_path):
-    """Return what ./lidar WORDS prints in an environment whose programs print their arguments."""
+    """Return the output of ./lidar WORDS in an environment whose programs print their arguments."""
     for name in ("python", "lidar-perception"):
         write(tmp_path / "bin" / name, f"#!/bin/sh\necho {name} $*\n").chmod(0o755)
     write(tmp_path / "lidar-setup", stamp())
@@ -187,4 +188,4 @@ def test_pip_configuration_is_passed_to_uv(tmp_path, monkeypatch):
     assert ("--find-links", "/never") not in pairs
     assert variables == {"SSL_CERT_FILE": "/ca.crt", "UV_HTTP_TIMEOUT": "9"}
     assert set_up["find_uv_options"]({"no-index": "true"})[0][2:] == ["--no-index"]
-    assert set_up["find_uv_options"]({**settings, "target": "/x"}) is None  # uv has no such thing
+    assert set_up["find_uv_options"]({**settings, "target": "/x"}) is None  # uv has no such option

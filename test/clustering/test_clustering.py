@@ -18,13 +18,13 @@ from lidar_perception.clustering.dbscan_growth import dbscan_by_growing
 from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.ground.threshold import segment_by_threshold
 
-pytestmark = pytest.mark.no_cover  # other tests cover these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 SCANS = DATA / "kitti_object/training/velodyne_reduced"
 
 
 def reference(xyz, eps, min_samples):
-    """Return scikit-learn's labels plus one: 0 for noise. Both compute in float64."""
+    """Return scikit-learn's labels plus one, so that noise is 0. Both compute in float64."""
     if len(xyz) == 0:
         return np.zeros(0, np.int32)
     model = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree")
@@ -76,7 +76,7 @@ def test_labels_equal_sklearn_with_many_equal_distances(seed, count, reach, min_
 
 @pytest.mark.parametrize("min_samples", [2, 5, 6, 7, 27])
 def test_border_points_join_the_first_cluster(min_samples):
-    # Dense balls so close that most border points are between two of them.
+    # Dense balls so close to each other that most border points are between two of them.
     rng = np.random.default_rng(3)
     xyz, _ = blobs(rng, [[0, 0, 0], [0.9, 0, 0], [0, 0.9, 0], [0.9, 0.9, 0.2]], 40, 0.25)
     bridge = rng.uniform(-0.2, 1.1, (60, 3)).astype(np.float32)
@@ -126,7 +126,7 @@ def test_labels_equal_sklearn_on_real_clouds(scan):
 
 
 def banded_reference(xyz, params):
-    """Cluster each band with scikit-learn, with ids that continue; ranges are float32."""
+    """Cluster each band with scikit-learn and number the clusters consecutively; ranges are float32."""
     limits = [-np.inf, *params.range_limits, np.inf]
     ranges = np.sqrt(xyz[:, 0] * xyz[:, 0] + xyz[:, 1] * xyz[:, 1])
     labels, last = np.zeros(len(xyz), int), 0
@@ -198,7 +198,7 @@ def test_join_bands_reunites_a_cluster_across_a_limit():
     xyz = np.zeros((200, 3), np.float32)
     xyz[:, 0] = np.linspace(14, 16, 200)
     assert distance_aware_dbscan(xyz, JOIN).tolist() == [1] * 200
-    gap = xyz[(xyz[:, 0] < 14.9) | (xyz[:, 0] > 15.1)]  # 0.2 m: more than the smaller eps
+    gap = xyz[(xyz[:, 0] < 14.9) | (xyz[:, 0] > 15.1)]  # a gap of 0.2 m, more than the smaller eps
     assert distance_aware_dbscan(gap, JOIN).max() == 2
 
 
@@ -338,7 +338,7 @@ def test_dbscan_by_growing_rejects_dense_points():
 
 
 def test_a_forked_process_can_cluster():
-    """A forked process does not have the threads that its parent keeps for the bands."""
+    """A forked process lacks its parent's thread pool for the bands."""
     xyz = np.random.default_rng(0).uniform(-40, 40, (500, 3)).astype(np.float32)
     labels = distance_aware_dbscan(xyz)
     child = multiprocessing.get_context("fork").Process(target=assert_labels, args=(xyz, labels))

@@ -1,4 +1,4 @@
-"""Curvature-consistent growing: equals plain NumPy, and parts a bush from the wall it touches."""
+"""Curvature-consistent growing equals plain NumPy and separates a bush from the wall it touches."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_consistent_points_equal_plain_numpy():
     found = find_consistent_points(xyz, radii, 0.02, MAX_WORK)
     assert 0.1 < found.mean() < 0.9
     np.testing.assert_array_equal(found, plain(xyz, 0.5, 0.02))
-    assert (find_consistent_points(xyz, radii, 0.02, 1000) == found).mean() > 0.5  # by a sample
+    assert (find_consistent_points(xyz, radii, 0.02, 1000) == found).mean() > 0.5  # estimated from 1000 points
 
 
 @pytest.mark.parametrize("max_distances", [2**15, 0], ids=["grid", "tree"])

@@ -65,8 +65,8 @@ def test_density_matches_angular_resolution(elevation_step, azimuth_step):
     # Each beam has 1 / azimuth_step returns per degree of azimuth, at every elevation.
     slant = np.cos(np.radians(np.arange(-25.0, 5.0, elevation_step))).mean()
     expected = 1 / (elevation_step * azimuth_step * slant)
-    # The tolerance is for cells that are only half filled, at the end of the view or with every
-    # second beam: the point itself counts too little there.
+    # Cells at the border of the view, or with every second beam, are only half filled, so the density is too
+    # low there.
     found = measure_density(make_scan(elevation_step, azimuth_step, np.random.default_rng(3)))
     assert found == pytest.approx(expected, rel=0.12, abs=0.3)
 
@@ -161,7 +161,7 @@ def test_objects_are_not_split_with_a_tenth_of_the_points(params, scan):
     ground = np.isin(scan.semantic[kept], (40, 44, 48, 49, 60, 72))
 
     def count_whole(params):
-        """Count objects that share most of their points with most of one cluster."""
+        """Count objects that contain most of a cluster which contains most of the object."""
         ids, count = cluster_obstacles(xyz, ground, params), 0
         for box, name in zip(scan.truth.boxes, scan.truth.labels):
             inside = ids[points_in_box(xyz, box) & ~ground]

@@ -13,7 +13,7 @@ from benchmark.plain_euclidean import cluster_euclidean as plain_euclidean
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import EuclideanParams
 
-pytestmark = pytest.mark.no_cover  # other tests cover these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 LOCAL = EuclideanParams()
 SETTINGS = [
@@ -78,13 +78,13 @@ def test_degenerate_clouds_equal_the_plain_implementation(xyz, params):
 def test_scenes_equal_the_plain_implementation(seed, params):
     labels = cluster_euclidean(scene(seed), params)
     np.testing.assert_array_equal(labels, plain_euclidean(scene(seed), params))
-    # The comparison is not trivial.
+    # Check that the comparison is not trivial.
     assert labels.max() > 3 and ((labels == 0).any() or params.beta == 0)
 
 
 @given(st.data())
 def test_lattice_clouds_equal_the_plain_implementation(data):
-    """On a coarse lattice, equal distances and distances equal to a threshold are common."""
+    """On a coarse lattice many distances are equal or equal to a threshold."""
     count = data.draw(st.integers(1, 60))
     step = data.draw(st.sampled_from([0.05, 0.125, 0.3, 2.0]))
     rows = data.draw(st.lists(st.tuples(*[st.integers(-6, 6)] * 3), min_size=count, max_size=count))
@@ -127,7 +127,7 @@ def test_permuting_points_permutes_labels(params):
 
 @pytest.mark.parametrize("params", SETTINGS[:2], ids=SETTING_NAMES[:2])
 def test_moving_and_rotating_the_cloud_changes_nothing(params):
-    """The clusters are far enough apart for rounding not to matter."""
+    """The clusters are so far apart that rounding does not matter."""
     xyz = blobs(3, [[0, 0, 0], [8, 0, 0], [0, 9, 1], [-7, -7, 0]])
     turn = np.array([[np.cos(0.7), -np.sin(0.7), 0], [np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])
     moved = (xyz.astype(float) @ turn.T + [30, -20, 1]).astype(np.float32)
@@ -173,8 +173,8 @@ def test_gamma_merges_clusters_nearer_than_their_diameters():
 
 
 def test_local_threshold_adapts_to_the_density():
-    """Why Eq. 11 is the default: it finds a wall with points 2 cm apart and, in the same cloud, one
-    with points 0.4 m apart, as on a far car. One threshold finds the dense wall only."""
+    """Reason for Eq. 11 as the default: it finds both a wall with points 2 cm apart and one with points 0.4 m
+    apart, as on a distant car. A single threshold finds the dense wall only."""
 
     def wall(x, step):
         y, z = np.meshgrid(np.arange(0, 2.01, step), np.arange(0, 1.61, step))

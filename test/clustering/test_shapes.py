@@ -43,13 +43,13 @@ def make_clusters(seed):
 
 
 def apply_to_one(function, xyz, *rest):
-    """Return the function's row for points that form one cluster."""
+    """Apply the function to points of a single cluster and return its row."""
     xyz = np.asarray(xyz, np.float32).reshape(-1, 3)
     return function(xyz, np.ones(len(xyz), np.int32), *rest)[0]
 
 
 def least_area(xy):
-    """Return the area of the smallest rectangle, over all edges of SciPy's hull."""
+    """Return the area of the smallest enclosing rectangle, from all edges of SciPy's convex hull."""
     hull = ConvexHull(xy.astype(float))
     normals = hull.equations[:, :2]
     along = normals @ [[0, 1], [-1, 0]] @ hull.points.T
@@ -152,7 +152,7 @@ def test_rotating_a_cloud_rotates_its_min_area_box(seed, angle):
 
 @given(seeds, st.integers(-720, 720).map(np.radians))
 def test_rotating_a_car_rotates_its_l_shape_box(seed, angle):
-    # A rotation by whole degrees maps the angles that are tried onto themselves.
+    # A rotation by an integer number of degrees maps the tested angles onto themselves.
     rng = np.random.default_rng(seed)
     xyz, _ = l_shaped_car(rng, np.radians(rng.integers(0, 360) + 0.2))
     before = apply_to_one(fit_boxes, xyz, "l_shape")

@@ -1,4 +1,4 @@
-"""Clouds that make every exact method compare all pairs: their work is bounded too."""
+"""Bounded work for clouds that make exact methods compare all pairs."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ REACH = 0.5
 
 
 def shell(n, gap, seed=0):
-    """Return half of the points at x = 15 m and half on a hemisphere around them.
-
-    The hemisphere is farther from the sensor, and out of reach by a share `gap` of REACH.
+    """Return half of the points at x = 15 m and half on a hemisphere around them, which is farther from the
+    sensor. The radius of the hemisphere is (1 + gap) * REACH.
     """
     rng = np.random.default_rng(seed)
     normal = rng.normal(size=(n // 2, 3))
@@ -53,7 +52,7 @@ def test_points_slightly_farther_than_eps_are_separate_clusters(method):
 @each_method
 @pytest.mark.parametrize("seed", range(3))
 def test_thinning_connects_at_least_the_same_points_and_few_more(method, seed, always_thin):
-    """Thinned clusters lie between those of the reach and those of the longer reach."""
+    """Thinned clusters contain those of REACH and are contained in those of the longer reach."""
     rng = np.random.default_rng(seed)
     blobs = rng.uniform(-2.5, 2.5, (12, 3)) + [15, 0, 0]
     xyz = np.concatenate([blob + rng.normal(0, 0.05, (60, 3)) for blob in blobs])

@@ -1,4 +1,4 @@
-"""The k-d tree agrees with a comparison of all pairs, and its work is bounded."""
+"""The k-d tree equals a comparison of all pairs, and its work is bounded."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from lidar_perception.clustering.tree import (
     find_touching_labels,
 )
 
-pytestmark = pytest.mark.no_cover  # other tests cover these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 
 def sphere(rng, n):
@@ -57,7 +57,7 @@ def make_points(arrange, count, seed=0):
 
 
 def draw_lattice(data):
-    """Draw points on a coarse lattice, where distances tie and points coincide."""
+    """Draw points on a coarse lattice with many equal distances and coincident points."""
     rows = data.draw(st.lists(st.tuples(*[st.integers(-4, 4)] * 3), min_size=1, max_size=60))
     return np.array(rows) * data.draw(st.sampled_from([0.125, 0.25]))
 
@@ -125,7 +125,7 @@ SETTINGS = [
 @pytest.mark.parametrize("params", SETTINGS, ids=range(4))
 @pytest.mark.parametrize("max_distances", [-1, 2000])
 def test_grid_and_tree_give_the_same_clusters(arrange, params, max_distances):
-    """-1 uses the tree only. The plain implementation has no fixed threshold."""
+    """With max_distances -1 only the tree is used. The plain implementation has no fixed threshold."""
     xyz = make_points(arrange, 700)
     expected = cluster_euclidean(xyz, params, 10**9) if params.threshold == "fixed" else plain_euclidean(xyz, params)
     np.testing.assert_array_equal(cluster_euclidean(xyz, params, max_distances), expected)

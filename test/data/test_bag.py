@@ -183,7 +183,7 @@ def load_bytes(frames, i):
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_frames_can_be_loaded_in_any_order_thread_and_process(written, tmp_path, storage):
-    """Each thread opens the bag once, as its index may be long."""
+    """Each thread opens the bag once, because reading a long index takes time."""
     copy_bag(written, tmp_path / "bag", storage)
     frames = open_recording(tmp_path / "bag").frames
     expected = [frame.load().xyz.tobytes() for frame in frames]
@@ -213,7 +213,7 @@ def test_raw_messages_are_selected_by_topic_and_time(written):
 
 @pytest.mark.parametrize("reverse", [False, True])
 def test_messages_without_chunks_are_read_one_by_one(written, tmp_path, monkeypatch, reverse):
-    """`ros2 bag record` writes no chunks with its preset fastwrite."""
+    """The preset fastwrite of `ros2 bag record` writes no chunks."""
     path, rows = tmp_path / "fast.mcap", message_bytes(written)
     last = max(time for _, time, _ in rows)
     with open(written / "drive.mcap", "rb") as stream, open(path, "wb") as out:

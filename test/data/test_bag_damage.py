@@ -1,4 +1,4 @@
-"""Bags that exist already, are damaged, or are not bags: nothing is lost, and each is reported."""
+"""Existing bags, damaged bags and other files: nothing is lost, and each problem is reported."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_invalid_target_folder_is_reported(tmp_path):
 
 @pytest.fixture
 def limit_file_size():
-    """Return a function that limits the size of files, as a full disk does."""
+    """Return a function that limits the size of files, to imitate a full disk."""
     _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, hard))
@@ -188,7 +188,7 @@ def test_truncated_bag_is_reported(written, tmp_path, folder):
 
 
 def read_unless_damaged(path):
-    """Return the messages, or None if the bag is reported as damaged, in one line."""
+    """Return the messages, or None if the bag is reported as damaged in one line."""
     try:
         with Bag(path) as bag:
             rows = list(bag.raw_messages())
@@ -209,7 +209,7 @@ DAMAGES = {
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 @pytest.mark.no_cover
 def test_damaged_byte_is_reported_or_changes_nothing(written, tmp_path, damage):
-    """Damage in the data, at the head of a chunk, and in the index."""
+    """The damage is in the data, in a chunk header, or in the index."""
     raw, before = (written / "drive.mcap").read_bytes(), message_bytes(written)
     path, reported = tmp_path / "drive.mcap", 0
     with open(written / "drive.mcap", "rb") as stream:

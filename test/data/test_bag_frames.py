@@ -55,7 +55,7 @@ def find_scene(frame):
 
 
 def test_first_frame_needs_no_scan_of_the_bag(written, monkeypatch):
-    """Scanning an hour of clouds takes minutes, and many commands need the first one only."""
+    """Scanning an hour of clouds takes minutes, and many commands need only the first one."""
     stamped = []
     monkeypatch.setattr(bag_frames.BagFrames, "_stamp", lambda self, data, time: stamped.append(time) or time)
     frames = open_recording(written).frames
@@ -130,7 +130,7 @@ def test_scan_with_negative_stamp_is_skipped_and_reported(tmp_path):
     [([0, 1, 2], [0, 1, 2]), ([0, 0, 2], [0, 0, 2]), ([5, 0, 2], [5, 0, 2]), ([0, 0], [70, 71]), ([0], [70])],
 )
 def test_zero_stamps_are_replaced_only_if_all_are_zero(tmp_path, stamps, expected):
-    """Simulated time starts at 0; drivers that set no stamp leave all of them 0."""
+    """Simulated time starts at 0. Drivers that set no stamps leave all of them at 0."""
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")

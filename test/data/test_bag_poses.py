@@ -1,4 +1,4 @@
-"""Poses of the sensor of a bag, from the odometry and TF that various robots record."""
+"""Sensor poses from the odometry and TF that various robots record."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from msg_utils.stamps import SECOND_NS, make_header
 
 
 def wheel_transforms():
-    """Yield transforms of wheels, which turn for a while before the robot is localised."""
+    """Yield transforms of wheels, which rotate for a while before the robot is localised."""
     for i in range(600):
         stamp = START - SECOND_NS + i * SECOND_NS // 1000
         yield TF, TF_MESSAGE, stamp, tf(transform("base_link", "wheel", stamp, np.eye(4)))
@@ -51,7 +51,7 @@ def test_odometry_without_tf_is_the_pose_of_the_sensor(tmp_path):
 
 
 def test_odometry_of_another_frame_is_transformed_to_the_sensor(tmp_path):
-    """Such as an IMU, or a base_footprint below the base."""
+    """The other frame is an IMU, or a base_footprint below the base."""
     imu = make_tilted_pose(0.1, 0.2, 0.3)
     mounting = [(TF_STATIC, TF_MESSAGE, START, tf(transform("base_link", "imu", 0, imu)))]
     check(recorded(tmp_path / "bag", moving(ODOMETRY, "imu"), mount(), mounting), invert_pose(imu) @ ON_BASE)
@@ -88,7 +88,7 @@ def test_sensor_that_rotates_on_the_robot_has_correct_poses(tmp_path):
 
 
 def test_no_pose_is_guessed(tmp_path):
-    fixed = recorded(tmp_path / "fixed", mount())  # nothing moves
+    fixed = recorded(tmp_path / "fixed", mount())  # static transforms only
     assert POSES not in fixed.has and [frame.pose() for frame in fixed] == [None] * CLOUDS
     two = recorded(tmp_path / "two", moving("/left"), moving("/right"))
     assert POSES not in two.has
@@ -106,7 +106,7 @@ def test_no_pose_is_guessed(tmp_path):
             )
         ],
     )
-    assert [frame.pose() for frame in short] == [None] * CLOUDS  # it ends a second before
+    assert [frame.pose() for frame in short] == [None] * CLOUDS  # the odometry ends a second earlier
     circle = recorded(
         tmp_path / "circle",
         [

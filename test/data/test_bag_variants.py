@@ -1,4 +1,4 @@
-"""Bags as other recorders, versions and people write them."""
+"""Bags of other recorders and versions, and edited bags."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_topic_with_two_types_is_read_as_the_frequent_one(written, rows, tmp_pat
         assert message_bytes(tmp_path / "a.mcap") == clouds
 
 
-SCHEMAS = {  # columns of topics by distribution
+SCHEMAS = {  # columns of the table topics, by distribution
     "dashing": "id INTEGER PRIMARY KEY, name TEXT, type TEXT",
     "foxy": "id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, offered_qos_profiles TEXT",
     "jazzy": "id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, "
@@ -217,7 +217,7 @@ def test_sqlite_file_of_any_distribution_is_read(written, rows, tmp_path, schema
 
 @pytest.mark.parametrize("shm", [True, False])
 def test_sqlite_wal_is_read_from_a_read_only_folder(written, rows, tmp_path, shm):
-    """A crash leaves such a file with the recorder's preset resilient."""
+    """The recorder's preset resilient leaves such a file after a crash."""
     with Bag(written) as bag:
         database = write_sqlite(tmp_path / "a.db3", bag, rows, mode="WAL")
     (tmp_path / "bag").mkdir()

@@ -1,4 +1,4 @@
-"""Point cloud files of other programs, and formats that are not supported."""
+"""Point cloud files of other programs, and unsupported formats."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def text(columns=CLOUD, form="{:.6f}"):
 
 
 def padded(count0):
-    """Return a PCD file with padding and a field without numbers."""
+    """Return a PCD file with padding and an empty field."""
     kind = np.dtype([("xyz", "<f4", 3), ("pad", "V4"), ("intensity", "<f4"), ("end", "V2")])
     made = np.zeros(len(CLOUD), kind)
     made["xyz"], made["intensity"] = CLOUD[:, :3], CLOUD[:, 3]
@@ -198,7 +198,7 @@ def test_map_coordinates_are_reported_with_remedy(tmp_path):
         "offset, such as 513000 5404000, from x y",
     ):
         load(tmp_path)
-    far[0, :3] = 1, 2, 3  # with one point in range, the others are invalid returns
+    far[0, :3] = 1, 2, 3  # one point in range; the others are invalid returns
     np.save(tmp_path / "one.npy", far)
     assert len(load(tmp_path)) == 1
     np.save(tmp_path / "one.npy", np.full((5, 3), np.nan))
@@ -215,7 +215,7 @@ FIRST = 1_741_286_117
         ([f"{FIRST}.{i * 10**8 + 11_149_430}" for i in range(10)], [i * 10**8 + 11_149_430 for i in range(10)]),
         ([f"{FIRST}.{i * 10**8 + 7}" for i in range(3)], [i * 10**8 + 7 for i in range(3)]),
         ([f"{FIRST}.5000", f"{FIRST}.100005000"], [5000, 100_005_000]),
-        # decimal fractions, padded or as printed floats
+        # decimal fractions, zero-padded or as printed floats
         ([f"{FIRST}.{i * 10**8 + 11_149_430:09}" for i in range(10)], [i * 10**8 + 11_149_430 for i in range(10)]),
         ([f"{FIRST}.1", f"{FIRST}.2", f"{FIRST}.3000001"], [10**8, 2 * 10**8, 300_000_100]),
         ([f"{FIRST}.05", f"{FIRST}.123456789"], [5 * 10**7, 123_456_789]),

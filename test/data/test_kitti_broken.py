@@ -1,4 +1,4 @@
-"""KITTI folders with invalid or missing files: they are reported, other frames are not affected."""
+"""Invalid or missing files in KITTI folders are reported and do not affect other frames."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from samples import LABELS, calibration_text, object_folder, write
 from lidar_perception.data.open import open_recording
 from lidar_perception.types import InputError
 
-INVALID_FILES = {  # invalid file: its content (None: removed) and words of the error
+INVALID_FILES = {  # invalid file -> its content (None: removed), words of the error
     "velodyne/000000.bin": [(b"123", "multiple of 16")],
     "calib/000000.txt": [
         (None, "cannot read"),
@@ -31,7 +31,7 @@ INVALID_FILES = {  # invalid file: its content (None: removed) and words of the 
 
 
 def read(frame):
-    """Read everything that a frame has."""
+    """Read all parts of a frame."""
     return frame.load(), frame.truth(), frame.calibration()
 
 

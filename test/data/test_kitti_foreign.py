@@ -31,7 +31,7 @@ def test_class_names_are_recognised_in_any_spelling(text):
     name = SPELLINGS[text]
     assert parse_label(CAR.replace("Car", text))["class"] == name
     assert parse_label(CAR.replace("Car", text) + " 0.9")["score"] == 0.9
-    if text != "Person":  # a name of the tracking benchmark only
+    if text != "Person":  # exists only in the tracking benchmark
         assert [CLASSES[i] for i in class_ids([text])] == [name if name in CLASSES else "Misc"]
     if name in CLASSES:
         assert parse_label(CAR.replace("Car", text), known_only=True)
@@ -41,7 +41,7 @@ def test_class_names_are_recognised_in_any_spelling(text):
 
 
 def encode_for_windows(text):
-    """Return a text as Windows editors save it, with spaces at the ends of lines."""
+    """Encode a text like Windows editors, with trailing spaces."""
     return b"\xef\xbb\xbf" + text.replace("\n", " \t\r\n").encode() + b"\r\n\r\n"
 
 

@@ -1,4 +1,4 @@
-"""KITTI labels as text, boxes and markers."""
+"""KITTI labels as text, boxes and markers are equivalent."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_labels_survive_conversion_to_truth_and_markers(lines):
     truth = to_ground_truth([parse_label(line) for line in lines], LIDAR_TO_CAMERA)
     received = through_markers(truth)
     assert same(received, truth)
-    expected = sorted(lines, key=lambda line: line.startswith("DontCare"))  # notes come last
+    expected = sorted(lines, key=lambda line: line.startswith("DontCare"))  # regions come last
     assert format_truth(truth) == format_truth(received) == expected
 
 
@@ -57,7 +57,7 @@ def test_label_can_be_computed_from_its_box(line):
     np.testing.assert_allclose(again["dimensions"], label["dimensions"], atol=1e-9)
     np.testing.assert_allclose(again["location"], label["location"], atol=1e-9)
     assert abs(np.sin((again["rotation_y"] - label["rotation_y"]) / 2)) < 0.0025
-    x, _, z = label["location"]  # alpha is the heading seen along the ray to the object
+    x, _, z = label["location"]  # alpha: heading relative to the ray to the object
     assert abs(np.sin((again["alpha"] - (again["rotation_y"] - np.arctan2(x, z))) / 2)) < 1e-9
     assert -np.pi <= again["alpha"] <= np.pi
 

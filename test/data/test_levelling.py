@@ -1,4 +1,4 @@
-"""Clouds of a tilted sensor, converted to what nodes with its parameter file see."""
+"""Conversion of clouds of a tilted sensor to a level frame, as nodes with its parameter file do."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def pose(i):
 
 
 def make_tilted_frames():
-    """Yield frames of the tilted sensor, whose first points are on the robot itself."""
+    """Yield frames of the tilted sensor. Their first points are on the robot itself."""
     rotation = np.eye(4)
     rotation[:3, :3] = UPRIGHT.as_matrix()
     xyz = np.vstack([BODY, UPRIGHT.inv().apply(LEVEL)])

@@ -1,4 +1,4 @@
-"""Height and lean of a sensor, measured from its clouds."""
+"""Height and tilt of a sensor, measured from its clouds."""
 
 from __future__ import annotations
 

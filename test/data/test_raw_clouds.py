@@ -1,4 +1,4 @@
-"""Clouds of any file with all their columns."""
+"""Raw clouds with all columns, from any kind of file."""
 
 import struct
 
@@ -37,12 +37,12 @@ def points(n=200):
             if part.dtype.kind == "f"
             else rng.integers(0, np.iinfo(part.dtype).max // 2, part.shape, np.int64)
         )
-    made["ring"] = np.arange(n) // 20  # runs, which compress
+    made["ring"] = np.arange(n) // 20  # runs of equal values, which compress well
     return made
 
 
 def compress_lzf(data):
-    """Compress with LZF, greedily: copy earlier runs of at least three bytes, else literals."""
+    """Compress with greedy LZF: references to earlier runs of at least three bytes, literals otherwise."""
     out, literal, seen, i = bytearray(), bytearray(), {}, 0
 
     def flush():
@@ -171,7 +171,7 @@ def test_cloud_files_and_folders_are_opened(tmp_path):
     assert [len(to_array(clouds.load(i))) for i in range(3)] == [50, 51, 52]
     assert open_clouds(tmp_path / "1.pcd").count == 1
     rng = np.random.default_rng(0)
-    four = rng.normal(0, 10, (500, 4)).astype(np.float32)  # as many bytes as 400 records of five
+    four = rng.normal(0, 10, (500, 4)).astype(np.float32)  # same number of bytes as 400 records of five
     four[:, 3] = abs(four[:, 3])
     (tmp_path / "a.bin").write_bytes(four.tobytes())
     five = np.column_stack([four, rng.integers(0, 32, 500)]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Intensity scale of recordings: the same for all frames, in any order."""
+"""The intensity scale of a recording is the same for all frames, in any order."""
 
 from __future__ import annotations
 

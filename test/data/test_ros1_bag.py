@@ -1,4 +1,4 @@
-"""ROS 1 bags are read like ROS 2 bags."""
+"""Reading of ROS 1 bags."""
 
 import shutil
 
@@ -15,7 +15,7 @@ from lidar_perception.data.raw_clouds import open_clouds
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import ODOMETRY
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 
 @pytest.mark.parametrize("compress", [None, "lz4"])

@@ -1,4 +1,4 @@
-"""detect: results in all formats are equal to the detections."""
+"""The command detect: results in all formats equal the detections."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_all_formats_of_a_run_have_the_same_boxes(drives, tmp_path, monkeypatch)
 
 
 def seen_by_view(path):
-    """A bag as `view` opens it: the recording and its results."""
+    """Open a bag as `view` does: the recording and its results."""
     recording = open_recording(path, points=choose_points_topic(path))
     return recording, read_recorded_results(recording.frames.poses, [frame.stamp_ns for frame in recording.frames[:]])
 
@@ -171,7 +171,7 @@ def test_bag_with_duplicate_stamps_is_written_without_labels(tmp_path, monkeypat
 
 @pytest.mark.parametrize("camera", [True, False], ids=["camera", "nominal"])
 def test_written_results_score_like_the_detector(kitti, tmp_path, monkeypatch, camera, capsys):
-    write(kitti / "training/velodyne/000002.bin", b"123")  # which is skipped by both
+    write(kitti / "training/velodyne/000002.bin", b"123")  # skipped by both commands
     if not camera:
         frames = [replace(frame, calibration=return_none) for frame in open_recording(kitti)]
         kitti = tmp_path / "bag"
@@ -255,7 +255,7 @@ def test_drives_of_a_bag_are_tracked_separately(tmp_path, monkeypatch):
         assert [*read_tracking_labels(out / f"kitti/{name}.txt", FORWARD_CAMERA.lidar_to_camera)] == [0, 1]
 
 
-# Runs that stop, and other runs
+# Interrupted runs, and other runs in the same folder
 
 
 class Stopped(Exception):
@@ -275,7 +275,7 @@ def test_stopped_run_is_resumed(drives, tmp_path, made):
         run_detector(parts, partial(MadeDetector, fails=stop), [Json], ego="none", tracking=TrackingParams())
     assert len(made) == 3 and not (tmp_path / "parts/detections.json").exists()
     run_detector(parts, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
-    assert len(made) == len(recording)  # and none of them twice
+    assert len(made) == len(recording)  # none of them twice
     assert read_json(tmp_path / "parts") == read_json(tmp_path / "whole")
 
 
@@ -291,7 +291,7 @@ def test_the_number_of_processes_does_not_change_the_result(drives, tmp_path):
 def test_folder_of_another_run_needs_force(kitti, tmp_path, monkeypatch, capsys, made):
     out = tmp_path / "out"
     assert detect(monkeypatch, kitti, "--out", out, "--format", "kitti,csv", "--limit", 2) == 0
-    assert detect(monkeypatch, kitti, "--out", out) == 0  # more frames, another format
+    assert detect(monkeypatch, kitti, "--out", out) == 0  # all frames, another format
     assert len(made) == 4 and len(read_json(out)["frames"]) == 4
     capsys.readouterr()
     line = refused(monkeypatch, capsys, kitti, "--out", out, "--min-score", 0.1)
@@ -304,14 +304,14 @@ def test_folder_of_another_run_needs_force(kitti, tmp_path, monkeypatch, capsys,
     assert "has no run of this command" in said
 
 
-# What cannot be used
+# Invalid options
 
 
 def test_unreadable_frames_are_reported_and_others_written(kitti, tmp_path, monkeypatch, capsys, made):
     cut, out = kitti / "training/velodyne/000001.bin", tmp_path / "out"
     whole = cut.read_bytes()
     write(cut, b"123")
-    for _ in range(2):  # tried again each time
+    for _ in range(2):  # the failure is not remembered
         assert detect(monkeypatch, kitti, "--out", out, "--format", ALL) == 1
         assert "000001.bin" in (said := capsys.readouterr().out) and "3 frames" in said
     assert len(made) == 3
@@ -369,7 +369,7 @@ def test_unusable_options_are_rejected(arguments, words, kitti, tmp_path, monkey
     assert words in capsys.readouterr().err and made == [] and not (tmp_path / "out").exists()
 
 
-# PictureWriter and films
+# Pictures and videos
 
 
 def test_pictures_and_video_show_every_frame(drives, tmp_path, monkeypatch, made):
@@ -379,7 +379,7 @@ def test_pictures_and_video_show_every_frame(drives, tmp_path, monkeypatch, made
     images = {name: Image.open(out / f"png/{name}.png") for name in names}
     assert {image.size for image in images.values()} == {(1280, 720)}
     assert Image.open(film).n_frames == len(names)
-    assert not (out / "detections.json").exists()  # which nobody asked for
+    assert not (out / "detections.json").exists()  # not requested
     drawn = {name: (out / f"png/{name}.png").stat().st_mtime_ns for name in names}
     (out / f"png/{names[1]}.png").unlink()
     assert detect(monkeypatch, drives, "--out", out, "--png", "--track", "--ego", "none") == 0

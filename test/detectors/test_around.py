@@ -1,4 +1,4 @@
-"""The range `around` in two passes of a network trained for `ahead`."""
+"""The range `around`: two passes of a network trained for `ahead`."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def shipped(version="v4", range="auto"):
 
 
 def columns_of(scan):
-    """Return the experts' columns; for a rotated cloud they would differ slightly."""
+    """Return the experts' columns, which would differ slightly for a rotated cloud."""
     ground = segment_ground(scan, EXPERT_GROUND)
     return {"ground": ground, "cluster_ids": cluster_obstacles(scan.xyz, ground, EXPERT_CLUSTERING)}
 
@@ -88,7 +88,7 @@ def test_range_can_be_changed_and_restored(street):
     assert around.with_range("around") is around
     assert around.proposer.config.low == RANGES["around"]["low"]
     assert same(around.with_range("ahead")(street.frame), detector(street.frame))
-    trained = random_detector(**RANGES["around"])  # one look of it is enough
+    trained = random_detector(**RANGES["around"])  # one pass is enough
     assert trained.with_range("around") is trained and len(trained.proposer.half_turns) == 1
 
 

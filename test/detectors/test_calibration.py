@@ -1,4 +1,4 @@
-"""Calibration keeps the order of scores; thresholds are probabilities; bad lines are refused."""
+"""Calibrated scores are probabilities in the same order; invalid calibrations are rejected."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_save_header_keeps_stored_weights(tmp_path, half):
     header, after = read_checkpoint(path, type(config))
     assert header.calibration == {"Car": (1.0, 0.0)} and after.keys() == before.keys()
     assert all(value.dtype == before[name].dtype and value.equal(before[name]) for name, value in after.items())
-    # scans without enough objects give no line, and the file keeps those that it has
+    # scans without enough objects give no calibration, so the file keeps its own
     whole = path.read_bytes()
     script = runpy.run_path(str(Path(__file__).parents[2] / "scripts/calibrate_weights.py"))
     result = CliRunner().invoke(script["main"], [str(object_folder(tmp_path / "scans", count=1)), str(path)])

@@ -1,4 +1,4 @@
-"""Every detector of the package fulfils the contract."""
+"""Every detector of the package fulfills the contract."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_detector_has_classes_and_thresholds(detectors, name):
 
 @each_name
 def test_array_gives_the_detections_of_its_frame(detectors, frame, name):
-    """Columns have a value for each row, also for unusable points."""
+    """Columns have a value for every row, including unusable points."""
     scan, detector = frame.load(), detectors[name]
     cloud, ground = scan.points(), scan.xyz[:, 2] < -1.5
     assert same(detector(cloud), detector(scan))
@@ -78,7 +78,7 @@ def test_array_gives_the_detections_of_its_frame(detectors, frame, name):
     broken = np.insert(cloud, [0, 50], [[np.nan] * 4, [0, 0, 0, 1]], axis=0)
     assert same(detector(broken, ground=np.insert(ground, [0, 50], True)), expected)
     assert same(detector(broken.tolist(), ground=np.insert(ground, [0, 50], True).tolist()), expected)
-    if "STM-CPA" not in name or "auto" in name:  # the others find no seed there
+    if "STM-CPA" not in name or "auto" in name:  # the others have no seed in this frame
         assert len(detector([]).detections) == 0 and detector(np.full((9, 3), np.nan)).problem
     for wrong, said in ((np.ones((5, 5)), r"points\[:, :4\]"), (frame, "frame.load"), (None, "NoneType")):
         with pytest.raises(InputError, match=said):
@@ -93,7 +93,7 @@ def test_other_intensity_scale_is_reported_and_normalized(detectors, frame, name
     raw = np.column_stack([scan.xyz, np.round(scan.intensity * full)])
     found, expected = detector(raw), detector(PointCloud.of(raw, intensity_max=full))
     assert same(found.detections, expected.detections)
-    if name.startswith("STM-CPA") and "PointNet" not in name:  # which read no intensity
+    if name.startswith("STM-CPA") and "PointNet" not in name:  # these do not use intensity
         assert found.problem == expected.problem
     else:
         assert f"divided by {full}, a guess" in found.problem and "PointCloud.of" in found.problem
@@ -102,7 +102,7 @@ def test_other_intensity_scale_is_reported_and_normalized(detectors, frame, name
 
 @given(st.integers(0, 2**32 - 1))
 def test_ego_vehicle_is_dropped_for_any_heading(seed):
-    """Dropped are boxes that contain the sensor or a mast of 1 m, and cars below it within 1 m."""
+    """Boxes that contain the sensor or a mast of 1 m, and cars below it within 1 m, are dropped."""
     rng = np.random.default_rng(seed)
     boxes = np.column_stack([rng.uniform(-4, 4, (50, 3)), rng.uniform(0.5, 5, (50, 3)), rng.uniform(-4, 4, 50)])
     class_ids = np.arange(50) % len(CLASSES)
@@ -115,7 +115,7 @@ def test_ego_vehicle_is_dropped_for_any_heading(seed):
         held = points_in_box(np.zeros((1, 3)), high)[0]
         if class_id == CAR and box[2] + box[5] / 2 < 0:
             if points_in_box(disc, high).any() != points_in_box(1.02 * disc, high).any():
-                continue  # too near to the limit for points to tell
+                continue  # too close to the limit to be decided by points
             held = points_in_box(disc, high).any()
         assert (tuple(box.astype(np.float32).tolist()) in left) != held
 
@@ -125,8 +125,7 @@ def test_ego_vehicle_is_dropped_for_any_heading(seed):
     [SensorPoseParams(), SensorPoseParams(height=2.4), SensorPoseParams(roll=np.pi), SensorPoseParams(height=6.0)],
 )
 def test_ego_vehicle_is_dropped_and_next_car_is_kept(pose):
-    """The roof is detected in three parts, as in KITTI, with any mounting up to MAX_MAST_M above
-    the car."""
+    """The roof is detected in three parts, as in KITTI, for sensors up to MAX_MAST_M above the car."""
     up = pose.height - SENSOR_HEIGHT
     roof = np.array(
         [

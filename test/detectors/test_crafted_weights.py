@@ -1,4 +1,4 @@
-"""Crafted weights are used or refused with a one-line reason."""
+"""Crafted weight files are used or rejected with a one-line reason."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import InputError
 
-# Others run these lines.
+# covered by other tests
 pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread")]
 
 ODD = [
@@ -72,7 +72,7 @@ def write(path, tensors, header):
 
 
 def places(value, path=()):
-    """Return the paths of all values in a JSON object."""
+    """Return the key paths of all values in a JSON object."""
     yield path
     if isinstance(value, dict | list):
         for key, part in value.items() if isinstance(value, dict) else enumerate(value):
@@ -114,7 +114,7 @@ SMALL = {
 
 @pytest.mark.parametrize("kind", SMALL)
 def test_mutated_header_is_used_or_rejected_in_one_line(kind, tmp_path):
-    """Accepted headers have the shapes of the tensors, so memory use is bounded by the file."""
+    """Accepted headers match the shapes of the tensors, so the size of the file bounds the memory."""
     make_header, make, load, params = SMALL[kind]
     header = make_header()
     tensors = make(header.config).state_dict()
@@ -167,7 +167,7 @@ def test_constant_scores_are_reported_as_broken_weights():
 
 
 def test_onnx_files_with_other_inputs_are_rejected(tmp_path):
-    """Inputs are renamed, of another type or rank, or missing."""
+    """Inputs are renamed, missing, or of another type or rank."""
     onnx = pytest.importorskip("onnx", reason="needs the extra [onnx]")
     pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
     from onnx import TensorProto, helper
@@ -206,7 +206,7 @@ def test_onnx_files_with_other_inputs_are_rejected(tmp_path):
         (dict(inputs=right, header=""), "no header"),
         (dict(inputs=right, header="NO UTF-8"), "cannot read"),
         (dict(inputs=right), "n.onnx"),
-    ):  # outputs of a shape that no cloud has
+    ):  # outputs of impossible shapes
         model(path, **change)
         with pytest.raises(InputError, match=words) as error:
             load_detector(path, "cpu")(frame())

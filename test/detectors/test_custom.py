@@ -1,4 +1,4 @@
-"""Custom detectors: classes by reference or entry point, in the adapter."""
+"""Custom detectors: classes given by reference or entry point."""
 
 from __future__ import annotations
 

@@ -25,13 +25,13 @@ from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import InputError
 
 seeds = st.integers(0, 2**32 - 1)
-# Others run these lines.
+# covered by other tests
 pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread")]
 each_version = pytest.mark.parametrize("version", VERSIONS)
 
 
 def some_points(config, count=600, seed=0, margin=0.0) -> torch.Tensor:
-    """Return points all over the range, enlarged by margin, with a few in each pillar."""
+    """Return points in the entire range, enlarged by `margin`, a few in each pillar."""
     rng = torch.Generator().manual_seed(seed)
     low, high = torch.tensor(config.low) - margin, torch.tensor(config.high) + margin
     points = torch.rand(count, config.point_columns, generator=rng)
@@ -171,7 +171,7 @@ def test_shift_by_one_pillar_shifts_image_by_one_cell():
     config = tiny("v0", low=(0.0, -4.0, -3.0), high=(8.0, 4.0, 1.0), cell=0.25)
     network = lively(config)
     network.pillar_net.linear.weight[:, :2] = 0  # x and y themselves
-    points = (some_points(config) * 64).round() / 64  # so that moving is exact
+    points = (some_points(config) * 64).round() / 64  # so that shifts are exact
     points = points[(points[:, 0] < 7.5) & (points[:, 1] < 3.5)]
     image = network.pillar_net(make_pillar_batch([points], config))
     for axis, (rows, columns) in ((0, (0, 1)), (1, (1, 0))):
@@ -201,7 +201,7 @@ def test_limited_number_of_pillars_equals_padding(middle_z):
     cells = ((points[:, :2] - low[:2]) / config.cell).floor().long()
     for column, row in set(map(tuple, cells.tolist())):
         members = points[(cells == torch.tensor([column, row])).all(1)][:2]
-        rows = torch.zeros(2, 9 + middle_z)  # filled up with zeros, which take part in the maximum
+        rows = torch.zeros(2, 9 + middle_z)  # padded with zeros, which take part in the maximum
         middle = [*(low[:2] + (torch.tensor([column, row]) + 0.5) * config.cell), -1.0]
         rows[: len(members)] = torch.cat(
             [

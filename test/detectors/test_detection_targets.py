@@ -66,7 +66,7 @@ def test_decoding_undoes_encoding(seed, offset):
     anchors = torch.from_numpy(some_boxes(seed ^ 1))
     codes, bins = encode(boxes, anchors, offset)
     turned = codes.clone()
-    turned[:, 6] += np.pi  # the direction is in the bins alone
+    turned[:, 6] += np.pi  # only the direction bins contain the direction
     for given_codes in codes, turned:
         back = torch.from_numpy(decode(given_codes.numpy(), bins.numpy(), anchors.numpy(), offset))
         torch.testing.assert_close(back[:, :6], boxes[:, :6], atol=1e-9, rtol=1e-9)
@@ -178,7 +178,7 @@ def test_loss_is_zero_for_targets_and_positive_for_errors():
     right = outputs_of(targets)
     assert detection_loss(right, targets, kinds).total < 1e-4
     turned = right._replace(codes=right.codes + torch.tensor([0, 0, 0, 0, 0, 0, np.pi]))
-    assert detection_loss(turned, targets, kinds).boxes < 1e-6  # the direction is another loss
+    assert detection_loss(turned, targets, kinds).boxes < 1e-6  # the direction has its own loss
     wrong = right._replace(directions=-right.directions)
     assert detection_loss(wrong, targets, kinds).directions > 1
     assert detection_loss(right._replace(codes=right.codes + 0.3), targets, kinds).boxes > 0.1

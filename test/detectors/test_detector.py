@@ -1,4 +1,4 @@
-"""The detector from frame to boxes: experts, pose, thresholds, bad input, devices."""
+"""The PointPillars detector: experts, pose, thresholds, bad input, devices."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_cluster_map_equals_a_plain_loop_over_cells():
     spots = rng.uniform([0, -6, 0], [10.5, 6, 0], (25, 3))
     spread = np.linspace(0.02, 3, 25)[:, None, None]
     xyz = (spots[:, None] + rng.normal(size=(25, 40, 3)) * spread * 0.5).reshape(-1, 3)
-    xyz, ids = xyz.astype(np.float32), np.repeat(np.arange(25), 40).astype(np.int32)  # 0 is none
+    xyz, ids = xyz.astype(np.float32), np.repeat(np.arange(25), 40).astype(np.int32)  # 0: no cluster
     kinds = classify_by_diagonal(fit_boxes(xyz, ids, "min_area"))
     assert {*kinds} == {-1, *(CLASSES.index(n) for n in MAP_CLASSES)}
     expected = np.zeros((3, *config.grid), np.uint8)
@@ -101,7 +101,7 @@ def test_cluster_map_equals_a_plain_loop_over_cells():
         centre = np.maximum(abs(x - cx), abs(y - cy)) <= 0.08
         expected[MAP_CLASSES.index(CLASSES[kind])] |= ((u / a) ** 2 + (v / b) ** 2 <= 1) | centre
     drawn = draw_clusters(xyz, ids, config)
-    assert (drawn != expected).sum() <= 2  # cells whose middle is on the rim
+    assert (drawn != expected).sum() <= 2  # cells whose centre is on the edge of an ellipse
     assert drawn.shape == (3, 64, 64) and all(layer.any() for layer in drawn)
 
 
@@ -216,7 +216,7 @@ def test_best_scores_are_reported_without_detections():
     assert list(nothing.best) == list(detector.classes)
     assert max(nothing.best.values()) == pytest.approx(max(highest.values()))
     assert all(nothing.best[name] >= score - 1e-6 for name, score in highest.items())
-    assert same(detector(scan), found)  # which keeps its own threshold
+    assert same(detector(scan), found)  # the copy does not change the original
     for parameter in detector.proposer.network.network.head.parameters():
         parameter.fill_(np.nan)
     assert "NaN" in detector(scan).problem
@@ -238,12 +238,12 @@ def test_huge_and_non_finite_clouds_are_handled():
 def test_columns_of_wrong_length_are_rejected():
     with pytest.raises(InputError, match="ground has 3 values"):
         random_detector()(frame(), ground=np.zeros(3, bool))
-    with pytest.raises(TypeError):  # columns are named, so that none is taken for the other
+    with pytest.raises(TypeError):  # columns are keyword-only, so that they cannot be confused
         random_detector()(frame(), np.zeros(len(frame()), bool))
 
 
 class OutOfMemory(TorchNetwork):
-    """A network that runs out of memory on every device but the CPU."""
+    """Network that runs out of memory on every device except the CPU."""
 
     def __init__(self, network):
         super().__init__(network, CPU)
@@ -266,7 +266,7 @@ def test_cpu_fallback_after_out_of_memory_is_reported():
         assert same(found, random_detector()(scan)) and "CPU" in found.problem
         assert broken.device == CPU
     broken = make_detector(OutOfMemory(lively(config)), Header(config), eager(), meta)
-    others = broken.with_min_score(0.5), broken.with_raw_scores()  # of the same network
+    others = broken.with_min_score(0.5), broken.with_raw_scores()  # these share the network
     broken(scan)
     assert all(other.device == CPU and "CPU" in other(scan).problem for other in others)
     never = with_values(eager(), {"pointpillars.cpu_fallback": False})

@@ -44,7 +44,7 @@ from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, PointCloud
 
-# Others run these lines.
+# covered by other tests
 pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread")]
 SEEDS = st.integers(0, 2**32 - 1)
 EAGER = FusedDetectorParams(fused=FusedParams(warm_up=False))
@@ -95,7 +95,7 @@ def test_move_to_points_corrects_shifted_car_only(seed):
     way = rng.uniform(-np.pi, np.pi)
     box = np.array(
         [away * np.cos(way), away * np.sin(way), -0.9, 4.0, 1.7, 1.5, way + rng.choice([-1, 1]) * rng.uniform(0.6, 0.9)]
-    )  # two faces are seen
+    )  # two faces are visible
     points = shell(box, rng)
     off = box.copy()
     off[:2] += rng.uniform(-0.2, 0.2, 2)
@@ -134,7 +134,7 @@ def test_move_towards_interpolates_and_keeps_heading(seed):
     np.testing.assert_array_equal(half[silent], none[silent])
     np.testing.assert_allclose(there[~silent, :6], others[~silent, :6])
     np.testing.assert_allclose(half[:, :6], (none + there)[:, :6] / 2)
-    # Onto the same line, either way, by a quarter turn at most; halfway is half of that.
+    # Headings are interpolated modulo 180 degrees, so they change by at most 90 degrees.
     np.testing.assert_allclose(np.sin(there - others)[~silent, 6], 0, atol=1e-9)
     turned, halfway = (wrap_angle(moved[:, 6] - none[:, 6]) for moved in (there, half))
     assert (np.abs(turned) <= np.pi / 2 + 1e-9).all() and (np.abs(half[:, 6]) <= np.pi).all()
@@ -162,7 +162,7 @@ def test_probability_increases_with_evidence(seed):
 
 @given(st.integers(0, 2**32 - 1))
 def test_max_probability_holds_for_any_evidence_and_curve(seed):
-    """PointNet skips proposals whose bound is below the threshold."""
+    """PointNet skips proposals whose upper bound is below the threshold."""
     rng = np.random.default_rng(seed)
     models = {
         name: {
@@ -202,7 +202,7 @@ def test_remove_duplicates_by_class():
     )
     ids = np.array([PEDESTRIAN] * 2 + [CAR] * 3 + [CLASSES.index("Cyclist"), CAR, PEDESTRIAN])
     found = Detections.of(boxes, ids, [0.5, 0.8, 0.9, 0.7, 0.95, 0.4, 0.3, 0.2])
-    (car, person), (other, beside) = boxes[[4, 1]], boxes[[6, 7]]  # overlap by 4 % either
+    (car, person), (other, beside) = boxes[[4, 1]], boxes[[6, 7]]  # each pair overlaps by 4 %
     assert min(bev_iou(car[None], other[None]), bev_iou(person[None], beside[None])) > 0.03
     assert remove_duplicates(found, FusedParams()).tolist() == [4, 1, 3, 5, 7]
     assert len(remove_duplicates(found[:0], FusedParams())) == 0
@@ -221,7 +221,7 @@ def test_fused_fulfills_the_detector_contract(detector):
     found = detector(scan)
     assert len(found.detections) > 3 and tuple(found.timings) == STEPS
     assert (np.diff(found.detections.scores) <= 0).all()
-    assert same(detector(scan), found)  # nothing is left on it
+    assert same(detector(scan), found)  # no state is left in the detector
     said = found.detections.sources
     assert set(said) == set(KNOTS) and all(len(x) == len(found.detections) for x in said.values())
     cars = found.detections.class_ids == CAR
@@ -245,7 +245,7 @@ def test_sensor_height_and_given_columns_change_nothing(detector):
     high = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
     above = detector.with_sensor_height(1.73 + 0.5)(high).detections
     above = replace(above, boxes=above.boxes + np.array([0, 0, 0.5, 0, 0, 0, 0], np.float32))
-    # Except for boxes that would be the ego vehicle of one of the sensors.
+    # Except boxes that count as the ego vehicle of one of the sensors.
     above, below = drop_ego_vehicle(above, 1.73), drop_ego_vehicle(found, 1.73 + 0.5)
     assert len(below) > 90
     np.testing.assert_allclose(above.boxes, below.boxes, atol=2e-3)
@@ -262,7 +262,7 @@ def test_sensor_height_and_given_columns_change_nothing(detector):
 @pytest.mark.parametrize("use_intensity", [True, False])
 @pytest.mark.parametrize("height", [1.73, 2.5])
 def test_ground_of_experts_in_range_gives_equal_detections(detector, height, use_intensity):
-    """The node ground_segmentation segments the range of the detector only, with intensity."""
+    """The ground_segmentation node segments only the range of the detector, with intensity."""
     own = detector.with_params(with_values(detector.params, {"fused.use_intensity": use_intensity})).with_sensor_height(
         height
     )
@@ -276,7 +276,7 @@ def test_ground_of_experts_in_range_gives_equal_detections(detector, height, use
 
 
 def test_ignored_intensity_equals_missing_intensity(detector):
-    """Also for the ground segmentation, which removes low dark points as reflections."""
+    """This includes the ground segmentation, which removes low dark points as reflections."""
     scan, other = frame(), copy.copy(detector)
     other.params = with_values(detector.params, {"fused.use_intensity": False})
     pit = np.random.default_rng(0).uniform([4, -4, -2.81], [9, 4, -2.79], (3000, 3))
@@ -314,7 +314,7 @@ def test_classifier_box_interpolates_between_networks(detector):
 
 
 def test_hilly_ground_changes_only_the_height_of_boxes():
-    """The networks get the points on flat ground."""
+    """The networks get the points relative to flat ground."""
     detector = load_fused_detector("", "cpu", EAGER).with_range("around")
     scan = SimulatedScenes(7, 1, find_sensor("hdl64e", 0.0), Scenes(None, 3.0, "street"), around=True).frame(0).load()
 
@@ -334,7 +334,7 @@ def test_hilly_ground_changes_only_the_height_of_boxes():
 
 @pytest.mark.parametrize("height, stays", [(0.4, True), (1.0, True), (1.73, False), (6.0, True)])
 def test_nearby_car_that_is_not_ego_vehicle_is_kept(detector, monkeypatch, height, stays):
-    """The ego vehicle is determined with the real height of the sensor, not with 1.73 m."""
+    """The ego vehicle is determined with the actual sensor height instead of 1.73 m."""
     car = Detections.of([[0, 1.4, -0.98, 4, 1.6, 1.5, 0]], CAR, 0.9)  # 0.6 m aside
     monkeypatch.setattr(detector.proposer.__class__, "propose", lambda *_: DetectionResult(car))
     assert len(detector.with_sensor_height(height).propose(frame()).detections) == stays
@@ -348,7 +348,7 @@ def test_cpu_fallback_of_one_network_is_reported(detector):
 
 
 def test_without_cpu_fallback_the_error_is_raised(detector, monkeypatch):
-    """The parameter of the node applies to both networks."""
+    """The parameter applies to both networks."""
 
     def predict(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory")

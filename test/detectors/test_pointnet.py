@@ -128,7 +128,7 @@ def test_farthest_points_come_first(rng, size):
 def test_ground_height_follows_slopes(rng):
     flat = rng.uniform(-40, 40, (20_000, 3))
     flat[:, 2] = 0.05 * flat[:, 0] - 1.7
-    flat = flat[np.hypot(flat[:, 0] - 10, flat[:, 1]) > 4]  # none near here, but farther on
+    flat = flat[np.hypot(flat[:, 0] - 10, flat[:, 1]) > 4]  # no ground nearby, but farther away
     indices = np.array([[10.0, 0], [-20, 5], [30, -30], [39, 39], [500, 0], [9e4, 9e4]])
     found = find_ground_heights(flat.astype(np.float32), indices)
     for place, height in zip(indices, found):
@@ -139,7 +139,7 @@ def test_ground_height_follows_slopes(rng):
     assert found[0] == pytest.approx(-1.2, abs=0.02) and found[4] == found[5] == -SENSOR_HEIGHT
     assert len(find_ground_heights(flat, np.zeros((0, 2)))) == 0
     assert (find_ground_heights(flat[:0], indices) == -SENSOR_HEIGHT).all()
-    # heights are over it: a hill changes nothing
+    # heights are relative to the ground, so a hill changes nothing
     clusters = replace(blobs(rng, [20, 30]), ground=np.array([-1.7, -1.5]))
     lifted = replace(clusters, points=clusters.points + np.float32([0, 0, 3, 0]), ground=clusters.ground + 3)
     here, there = make_network_input(clusters, 24), make_network_input(lifted, 24)
@@ -158,7 +158,7 @@ def test_network_input_does_not_depend_on_azimuth(rng):
     assert np.allclose(here.points, there.points, atol=1e-5)
     assert np.allclose(here.context, there.context, atol=1e-5)
     assert np.allclose(wrap_angle(there.azimuths - here.azimuths - turn), 0, atol=1e-6)
-    # so its box is the same, turned
+    # so its box is rotated as well
     net = TorchPointNet(network())
     first = predict(net, clusters).boxes
     second = predict(net, Clusters(turned, clusters.first, clusters.ids)).boxes
@@ -222,7 +222,7 @@ def test_padding_points_change_nothing(rng, name):
         other[i, len(real) :] = inputs.points[i, rng.choice(real, net.config.points - len(real))]
     for mine, theirs in zip(called(net, clusters), called(net, clusters, points=other)):
         assert torch.allclose(mine, theirs, atol=1e-5)
-    for mine, theirs in zip(run_network(net, inputs, chunk=2), called(net, clusters)):  # left out
+    for mine, theirs in zip(run_network(net, inputs, chunk=2), called(net, clusters)):  # padding removed
         assert torch.allclose(mine, theirs, atol=1e-5)
     engine = TorchPointNet(net)
     again = predict(engine, clusters.take(np.array([2, 0])))
@@ -324,7 +324,7 @@ def test_calibration_makes_scores_match_accuracy(rng):
     net = network()
     truth = torch.from_numpy(rng.normal(size=(4000, 4)))
     labels = torch.distributions.Categorical(logits=truth).sample()
-    logits = truth * 4 + torch.tensor([2.0, 0, 0, 0])  # too sure, and partial to one class
+    logits = truth * 4 + torch.tensor([2.0, 0, 0, 0])  # overconfident and biased to one class
     before = calibration_error(torch.softmax(logits, 1).numpy(), labels.numpy())
     calibrate(net, logits, labels)
     after = calibration_error(

@@ -25,7 +25,7 @@ pytestmark = [
 ]
 
 SIZES = [1, 2, 3, 5, 11, 12, 13, 31, 32, 33, 100, 300, 7]
-TOLERANCE = 1e-4  # of numbers whose sizes are about 1 to 20
+TOLERANCE = 1e-4  # for values of about 1 to 20
 
 
 def compiled_network(network):
@@ -40,7 +40,7 @@ def assert_equal(config, clusters, seed=0):
     for ours, theirs in zip(found, wanted):
         assert ours.shape == theirs.shape
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=TOLERANCE)
-    assert wanted.logits.std(dim=0).max() > 0.1  # clusters do differ
+    assert wanted.logits.std(dim=0).max() > 0.1  # clusters have different outputs
 
 
 @pytest.mark.parametrize("spread", [0.05, 0.4, 3.0])

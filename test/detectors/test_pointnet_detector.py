@@ -1,4 +1,4 @@
-"""The PointNet detector from frame to boxes: clusters, pose, thresholds, bad input, weights."""
+"""The PointNet detector: clusters, pose, thresholds, bad input, weights."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_frame_without_clusters_has_a_problem(ids):
         assert found.problem is None and found.timings["network"] > 0
 
 
-# where the sensor is
+# sensor pose
 
 
 def test_rotated_scene_has_rotated_boxes(ids):
@@ -148,12 +148,12 @@ def test_rotated_scene_has_rotated_boxes(ids):
 
 def test_sensor_height_only_shifts_boxes(ids):
     detector, scan = random_detector(), frame()
-    known = {"clustering.density": 0.0}  # which depends on where a cloud is seen from
+    known = {"clustering.density": 0.0}  # the density depends on the viewpoint
     for columns in {"cluster_ids": ids}, {}:
         detector.params = with_values(eager(), known)
         found = detector(scan, **columns).detections
         higher = replace(scan, xyz=scan.xyz - np.float32([0, 0, 0.5]))
-        # heights are relative to the ground around, so no parameter is needed
+        # heights are relative to the nearby ground, so no parameter is needed
         assert alike(detector(higher, **columns), moved(found, shift=(0, 0, -0.5)), 1e-3)
         detector.params = with_values(eager(), known | {"ground.sensor_pose.height": 2.23})
         assert alike(detector(higher, **columns), moved(found, shift=(0, 0, -0.5)), 1e-3)
@@ -189,7 +189,7 @@ def test_detections_pass_thresholds_sorted_without_overlap(ids):
     assert len(others) and same(fewer[fewer.class_ids != found.class_ids[0]], others)
     detector.params = with_values(eager(), {"pointnet.nms.max_boxes": 2})
     assert same(detector(scan, cluster_ids=ids), found[:2])
-    halves = ids.copy()  # two clusters of one thing: one box of them stays
+    halves = ids.copy()  # two clusters of one object: one of their boxes remains
     thing = np.flatnonzero(ids == 1)
     halves[thing[::2]] = ids.max() + 1
     detector.params = with_values(eager(), {"pointnet.nms.iou": 1.0})
@@ -206,7 +206,7 @@ def test_best_scores_are_reported_without_detections(ids):
     assert len(nothing.detections) == 0 and nothing.problem is None
     assert list(nothing.best) == ["Car", "Pedestrian", "Cyclist"]
     assert max(nothing.best.values()) == pytest.approx(found.scores.max())
-    assert same(detector(scan, cluster_ids=ids), found)  # which keeps its own threshold
+    assert same(detector(scan, cluster_ids=ids), found)  # the copy does not change the original
 
 
 @pytest.mark.parametrize("layer", ["classes", "box"])
@@ -309,7 +309,7 @@ def test_checkpoint_round_trip(saved, tmp_path):
     assert (tmp_path / "half").stat().st_size < path.stat().st_size
     detector = load_pointnet_detector(path, "cpu", eager())
     assert same(detector(frame()), random_detector()(frame()), 1e-5)
-    first = with_header(other, tmp_path / "first.safetensors", network=None)  # had no such key
+    first = with_header(other, tmp_path / "first.safetensors", network=None)  # older checkpoints lack this key
     assert read_network_name(other) == read_network_name(first) == "pointpillars"
     assert load_network(first)[0] == load_network(other)[0]
 

@@ -1,4 +1,4 @@
-"""Shipped weights: small files with a model card that detect objects in a simulated street."""
+"""Shipped weights are small, have a model card, and detect objects in a simulated street."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import CLASSES
 
-# Others run these lines.
+# covered by other tests
 pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("one_thread", "streets")]
 FILES = [*sorted(POINTPILLARS_WEIGHTS.glob("*.safetensors")), POINTNET_WEIGHTS, find_judge_weights()]
 MOST = {"pointpillars": 30e6, "pointnet": 6e6}  # bytes of all files
@@ -56,7 +56,7 @@ def scans(streets):
 def test_each_network_finds_most_clear_cars(file, scans):
     detector = open_detector(file, "cpu")
     found = hits = 0
-    for scan in scans[2:] if "full" in file.stem else scans[1:]:  # these are slow
+    for scan in scans[2:] if "full" in file.stem else scans[1:]:  # full-size networks are slow
         cars = scan.truth.class_ids == CLASSES.index("Car")
         plain = np.array([e["num_points"] > 100 and e["visible"] > 0.5 for e in scan.truth.extras])
         ahead = (scan.truth.boxes[:, 0] > 5) & (scan.truth.boxes[:, 0] < 35) & (np.abs(scan.truth.boxes[:, 1]) < 20)
@@ -84,7 +84,7 @@ def test_only_cars_are_moved_to_their_points(name, scans):
 
 
 def test_ego_vehicle_is_not_detected(data):
-    """Whole scans of KITTI contain some points of the roof."""
+    """Full scans of KITTI contain some points of the vehicle's roof."""
     frames = [frame for frame in open_recording(data / "kitti_object") if (frame.load().xyz[:, 0] < -5).any()][:3]
     for detector in open_detector("fused", "cpu", range="around"), open_detector("pointnet", "cpu"):
         for frame in frames:

@@ -35,7 +35,7 @@ pytestmark = [
     pytest.mark.skipif(not LANES, reason="Numba compiles for a processor without AVX2"),
 ]
 
-TOLERANCE = 1e-4  # of features and logits, whose sizes are about 1 to 30
+TOLERANCE = 1e-4  # for features and logits of about 1 to 30
 WIDE = dict(low=(-12.8, -14.08, -3.0), high=(12.8, 14.08, 1.0))  # 176 x 160 pillars
 
 
@@ -53,8 +53,8 @@ def sparse_network(network):
 
 
 def inputs(config, points, drawn, seed=0, share=1.0):
-    """Return pillars of random points in a share of each axis, and a cluster map with the share
-    `drawn` of its cells filled there."""
+    """Return pillars of random points in a fraction of each axis, and a cluster map in which the fraction `drawn`
+    of these cells is filled."""
     rng = np.random.default_rng(seed)
     cloud = rng.uniform([*config.low, 0], [*config.high, 1], (points, 4))
     cloud[:, :2] = config.low[:2] + share * (cloud[:, :2] - config.low[:2])

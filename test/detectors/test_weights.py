@@ -82,18 +82,18 @@ def test_matching_weights_of_another_network_are_copied(saved):
     taken, count = copy_matching_weights(same, path, NetworkConfig)
     assert taken == count == len(state)
     assert all(torch.equal(value, state[name]) for name, value in same.state_dict().items())
-    # without the branch of the map the first block has fewer inputs, of which it takes its own
+    # without the map branch the first block has fewer inputs; it copies the matching ones
     other = make_network(tiny("v1"))
     taken, count = copy_matching_weights(other, path, NetworkConfig)
     assert taken == count
     first, old = (s["blocks.0.0.0.weight"] for s in (other.state_dict(), state))
     assert first.shape[1] < old.shape[1] and torch.equal(first, old[:, : first.shape[1]])
-    # a new input, such as the number of the cluster, comes last and begins at 0
+    # a new input, such as the cluster id, comes last and starts at 0
     numbered = make_network(tiny("v2"))
     assert len(set(copy_matching_weights(numbered, path, NetworkConfig))) == 1
     first, old = (s["pillar_net.linear.weight"] for s in (numbered.state_dict(), state))
     assert torch.equal(first[:, :-1], old) and not first[:, -1].any()
-    # and another neck begins at random
+    # a different neck starts with random weights
     third = make_network(tiny("v0"))
     before = {name: value.clone() for name, value in third.state_dict().items()}
     taken, count = copy_matching_weights(third, path, NetworkConfig)
@@ -172,7 +172,7 @@ def test_error_for_missing_weights_explains_how_to_get_them(tmp_path, monkeypatc
 @needs_onnx
 @pytest.mark.no_cover
 def test_exported_network_gives_the_same_detections(tmp_path):
-    """v0 is exported here, v4 by the command; the others have parts of both."""
+    """v0 is exported by the function, v4 by the command. The other versions consist of parts of both."""
     from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork, export_onnx
 
     config = tiny("v0", anchors=tiny().anchors[:1], max_points=3, zero_row=True, middle_z=True)
@@ -297,8 +297,8 @@ def test_weights_of_other_projects_are_imported(project, wrapped, big, tmp_path)
     linear = "pillar_net.linear.weight"
     assert all(torch.equal(state[k], v) for k, v in big.items() if k != linear)
     xyz, rest = torch.randn(50, 3), torch.randn(50, 4)
-    middle = xyz - torch.tensor([3.0, 2.0, -1.0])  # any pillar; z above the middle of the range
-    first = middle if project == "mmdetection3d" else xyz  # it overwrites x y z
+    middle = xyz - torch.tensor([3.0, 2.0, -1.0])  # any pillar; z relative to the middle of the range
+    first = middle if project == "mmdetection3d" else xyz  # mmdetection3d overwrites x y z
     torch.testing.assert_close(
         torch.cat([first, rest, middle], dim=1) @ big[linear].T, torch.cat([xyz, rest, middle], dim=1) @ state[linear].T
     )
@@ -330,7 +330,7 @@ def test_weights_are_imported_from_the_command_line(big, tmp_path):
 
 
 class Code:
-    """An object that runs code when it is unpickled; weights_only must prevent that."""
+    """Object that runs code when it is unpickled, which weights_only must prevent."""
 
     def __reduce__(self):
         return print, ("run",)
@@ -357,7 +357,7 @@ def test_files_with_other_content_are_rejected(big, tmp_path, capsys):
             import_weights(tmp_path / "x.pth", classes)
         assert "\n" not in str(error.value)
     (tmp_path / "x.pth").write_bytes(b"no pickle")
-    with zipfile.ZipFile(tmp_path / "damaged.pth", "w") as file:  # takes what nobody has put there
+    with zipfile.ZipFile(tmp_path / "damaged.pth", "w") as file:  # reads an entry that does not exist
         file.writestr("x/data.pkl", b"\x80\x02R.")
         file.writestr("x/version", "3")
     for name, words in (("x.pth", "weights only"), ("damaged.pth", "weights only"), ("none.pth", "file not found")):

@@ -1,4 +1,4 @@
-"""Paper C's experiment: the counts of the segmentation, its peer on a range image, the report."""
+"""Paper C's segmentation experiment: counts, the range image method, and the report."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_range_image_separates_an_object_from_the_one_behind():
 
 
 def test_range_image_joins_clusters_across_180_degrees():
-    behind = panel(-10, -0.5)  # the azimuth jumps from 180 to -180 degrees there
+    behind = panel(-10, -0.5)  # where the azimuth jumps from 180 to -180 degrees
     assert len(np.unique(cluster_range_image(behind))) == 1
     assert (cluster_range_image(panel(10, 0)[:5]) == 0).all()
     assert cluster_range_image(np.zeros((0, 3), np.float32)).shape == (0,)

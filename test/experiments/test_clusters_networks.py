@@ -1,4 +1,4 @@
-"""Paper C's experiment with networks: detections, changed clouds, drives, and the tables."""
+"""Paper C's experiment with networks: detections, modified clouds, drives, and tables."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def coarse():
 
 @pytest.fixture(scope="module")
 def models(tmp_path_factory):
-    """Random networks in place of trained ones."""
+    """Networks with random weights in place of trained ones."""
     folder, found = tmp_path_factory.mktemp("models"), {}
     for seed, name in ((0, "improved"), (1, "improved"), (0, "base"), (0, "farthest")):
         config = small(name)

@@ -1,4 +1,4 @@
-"""The verb compare: scores, missing detectors and the figure."""
+"""The command compare: scores, missing detectors and the figure."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ ROW = {"weights", "classes", "ap", "mean_ap", "pedestrian_centres", "ms", "ms_of
 
 @pytest.fixture
 def bare(monkeypatch, tmp_path):
-    """A package without weights."""
+    """A copy of the package without weights."""
     monkeypatch.setattr(weights_file, "POINTPILLARS_WEIGHTS", tmp_path / "none")
     monkeypatch.setattr(weights_file, "POINTNET_WEIGHTS", tmp_path / "none.safetensors")
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """Random networks: PointPillars v0 compact twice, and a PointNet."""
+    """Networks with random weights: PointPillars v0 compact twice, and a PointNet."""
     folder = tmp_path_factory.mktemp("weights")
     config = detection_samples.tiny()
     for name, seed in ("a", 0), ("b", 1):
@@ -111,7 +111,7 @@ def test_candidates_are_compared_in_any_layout(bare, tmp_path):
     reasons = {each["name"]: each["reason"] for each in content["missing"]}
     assert len(reasons) == 12 and "--weights" in reasons["PointNet"]
     assert (tmp_path / "a.png").stat().st_size > 0
-    frame, _ = open_recording(crowd_folder(tmp_path / "crowd", 2))  # as of a bag without a camera
+    frame, _ = open_recording(crowd_folder(tmp_path / "crowd", 2))  # like a bag without a camera
     found, _ = open_contenders([], "cpu", 1.73)
     scan, blind = frame.load(), replace(frame, calibration=lambda: None)
     whole, cropped = ([len(each.make_detector(one)(scan).detections) for each in found] for one in (blind, frame))

@@ -1,4 +1,4 @@
-"""The EG-PointPillars experiment: its tables from known records, and a tiny run of everything."""
+"""The EG-PointPillars experiment: tables from known records, and a tiny complete run."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_cells_equal_scores_and_samples_are_paired():
     cells = compute_cells(frames)
     car = [i for i, (name, _) in enumerate(CELLS) if name == "Car"]
     np.testing.assert_allclose(cells[:, car[1:]], 100)
-    assert np.isnan(np.delete(cells[:, :-1], car, axis=1)).all()  # no such objects
+    assert np.isnan(np.delete(cells[:, :-1], car, axis=1)).all()  # no objects of these classes
     draws = draw_cells([f"{i}" for i in range(12)], {"a": frames, "b": compare_records(true, half)}, replicates=20)
     gain = (draws["a"] - draws["b"])[:, 0, -1]
     assert gain[0] > 30 and compute_sampled_p(gain) == pytest.approx(2 / 21)
@@ -99,7 +99,7 @@ def test_report_has_paper_values_and_every_label_fraction():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tables, "draw_cells", partial(draw_cells, replicates=4))
         sections = tables.make_sections(records, models)
-        tables.make_sections([], models)  # of an unfinished run
+        tables.make_sections([], models)  # an unfinished run has no records
         some = {name: m for name, m in models.items() if m.model.label_share == 1.0}
         tables.make_sections(records, some)
     assert "long enough" not in sections[1].text

@@ -1,4 +1,4 @@
-"""Laws of the parts of a report, and of the command."""
+"""Parts of a report, and the command reproduce."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from experiments.framework.runner import run_experiment
 from lidar_perception.data.open import open_recording
 
 ROOT = Path(__file__).resolve().parents[2]
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 # The report
 

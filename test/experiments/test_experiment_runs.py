@@ -1,5 +1,5 @@
-"""Runs of experiments: records do not depend on processes or interruptions, bad frames are skipped,
-and every format of the report has every number."""
+"""Runs of experiments: records do not depend on processes or interruptions, bad frames are skipped, and every
+report format has every number."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from lidar_perception.runs import journal
 from lidar_perception.scoring import run as scoring_run
 from lidar_perception.types import InputError
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMED = {"table_9", "table_9_median"}
@@ -59,7 +59,7 @@ def read_untimed_files(folder):
     }
 
 
-# However it is spread and stopped
+# Processes and interruptions
 
 
 def test_dask_cluster_gives_the_same_records(crowds, whole, tmp_path):
@@ -106,14 +106,14 @@ def test_killed_run_of_two_processes_resumes(crowds, whole, tmp_path):
         time.sleep(0.005)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    wait_for_the_end(process.pid)  # its children end by themselves
+    wait_for_the_end(process.pid)  # its children end without a signal
     assert "Traceback" not in process.communicate()[1]
     kept = read_lines(out)
     assert 4 <= len(kept)  # on a busy machine all may be measured before the signal comes
     command("--data", crowds, "--out", out, "--jobs", 1)
     assert untimed(out) == untimed(whole)
     assert read_untimed_files(out) == read_untimed_files(whole)
-    assert set(kept[:4]) <= set(read_lines(out))  # with their times: they were not measured again
+    assert set(kept[:4]) <= set(read_lines(out))  # times are equal, so they were not measured again
 
 
 @pytest.mark.parametrize("cut", [1, 2, 40])
@@ -154,7 +154,7 @@ def test_skipped_frame_is_tried_again(few, tmp_path):
     assert resumed == fresh
 
 
-# Obstacles in the folder
+# Output folders with other content
 
 
 def test_error_names_the_changed_settings(few, tmp_path):
@@ -224,7 +224,7 @@ def test_full_disk_is_reported_in_one_line_and_run_resumes(few, tmp_path, monkey
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_bug_in_experiment_ends_the_run(few, tmp_path, jobs, capfd):
     if jobs > 1:
-        forkserver._forkserver._stop()  # processes say it where their server was started
+        forkserver._forkserver._stop()  # the server's processes still print to its original stderr
     with pytest.raises((ZeroDivisionError, InputError)) as error:
         run_experiment(small(raise_bug), open_recording(few), tmp_path / "out", jobs=jobs)
     said = capfd.readouterr().err + "".join(getattr(error.value, "__notes__", []))
@@ -248,9 +248,9 @@ def test_killed_worker_ends_run_with_reason(few, tmp_path):
 BROKEN = {
     "velodyne/000000.bin": lambda b: b[:1003],  # cut
     "velodyne/000001.bin": lambda b: b"",  # empty
-    "label_2/000002.txt": lambda b: b[:-30],  # cut in a line
+    "label_2/000002.txt": lambda b: b[:-30],  # truncated within a line
     "label_2/000003.txt": lambda b: b.replace(b"1.", b"nan ", 1),
-    "label_2/000004.txt": None,  # not there
+    "label_2/000004.txt": None,  # missing
     "calib/000005.txt": None,
     "calib/000006.txt": lambda b: b[:200],
     "calib/000007.txt": lambda b: re.sub(rb"(Tr_velo_to_cam:).*", rb"\1" + b" 0" * 12, b),

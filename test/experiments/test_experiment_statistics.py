@@ -1,4 +1,4 @@
-"""Laws of the bootstrap by frame."""
+"""Properties of the bootstrap over frames."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def share(sums):
 
 
 def hits(frames, rate, rng):
-    """(F, 2) hits and misses of one case a frame."""
+    """Hits and misses (F, 2) with one case per frame."""
     hit = rng.uniform(size=frames) < rate
     return np.column_stack([hit, ~hit])
 
@@ -59,7 +59,7 @@ def test_interval_covers_truth_at_its_level():
     params = BootstrapParams(replicates=400)
     inside = 0
     for _ in range(200):
-        # Frames of many cases that go together: the interval of independent cases is too narrow.
+        # Cases of a frame are correlated, so an interval for independent cases would be too narrow.
         rate = rng.beta(4, 4, size=120)
         cases = rng.poisson(5, size=120)
         found = rng.binomial(cases, rate)
@@ -69,7 +69,7 @@ def test_interval_covers_truth_at_its_level():
 
 
 def test_weights_are_draws_with_replacement():
-    """Sums of one-hot frames are how often each was drawn."""
+    """Sums of one-hot frames count how often each frame was drawn."""
     counts = np.eye(6)
     seen = []
     bootstrap(counts, lambda sums: seen.append(sums) or sums[..., :1])

@@ -1,4 +1,4 @@
-"""Laws of the comparison of simulated with real scans."""
+"""Properties of the comparison of simulated with real scans."""
 
 from __future__ import annotations
 
@@ -54,15 +54,15 @@ COUNTS = (
     *(f"{name} {what}" for name in CLASSES for what in ("points", "points of all", "density")),
 )
 EXTENTS = [f"{name} {what}" for name in CLASSES for what in ("height", "length", "width")]
-FACES = [name for name in CURVES if name.startswith("Car from")]  # no car there shows one face only
+FACES = [name for name in CURVES if name.startswith("Car from")]  # no car in these scenes shows only one face
 LIGHT = [name for name in CURVES if "intensity" in name]
 
 
 def make_scan(seed: int, points: int = 500) -> Frame:
-    """A street all around, and objects full of points."""
+    """Return a street all around with objects that are filled with points."""
     rng = np.random.default_rng(seed)
     reach, turn = rng.uniform(3, 70, 12000), rng.uniform(-np.pi, np.pi, 12000)
-    reach[:3000] = rng.uniform(3, 9, 3000)  # so dense that cells of the ground have enough
+    reach[:3000] = rng.uniform(3, 9, 3000)  # dense enough for every ground cell
     parts = [np.column_stack([reach * np.cos(turn), reach * np.sin(turn), rng.normal(FEET, 0.01, 12000)])]
     boxes, ids = [], []
     for name, places in PLACES.items():
@@ -79,17 +79,17 @@ def make_scan(seed: int, points: int = 500) -> Frame:
 
 
 def with_scan(frame: Frame, scan: PointCloud) -> Frame:
-    """The frame with other points."""
+    """Return the frame with other points."""
     return Frame.of(frame.name, scan, frame.truth(), frame.calibration())
 
 
 def compute_rows(frame: Frame) -> dict:
-    """The rows of its objects."""
+    """Return the rows of the frame's objects."""
     return compute_object_rows(frame.load(), frame.truth(), frame.camera())
 
 
 def change_scans(change, count: int = SCANS) -> list[Frame]:
-    """The street's scans with every frame changed."""
+    """Return the street's scans after a change of every frame."""
     return [
         with_scan(r, change(r.load(), np.random.default_rng(100 + i)))
         for i, r in enumerate(map(make_scan, range(count)))
@@ -219,7 +219,7 @@ def test_objects_at_image_border_do_not_count():
     border = one.truth().boxes[:1].copy()
     while one.camera().in_view(border[:, :3]).all():
         border[0, 1] += 0.1
-    border[0, 1] -= 0.2  # the centre is seen, a half is not
+    border[0, 1] -= 0.2  # the centre is in view, half of the box is not
     assert compute_object_rows(one.load(), GroundTruth.of(border, [0]), one.camera()) == {}
 
 
@@ -358,7 +358,7 @@ def test_command_writes_json_and_picture(tmp_path, monkeypatch):
     import matplotlib.pyplot as plt
 
     def few_drawn(path, content):
-        """One panel of each kind: to draw all takes long."""
+        """Draw only one panel of each kind, because drawing all takes long."""
         kinds = {(CURVES[name].histogram, CURVES[name].log): name for name in CURVES}
         draw_realism(path, {**content, "curves": {name: content["curves"][name] for name in kinds.values()}})
 

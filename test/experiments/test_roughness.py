@@ -1,4 +1,4 @@
-"""Laws of the roughness of the ground."""
+"""Properties of the measured ground roughness."""
 
 import numpy as np
 import pytest

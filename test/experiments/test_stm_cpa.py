@@ -1,4 +1,4 @@
-"""The STM-CPA experiment: its counts agree with the pipeline, and add up."""
+"""The STM-CPA experiment: counts agree with the pipeline and add up."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def refine(segmented, seed, params):
 
 
 def add_up(measured, *keys):
-    """Sum record[key][key]... over the records."""
+    """Sum record[key1][key2]... over the records."""
     values = measured
     for key in keys:
         values = [value[key] for value in values]
@@ -165,7 +165,7 @@ def test_zero_cpa_steps_equal_stage_2(measured):
     for k in range(1, NUMBERS.cpa_steps + 1):
         assert add_up(measured, "cpa", k, "tp")[0] == add_up(measured, "cpa", 0, "tp")[0]
     without, much = (add_up(measured, "cpa", k, "tp") for k in (0, NUMBERS.cpa_steps))
-    assert much[2] > without[2]  # beyond the 30 m of the final stage
+    assert much[2] > without[2]  # includes pedestrians beyond the 30 m of the final stage
 
 
 def test_two_cpa_steps_equal_final_stage_at_15_to_30_m(refined):
@@ -193,7 +193,8 @@ def test_readings_and_detector_share_their_pedestrians(measured):
 
 
 def test_search_at_paper_setting_equals_stage_1(refined, measured):
-    """Compare ranges without boxes or pedestrians near their limits, where clusters are cut."""
+    """Only ranges without boxes or pedestrians near their limits are compared, because clusters are split
+    there."""
     compared = 0
     for (labelled, _, _, found), record in zip(refined, measured):
         boxes, truth = found.stage1.boxes, labelled.pedestrians
@@ -230,14 +231,14 @@ def test_kept_pedestrians_are_hit_twice():
 
 def test_overlaps_of_known_boxes():
     truth = np.array([[5, 0, 0, 1, 1, 2, 0], [20, 0, 0, 1, 1, 2, np.pi / 2.0]])
-    half = truth + [0, 0, 0.5, 0, 0, -1, 0]  # their upper halves
+    half = truth + [0, 0, 0.5, 0, 0, -1, 0]  # upper halves of the boxes
     hits, *shares, space, bev = measure_overlaps(half, truth)
     assert (hits, shares) == (2, [2, 2, 2, 2]) and bev == pytest.approx(2, abs=1e-5)
     assert space == pytest.approx(1.0, abs=1e-5)
     assert measure_overlaps(truth[:0], truth) == [0, 0, 0, 0, 0, 0, 0]
-    low = truth + [0, 0, -0.8, 0, 0, -1.6, 0]  # the lowest fifth of each
+    low = truth + [0, 0, -0.8, 0, 0, -1.6, 0]  # lowest fifth of each box
     assert measure_overlaps(low, truth)[1:5] == [2, 0, 2, 2]
-    away = truth + [0.8, 0, 0, 0, 0, 0, 0]  # a ninth is shared
+    away = truth + [0.8, 0, 0, 0, 0, 0, 0]  # overlap of one ninth
     hits, *shares, _, _ = measure_overlaps(away, truth)
     assert (hits, shares) == (2, [2, 0, 2, 0])
 
@@ -361,7 +362,7 @@ def test_published_values_agree_with_digest():
     assert rows("5") == [list(row[:3]) for row in paper.TABLE_5]
     assert rows("8") == [list(row) for row in paper.TABLE_8.values()]
     for ours, theirs in zip(paper.TABLE_9.values(), rows("9"), strict=True):
-        assert list(ours) == pytest.approx(theirs, abs=0.051)  # rounded there
+        assert list(ours) == pytest.approx(theirs, abs=0.051)  # the digest is rounded
     for name, *stages in re.findall(r"([\d-]+): ([\d. ]+), ([\d. ]+)", cells["4"]):
         for stage, part in zip(("stage1", "stage2"), stages, strict=True):
             recall, precision, f1, *_ = paper.TABLE_4[name][stage]

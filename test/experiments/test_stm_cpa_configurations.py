@@ -1,4 +1,4 @@
-"""The configurations `paper` and `best`: their counts, the seed left out, the best threshold."""
+"""The configurations `paper` and `best`: counts, exclusion of the seed, and best threshold."""
 
 from __future__ import annotations
 

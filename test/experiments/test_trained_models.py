@@ -1,4 +1,4 @@
-"""Detectors trained by an experiment: one plan for all, resumed, and each trained only once."""
+"""Training of an experiment's detectors: one plan for all, resumable, each trained once."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def choose_models(params, seed):
 
 
 def count_weights(frames, number, models):
-    """Measure which weights a frame is measured with."""
+    """Record the weights that a frame is measured with."""
     return {
         "frame": frames[number].name,
         "points": len(frames[number].load()),
@@ -75,13 +75,13 @@ def test_models_share_one_plan_and_are_trained_once(tmp_path, monkeypatch):
     seeds = [read_header(model.weights).training["seed"] for model in trained.values()]
     assert seeds == [0, 0, 1, 1]
     scans = {path: path.stat().st_mtime_ns for path in (tmp_path / "scans").glob("*.npz")}
-    assert len(scans) == 4 + 1  # simulated once for all
+    assert len(scans) == 4 + 1  # simulated once for all models
 
     monkeypatch.setattr(trained_models, "_train", None)
     monkeypatch.setattr(trained_models, "_make_plan", None)
     assert train_models(request, plan_training(request)) == trained
     other = make_request(tmp_path, seeds=2, params={"lr": 0.001})
-    with pytest.raises(TypeError):  # other settings are another plan
+    with pytest.raises(TypeError):  # other settings need a new plan
         plan_training(other)
 
 
@@ -121,7 +121,7 @@ def test_stopped_training_resumes(tmp_path, monkeypatch):
     steps = []
     monkeypatch.setattr(Run, "step", lambda run, batch: steps.append(1) or step(run, batch))
     assert len(train_models(request, plan)) == 2
-    assert len(steps) == 3  # of 2 x 2, as one was done before
+    assert len(steps) == 3  # of 2 x 2; one was finished before
 
 
 def run(*arguments):

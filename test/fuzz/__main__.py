@@ -14,7 +14,7 @@ import click
 
 from fuzz.case import FAILED, REFUSED, SURVIVED, run_cases
 
-PARTS = {"messages": 1500.0, "parameters": 1500.0, "files": 3000.0}  # MB that one case may take
+PARTS = {"messages": 1500.0, "parameters": 1500.0, "files": 3000.0}  # memory limit of one case, in MB
 
 
 @click.command(help=f"Run fuzz cases of PART: {', '.join(PARTS)}. Exit code 1 if a case failed.")

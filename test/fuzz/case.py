@@ -13,30 +13,30 @@ from typing import Any, NamedTuple
 import numpy as np
 
 SURVIVED, REFUSED, FAILED = "survived", "refused", "failed"
-CASE_SECONDS = 300.0  # after which a case counts as hanging, and the process ends with all stacks
+CASE_SECONDS = 300.0  # time limit of a case; then the process ends and prints all stacks
 
 
 class Case(NamedTuple):
-    """One input, described by a name and by the settings that its part needs to make it."""
+    """One input: its name, and the settings that its part needs to generate it."""
 
     name: str
     settings: tuple[Any, ...] = ()
 
 
 class Outcome(NamedTuple):
-    """The result of a case; reason: why it was refused or failed."""
+    """Result of a case. reason: why it was rejected or failed."""
 
     verdict: str
     reason: str = ""
 
 
 def make_generator(part: str, seed: int, number: int) -> np.random.Generator:
-    """Return the random numbers of one case, the same on every machine."""
+    """Return the random generator of one case, which is the same on every machine."""
     return np.random.default_rng([zlib.crc32(part.encode()), seed, number])
 
 
 def pick(rng: np.random.Generator, choices: Any) -> Any:
-    """Return one element of a sequence, unlike rng.choice without converting its type."""
+    """Draw one element of a sequence. Unlike rng.choice, it keeps the type."""
     return choices[int(rng.integers(len(choices)))]
 
 
@@ -73,8 +73,8 @@ def run_cases(
 
 
 def read_memory_mb(name: str, reset: bool = False) -> float:
-    """Return the memory of this process in MB by its name in /proc: VmRSS is the present value,
-    VmHWM the highest since the last reset. 0 where there is no /proc."""
+    """Return the memory of this process in MB by its name in /proc: VmRSS is the current value, VmHWM the maximum
+    since the last reset. 0 on systems without /proc."""
     try:
         if reset:
             with open("/proc/self/clear_refs", "w") as file:

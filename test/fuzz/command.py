@@ -1,4 +1,4 @@
-"""Run commands as a user does, each in a fork of a process that has imported everything already."""
+"""Run commands like a user, each in a fork of a process that has already imported everything."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from lidar_perception.wire.codec import make_bag_message
 
 
 def judge_command(code: int | None, out: str, errors: str) -> Outcome:
-    """Judge a command: it must give a result, or one line with the reason. code: its exit code,
-    minus the signal that ended it, or None if it took too long."""
+    """Check that a command gave a result, or one line with the reason. code: exit code, the negative signal that
+    ended it, or None if it took too long."""
     lines = [line for line in errors.splitlines() if line.strip()]
     last = lines[-1] if lines else ""
     if code is None:
@@ -41,11 +41,11 @@ def judge_command(code: int | None, out: str, errors: str) -> Outcome:
 
 
 def load_all() -> None:
-    """Import what commands import, and compile; start no thread."""
+    """Import and compile everything that commands use, without starting threads."""
     for room in ("data", "scoring", "detectors", "simulation"):
         package = importlib.import_module(f"lidar_perception.{room}")
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            with suppress(ImportError):  # of an extra
+            with suppress(ImportError):  # belongs to an optional extra
                 importlib.import_module(module.name)
     make_bag_message("sensor_msgs/msg/PointCloud2")
     warm_up()

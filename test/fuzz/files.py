@@ -88,7 +88,7 @@ INSTEAD: dict[str, Callable[[Path], object]] = {
 
 @functools.cache
 def load_samples() -> dict[str, bytes]:
-    """Return the bytes of every valid file by its path."""
+    """Return {path: bytes} of all valid files."""
     with tempfile.TemporaryDirectory() as folder:
         # In another process, because threads that torch starts here would be missing in forks.
         subprocess.run([sys.executable, "-m", "fuzz.sample_files", folder], check=True)
@@ -118,7 +118,7 @@ def make_case(seed: int, number: int) -> Case:
 
 
 class Attempt:
-    """Run cases in a folder with all valid files, of which one at a time is replaced."""
+    """Run cases in a folder of valid files, one of which is replaced for each case."""
 
     def __init__(self, folder: Path):
         self.folder = folder

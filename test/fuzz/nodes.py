@@ -29,8 +29,8 @@ from msg_utils.point_cloud2 import CloudError, to_array
 CAMERA = {"input/camera_info": "sensor_msgs/msg/CameraInfo", "input/extrinsics": "geometry_msgs/msg/TransformStamped"}
 SEED = {"input/ground_truth": MARKERS, "clicked_point": "geometry_msgs/msg/PointStamped"}
 POINTS = {"input/points": CLOUD}
-# Node -> its weight, its inputs with their types, the settings of which each case has one.
-# Detectors have small weights, as they take a tenth of a second for any cloud.
+# Node -> weight, inputs with their types, and the settings from which each case draws one. Detectors have small
+# weights because they take a tenth of a second per cloud.
 INPUTS: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
     "ground_segmentation": (
         20,
@@ -87,11 +87,11 @@ INPUTS: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
     "fused_detector": (0.2, POINTS, [{}]),
 }
 WEIGHTS = np.array([weight for weight, _, _ in INPUTS.values()])
-BUG = "this is a bug"  # in a node's state after an exception that it did not expect
+BUG = "this is a bug"  # state of a node after an unexpected exception
 
 
 def draw_node(rng: np.random.Generator) -> str:
-    """Return the name of a node by its weight."""
+    """Draw the name of a node with probability proportional to its weight."""
     return list(INPUTS)[int(rng.choice(len(INPUTS), p=WEIGHTS / WEIGHTS.sum()))]
 
 
@@ -109,7 +109,7 @@ class Nodes:
 
 
 class FedNode:
-    """A node whose messages are delivered by calls, and whose output is kept in `sent`."""
+    """Node that gets its messages by calls; `sent` collects its output."""
 
     def __init__(self, name: str, context: Context, **values: Any):
         self.node = load_node_class(name)(
@@ -128,11 +128,11 @@ class FedNode:
         self.sent: list[tuple[Any, bytes]] = []
         for publisher in self.node.publishers:
             publisher.publish = lambda data, by=publisher: self.sent.append((by, data))
-            publisher.get_subscription_count = lambda: 1  # so that every output is made
+            publisher.get_subscription_count = lambda: 1  # so that nodes compute every output
 
     def attempt(self, topic: str, data: bytes, params: dict[str, Any], then_valid: bool) -> Outcome:
-        """Deliver valid messages to the other inputs, then data, and with then_valid valid messages
-        again, which must be served."""
+        """Deliver valid messages to the other inputs, then `data`. With then_valid, deliver valid messages again,
+        which must have a result."""
         if params != self.params:
             results = self.node.set_parameters(to_parameters(params))
             assert all(result.successful for result in results), results
@@ -150,8 +150,7 @@ class FedNode:
         return Outcome(REFUSED, message) if level == ERROR else Outcome(SURVIVED)
 
     def deliver(self, topic: str, data: bytes) -> tuple[bytes, str]:
-        """Return level and message of the node's state after a message; before it the state is
-        OK."""
+        """Deliver a message in state OK and return level and text of the node's state afterwards."""
         if topic == "input/points":
             self.sent.clear()
         self.node.diagnostics.state = (OK, "")
@@ -166,8 +165,8 @@ class FedNode:
         ]
 
     def judge(self, states: list[tuple[bytes, str]]) -> Outcome:
-        """Fail on a bug, on output that cannot be read, and if the last message, which is valid
-        where there are several, was refused."""
+        """Fail on a bug, on unreadable output, or if the last of several messages, which is valid, was
+        rejected."""
         problem = next((message for _, message in states if BUG in message), None)
         if problem is None and len(states) > 1 and states[-1][0] == ERROR:
             problem = f"a valid message was refused: {states[-1][1]}"

@@ -1,5 +1,5 @@
-"""Part `parameters`: hostile values of parameters at run time. A value is refused with a reason, or
-the node goes on with it and serves valid messages."""
+"""Part `parameters`: hostile parameter values at run time. The node rejects a value with a reason, or accepts it
+and still processes valid messages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NOT_OURS = ("qos_overrides.", "use_sim_time", "start_type_description_service")
 
 
 def make_case(seed: int, number: int) -> Case:
-    """Return a case with one node; its parameters and values are drawn when they are known."""
+    """Return a case for one node; parameters and values are drawn once the node exists."""
     node = draw_node(make_generator("parameters", seed, number))
     return Case(f"{node}, {number}", (node, seed, number))
 

@@ -160,7 +160,7 @@ def _write_yaml(values: dict[str, Any]) -> str:
 
 
 def _make_pth() -> bytes:
-    """Return a file in OpenPCDet's form with a few tensors."""
+    """Return a checkpoint in OpenPCDet's format with a few tensors."""
     import torch
 
     stream = io.BytesIO()

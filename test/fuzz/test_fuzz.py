@@ -102,7 +102,7 @@ def test_extreme_columns_allocate_no_memory(nodes, name):
                 outcome = node.attempt("input/points", data, params, False)
                 case = column, kind, values[:7].tolist(), outcome.reason
                 assert outcome.verdict != FAILED, case
-                assert read_memory_mb("VmHWM") - before < 64, case  # a byte per id: 2048
+                assert read_memory_mb("VmHWM") - before < 64, case  # a byte per id would take 2048 MB
     assert node.attempt("input/points", data, params, True).verdict != FAILED
 
 

@@ -1,4 +1,4 @@
-"""Valid messages, small enough to try thousands a second, and how they are mutated."""
+"""Small valid messages and their mutation; thousands can be tried per second."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def make_message_header() -> Any:
 
 
 def make_cloud(kind: str = "columns") -> Any:
-    """Return a valid PointCloud2; kind: one of KINDS."""
+    """Return a valid PointCloud2. kind: key of KINDS."""
     xyz = make_points()[: {"empty": 0, "one": 1}.get(kind)]
     points = np.zeros(len(xyz), np.dtype(LAYOUTS.get(kind, PLAIN)))
     for i, name in enumerate("xyz"):
@@ -144,10 +144,10 @@ def _change_values(message: Any, rng: np.random.Generator) -> str:
 
 
 def _add_column(message: Any, rng: np.random.Generator) -> str:
-    """Add a column that our nodes read, of any type and with any values."""
+    """Add a column that the nodes read, with any type and values."""
     try:
         count = len(to_array(message))
-    except CloudError:  # an earlier change has made it no cloud
+    except CloudError:  # an earlier change made the cloud invalid
         return mutate_message(message, rng)
     name = pick(rng, ("ground", "in_view", "cluster_id", "cluster_id", "intensity"))
     kind = pick(rng, ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"))

@@ -1,4 +1,4 @@
-"""Laws of the cloth solver and of ground segmentation by cloth."""
+"""Properties of the cloth solver and of ground segmentation by cloth."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lidar_perception.ground.cloth_solver import settle_sheet
 from lidar_perception.ground.params import ClothParams
 from lidar_perception.scoring.points.segmentation import PROTOCOLS, count_ground, select_true_ground, to_ground_row
 
-pytestmark = pytest.mark.no_cover  # other tests cover these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 
 def make_obstacles(seed, rows=24, columns=40):

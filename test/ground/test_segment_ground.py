@@ -1,4 +1,4 @@
-"""Laws that all methods of ground segmentation share, also for a tilted sensor."""
+"""Properties of all ground segmentation methods, including tilted sensors."""
 
 from __future__ import annotations
 
@@ -118,8 +118,8 @@ def run_library(xyz, intensity, height=1.73, rnr=True):
 
 
 def hilly_scene(seed):
-    """Return points (N, 3) on slopes, raised plates, walls and reflections below the ground, with
-    the intensity (N,): everything that Patchwork++ tells apart."""
+    """Return points (N, 3) on slopes, raised plates, walls and reflections below the ground, and their intensity
+    (N,). The scene contains every case that Patchwork++ distinguishes."""
     rng = np.random.default_rng(seed)
     distance, angle = 3 + 70 * rng.random(60_000) ** 2, rng.uniform(-np.pi, np.pi, 60_000)
     x, y = distance * np.cos(angle), distance * np.sin(angle)
@@ -156,7 +156,7 @@ def test_patchwork_equals_the_library_on_a_real_scan():
         (segment_ground(PointCloud(frame.xyz), params), without),
         (segment_ground(frame, off), without),
     ):
-        assert (found != expected).sum() <= 20  # of 124,668; points within rounding of a limit
+        assert (found != expected).sum() <= 20  # of 124,668 points, due to rounding at limits
 
 
 @needs_data

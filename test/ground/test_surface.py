@@ -16,7 +16,7 @@ def test_surface_of_a_plane_is_the_plane(seed, along, across):
     rng = np.random.default_rng(seed)
     xy = rng.uniform(-40, 40, (40_000, 2))
     ground = np.column_stack([xy, xy @ [along, across] - 1.7])
-    holes = np.hypot(*(xy - [5, 5]).T) > 2.0  # as under a car
+    holes = np.hypot(*(xy - [5, 5]).T) > 2.0  # like the hole under a car
     places = np.concatenate([rng.uniform(-25, 25, (10, 2)), [[5, 5]]])
     heights = fit_ground_surface(ground[holes], 0.0).at(places)
     np.testing.assert_allclose(heights, places @ [along, across] - 1.7, atol=0.05)

@@ -1,4 +1,4 @@
-"""Laws of the ground plane: robust to noise and outliers, a fixed point of fitting."""
+"""Properties of the ground plane: robust to noise and outliers, and a fixed point of fitting."""
 
 from __future__ import annotations
 
@@ -112,10 +112,10 @@ def test_plane_of_a_real_cloud_equals_sklearn_ransac(scan):
         random_state=1,
         min_samples=3,
     )
-    sample = np.random.default_rng(0).permutation(len(low))[:5000]  # 2000 trials on all are slow
+    sample = np.random.default_rng(0).permutation(len(low))[:5000]  # 2000 trials on all points would be slow
     model.fit(low[sample, :2].astype(float), low[sample, 2].astype(float))
     plane = np.array([*model.estimator_.coef_, model.estimator_.intercept_])
-    for _ in range(100):  # refine to the fixed point on all points, as ours does
+    for _ in range(100):  # refine to the fixed point on all points, like the implementation
         near = np.abs(height_above_plane(low, plane)) <= params.inlier_distance
         plane, before = fit_plane(low[near]), plane
         if np.array_equal(plane, before):
@@ -201,7 +201,7 @@ def test_a_plane_steeper_than_max_slope_is_not_ground():
 
 
 def test_ground_continues_where_the_road_rises_above_max_height():
-    # 12 degrees: 4 m up at 20 m; a threshold on z would end after 2 m.
+    # A slope of 12 degrees is 4 m high at 20 m; a threshold on z would end after 2 m.
     xyz = sloped_scene(2, [0.2, 0, -1.73], outliers=0.3)
     on_plane = np.abs(height_above_plane(xyz, np.array([0.2, 0, -1.73]))) < 0.05
     ground = segment_by_threshold(xyz)

@@ -1,4 +1,4 @@
-"""Invalid labels: one line names the problem and the remedy, and nothing is partly written."""
+"""Invalid labels are reported in one line with a remedy, and nothing is partly written."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def test_fields_of_other_tools_are_kept_or_rejected(key, format, tmp_path):
 
 
 def test_huge_integers_survive_every_format(tmp_path):
-    """In extra fields, which nobody computes with."""
+    """The integers are in extra fields, which are only copied."""
     frames = drive("one")
     path = write_labels(tmp_path / "in", "labelcloud", '"name"', f'"n": {10**400}, "name"')
     labels = import_labels(path, "labelcloud", frames)
@@ -242,7 +242,7 @@ def test_force_keeps_other_files(tmp_path):
 
 @pytest.fixture
 def limit_file_size():
-    """Return a function that limits the size of files, as a full disk does."""
+    """Return a function that limits the size of files, to imitate a full disk."""
     _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, hard))

@@ -130,7 +130,7 @@ def frames_at(seconds, **more):
 
 @pytest.mark.parametrize("kind", ["tables", "results"])
 def test_labels_of_a_tilted_vehicle_are_written_as_read(kind, tmp_path):
-    """nuScenes' boxes are upright in the global frame, ours in the vehicle's."""
+    """nuScenes boxes are upright in the global frame, those of the package in the vehicle frame."""
     tables = make_tables(frames=2, objects=8, scenes=("scene-0001",))
     recording = open_recording(save(tmp_path / "there", tables))
     if kind == "tables":
@@ -199,7 +199,7 @@ def test_point_labels_are_written_where_the_layout_has_them(tmp_path, monkeypatc
 
 
 def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
-    """MarkerArray of our nodes, and Detection3DArray of any node, also of tracks."""
+    """The topic has a MarkerArray of the package's nodes or a Detection3DArray of any node, also of tracks."""
     frames, rng = drive("one"), np.random.default_rng(2)
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/found", "visualization_msgs/msg/MarkerArray")

@@ -1,5 +1,4 @@
-"""Label files of other tools: headings and corners have their meaning, and unknown fields are
-kept."""
+"""Label files of other tools: conventions of headings and corners, and unknown fields."""
 
 from __future__ import annotations
 
@@ -75,7 +74,7 @@ def test_labelcloud_vertices_give_heading_and_sides(tmp_path):
     np.testing.assert_allclose(along, 4.0 * HEADING, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm([across, up], axis=1), [1.8, 1.5], atol=1e-6)
     assert np.cross(along, across)[2] > 0 and up[2] > 0
-    assert recognise_format(tmp_path / "l") == "labelcloud"  # which reads vertices, too
+    assert recognise_format(tmp_path / "l") == "labelcloud"  # labelCloud also reads vertices
     read = import_labels(tmp_path / "l", "labelcloud", make_one_frame())
     np.testing.assert_allclose(read.frames[0].boxes[0], BOX, atol=1e-7)
 
@@ -175,7 +174,7 @@ def test_openlabel_of_another_tool_is_transformed_and_kept(tmp_path):
     for key in ("metadata", "ontologies", "coordinate_systems"):
         assert again[key] == FOREIGN["openlabel"][key]
     assert again["objects"]["3"]["ontology_uid"] == "0"
-    frame_labels.boxes[:, 0] += 1.0  # moved boxes are in the LiDAR's system
+    frame_labels.boxes[:, 0] += 1.0  # moved boxes are in LiDAR coordinates
     export_labels(labels, "openlabel", tmp_path / "moved.json", frames)
     moved = import_labels(tmp_path / "moved.json", "openlabel", frames)
     np.testing.assert_allclose(moved.frames[0].boxes, frame_labels.boxes, atol=1e-9)
@@ -188,7 +187,7 @@ def test_openlabel_of_another_tool_is_transformed_and_kept(tmp_path):
                 ("DontCare", {**DONT_CARE, "bbox": [1.0, 2.0, 3.0, 4.0]}),
             ],
         )
-    ]  # regions of an image
+    ]  # image regions
     frames = [replace(frames[0], calibration=lambda: CALIBRATION)]
     for format in ("kitti-tracking", "kitti"):
         export_labels(DriveLabels(flat), format, tmp_path / format, frames)
@@ -272,7 +271,7 @@ def test_track_name_goes_to_one_part_of_a_split_track(format, key, tmp_path):
     )
     export_labels(DriveLabels([before]), format, tmp_path / "out", frames)
     after = import_labels(tmp_path / "out", format, frames).frames[0]
-    assert sorted(after.track_ids.tolist()) == [8, 9]  # names get the next number
+    assert sorted(after.track_ids.tolist()) == [8, 9]  # track names get the next free numbers
     assert [e.get(key) for e in after.extra if e] == [name]
 
 

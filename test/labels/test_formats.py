@@ -14,7 +14,7 @@ from lidar_perception.labels.drive_labels import DriveLabels
 from lidar_perception.labels.exchange import FORMATS, export_labels, import_labels
 from lidar_perception.labels.formats.kitti_lines import compute_occlusion_levels
 
-VERTICES = "labelcloud-vertices"  # sides are computed from rounded corners
+VERTICES = "labelcloud-vertices"  # sizes are computed from rounded corners
 REAL = {"kitti-tracking": "kitti_tracking/training/label_02", "kitti": "kitti_object/training/label_2"}
 
 
@@ -46,7 +46,7 @@ def test_second_export_is_identical(format, name, tmp_path):
 @needs_data
 @pytest.mark.parametrize("format", REAL)
 def test_kitti_label_files_survive_every_format(format, tmp_path):
-    """Other formats get the first frames. Some have no track ids, or no DontCare regions."""
+    """Other formats get the first frames only. Some have no track ids or no DontCare regions."""
     folder = DATA / REAL[format]
     frames = [replace(frame, pose=np.eye(4).copy) for frame in open_recording(folder.parent.parent)]
     labels = import_labels(folder, format, frames)

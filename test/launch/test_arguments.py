@@ -1,4 +1,4 @@
-"""Arguments that a launch file does not have are refused by launch itself, before any node starts.
+"""Launch rejects unknown arguments before any node starts.
 
 Runs where ROS 2's launch is installed; test_launch_files.py has stand-ins for it.
 """
@@ -26,7 +26,7 @@ NOTHING_STARTS = {"detectors": "dream"}
     ],
 )
 def test_unknown_launch_argument_is_rejected(name, given, words, capfd):
-    """Launch configurations of the file that includes ours are not its arguments."""
+    """Launch configurations of an including file are not arguments of the included one."""
     service = LaunchService(noninteractive=True)
     service.include_launch_description(
         LaunchDescription(

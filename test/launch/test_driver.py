@@ -1,5 +1,5 @@
-"""launch/perception.launch.py behind a driver of another package, a process without our Fast DDS
-profile: every cloud is accounted for, candidates come, all end with 0.
+"""launch/perception.launch.py with a driver of another package, which does not use the package's Fast DDS
+profile: every cloud is processed or counted, candidates are published, and all processes exit with 0.
 
 Runs where launch_testing is installed (a full ROS 2); test_reception.py tests the same with plain
 processes everywhere.

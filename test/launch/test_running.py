@@ -1,4 +1,4 @@
-"""Every launch file with its nodes: results come, the bag is scored, and all nodes end with 0.
+"""Every launch file with its nodes: results are published, the bag is scored, and all nodes exit with 0.
 
 Where launch_ros is installed, `ros2 launch` runs the files; elsewhere launch_stand_in.py does.
 """
@@ -25,7 +25,7 @@ HAS_LAUNCH = importlib.util.find_spec("launch_ros") is not None
 
 @pytest.fixture
 def launch(processes, peer, monkeypatch):
-    """Return a function that starts a launch file, and returns one that waits for its end."""
+    """Return a function that starts a launch file and returns a function that waits for its end."""
 
     def start(name, **arguments):
         if HAS_LAUNCH:

@@ -25,7 +25,7 @@ from msg_utils.markers import (
     to_marker_array,
 )
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 metres = st.floats(-200, 200)
 yaws = st.floats(-math.pi, math.pi, exclude_min=True) | st.sampled_from([math.pi, 0.0])
@@ -96,7 +96,7 @@ def test_quaternion_is_normalized_and_rotates_about_z_only(make, yaw):
     pose = make_box_pose(np.array([1.0, 2, 3, 4, 5, 6, yaw]), make)
     q = pose.orientation
     assert q.x == q.y == 0 and math.hypot(q.z, q.w) == pytest.approx(1, abs=1e-15)
-    forward = (1 - 2 * q.z * q.z, 2 * q.z * q.w)  # where the quaternion takes the x axis
+    forward = (1 - 2 * q.z * q.z, 2 * q.z * q.w)  # the rotated x axis
     assert forward == pytest.approx((math.cos(yaw), math.sin(yaw)), abs=1e-12)
     q.z, q.w = -q.z, -q.w  # the same rotation
     assert math.remainder(compute_yaw(pose) - yaw, math.tau) == pytest.approx(0, abs=1e-12)

@@ -20,14 +20,14 @@ from msg_utils.point_cloud2 import (
     to_array,
 )
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 
 
 @st.composite
 def layouts(draw) -> np.dtype:
-    """Draw dtypes of clouds, with all datatypes, gaps, counts, byte and field orders."""
+    """Draw dtypes of clouds with all datatypes, gaps, counts, byte orders and field orders."""
     names = draw(st.lists(st.sampled_from(["x", "y", "z", "intensity", "ring", "t"]), min_size=1, unique=True))
     order = draw(st.sampled_from("<>"))
     gaps = st.integers(0, 5)

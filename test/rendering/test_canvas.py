@@ -149,7 +149,7 @@ def test_video_has_every_picture_with_its_duration(name, tmp_path):
 
 
 def read_video(path):
-    """Return the pictures and the start of each in seconds."""
+    """Return the pictures and their start times in seconds."""
     if path.suffix in (".gif", ".webp"):
         image, seen, times, now = Image.open(path), [], [], 0.0
         for k in range(image.n_frames):

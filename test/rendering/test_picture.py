@@ -64,12 +64,12 @@ def test_labels_trails_and_arrows_are_drawn(stage):
 @given(st.integers(0, 1000))
 def test_order_of_points_and_boxes_does_not_matter(stage, seed):
     rng, scan = np.random.default_rng(seed), cloud(seed, 300)
-    scan.xyz[:, 2] += np.linspace(0, 1, 300)  # no two at one depth
+    scan.xyz[:, 2] += np.linspace(0, 1, 300)  # all depths differ
     boxes = np.vstack([BOX, BOX + [9, 8, 0, 0, 0, 0, 1]])
     order, turned = rng.permutation(len(scan)), slice(None, None, -1)
     one = draw_frame(stage, scan, Boxes(boxes, np.array([CAR, PEDESTRIAN])))
     two = draw_frame(stage, scan.take(order), Boxes(boxes[turned], np.array([PEDESTRIAN, CAR])))
-    assert np.mean(np.any(one != two, axis=2)) < 2e-3  # except points within one step of depth
+    assert np.mean(np.any(one != two, axis=2)) < 2e-3  # except points within one depth step
 
 
 @each_stage

@@ -29,7 +29,7 @@ def test_deskew_inverts_skew(velocity, rotation):
 def test_deskew_equals_loop_over_points():
     xyz, seconds = make_sweep()
     velocity, rotation = np.array([15.0, 0.3, -0.2]), np.array([0.02, -0.1, 0.7])
-    steps = 400  # the arc is integrated in small straight steps
+    steps = 400  # integrate the arc in small straight steps
     expected = []
     for point, t in zip(xyz[:40].astype(float), seconds):
         attitude, position = Rotation.identity(), np.zeros(3)
@@ -39,7 +39,7 @@ def test_deskew_equals_loop_over_points():
             attitude = attitude * Rotation.from_rotvec(rotation * t / steps)
         expected.append(attitude.apply(point) + position)
     found = deskew(xyz, seconds, make_constant_motion(velocity, rotation))
-    np.testing.assert_allclose(found[:40], expected, atol=3e-3)  # MAX_POSES: 15 m/s for 12 us
+    np.testing.assert_allclose(found[:40], expected, atol=3e-3)  # at most MAX_POSES poses per sweep
     assert np.abs(np.array(expected) - xyz[:40]).max() > 0.5
 
 

@@ -165,12 +165,12 @@ def test_jump_back_in_time_forgets_moving_transforms():
     tree.set("odom", "base", START - 19 * SECOND_NS, [2, 2, 3], [0, 0, 0, 1])
     assert tree.lookup("odom", "base", START - 19 * SECOND_NS - SECOND_NS // 2)[0, 3] == 1.5
     tree.set("odom", "base", START - 19 * SECOND_NS - SECOND_NS // 4, [5, 2, 3], [0, 0, 0, 1])
-    assert tree.jumps == 1  # slightly out of order is not a jump
+    assert tree.jumps == 1  # a slightly older stamp is not a jump
     assert tree.lookup("odom", "base", START - 19 * SECOND_NS - SECOND_NS // 4)[0, 3] == 5
 
 
 class CountingStamp(int):
-    """A stamp that counts its comparisons."""
+    """Stamp that counts comparisons."""
 
     comparisons = 0
 

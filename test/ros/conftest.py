@@ -7,8 +7,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def domain(domain) -> int:
-    """Nodes are forked from a process without coverage: nodes in the process of a test cover
-    nearly all lines."""
+    """Fork nodes from a process without coverage, because in-process nodes cover nearly all lines."""
     from lidar_perception.testing import forking  # noqa: F401  sets what that process loads
 
     with pytest.MonkeyPatch.context() as patch:
@@ -29,7 +28,7 @@ def good_cloud(drive_bag):
 
 @pytest.fixture(scope="module")
 def found(tested, shared_processes, shared_peer, weights):
-    """Detections of the graph of the detector `tested` with its weights."""
+    """Detections of the graph of the detector under test."""
     from ros_samples import MARKERS, QUIET
 
     from lidar_perception.candidates.params import PipelineParams
@@ -49,7 +48,7 @@ def found(tested, shared_processes, shared_peer, weights):
 
 @pytest.fixture(scope="module")
 def talker(tested, shared_peer, found):
-    """Publisher of clouds for the detector."""
+    """Publisher of clouds to the detector."""
     from ros_samples import CLOUD
 
     return shared_peer.advertise(tested.between, CLOUD)

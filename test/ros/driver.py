@@ -1,4 +1,4 @@
-"""A driver as others write it: rclpy and nothing of ours, no Fast DDS profile.
+"""A driver like those of other packages: plain rclpy, without the package's Fast DDS profile.
 
 python driver.py TOPIC reliable|best_effort COUNT HZ POINTS FIRST_STAMP
 """
@@ -43,6 +43,6 @@ for i in range(count):
     sleep(max(0.0, start + i / hz - monotonic()))
     publisher.publish(cloud)
 print("sent", flush=True)
-sys.stdin.readline()  # keeps the writer alive, which may resend clouds to reliable subscribers
+sys.stdin.readline()  # keep the writer alive, because it may resend clouds to reliable subscribers
 node.destroy_node()
 rclpy.try_shutdown()

@@ -30,7 +30,7 @@ def peer(shared_peer):
 
 @pytest.fixture(scope="module")
 def send(shared_processes, peer):
-    """Return send(node, cloud, condition, what): it sends until the condition holds."""
+    """Return send(node, cloud, condition, what), which sends until the condition holds."""
     nodes = "ground_segmentation", "perception", "clustering", "candidate_refinement"
     talkers = {node: peer.advertise(f"/{node}/input/points", CLOUD) for node in nodes}
     for node in nodes:
@@ -40,7 +40,7 @@ def send(shared_processes, peer):
 
 @pytest.fixture(scope="module")
 def results(peer):
-    """Return {node: the clouds that it has published}."""
+    """Return {node: published clouds}."""
     return {node: peer.listen(f"/{node}/output/points", CLOUD) for node in ("ground_segmentation", "perception")}
 
 
@@ -119,7 +119,7 @@ def test_wrong_height_and_intensity_scale_are_reported(send, peer, good_cloud):
 
 
 def test_layout_does_not_change_the_result(process, good_cloud):
-    """Big-endian, organised and NaN-padded clouds give the ground of the plain cloud."""
+    """Big-endian, organised and NaN-padded clouds have the same ground as the plain cloud."""
     xyz = xyz_of(good_cloud)[:40_000]
     holes = np.full((20_000, 3), np.nan, np.float32)
     organised = cloud(np.concatenate([xyz, holes, np.zeros_like(holes)]), 103, is_dense=False)
@@ -144,7 +144,7 @@ def test_clustering_and_refinement_name_the_missing_column(send, peer, good_clou
 
 
 def test_diagnostics_report_missing_camera_and_seed(send, peer, good_cloud, drive_bag):
-    """view.enabled without CameraInfo; then without a seed; then with a clicked pedestrian."""
+    """First view.enabled without CameraInfo, then no seed, then a clicked pedestrian."""
 
     def is_reported(words):
         send("perception", good_cloud, lambda: words in peer.get_message("perception"), words)

@@ -22,9 +22,8 @@ FILE = {"view.enabled": False, "seed.source": "file"}
 
 
 def test_boxes_and_candidates_keep_the_ids_of_the_cloud(processes, peer, drive_bag):
-    """Foreign ids with gaps, most of them beyond a marker's 32 bits: candidate_refinement says them
-    in the text of its candidates; clustering replaces them by its own, in the cloud and the boxes
-    alike."""
+    """The given ids have gaps, and most exceed a marker's 32 bits. candidate_refinement puts them into the text
+    of its candidates. clustering replaces them in the cloud and the boxes."""
     params = with_values(PAPER, FILE)
     seed = make_fixed_source(load_seed(params.seed.file))
     scan = next(iter(open_recording(drive_bag))).load()

@@ -1,4 +1,4 @@
-"""demo, README's first command: a bag through the graph of the default detector, to a score."""
+"""The command demo: replays a bag through the graph of the default detector and scores it."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from lidar_perception.nodes.replay import graph_replay
 from lidar_perception.scoring.recorded import read_results
 from lidar_perception.types import InputError
 
-FRAMES = 4  # tracks are confirmed
+FRAMES = 4  # enough to confirm tracks
 
 
 def test_demo_scores_like_offline_in_one_or_many_processes(drive_bag, make_bag, tmp_path):
-    """Tracks are equal to the byte."""
+    """Tracks are equal byte by byte."""
     bag = make_bag(open_recording(drive_bag).frames[:FRAMES])
     frames = {frame.stamp_ns: frame for frame in open_recording(bag)}
-    torch.set_num_threads(len(os.sched_getaffinity(0)))  # sums depend on it; nodes take all cores
+    torch.set_num_threads(len(os.sched_getaffinity(0)))  # sums depend on the number of threads; nodes use all cores
     fused = open_detector(sensor_height=next(iter(frames.values())).sensor_height)
     expected = {stamp: fused(frame.load()).detections for stamp, frame in frames.items()}
     tracks = []
@@ -62,7 +62,7 @@ def test_real_time_demo_uses_the_input_queue_of_a_robot(drive_bag, tmp_path, mon
         pass
 
     def start(processes, node, remap, values):
-        assert values.get("input.queue") == waiting  # None: the node's own
+        assert values.get("input.queue") == waiting  # None: the default of the node
         raise Enough
 
     monkeypatch.setattr(graph_replay.Processes, "start", start)

@@ -26,8 +26,8 @@ def drive(at_ns):
 
 @pytest.mark.parametrize("source", ["odometry", "tf"])
 def test_cloud_of_moving_sensor_is_compensated(start, source):
-    """Later nodes get the compensated points; those of the robot's body stay. Without odometry the
-    cloud is used uncompensated, with a warning."""
+    """Later nodes get the compensated points; those on the robot's body do not move. Without odometry the cloud
+    is used uncompensated, with a warning."""
     rng = np.random.default_rng(0)
     sensor = mount_pose(1.2, 0.1, 1.8, 0.5, 0.0, 0.0)
     still = np.vstack(
@@ -77,7 +77,7 @@ def test_cloud_of_moving_sensor_is_compensated(start, source):
     again = start(GroundSegmentation, **{"input.deskew": source})
     again.transforms = node.transforms
     give(again, after)
-    np.testing.assert_array_equal(  # moved once
+    np.testing.assert_array_equal(  # compensated only once
         to_array(decode(again.sent["points"][-1], "sensor_msgs/msg/PointCloud2"))["x"], moved[:, 0]
     )
     give(node, message(raw, START + PERIOD))
@@ -105,8 +105,8 @@ def test_first_cloud_waits_for_odometry_of_its_sweep(start):
 
 @pytest.mark.parametrize("first, begin, sectors", [(0.3, 0.0, ()), (1.0, -1.0, (120.0, 240.0))])
 def test_later_clouds_wait_for_the_end_of_their_sweep(start, first, begin, sectors):
-    """The first turn is partial, or the stamp is at the end of a turn, with cropped points there.
-    Odometry comes every 0.02 s."""
+    """The first sweep is partial, or the stamp is at the end of a sweep whose last points are cropped. Odometry
+    arrives every 0.02 s."""
     node = start(GroundSegmentation, **{"input.deskew": "odometry", "crop.sectors": sectors})
     deliver = node.inputs.receptions[0].deliver
     heard = iter(range(START, START + 20 * PERIOD, PERIOD // 5))

@@ -1,4 +1,4 @@
-"""Sensor poses of the tracker in nodes, compared with the library run on the true poses."""
+"""Sensor poses in tracking nodes, compared with the library run on the true poses."""
 
 from __future__ import annotations
 
@@ -44,9 +44,8 @@ def tracked(node):
 
 
 def drive(node, tell, poses, frame_id="lidar"):
-    """Send a node frames of a crowd, seen from poses (K, 4, 4), and compare with the library.
-
-    tell(i, stamp) is called before each frame.
+    """Send frames of a crowd, seen from poses (K, 4, 4), to a node and compare with the library. tell(i, stamp)
+    is called before each frame.
     """
     library = Tracker()
     for i, (found, at) in enumerate(zip(crowd(frames=len(poses)), poses)):
@@ -98,7 +97,7 @@ def test_missing_odometry_to_sensor_transform_is_reported(start):
     node.transforms.on_odometry(odometry(base_at(10), stamp))
     found = next(crowd())
     node.on_markers(make_detection_markers(found, header(stamp), make_bag_message))
-    assert min(tracked(node).ids) > 6  # the poses are others from here on: all tracks ended
+    assert min(tracked(node).ids) > 6  # the source of poses changed, so all tracks ended
 
 
 def test_error_names_the_missing_transform(start):
@@ -141,7 +140,7 @@ def test_auto_falls_back_to_scans_and_returns_to_poses(start, better):
             node.transforms.on_tf(transforms(("odom", "lidar", base_at(i), stamp)), static=False)
     frames(14, 2)
     assert node.diagnostics.counts["ego"] == better and min(tracked(node).ids) > before
-    assert ICP_MS not in node.diagnostics.counts  # scans are not registered any more
+    assert ICP_MS not in node.diagnostics.counts  # scans are no longer registered
 
 
 def test_detector_cloud_waits_for_its_pose_with_timeout(start):
@@ -157,7 +156,7 @@ def test_detector_cloud_waits_for_its_pose_with_timeout(start):
     np.testing.assert_allclose(node.results.final.tracks.tracker.pose, base_at(1), atol=1e-9)
     assert deliver(clouds[2], True) == "the pose of its time"
     assert node.set_parameters([Parameter("ego.max_wait", value=0.0)])[0].successful
-    assert deliver(clouds[2], True) is None  # the time to wait is over
+    assert deliver(clouds[2], True) is None  # the waiting time has expired
     assert deliver(clouds[19], True) is None  # the odometry has stopped
     assert len(node.sent["tracks"]) == 4
 
@@ -180,11 +179,11 @@ def test_late_poses_delay_frames_by_max_wait_once(start, monkeypatch):
     ego, wait = node.tracks.ego, node.params.ego.max_wait
     ego.node.transforms.on_odometry(odometry(base_at(0), START, "lidar"))
     held = []
-    for i in range(1, 9):  # half a second and less after the last pose, so that they are late
+    for i in range(1, 9):  # up to half a second after the last pose, so that they are late
         held.append(ego.find_missing_pose(header(START + i * TENTH // 2)) is not None)
         now[0] += 0.06
     assert held == [0.06 * i < wait for i in range(8)] and not all(held)
-    now[0] = 100.0 + wait + ego_module.PAUSE_S + 0.01  # patience begins again
+    now[0] = 100.0 + wait + ego_module.PAUSE_S + 0.01  # the node waits again
     assert ego.find_missing_pose(header(START + TENTH // 2)) is not None
     ego.node.transforms.on_odometry(odometry(base_at(1), START + TENTH, "lidar"))
     assert ego.find_missing_pose(header(START + TENTH)) is None and ego.late_since is None
@@ -205,7 +204,7 @@ def test_stopped_or_foreign_clock_odometry_is_reported(start, monkeypatch):
     assert "1000 s ahead of the detections" in report(0) and "same clock" in node.diagnostics.state[1]
     node.transforms.on_odometry(odometry(base_at(0), START, "lidar"))
     now[0] += 5.0
-    report(2)  # the tracker continues for the first seconds
+    report(2)  # the tracker continues at first
     assert "no odometry on /tracker/input/odometry for 5 s" in report(2.1)
 
 
@@ -269,10 +268,10 @@ def test_scan_poses_are_converted_to_detection_frame(start):
         ego.find_pose(header(START, "base")), ego.find_pose(header(START)) @ invert_pose(rear), atol=1e-6
     )
     assert ego.find_problem("base", START) is None
-    for late in (0, 1):  # repeated, or late from the queue of another driver: the map stays
+    for late in (0, 1):  # repeated or late clouds do not change the map
         ego._on_cloud(message(xyz, START + (2 - late) * TENTH))
     assert ego.icp_restarts == 1
-    ego._on_cloud(message(xyz, START + 10**11))  # another map, with another origin
+    ego._on_cloud(message(xyz, START + 10**11))  # a new map with another origin
     assert ego.icp_restarts == 2
 
 

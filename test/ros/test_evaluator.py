@@ -82,7 +82,7 @@ def test_boxes_in_other_frames_are_scored_with_a_warning(start):
 
 
 def objects(stamp, cars=(), cyclists=(), pedestrians=()):
-    """Return markers of objects at the given distances ahead, 2 m apart to the left."""
+    """Return markers of objects at the given distances ahead, each 2 m further to the left."""
     rows = [
         [x, 2.0 * i, -0.9, *size, 0.0, CLASSES.index(name)]
         for name, size, found in (
@@ -135,7 +135,7 @@ def test_all_classes_are_scored_and_precision_at_the_end(with_camera, start, tmp
         return result["frames"], row["tp"], row["fp"], row["fn"]
 
     behind = int(not with_camera)  # the car behind is outside the image
-    assert counts(content) == (2, 2, 1, 0)  # not in the frame without a pedestrian
+    assert counts(content) == (2, 2, 1, 0)  # the frame without pedestrians is not scored
     assert counts(content["classes"]["Car"]) == (3, 2, behind, behind)
     assert counts(content["classes"]["Cyclist"]) == (3, 0, 1, 1)
     assert content["ap"]["final"]["Pedestrian"]["3d"]["easy"]["r40"] == 50

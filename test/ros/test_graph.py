@@ -1,4 +1,4 @@
-"""The nodes as real processes over DDS, against the offline path on the same bag."""
+"""The nodes as real processes over DDS, compared with the offline path on the same bag."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from msg_utils.markers import from_marker_array
 from msg_utils.point_cloud2 import to_array
 
 PAPER_C = {"ground.method": "cloth", "clustering.method": "euclidean", "boxes.shape": "l_shape"}
-RUNS = {  # (single, processes, parameters in addition to PAPER)
+RUNS = {  # single process, processes, parameters in addition to PAPER
     "three nodes of paper C": (False, True, PAPER_C),
     "the same in one process": (False, False, PAPER_C),
     "one node, patchwork": (
@@ -44,7 +44,7 @@ def setting(request):
 
 @pytest.fixture(scope="module")
 def run(setting, drive_bag, tmp_path_factory):
-    """One replay: whether in one process, its scores, and the folder with the result bag."""
+    """One replay: whether it is a single process, its scores, and the folder of the result bag."""
     single, processes, params = setting
     out = tmp_path_factory.mktemp("run")
     with Bag(drive_bag) as bag, pytest.MonkeyPatch.context() as patch:
@@ -55,7 +55,7 @@ def run(setting, drive_bag, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def offline(setting, drive_bag):
-    """Stamp -> what the offline pipeline finds; and its report."""
+    """Candidates of the offline pipeline by stamp, and its report."""
     report, results, params = CandidateReport(), {}, setting[-1]
     for frame in open_recording(drive_bag):
         people = select_pedestrians(frame.truth())

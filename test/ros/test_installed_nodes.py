@@ -1,5 +1,5 @@
-"""The installed executables end with code 0 at SIGINT and SIGTERM, at any moment after their start,
-and leave no shared memory behind."""
+"""The installed executables exit with 0 at SIGINT and SIGTERM at any time after their start, and leave no shared
+memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STARTED_BY = {
     "ros2 run": lambda node: [PREFIX / "lib/lidar_perception" / node],
     "lidar-perception run": lambda node: [PREFIX / "bin/lidar-perception", "run", node],
 }
-LIMIT = 120.0  # seconds until a process is where a test wants it, on a busy machine
+LIMIT = 120.0  # seconds for a process to reach a stage, on a busy machine
 NOTE = "std_msgs/msg/String"
 
 pytestmark = pytest.mark.skipif(
@@ -33,13 +33,13 @@ pytestmark = pytest.mark.skipif(
 
 
 def blocks_signals(thread: Path) -> bool:
-    """Return True if a thread of /proc holds back all signals that end a node."""
+    """Return True if a thread blocks all signals that end a node."""
     blocked = int(re.search(r"^SigBlk:\s*(\w+)", (thread / "status").read_text(), re.M)[1], 16)
     return all(blocked >> (number - 1) & 1 for number in STOP_SIGNALS)
 
 
 def shared_segments(process: Path) -> set[Path]:
-    """Return the segments of Fast DDS that a process has made: it holds their locks open."""
+    """Return the Fast DDS segments that a process created; it keeps their lock files open."""
     opened = {file.readlink() for file in (process / "fd").iterdir() if file.is_symlink()}
     return {
         path.with_name(path.name.removesuffix("_el"))
@@ -52,7 +52,7 @@ def wait_for_stage(process: subprocess.Popen, stage: str, log: Path) -> None:
     """Wait until a starting node blocks signals, has loaded a library, or has logged a word."""
     proc, end = Path(f"/proc/{process.pid}"), monotonic() + LIMIT
     own = Path("/proc/self/cmdline").read_bytes()
-    # Between fork and exec the child has this process's libraries, and blocks all signals.
+    # Between fork and exec the child still has this process's libraries and blocks all signals.
     while (proc / "cmdline").read_bytes() == own or not (
         blocks_signals(proc) if stage == "blocked" else stage in (proc / "maps").read_text() or stage in log.read_text()
     ):
@@ -82,7 +82,7 @@ def test_node_stops_cleanly_at_any_stage(how, node, stage, number, processes):
     if stage == "ready":
         assert all(map(blocks_signals, (proc / "task").iterdir()))
     segments = shared_segments(proc)
-    assert segments or stage not in ("configuring", "ready")  # DDS is up by then
+    assert segments or stage not in ("configuring", "ready")  # DDS has started by then
     process.send_signal(number)
     assert process.wait(timeout=60) == 0
     assert not [path for path in segments if path.exists()] and "Traceback" not in log.read_text()
@@ -105,7 +105,7 @@ def test_recorder_completes_its_bag(number, processes, peer, tmp_path):
 
 
 def test_node_entry_blocks_signals_before_loading_libraries():
-    """A thread that one starts would not block them: of NumPy's OpenBLAS, for one."""
+    """Threads of libraries, such as NumPy's OpenBLAS, would otherwise not block them."""
     code = (
         "import sys; before = {*sys.modules}; import lidar_perception.nodes.main, "
         "lidar_perception.cli.entry; print(*{n.partition('.')[0] for n in {*sys.modules} - "

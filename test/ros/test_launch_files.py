@@ -22,9 +22,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def launched(monkeypatch):
-    """Return a function that executes a launch file: launched(name)(**arguments) is {name: node}.
-
-    Its attribute `messages` has the log of the last call.
+    """Return launched(name)(**arguments), which executes a launch file and returns {name: node}. Its attribute
+    `messages` has the log of the last call.
     """
     install(monkeypatch)
 
@@ -71,7 +70,7 @@ def test_launch_file_starts_its_graph_or_single_detectors(name, launched):
     for node in nodes(autostart="false").values():
         assert node.parameters[1] == {"autostart": False}  # other parameters are those of the file
     mine = str(ROOT / "config" / "best.param.yaml")
-    for node in nodes(config=mine, tracking="true").values():  # on top of the package's own
+    for node in nodes(config=mine, tracking="true").values():  # in addition to the package's file
         assert node.parameters[0] != node.parameters[1] == mine
     frames = {"base_frame": "base", "target_frame": "odom"}
     for node in nodes(deskew="odometry", odometry="/odometry", **frames).values():
@@ -177,13 +176,13 @@ def test_experts_choose_the_file_of_ground_and_clusters(launched, tmp_path):
     started = nodes(detectors="pointnet,pointpillars", config=str(mine), experts="pointpillars")
     assert started["pointnet_detector"].parameters[1] == str(mine)
     assert started["clustering"].parameters[0].endswith("pointpillars.param.yaml")
-    assert "ground.method" not in nodes.messages[0]  # which is equal for both
+    assert "ground.method" not in nodes.messages[0]  # which is the same for both
     nodes(single="true", experts="pointnet")
     assert "has no effect" in nodes.messages[0]
 
 
 def test_arguments_override_user_file_and_defaults(launched, tmp_path):
-    """rcl prefers a section that names a node to /**, which is the only section of our files."""
+    """rcl prefers a section with a node's name to /**, the only section of the package's files."""
     for file in (ROOT / "config").glob("*.param.yaml"):
         assert list(read_sections(file)) == ["/**"]
     nodes = launched("fused")
@@ -214,7 +213,7 @@ def test_arguments_override_user_file_and_defaults(launched, tmp_path):
         ("front_fused_detector", ""),
         ("perception", ""),
     ],
-)  # ours, in another graph
+)  # the package's nodes in another graph
 def test_section_of_unknown_node_is_a_warning(section, words, launched, tmp_path):
     mine = tmp_path / "mine.yaml"
     mine.write_text(f"{section}:\n  ros__parameters: {{input.queue: 2}}\n")
@@ -310,7 +309,7 @@ def test_rviz_follows_the_names_of_the_graph(launched):
     prefixed = dict(nodes(rviz="true", detectors=SEVERAL, name_prefix="left_")["rviz2"].remappings)
     assert prefixed["clustering/output/points"] == "left_clustering/output/points"
     assert prefixed["tracker/output/tracks"] == "left_candidates_tracker/output/tracks"
-    assert not {"points", "clicked_point"} & set(prefixed)  # of no node of ours
+    assert not {"points", "clicked_point"} & set(prefixed)  # not of the package's nodes
     single = dict(nodes(rviz="true", detectors=SEVERAL, single="true")["rviz2"].remappings)
     assert single["clustering/output/points"] == "perception/output/points"
     assert single["candidate_refinement/output/detections"] == "perception/output/detections"
@@ -321,7 +320,7 @@ def test_rviz_follows_the_names_of_the_graph(launched):
 @pytest.mark.parametrize("name", ["pointpillars", "pointnet", "fused"])
 def test_weights_device_and_range_of_a_detector_are_arguments(name, launched):
     expected = {f"{name}.weights": "w.safetensors", f"{name}.device": "cpu"}
-    if name != "pointnet":  # its range is always all around
+    if name != "pointnet":  # always uses the full range
         expected[f"{name}.range"] = "around"
     for file, weights in (name, "w.safetensors"), ("detectors", f"{name}=w.safetensors"):
         nodes = launched(file)
@@ -337,7 +336,7 @@ def test_weights_device_and_range_of_a_detector_are_arguments(name, launched):
 @pytest.mark.parametrize("single", ["false", "true"])
 @pytest.mark.parametrize("detectors", ["candidates", "fused", "candidates,pointpillars"])
 def test_replay_connects_player_nodes_and_evaluator(detectors, single, launched, drive_bag):
-    """Also where the file that includes it has arguments of these names."""
+    """Also if an including file has arguments of these names."""
     nodes = launched("replay")
     started = nodes(bag=str(drive_bag), detectors=detectors, single=single, scores="scores.json", processes="true")
     names = detectors.split(",")
@@ -378,7 +377,7 @@ def test_unusable_launch_argument_is_rejected(given, words, launched):
 
 @pytest.mark.parametrize("path", sorted((ROOT / "test/launch").glob("*.py")), ids=lambda p: p.stem)
 def test_modules_imported_by_launch_tests_exist(path):
-    """They run only where launch_testing is installed."""
+    """The launch tests run only where launch_testing is installed."""
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and str(node.module).startswith("lidar_perception"):

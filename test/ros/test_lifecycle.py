@@ -1,4 +1,4 @@
-"""Managed nodes, driven over DDS as by Nav2's lifecycle manager."""
+"""Managed nodes, driven over DDS like by Nav2's lifecycle manager."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def peer(shared_peer):
 
 @pytest.fixture(scope="module")
 def later(tmp_path_factory):
-    """Return the path where the test puts the weights of two nodes later."""
+    """Return the path where the test later puts the weights of two nodes."""
     return tmp_path_factory.mktemp("later") / "later.safetensors"
 
 
@@ -75,7 +75,7 @@ def state(peer, node):
 
 
 def change(peer, node, name):
-    """Return True if the node has made a transition and is in the state that follows."""
+    """Request a transition; return True if the node is in the resulting state."""
     number = getattr(Transition, f"TRANSITION_{name.upper()}")
     request = ChangeState.Request(transition=Transition(id=number))
     done = peer.call(f"/{node}/change_state", ChangeState, request).success
@@ -90,7 +90,7 @@ def drive(peer, node, *names):
 
 @pytest.fixture
 def here(peer):
-    """Return a function that makes nodes in this process, whose memory the test can inspect."""
+    """Return a function that creates nodes in this process, so that the test can inspect their memory."""
     made = []
 
     def make(kind, values, remap):
@@ -132,7 +132,7 @@ def test_manager_drives_a_detector_through_all_states(nodes, peer, weights):
     drive(peer, node, "configure")
     assert talker.get_subscription_count() == 0
     for round_ in (10, 20):
-        talker.publish(encode(message(round_)))  # to nobody
+        talker.publish(encode(message(round_)))  # nobody receives it
         drive(peer, node, "activate")
         peer.send(talker, message(round_ + 1), lambda n=round_: received(found, n + 1), "detections")
         assert_equal(received(found, round_ + 1), offline(weights, message(1)))
@@ -145,7 +145,7 @@ def test_manager_drives_a_detector_through_all_states(nodes, peer, weights):
         assert received(found, round_) is None
     drive(peer, node, "cleanup", "configure", "activate")
     peer.send(talker, message(31), lambda: received(found, 31), "detections")
-    assert not change(peer, node, "configure")  # rclpy would end the node
+    assert not change(peer, node, "configure")  # rclpy alone would end the node
     drive(peer, node, "deactivate", "cleanup", "unconfigured_shutdown")
     process = f"ready.{NODE}"
     assert not nodes.has_ended(process) and nodes.end(process) == 0
@@ -204,7 +204,7 @@ def test_simulated_clock_continues_after_cleanup(here, peer):
 
 
 def test_node_waits_for_missing_network_file(nodes, peer, later, weights):
-    """A manager is refused until the file exists; an autostarted node then loads it."""
+    """Configuring fails until the file exists; an autostarted node loads it then."""
     reason = f"there is no checkpoint {later}"
     driven, alone = f"waits/{NODE}", f"tries/{NODE}"
     for _ in range(2):

@@ -100,7 +100,7 @@ def test_frames_have_the_published_columns_and_boxes(view, received, shared_peer
                 body = view.bytes(f"api/cloud/{frame['frame']}")
                 count = int(np.frombuffer(body, np.uint32, 1, 4)[0])
                 ground = np.frombuffer(body, np.uint8, count, 8 + 13 * count)
-                if ground.any():  # not a cloud shown before the first with columns
+                if ground.any():  # not a cloud from before the first one with columns
                     found[:] = [
                         np.array([[*row[:7], row[8]] for row in rows]),
                         frame["stamp_ns"],
@@ -137,7 +137,7 @@ def test_newest_frame_appears_and_replay_can_pause(view, received, shared_peer):
         page.keyboard.press(" ")  # pause
         page.wait_for_function("() => !page.store.playing && page.store.requestedFrame === page.store.frame")
         held = page.evaluate("page.store.frame")
-        page.wait_for_function("() => page.store.status.clouds.skipped > 2")  # still counted
+        page.wait_for_function("() => page.store.status.clouds.skipped > 2")  # counted although paused
         page.keyboard.press(",")
         page.wait_for_function("n => page.store.frame === n - 1", arg=held)
         page.keyboard.press(" ")

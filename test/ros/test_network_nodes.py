@@ -47,7 +47,7 @@ def tested(request):
 
 @pytest.fixture(scope="module")
 def shared_processes(tested, domain, tmp_path_factory):
-    """The nodes of one detector, stopped before those of the next one start."""
+    """The nodes of one detector; they are stopped before those of the next one start."""
     with NodesUnderTest(tmp_path_factory.mktemp("logs"), domain) as processes:
         yield processes
 
@@ -64,13 +64,13 @@ def weights(tested, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def segmented(tested):
-    """Ground and clusters of message(1) by the nodes before the detector."""
+    """Ground and clusters of message(1) from the nodes before the detector."""
     params = with_values(PipelineParams(), read_config(tested.stages, PipelineParams()))
     return segment_cloud(to_point_cloud(message(1), 0.0)[0], None, params)
 
 
 def test_detections_equal_those_of_offline_detector(tested, found, talker, peer, weights, segmented):
-    """A cloud through the whole graph, and one without columns sent to the detector directly."""
+    """One cloud passes the complete graph; one without columns is sent directly to the detector."""
     points = peer.listen(tested.between, CLOUD)
     times = {step: peer.listen(f"/{tested.node}/debug/{step}_ms", "std_msgs/msg/Float64") for step in tested.steps}
     peer.wait_for_diagnostics(tested.node, "waiting for input")
@@ -194,7 +194,7 @@ def unshipped_version():
 
 UNSHIPPED = unshipped_version()
 MISSING = "there is no checkpoint /nowhere.safetensors"
-UNUSABLE = {  # by detector: parameters made in a folder, level, words; more in test_weights.py
+UNUSABLE = {  # by detector: function that makes parameters, level, words; more in test_weights.py
     POINTPILLARS_NODE.node: [
         (lambda folder: {"pointpillars.weights": "/nowhere.safetensors"}, 2, MISSING),
         (
@@ -242,7 +242,7 @@ def test_unusable_weights_are_reported_in_diagnostics(tested, shared_processes, 
         assert "Traceback" not in shared_processes.read_log(log)
         maps = Path(f"/proc/{shared_processes.running[log].pid}/maps")
         if words == MISSING and tested is not FUSED_NODE and maps.is_file():
-            assert "libtorch" not in maps.read_text()  # it takes seconds and 200 MB
+            assert "libtorch" not in maps.read_text()  # loading torch takes seconds and 200 MB
 
 
 def test_node_runs_own_detector_class(start, tmp_path, monkeypatch):
@@ -284,7 +284,7 @@ def test_help_lists_parameters(node, words, capsys):
 
 @pytest.mark.parametrize("range", ["ahead", "around"])
 def test_experts_segment_the_points_that_the_detector_reads(start, range):
-    """Ground as the detector computes it; the parts of the cloud have all its points."""
+    """The ground equals that of the detector, and the published parts contain all points of the cloud."""
     node = start(GroundSegmentation, range=range, **{"ground.method": "patchwork"})
     assert read_header(find_fused_weights(FusedParams()), NetworkConfig).config.low == AHEAD["low"]
     cloud = message(1)

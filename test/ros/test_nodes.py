@@ -34,7 +34,7 @@ SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
 def test_every_node_exits_with_0(processes, peer, tmp_path, drive_bag):
-    """SIGINT and SIGTERM in turn; test_stopping.py sends them in each phase."""
+    """Send SIGINT and SIGTERM in turn; test_stopping.py sends them in each phase."""
     arguments = {
         "bag_player": {"bag": str(drive_bag), "loop": True, "wait_timeout": 0.0},
         "bag_recorder": {"bag": str(tmp_path / "bag"), "topics": ["/nothing"]},
@@ -64,7 +64,7 @@ def talker(shared_peer):
 
 
 def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
-    """Names, defaults, descriptions and ranges; a value out of range is refused with a reason."""
+    """Compare names, defaults, descriptions and ranges; a value out of range is rejected with a reason."""
     peer = shared_peer
     names = set(peer.call("/perception/list_parameters", ListParameters, ListParameters.Request()).result.names)
     fields, defaults = collect_fields(PipelineParams()), flatten(PipelineParams())
@@ -111,7 +111,7 @@ def test_every_parameter_is_readable_and_lists_may_be_empty(start, kind):
 
 
 def test_problem_with_changing_numbers_is_logged_once(start, monkeypatch):
-    """The end of the problem is logged too, so the log ends with the current state."""
+    """The end of the problem is logged as well, so the log ends with the current state."""
     node, lines = start(GroundSegmentation), []
     monkeypatch.setattr(node.diagnostics, "_log", lambda level, message: lines.append((level, message)))
     for i in range(100):
@@ -180,7 +180,7 @@ def test_bad_parameter_files_are_rejected_in_one_line(processes):
 
 
 def test_missing_template_is_reported_with_first_cloud(perception, shared_peer, talker, good_cloud):
-    """It is a diagnostic, because the file may appear later."""
+    """It is only a diagnostic, because the file may appear later."""
     peer = shared_peer
     with peer.parameters("/perception", {"seed.file": "/nowhere.json"}):
         peer.send(talker, good_cloud, lambda: "/nowhere.json" in peer.get_message("perception"), "the diagnostic")
@@ -218,7 +218,7 @@ def test_old_markers_are_deleted_and_time_jumps_noticed(perception, shared_peer,
 
 
 def test_restarted_bag_pairs_clouds_of_the_new_round():
-    """After the jump, no message of the round before is delivered."""
+    """After the jump in time, no message of the previous round is delivered."""
     for first in ("cloud", "partner"):
         delivered, dropped = [], []
         paired = StampMatcher(lambda c, p, d=delivered: d.append((c, p)), on_drop=dropped.append)
@@ -235,8 +235,8 @@ def test_restarted_bag_pairs_clouds_of_the_new_round():
 
 
 def test_clouds_wait_for_the_partner_with_their_stamp():
-    """In any order of arrival, each cloud gets its own partner, in the order of the clouds; a cloud
-    whose partner is lost is delivered without one."""
+    """For any order of arrival, clouds are delivered in order with their partners; a cloud whose partner is lost
+    is delivered without one."""
     rng = np.random.default_rng(0)
     delivered = []
 

@@ -1,4 +1,4 @@
-"""Laws of the player's pacing: when the next cloud may be sent."""
+"""Pacing of the player: when the next cloud may be sent."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def pace_of(topics, ahead, timeout=10.0):
 
 
 def test_player_limits_clouds_in_flight():
-    """With answers that come late, twice, or not at all."""
+    """Results may arrive late, twice, or never."""
     rng = np.random.default_rng(0)
     for _ in range(100):
         topics, ahead = ["/a", "/b"][: rng.integers(1, 3)], int(rng.integers(1, 4))
@@ -92,7 +92,7 @@ def test_cloud_topics_are_found_or_the_existing_ones_are_listed():
 
 @pytest.mark.parametrize("own", [{}, {"OMP_WAIT_POLICY": "active"}], ids=["ours", "the user's"])
 def test_waiting_threads_sleep_unless_configured_otherwise(own):
-    """The command sets it before torch is loaded, which reads it then."""
+    """The command sets the variables before it loads torch, which reads them on import."""
     program = (
         "import atexit, os, sys; sys.argv[1:] = ['--version']; "
         "atexit.register(lambda: print([os.environ.get(k) for k in "

@@ -95,10 +95,10 @@ def test_a_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
 
 
 def test_static_transforms_accumulate_others_keep_last(monkeypatch, start, tmp_path):
-    """Each of their publishers sends its own, once."""
+    """Every publisher of static transforms sends its own, once."""
     from lidar_perception.nodes.replay import bag_player
 
-    monkeypatch.setattr(bag_player, "TF_MESSAGE", TEXT)  # which the wheels of ROS lack
+    monkeypatch.setattr(bag_player, "TF_MESSAGE", TEXT)  # not in the ROS wheels
     with BagWriter(tmp_path / "bag") as bag:
         bag.add_topic("/tf_static", TEXT, LATCHED_QOS)
         bag.add_topic("/info", INFO, LATCHED_QOS)
@@ -236,17 +236,17 @@ def test_clock_follows_a_looped_bag(processes, peer, text_bag):
     start(processes, text_bag, loop=True, rate=3.0, clock_hz=200.0)
     peer.wait(lambda: len(heard) > 45, "two and a half rounds")
     numbers = np.array(texts(heard), int)
-    again = np.flatnonzero(np.diff(numbers) < 0)  # a busy subscriber misses no round
+    again = np.flatnonzero(np.diff(numbers) < 0)  # also a busy subscriber notices every round
     assert 2 <= len(again) <= 3 and (np.diff(numbers) != 0).all()
     assert (numbers[again] > 14).all() and (numbers[again + 1] < 5).all()
     times = np.array([to_ns(c.clock) for c in clock])
     assert (times >= START).all() and (times <= START + 25 * STEP).all()
     back = np.diff(times) < 0
-    assert 1 <= back.sum() <= 3  # back to the start, once a round
+    assert 1 <= back.sum() <= 3  # jumps back once per round
 
 
 def test_player_waits_for_subscribers(processes, peer, text_bag):
-    start(processes, text_bag, wait_for=["/text:=2"], rate=1.0)  # ten are kept for late subscribers
+    start(processes, text_bag, wait_for=["/text:=2"], rate=1.0)  # the player keeps ten for late subscribers
     first = peer.listen("/text", TEXT)
     peer.wait(lambda: peer.get_value("bag_player", "subscribers of /text") == "1", "one subscriber")
     assert first == []
@@ -255,8 +255,8 @@ def test_player_waits_for_subscribers(processes, peer, text_bag):
 
 
 def test_player_waits_until_a_subscriber_is_matched(processes, peer, text_bag):
-    """The player discovers a subscriber before the publishing node does, whose messages until then
-    would be lost."""
+    """The player discovers a subscriber before the publishing node does; messages sent in between would be
+    lost."""
     me = peer.node.get_name()
     between = f"/{me}/output/between"
     said = peer.advertise("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
@@ -300,7 +300,7 @@ BAD = {
 
 @pytest.fixture(scope="module")
 def refused(shared_processes, text_bag, drive_bag, tmp_path_factory):
-    """Start one player for each case, each in its own namespace; return them and the cut bag."""
+    """Start one player per case in its own namespace; return the players and the truncated bag."""
     cut = tmp_path_factory.mktemp("cut") / "texts"
     shutil.copytree(text_bag, cut)
     storage = next(cut.glob("*.mcap"))
@@ -352,7 +352,7 @@ def test_looped_single_message_bag_is_not_played_in_a_busy_loop(monkeypatch, tmp
 
     def play():
         player.now_ns, player.anchor = START, now[0]
-        for late in range(200):  # as at a rate that is too high
+        for late in range(200):  # like a rate that is too high
             if not player._wait_until(START - late, "/text"):
                 return
             sent.append(now[0])
@@ -370,4 +370,4 @@ def test_looped_single_message_bag_is_not_played_in_a_busy_loop(monkeypatch, tmp
     player._play_once, player.stop, sent = lambda: sent.append(now[0]), Future(), []
     now[0] = 50.0
     player.spin(SimpleNamespace(spin_once=serve))
-    assert 90 < len(sent) < 110  # ten a second
+    assert 90 < len(sent) < 110  # ten per second

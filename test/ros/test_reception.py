@@ -63,8 +63,8 @@ def driver(peer, reliability, count, points=KITTI, first=1, hz=10):
 
 
 def test_clouds_of_drivers_with_other_qos_are_received(processes, peer):
-    """A RELIABLE driver loses nothing. A BEST_EFFORT one loses little where a socket buffer holds a
-    cloud, and losses are reported with a remedy. Its end is an ERROR, then STALE."""
+    """A RELIABLE driver loses nothing. A BEST_EFFORT driver loses little if the socket buffer holds a cloud, and
+    losses are reported with a remedy. When it ends, the diagnostic is ERROR, then STALE."""
 
     def value(key):
         return int(peer.get_value(NODE, key) or 0)
@@ -94,7 +94,7 @@ def test_clouds_of_drivers_with_other_qos_are_received(processes, peer):
     peer.wait(lambda: "no cloud" in peer.get_message(NODE), "the end")
     assert value("frames") > before and done() + value("lost") <= 60
     if read_socket_buffer_size() >= SOCKET_BUFFER:
-        assert done() - 30 > 15  # a plain rclpy subscriber gets a third of them
+        assert done() - 30 > 15  # a plain rclpy subscriber receives a third
     if value("lost"):
         log = (processes.logs / f"{NODE}.log").read_text()
         assert log.count("were lost in transit; let /driver publish reliable") == 1
@@ -102,7 +102,7 @@ def test_clouds_of_drivers_with_other_qos_are_received(processes, peer):
     peer.set_parameter(f"/{NODE}", "input.stale_after", 1000)
     peer.wait(lambda: "no cloud" not in peer.get_message(NODE), "no limit")
 
-    with driver(peer, "reliable", 30, points=2000, first=200):  # some pass while the node changes
+    with driver(peer, "reliable", 30, points=2000, first=200):  # some are lost while the node reconnects
         peer.wait(lambda: value("last_stamp_ns") == 229 * 10**9, "a reliable one again")
         assert peer.get_value(NODE, "reliability") == "reliable"
     processes.check()
@@ -156,7 +156,7 @@ def test_sensors_in_two_namespaces_are_separate(two_sensors, shared_peer):
         stamp = 5 * 10**9 * (i + 1)
         peer.send(talker, cloud(street, stamp), lambda s=side: found[s], f"the result of {side}")
         assert {to_ns(m.markers[0].header.stamp) for m in found[side]} == {stamp}
-        assert found[side][0].markers[0].lifetime.sec == 2  # so the boxes of a dead node disappear
+        assert found[side][0].markers[0].lifetime.sec == 2  # so that boxes of a dead node disappear
     own = {f"{side}/{node}": (side, f"{side}/lidar") for side in SIDES for node in STAGES}
     peer.wait(lambda: own.keys() <= peer.diagnostics.keys(), "diagnostics of all")
     assert all(peer.diagnostics[name].hardware_id in ids for name, ids in own.items())
@@ -212,7 +212,7 @@ def test_restarted_or_second_driver_loses_no_cloud():
     for number in (7, 8, 1, 2):
         arrivals.add(infos([number]), 0)
     arrivals.add(infos([90]), 0, one_publisher=False)
-    arrivals.add(infos([99]), 0)  # the first one again, alone
+    arrivals.add(infos([99]), 0)  # the first publisher again, alone
     arrivals.add(infos([101]), 0)
     assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (1, 0, 8)
 
@@ -324,9 +324,8 @@ def test_problem_names_the_type_of_publisher(monkeypatch, topic, what, publisher
 
 
 class Late:
-    """A Reception of clouds at 10 Hz in simulated time, whose poses come lag(stamp) seconds later.
-
-    answered: (stamp, True if the cloud had its pose) of each delivered cloud.
+    """Reception of clouds at 10 Hz in simulated time with poses that arrive lag(stamp) seconds later. answered:
+    (stamp, True if the cloud had its pose) of each delivered cloud.
     """
 
     def __init__(self, monkeypatch, lag, **params):

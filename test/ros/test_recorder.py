@@ -18,7 +18,7 @@ TEXT, INFO = "std_msgs/msg/String", "sensor_msgs/msg/CameraInfo"
 
 
 def test_recorder_stores_latched_messages_of_every_publisher(processes, peer, tmp_path):
-    for i in range(6):  # as each node with a fixed sensor does on /tf_static
+    for i in range(6):  # like nodes with fixed sensors on /tf_static
         peer.advertise("/note", TEXT, LATCHED).publish(encode(make_bag_message(TEXT, data=str(i))))
     processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["/note"]})
     peer.wait(lambda: peer.get_value("bag_recorder", "frames") == "6", "six messages")
@@ -28,7 +28,7 @@ def test_recorder_stores_latched_messages_of_every_publisher(processes, peer, tm
 
 
 def test_late_publisher_with_weaker_qos_is_recorded(processes, peer, tmp_path):
-    """Also by a name of the node's namespace."""
+    """Also if the topic is in the node's namespace."""
     first = peer.advertise("/robot/text", TEXT, RELIABLE)
     processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["text"]}, namespace="robot")
 

@@ -102,9 +102,8 @@ def weights(tmp_path_factory):
 
 
 def test_detections_of_tilted_and_level_sensor_are_equal(start, weights):
-    """Boxes in the base frame equal those of a level sensor, with the mount from TF or parameters.
-
-    Without target_frame they are in the frame of the cloud.
+    """Boxes in the base frame equal those of a level sensor, whether the mount is from TF or parameters. Without
+    target_frame they are in the frame of the cloud.
     """
     scan = frame()
     place = mount_pose(0.7, -0.3, 1.73, 0.2, 0.0, 0.0)
@@ -140,7 +139,7 @@ def test_detections_of_tilted_and_level_sensor_are_equal(start, weights):
 
 @pytest.mark.parametrize("by", ["hand", "TF", "nothing"])
 def test_parameter_ahead_rotates_the_view_of_the_detectors(start, weights, by):
-    """A turned and tilted sensor gives the boxes of a level one, and points behind are cropped."""
+    """A rotated and tilted sensor gives the boxes of a level one, and points behind it are cropped."""
     scan, ahead = frame(), 150.0
     weights = {**weights, "crop.sectors": [100.0, 260.0]}
     plain = start(PointPillarsNode, **weights)
@@ -190,7 +189,7 @@ def test_click_and_candidates_in_rotated_cloud(start):
 
 
 def test_missing_frames_are_reported_and_parameters_used(start):
-    """Columns and boxes are bit for bit those of a node without frame parameters."""
+    """Columns and boxes equal those of a node without frame parameters, bit for bit."""
     xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     plain = start(Perception)
     asks = start(Perception, base_frame="base_footprint", target_frame="odom")
@@ -220,7 +219,7 @@ def test_missing_frames_are_reported_and_parameters_used(start):
 
 
 def test_body_crop_needs_a_known_frame(start):
-    """Otherwise it could be a person. A body below the ground is reported."""
+    """With an unknown frame it could remove people. A body below the ground is reported."""
     node = start(GroundSegmentation, base_frame="base", **{"crop.body": [-0.5, -0.4, 0.2, 0.5, 0.4, 1.0]})
     floor = np.random.default_rng(0).uniform(-20, 20, (2000, 3)) * [1, 1, 0]
     sensor = mount_pose(0.5, 0.0, 1.2, 0.0, 0.0, 0.0)  # the base's origin is behind it
@@ -253,7 +252,7 @@ def test_unreadable_template_affects_candidates_only(start):
 
 
 def test_cloud_waits_for_late_or_missing_transform(start):
-    """It does not wait for a transform that has stopped, nor without TF."""
+    """It waits neither for a transform that has stopped nor without TF."""
     xyz, _ = walker(mount_pose(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     node = start(Perception, target_frame="odom")
     deliver, msg = node.inputs.receptions[0].deliver, encode(message(xyz))
@@ -268,13 +267,13 @@ def test_cloud_waits_for_late_or_missing_transform(start):
     node.transforms.on_tf(transforms(("odom", "lidar", np.eye(4), START + PERIOD)), static=False)
     assert deliver(msg, True) is None and boxes_of(node)[1:] == ("odom", START)
     assert "odom" not in problems(node)
-    deliver(encode(message(xyz, START + 2 * PERIOD)), False)  # the time to wait is over
+    deliver(encode(message(xyz, START + 2 * PERIOD)), False)  # the waiting time has expired
     assert boxes_of(node)[1] == "lidar" and "0.100 s older than needed" in problems(node)
     assert deliver(encode(message(xyz, START + 20 * PERIOD)), True) is None  # odom has stopped
 
 
 def test_tracks_of_tilted_sensor_are_in_the_cloud_frame(start, weights):
-    """Tracks are in the frame of the cloud while detections are in that of the base."""
+    """Tracks are in the cloud frame although detections are in the base frame."""
     scan, tilt = frame(), make_tilted_pose(-0.2, 0.3, 1.73)
     node = start(
         PointPillarsNode,

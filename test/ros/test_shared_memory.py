@@ -50,7 +50,7 @@ def segments(pid: int | str) -> set[Path]:
 
 
 def shares_no_segment(process) -> bool:
-    """Return True if a process shares no segment with another one."""
+    """Return True if a process shares no segment with another process."""
     return all(
         segments(process.pid).isdisjoint(segments(other.name))
         for other in Path("/proc").glob("[0-9]*")
@@ -80,7 +80,7 @@ def test_only_shared_memory_of_killed_process_is_removed(capsys):
         theirs, others = segments(killed.pid), segments(living.pid)
 
         def remove_as_if_old():
-            """Make the segments old during the call: other starting nodes would remove them."""
+            """Make the segments look old only during the call, because other starting nodes would remove them."""
             for age in (0, 0), None:
                 for segment in theirs | others:
                     with suppress(FileNotFoundError):

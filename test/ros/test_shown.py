@@ -41,7 +41,7 @@ SOURCE = {
     "expected_update_rate": float,
 }
 PLANAR = SOURCE | {"obstacle_max_range": float, "raytrace_max_range": float}
-LAYERS = {  # parameters of a layer, and of its sources, of those that nav2.md uses
+LAYERS = {  # parameters of each layer in nav2.md and of its sources
     "nav2_costmap_2d::ObstacleLayer": ({"min_obstacle_height": float, "max_obstacle_height": float}, PLANAR),
     "nav2_costmap_2d::VoxelLayer": (
         {
@@ -78,7 +78,7 @@ def graph(domain):
     }.items():
         rules = [word for rule in remap.items() for word in ("-r", ":=".join(rule))]
         node = load_node_class(name)(context=context, cli_args=["--ros-args", *rules])
-        node.start()  # which creates the topics of managed nodes
+        node.start()  # creates the topics of managed nodes
         nodes.append(node)
         types.update((t, kinds[0]) for t, kinds in node.get_subscriber_names_and_types_by_node(name, "/"))
         for topic, kinds in node.get_publisher_names_and_types_by_node(name, "/"):
@@ -158,7 +158,7 @@ def test_nav2_recipes_match_the_published_obstacles(graph):
 
 
 def test_costmap_gets_the_obstacles_of_each_cloud(processes, peer, drive_bag):
-    """Obstacles of both nodes equal the offline ones, with the cloud's header and Nav2's layout."""
+    """Obstacles of both nodes equal the offline ones and have the cloud's header and Nav2's layout."""
     with Bag(drive_bag) as bag:
         cloud = next(m for _, _, m in bag.messages({POINTS}))
     band = {"obstacles.min_height": 0.2, "obstacles.max_height": 2.5}

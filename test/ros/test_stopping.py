@@ -1,4 +1,4 @@
-"""A node's process ends with code 0 at a signal, even if a library holds the lock."""
+"""A node exits with 0 at a signal, even if a library holds the interpreter lock."""
 
 import importlib.util
 import signal
@@ -73,7 +73,7 @@ def test_node_ends_although_a_callback_hangs(ended, name):
 
 
 class Changing:
-    """A node in whose graph other nodes leave for some time, or for ever."""
+    """Node in whose graph other nodes keep leaving for some time, or forever."""
 
     def __init__(self, looks):
         self.looks, self.destroyed = looks, None

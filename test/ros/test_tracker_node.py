@@ -1,4 +1,4 @@
-"""The tracker as a real process over DDS, against the library on the same detections."""
+"""The tracker as a real process over DDS, compared with the library on the same detections."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def looped(domain, drive_bag, tmp_path_factory):
         for node, remap in graph.items():
             extra = {**flatten(params), "tracking.enabled": True, "input.queue": 2} if node == "perception" else {}
             processes.start(node, {**remap, **ODOMETRY_INPUT}, {**extra, "ego.max_wait": 60.0})
-        listeners = {"found": 2, "behind": 1, "inside": 1}  # by the diagnostics of each node
+        listeners = {"found": 2, "behind": 1, "inside": 1}  # according to the diagnostics of each node
         peer.wait(
             lambda: all(
                 int(peer.get_value(topic.split("/")[1], f"subscribers of {topic}") or 0) >= listeners[name]
@@ -117,9 +117,8 @@ def looped(domain, drive_bag, tmp_path_factory):
 
 
 def assert_tracked(frames, messages, poses, params):
-    """Require that messages are the tracks of the library for frames, MarkerArrays of detections.
-
-    Return the Tracks of each frame, None without an answer.
+    """Assert that messages equal the library's tracks of `frames`, MarkerArrays of detections. Return the Tracks
+    of each frame, None if there was no message.
     """
     tracker, shown, messages = Tracker(params), [], iter(messages)
     for frame in map(from_marker_array, frames):
@@ -174,7 +173,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     )
 
     def send(message, words="tracking", answered=True):
-        """Publish once; wait for the tracks, if any are expected, and for the reason."""
+        """Publish once; wait for the expected tracks, if any, and for the reason in the diagnostics."""
         shown = len(tracks)
         talker.publish(encode(message))
         peer.wait(lambda: words in peer.get_message(NODE) and len(tracks) >= shown + answered, f"'{words}'")
@@ -186,7 +185,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
         return make_detection_markers(found, header(now, frame_id), make_bag_message)
 
     def move(poses, child="lidar"):
-        """Send poses of the next frames. A second child frame counts once the first is silent."""
+        """Send poses of the next frames. A second child frame is used once the first one stops."""
         for i, at in enumerate(poses):
             stamp = now + (i + 1) * TENTH
             message = make_odometry(at, header(stamp, "odom"), child, make_bag_message)
@@ -202,7 +201,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     send(make_bag_message(MARKERS), "an array without a marker", answered=False)
     now += TENTH
     gone = make_bag_message("visualization_msgs/msg/Marker", header=header(now), action=DELETEALL)
-    assert read(send(make_bag_message(MARKERS, markers=[gone])))[:2] == (now, [1])  # missed once
+    assert read(send(make_bag_message(MARKERS, markers=[gone])))[:2] == (now, [1])  # missed in one frame
     bad = Detections.of([car(10), car(np.nan), [1, 1, 1, 0, 1, 1, 0]], CAR, [0.9, 0.9, np.nan])
     assert read(send(frame(bad), "2 of 3 detections are ignored"))[1] == [1]
     many = np.random.default_rng(0).uniform(1, 80, (10_000, 7))
@@ -211,7 +210,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     send(frame(found, "other"), "are mixed")
     now += 100 * TENTH
     before = read(send(frame(found), "are mixed"))[1]
-    for i in range(6):  # a class that changes each frame is one track
+    for i in range(6):  # changing classes stay one track
         last = send(frame(cars(person(30), kind=[PEDESTRIAN, CYCLIST][i % 2])))
     assert len({*read(last)[1]} - {*before}) == 1
 

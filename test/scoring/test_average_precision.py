@@ -1,4 +1,4 @@
-"""Average precision of a curve: thresholds at evenly spaced recall, and sampling of few objects."""
+"""Average precision: thresholds at evenly spaced recall, and few objects."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from lidar_perception.scoring.average_precision import average_curve, choose_thresholds, sample_curve
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 few = settings(max_examples=15, database=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -23,7 +23,7 @@ def test_thresholds_are_scores_at_evenly_spaced_recall(seed, objects):
     chosen = choose_thresholds(hits, objects)
     assert len(chosen) <= 41 and (np.diff(chosen) < 0).all() and np.isin(chosen, hits).all()
     recall = np.array([(hits >= t).sum() for t in chosen]) / objects
-    # Each is within half a step of its recall point; the last hit covers the remaining points.
+    # Each threshold is within half a step of its recall; the last hit covers the remaining points.
     np.testing.assert_allclose(recall[:-1], np.arange(len(chosen) - 1) / 40, atol=1 / objects + 1e-9)
     assert chosen[-1] == hits.min()
 

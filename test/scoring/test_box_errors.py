@@ -1,4 +1,4 @@
-"""Box errors: known differences are measured."""
+"""Box errors: known differences are measured correctly."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def frame(true: np.ndarray, found: np.ndarray, scores=0.9):
 
 
 def cars(count: int, rng) -> np.ndarray:
-    """Return cars on an outward spiral, so that none touches another."""
+    """Return cars on a spiral that do not touch each other."""
     way, away = np.linspace(-1, 1, count), np.linspace(8, 70, count)
     return np.column_stack(
         [
@@ -37,7 +37,7 @@ def cars(count: int, rng) -> np.ndarray:
 
 
 def moved(boxes: np.ndarray, away=0.0, aside=0.0, **sizes) -> np.ndarray:
-    """Shift boxes along the ray and to its left, and change sizes with the bottoms in place."""
+    """Shift boxes along the ray and to its left, and change sizes while the bottoms stay in place."""
     azimuth = np.arctan2(boxes[:, 1], boxes[:, 0])
     off = boxes.copy()
     off[:, 0] += np.cos(azimuth) * away - np.sin(azimuth) * aside

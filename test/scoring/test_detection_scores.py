@@ -22,7 +22,7 @@ from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED, Compar
 from lidar_perception.scoring.kitti.report import ROWS, DetectionReport, average_3d
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 few = settings(max_examples=15, database=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -51,7 +51,7 @@ def numbers(content):
     return [] if content is None else [content]
 
 
-# One line: a car 20 m ahead, 60 pixels high, seen in full; a result is the same with a score.
+# Label of a fully visible car 20 m ahead, 60 pixels high; a result line also has a score.
 def car(
     kind="Car", left=500, top=150, bottom=210, z=20.0, x=0.0, occluded=0, truncated=0.0, alpha=0.0, score=None, y=1.6
 ):
@@ -60,7 +60,7 @@ def car(
 
 
 REGION = "DontCare -1 -1 -10 {} 100 {} 250 -1 -1 -1 -1000 -1000 -1000 -10"
-WRONG = dict(left=900, z=40.0, x=10.0)  # elsewhere in the image and in 3D
+WRONG = dict(left=900, z=40.0, x=10.0)  # far away in the image and in 3D
 
 
 def concatenate(*lines):
@@ -105,17 +105,17 @@ def test_average_precision_of_four_objects_worked_out_by_hand():
     assert row["r40"] == pytest.approx(100 * (10 * 1 + 10 * 2 / 3 + 10 * 3 / 5) / 40)
     # 11 points: 0 .1 .2; .3 .4 .5; .6 .7; .8 .9 1.
     assert row["r11"] == pytest.approx(100 * (3 * 1 + 3 * 2 / 3 + 2 * 3 / 5) / 11)
-    # KITTI's program puts the three precisions on the first three of 41 points.
+    # KITTI's program assigns the three precisions to the first three of 41 points.
     assert row["official_r40"] == pytest.approx(100 * (2 / 3 + 3 / 5) / 40)
     assert row["official_r11"] == pytest.approx(100 * 1 / 11)
-    # The second hit points a quarter turn away: similarities 1, 1 + 1/2, 2 + 1/2 of 1, 3, 5.
+    # The second hit is rotated by 90 degrees: similarities 1, 1 + 1/2, 2 + 1/2 of 1, 3, 5.
     aos = ap([(truth, found)])["Car"]["aos"]["easy"]
     assert aos["r40"] == pytest.approx(100 * (10 * 1 + 10 * 1.5 / 3 + 10 * 2.5 / 5) / 40)
 
 
 def test_average_precision_equals_hand_computed_value():
-    # 50 cars found, then 50 false ones, then the other 50 cars: precision 1 up to recall 1/2, and
-    # at recall 1 it is 100 / 150, which is the best there is beyond 1/2.
+    # 50 hits, 50 false positives, 50 hits: precision is 1 up to recall 1/2. At recall 1 it is 100 / 150, the
+    # maximum beyond 1/2.
     frames = [(car(), concatenate(car(score=0.9 - i * 1e-3), car(score=0.5 + i * 1e-4, **WRONG))) for i in range(50)]
     frames += [(car(), car(score=0.4 - i * 1e-3)) for i in range(50)]
     for key in ("", "official_"):
@@ -124,8 +124,8 @@ def test_average_precision_equals_hand_computed_value():
         assert row[f"{key}r11"] == pytest.approx(100 * (6 * 1 + 5 * 2 / 3) / 11)
 
 
-# A car found at 0.9 and something found at 0.95: AP is 100 if that does not count, else 50, as
-# the only precision is 1 / 2. By metric, in the difficulty that is named.
+# A car detected with 0.9 and another detection with 0.95: AP is 100 if the latter is ignored, otherwise 50,
+# because the only precision is 1 / 2. By metric and difficulty.
 @pytest.mark.parametrize(
     "case, other_truth, other_found, level, image, space",
     [
@@ -144,9 +144,9 @@ def test_average_precision_equals_hand_computed_value():
         ("24 pixels", None, car(**WRONG, bottom=174, score=0.95), "hard", 100, 100),
         ("25 pixels", None, car(**WRONG, bottom=175, score=0.95), "hard", 50, 50),
         ("another class", None, car("Pedestrian", **WRONG, score=0.95), "easy", 100, 100),
-        # A detection lower than 25 pixels is ignored, but it is matched with the car.
+        # A detection of less than 25 pixels is ignored, but it is matched with the car.
         ("24 pixels, another class", None, car("Pedestrian", bottom=174, score=0.95), "hard", 100, 0),
-        # The better score is the only threshold, and above it nothing is wrong.
+        # The higher score is the only threshold, and it has no false positives.
         ("found twice", None, car(score=0.95), "easy", 100, 100),
     ],
 )
@@ -220,7 +220,7 @@ def test_missing_label_fields_are_computed_from_the_box():
 @given(seeds)
 def test_labels_as_detections_score_100_everywhere(seed):
     rng = np.random.default_rng(seed)
-    # Objects far apart: where labels overlap one another one may be found by another's box.
+    # Objects are far apart; overlapping labels could match the detection of their neighbour.
     truths = [
         labels(
             concatenate(
@@ -263,7 +263,7 @@ def test_the_order_of_detections_changes_nothing(seed):
 
 
 def test_the_order_of_equal_scores_changes_nothing():
-    # The first of two people is found by either detection, the second by one of them only.
+    # Both detections match the first person, only one matches the second.
     truth = concatenate(*(car("Pedestrian", left=300 * i, x=1.6 * i) for i in range(2)))
     found = [car("Pedestrian", x=x, score=0.5) for x in (0.8, -0.8)]
     there, back = (ap([(truth, concatenate(*order))])["Pedestrian"] for order in (found, found[::-1]))
@@ -323,7 +323,7 @@ def test_detections_outside_the_image_do_not_count():
         total.update(FrameDetections("frame", truth, boxes, CALIBRATION))
         assert total.compute()["ap"]["Car"]["bev"]["hard"]["r40"] == expected
     total = DetectionReport()
-    total.update(FrameDetections("frame", truth, found))  # no camera: everything around counts
+    total.update(FrameDetections("frame", truth, found))  # without a camera, objects all around count
     rows = total.compute()["ap"]["Car"]
     assert rows["bev"]["hard"]["r40"] == pytest.approx(100 / 3) and "image" not in rows
 
@@ -383,7 +383,7 @@ def test_best_score_is_the_maximum_of_all_scores(seed):
 
 
 def test_detections_of_equal_score_share_a_threshold():
-    # From 0.9 on: 2 * 1 / (1 + 2). From 0.5 on: 2 * 2 / (5 + 2). The hit alone is no choice.
+    # Threshold 0.9: 2 * 1 / (1 + 2). Threshold 0.5: 2 * 2 / (5 + 2). Equal scores are kept together.
     scores, person, wrong = CentreScores(), np.array([[10.0, 0, 0, 1, 1, 1, 0]]), np.ones((3, 7))
     scores.update(person, person, np.array([0.9]))
     scores.update(person, np.concatenate([person, wrong]), np.full(4, 0.5))
@@ -400,7 +400,7 @@ def test_pedestrians_by_centre_distance_worked_out_by_hand():
     total.update(FrameDetections("no pedestrian", GroundTruth.of([], []), found, CALIBRATION))
     content = total.compute()["pedestrian_centres"]
     assert (content["frames"], content["ground_truth"]) == (1, 2)
-    # Only the near one is a hit; boxes behind the camera do not count: 2 * 1 / (2 + 2)
+    # Only the near detection is a hit; boxes behind the camera do not count: 2 * 1 / (2 + 2)
     assert content["of_all"]["all"]["f1"] == 0.5
     assert content["best_score"] == pytest.approx(0.8)  # 2 * 1 / (1 + 2)
     assert content["at_best_score"]["all"]["f1"] == pytest.approx(2 / 3)

@@ -1,4 +1,4 @@
-"""evaluate detection: result files, checkpoints, splits, and invalid ones."""
+"""The command evaluate detection: result files, checkpoints, splits, and invalid input."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def found(tmp_path):
 
 @pytest.fixture
 def detector(monkeypatch):
-    """Replace the detector of a checkpoint by made.find, and record the calls in made.asked."""
+    """Replace the detector of a checkpoint by made.find and record the calls in made.asked."""
     made = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
 
     def open_detector(path, device="auto", *, min_score=None, sensor_height=None, range="auto", settings=None):
@@ -97,7 +97,7 @@ def test_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path, mon
 
 
 def test_short_bag_has_no_interval(kitti, detector, tmp_path):
-    """One second of a drive is a single block, so nothing can be resampled."""
+    """One second of a drive is a single block, so there is nothing to resample."""
     detector.find = lambda frame: truth_of(kitti)
     write_bag(tmp_path / "bag", open_recording(kitti))
     arguments = "--weights", "any", "--intervals", 10
@@ -137,7 +137,7 @@ def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
     assert len(detector.scans[0]) == len(open_recording(kitti).frames[0].load())
     assert content["ms"] >= 0 and "ms a frame" in text
     for (_, row, _), cell in cells(content).items():
-        if row not in ("image", "aos"):  # the made-up 2D boxes of the labels are no projections
+        if row not in ("image", "aos"):  # 2D boxes of these labels are not projections
             assert cell["r40"] == 100
 
 
@@ -155,7 +155,7 @@ def test_thinning_to_a_fraction_is_repeatable(kitti, detector, tmp_path):
         np.testing.assert_array_equal(whole[:, :3], frame.load().xyz)
         assert abs(len(tenth) / len(whole) - 0.1) < 0.03
         assert set(map(tuple, tenth)) < set(map(tuple, whole))
-    assert len(kept[0.1][0]) != len(kept[0.1][1])  # each frame draws its own
+    assert len(kept[0.1][0]) != len(kept[0.1][1])  # each frame has its own random numbers
 
 
 def test_smaller_fraction_is_a_subset_of_a_larger_one(kitti):
@@ -199,7 +199,7 @@ def test_result_files_have_the_detections(tmp_path):
     write_results(path, made, CALIBRATION)
     back = read_results(path, CALIBRATION.lidar_to_camera)
     np.testing.assert_array_equal(back.class_ids, made.class_ids)
-    # LiDAR and camera are tilted to each other by a degree, and a file has upright boxes only.
+    # LiDAR and camera are tilted by one degree to each other, and files have upright boxes only.
     np.testing.assert_allclose(back.boxes[:, :6], made.boxes[:, :6], atol=2e-4)
     np.testing.assert_allclose(np.cos(back.boxes[:, 6] - made.boxes[:, 6]), 1, atol=1e-4)
     np.testing.assert_allclose([e["score"] for e in back.extras], made.scores, atol=1e-4)
@@ -343,8 +343,8 @@ def test_real_labels_as_results_score_100(data, tmp_path):
 
 @pytest.mark.no_cover
 def test_real_boxes_project_onto_their_2d_labels(data, detector, tmp_path):
-    """Boxes alone score 100 in BEV and 3D. In the image, limbs and occlusion make the label of a
-    person differ from the projection of the box."""
+    """Boxes score 100 in BEV and 3D. In the image, limbs and occlusion make a person's label differ from the
+    projected box."""
     truths = iter([f.truth() for f in open_recording(data / "kitti_object")])
 
     def find(frame):

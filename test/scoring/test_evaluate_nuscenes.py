@@ -1,4 +1,4 @@
-"""evaluate nuscenes: result files, checkpoints, scenes, and invalid ones."""
+"""The command evaluate nuscenes: result files, checkpoints, scenes, and invalid input."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def detections(frame, seed=0):
 
 @pytest.fixture
 def detector(monkeypatch):
-    """A stand-in for the detector of a checkpoint."""
+    """Stand-in for the detector of a checkpoint."""
     made = types.SimpleNamespace(asked=[], find=lambda scan: Detections.none())
 
     def opened(path, device, *, min_score, sensor_height, range, settings):

@@ -1,4 +1,4 @@
-"""Matching and scores: optimal and one to one, and counts add up."""
+"""Matching is optimal and one to one, and counts add up."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def some(rng, count, reach=1.2):
 
 
 def brute_force(found, truth, limit):
-    """Return the best of all pairings: most pairs, then least distance."""
+    """Return the best assignment: most pairs, then smallest distance."""
     if len(found) > len(truth):
         return brute_force(truth, found, limit)
     best = (0, 0.0)
@@ -98,7 +98,7 @@ def test_maximum_distance_in_3d_is_a_hit():
 
 
 def test_detections_that_are_not_finite_are_false_positives():
-    # Another node may send anything; one broken box must not stop the evaluation.
+    # Other nodes may send anything; one broken box must not stop the evaluation.
     truth = boxes([10, 0, 0], [20, 0, 0])
     found = boxes([np.nan, 0, 0], [20.1, 0, 0], [np.inf, 0, 0])
     i, j = match_centres(found, truth)

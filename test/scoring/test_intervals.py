@@ -1,4 +1,4 @@
-"""Intervals: drives are resampled, not frames, and constant scores have no width."""
+"""Confidence intervals: drives are resampled, not frames; constant scores have no width."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_interval_contains_score_and_is_repeatable(seed, count):
 
 
 def test_repeated_frames_of_a_drive_keep_interval_wide():
-    """Ten equal frames of a drive carry no more information than one."""
+    """Ten equal frames of a drive have no more information than one."""
     person, elsewhere = np.array([[10.0, 0, 0, 1, 1, 2, 0]]), np.array([[20.0, 0, 0, 1, 1, 2, 0]])
     once, often = CentreScores(), CentreScores()
     for drive in range(12):

@@ -76,8 +76,8 @@ def test_recall_up_to_0_1_counts_nothing():
 
 
 def test_false_positive_of_higher_score_lowers_precision():
-    """Precision is interpolated between (recall 0, 0) and (1, 0.5), so it is r / 2. Above 0.1 its
-    mean over the recalls is 16.2 / 90, of at most 0.9."""
+    """Precision is interpolated between (recall 0, 0) and (1, 0.5), so it is r / 2. Above recall 0.1 its mean is
+    16.2 / 90, of at most 0.9."""
     s = scored(boxes((0, 0)), boxes((30, 0), (0, 0), scores=[0.9, 0.8]))
     assert s.mean_ap == pytest.approx(0.2)
 
@@ -97,7 +97,7 @@ def test_object_matches_once_with_the_better_score():
 
 
 def test_detection_matches_the_nearest_unmatched_object():
-    """The first takes the nearer object; the other takes the farther one, or is a false
+    """The first detection matches the nearer object; the other matches the farther one, or is a false
     positive."""
     s = scored(boxes((0, 0), (3, 0)), boxes((0.1, 0), (0.5, 0), scores=[0.9, 0.8]))
     assert s.ap == pytest.approx({**dict.fromkeys((0.5, 1.0, 2.0), (39 + 0.4 / 0.9) / 90), 4.0: 1})
@@ -131,8 +131,8 @@ def test_errors_of_a_match_equal_hand_computed_values():
 
 
 def test_error_is_a_mean_of_means_over_recall():
-    """Two objects have the errors 0 and 1, by falling score. The error is 0 at recalls 0.11 .. 0.5
-    and rises to the mean of both, 0.5, at 0.51 .. 1 in 50 steps."""
+    """Two objects have errors 0 and 1, in order of score. The error is 0 at recalls 0.11 to 0.5 and rises in 50
+    steps to the mean of both, 0.5, at recall 1."""
     s = scored(boxes((0, 0), (20, 0)), boxes((0, 0), (21, 0), scores=[0.9, 0.8]))
     assert s.errors["ate"] == pytest.approx(sum(0.01 * k for k in range(1, 51)) / 90)
 

@@ -22,7 +22,7 @@ COUNT = 5
 
 @dataclass
 class Names:
-    """A report that keeps the names of its frames."""
+    """Report that collects the names of its frames."""
 
     names: list = field(default_factory=list)
     skipped: list = field(default_factory=list)
@@ -50,7 +50,7 @@ def ending(name, recording):
 
 @pytest.fixture
 def root(tmp_path):
-    """Five frames: the scan of 000001 was cut, 000003 has no labels."""
+    """Five frames: the scan of 000001 is truncated, 000003 has no labels."""
     root = object_folder(tmp_path / "kitti", walker_label(), COUNT)
     write(root / "training/velodyne/000001.bin", b"123")
     (root / "training/label_2/000003.txt").unlink()
@@ -171,5 +171,5 @@ def test_results_are_sorted_and_yielded_early(numbers, random):
     for k, pair in enumerate(sort_results(pairs(), numbers)):
         assert pair == (numbers[k], -numbers[k])
         needed = 1 + max(sent.index(number) for number in numbers[: k + 1])
-        assert taken == sent[:needed]  # no more than it needed
+        assert taken == sent[:needed]  # no more than needed
     assert taken == sent

@@ -89,7 +89,7 @@ def test_two_objects_in_one_cluster_are_both_under_segmented():
     owner = np.repeat([1, 2, 3, 0], [30, 60, 50, 5])
     content = report_of(np.repeat([4, 4, 7, 0], [30, 60, 50, 5]), objects(owner))
     assert (content["under_segmented"], content["over_segmented"]) == (2, 0)
-    # 30 of 90 points, 60 of 90, and the third perfectly.
+    # IoU of 30 / 90, 60 / 90, and 1.
     assert content["mean_iou"] == pytest.approx((1 / 3 + 2 / 3 + 1) / 3)
     assert (content["objects"], content["hits"], content["judged_clusters"]) == (3, 2, 2)
     assert content["under_segmentation"] == pytest.approx(2 / 3)
@@ -111,8 +111,8 @@ def test_fragments_need_a_tenth_of_the_object():
 
 
 def test_scores_equal_hand_computed_values():
-    # Of object a 8 of 10 points are in cluster 1, beside 2 others; of b none is found. Cluster 2
-    # is half near an object, so not judged; cluster 3 is far from all; 4 is judged, and no hit.
+    # Cluster 1 has 8 of 10 points of object a and 2 others; object b has no cluster. Half of cluster 2 is near
+    # an object, so it is not scored; cluster 3 is far from all; cluster 4 is scored and no hit.
     owner = np.repeat([1, 1, 2, 0, 0, 0, 0], [8, 2, 10, 2, 4, 6, 3])
     found = np.repeat([1, 0, 0, 1, 2, 3, 4], [8, 2, 10, 2, 4, 6, 3])
     near = np.repeat([1, 1, 1, 0, 0, 0, 1], [8, 2, 10, 2, 4, 6, 3])
@@ -122,7 +122,7 @@ def test_scores_equal_hand_computed_values():
     assert (content["objects"], content["hits"]) == (2, 1)
     assert content["mean_iou"] == pytest.approx(8 / 12 / 2)
     assert (content["precision"], content["recall"], content["f1"]) == (0.5, 0.5, 0.5)
-    assert content["mean_pieces"] == 1  # of a; b has none
+    assert content["mean_pieces"] == 1  # object a; object b has no pieces
     assert content["by_class"]["b"]["mean_pieces"] is None
     assert content["by_class"]["a"]["mean_iou"] == pytest.approx(2 / 3)
     assert [row["objects"] for row in content["by_range"].values()] == [1, 0, 0, 1]
@@ -150,7 +150,7 @@ def test_order_of_points_and_numbers_of_clusters_do_not_matter(seed):
     found, truth = some(seed)
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(found))
-    large = rng.permutation(np.unique(rng.integers(1, 2**31, 40)))[:10]  # tables would take GBs
+    large = rng.permutation(np.unique(rng.integers(1, 2**31, 40)))[:10]  # lookup tables would take gigabytes
     renamed = np.concatenate([[0], large])[found]
     shuffled = replace(truth, **{name: getattr(truth, name)[order] for name in ("owner", "region", "near", "counted")})
     assert report_of(renamed[order], shuffled) == report_of(found, truth)
@@ -175,7 +175,7 @@ def test_scores_equal_a_plain_loop_over_sets(seed):
         )
     near = set(np.flatnonzero(truth.near))
     assert score.judged == sum(2 * len(s & near) > len(s) for s in sets.values())
-    assert score.judged >= np.sum(score.iou > 0.5)  # so that no ratio is above 1
+    assert score.judged >= np.sum(score.iou > 0.5)  # so that ratios are at most 1
 
 
 def test_no_clusters_or_no_objects_have_scores():
@@ -254,7 +254,7 @@ def test_instances_include_moving_points():
 def test_scores_of_each_protocol_equal_hand_computed_values():
     semantic = np.array([40, 44, 48, 49, 60, 72, 70, 70, 70, 0, 1, 10, 50], np.uint16)
     z = np.full(len(semantic), -1.7)
-    z[7:9] = [-1.3, -1.2]  # at the limit is not low
+    z[7:9] = [-1.3, -1.2]  # points at the limit are not low
     expected = (
         [1] * 6 + [None] * 5 + [0, 0],
         [1] * 7 + [0, 0, None, None, 0, 0],
@@ -405,7 +405,7 @@ def test_error_for_invalid_call_names_the_reason(tmp_path):
 
 @pytest.mark.parametrize("command", [segmentation, candidates])
 def test_bag_of_a_lower_sensor_scores_equally(command, tmp_path):
-    """The height is measured and used, unless options give another one."""
+    """The sensor height is measured unless an option gives it."""
 
     def scores(name, lower, *flags):
         path, bag = tmp_path / f"{name}.json", tmp_path / name

@@ -1,4 +1,4 @@
-"""HOTA, CLEAR MOT and AB3DMOT's scores: invariants, and slow implementations of the papers."""
+"""HOTA, CLEAR MOT and AB3DMOT scores: invariants and comparison with slow implementations of the papers."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_renaming_ids_changes_nothing():
 
 
 def drive(ids=(1, 2), frames=10, switch_at=None, kind=CAR):
-    """Return frames (truth, tracks) of two cars that drive side by side, tracked without error."""
+    """Return frames (truth, tracks) of two perfectly tracked cars side by side."""
     result = []
     for i in range(frames):
         boxes = np.array([[10.0 + i, y, -1.0, 4.0, 1.8, 1.5, 0.0] for y in (-3.0, 3.0)])
@@ -127,7 +127,7 @@ def test_tracks_that_are_the_labels_score_one():
 def test_swapped_ids_are_two_switches():
     score = scored(drive(switch_at=5))
     assert score["switches"] == 2 and score["DetA"] == pytest.approx(1.0)
-    assert score["AssA"] == pytest.approx(1 / 3)  # each pair 5 of 10 + 10 - 5
+    assert score["AssA"] == pytest.approx(1 / 3)  # each pair: 5 / (10 + 10 - 5)
 
 
 def test_order_of_frames_does_not_matter():
@@ -247,9 +247,9 @@ def test_error_explains_why_tracks_cannot_be_scored():
         make_pairs(GroundTruth.of(truth.boxes, truth.class_ids), tracks, None)
     frame = Frame(
         "a/0", 0, lambda: 1 / 0, lambda: GroundTruth.of(truth.boxes, truth.class_ids, [{"track_id": -1}] * len(truth))
-    )  # as KITTI writes none
+    )  # KITTI writes none
     measure = measure_tracking(lambda: None, TrackingParams(), "none", Recording("a", "", [frame], frozenset()))
-    with pytest.raises(InputError, match="no track id"):  # before the scan is loaded
+    with pytest.raises(InputError, match="no track id"):  # reported before the scan is loaded
         measure(frame)
     with pytest.raises(InputError, match="needs a calibration"):
         make_pairs(truth, tracks, None, "image")
@@ -263,7 +263,7 @@ def test_result_file_round_trip(tmp_path):
     path = tmp_path / "0000.txt"
     write_tracking_results(path, frames, FORWARD_CAMERA)
     found = read_tracking_labels(path, FORWARD_CAMERA.lidar_to_camera)
-    assert " Person " in path.read_text()  # the tracking benchmark's name of Person_sitting
+    assert " Person " in path.read_text()  # name of Person_sitting in the tracking benchmark
     for number, _, detections in frames:
         again = found[number]
         np.testing.assert_allclose(again.boxes, detections.boxes, atol=2e-6)

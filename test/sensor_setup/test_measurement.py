@@ -1,4 +1,4 @@
-"""Measurements of simulated tilted sensors and of real ones agree with the truth."""
+"""Measurements of simulated tilted sensors and of real sensors agree with the truth."""
 
 from dataclasses import replace
 from functools import cache
@@ -20,7 +20,7 @@ from lidar_perception.sensor_setup.report.warnings import find_warnings
 from lidar_perception.simulation.sensor import SENSOR_NAMES, find_sensor, load_sensor
 from lidar_perception.wire.params import InputParams
 
-CHECKED = ("hdl-64e", "vlp-16", "pandarxt-32")  # by order, by rings, and by elevations
+CHECKED = ("hdl-64e", "vlp-16", "pandarxt-32")  # beams by order, by ring column, and by elevation
 
 
 @cache
@@ -69,7 +69,7 @@ def test_sensor_file_is_the_measured_sensor(tmp_path):
         assert sensor.columns == known.columns and sensor.divergence == pytest.approx(known.divergence, abs=1e-6)
         assert np.allclose(sensor.elevations, known.elevations, atol=np.radians(0.05))
         assert sensor.height == pytest.approx(MOUNTS[name][3], abs=0.02)
-        assert sensor.min_range == known.min_range  # not the nearest ground of this drive
+        assert sensor.min_range == known.min_range  # not the distance of the nearest ground
 
 
 def test_slice_of_wall_is_not_ground_of_upside_down_sensor():
@@ -128,7 +128,7 @@ def test_beams_by_ring_and_by_elevation_agree():
 
 
 def test_scan_lines_of_non_repeating_pattern_are_not_beams():
-    """The four lines of a Livox scan the whole view; here all returns are from a ceiling."""
+    """The four scan lines of a Livox sweep the entire view; here all returns are from a ceiling."""
     rng = np.random.default_rng(0)
     changed = []
     for scan in scans("vlp-16"):
@@ -189,7 +189,7 @@ def test_real_sensors_are_recognised(data, folder, model, height, rings):
     assert m.pattern.model == model and rings - 2 <= len(m.pattern.beams.elevations) <= rings
     step = np.degrees(find_sensor(model).azimuth_step)
     assert m.pattern.azimuth_step == pytest.approx(step, rel=0.05)
-    if height is None:  # indoors, on a table
+    if height is None:  # an indoor sensor on a table
         assert m.mounting.mount is None and any("no ground" in line for line in find_warnings(m))
     else:
         assert m.mounting.mount.height == pytest.approx(height, abs=0.1)

@@ -1,4 +1,4 @@
-"""TF and odometry of a bag compared with the clouds."""
+"""TF and odometry of a bag, compared with the clouds."""
 
 from dataclasses import replace
 from functools import cache
@@ -70,7 +70,7 @@ def test_heading_is_the_x_axis_of_the_base_even_when_reversing(yaw):
         ahead = choose_params(m).get("input.ahead", (0.0,))[0]
         assert abs((ahead + yaw + 180) % 360 - 180) < 3
     if not yaw:
-        # without odometry it drives towards its back
+        # without odometry it seems to drive backwards
         heading = measure_drive(RecordedPoses(), backwards=True).mounting.heading
         assert abs(abs(heading.degrees) - 180) < 3
     written = yaml.safe_load(format_params(m))["/**"]["ros__parameters"]["input"]
@@ -161,7 +161,7 @@ def test_mount_and_poses_are_read_from_bag(tmp_path):
     recorded(tmp_path / "bare", moving(ODOMETRY, ""))
     clouds = open_clouds(tmp_path / "bare")
     assert read_recorded_poses(clouds.poses, range(3), clouds.stamps_ns) == RecordedPoses(problem=nameless.problem)
-    # With another clock there are no poses at the times of the clouds.
+    # Odometry with another clock has no poses at the times of the clouds.
     recorded(tmp_path / "clock", moving(ODOMETRY), mount())
     clouds = open_clouds(tmp_path / "clock")
     assert read_recorded_poses(clouds.poses, range(3), clouds.stamps_ns).problem == ""

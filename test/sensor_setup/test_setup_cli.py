@@ -1,4 +1,4 @@
-"""The command setup: files that other commands read, nothing overwritten, clear errors."""
+"""The command setup: readable files, nothing overwritten, clear errors."""
 
 import json
 

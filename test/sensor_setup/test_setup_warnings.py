@@ -1,4 +1,4 @@
-"""Warnings of a measurement with their remedies, and clouds that are refused."""
+"""Warnings of a measurement with remedies, and rejected clouds."""
 
 import json
 import re
@@ -46,7 +46,7 @@ def change_cloud(msg, change, frame_id="lidar"):
 
 
 def turn_by(matrix):
-    """Return a change that turns all points."""
+    """Return a function that rotates all points of a cloud."""
 
     def change(points):
         xyz = np.column_stack([points[a] for a in "xyz"]) @ np.transpose(matrix)
@@ -116,10 +116,9 @@ def test_robot_body_is_found_and_cropped():
 
 
 def simulate_scans(half=np.inf, body=0.0, height=0.6, seed=0, turn=np.eye(3)):
-    """Yield 8 scans of a sensor with 16 beams on a robot under the sky, with random things around.
-
-    half: distance of the walls to both sides; body: distance of the robot's deck behind the sensor,
-    0 for none; height: of the sensor, all in m. turn: from the sensor's axes to level ones.
+    """Yield 8 scans of a sensor with 16 beams on a robot outdoors with random objects around it. half: distance
+    of the walls on both sides; body: distance of the robot's deck behind the sensor, 0 for none; height: sensor
+    height, all in m. turn: rotation from the sensor's axes to level ones.
     """
     rng = np.random.default_rng(seed)
     up, aside = np.radians(np.meshgrid(np.arange(-15.0, 16, 2), np.arange(0.0, 360, 0.5)))
@@ -181,7 +180,7 @@ def test_robot_stands_still_while_people_pass():
     parked = measure_sensor(scans, range(8), "parked", 8, None, NO_POSES._replace(poses=poses))
     assert parked.view.coverage.stationary and warns(parked, "stands still")
     assert len(parked.view.coverage.box) and not parked.view.coverage.blocked
-    # A slow robot hardly moves between successive clouds, either.
+    # A slow robot hardly moves between successive clouds.
     numbers = [40 * (i // 2) + i % 2 for i in range(8)]
     slow = [
         make_scan(np.concatenate([scan.xyz[scan.xyz[:, 2] < -0.5], make_trees() - [0.04 * n, 0, 0]]))
@@ -244,7 +243,7 @@ def test_frame_with_y_ahead_or_z_down_is_reported():
 
 @pytest.mark.parametrize("beams", [True, False])
 def test_upside_down_sensor_is_described_as_mounted(beams):
-    def select_part(points):  # more below than above the horizon, and to the left
+    def select_part(points):  # more points below than above the horizon, and on the left
         if not beams:
             points["ring"] = 0
             nearer = np.random.default_rng(0).uniform(0.7, 1.0, len(points))
@@ -262,7 +261,7 @@ def test_upside_down_sensor_is_described_as_mounted(beams):
     np.testing.assert_allclose(turned.blocked, level.blocked, atol=1.01)
     assert turned.wander == pytest.approx(level.wander, rel=0.05)
     assert bool(turned.wander) != beams
-    if beams:  # closer to each other where people are than above
+    if beams:  # beams are denser at the height of people
         up = np.array([14.0, 11, 8, 5, 3, 1, -6, -8, -10, -12, -14])
         assert with_elevations(own, up).elevation_step == 2
         assert with_elevations(other, -up[::-1]).elevation_step == 2

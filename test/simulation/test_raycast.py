@@ -1,4 +1,4 @@
-"""The ray caster."""
+"""Ray casting of solids, foliage and glass."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from lidar_perception.simulation.sensor import NO_MOTION, Motion, make_generic_s
 from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID
 from lidar_perception.simulation.terrain import Ground
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 WIDE = replace(SENSOR, divergence=8e-3)
 NO_GROUND = np.array([0.0, 0.0, 1e4])
@@ -22,7 +22,7 @@ DRIVE = Motion((12.0, -1.0, 0.2), 0.8, stamp=0.3)
 
 
 def cast_by_brute_force(objects, sensor, motion=NO_MOTION):
-    """Return range, solid (columns, rings) and reached by testing every solid with every ray."""
+    """Return range, solid (columns, rings) and reached, from tests of every solid with every ray."""
     turn = make_rays(sensor, motion)
     nearest = np.full(turn.direction.shape[:2], np.inf)
     solid, reached = np.full(nearest.shape, -1), {}
@@ -90,8 +90,8 @@ def test_hits_depend_on_seed_only():
 
 @pytest.mark.parametrize("motion", [NO_MOTION, DRIVE])
 def test_nearest_of_single_casts_equals_joint_cast(motion):
-    """Overlapping solids in high grass, most without an owner: neither order nor skipping changes a
-    byte."""
+    """Cast overlapping solids in high grass, most without an owner. Neither order nor skipping changes the
+    result."""
     count, rng = 160, np.random.default_rng(0)
     objects = make_crowd(5, count)
     far = np.linalg.norm(objects.centre[:, :2], axis=1)[:, None]
@@ -106,7 +106,7 @@ def test_nearest_of_single_casts_equals_joint_cast(motion):
     hits = cast_rays(objects, ground, OVER_ROAD, SENSOR, motion)
     nearest = cast_rays(objects.take(np.arange(0)), ground, OVER_ROAD, SENSOR, motion)._asdict()
     for i in range(count):
-        # The others are out of reach, so that solid i keeps its place among them.
+        # The other solids are out of reach, so that solid i keeps its index.
         alone = replace(objects, centre=np.where(np.arange(count)[:, None] == i, objects.centre, 1e4))
         met = cast_rays(alone, Ground(), NO_GROUND, SENSOR, motion)
         nearer = met.range < nearest["range"]
@@ -139,7 +139,7 @@ def even_leaves(monkeypatch):
 
 
 def test_leaf_clumps_are_constant_during_drive():
-    """Two casts with other random numbers hit leaves in the same cells, a share of LEAF_SHARE."""
+    """Two casts with different random numbers hit leaves in the same cells, a fraction LEAF_SHARE of all."""
     fine = make_generic_sensor(64, -8.0, 8.0, 0.1, 10.0, divergence=0.0)
     plant = make_solids(BOX, (12, 0, 0), (3, 3, 3), density=2.0)
     filled = []
@@ -166,7 +166,7 @@ def test_foliage_stops_rays_after_mean_free_path(kind, even_leaves):
     shell = np.isfinite(thin.range)
     path = thick.range[shell] - thin.range[shell]
     assert shell.sum() > 1000 and (path > 0).all()
-    # Where the way through is long, paths are exponential up to 2 m.
+    # In deep foliage, path lengths are exponentially distributed up to 2 m.
     middle = shell & (np.abs(fine.directions()[..., 1]) < 0.1)
     path = (thick.range - np.where(shell, thin.range, 0))[middle]
     for depth in (0.5, 1.0, 2.0):
@@ -216,9 +216,9 @@ def test_beam_on_an_edge_returns_one_side_or_a_range_between():
     unchanged = beams.range == exact.range
     assert 0.9 < unchanged[exact.owner > 0].mean() < 1
     x = (fine.directions() * np.where(np.isfinite(beams.range), beams.range, 0)[..., None])[..., 0]
-    assert (np.abs(x[beams.owner == 1] - 4.8) < 0.01).all()  # an owner's points are on it
+    assert (np.abs(x[beams.owner == 1] - 4.8) < 0.01).all()  # points with an owner are on its surface
     apart = cast_rays(replace(objects, centre=objects.centre + [[0, 0, 0], [3, 0, 0]]), Ground(), NO_GROUND, fine)
-    assert (apart.owner[np.isfinite(apart.range)] > 0).all()  # too far apart to mix
+    assert (apart.owner[np.isfinite(apart.range)] > 0).all()  # too far apart for mixed returns
     assert np.array_equal(beams.reached, exact.reached)
 
 

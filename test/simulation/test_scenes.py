@@ -1,4 +1,4 @@
-"""Scenes for robots, compared with streets."""
+"""Scenes for robots."""
 
 from dataclasses import replace
 from functools import cache
@@ -49,7 +49,7 @@ def transform_points(xyz, pose):
     ],
 )
 def test_seed_gives_known_scene(scenes, seed, moment, points, metres, labels):
-    """Update the values when things are changed on purpose."""
+    """Update the expected values after intended changes of the scenes."""
     scan = simulate_scan(seed, moment, TINY, scenes)
     assert len(scan.frame) == points
     assert np.abs(scan.frame.xyz, dtype=float).sum() == pytest.approx(metres, rel=1e-6)
@@ -90,8 +90,8 @@ def test_actors_never_touch_robot_or_each_other(scene, kind):
 
 @pytest.mark.parametrize("scene, kind", ROBOTS)
 def test_points_and_boxes_agree_with_world(scene, kind):
-    """At any heading and yaw rate the ground agrees with the world, and points of labelled objects
-    are in their boxes."""
+    """For any heading and yaw rate, the ground agrees with the world and points of labelled objects are in their
+    boxes."""
     simulated = make_cached_scene(scene, kind)
     simulated = replace(simulated, ground=simulated.ground._replace(rough=0.0, litter=0.0))
     for t in (0.0, 7.3):
@@ -101,7 +101,7 @@ def test_points_and_boxes_agree_with_world(scene, kind):
         world = transform_points(got.xyz.astype(float), pose)
         ground = np.isin(got.semantic, GROUND) & (got.owner == 0)
         off = world[ground, 2] - surface_height(simulated.ground, *world[ground, :2].T)
-        # On the edge of a kerb, height is that of either side.
+        # At the edge of a kerb, the height is that of either side.
         assert ground.sum() > 100 and (np.abs(off) < 2e-3).mean() > 0.97
         assert np.abs(off).max() <= simulated.ground.curb_height + 2e-3
         boxes = moment.boxes.copy()
@@ -175,7 +175,7 @@ def test_command_writes_every_layout_for_robots(layout, tmp_path):
     assert result.exit_code == 0
     first, second = open_recording(out)
     assert len(first.load()) > 500
-    if layout != "kitti-tracking":  # which has no poses
+    if layout != "kitti-tracking":  # this layout has no poses
         apart = np.linalg.inv(first.pose()) @ second.pose()
         assert 0.0 <= np.linalg.norm(apart[:3, 3]) < 0.3
     if layout == "semantickitti":

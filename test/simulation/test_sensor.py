@@ -244,7 +244,7 @@ def test_far_and_dark_returns_are_lost():
     for r in (5, 25, 50, 100):
         assert share[r, 0.03] <= share[r, 0.1] <= share[r, 0.4] <= share[r, 0.9]
     assert share[5, 0.1] == 1 and abs(share[50, 0.1] - 0.5) < 0.1
-    assert abs(share[100, 0.4] - 0.5) < 0.1  # power goes with brightness over range squared
+    assert abs(share[100, 0.4] - 0.5) < 0.1  # power is proportional to brightness / range^2
     assert len(make_measurement(open_sensor, 5.0, 0.0).xyz) == 0 and not len(make_measurement(SMALL, np.inf).xyz)
     assert len(make_measurement(SMALL, 50.0, cosine=0.05).xyz) < len(make_measurement(SMALL, 50.0).xyz)
     lost = 1 - len(make_measurement(replace(SMALL, dropout=0.2), 5.0).xyz) / SMALL.columns / SMALL.rings
@@ -277,7 +277,7 @@ def test_only_weak_returns_have_intensity_0():
     assert (make_measurement(sensor, 10.0, 0.4).intensity > 0.2).all()
     on_the_verge = make_measurement(sensor, 10.0, 0.2).intensity
     assert 0.4 < (on_the_verge == 0).mean() < 0.6
-    assert on_the_verge[on_the_verge > 0].min() >= 0.3  # nothing between 0 and the floor
+    assert on_the_verge[on_the_verge > 0].min() >= 0.3  # no values between 0 and the floor
 
 
 def test_retroreflectors_do_not_fade():

@@ -1,4 +1,4 @@
-"""The command simulate: files do not depend on processes and interruptions; existing files are kept."""
+"""The command simulate: files do not depend on processes or interruptions; existing files are kept."""
 
 import contextlib
 import errno
@@ -105,13 +105,13 @@ def start():
 
 def test_killed_command_leaves_no_process_and_resumes(start, tmp_path):
     out, frames = tmp_path / "set", 40
-    process = start(out, frames, "--streets-of", 30)  # in two processes; the rest in one
-    os.kill(process.pid, signal.SIGKILL)  # its children end by themselves
+    process = start(out, frames, "--streets-of", 30)  # two processes; the resumed run has one
+    os.kill(process.pid, signal.SIGKILL)  # its children end without a signal
     process.wait()
     wait_for_the_end(process.pid)
     assert "Traceback" not in process.communicate()[1]
     assert (out / "INCOMPLETE").exists()
-    (out / "training/velodyne/0000/.000299.bin.1-0.tmp").write_bytes(b"half")  # as a kill leaves it
+    (out / "training/velodyne/0000/.000299.bin.1-0.tmp").write_bytes(b"half")  # as after a kill
     assert 3 <= len(list(out.glob(".parts/*.json"))) < frames
     again = run(out, "kitti-tracking", frames, 1, "--streets-of", 30, "--resume")
     assert again.exit_code == 0
@@ -156,7 +156,7 @@ def test_full_disk_is_reported_in_one_line(made, tmp_path, monkeypatch, call):
 def test_unwritable_file_ends_the_run(tmp_path):
     blocked = tmp_path / "set/training/velodyne/000003.bin"
     run(tmp_path / "set", "kitti", 5, 1, "--streets-of", 5)
-    (tmp_path / "set/dataset.json").rename(tmp_path / "set/INCOMPLETE")  # .parts is gone already
+    (tmp_path / "set/dataset.json").rename(tmp_path / "set/INCOMPLETE")  # .parts was already deleted
     blocked.unlink()
     blocked.mkdir()
     with pytest.raises(InputError, match=r"cannot write .*000003\.bin"):
@@ -187,7 +187,7 @@ def test_existing_files_are_kept_without_force(made, tmp_path):
         run(out, "kitti", 2, 1, "--force")
     assert content(out) == before | {"notes.txt": b"dear"}
     notes.unlink()
-    (out / resumable_folder.RECORD_NAME).unlink()  # as an interrupted --force leaves it
+    (out / resumable_folder.RECORD_NAME).unlink()  # as after an interrupted --force
     (out / resumable_folder.INCOMPLETE_NAME).write_text("{}")
     with pytest.raises(InputError, match="start again with --force"):
         run(out, "kitti", 2, 1, "--resume")

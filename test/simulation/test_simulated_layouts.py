@@ -1,4 +1,4 @@
-"""Simulated data sets: documented properties of scans, and reading from every layout."""
+"""Simulated data sets: properties of scans, and reading of every layout."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from lidar_perception.simulation.sensor import SENSORS
 from lidar_perception.types import SENSOR_HEIGHT
 
 pytestmark = [
-    pytest.mark.no_cover,  # others run these lines
+    pytest.mark.no_cover,  # covered by other tests
     pytest.mark.usefixtures("streets", "tiny_sensor"),
 ]
 
@@ -44,12 +44,12 @@ def test_columns_of_scan_agree_with_points():
     assert np.abs(scan.time[ahead]).max() < 0.01  # the stamp is when the sensor looks ahead
     assert scan.instance[np.isin(scan.semantic, (40, 48, 50, 70, 72, 80))].max() == 0
     things = scan.instance > 0
-    assert np.isin(scan.semantic[things], [*THINGS, *MOVING, 99]).all()  # 99: what one carries
+    assert np.isin(scan.semantic[things], [*THINGS, *MOVING, 99]).all()  # 99: carried objects
     assert np.isin(scan.semantic, list(MOVING)).any() and (scan.semantic == 10).any()
     for box, extra in zip(scan.truth.boxes, scan.truth.extras):
         own = scan.instance == extra["track_id"]
         assert own.sum() == extra["num_points"]
-        assert points_in_box(xyz[own], box, margin=1.0).all()  # what moves, mirrors, umbrellas
+        assert points_in_box(xyz[own], box, margin=1.0).all()  # moving parts, mirrors, umbrellas
 
 
 def test_object_layout_reads_back(made):
@@ -124,7 +124,7 @@ def test_semantickitti_layout_reads_back(made):
         to_camera = np.vstack([np.fromstring(calibration["Tr"], sep=" ").reshape(3, 4), [0, 0, 0, 1]])
         poses = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
         assert np.loadtxt(folder / "times.txt").tolist() == [0.0, 0.1]
-        for moment, pose in enumerate(poses):  # as SemanticKITTI's own tools do
+        for moment, pose in enumerate(poses):  # like SemanticKITTI's tools
             pose = np.linalg.inv(to_camera) @ np.vstack([pose, [0, 0, 0, 1]]) @ to_camera
             assert np.allclose(pose, simulate_scan(3 + sequence, moment, TINY).pose, atol=1e-9)
 
@@ -143,7 +143,7 @@ def test_sensor_height_is_kept_in_every_layout(tmp_path, layout, inner):
     for other in (
         "{",
         "[" * 10**4,
-        '{"height": 480}',  # of another program
+        '{"height": 480}',  # written by another program
         '{"height": "1", "sensor_digest": ""}',
         '{"height": NaN, "sensor_digest": ""}',
     ):
@@ -186,7 +186,7 @@ def test_2d_boxes_contain_projected_corners():
     assert np.allclose(
         rectangles[inside], np.concatenate([pixels[inside].min(axis=1), pixels[inside].max(axis=1)], axis=1)
     )
-    # Many points of a box that reaches behind the camera: none in the image is outside its 2D box.
+    # A box that reaches behind the camera: all of its points in the image are in its 2D box.
     for box, limits in zip(boxes[~whole & in_image], rectangles[~whole & in_image]):
         inner = rng.uniform(-0.5, 0.5, (4000, 3)) * box[3:6]
         cos, sin = np.cos(box[6]), np.sin(box[6])

@@ -17,7 +17,7 @@ from lidar_perception.types import CLASSES, PEDESTRIAN
 
 COARSE = replace(HDL64E, azimuth_step=float(np.radians(0.5)))
 EXACT = replace(COARSE, range_noise=0.0, dropout=0.0, divergence=0.0)
-pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("streets")]  # others run these lines
+pytestmark = [pytest.mark.no_cover, pytest.mark.usefixtures("streets")]  # covered by other tests
 
 
 def street(seed):
@@ -74,9 +74,9 @@ def test_points_of_object_are_in_its_box(seed, t):
     _, moment, hits, xyz, owner = scan(seed, t)
     semantic = make_returns(hits, COARSE, NO_MOTION, np.random.default_rng(0)).semantic
     for box, track, speed, kind in zip(moment.boxes, moment.track_ids, moment.speeds, moment.class_ids):
-        own = (owner == track) & (semantic != 99)  # 99: what a person carries
-        # What only the rim of a beam meets is reported in the middle of the beam. A box is that at
-        # the stamp, half a turn from some points. Mirrors and umbrellas stick out.
+        own = (owner == track) & (semantic != 99)  # 99: carried objects
+        # Hits at the edge of a beam are reported at its centre. Boxes are those at the stamp, up to half a
+        # sweep from some points. Mirrors and umbrellas stick out.
         beam = (np.linalg.norm(box[:3]) + 10) * COARSE.divergence / 2 + 6 * COARSE.range_noise
         margin = beam + speed / COARSE.rate / 2 + (0.6 if kind == PEDESTRIAN else 0.2)
         assert points_in_box(xyz[own], box, margin=margin).all()
@@ -95,7 +95,7 @@ def test_boxes_stand_on_ground_without_overlap(seed):
         world = moment.boxes[:, :3] + moment.position
         ground = np.array([surface_height(scene.ground, x, y) for x, y, _ in world])
         assert np.abs(world[:, 2] - moment.boxes[:, 5] / 2 - ground).max() < 0.05
-        # No two footprints have a corner or a centre of the other inside.
+        # No footprint contains a corner or the centre of another one.
         flat = moment.boxes * [1, 1, 0, 1, 1, 1, 1]
         marks = np.concatenate([box_corners(flat)[:, :4] * [1, 1, 0], flat[:, None, :3]], axis=1)
         for i, box in enumerate(flat):
@@ -111,8 +111,7 @@ def test_pedestrians_are_always_in_view():
 
 
 def test_scans_resemble_those_of_real_sensor():
-    """KITTI's scans have 109 000 to 127 000 points, and about 27 000 / range^2 on a pedestrian in
-    full view."""
+    """KITTI scans have 109 000 to 127 000 points, and about 27 000 / range^2 on a fully visible pedestrian."""
     density, labels = [], set()
     for seed in (0, 33):
         scan = next(simulate_drive(seed, 1, scenes=CROWDED_ZONES))

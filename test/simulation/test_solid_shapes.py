@@ -24,7 +24,7 @@ from lidar_perception.simulation.solids import compute_extents, make_parts, plac
 from lidar_perception.simulation.terrain import Ground
 from lidar_perception.types import CLASSES
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 SEEDS = range(12)
 LABELLED = {
@@ -68,7 +68,7 @@ SEMANTICS = {10, 11, 15, 16, 18, 20, 30, 31, 32, 50, 51, 70, 71, 80, 81, 99}
 
 
 def draw_parts(make, seed):
-    """Return the parts of a obj, labelled or not."""
+    """Return the parts of an object, labelled or not."""
     obj = make(np.random.default_rng(seed))
     return obj.parts(0.7) if hasattr(obj, "parts") else obj
 
@@ -205,7 +205,7 @@ def test_vehicles_are_symmetric(style):
 
 
 def test_beam_can_pass_through_windows_of_car():
-    """Above the belt and behind the screens only pillars and seats are solid."""
+    """In the windows of a car only pillars and seats are solid."""
     parts = vehicles.make_body((4.0, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.85, driver=False)
     low, high = compute_extents(parts)
     x, z = -0.45, 1.25  # between the pillars in the middle and at the back, above the seats
@@ -214,7 +214,7 @@ def test_beam_can_pass_through_windows_of_car():
 
 
 def scan_object(obj, distance, yaw, seed):
-    """Return the xyz that the HDL-64E sees of a obj at a distance ahead; z above its bottom."""
+    """Return the points that an HDL-64E measures on an object at a distance ahead, with z above its bottom."""
     parts = obj.parts(0.4 * seed)
     base = np.tile([distance, 0.0, -1.73], (len(parts), 1))
     solids = place_parts(parts, base, np.full(len(parts), yaw), np.ones(len(parts)), np.zeros((len(parts), 3)))
@@ -235,8 +235,8 @@ def test_fraction_of_low_points_of_cyclist_agrees_with_kitti():
 
 @pytest.mark.parametrize("distance, low, high", [(20.0, 0.22, 0.32), (33.0, 0.20, 0.32), (48.0, 0.08, 0.25)])
 def test_fraction_of_points_above_car_windows_falls_with_range(distance, low, high):
-    """On KITTI 38, 31 and 16 % of the points are above 0.65 of the height, of 22, 17 and 15 cars
-    seen from behind at 12 to 25, 25 to 40 and 40 to 70 m, whose lower parts are often hidden."""
+    """In KITTI, 38, 31 and 16 % of the points are above 0.65 of the height for 22, 17 and 15 cars seen from
+    behind at 12 to 25, 25 to 40 and 40 to 70 m. Their lower parts are often occluded."""
     shares = []
     for seed in range(16):
         obj = vehicles.make_car(np.random.default_rng(seed))
@@ -257,8 +257,8 @@ def scan_cars_from_front():
     "zone, low, high", [((0.15, 0.35), 0.04, 0.10), ((0.35, 0.55), 0.12, 0.24), ((0.55, 0.65), 0.45, 0.75)]
 )
 def test_only_the_bumper_touches_the_front_of_the_box(zone, low, high):
-    """A quarter of the points of a zone of heights are within 0.07, 0.17 and 0.60 m of the end of
-    the box: medians of 42 to 59 cars of KITTI seen from the front."""
+    """In three height zones of KITTI cars seen from the front (medians of 42 to 59 cars), a quarter of the points
+    are within 0.07, 0.17 and 0.60 m of the front of the box."""
     depths = []
     for obj, points in scan_cars_from_front():
         x, y, z = points.T
@@ -286,7 +286,7 @@ def test_sizes_have_the_deviation_of_the_table(label):
 
 
 def test_size_table_agrees_with_labels(data):
-    """The table agrees with the labels of the sample, up to rounding."""
+    """The table agrees with the labels of the sample up to rounding."""
     rows = {}
     for path in (data / "kitti_object/training/label_2").glob("*.txt"):
         for line in path.read_text().splitlines():

@@ -15,11 +15,11 @@ from lidar_perception.simulation.street import STREET_KINDS
 from lidar_perception.simulation.terrain import surface_height
 from lidar_perception.types import CLASSES, InputError
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 SEEDS = range(3)
 EVERY = [(kind, seed) for kind in STREET_KINDS for seed in SEEDS]
-SIGN = 81  # of SemanticKITTI
+SIGN = 81  # SemanticKITTI class
 TIMES = (0.0, 4.0, 8.0, 12.0, 16.0)
 HEIGHT = 1.73
 SITTING, CAR, PEDESTRIAN, CYCLIST = (CLASSES.index(name) for name in ("Person_sitting", "Car", "Pedestrian", "Cyclist"))
@@ -28,7 +28,7 @@ make_cached_scene = cache(lambda kind, seed, people=1.0: make_scene(seed, kind, 
 
 @pytest.mark.parametrize("kind, seed", EVERY)
 def test_actors_never_overlap(kind, seed):
-    """Labelled and unlabelled things and the ego vehicle, except people on benches and plants."""
+    """Includes labelled and unlabelled objects and the ego vehicle, except people on benches and plants."""
     scene = make_cached_scene(kind, seed)
     props = [a for a in scene.actors if not a.obj.label]
     plants = np.array([is_plant(a) for a in props])
@@ -122,7 +122,7 @@ def test_islands_are_at_crossings_and_off_lanes():
         for actor in middle:
             count += 1
             assert np.abs(edges - actor.x).min() <= 15.0
-            assert abs(actor.footprint[1]) - actor.footprint[WIDTH] > 1.0  # our lane's cars
+            assert abs(actor.footprint[1]) - actor.footprint[WIDTH] > 1.0  # cars in the ego lane
     assert count > 10
 
 
@@ -194,5 +194,5 @@ def test_footprints_touch_equals_dense_sampling():
         boxes[0] = make_flat_boxes(one[None], t)[0]
         slow[[j - 1 for i, j in find_overlaps(boxes, 1)]] = True
     assert 20 < fast.sum() < 100
-    assert (fast >= slow).all() and (fast != slow).sum() <= 2  # touched for less than an interval
+    assert (fast >= slow).all() and (fast != slow).sum() <= 2  # contact shorter than a sampling interval
     assert np.array_equal(fast, [footprints_touch(row, one, 5.0, 0.0) for row in many])

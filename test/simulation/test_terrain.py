@@ -12,7 +12,7 @@ from lidar_perception.simulation.raycast import cast_rays
 from lidar_perception.simulation.sensor import HDL64E, make_rays
 from lidar_perception.simulation.terrain import Ground, cast_ground, surface_height, to_compiled, tuft_height
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 
 def test_flat_ground_range_is_height_over_sine():
@@ -84,7 +84,7 @@ def test_rough_ground_is_bounded_and_constant():
         near = chosen & (np.linalg.norm(at[:, :2], axis=1) < 20)
         assert off[near].min() > -0.01 and np.quantile(off[near], 0.99) < 1.3 * most
         assert off[near].std() > 0.1 * most
-    # The same bumps from elsewhere.
+    # The same bumps from another viewpoint.
     assert np.isfinite(cast_on_ground(rough, (4.0, 0.4))[0]).all()
 
 
@@ -93,7 +93,7 @@ def test_grass_is_rough_and_hides_ground_behind():
     at, _, met, hits = cast_on_ground(meadow, sensor=HDL64E)
     above = at[:, 2] - surface_height(meadow, at[:, 0], at[:, 1])
     assert -0.01 < above.min() and above.max() < 0.6
-    wild = np.abs(at[:, 1]) > 8  # no tuft of the road's side reaches there
+    wild = np.abs(at[:, 1]) > 8  # no tufts of the roadside reach there
     near, middle, far = compute_roughness(at[wild], np.array([8.0, 12.0, 18.0, 30.0]))
     assert 0.02 < min(near, middle, far) and max(near, middle, far) < 0.1
     _, _, _, smooth = cast_on_ground(meadow._replace(rough=0.0), sensor=HDL64E)
@@ -102,7 +102,7 @@ def test_grass_is_rough_and_hides_ground_behind():
 
 @njit
 def march_to_tufts(ground, start, way):
-    """Return the first range, in steps of 5 mm, at which a ray is below the tufts."""
+    """March along rays in steps of 5 mm and return the first range below the tufts."""
     t = 0.0
     while t < 30.0 and start[2] + t * way[2] >= tuft_height(ground, start[0] + t * way[0], start[1] + t * way[1], 0.0):
         t += 0.005
@@ -121,13 +121,13 @@ def test_tuft_hits_equal_slow_march():
             for way in ways.tolist()
         ]
     )
-    # Steps are longer than tufts are thick: some are missed, and few met too early.
+    # Steps are longer than tufts are wide, so some tufts are missed and a few are hit too early.
     assert np.quantile(off, 0.5) < 0.1 and np.quantile(off, 0.9) < 0.5
 
 
 @pytest.mark.parametrize("height, least", [(0.3, 0.0), (0.02, -1e-9)])
 def test_low_sensor_has_no_hits_at_its_origin(height, least):
-    """Next to a meadow whose tufts are higher than the sensor, and among bumps of the road."""
+    """The sensor is lower than the tufts of a meadow next to it and than bumps of the road."""
     meadow = Ground(curb_left=1.0, curb_right=-1.0, walk=0.0, rough=0.8)
     low = replace(SENSOR, height=height, lifts=())
     hits = cast_rays(make_crowd(0, 0), meadow, np.array([0.0, 0.0, height]), low)

@@ -49,5 +49,5 @@ def page(first_page):
 
 @pytest.fixture(scope="module")
 def person(drive_bag):
-    """(7,) the box of a labelled person near the sensor in the first frame."""
+    """Box (7,) of a labelled person near the sensor in the first frame."""
     return find_nearest_person(next(iter(open_recording(drive_bag))))

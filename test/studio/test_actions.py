@@ -19,7 +19,7 @@ from lidar_studio.interpolation import Motion
 from lidar_studio.state import KEY, PROPOSED, Box, State, Track, find_next_uncertain, track_from_json, track_to_json
 
 FRAMES = 8
-STAMPS = np.array([0, 100, 200, 350, 400, 500, 650, 700]) * 10**6  # not evenly
+STAMPS = np.array([0, 100, 200, 350, 400, 500, 650, 700]) * 10**6  # uneven intervals
 SIZE = [0.8, 0.6, 1.7]
 
 
@@ -67,7 +67,7 @@ ACTIONS = st.one_of(
 
 
 def done(actions, motion, state=State()):
-    """Return the state after all valid actions, and these actions."""
+    """Return the state after all valid actions, and the list of these actions."""
     lines = []
     for action in actions:
         try:
@@ -112,7 +112,7 @@ def test_undo_and_redo_are_inverses_at_any_depth(actions, motion):
     for expected in reversed(seen[:-1]):
         state, _ = apply(state, {"do": "redo"}, motion)
         assert labels(state) == expected
-    assert state.next_id == end.next_id  # an id is never given twice
+    assert state.next_id == end.next_id  # ids are never reused
 
 
 @given(ACTIONS, st.lists(ACTIONS, max_size=8))
@@ -190,7 +190,7 @@ def test_constant_motion_is_exact_between_key_boxes_in_any_order(start, velocity
         assert close(box.values, true[f].values, 1e-7)
         assert (box.kind == KEY) == (f in keys)
         if f in keys:
-            assert box.values == true[f].values  # to the last bit
+            assert box.values == true[f].values  # exactly
 
 
 @given(

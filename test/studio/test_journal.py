@@ -1,4 +1,4 @@
-"""The journal file: killed processes, full disks, other drives."""
+"""The journal file after kills, on full disks, and of other drives."""
 
 from __future__ import annotations
 

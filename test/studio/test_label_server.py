@@ -336,7 +336,7 @@ def test_exported_labels_are_imported_unchanged(written, tmp_path):
         async with page.http.post(f"{page.base}/api/export", json=export_request) as answer:
             first = await answer.json()
         async with page.http.post(f"{page.base}/api/export", json=export_request) as answer:
-            assert answer.status == 400, await answer.text()  # it exists
+            assert answer.status == 400, await answer.text()  # the path exists but is not allowed
         async with page.http.post(f"{page.base}/api/export", json={**export_request, "force": True}) as answer:
             assert await answer.json() == first
         for bad in ({"format": "x", "out": "y"}, {"format": "openlabel", "out": "../y"}, {}):

@@ -1,4 +1,4 @@
-"""Frames of a running graph, without ROS: storage, late boxes, selection of topics."""
+"""Frames of a running graph, tested without ROS: storage, late boxes, selection of topics."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def list_shown_frames(live):
 
 def test_frame_waits_for_its_boxes_and_late_ones_are_counted(live, monkeypatch):
     live.add_cloud(cloud(10))
-    live.add_boxes(FOUND, boxes(10), None)  # the first: from now on clouds wait for this topic
+    live.add_boxes(FOUND, boxes(10), None)  # the first boxes; from now on clouds wait for this topic
     live.add_cloud(cloud(20))
     assert list_shown_frames(live)[-1] == 0
     live.add_boxes(FOUND, boxes(20), None)
@@ -124,7 +124,7 @@ def test_looping_bag_is_shown_again(live):
     for stamp in (1, 2, 1, 2):
         live.add_cloud(cloud(stamp))
         live.add_boxes(FOUND, boxes(stamp), None)
-    assert list_shown_frames(live) == [0, 0, 1, 2, 3]  # that of the first boxes again
+    assert list_shown_frames(live) == [0, 0, 1, 2, 3]  # the frame of the first boxes again
     assert all(live.layers(i, 0.0)["detections"] for i in range(4))
 
 
@@ -188,7 +188,7 @@ def test_boxes_in_another_frame_are_transformed_once_tf_arrives(live, monkeypatc
     live.add_boxes(TRACKED, boxes(11 * second + second // 2, "odom"), None)
     assert any("the newest transform" in line for line in live.get_status()["lines"])
     live.add_boxes(FOUND, boxes(11 * second + second // 2), None)
-    assert list_shown_frames(live)[-1] == 2  # shown without
+    assert list_shown_frames(live)[-1] == 2  # shown without boxes
 
 
 def test_two_trackers_have_distinct_ids_and_misses_are_counted(live):
@@ -202,7 +202,7 @@ def test_two_trackers_have_distinct_ids_and_misses_are_counted(live):
     assert len({t["id"] for t in live.list_tracks()}) == 2
     match = live.layers(0, 0.0)["matches"]["fused_detector"]
     assert match == {"missed": [0], "false": None, "ignored_labels": [], "ignored": None}
-    live.forget_topic(TRACKED)  # another graph takes its place
+    live.forget_topic(TRACKED)  # replaced by another graph
     live.expect_topic("/c/tracker/output/tracks", TRACKS)
     live.add_boxes("/c/tracker/output/tracks", boxes(1), None)
     assert len({t["id"] for t in live.list_tracks()}) == 2
@@ -266,7 +266,7 @@ def test_boxes_of_another_robot_are_not_selected():
         ("/points", True),
         ("/livox/lidar", True),
     ):
-        alone = {"/b" + FOUND: MARKERS}  # of another robot, or the only one
+        alone = {"/b" + FOUND: MARKERS}  # belongs to another robot, or is the only one
         assert bool(select_box_topics(alone, clouds)) == theirs
         assert not select_box_topics(alone | {"/c" + FOUND: MARKERS}, clouds)
     assert set(select_box_topics(one, "/ouster/points")) == {FOUND, TRACKED, TRUTH}

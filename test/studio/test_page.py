@@ -12,7 +12,7 @@ from labeling_pages import boxes_of, drag, faces, middle, opened, serving
 from lidar_perception.data.open import open_recording
 from lidar_perception.geometry import wrap_angle
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 
 def test_click_on_a_person_makes_a_track_and_a_seed(page, labels, person):
@@ -29,7 +29,7 @@ def test_seed_works_without_a_mouse(page, labels, person):
     before = set(labels.tracks())
     labels.look_at(page, person)
     page.locator("#tracks").focus()
-    for key in ("Escape", "s", "Enter"):  # picks the middle of the view
+    for key in ("Escape", "s", "Enter"):  # picks the centre of the view
         page.keyboard.press(key)
     page.wait_for_function(
         "before => page.store.selected !== null && !before.includes(page.store.selected)", arg=sorted(before)
@@ -113,7 +113,7 @@ def test_body_is_dragged_horizontally_and_turns_about_its_centre(page, labels, p
     assert moved[2:] == pytest.approx(before[2:]) and math.dist(moved[:2], before[:2]) > 0.1
     x, y = middle(page, "[data-view=top] circle.turn")
     centre = middle(page, "[data-view=top]")
-    drag(page, (x, y), (centre[0] - x, centre[1] - 60 - y))  # from the right to above: a quarter
+    drag(page, (x, y), (centre[0] - x, centre[1] - 60 - y))  # from the right to the top: a quarter turn
     labels.wait(page, number, lambda t: boxes_of(t)[0] != moved)
     turned = labels.box(number)
     assert turned[:6] == pytest.approx(moved[:6], abs=1e-6)
@@ -173,7 +173,7 @@ def test_small_drag_moves_no_box_and_space_presses_no_button(page, labels, perso
     number = labels.chosen(page, person)
     lines = len(labels.lines())
     drag(page, middle(page, "[data-view=top] rect.body"), (2, 2))
-    page.click("[data-do=copy]")  # and on to frame 1
+    page.click("[data-do=copy]")  # continues to frame 1
     page.wait_for_function("() => page.store.frame === 1")
     page.keyboard.press("Space")
     page.wait_for_function("() => page.store.playing")
@@ -191,7 +191,7 @@ def test_undo_and_redo_step_through_every_state(page, labels, person):
         page.wait_for_function("n => page.store.seq >= n", arg=labels.state()["seq"])
         labels.wait(page, number, lambda t, last=states[-1]: t != last[number])
         states.append(labels.tracks())
-    page.keyboard.press(",")  # a copy goes on to its frame
+    page.keyboard.press(",")  # copying moves to the next frame
     for key, expected in [*(("Control+z", s) for s in states[-2::-1]), *(("Control+y", s) for s in states[1:])]:
         page.keyboard.press(key)
         labels.wait(page, number, lambda t, e=expected: t == e[number])
@@ -202,7 +202,7 @@ def test_undo_and_redo_step_through_every_state(page, labels, person):
 def test_class_of_a_seed_is_chosen_at_the_click(page, labels, person):
     number = labels.chosen(page, person)
     page.keyboard.press("s")
-    page.keyboard.press("3")  # of new ones, though a track is selected
+    page.keyboard.press("3")  # class of new tracks, although a track is selected
     name = page.evaluate("page.store.drive.classes[2].name")
     page.wait_for_selector(f"#tool-classes [aria-pressed=true]:has-text('{name}')")
     before = set(labels.tracks())
@@ -214,7 +214,7 @@ def test_class_of_a_seed_is_chosen_at_the_click(page, labels, person):
     tracks = labels.tracks()
     assert tracks[page.evaluate("page.store.selected")]["class"] == name
     assert tracks[number]["class"] != name and labels.lines()[-1]["class"] == name
-    page.keyboard.press("4")  # as it was
+    page.keyboard.press("4")  # the previous class
     page.keyboard.press("Escape")
 
 
@@ -250,7 +250,7 @@ def test_pages_see_each_others_edits(page, browser, labels, person):
 def test_unsaved_edit_is_reported_and_reverted(page, labels, person):
     number = labels.chosen(page, person)
     before = labels.tracks()
-    page.keyboard.press("x")  # there is nothing before its only frame, or after it
+    page.keyboard.press("x")  # the only frame cannot be trimmed
     page.wait_for_selector("#errors .toast")
     assert labels.tracks() == before and labels.tracks()[number]
     page.fill("#field-length", "-1")
@@ -292,7 +292,7 @@ def test_help_lists_the_keys_and_works_without_a_mouse(page):
     assert "Accept" in page.inner_text("#keys") and "Undo" in page.inner_text("#keys")
     page.keyboard.press("Escape")
     page.wait_for_selector("#help", state="hidden")
-    for _ in range(40):  # every command can be reached and has a name
+    for _ in range(40):  # every command is reachable and has a name
         page.keyboard.press("Tab")
         name = page.evaluate("""() => { const e = document.activeElement;
             return e === document.body ? "-" : e.ariaLabel || e.title || e.textContent.trim()
@@ -308,7 +308,7 @@ def test_killed_server_loses_nothing(page, browser, labels, person):
     labels.process.kill()
     page.wait_for_selector("#lost", state="visible")
     page.keyboard.press("r")
-    page.wait_for_selector("#errors .toast")  # not saved, and said so
+    page.wait_for_selector("#errors .toast")  # not saved, and reported
     with serving(*labels.arguments) as server:
         labels.process, labels.url = server.process, server.url
         assert labels.tracks() == before and before[number]["state"] != "rejected"
@@ -316,7 +316,7 @@ def test_killed_server_loses_nothing(page, browser, labels, person):
             assert again.evaluate("n => page.store.tracks.has(n)", number)
         page.wait_for_function(
             "() => document.getElementById('lost').textContent.includes('address')"
-        )  # its token is another one now
+        )  # it has a new token now
 
 
 def test_view_shows_labels_and_refuses_actions(browser, drive_bag):
@@ -334,7 +334,7 @@ def test_view_shows_labels_and_refuses_actions(browser, drive_bag):
 
 
 def test_view_selects_labels_and_keys_step_through_missed_ones(browser, drive_bag, tmp_path):
-    results = tmp_path / "nothing"  # was found in any frame
+    results = tmp_path / "nothing"  # no detections in any frame
     results.mkdir()
     with serving("view", drive_bag, "--results", results, "--no-open") as shown, opened(browser, shown.url) as page:
         missed = page.evaluate("page.store.results.matches.nothing.missed")
@@ -350,7 +350,7 @@ def test_view_selects_labels_and_keys_step_through_missed_ones(browser, drive_ba
                 arg=[k, seen[-1] if seen else -1],
             )
             seen.append(page.evaluate("page.store.selectedResult.frame * 1000 + page.store.selectedResult.k"))
-        assert seen[:-1] == missed and seen[-1] >= 1000  # then the next frame
+        assert seen[:-1] == missed and seen[-1] >= 1000  # the last one is in the next frame
         assert page.inner_text("#state") == "missed" and page.is_visible("#facts")
         page.keyboard.press("[")
         page.wait_for_function("k => page.store.frame === 0 && page.store.selectedResult?.k === k", arg=missed[-1])

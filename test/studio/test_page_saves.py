@@ -8,7 +8,7 @@ import math
 import pytest
 from labeling_pages import boxes_of, opened
 
-pytestmark = pytest.mark.no_cover  # others run these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 
 def test_typed_number_changes_one_value_and_escape_cancels(page, labels, person):
@@ -82,7 +82,7 @@ def test_arrow_moves_the_box_after_a_class_was_chosen_by_mouse(page, labels, per
     number = labels.chosen(page, person)
     before = labels.box(number)
     page.click("#class")
-    for key in "ArrowDown", "Enter":  # in the list that has opened
+    for key in "ArrowDown", "Enter":  # in the opened list
         page.keyboard.press(key)
     labels.wait(page, number, lambda t: t["class"] != "Pedestrian")
     chosen = labels.tracks()[number]["class"]
@@ -109,7 +109,7 @@ def test_outdated_server_state_reverts_nothing(browser, page, labels, person):
         page.route("**/api/state*", reply)
 
     with opened(browser, labels.url, held) as other:
-        while len(states) < 2:  # one as the page opens, one as it begins to listen
+        while len(states) < 2:  # one when the page opens, one when it subscribes
             other.wait_for_timeout(10)
         page.keyboard.press("3")
         name = page.evaluate("page.store.drive.classes[2].name")

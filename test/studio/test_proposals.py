@@ -68,7 +68,7 @@ def click(session):
 
 def test_clicked_person_is_tracked_through_the_drive(session):
     session.propose()
-    assert not session.state.tracks  # nothing is like nobody
+    assert not session.state.tracks  # without clicks nothing is similar
     boxes, track = click(session)
     assert len(boxes) >= FRAMES - 1 and boxes.keys() <= track.boxes.keys()
     near = [np.hypot(*(np.array(track.boxes[f].values)[:2] - b[:2])) for f, b in boxes.items()]
@@ -152,7 +152,7 @@ def test_cluster_of_the_seed_size_is_most_similar(length, width, height, share):
 
 
 def run_survey(drive, folder, until=FRAMES):
-    """Survey until a number of frames; return the progress, the messages and the labels."""
+    """Survey a number of frames; return the progress, the messages and the labels."""
     progress, messages = [], []
     with open_session(drive, folder, detector=None) as session:
         session.listeners.append(lambda event: messages.append(event.get("error", "")))
@@ -176,7 +176,7 @@ def read_cache(folder):
 @pytest.mark.parametrize("posed", [True, False])
 def test_cancelled_survey_is_continued(drive, tmp_path, monkeypatch, posed):
     monkeypatch.setattr(survey_cache, "FRAMES_PER_FILE", 2)
-    if not posed:  # then KISS-ICP finds the poses, scan after scan
+    if not posed:  # then KISS-ICP estimates the poses scan by scan
         pytest.importorskip("kiss_icp")
         frames = [replace(frame, pose=lambda: None) for frame in drive.frames]
         drive = Drive("simulated", Recording(Path("simulated"), "simulated", frames))
@@ -197,9 +197,9 @@ def test_survey_of_another_drive_is_replaced_and_reported(drive, tmp_path, monke
         Recording(
             Path("simulated"), "simulated", [replace(frame, load=drive.frames[0].load) for frame in drive.frames]
         ),
-    )  # other clouds only
+    )  # only the clouds differ
     run_survey(drive, tmp_path, until=5)
-    (tmp_path / JOURNAL_NAME).unlink()  # the journal is of the clouds, too
+    (tmp_path / JOURNAL_NAME).unlink()  # the journal is also identified by the clouds
     progress, messages, _ = run_survey(other, tmp_path, until=3)
     assert progress == [1, 2, 3] and "another survey (clouds " in messages
     assert read_cache(tmp_path).keys() == {"000000.npz"}
@@ -226,7 +226,7 @@ def test_seed_corrected_before_tracking_is_tracked(drive, tmp_path, monkeypatch,
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
     with open_session(drive, tmp_path, detector=None) as session:
         session.propose()
-        monkeypatch.setattr(session, "_start", lambda *_: None)  # it had no time
+        monkeypatch.setattr(session, "_start", lambda *_: None)  # as if there was no time
         _, track = click(session)
         moved = [track.boxes[1].values[0] + 0.1, *track.boxes[1].values[1:]]
         session.do({"do": "box", "track": track.id, "frame": 1, "box": moved})
@@ -248,7 +248,7 @@ def test_undoing_a_correction_keeps_the_track(session, monkeypatch):
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
     session.propose()
     begun, start = [], session._start
-    monkeypatch.setattr(session, "_start", lambda *asked: begun.append(asked))  # slowly
+    monkeypatch.setattr(session, "_start", lambda *asked: begun.append(asked))  # as if it were slow
     _, track = click(session)
     session.do(
         {
@@ -275,7 +275,7 @@ def test_click_rejected_while_tracking_is_tracked_once_restored(session, monkeyp
     monkeypatch.setattr("lidar_studio.session.NEARBY_FRAMES", 1)
     session.propose()
     begun, start = [], session._start
-    monkeypatch.setattr(session, "_start", lambda *asked: begun.append(asked))  # slowly
+    monkeypatch.setattr(session, "_start", lambda *asked: begun.append(asked))  # as if it were slow
     _, track = click(session)
     session.do({"do": "reject", "track": track.id})
     ((_, work),) = begun
@@ -383,7 +383,7 @@ def test_cancelled_proposals_write_nothing(session):
 def test_boxes_snap_to_ground_and_cluster(drive):
     frame = drive.frames[0]
     truth, scan = frame.truth(), drive.load_scan(0)
-    near = np.hypot(*truth.boxes[:, :2].T) < 20  # farther away little ground is seen
+    near = np.hypot(*truth.boxes[:, :2].T) < 20  # farther away there are few ground points
     for box in truth.boxes[(truth.class_ids == 3) & near]:
         lifted = box + [0.1, -0.1, 0.3, 0, 0, 0, 0]
         down = snap_to_ground(scan, lifted)

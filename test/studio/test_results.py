@@ -126,7 +126,7 @@ def test_tracks_of_different_trackers_have_distinct_ids(trackers, far):
     ]
     all_ids = [number for each in made for number in each]
     assert len(set(all_ids)) == len(all_ids) == sum(map(len, trackers))
-    assert all(0 <= number < 2**53 for number in all_ids)  # what a page can count
+    assert all(0 <= number < 2**53 for number in all_ids)  # integers that JavaScript represents exactly
     assert set(made[0]) >= {n for n in trackers[0] if n >= 0}
 
 

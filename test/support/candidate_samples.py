@@ -30,7 +30,7 @@ def floor(seed=0):
 
 
 def scene():
-    """Return a floor, three people and two other objects, one of them as high as a person."""
+    """Return a floor, three people and two other objects, one of them as tall as a person."""
     parts = [
         floor(),
         *(person(*at, seed=i) for i, at in enumerate(PEOPLE)),

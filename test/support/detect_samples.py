@@ -1,4 +1,4 @@
-"""A detector that needs no network, and runs of `detect` with it."""
+"""Stand-in detector without a network, and runs of `detect` with it."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from lidar_perception.detectors.contract import DetectionResult
 from lidar_perception.param_fields import Params, param
 from lidar_perception.types import CLASSES, Detections
 
-NAME = "made"  # under which it is opened
+NAME = "made"  # name that opens the detector
 CAR, PEDESTRIAN = CLASSES.index("Car"), CLASSES.index("Pedestrian")
 WEAK, STRONG = 0.15, 0.876543
 
 
 @dataclass(frozen=True)
 class MadeParams(Params):
-    """Its parameters."""
+    """Parameters of MadeDetector."""
 
     least: float = param(0.5, "Least score.", low=0.0, high=1.0)
 
 
 class MadeDetector:
-    """It finds a walker, and a weak car that differs from cloud to cloud. calls: the clouds that
-    any such detector has seen; fails(scan): called before it detects."""
+    """Detector that finds a walker, and a car with a low score that differs between clouds. calls: all clouds
+    that were given to any instance; fails(scan): called before each detection."""
 
     classes = ("Car", "Pedestrian")
     calls: list = []
@@ -61,23 +61,23 @@ class MadeDetector:
 
 
 def opened(path="", device="auto"):
-    """Load it, as a loader of detectors.open.LOAD."""
+    """Load the detector, like the loaders in detectors.open.LOAD."""
     return MadeDetector()
 
 
 def detect(monkeypatch, *arguments):
-    """The exit code of `detect --weights made ARGUMENTS`."""
+    """Return the exit code of `detect --weights made ARGUMENTS`."""
     return exit_of(monkeypatch, "detect", "--weights", NAME, *arguments)
 
 
 def refused(monkeypatch, capsys, *arguments):
-    """The line of the error of a call that is refused."""
+    """Return the error line of an invalid call."""
     assert detect(monkeypatch, *arguments) == 2
     return error_line(capsys)
 
 
 def read_json(out):
-    """detections.json, without the times."""
+    """Return detections.json without the times."""
     content = json.loads((out / "detections.json").read_text())
     for frame in content["frames"]:
         assert frame.pop("ms") >= 0
@@ -85,7 +85,7 @@ def read_json(out):
 
 
 def objects(content):
-    """Frame -> rows of numbers of its objects."""
+    """Return {frame: rows of numbers of its objects}."""
     return {
         frame["name"]: [
             [

@@ -18,13 +18,13 @@ from lidar_perception.detectors.pointpillars.torch_network import TorchNetwork
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import Detections, PointCloud
 
-# A car across and a pedestrian, standing on the ground 1.73 m below [x y z l w h yaw].
+# A car seen from the side and a pedestrian on the ground 1.73 m below [x y z l w h yaw].
 BOXES = torch.tensor([[6.0, 1.5, -0.95, 3.9, 1.7, 1.5, 1.2], [3.0, -2.5, -0.86, 0.8, 0.7, 1.7, -2]])
 LABELS = torch.tensor([0, 1])
 
 
 def tiny(version: str = "v0", **changes) -> NetworkConfig:
-    """Any version on 32 x 32 pillars with a few channels."""
+    """Return the configuration of a version with 32 x 32 pillars and few channels."""
     small = dict(
         low=(0.0, -5.12, -3.0),
         high=(10.24, 5.12, 1.0),
@@ -40,12 +40,12 @@ def tiny(version: str = "v0", **changes) -> NetworkConfig:
 
 
 def anchor_tensors(config: NetworkConfig) -> tuple[torch.Tensor, torch.Tensor]:
-    """The anchors (A, 7) of a network, and the class (A,) of each."""
+    """Return the anchors (A, 7) of a network and their classes (A,)."""
     return torch.from_numpy(make_anchors(config)), torch.from_numpy(anchor_classes(config))
 
 
 def two_objects(seed: int = 0) -> np.ndarray:
-    """(N, 4) float32 [x y z intensity]: flat ground with the surfaces of BOXES on it."""
+    """Return flat ground with the surfaces of BOXES on it, (N, 4) float32 [x y z intensity]."""
     rng = np.random.default_rng(seed)
     parts = [rng.uniform([0, -5, -1.74], [10, 5, -1.72], (3000, 3))]
     for x, y, z, length, width, height, yaw in BOXES.tolist():
@@ -64,7 +64,7 @@ def two_objects(seed: int = 0) -> np.ndarray:
 
 
 def lively(config, seed=0) -> torch.nn.Module:
-    """A network in inference mode whose norms and head are not at their first values."""
+    """Return a network in eval mode whose norms and head differ from their initial values."""
     torch.manual_seed(seed)
     network = make_network(config).eval()
     for module in network.modules():
@@ -80,7 +80,7 @@ def lively(config, seed=0) -> torch.nn.Module:
 
 
 def frame(seed: int = 0) -> PointCloud:
-    """The two objects, and points behind and far away."""
+    """Return a frame with the two objects, and points behind the sensor and far away."""
     points = two_objects(seed)
     points = np.concatenate([points, points[::7] * [-1, 1, 1, 1], points[::9] + [50, 0, 0, 0]])
     points = points.astype(np.float32)
@@ -88,7 +88,7 @@ def frame(seed: int = 0) -> PointCloud:
 
 
 def eager(params: DetectorParams = DetectorParams(), score: float = 0.25, engine: str = "auto") -> DetectorParams:
-    """Parameters with which random weights find something."""
+    """Return parameters with which random weights detect something."""
     names = ("car", "pedestrian", "cyclist", "other")
     return with_values(
         params,
@@ -101,7 +101,7 @@ def eager(params: DetectorParams = DetectorParams(), score: float = 0.25, engine
 
 
 def random_detector(version: str = "v0", params: DetectorParams | None = None, **changes) -> PointPillarsDetector:
-    """With random weights."""
+    """Return a PointPillars detector with random weights."""
     return make_detector(
         TorchNetwork(lively(tiny(version, **changes))), Header(tiny(version, **changes)), params or eager()
     )
@@ -114,7 +114,7 @@ def make_detector(
 
 
 def same(a: Detections | DetectionResult, b: Detections | DetectionResult, atol: float = 0.0) -> bool:
-    """Return True if both are equal, in the same order."""
+    """Return True if the detections are equal and in the same order."""
     a, b = (x.detections if isinstance(x, DetectionResult) else x for x in (a, b))
     return (
         len(a) == len(b)

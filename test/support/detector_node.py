@@ -61,7 +61,7 @@ class DetectorUnderTest:
 
     @property
     def between(self) -> str:
-        """Topic of the clouds that the detector receives."""
+        """Topic from which the detector receives clouds."""
         return self.graph[self.node]["~/input/points"]
 
     @property
@@ -106,7 +106,7 @@ def message(stamp, **columns):
 
 
 def received(messages, stamp):
-    """Return the detections of the cloud with this stamp, or None."""
+    """Return the received detections of the cloud with this stamp, or None."""
     return next((m for m in map(from_marker_array, messages) if m.stamp_ns == stamp), None)
 
 

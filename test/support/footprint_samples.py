@@ -1,4 +1,4 @@
-"""Boxes of simulated footprints, and overlaps between them, by plain geometry."""
+"""Boxes of simulated footprints and overlaps between them, computed by plain geometry."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""A second, plain reading of KITTI's object benchmark, for comparison: label files in, percent out.
-
-Slow loops over lines of text, in the camera's frame (x right, y down, z forward). It shares no code
-with the package. Random frames to try both on are made here, too.
+"""Independent plain implementation of KITTI's object benchmark, for comparison: label files in, percent out. It
+uses slow loops over lines of text in camera coordinates (x right, y down, z forward) and shares no code with the
+package. It also generates random frames for the comparison.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ NAMES = ("kind truncated occluded alpha left top right bottom h w l x y z ry sco
 
 
 def read(text):
-    """One dict a line."""
+    """Return one dict per line."""
     rows = []
     for line in text.splitlines():
         words = line.split()
@@ -28,7 +27,7 @@ def read(text):
 
 
 def footprint(o):
-    """Corners in the x-z plane, around."""
+    """Return the corners in the x-z plane, in order."""
     c, s = math.cos(o["ry"]), math.sin(o["ry"])
     return [
         (o["x"] + c * a + s * b, o["z"] - s * a + c * b)
@@ -58,8 +57,8 @@ def crossing(p, q, r, s):
 
 
 def shared_ground(a, b):
-    """The corners of the shared area are corners of one box inside the other, and crossings of
-    edges; sorted by angle around their middle."""
+    """Return the overlap area. Its corners are corners of one box inside the other and crossings of edges, sorted
+    by angle around their centre."""
     if math.hypot(a["x"] - b["x"], a["z"] - b["z"]) > (a["l"] + a["w"] + b["l"] + b["w"]) / 2:
         return 0.0
     pa, pb = footprint(a), footprint(b)
@@ -98,7 +97,7 @@ def overlap(a, b, metric):
 
 
 def role_of_truth(o, kind, level):
-    """'find', 'may find' or None."""
+    """Return 'find', 'may find' or None."""
     height, occluded, truncated = LIMITS[level]
     if o["kind"] == kind:
         easy_enough = o["bottom"] - o["top"] >= height and o["occluded"] <= occluded and o["truncated"] <= truncated
@@ -120,7 +119,7 @@ def by_falling_score(detections):
 
 
 def prepare(frames, metric):
-    """(truth, found, overlaps {(found, true): value}) of (label text, result text)."""
+    """Convert (label text, result text) to (truth, found, overlaps {(found, true): value})."""
     prepared = []
     for labels, results in frames:
         truth, found = read(labels), by_falling_score(read(results))
@@ -135,7 +134,7 @@ def prepare(frames, metric):
 
 
 def first_pass(prepared, kind, level, least):
-    """Number of objects to find, and the scores with which they are found."""
+    """Return the number of objects to find, and the scores of their detections."""
     objects, scores = 0, []
     for truth, found, table in prepared:
         used = set()
@@ -158,7 +157,7 @@ def first_pass(prepared, kind, level, least):
 
 
 def second_pass(prepared, kind, level, least, metric, threshold):
-    """Precision and orientation similarity among detections of this score and more."""
+    """Return precision and orientation similarity of detections with at least this score."""
     right = wrong = similarity = 0
     for truth, found, table in prepared:
         kept = [j for j, d in enumerate(found) if d["score"] >= threshold]
@@ -195,7 +194,7 @@ def second_pass(prepared, kind, level, least, metric, threshold):
 
 
 def sampled(scores, objects):
-    """The scores nearest to recall 0, 1/40, .. 1."""
+    """Return the scores nearest to recalls 0, 1/40, ..., 1."""
     thresholds, wanted = [], 0.0
     for i, score in enumerate(scores, 1):
         last = i == len(scores)
@@ -212,7 +211,7 @@ def averages(values):
 
 
 def evaluate(prepared, kind, level, least, metric):
-    """objects, r11, r40, aos_r11, aos_r40, official_r11, official_r40; None without objects."""
+    """Return objects, r11, r40, aos_r11, aos_r40, official_r11, official_r40; None without objects."""
     objects, scores = first_pass(prepared, kind, level, least)
     if objects == 0:
         return None
@@ -224,7 +223,7 @@ def evaluate(prepared, kind, level, least, metric):
     official += [(0.0, 0.0)] * (41 - len(official))
     if objects > 40:
         points = official
-    else:  # every recall point k / 40: the best of all scores that reach it
+    else:  # for each recall k / 40, the best of all scores that reach it
         reached = [(n / objects, *at(score)) for n, score in enumerate(scores, 1)]
         points = []
         for k in range(41):
@@ -293,7 +292,7 @@ def line(o, score=None):
 
 
 def random_frame(rng, most=8, noise=0.12):
-    """(label text, result text): misses, duplicates, wrong classes, false boxes, DontCare."""
+    """Return (label text, result text) with misses, duplicates, wrong classes, false boxes and DontCare."""
     truth = [some_object(rng) for _ in range(rng.integers(0, most + 1))]
     found = [moved(o, rng, noise * rng.uniform(0.1, 1.5)) for o in truth for _ in range(rng.choice([0, 1, 1, 1, 2]))]
     found += [some_object(rng) for _ in range(rng.integers(0, 4))]

@@ -103,7 +103,7 @@ class Label:
         page.evaluate("([place, from]) => page.lookAt(place, from)", [[x, y, z], [x - x * away, y - y * away, z + 1.5]])
 
     def seed(self, page, person: np.ndarray) -> int:
-        """Click a person as a seed; return the id of the new track."""
+        """Click a person to place a seed; return the id of the new track."""
         before = set(self.tracks())
         self.look_at(page, person)
         page.keyboard.press("Escape")
@@ -118,7 +118,7 @@ class Label:
         return page.evaluate("page.store.selected")
 
     def chosen(self, page, person: np.ndarray) -> int:
-        """Make and select a new track of a person; decisions do not go to the next track."""
+        """Create and select a new track of a person; decisions do not move on to the next track."""
         number = self.seed(page, person)
         page.uncheck("#advance")
         page.locator("#scene").focus()
@@ -179,7 +179,7 @@ def drawn(page) -> None:
 
 
 def middle(page, selector: str) -> tuple[float, float]:
-    """Return the centre of an element, in pixels of the page."""
+    """Return the centre of an element in page pixels."""
     drawn(page)
     area = page.locator(selector).bounding_box()
     return area["x"] + area["width"] / 2, area["y"] + area["height"] / 2

@@ -1,6 +1,5 @@
-"""Stand-in for the parts of launch and launch_ros (Jazzy) that our launch files use.
-
-install() puts it in the place of launch and launch_ros. Launch executes a launch file as
+"""Stand-in for the parts of launch and launch_ros (Jazzy) that the package's launch files use. install() replaces
+launch and launch_ros by it. Launch executes a launch file as
 `ros2 launch` does, and run() starts its nodes. Respawning and RViz are left out.
 """
 
@@ -134,7 +133,7 @@ class Node(SimpleNamespace):
         context.nodes.append(self)
 
     def list_arguments(self, folder: Path) -> list[str]:
-        """Return the command line, with parameters that are values in a file in `folder`."""
+        """Return the command line; parameter values are written to a file in `folder`."""
         rules = [
             *([("__node", self.name)] if self.name else []),
             *([("__ns", f"/{self.namespace}")] if self.namespace else []),
@@ -178,7 +177,7 @@ def install(monkeypatch) -> None:
         vars(module).update({kind.__name__: kind for kind in classes})
         monkeypatch.setitem(sys.modules, name, module)
     shared = "lidar_perception.nodes.launching"
-    monkeypatch.setitem(sys.modules, shared, None)  # so that the test's version is forgotten
+    monkeypatch.setitem(sys.modules, shared, None)  # discards the version of an earlier test
     del sys.modules[shared]
 
 

@@ -109,7 +109,7 @@ def make_scene(tables, rng, number, name, frames, objects, kinds):
     for k in range(frames):
         sample, time = f"{scene}k{k}", start + k * duration + int(rng.integers(0, 20_000))
         if k == frames - 1:
-            time += 2_000_000  # velocities over this gap are unknown
+            time += 2_000_000  # a gap over which velocities are unknown
         tables["sample"].append(
             {
                 "token": sample,

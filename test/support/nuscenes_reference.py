@@ -1,5 +1,5 @@
-"""A second, plain reading of nuScenes' detection task, for comparison: table rows and result rows
-in, figures out. Slow loops, no code of the package.
+"""Independent plain implementation of nuScenes' detection task, for comparison: table rows and result rows in,
+scores out. Slow loops, no code of the package.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def flat_distance(a, b):
 
 
 def velocity(label, labels, times):
-    """Metres a second, or None."""
+    """Return the velocity in m/s, or None."""
     before, after = labels.get(label["prev"], label), labels.get(label["next"], label)
     seconds = (times[after["sample_token"]] - times[before["sample_token"]]) / 1e6
     allowed = 3.0 if label["prev"] and label["next"] else 1.5
@@ -54,7 +54,7 @@ def in_rack(box, racks):
 
 
 def labels_by_sample(tables, classes):
-    """{sample: (labels that count with their class, velocity and attribute, racks, vehicle)}."""
+    """Return {sample: (scored labels with class, velocity and attribute, racks, vehicle)}."""
     categories = {r["token"]: r["name"] for r in tables["category"]}
     of_instance = {r["token"]: categories[r["category_token"]] for r in tables["instance"]}
     attributes = {r["token"]: r["name"] for r in tables["attribute"]}
@@ -89,7 +89,8 @@ def counts(box, name, racks, vehicle):
 
 
 def read_off(x, xs, ys):
-    """Between the points of a rising curve; of several with one x the last. The ends go on."""
+    """Interpolate a rising curve linearly; of several points with equal x the last counts. Both ends are
+    constant."""
     if x < xs[0]:
         return ys[0]
     i = max(k for k in range(len(xs)) if xs[k] <= x)
@@ -99,7 +100,7 @@ def read_off(x, xs, ys):
 
 
 def error(kind, true, found, name):
-    """A number, or None where it is not known."""
+    """Return the error, or None if it is unknown."""
     if kind == "translation":
         return flat_distance(true["translation"], found["translation"])
     if kind == "scale":
@@ -117,7 +118,7 @@ def error(kind, true, found, name):
 
 
 def of_class(samples, results, name, most):
-    """AP and the five errors at one distance."""
+    """Return AP and the five errors for one distance threshold."""
     left = {
         s: [b for b in true if b["name"] == name and counts(b, name, racks, vehicle)]
         for s, (true, racks, vehicle) in samples.items()
@@ -141,7 +142,7 @@ def of_class(samples, results, name, most):
         scores.append(box["detection_score"])
     if not pairs:
         return objects, 0.0, dict.fromkeys(ERRORS, 1.0)
-    # As nuScenes rounds them: 0.7 is not reached by 21 objects of 30, 0.01 * 70 being above 0.7.
+    # Rounded like nuScenes: 21 of 30 objects do not reach 0.7, because 0.01 * 70 is above 0.7.
     reached = [0.01 * k for k in range(11, 101) if 0.01 * k <= recall[-1]]
     ap = sum(max(0, read_off(r, recall, precision) - 0.1) for r in reached) / 90 / 0.9
     errors = {}
@@ -160,7 +161,7 @@ def of_class(samples, results, name, most):
 
 
 def evaluate(tables, results, classes):
-    """{class: objects, ap by distance, errors}, mAP, mean errors and NDS over the ten classes."""
+    """Return {class: objects, ap by distance, errors}, mAP, mean errors and NDS over the ten classes."""
     samples, by_class = labels_by_sample(tables, classes), {}
     for name in RANGE:
         rows = {d: of_class(samples, results, name, d) for d in (0.5, 1.0, 2.0, 4.0)}

@@ -31,13 +31,13 @@ SMALL = dict(
 
 
 def small(name: str = "improved", **changes) -> PointNetConfig:
-    """Any network with a few channels."""
+    """Return the configuration of a network with few channels."""
     return make_pointnet_config(name, **{**SMALL, **changes})
 
 
 def lively(config: PointNetConfig, seed: int = 0) -> PointNet:
-    """A network in inference mode whose norms have seen random clusters, so that its outputs differ
-    from cluster to cluster."""
+    """Return a network in eval mode whose norms were updated with random clusters, so that outputs differ between
+    clusters."""
     torch.manual_seed(seed)
     network = make_pointnet(config)
     for module in network.modules():
@@ -52,14 +52,14 @@ def lively(config: PointNetConfig, seed: int = 0) -> PointNet:
         torch.rand(64, CONTEXT) * 2,
     )
     with torch.no_grad():
-        network(*clusters)  # which the norms remember
+        network(*clusters)  # updates the norms
         logits = network.eval()(*clusters).logits
-        network.classes.bias -= logits.mean(dim=0)  # no class is likelier than the others
+        network.classes.bias -= logits.mean(dim=0)  # makes all classes equally likely
     return network.requires_grad_(False)
 
 
 def eager(params: PointNetDetectorParams = PointNetDetectorParams(), score: float = 0.0) -> PointNetDetectorParams:
-    """Parameters with which random weights find something; with a score of 0 every cluster."""
+    """Return parameters with which random weights detect something; a score of 0 accepts every cluster."""
     return with_values(
         params,
         {f"pointnet.scores.{name}": score for name in ("car", "pedestrian", "cyclist", "other")}
@@ -68,18 +68,18 @@ def eager(params: PointNetDetectorParams = PointNetDetectorParams(), score: floa
 
 
 def make_classifier(network: PointNet, header: Header, engine: str = "auto") -> PointNetClassifier:
-    """For inference."""
+    """Return a network in eval mode as a classifier."""
     return PointNetClassifier(TorchPointNet(fuse_norms(network), engine), header)
 
 
 def random_detector(params: PointNetDetectorParams | None = None, **changes) -> PointNetDetector:
-    """With random weights."""
+    """Return a PointNet detector with random weights."""
     config = small(**changes)
     return PointNetDetector(make_classifier(lively(config), Header(config)), params or eager())
 
 
 def blobs(rng, sizes, spread=0.4):
-    """Make clusters of the given numbers of points, each around its own centre."""
+    """Return clusters with the given numbers of points, each around its own centre."""
     middles = rng.uniform(-30, 30, (len(sizes), 3)) * [1, 1, 0.03]
     number = np.repeat(np.arange(len(sizes)), sizes)
     xyz = middles[number] + rng.normal(0, spread, (len(number), 3))

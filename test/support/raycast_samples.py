@@ -16,7 +16,7 @@ FULL = Ground(0.01, -0.02, 0.05, 20.0, 0.02, 6.0, -4.0, 0.13, 2.0, ((8.0, 15.0),
 
 
 def make_solids(kind, centre, half, owner=1, axes=None, density=np.inf, transmission=0.0, velocity=(0.0, 0.0, 0.0)):
-    """Return solids of P kinds, centres and half sizes; other values for each or for all."""
+    """Return solids of P kinds, centres and half sizes; other attributes are given per solid or for all."""
     kind, centre = np.atleast_1d(np.array(kind, np.int8)), np.atleast_2d(np.array(centre, float))
     n = len(kind)
     axes = np.eye(3) if axes is None else axes

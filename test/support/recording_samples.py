@@ -23,7 +23,7 @@ def drive(i):
 
 
 def semantic_folder(root):
-    """Write two sequences; each point has other labels."""
+    """Write two sequences in which every point has a different label."""
     for sequence, count in (("00", 2), ("08", 1)):
         folder = root / "sequences" / sequence
         for i in range(count):

@@ -1,4 +1,4 @@
-"""Messages of a robot with tilted sensors, frames and odometry, for nodes in the test's process."""
+"""Messages of a robot with tilted sensors, frames and odometry, for nodes in the test process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WALKING = {"seed.source": "click", "clustering.dbscan.eps": (0.5, 0.5, 0.5)}
 
 
 def give(node, msg):
-    """The cloud as it comes from the middleware."""
+    """Deliver a cloud as the middleware does."""
     node.inputs.receptions[0].deliver(encode(msg), False)
 
 
@@ -34,7 +34,7 @@ def message(xyz, stamp=START, intensity=None, frame_id="lidar", **columns):
 
 
 def transforms(*rows):
-    """tf2_msgs/TFMessage of rows of parent, child, pose (4, 4), stamp."""
+    """Return a tf2_msgs/TFMessage of rows (parent, child, pose (4, 4), stamp)."""
     return tf(*(transform(parent, child, stamp, pose) for parent, child, pose, stamp in rows))
 
 

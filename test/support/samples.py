@@ -23,8 +23,8 @@ from msg_utils.stamps import make_header
 
 
 def for_all(cases):
-    """One test that goes through all cases: thousands of a microsecond each would take longer to
-    list than to run. The case that fails is named. A case is an argument, a tuple of them, or a
+    """Run a test for all cases in one pytest item, because collecting thousands of items takes longer than
+    running them. The error names the failing case. A case is an argument, a tuple of arguments, or a
     pytest.param."""
 
     def of(test):
@@ -64,7 +64,7 @@ needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="no real data next to 
 
 STAMP = 1_700_000_000_123_456_789
 
-# A forward-looking camera, almost level, a little before the LiDAR.
+# A forward-looking camera, almost level, slightly ahead of the LiDAR.
 AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # x forward, z up -> x right, y down
 RECTIFY = Rotation.from_euler("xyz", [0.004, -0.007, 0.003]).as_matrix()
 VELODYNE = np.column_stack(
@@ -88,7 +88,7 @@ def header(make, ns: int = STAMP, frame_id: str = "velodyne"):
 
 
 def scene(seed: int = 0) -> np.ndarray:
-    """(N, 4) float32: flat ground 1.7 m below, and a person inside the box WALKER."""
+    """Return flat ground 1.7 m below and a person inside the box WALKER, (N, 4) float32."""
     rng = np.random.default_rng(seed)
     flat = rng.uniform(-20, 20, (3000, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
     person = rng.uniform(-0.15, 0.15, (400, 3)) * [1, 1, 5.5] + WALKER[:3]
@@ -123,7 +123,7 @@ def png_header(width: int, height: int) -> bytes:
 
 
 def object_folder(root: Path, labels: str = LABELS, count: int = 2) -> Path:
-    """KITTI 3D object: training/{velodyne,calib,label_2}, frames 000000..."""
+    """Write a KITTI object folder training/{velodyne,calib,label_2} with frames 000000..."""
     for i in range(count):
         write(root / f"training/velodyne/{i:06}.bin", scene(i).tobytes())
         write(root / f"training/calib/{i:06}.txt", calibration_text())
@@ -132,8 +132,8 @@ def object_folder(root: Path, labels: str = LABELS, count: int = 2) -> Path:
 
 
 def upright(rng, x: float, y: float, height: float, width: float) -> np.ndarray:
-    """(N, 3) the side of a thing that a sensor sees, with fewer points the farther it stands: a
-    person if width is negative, narrow at the head and at the feet."""
+    """Return the visible side of an object (N, 3), with fewer points at larger distances. With negative width it
+    is a person, narrow at the head and the feet."""
     away = np.hypot(x, y)
     z, across = (
         m.ravel() for m in np.meshgrid(np.arange(0.02, height, 0.0073 * away), np.arange(-0.5, 0.5, 0.003 * away))
@@ -146,8 +146,8 @@ def upright(rng, x: float, y: float, height: float, width: float) -> np.ndarray:
 
 
 def crowd(seed: int, people: int = 4) -> tuple[np.ndarray, GroundTruth]:
-    """(N, 4) float32 cloud and labels: people, posts, boxes and a labelled car without points on
-    flat ground 1.7 m below, 6 to 40 m away, none of them across 15 or 30 m."""
+    """Return a cloud (N, 4) float32 and labels: people, posts, boxes and a labelled car without points on flat
+    ground 1.7 m below, 6 to 40 m away, none of them across 15 or 30 m."""
     rng = np.random.default_rng(seed)
     parts = [rng.uniform([2, -20, -1.7], [50, 20, -1.69], (4000, 3))]
     boxes, ids = [], []
@@ -172,7 +172,7 @@ def crowd(seed: int, people: int = 4) -> tuple[np.ndarray, GroundTruth]:
 
 
 def lowered_crowd(seed: int, by: float) -> Frame:
-    """Return the frame of a crowd, seen by a sensor `by` metres lower, at 0.1 s times the seed."""
+    """Return the frame of a crowd seen by a sensor that is `by` metres lower, at 0.1 s times the seed."""
     cloud, truth = crowd(seed)
     up = np.array([0, 0, by], np.float32)
     scan = PointCloud.of(cloud[:, :3] + up, cloud[:, 3].copy(), 10**9 + seed * 10**8, "velodyne")
@@ -180,7 +180,7 @@ def lowered_crowd(seed: int, by: float) -> Frame:
 
 
 def crowd_folder(root: Path, count: int = 6) -> Path:
-    """KITTI 3D object: frames 000000... of people, of which the last has none."""
+    """Write a KITTI object folder with crowds of people; the last frame has none."""
     for i in range(count):
         cloud, truth = crowd(i, people=4 if i < count - 1 else 0)
         write_object(root, i, cloud, truth, CALIBRATION)

@@ -37,7 +37,7 @@ MOUNTS = {  # sensor: driver, roll and pitch in degrees, height in metres
 
 
 def tilt_matrix(roll: float, pitch: float) -> np.ndarray:
-    """Return (3, 3) from the axes of a sensor with this roll and pitch in degrees to level ones."""
+    """Return the rotation (3, 3) from a sensor with this roll and pitch (degrees) to the level frame."""
     r, p = np.radians([roll, pitch])
     return np.array([[np.cos(p), 0, np.sin(p)], [0, 1, 0], [-np.sin(p), 0, np.cos(p)]]) @ np.array(
         [[1, 0, 0], [0, np.cos(r), -np.sin(r)], [0, np.sin(r), np.cos(r)]]
@@ -45,7 +45,7 @@ def tilt_matrix(roll: float, pitch: float) -> np.ndarray:
 
 
 def find_road_pose(ground: Ground, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return axes (3, 3) with z along the normal of the road around (x, y), and its point there."""
+    """Return axes (3, 3) with z along the road's normal at (x, y), and the point on the road."""
     x, y = np.meshgrid(np.linspace(-6, 6, 25), np.linspace(-3, 3, 13))
     z = surface_height(ground._replace(curb_height=0.0), at[0] + x, at[1] + y)
     a, b, c = np.linalg.lstsq(np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]), z.ravel(), rcond=None)[0]
@@ -70,9 +70,8 @@ def _cast_ground(ground, start, direction, since, velocity, lift, max_range):
 
 
 def simulate_tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int, even: bool = True):
-    """Return the returns of one turn of a sensor with roll and pitch in degrees against the road.
-
-    even: the street has slopes and curbs, but is smooth otherwise.
+    """Simulate one sweep of a sensor with roll and pitch in degrees relative to the road. even: the street has
+    slopes and curbs but is otherwise smooth.
     """
     scene = drive._make_cached_scene(street, ALL_STREETS)
     ground = scene.ground._replace(**EVEN) if even else scene.ground
@@ -117,7 +116,7 @@ def simulate_tilted(sensor: Sensor, roll: float, pitch: float, street: int, numb
 
 
 def make_cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str = "lidar"):
-    """Return a PointCloud2 with a driver's columns: beam by beam for KITTI, else by firings."""
+    """Return a PointCloud2 with a driver's columns, ordered by beam for KITTI and by firing otherwise."""
     order = np.arange(len(returns.xyz)) if driver is KITTI else np.argsort(returns.time, kind="stable")
     columns = {axis: returns.xyz[order, i] for i, axis in enumerate("xyz")}
     kinds = [(axis, "<f4") for axis in "xyz"]
@@ -141,7 +140,7 @@ def make_cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str =
 
 
 def simulate_clouds(name: str, count: int = 4, even: bool = True, street: int = 40):
-    """Yield clouds of a sensor on its mount of MOUNTS, each pair on another street."""
+    """Yield clouds of a sensor mounted as in MOUNTS; every two clouds are from a new street."""
     driver, roll, pitch, height = MOUNTS[name]
     sensor = replace(find_sensor(name), height=height)
     for i in range(count):

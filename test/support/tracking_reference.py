@@ -1,7 +1,6 @@
-"""Tracking scores by their definitions, one box at a time: slow, and sharing nothing with ours.
-
-A frame is (labels, tracks, alike, overlap): labels [(id, ignored)], tracks [(id, score, excused)],
-and two functions of their indices. Assignments are found by trying all of them.
+"""Tracking scores from their definitions, one box at a time. The code is slow and independent of the package. A
+frame is (labels, tracks, alike, overlap): labels [(id, ignored)], tracks [(id, score, excused)], and two
+functions of their indices. Assignments are found by brute force.
 """
 
 from itertools import permutations
@@ -10,7 +9,7 @@ import numpy as np
 
 
 def best_assignment(rows, columns, gain):
-    """Pairs (row, column) of the greatest sum of gain, only those with a gain above 0."""
+    """Return the pairs (row, column) with the largest sum of gains; all gains are above 0."""
     few, many, flipped = (rows, columns, False) if rows <= columns else (columns, rows, True)
     best, pairs = -1.0, []
     for chosen in permutations(range(many), few):
@@ -22,7 +21,7 @@ def best_assignment(rows, columns, gain):
 
 
 def counted(frames):
-    """Without what nobody needs to find: frames of labels [id], tracks [id], alike {(i, j): s}."""
+    """Remove ignored labels: return frames of labels [id], tracks [id], alike {(i, j): s}."""
     result = []
     for labels, tracks, alike, _ in frames:
         pairs = best_assignment(
@@ -44,7 +43,7 @@ def counted(frames):
 
 
 def hota(sequences):
-    """HOTA, DetA, AssA."""
+    """Return HOTA, DetA and AssA."""
     alphas = [0.05 * k for k in range(1, 20)]
     tp, labels, boxes, associated = ([0.0] * len(alphas) for _ in range(4))
     for frames in map(counted, sequences):
@@ -82,7 +81,7 @@ def hota(sequences):
 
 
 def clear(sequences):
-    """tp, fn, fp, switches, fragments."""
+    """Return tp, fn, fp, switches and fragments."""
     tp = fn = fp = switches = fragments = 0
     for frames in map(counted, sequences):
         last, before, ever = {}, {}, set()
@@ -108,7 +107,7 @@ def clear(sequences):
 
 
 def over_recall(sequences):
-    """sAMOTA, AMOTA, AMOTP."""
+    """Return sAMOTA, AMOTA and AMOTP."""
     mean = []
     for frames in sequences:
         scores = {}

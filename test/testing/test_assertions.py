@@ -1,4 +1,4 @@
-"""What is paired, what is said of the rest, and bags in the bytes of another program."""
+"""Assertions on detections: matching, messages, and bags of other programs."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_order_does_not_matter_and_removed_detection_is_missing(limit):
 
 
 def test_matching_maximizes_pairs_of_equal_class():
-    """The nearest of the first would leave the second without any."""
+    """Matching the first with its nearest would leave the second without a match."""
     found = [("Car", [0, 0, 0]), ("Car", [0.9, 0, 0])]
     assert assert_detections(found, [("Car", [0.8, 0, 0]), ("Car", [1.7, 0, 0])]) == [(0, 0), (1, 1)]
     cyclist = [("Cyclist", [0, 0, 0]), ("Car", [0.9, 0, 0])]

@@ -1,4 +1,4 @@
-"""docs/how-to/test-your-stack.md: its files are written to a folder, and its commands run there."""
+"""The files of docs/how-to/test-your-stack.md are written to a folder and its commands run there."""
 
 from __future__ import annotations
 

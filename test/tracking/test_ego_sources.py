@@ -103,7 +103,7 @@ def test_odometry_of_simulated_drive_is_repeatable(drive):
 
 
 def test_odometry_registers_small_scans(drive):
-    """In a small room a coarse grid leaves too few points."""
+    """A coarse grid leaves too few points in a small room."""
     xyz = drive[0][0]
     near = xyz[np.linalg.norm(xyz[:, :2], axis=1) < 12]
     odometry = Odometry()

@@ -50,7 +50,7 @@ def test_covariance_prediction_matches_numeric_jacobian(state, seconds):
 
 def test_constant_turn_rate_gives_a_circle():
     circle = np.array([[0.0, 0.0, 2.0, 0.0, 0.0, np.pi / 2]])
-    means, _ = predict(circle, spread(), 4.0, NONE, NONE, NONE)  # once around
+    means, _ = predict(circle, spread(), 4.0, NONE, NONE, NONE)  # a full circle
     np.testing.assert_allclose(means, circle, atol=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""The peer of the tracking benchmark: births and deaths as in AB3DMOT, and the comparison."""
+"""AB3DMOT as peer of the tracking benchmark: births and deaths, and the comparison."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 
-pytestmark = pytest.mark.no_cover  # other tests cover these lines
+pytestmark = pytest.mark.no_cover  # covered by other tests
 
 FRAMES = 20
 

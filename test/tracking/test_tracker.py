@@ -151,7 +151,7 @@ def test_correlated_observations_are_discounted():
 
 
 def test_constantly_low_scores_keep_a_track_at_low_score():
-    """A neutral score adds no evidence, however often it is seen."""
+    """A neutral score adds no evidence, however often it occurs."""
     neutral = TrackingParams().existence.neutral
     tracker = Tracker(with_values(TrackingParams(), {"report": 0.0}))
     tracks = track([cars(person(15), scores=neutral, kind=PEDESTRIAN)] * 100, tracker=tracker)
@@ -224,7 +224,7 @@ def test_short_loop_is_a_jump_not_late_frames():
     tracks = track([cars(car(10))] * 18, tracker=tracker, stamps=short * 3)
     assert tracker.ended == 2
     assert [t.ids.tolist()[-1] for t in tracks] == [1] * 7 + [2] * 6 + [3] * 5
-    # frames that are late one after the other change nothing
+    # several late frames in a row change nothing
     tracker = Tracker()
     stamps = [START + i * TENTH for i in (0, 1, 4, 3, 2, 5)]
     tracks = track([cars(car(10))] * 6, tracker=tracker, stamps=stamps)
@@ -289,7 +289,7 @@ def test_assignment_maximizes_pairs_within_gates():
 
 @pytest.mark.parametrize(("count", "overlap"), [(1, 0.5), (40, 0.5), (40, 0.0), (150, 1.0)])
 def test_sparse_assignment_equals_dense_one(count, overlap):
-    """Reference: costs of all tracks with all detections, and one assignment of all."""
+    """The reference assigns with costs of all pairs of tracks and detections."""
     rng, params = np.random.default_rng(count), AssociationParams(overlap=overlap)
     extent = 2.5 * np.sqrt(count)
     tracks = np.column_stack(
@@ -332,7 +332,7 @@ def test_parked_cars_keep_ids_from_turning_car_without_poses():
 
 
 def test_fast_object_is_probably_not_a_pedestrian():
-    """Only with poses: relative to a moving sensor everything is fast."""
+    """This needs poses: relative to a moving sensor everything is fast."""
 
     def score(speed, at):
         frames = [cars(person(20 + 0.1 * speed * i), kind=PEDESTRIAN, scores=0.7) for i in range(20)]

@@ -1,4 +1,4 @@
-"""Past positions of tracks, and the messages made of tracks."""
+"""Past positions of tracks, and messages of tracks."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_trails_are_the_past_positions_of_tracks(seconds):
 def test_trails_last_equally_long_at_any_rate(rate, seconds):
     tracker, trails = Tracker(), Trails()
     for i in range(round(1.5 * seconds * rate)):
-        stamp = START + i * 10**9 // rate + 1000 * (i % 3)  # 1 or 2 us late
+        stamp = START + i * 10**9 // rate + 1000 * (i % 3)  # up to 2 us late
         tracks = tracker(cars(car(2 * i / rate)), stamp, pose(0))
         (line,) = trails(tracks, tracker.pose, stamp, seconds)
         assert len(line) <= TRAIL_POINTS and line[-1, 0] == tracks.detections.boxes[0, 0]

@@ -1,4 +1,4 @@
-"""Clusters that are cut from labelled scenes, augmented, learned and scored."""
+"""Clusters of labelled scenes: cutting, augmentation, learning and scoring."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_cluster_gets_label_of_most_of_its_points(rng):
     clusters = fill_boxes(rng, np.concatenate([BOXES, BOXES[:1] + [40, 0, 0, 0, 0, 0, 0]]))
     labels, owners = label_clusters(clusters, BOXES, names, CONFIG.classes)
     assert labels.tolist() == [0, 1, 2, UNKNOWN, 3] and owners.tolist() == [0, 1, 2, -1, -1]
-    # a third in the box is neither object nor background, a tenth is background
+    # with a third of its points in the box a cluster is unknown, with a tenth it is background
     for share, expected in ((0.9, 0), (0.3, UNKNOWN), (0.1, 3)):
         points = clusters.points[:60].copy()
         points[int(60 * share) :, 2] += 5
@@ -129,7 +129,7 @@ def test_background_in_unlabelled_regions_is_unknown(rng):
     truth = GroundTruth.of(np.zeros((0, 7)), [], notes=(("DontCare", {"bbox": whole}),))
     blind = find_unlabelled(truth, camera, clusters.points[:, :3])
     assert blind.all() and not find_unlabelled(replace(truth, notes=()), camera, clusters.points[:, :3]).any()
-    blind[:14] = False  # the first cluster, and four tenths of the second
+    blind[:14] = False  # the first cluster, and 40 % of the second
     assert mask_unlabelled(np.array([3, 3, 3]), clusters, blind, 3).tolist() == [3, UNKNOWN, UNKNOWN]
     assert mask_unlabelled(np.array([0, 1, 2]), clusters, blind, 3).tolist() == [0, 1, 2]
 
@@ -138,7 +138,7 @@ def test_cluster_and_point_scores_agree_with_hand_count(rng):
     scores = ClusterScores(CONFIG.classes)
     clusters = blobs(rng, [20, 20, 12, 12, 9])
     found = np.eye(4, dtype=np.float32)[[0, 3, 1, 2, 0]]
-    labels = np.array([0, 0, 1, 3, 0])  # right, missed, right, wrong; too small to count
+    labels = np.array([0, 0, 1, 3, 0])  # correct, missed, correct, wrong; too small to count
     numbers = np.array([1, 1, 2, 3, 0, 0])
     truth = np.array([0, 3, 0, 1, 1, UNKNOWN])
     scores.update(
@@ -152,7 +152,7 @@ def test_cluster_and_point_scores_agree_with_hand_count(rng):
     car = content["clusters"]["by_class"]["Car"]
     assert (car["objects"], car["precision"], car["recall"]) == (2, 100.0, 50.0)
     assert content["clusters"]["by_class"]["Cyclist"]["recall"] is None
-    car = content["points"]["by_class"]["Car"]  # of two one is found, and one is wrong
+    car = content["points"]["by_class"]["Car"]  # one of two is detected, and one detection is wrong
     assert (car["precision"], car["recall"], car["f1"], car["iou"]) == (50.0, 50.0, 50.0, pytest.approx(100 / 3))
     assert content["points"]["mean"]["recall"] == 50.0
     empty = ClusterScores(CONFIG.classes).compute()
@@ -170,7 +170,7 @@ def test_augmented_clusters_stay_in_boxes_and_thin_with_range(rng):
         for k in range(4):
             own = augmented.points[augmented.first[k] : augmented.first[k + 1], :3]
             assert len(own) >= MIN_POINTS_LEFT and points_in_box(own, boxes[k], 1e-3).all()
-        # objects that are moved away stay in their direction and have fewer points
+        # objects that are moved away keep their direction and have fewer points
         ratio = np.hypot(*boxes[:, :2].T) / np.hypot(*BOXES[:, :2].T)
         assert np.allclose(
             np.abs(np.arctan2(boxes[:, 1], boxes[:, 0])), np.abs(np.arctan2(BOXES[:, 1], BOXES[:, 0])), atol=0.03
@@ -201,7 +201,7 @@ def make_scene(rng):
 
 @dataclass(frozen=True)
 class RepeatedScene:
-    """Source that repeats one scene."""
+    """Scene source that repeats one scene."""
 
     one: TrainingScene
     count: int = 1
@@ -224,7 +224,7 @@ def test_scene_is_cut_by_clustering_and_around_objects(rng, tmp_path):
     assert np.array_equal(cut.boxes[cut.is_box_crop], BOXES[:2])
     assert not cut.boxes[cut.labels == UNKNOWN].any() and cut.boxes[cut.labels == 1].any()
     source = CutScenes(RepeatedScene(scene), CONFIG, 5, tmp_path)
-    first, again = source.scene(0), source.scene(0)  # the second from the cache
+    first, again = source.scene(0), source.scene(0)  # the second one is read from the cache
     assert len(list(tmp_path.iterdir())) == 1
     for name in ("labels", "boxes", "is_box_crop"):
         assert np.array_equal(getattr(first, name), getattr(again, name))
@@ -233,12 +233,12 @@ def test_scene_is_cut_by_clustering_and_around_objects(rng, tmp_path):
     assert np.array_equal(source.scene(0).labels, first.labels)
     other = CutScenes(RepeatedScene(scene), make_pointnet_config("base"), 5, tmp_path)
     other.scene(0)
-    assert len(list(tmp_path.iterdir())) == 2  # another configuration
+    assert len(list(tmp_path.iterdir())) == 2  # another configuration has its own cache file
 
 
 def test_clusters_equal_those_of_detector_at_scene_height(rng):
     seen = make_scene(rng)
-    small_boxes = BOXES[:3] * [1, -1, 1, 0.1, 0.3, 0.3, 0]  # some of them too small
+    small_boxes = BOXES[:3] * [1, -1, 1, 0.1, 0.3, 0.3, 0]  # some are too small
     things = fill_boxes(rng, small_boxes, 6).points
     points = np.concatenate([seen.points, things])
     scene = raise_scene(replace(seen, points=points, height=3.5), SENSOR_HEIGHT - 3.5)
@@ -270,7 +270,7 @@ def test_fraction_of_sparse_scenes_is_reproducible(rng, tmp_path):
     whole, known = none.scene(0), set(map(bytes, scene.points[:, :3]))
     sizes = []
     for i in range(count):
-        thinned, again = all_.scene(i), all_.scene(i)  # the second from the cache
+        thinned, again = all_.scene(i), all_.scene(i)  # the second one is read from the cache
         assert np.array_equal(thinned.clusters.points, again.clusters.points)
         assert known >= set(map(bytes, thinned.clusters.points[:, :3]))
         sizes.append(thinned.clusters.sizes[(thinned.labels == 0) & thinned.is_box_crop][0])

@@ -1,4 +1,4 @@
-"""Fused detectors of other weights: curves are probabilities, and damaged files are refused."""
+"""Fusion of other weights: curves are probabilities, and damaged files are rejected."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def draw_samples(rng, count: int, class_id: int, odds: float = -1.5) -> Samples:
-    """Draw proposals whose log-odds have mean `odds`, and sources that know them with an error."""
+    """Draw proposals whose log-odds have mean `odds`, and noisy sources of these log-odds."""
     true = rng.normal(odds, 2.0, count)
     evidence = {name: np.clip(true + rng.normal(0, 0.5, count), -6.5, 6.5) for name in KNOTS}
     evidence["silhouette"][rng.random(count) < 0.2] = np.nan
@@ -115,7 +115,7 @@ def test_objects_count_once_and_vans_do_not_count(camera: Camera | None):
 
 @pytest.fixture
 def others(tmp_path):
-    """Write a fusion file with other curves than the package, for a copy of the PointNet."""
+    """Write a fusion file for a copy of the PointNet with curves that differ from the package's."""
     classifier = tmp_path / "own/pointnet.safetensors"
     classifier.parent.mkdir()
     classifier.write_bytes(find_pointnet_weights(PointNetParams()).read_bytes())
@@ -141,7 +141,7 @@ def test_fusion_file_round_trip_in_moved_folder(others, tmp_path, monkeypatch):
     monkeypatch.chdir(moved)
     assert open_detector("fused.json", "cpu").models == models
     assert find_fused_weights(FusedParams(weights="fused.json")).name == "fused.json"
-    # Weights that changed or are lost.
+    # Changed or missing weights.
     again.classifier.write_bytes(again.classifier.read_bytes() + b"\0")
     assert "pointnet.safetensors, so its scores" in read_fusion(moved / "fused.json").curve_warning
     again.classifier.unlink()

@@ -1,4 +1,4 @@
-"""Training plans: they fit into the budget, and given numbers stay."""
+"""Training plans fit into the budget and keep given numbers."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_plan_for_two_cores_and_two_hours():
     plan = fit_plan(2.0, 2, SPEED, SIM)
     assert 1000 < plan.scans <= 3000 and plan.part
     assert 3 * plan.scans <= 4 * plan.steps <= 10 * plan.scans  # each scene is seen several times
-    assert fit_plan(50.0, 2, SPEED, SIM).part is False  # with much time, the whole range
+    assert fit_plan(50.0, 2, SPEED, SIM).part is False  # with enough time, the full range
 
 
 def test_more_time_or_cores_give_larger_plan():
@@ -82,9 +82,9 @@ def test_more_time_or_cores_give_larger_plan():
 
 def test_plan_keeps_numbers_given_by_the_user():
     plan = fit_plan(1.0, 2, SPEED, SIM, Plan(scans=30, val_scans=7, steps=5000, validate_steps=11, part=False))
-    assert plan == Plan(30, 7, 30, 5000, 11, False)  # it takes longer than the budget
+    assert plan == Plan(30, 7, 30, 5000, 11, False)  # although it takes longer than the budget
     assert fit_plan(1.0, 2, SPEED, SIM, Plan(scans=100), epochs=3).steps == 75
-    assert fit_plan(1.0, 2, SPEED, SIM, Plan(steps=10)).scans <= 40  # not more than the steps use
+    assert fit_plan(1.0, 2, SPEED, SIM, Plan(steps=10)).scans <= 40  # not more scans than the steps use
 
 
 def test_pace_counts_steps_that_fit_between_validations(monkeypatch):
@@ -104,7 +104,7 @@ def test_pace_counts_steps_that_fit_between_validations(monkeypatch):
     for _ in range(400):
         now[0] += 4.0
         pace.count_step()
-    assert pace.step_duration == pytest.approx(4.0, abs=0.2)  # old steps hardly count
+    assert pace.step_duration == pytest.approx(4.0, abs=0.2)  # old steps have little weight
     assert pace.is_over() and pace.steps_left(3) < 1
     endless = Pace(math.inf, 1)
     now[0] += 1e6

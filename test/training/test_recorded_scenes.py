@@ -38,7 +38,7 @@ def test_broken_scenes_are_skipped_reported_and_counted(tmp_path, capsys):
     assert len(batches.skipped) == 2
     reasons = sorted(batches.skipped)
     assert "000001.txt:1" in reasons[0] and "000003.bin" in reasons[1]
-    assert capsys.readouterr().err.replace("\n", "").count("skipped:") == 2  # each is printed once
+    assert capsys.readouterr().err.replace("\n", "").count("skipped:") == 2  # each one is printed once
     broken = Stream((RecordedScenes(root, ("000001", "000003")),), prepare_all)
     with pytest.raises(InputError, match="none of the 2 scenes"):
         broken[0]
@@ -64,7 +64,7 @@ def test_bag_of_folder_has_same_scenes(tmp_path):
     folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
     write_bag(tmp_path / "bag", open_recording(folder))
     from_bag = open_labelled_frames(tmp_path / "bag").to_scenes()
-    from_bag.scene(0)  # opens files, which are not pickled
+    from_bag.scene(0)  # opens files, which cannot be pickled
     for source in (from_bag, pickle.loads(pickle.dumps(from_bag))):
         for i in range(2):
             scene, expected = source.scene(i), open_labelled_frames(folder).to_scenes().scene(i)
@@ -104,7 +104,7 @@ def test_held_out_frames_are_complete_drives_and_one_end(lengths, share, seed):
         held_out = draw(items, share, seed)
         assert held_out == draw(items, share, seed) and len(set(held_out)) == len(held_out)
         assert 0 < len(held_out) < ends[-1] and abs(len(held_out) - share * ends[-1]) <= 1
-    pieces = [sorted(set(held_out) & set(drive)) for drive in drives]  # of draw_drives
+    pieces = [sorted(set(held_out) & set(drive)) for drive in drives]  # see draw_drives
     cut = [(piece, drive) for piece, drive in zip(pieces, drives) if 0 < len(piece) < len(drive)]
     assert len(cut) <= 1 and all(piece == [*drive[-len(piece) :]] for piece, drive in cut)
 

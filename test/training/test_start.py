@@ -1,4 +1,4 @@
-"""Start of a training: refused input, the plan, preparation, and resuming after a kill."""
+"""Start of a training: invalid input, the plan, preparation, and resuming after a kill."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SENSOR = "generic:16,-20,5,2,10"
 
 
 def small_training(out: Path, *more: str) -> list[str]:
-    """Return the arguments of a training that is small in every way."""
+    """Return the arguments of a very small training."""
     return [
         "train",
         "pointpillars",
@@ -66,8 +66,8 @@ def small_training(out: Path, *more: str) -> list[str]:
 
 
 def kill_when(condition, *arguments: str) -> None:
-    """Begin a training in a copy of this process, which has imported torch, and kill it when
-    condition() is true."""
+    """Start a training in a fork of this process, which has imported torch, and kill it when condition() is
+    true."""
     process = multiprocessing.get_context("fork").Process(target=cli.main, args=(arguments,))
     process.start()
     end = time.monotonic() + 240
@@ -100,7 +100,7 @@ def test_run_killed_twice_equals_uninterrupted_run(tmp_path, one_thread):
     refused = CliRunner().invoke(cli, small_training(broken))
     assert isinstance(refused.exception, InputError) and "--resume" in str(refused.exception)
     kill_when((broken / STATE).exists, *small_training(broken, "--resume"))
-    assert {path: path.stat().st_mtime_ns for path in before} == before  # not made again
+    assert {path: path.stat().st_mtime_ns for path in before} == before  # not rewritten
     assert CliRunner().invoke(cli, small_training(broken, "--resume")).exit_code == 0
     assert read_tensors(broken) == read_tensors(whole)
     cached = {path.relative_to(broken): path.read_bytes() for path in broken.rglob("*.npz")}
@@ -108,7 +108,7 @@ def test_run_killed_twice_equals_uninterrupted_run(tmp_path, one_thread):
 
 
 def refuse(tmp_path: Path, *more: str) -> str:
-    """Return the one-line error for refused input; nothing may be written."""
+    """Return the one-line error for invalid input; nothing may be written."""
     result = CliRunner().invoke(cli, ["train", "pointnet", "--data", "sim", "--out", str(tmp_path / "run"), *more])
     assert result.exception is not None and not isinstance(result.exception, SystemExit)
     assert not list(tmp_path.glob("run/scans/*")) and not (tmp_path / "run" / RUN).exists()
@@ -234,13 +234,13 @@ def small_run(kind: str, out: Path, root: Path, *more: str):
 
 @pytest.mark.parametrize("kind", ["pointpillars", "pointnet"])
 def test_unusable_first_scenes_are_skipped(kind, tmp_path, one_thread):
-    """The first scenes are truncated, without a label file, or empty."""
+    """The first scenes are truncated, empty, or lack a label file."""
     root = object_folder(tmp_path / "kitti", walker_label() + "\n", 6) / "training"
     for number in (0, 2):
         write(root / f"velodyne/{number:06}.bin", b"cut")
     (root / "label_2/000003.txt").unlink()
     for number in (1, 4):
-        write(root / f"velodyne/{number:06}.bin", scene()[:1000])  # the ground alone
+        write(root / f"velodyne/{number:06}.bin", scene()[:1000])  # only ground
         write(root / f"label_2/{number:06}.txt", "")
     held = write(tmp_path / "val.txt", "000002\n000003\n000004\n")
     done = small_run(kind, tmp_path / "run", root, "--val-split", str(held))

@@ -1,4 +1,4 @@
-"""The training loop under interruptions, kills, full disks, NaN values and time limits."""
+"""The training loop with interruptions, kills, full disks, NaN values and time limits."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_second_signal_ends_run_and_keeps_saved_state(unbroken, tmp_path):
 
 
 def fork(target, *arguments) -> multiprocessing.Process:
-    """Run target in a copy of this process, which has imported torch."""
+    """Run target in a fork of this process, which has imported torch."""
     process = multiprocessing.get_context("fork").Process(target=target, args=arguments)
     process.start()
     return process
@@ -161,7 +161,7 @@ def test_run_is_not_overwritten_or_resumed_with_other_settings(unbroken, tmp_pat
     with pytest.raises(InputError, match="data None, not 'more'"):
         train(Toy().task(data="more"), PARAMS, folder, resume=True)
     train(Toy().task(), LoopParams(**{**vars(PARAMS), "log_steps": 7}), folder, resume=True)
-    assert equals(folder, unbroken[0])  # finished, so nothing happens
+    assert equals(folder, unbroken[0])  # already finished, so nothing happens
     (folder / STATE).write_bytes((folder / STATE).read_bytes()[:500])
     with pytest.raises(InputError, match="cannot read"):
         train(Toy().task(), PARAMS, folder, resume=True)
@@ -173,7 +173,7 @@ def test_settings_without_effect_may_differ_when_resuming():
     assert PointPillarsTraining(version="v0").fixed_settings() != settings
 
 
-# steps that are not finite
+# non-finite steps
 
 
 def spoil_batch(toy: Toy, part: str):

@@ -1,4 +1,4 @@
-"""Augmentation of scenes, and objects pasted into other scenes."""
+"""Augmentation of scenes, and pasting of objects into other scenes."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def test_intensity_stays_within_0_and_1_and_0_stays_0(seed):
     changed = change_intensity(scene, 1.4, 0.2)
     assert changed.points[:, 3].min() >= 0 and changed.points[:, 3].max() <= 1
     assert np.array_equal(changed.points[:, :3], scene.points[:, :3])
-    scene.points[::2, 3] = 0  # returns too weak to have an intensity
+    scene.points[::2, 3] = 0  # weak returns without an intensity
     assert (change_intensity(scene, 1.4, 0.2).points[::2, 3] == 0).all()
 
 
@@ -198,14 +198,14 @@ def test_pasted_objects_touch_nothing_and_keep_points(seed):
         present = (fuller.class_ids == kind).sum()
         assert present <= max(most, (scene.class_ids == kind).sum())
     within = find_points_of_boxes(fuller, 1e-3).sum(axis=1)
-    assert (within[:old] <= find_points_of_boxes(scene, 1e-3).sum(axis=1)).all()  # some may be in a shadow
+    assert (within[:old] <= find_points_of_boxes(scene, 1e-3).sum(axis=1)).all()  # some may be in the shadow of others
     sizes = np.diff(database.first)
     ranges = np.hypot(database.boxes[:, 0], database.boxes[:, 1])
     for box, number in zip(fuller.boxes[old:], within[old:]):
         assert (box[:2] >= AREA[0][:2]).all() and (box[:2] < AREA[1][:2]).all()
         origin = np.abs(ranges - np.hypot(box[0], box[1])).argmin()
         assert ranges[origin] == pytest.approx(np.hypot(box[0], box[1]), abs=1e-9)
-        assert number <= sizes[origin] and sizes[origin] >= 5  # another may hide it
+        assert number <= sizes[origin] and sizes[origin] >= 5  # others may hide it
     again = paste_objects(scene, database, params, *AREA, np.random.default_rng(seed))
     assert np.array_equal(again.points, fuller.points)
 
@@ -219,7 +219,7 @@ def make_wall(x: float, y: tuple[float, float], z: tuple[float, float], apart: f
 
 
 def make_walker(x: float) -> Database:
-    """Return a pedestrian x metres ahead, a flat grid of points."""
+    """Return a pedestrian x metres ahead as a flat grid of points."""
     own = make_wall(x, (-0.25, 0.25), (-1.7, 0))
     return Database(
         np.array([[x, 0, -0.86, 0.8, 0.7, 1.74, 0]]), np.array([PEDESTRIAN], np.int32), own, np.array([0, len(own)])

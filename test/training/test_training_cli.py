@@ -78,7 +78,7 @@ def test_trained_network_opens_as_detector(tmp_path, cache, tiny_size):
     assert again.exit_code == 1 and "--resume" in str(again.exception)
     assert train(*train_on_simulation(cache, out), "--version", "v4", "--seed", 5, "--resume").exit_code == 0
     assert (out / "last.safetensors").read_bytes() == before
-    # another run can start from its weights
+    # another run starts from its weights
     init = train(
         *train_on_simulation(cache, tmp_path / "next", **{"--steps": 1}),
         "--version",

@@ -61,7 +61,7 @@ def test_cached_scans_equal_simulated_ones(tmp_path, monkeypatch):
         assert np.array_equal(frame.xyz, again[0].xyz)
         assert np.array_equal(frame.intensity, again[0].intensity)
         assert np.array_equal(truth.boxes, again[1].boxes) and truth.extras == again[1].extras
-        monkeypatch.setattr(scenes_module, "simulate_scan", None)  # the second comes from the cache
+        monkeypatch.setattr(scenes_module, "simulate_scan", None)  # the second one is read from the cache
     monkeypatch.undo()
     (file,) = (tmp_path / "cache").iterdir()
     file.write_bytes(file.read_bytes()[:100])  # a damaged file is computed again
@@ -85,7 +85,7 @@ def test_hidden_simulated_objects_are_not_detectable():
 
 
 class Numbers:
-    """Source of scenes that have one point, with the number of the scene."""
+    """Scene source with one point per scene, which contains the scene number."""
 
     def __init__(self, first: int, count: int):
         self.first, self.count = first, count
@@ -108,7 +108,7 @@ def take_batches(batches: Batches, first: int, steps: int) -> list:
 def test_stream_depends_only_on_seed():
     stream = Stream((Numbers(0, 7), Numbers(100, 4)), prepare_all, 5)
     whole = take_batches(Batches(stream, 3), 0, 12)
-    assert take_batches(Batches(stream, 3), 5, 7) == whole[5:]  # as after a stop
+    assert take_batches(Batches(stream, 3), 5, 7) == whole[5:]  # like after an interruption
     assert take_batches(Batches(stream, 3, jobs=2), 0, 6) == whole[:6]
     pair = [take_batches(Batches(stream, 3, rank=rank, world=2), 0, 6) for rank in (0, 1)]
     assert [batch for both in zip(*pair) for batch in both] == whole
@@ -212,7 +212,7 @@ def test_validation_scores_of_perfect_and_empty_detections(tmp_path):
         assert metrics["score"] == metrics["Pedestrian_3d"] == 100.0
         assert np.isnan(metrics["Car_bev_relaxed"])
         assert select_metrics(blind.compute(), score, names)["score"] == 0.0
-        assert np.isnan(select_metrics(right.compute(), score, ["Car"])["score"])  # no such object
+        assert np.isnan(select_metrics(right.compute(), score, ["Car"])["score"])  # no object of this class
 
 
 @pytest.mark.parametrize("view", ["ahead", "around"])
@@ -270,7 +270,7 @@ class Large:
 def test_killed_worker_ends_training_with_reason(jobs):
     batches = load_items(Large(), ([n] for n in range(10**6)), jobs)
     pid = next(batches)[0][0]
-    time.sleep(0.2)  # it is sending the next one
+    time.sleep(0.2)  # it is sending the next item
     os.kill(pid, signal.SIGKILL)
     with pytest.raises(InputError, match=r"prepared scenes.*code -9.*try fewer --jobs"):
         for _ in range(20):

@@ -1,4 +1,4 @@
-"""Learning rate and weight average, also if the budget ends before the planned steps."""
+"""Learning rate and weight average, also if the time ends before the planned steps."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_average_is_weighted_sum_of_weights(values, decay):
         average.update(module)
         keep = min(decay, t / (t + 9))
         shares = [share * keep for share in shares] + [1 - keep]
-    start = 1 - sum(shares)  # share of the first weights
+    start = 1 - sum(shares)  # weight of the initial parameters
     expected = sum(s * v for s, v in zip(shares, values))
     first = average.module.weight.item() - expected
     assert abs(first) <= abs(start) + 1e-9
@@ -128,7 +128,7 @@ def test_slow_run_ends_in_time_with_final_learning_rate(seconds, fits, planned, 
     rates, whole = ([float(row["lr"]) for row in rows(folder)] for folder in (tmp_path, planned))
     assert rates[-1] == whole[-1] and max(rates) > 0.95 * max(whole)
     jumps, slope = (max(abs(a - b) for a, b in pairwise(each)) for each in (rates, whole))
-    assert jumps < 3 * slope / fits  # no sudden fall
+    assert jumps < 3 * slope / fits  # no sudden drop
     assert set(toy.saved) == {"best", "last"}
 
 

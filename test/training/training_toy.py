@@ -19,7 +19,7 @@ PARAMS = LoopParams(steps=13, validate_steps=4, save_steps=3, log_steps=1, seed=
 
 
 class Toy:
-    """Regression with dropout and batch norm. The loss of each step calls before(step)."""
+    """Regression network with dropout and batch norm. The loss of each step calls before(step)."""
 
     def __init__(self, before=lambda step: None, plain: bool = False, size: int = 8):
         torch.manual_seed(5)
@@ -112,5 +112,5 @@ def broken_folder(root):
 
 
 def prepare_all(scene, rng):
-    """Stand in for the preparation of a network; returns its input and a random number."""
+    """Stand-in for the preparation of samples; returns its input and a random number."""
     return scene.points.sum(), scene.boxes, rng.random()

@@ -1,4 +1,4 @@
-"""Decompression, also of a few bytes that expand to gigabytes."""
+"""Decompression, including decompression bombs."""
 
 from __future__ import annotations
 

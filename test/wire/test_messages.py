@@ -115,7 +115,7 @@ def test_ros_and_rosbags_read_each_others_bytes(build):
 def test_message_fields_default_to_zero_as_in_ros(name):
     serialization = pytest.importorskip("rclpy.serialization", reason="needs rclpy")
     theirs = make_ros_message(name)
-    if name.endswith(("Pose", "Marker")):  # ROS starts at the unit quaternion
+    if name.endswith(("Pose", "Marker")):  # ROS initialises the unit quaternion
         pose = theirs if name.endswith("Pose") else theirs.pose
         pose.orientation.w = 0.0
     got = serialization.deserialize_message(encode(make_bag_message(name)), load_message_class(name))
@@ -156,7 +156,7 @@ def test_intensities_are_read_in_every_drivers_scale(kind, full):
         points["intensity"][1:4] = np.nan, np.inf, -np.inf
         odd = to_point_cloud(from_array(points, header(make_bag_message), make_bag_message), 0.0)[0].intensity
         assert not odd[1:4].any() and np.array_equal(odd[4:], read.intensity[4:])
-    points["intensity"] = points["intensity"] * 0.02  # a scale that no driver uses
+    points["intensity"] = points["intensity"] * 0.02  # an unusual scale
     dark = to_point_cloud(from_array(points, header(make_bag_message), make_bag_message), float(full))[0]
     assert "input.intensity_max" in find_scale_problem(dark.intensity)
     assert "input.intensity_max" in find_scale_problem(read.intensity * 2)

@@ -51,7 +51,7 @@ def test_times_of_every_driver_are_read_in_seconds(driver, order):
     times = read_point_times(msg, all_indices(msg))
     assert times.name == name
     np.testing.assert_allclose(times.seconds, expected, atol=2e-6)
-    for some in ([7, 3, 999], [500], range(500, 505)):  # the last spans 0.4 ms only
+    for some in ([7, 3, 999], [500], range(500, 505)):  # the last one spans only 0.4 ms
         np.testing.assert_array_equal(read_point_times(msg, np.array(some)).seconds, times.seconds[some])
 
 
@@ -113,7 +113,7 @@ def test_unusable_times_are_reported(name, values, words):
 
 
 def test_times_of_missing_returns_are_ignored():
-    """Drivers fill organised clouds with zeros where a beam has no return."""
+    """Drivers fill organised clouds with zeros for beams without a return."""
     values = np.where(np.arange(1000) % 3, STAMP * 1e-9 + SECONDS, 0.0)
     msg, returns = cloud("timestamp", values), np.flatnonzero(np.arange(1000) % 3)
     for some in (returns, returns[500:503]):
