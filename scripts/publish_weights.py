@@ -41,7 +41,7 @@ from lidar_perception.scoring.run import fill_report
 from lidar_perception.training.record import round_metrics, select_metrics
 
 ROWS = (("bev_relaxed", "BEV"), ("bev", "BEV"), ("3d_relaxed", "3D"), ("3d", "3D"))
-DEFAULT_SENSOR = {"name": "hdl64e", "beams": 64, "height": 1.73}  # missing in early headers
+EARLY_SENSOR = {"name": "hdl64e", "beams": 64, "height": 1.73}  # of weights whose header has no such entry
 SAMPLES = 200  # bootstrap samples of the intervals
 SENSOR_FAILURES = [
     "Other sensors: many people are missed if the beams are sparser than in training.",
@@ -92,7 +92,7 @@ def describe_weights(header: checkpoint.Header, title: str) -> list[str]:
     """Return lines about the network, its training data, range and sensor."""
     training, config = header.training, header.config
     low, high = getattr(config, "low", None), getattr(config, "high", None)
-    sensor = training.get("sensor") or DEFAULT_SENSOR
+    sensor = training.get("sensor", EARLY_SENSOR)  # empty for scans of several sensors
     init, others = training.get("init"), training["validation_scenes"]
     if init:
         init = (
@@ -119,7 +119,9 @@ def describe_weights(header: checkpoint.Header, title: str) -> list[str]:
         if low is None or high is None
         else f"Range: x {low[0]:g} to {high[0]:g} m, y {low[1]:g} to {high[1]:g} m. `range: around` "
         "covers 51.2 m in all directions.",
-        f"Sensor: {sensor['name']}, {sensor['beams']} beams, {sensor['height']} m above the ground.",
+        f"Sensor: {sensor['name']}, {sensor['beams']} beams, {sensor['height']} m above the ground."
+        if sensor
+        else "Sensor: several, which the header does not list.",
         "Scores: calibrated probabilities." if header.calibration else "Scores: not calibrated.",
         "Stored as float16.",
     ]

@@ -172,8 +172,9 @@ def fused(
     """Fit the fused detector to your own weights.
 
     PointPillars, silhouettes and PointNet are evaluated on simulated scans of the sensor that the
-    weights were trained for. The fitted curves combine their scores into a calibrated probability.
-    This takes a few minutes. The file refers to the weights of both networks by their paths.
+    weights were trained for, with and without intensity. The fitted curves, one set for each,
+    combine their scores into a calibrated probability. This takes a few minutes. The file refers to
+    the weights of both networks by their paths.
 
     \b
     Examples:
@@ -192,7 +193,8 @@ def fused(
         raise InputError(f"{out} exists already; give another name, or --force")
     from lidar_perception.training.fusion_curves import fit_fusion
 
-    print_fusion_fits(fit_fusion(weights, classifier, out, params, jobs))
+    for kind, fits in fit_fusion(weights, classifier, out, params, jobs).items():
+        print_fusion_fits(kind, fits)
     console.print(f"use {out} with --weights of commands, or as fused.weights of the node")
 
 
@@ -206,11 +208,13 @@ def run(request: TrainingRequest, params: PointPillarsTraining | PointNetTrainin
         print_result(*result, request.out)
 
 
-def print_fusion_fits(fits: Any) -> None:
-    """Print the fitted curves of each class, compared with the packaged ones."""
+def print_fusion_fits(kind: str, fits: Any) -> None:
+    """Print the fitted curves of each class for one kind of cloud, compared with the packaged ones."""
     from lidar_perception.scoring.tables import make_table
 
-    table = make_table("Fitted curves on held-out scans", "", "proposals", "correct", ">= 0.4", "correct", "log loss")
+    table = make_table(
+        f"Fitted curves on held-out scans, {kind}", "", "proposals", "correct", ">= 0.4", "correct", "log loss"
+    )
     unfitted = []
     for name, fit in fits.items():
         rows = [("package", fit.before)]

@@ -19,7 +19,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import NETWORKS, Header
 from lidar_perception.detectors.fused.detector import FusedDetector, Proposals, load_fused_detector
 from lidar_perception.detectors.fused.evidence import Evidence, compute_probabilities
-from lidar_perception.detectors.fused.fusion import KNOTS, Models, load_shipped_models, write_fusion
+from lidar_perception.detectors.fused.fusion import KNOTS, Models, find_fusion, write_fusion
 from lidar_perception.detectors.fused.params import FusedDetectorParams, FusedParams
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.geometry import bev_iou, centre_distances
@@ -100,10 +100,16 @@ class ClassFit(NamedTuple):
     after: CurveScore | None
 
 
+# Kinds of clouds, which have separate curves.
+WITH, WITHOUT = KINDS = "with intensity", "without intensity"
+
+
 def fit_fusion(
     weights: Path | None, classifier: Path | None, out: Path, params: FusedTraining, jobs: int = 1
-) -> dict[str, ClassFit]:
+) -> dict[str, dict[str, ClassFit]]:
     """Fit the curves of two networks to simulated scans, and write a fusion file.
+
+    Clouds with and without intensity have separate curves, fitted to the same scans.
 
     Args:
         weights: Checkpoint of PointPillars; None for the packaged one.
@@ -113,7 +119,7 @@ def fit_fusion(
         jobs: Number of processes.
 
     Returns:
-        The fit of each class.
+        The fit of each class, by kind of cloud, see KINDS.
 
     Raises:
         InputError: An input cannot be used; raised before any scan is simulated.
@@ -136,19 +142,26 @@ def fit_fusion(
         if warning := network.find_height_mismatch(sensor.height):
             errors.print(f"{NETWORKS[network.network][0]}: {warning}")
     source = SimulatedScenes(FIRST_FIT_SEED, params.scans, sensor, scenes, around=around)
-    models, fits = fit_classes(simulate_samples(FusedDetectorParams(fused=fused), source, jobs), load_shipped_models())
+    samples, shipped = simulate_samples(FusedDetectorParams(fused=fused), source, jobs), find_fusion()
+    before = {WITH: shipped.models, WITHOUT: shipped.models_without_intensity or shipped.models}
+    models, fits = {}, {}
+    for kind in KINDS:
+        models[kind], fits[kind] = fit_classes(samples[kind], before[kind])
+    counts = {kind: {name: [fit.proposals, fit.correct] for name, fit in own.items()} for kind, own in fits.items()}
     write_fusion(
         out,
         (weights, classifier),
-        models,
+        models[WITH],
         {
             "sensor": params.sensor,
             "height": sensor.height,
             "scene": params.scene,
             "scans": params.scans,
             "range": "around" if around else "ahead",
-            "proposals, hits": {name: [fit.proposals, fit.correct] for name, fit in fits.items()},
+            "proposals, hits": counts[WITH],
+            "proposals, hits without intensity": counts[WITHOUT],
         },
+        models[WITHOUT],
     )
     return fits
 
@@ -226,21 +239,28 @@ def _match_boxes(boxes: np.ndarray, objects: np.ndarray, name: str) -> np.ndarra
     return hits
 
 
-def simulate_samples(params: FusedDetectorParams, scenes: SimulatedScenes, jobs: int) -> Samples:
-    """Simulate all scans and collect the proposals in them; the result does not depend on jobs."""
+def simulate_samples(params: FusedDetectorParams, scenes: SimulatedScenes, jobs: int) -> dict[str, Samples]:
+    """Simulate all scans and collect the proposals in them; the result does not depend on jobs.
+
+    Returns:
+        The proposals in the scans with their intensity, and in the same scans without, by kind.
+    """
     make_sampler = partial(_make_sampler, params, scenes)
     results = run_in_processes(make_sampler, range(len(scenes)), jobs, "detected in simulated scans")
     parts = dict(show_progress(results, "simulating and detecting", len(scenes)))
-    return Samples.concatenate([parts[i] for i in sorted(parts)])
+    return {kind: Samples.concatenate([parts[i][kind] for i in sorted(parts)]) for kind in KINDS}
 
 
-def _make_sampler(params: FusedDetectorParams, scenes: SimulatedScenes) -> Callable[[int], tuple[int, Samples]]:
+def _make_sampler(
+    params: FusedDetectorParams, scenes: SimulatedScenes
+) -> Callable[[int], tuple[int, dict[str, Samples]]]:
     detector: FusedDetector = load_fused_detector("", "cpu", params)
 
-    def sample_scan(i: int) -> tuple[int, Samples]:
+    def sample_scan(i: int) -> tuple[int, dict[str, Samples]]:
         frame = scenes.frame(i)
-        proposals = detector.with_sensor_height(frame.sensor_height).propose(frame.load())
-        return i, collect_samples(frame, proposals, i)
+        at_height, cloud = detector.with_sensor_height(frame.sensor_height), frame.load()
+        clouds = {WITH: cloud, WITHOUT: replace(cloud, intensity=None)}
+        return i, {kind: collect_samples(frame, at_height.propose(c), i) for kind, c in clouds.items()}
 
     return sample_scan
 

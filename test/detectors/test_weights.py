@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import runpy
 import struct
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pointnet_samples
@@ -148,6 +150,16 @@ def test_full_disk_keeps_the_last_checkpoint(saved, monkeypatch):
     with pytest.raises(InputError, match="No space left"):
         save_checkpoint(path, network, header, half=True)
     assert path.read_bytes() == before and [*path.parent.iterdir()] == [path]
+
+
+def test_model_card_states_the_sensor_of_the_header():
+    describe = runpy.run_path(str(Path(__file__).parents[2] / "scripts/publish_weights.py"))["describe_weights"]
+    training = dict(data=["sim"], scenes=5, validation_scenes=0, steps=9, batch=4, seconds=60, seed=0)
+    for sensor, expected in (
+        ({"name": "vlp-16", "beams": 16, "height": 0.6}, "Sensor: vlp-16, 16 beams, 0.6 m above the ground."),
+        ({}, "Sensor: several, which the header does not list."),
+    ):
+        assert expected in describe(Header(tiny(), training={**training, "sensor": sensor}), "v4")
 
 
 def test_error_for_missing_weights_explains_how_to_get_them(tmp_path, monkeypatch):

@@ -41,8 +41,18 @@ from lidar_perception.detectors.weights_file import (
 )
 from lidar_perception.param_fields import with_values
 from lidar_perception.simulation.camera import FORWARD_CAMERA
-from lidar_perception.training.fusion_curves import MIN_SAMPLES, Samples, collect_samples, fit_classes
-from lidar_perception.training.params import PointNetTraining
+from lidar_perception.training import fusion_curves
+from lidar_perception.training.fusion_curves import (
+    KINDS,
+    MIN_SAMPLES,
+    WITH,
+    WITHOUT,
+    Samples,
+    collect_samples,
+    fit_class,
+    fit_classes,
+)
+from lidar_perception.training.params import FusedTraining, PointNetTraining
 from lidar_perception.training.pointnet.trainer import find_proposer
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
 
@@ -77,6 +87,21 @@ def test_fitted_scores_are_probabilities_in_any_order_of_scans(seed):
         np.testing.assert_allclose(curve["values"], before["values"], atol=0.02)
     # A class with too few samples keeps its curves.
     assert models["Car"] == load_shipped_models()["Car"] and fits["Car"].after is None
+
+
+def test_clouds_without_intensity_get_their_own_curves(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    samples = {kind: draw_samples(rng, 2000, PEDESTRIAN, odds) for kind, odds in zip(KINDS, (-1.5, 1.0))}
+    monkeypatch.setattr(fusion_curves, "simulate_samples", lambda *_: samples)
+    fits = fusion_curves.fit_fusion(None, None, tmp_path / "fused.json", FusedTraining())
+    fusion, shipped = read_fusion(tmp_path / "fused.json"), find_fusion()
+    for kind, models, before in (
+        (WITH, fusion.models, shipped.models),
+        (WITHOUT, fusion.models_without_intensity, shipped.models_without_intensity),
+    ):
+        assert models["Pedestrian"]["bias"] == fit_class("Pedestrian", samples[kind])["bias"]
+        assert models["Car"] == before["Car"]
+        assert fits[kind]["Pedestrian"].correct == samples[kind].correct.sum()
 
 
 def test_curves_are_not_fitted_to_too_few_samples():
@@ -248,6 +273,7 @@ def test_train_fused_writes_usable_file(tmp_path, monkeypatch, capsys):
     assert "too few samples to fit curves" in " ".join(printed.out.split())
     fusion = read_fusion(out)
     assert fusion.models == load_shipped_models() and fusion.curve_warning is None
+    assert fusion.models_without_intensity == find_fusion().models_without_intensity != fusion.models
     assert fusion.fitted_to["sensor"] == "vlp-16" and fusion.fitted_to["range"] == "around"
     before = out.read_bytes()
     assert exit_of(monkeypatch, *command) == 2 and "exists already" in error_line(capsys)
