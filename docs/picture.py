@@ -100,7 +100,7 @@ def make(folder: Path = FOLDER) -> None:
         LOOK,
         segmented.xyz,
         color_by_cluster(segmented.ground, segmented.cluster_ids),
-        found.followed_by(candidates.final),
+        found.concatenate(candidates.final),
     )
     draw_detect(folder / "detect.png")
     draw_film(folder / "detect.webp")

@@ -33,7 +33,14 @@ from lidar_perception.scoring.run import Skipped, measure_frames
 from lidar_perception.simulation.recording import simulate_recording
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import find_sensor
-from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError, PointCloud, as_point_cloud, unknown_name
+from lidar_perception.types import (
+    SENSOR_HEIGHT,
+    Detections,
+    InputError,
+    PointCloud,
+    as_point_cloud,
+    make_unknown_name_error,
+)
 
 P = TypeVar("P")  # any parameter dataclass
 
@@ -47,17 +54,17 @@ def load_detector(
     min_score: float | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Detector:
-    """Load a detector: detector(cloud).detections are the objects in a cloud.
+    """Load a detector, whose detector(cloud).detections are the objects in a cloud.
 
     Args:
         name_or_file: a detector with the weights of the package (fused, pointpillars or pointnet);
             a file of weights (.safetensors, .onnx or the .json of `train fused`); or a class of
             your own, as "module:Class" or by the name of its entry point.
         device: auto, cpu, cuda or cuda:N.
-        range: ahead, around, or auto, the range that the weights were trained for.
+        range: ahead, around, or auto (the range that the weights were trained for).
         sensor_height: height of the sensor above the ground in metres. Default: 1.73, as in KITTI.
-        min_score: threshold of every class, 0..1. Default: those of the detector.
-        settings: other parameters by dotted name, such as {"fused.scores.car": 0.7}, which take
+        min_score: score threshold of every class, 0..1. Default: the thresholds of the detector.
+        settings: other parameters by dotted name, such as {"fused.scores.car": 0.7}; they take
             precedence over the arguments above.
 
     Raises:
@@ -76,32 +83,31 @@ def segment_ground(
     intensity: ArrayLike | None = None,
     **params: Any,
 ) -> np.ndarray:
-    """Segment the ground of a cloud.
+    """Segment the ground points of a cloud.
 
     Args:
         xyz: (N, 3) [x y z] or (N, 4) [x y z intensity] of a level sensor, metres, z up; or a
             PointCloud.
         method: threshold (one plane), patchwork (Patchwork++) or cloth (cloth simulation).
         sensor_height: height of the sensor above the ground, in metres.
-        intensity: (N,) if xyz is (N, 3); only patchwork uses it, to remove reflections.
-        params: parameters of the method, such as max_range=60.0 of patchwork: those of the node
-            ground_segmentation without the prefix ground.METHOD.
+        intensity: (N,) for xyz (N, 3); only patchwork uses it, to remove reflections.
+        params: parameters of the method, such as max_range=60.0 of patchwork. They are the
+            parameters of the node ground_segmentation without the prefix ground.METHOD.
 
     Returns:
-        (N,) bool, True = ground. Points that are not finite and points at the origin are not
-        ground.
+        (N,) bool, True = ground. It is False for points that are not finite or at the origin.
 
     Raises:
-        InputError: xyz or intensity has another shape, or the method or a parameter is unknown or
+        InputError: xyz or intensity has a wrong shape, or the method or a parameter is unknown or
             out of range.
     """
     if method not in GROUND_METHODS:
-        raise unknown_name("ground method", method, GROUND_METHODS)
+        raise make_unknown_name_error("ground method", method, GROUND_METHODS)
     defaults = GroundParams()
     pose = _set_params(defaults.sensor_pose, {"height": sensor_height})
-    own = _set_params(getattr(defaults, method), params)
+    method_params = _set_params(getattr(defaults, method), params)
     return segment.segment_ground(
-        _make_cloud(xyz, intensity), replace(defaults, method=method, sensor_pose=pose, **{method: own})
+        _make_cloud(xyz, intensity), replace(defaults, method=method, sensor_pose=pose, **{method: method_params})
     )
 
 
@@ -119,26 +125,26 @@ def cluster(
         xyz: (N, 3) [x y z] or (N, 4) [x y z intensity], metres; or a PointCloud.
         method: dbscan (eps grows with the range) or euclidean (adaptive).
         ground: (N,) bool; True = not clustered. Default: all points are clustered.
-        density: points per square degree of view for which the parameters are meant; they are
-            adapted to sparser clouds. 0: no adaptation.
-        params: parameters of the method, such as min_samples=5 of dbscan: those of the node
-            clustering without the prefix clustering.METHOD.
+        density: points per square degree for which the parameters are tuned; they are adapted to
+            sparser clouds. 0: no adaptation.
+        params: parameters of the method, such as min_samples=5 of dbscan. They are the parameters
+            of the node clustering without the prefix clustering.METHOD.
 
     Returns:
-        (N,) int32 ids: 1..K for the clusters, 0 for ground and points without a cluster.
+        (N,) int32 cluster ids 1..K, 0 for ground and points without a cluster.
 
     Raises:
-        InputError: xyz or ground has another shape, or the method or a parameter is unknown or
+        InputError: xyz or ground has a wrong shape, or the method or a parameter is unknown or
             out of range.
     """
     if method not in CLUSTERING_METHODS:
-        raise unknown_name("clustering method", method, CLUSTERING_METHODS)
+        raise make_unknown_name_error("clustering method", method, CLUSTERING_METHODS)
     defaults = ClusteringParams()
-    own = _set_params(getattr(defaults, method), params)
-    chosen = _set_params(replace(defaults, method=method, **{method: own}), {"density": density})
+    method_params = _set_params(getattr(defaults, method), params)
+    clustering_params = _set_params(replace(defaults, method=method, **{method: method_params}), {"density": density})
     cloud = as_point_cloud(xyz)
     mask = np.zeros(len(cloud), bool) if ground is None else np.asarray(ground)
-    return cluster_obstacles(cloud, mask, chosen)
+    return cluster_obstacles(cloud, mask, clustering_params)
 
 
 def find_candidates(
@@ -155,19 +161,19 @@ def find_candidates(
     Args:
         xyz: (N, 3) [x y z] or (N, 4) [x y z intensity], metres, z up; or a PointCloud.
         click: (3,) a point on a pedestrian, whose silhouette becomes the template. Default: the
-            cluster that is most likely a pedestrian, else the template of the package.
+            cluster that is most likely a pedestrian, or without one the template of the package.
         sensor_height: height of the sensor above the ground, in metres.
-        ground: (N,) bool, such as from segment_ground(). Default: segmented here.
-        cluster_ids: (N,) int, such as from cluster(). Default: clustered here.
+        ground: (N,) bool, for example from segment_ground(). Default: computed here.
+        cluster_ids: (N,) int, for example from cluster(). Default: computed here.
         settings: other parameters of the node perception by dotted name, such as
             {"stm.threshold": 0.5}.
 
     Returns:
-        Pedestrians with the confidence as score; K = 0 without any.
+        The candidates as pedestrians, with their confidence as score.
 
     Raises:
-        InputError: an array has another shape, there is no cluster at click, or a parameter is
-            unknown or out of range.
+        InputError: an array has a wrong shape, no cluster is at `click`, or a parameter is unknown
+            or out of range.
     """
     params = _set_params(BEST, {"view.enabled": False, "ground.sensor_pose.height": sensor_height, **(settings or {})})
     seed = (
@@ -193,10 +199,10 @@ def evaluate(
         detector: a loaded detector, a function that returns Detections for a PointCloud, or a name
             or file for load_detector(), which is loaded for the recording's sensor height.
         recording: an open recording, or its path.
-        limit: number of frames. Default: all.
-        min_score: threshold of every class, low as average precision needs boxes of low score;
-            None: those of the detector.
-        intervals: number of bootstrap resamples for 90 % intervals; 0: none.
+        limit: maximum number of frames. Default: all.
+        min_score: score threshold of every class. The default is low because average precision
+            needs boxes with low scores. None: the thresholds of the detector.
+        intervals: number of bootstrap resamples for 90 % confidence intervals; 0: none.
 
     Returns:
         The content of the JSON file of `evaluate detection`, such as
@@ -243,17 +249,17 @@ def simulate(
     """Simulate labelled scans, which are computed when they are read.
 
     Args:
-        frames: number of scans. A new scene starts after the 20 s of a drive.
-        seed: of the first scene; the same seed gives the same scans.
-        sensor: a preset in any spelling, such as vlp-16, or a .yaml file of `setup`.
+        frames: number of scans. A new scene starts after each drive of 20 s.
+        seed: random seed of the first scene; the same seed gives the same scans.
+        sensor: name of a preset, such as vlp-16, or a .yaml file written by `setup`.
         scene: street, campus or another scene of `simulate`, or several, such as street,campus.
-        kind: kind of the scene. Default: all in turn.
-        people: pedestrians and cyclists, as a multiple of the usual number.
-        sensor_height: metres above the ground. Default: that of the sensor's preset or file.
+        kind: kind of the scene. Default: all kinds in turn.
+        people: number of pedestrians and cyclists, as a multiple of the usual number.
+        sensor_height: metres above the ground. Default: the height in the preset or file.
 
     Returns:
-        A recording: iterate over its frames, or pass it to evaluate(). frame.load() is the cloud,
-        frame.truth() the labels.
+        A recording, to iterate over or to pass to evaluate(). frame.load() returns the cloud of a
+        frame, frame.truth() its labels.
 
     Raises:
         InputError: an argument is unknown or out of range.
@@ -268,7 +274,7 @@ def simulate(
 
 def _make_cloud(xyz: PointCloud | ArrayLike, intensity: ArrayLike | None) -> PointCloud:
     if intensity is not None and isinstance(xyz, PointCloud):
-        raise InputError("a PointCloud has its own intensity; give either a PointCloud or arrays")
+        raise InputError("a PointCloud already has an intensity; pass either a PointCloud, or arrays with an intensity")
     return as_point_cloud(xyz, intensity)
 
 

@@ -30,8 +30,8 @@ class Camera:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.projection).all() and 0 < self.width < MAX_PIXELS and 0 < self.height < MAX_PIXELS):
             raise InputError(
-                "the camera's calibration has a value that is not finite, or an "
-                f"image of {self.width} x {self.height} pixels; calibrate it again"
+                f"the camera calibration is invalid: a value is not finite, or the image size {self.width} x "
+                f"{self.height} is out of range; calibrate the camera again"
             )
 
     @staticmethod
@@ -59,7 +59,7 @@ class Camera:
     ) -> Camera:
         """Make a camera from its intrinsics (3, 4) and the pose of the LiDAR in the camera frame.
 
-        For the arguments see from_camera_pose.
+        The arguments have the same form as in from_camera_pose.
         """
         lidar_to_camera = np.eye(4)
         lidar_to_camera[:3, :3] = Rotation.from_quat(rotation).as_matrix()
@@ -75,7 +75,8 @@ class Camera:
     def in_regions(self, xyz: np.ndarray, regions: np.ndarray) -> np.ndarray:
         """Return (N,) bool: True for points (N, 3) in front of the camera and inside any region.
 
-        regions (R, 4) are [left top right bottom] in pixels and may extend beyond the image.
+        Args:
+            regions: (R, 4) [left top right bottom] in pixels; they may extend beyond the image.
         """
         u, v, depth = (np.asarray(xyz, np.float64) @ self.projection[:, :3].T + self.projection[:, 3]).T
         inside = np.zeros(len(xyz), bool)

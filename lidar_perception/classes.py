@@ -1,7 +1,7 @@
-"""Table of the object classes and their constants: a new class is one row.
+"""Table of the object classes and their constants. To add a class, add a row.
 
-Names are those of KITTI's labels. Classes with `numbers` are detected and scored; the others occur
-in labels only. The shapes of simulated objects are in simulation/shapes/.
+Names are those of KITTI's labels. Classes with detection constants are detected and scored; the
+others occur in labels only. The shapes of simulated objects are in simulation/shapes/.
 """
 
 from __future__ import annotations
@@ -12,15 +12,18 @@ Size = tuple[float, float, float]  # (length, width, height) in metres
 
 
 @dataclass(frozen=True)
-class DetectionNumbers:
+class DetectionConstants:
     """Constants of a detected class.
 
-    anchor: anchor box of PointPillars; positive at a BEV IoU of at least `matched`, background
-        below `unmatched` (Lang et al., CVPR 2019, Section 4.1 and its code).
-    mean_size: mean of KITTI's labels, to which PointNet's sizes are relative.
-    min_diagonal: smallest diagonal of a cluster's box in x-y, in metres (paper B, Table 2, whose
-        ranges 0.40-1.71, 1.72-2.99 and 3.00-6.40 are rounded; here each extends to the next).
-    strict, relaxed: minimum IoU of a hit, as in KITTI and for small objects.
+    Attributes:
+        anchor: size of the anchor box of PointPillars.
+        matched, unmatched: an anchor is positive at a BEV IoU of at least `matched`, and background
+            below `unmatched` (Lang et al., CVPR 2019, Section 4.1 and its code).
+        mean_size: mean size of KITTI's labels; PointNet's sizes are relative to it.
+        min_diagonal: minimum diagonal of a cluster's box in x-y, in metres. The ranges 0.40-1.71,
+            1.72-2.99 and 3.00-6.40 of paper B, Table 2, are rounded; here each extends to the next.
+        strict: minimum IoU of a hit in KITTI's benchmark.
+        relaxed: lower minimum IoU of a hit, for small objects.
     """
 
     anchor: Size
@@ -36,24 +39,27 @@ class DetectionNumbers:
 class ObjectClass:
     """A class of objects.
 
-    looks_like: class whose detections on this object are ignored, as in KITTI's benchmark.
-    vehicle: True if it can contain people.
-    moves_as: vehicle, pedestrian or cyclist, for the tracker.
-    aliases: names of the class in other stacks.
+    Attributes:
+        name: name in KITTI's labels.
+        numbers: constants for detection; None if the class is not detected.
+        looks_like: class whose detections on this object are ignored, as in KITTI's benchmark.
+        vehicle: True if it can contain people.
+        motion_model: motion model of the tracker: vehicle, pedestrian or cyclist.
+        aliases: names of the class in other stacks.
     """
 
     name: str
-    numbers: DetectionNumbers | None = None
+    numbers: DetectionConstants | None = None
     looks_like: str = ""
     vehicle: bool = False
-    moves_as: str = "vehicle"
+    motion_model: str = "vehicle"
     aliases: tuple[str, ...] = ()
 
 
 TABLE = (
     ObjectClass(
         "Car",
-        DetectionNumbers((3.9, 1.6, 1.56), 0.6, 0.45, (3.88, 1.63, 1.53), 3.00, 0.7, 0.5),
+        DetectionConstants((3.9, 1.6, 1.56), 0.6, 0.45, (3.88, 1.63, 1.53), 3.00, 0.7, 0.5),
         vehicle=True,
         aliases=("vehicle", "automobile"),
     ),
@@ -61,15 +67,15 @@ TABLE = (
     ObjectClass("Truck", vehicle=True),
     ObjectClass(
         "Pedestrian",
-        DetectionNumbers((0.8, 0.6, 1.73), 0.5, 0.35, (0.84, 0.66, 1.76), 0.40, 0.5, 0.25),
-        moves_as="pedestrian",
+        DetectionConstants((0.8, 0.6, 1.73), 0.5, 0.35, (0.84, 0.66, 1.76), 0.40, 0.5, 0.25),
+        motion_model="pedestrian",
         aliases=("person", "people", "human"),
     ),
-    ObjectClass("Person_sitting", looks_like="Pedestrian", moves_as="pedestrian"),
+    ObjectClass("Person_sitting", looks_like="Pedestrian", motion_model="pedestrian"),
     ObjectClass(
         "Cyclist",
-        DetectionNumbers((1.76, 0.6, 1.73), 0.5, 0.35, (1.76, 0.60, 1.74), 1.72, 0.5, 0.25),
-        moves_as="cyclist",
+        DetectionConstants((1.76, 0.6, 1.73), 0.5, 0.35, (1.76, 0.60, 1.74), 1.72, 0.5, 0.25),
+        motion_model="cyclist",
         aliases=("bicycle", "bicyclist", "rider"),
     ),
     ObjectClass("Tram", vehicle=True),
@@ -83,13 +89,13 @@ _NAME_BY_SPELLING = {"".join(filter(str.isalnum, name)).casefold(): name for nam
 # Lower-case name of a class -> index into CLASSES.
 ID_BY_ALIAS = {name.casefold(): i for i, row in enumerate(TABLE) for name in (row.name, *row.aliases)}
 DETECTED = {row.name: row.numbers for row in TABLE if row.numbers is not None}
-BY_SIZE = sorted(DETECTED, key=lambda name: -DETECTED[name].min_diagonal)  # classes, largest first
+CLASSES_BY_SIZE = sorted(DETECTED, key=lambda name: -DETECTED[name].min_diagonal)  # classes, largest first
 CAR, PEDESTRIAN, CYCLIST, DONT_CARE = map(CLASSES.index, ("Car", "Pedestrian", "Cyclist", "DontCare"))
 
 
-def class_name(text: str) -> str:
-    """Return the name in CLASSES that a text spells, else the text itself.
+def find_class_name(text: str) -> str:
+    """Return the name in CLASSES that matches a text, otherwise the text itself.
 
-    Case, blanks and punctuation are ignored: "car", "Person (sitting)".
+    Case, blanks and punctuation are ignored, as in "car" or "Person (sitting)".
     """
     return _NAME_BY_SPELLING.get("".join(filter(str.isalnum, text)).casefold(), text)

@@ -1,4 +1,4 @@
-"""Boxes, their overlap, ranges, and a counting sort; frames as in types.py."""
+"""Geometry of boxes, points and angles, and sorting in compiled code; frames as in types.py."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from numpy.typing import ArrayLike
 
 
 def wrap_angle(angle: ArrayLike) -> np.ndarray:
-    """Return the same angle in [-pi, pi)."""
+    """Wrap an angle to [-pi, pi)."""
     wrapped = (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
     return np.where(wrapped >= np.pi, -np.pi, wrapped)[()]  # values just below -pi round to pi
 
 
 def wrap_line(angle: ArrayLike) -> np.ndarray:
-    """Return the angle in [-pi/2, pi/2) of the same line, in either direction."""
+    """Wrap the angle of a line, whose direction does not matter, to [-pi/2, pi/2)."""
     return wrap_angle(2 * np.asarray(angle)) / 2
 
 
 def horizontal_range(xyz: np.ndarray) -> np.ndarray:
-    """Return the distance (N,) of points (N, >=2) from the sensor in x-y, in the dtype of xyz."""
+    """Return the distance (N,) in x-y from the origin to points (N, >=2), in the dtype of xyz."""
     return np.sqrt(xyz[:, 0] * xyz[:, 0] + xyz[:, 1] * xyz[:, 1])
 
 
@@ -30,12 +30,14 @@ def elevation_angles(xyz: np.ndarray) -> np.ndarray:
     return np.asarray(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
 
 
-def is_within(at: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
-    """Return (N,) bool: True where low <= x, y < high for points or boxes (N, >=2); False for NaN.
+def is_within(positions: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
+    """Return (N,) bool: True where low <= x, y < high; False for NaN.
 
-    Only x and y of low and high (>=2,) are used.
+    Args:
+        positions: (N, >=2) points or boxes.
+        low, high: (>=2,) limits, of which only x and y are used.
     """
-    xy, low, high = at[:, :2], np.asarray(low)[:2], np.asarray(high)[:2]
+    xy, low, high = positions[:, :2], np.asarray(low)[:2], np.asarray(high)[:2]
     return np.asarray(((xy >= low) & (xy < high)).all(axis=1))
 
 
@@ -49,30 +51,30 @@ def to_box_frame(xyz: np.ndarray, box: np.ndarray) -> np.ndarray:
 def points_in_box(xyz: np.ndarray, box: np.ndarray, margin: float = 0.0) -> np.ndarray:
     """Return (N,) bool: True for points (N, >=3) inside box (7,) or on its faces.
 
-    The box is enlarged by margin metres on every side.
+    The box is enlarged by `margin` metres on every side.
     """
-    half = np.asarray(box[3:6], np.float64) / 2 + margin
+    half_size = np.asarray(box[3:6], np.float64) / 2 + margin
     inside = np.zeros(len(xyz), bool)
-    candidates = np.flatnonzero(np.abs(xyz[:, 0] - np.float32(box[0])) <= np.hypot(*half[:2]) + 1e-3)
-    inside[candidates] = (np.abs(to_box_frame(xyz[candidates], box)) <= half).all(axis=1)
+    candidates = np.flatnonzero(np.abs(xyz[:, 0] - np.float32(box[0])) <= np.hypot(*half_size[:2]) + 1e-3)
+    inside[candidates] = (np.abs(to_box_frame(xyz[candidates], box)) <= half_size).all(axis=1)
     return inside
 
 
 def points_in_boxes(xyz: np.ndarray, boxes: np.ndarray, margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Find the points (N, 3) inside each of the boxes (K, 7), as points_in_box does.
 
-    A point can be in several boxes. The time is proportional to K * N, so this is meant for the
-    boxes of one frame.
+    A point can be in several boxes. The run time is proportional to K * N, so this function is
+    meant for the boxes of one frame.
 
     Returns:
-        indices (M,) int64 of the points; those of box k are indices[first[k]:first[k + 1]],
-        ascending.
-        first (K + 1,) int64.
+        indices: (M,) int64 indices of the points. Those of box k are
+            indices[first[k]:first[k + 1]], ascending.
+        first: (K + 1,) int64.
     """
     boxes = np.ascontiguousarray(boxes, np.float32).reshape(-1, 7)
     xyz = np.ascontiguousarray(xyz[:, :3], np.float32)
-    reach = np.hypot(boxes[:, 3] / 2.0 + margin, boxes[:, 4] / 2.0 + margin) + 1e-3
-    begin, end = boxes[:, 0] - reach, boxes[:, 0] + reach
+    radius = np.hypot(boxes[:, 3] / 2.0 + margin, boxes[:, 4] / 2.0 + margin) + 1e-3
+    begin, end = boxes[:, 0] - radius, boxes[:, 0] + radius
     low = max(_finite_min(begin), _finite_min(xyz[:, 0]), -MAX_DISTANCE_M)
     high = min(-_finite_min(-end), -_finite_min(-xyz[:, 0]), MAX_DISTANCE_M)
     indices, first = _points_in_boxes(xyz, boxes, margin, begin, end, low, high)
@@ -80,26 +82,27 @@ def points_in_boxes(xyz: np.ndarray, boxes: np.ndarray, margin: float = 0.0) -> 
     return np.sort(indices + offset) - offset, first
 
 
-SLAB_COUNT = 256  # slabs across x in which the points of a box are searched
-MAX_DISTANCE_M = 1e9  # no point is farther
+SLAB_COUNT = 256  # number of slabs along x into which points are sorted to find those in a box
+MAX_DISTANCE_M = 1e9  # maximum distance of a point along x
 
 
 def _finite_min(values: np.ndarray) -> float:
-    """Return the smallest value that is not NaN, inf if there is none."""
+    """Return the smallest value that is not NaN, or inf without such a value."""
     return float(np.fmin.reduce(values, initial=np.inf))
 
 
 @njit(cache=True, nogil=True)
 def counting_sort(keys, count, first):
-    """Sort indices stably by their keys (N,), 0..count-1.
+    """Sort indices by their integer keys (stable counting sort).
 
     Args:
-        keys: (N,) int.
+        keys: (N,) int, 0..count-1.
         count: number of possible keys.
         first: (N,) indices 0..N-1 in their initial order, which is kept among equal keys.
 
     Returns:
-        order (N,) and start (count + 1,): the indices with key k are order[start[k]:start[k + 1]].
+        order: (N,) sorted indices.
+        start: (count + 1,); the indices with key k are order[start[k]:start[k + 1]].
     """
     start = np.zeros(count + 1, np.int64)
     for key in keys:
@@ -116,9 +119,12 @@ def counting_sort(keys, count, first):
 # Numba takes seconds to compile NumPy's quantile, and half a second its searchsorted.
 @njit(cache=True, nogil=True)
 def quantile(values, fraction):
-    """Return the quantile of finite values (N,), N > 0, interpolated as by np.quantile.
+    """Return a quantile of finite values (N,), N > 0, with the interpolation of np.quantile.
 
-    The values are reordered in place. fraction is 0..1.
+    The values are reordered in place.
+
+    Args:
+        fraction: level of the quantile, 0..1.
     """
     rank = fraction * (len(values) - 1)
     k, low, high = int(rank), 0, len(values) - 1
@@ -140,9 +146,9 @@ def quantile(values, fraction):
 
 @njit(cache=True, nogil=True)
 def _partition(values, low, high):
-    """Partition values low..high around a pivot (Hoare); return i and j, j < i.
+    """Partition the values at indices low..high around a pivot (Hoare); return i and j, j < i.
 
-    No value up to j exceeds a value from i on, and all values between j and i are equal.
+    Values at indices up to j do not exceed those from i on, and all values in between are equal.
     """
     middle = (low + high) // 2
     a, pivot, c = values[low], values[middle], values[high]
@@ -162,7 +168,7 @@ def _partition(values, low, high):
 
 @njit(cache=True, nogil=True)
 def lower_bound(values, number):
-    """Return the number of values that are less than `number`; values (N,) must be ascending."""
+    """Return how many of the ascending values (N,) are less than `number`."""
     low, high = 0, len(values)
     while low < high:
         middle = (low + high) // 2
@@ -175,7 +181,7 @@ def lower_bound(values, number):
 
 @njit(cache=True, nogil=True)
 def _points_in_boxes(xyz, boxes, margin, begin, end, low, high):
-    """Return the result of points_in_boxes(), with the points of a box in any order."""
+    """Compute the result of points_in_boxes(), but with the points of a box in any order."""
     scale = (SLAB_COUNT - 1) / max(high - low, 1e-3)
     slab = np.full(len(xyz), SLAB_COUNT)  # the last slab holds points that no box can contain
     for i in range(len(xyz)):
@@ -223,30 +229,31 @@ def box_corners(boxes: np.ndarray) -> np.ndarray:
     cos, sin = np.cos(boxes[:, None, 6]), np.sin(boxes[:, None, 6])
     x = boxes[:, None, 0] + cos * offsets[..., 0] - sin * offsets[..., 1]
     y = boxes[:, None, 1] + sin * offsets[..., 0] + cos * offsets[..., 1]
-    half = boxes[:, None, 5] / 2
-    below, above = (np.broadcast_to(boxes[:, None, 2] + s * half, x.shape) for s in (-1, 1))
-    return np.concatenate([np.stack([x, y, below], -1), np.stack([x, y, above], -1)], axis=1)
+    half_height = boxes[:, None, 5] / 2
+    bottom, top = (np.broadcast_to(boxes[:, None, 2] + sign * half_height, x.shape) for sign in (-1, 1))
+    return np.concatenate([np.stack([x, y, bottom], -1), np.stack([x, y, top], -1)], axis=1)
 
 
-MAX_CORNERS = 8  # maximum corners where two rectangles overlap: clipping at four sides adds one corner each
+# Maximum corners of the overlap of two rectangles: clipping at each of four sides adds one corner to four.
+MAX_CORNERS = 8
 
 
 def bev_and_3d_iou(boxes: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return BEV IoU and 3D IoU, each (K, M) float64 0..1, of boxes (K, 7) and others (M, 7).
 
-    A box without area (BEV) or volume (3D), or with a value that is not finite, has IoU 0 with all
-    boxes, including itself.
+    A box that has no area (BEV) or no volume (3D), or a value that is not finite, has IoU 0 with
+    all boxes, including itself.
     """
     return _compute_ious(_to_rows(boxes), _to_rows(others))
 
 
 def bev_iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the BEV IoU (K, M) of bev_and_3d_iou."""
+    """Return the BEV IoU (K, M) of boxes (K, 7) and others (M, 7), see bev_and_3d_iou."""
     return bev_and_3d_iou(boxes, others)[0]
 
 
 def iou_3d(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the 3D IoU (K, M) of bev_and_3d_iou."""
+    """Return the 3D IoU (K, M) of boxes (K, 7) and others (M, 7), see bev_and_3d_iou."""
     return bev_and_3d_iou(boxes, others)[1]
 
 
@@ -258,14 +265,14 @@ def _to_rows(boxes: np.ndarray) -> np.ndarray:
 def _compute_ious(boxes, others):
     bev_ious = np.zeros((len(boxes), len(others)))
     volume_ious = np.zeros((len(boxes), len(others)))
-    reach, other_reach = footprint_radii(boxes), footprint_radii(others)
-    work = np.empty((4, MAX_CORNERS))
+    radii, other_radii = footprint_radii(boxes), footprint_radii(others)
+    buffer = np.empty((4, MAX_CORNERS))
     for i in range(len(boxes)):
         a = boxes[i]
         area_a = a[3] * a[4]
         for j in range(len(others)):
             b = others[j]
-            overlap = overlap_area(a, b, reach[i] + other_reach[j], work)
+            overlap = overlap_area(a, b, radii[i] + other_radii[j], buffer)
             if overlap <= 0:
                 continue
             area_b = b[3] * b[4]
@@ -280,9 +287,9 @@ def _compute_ious(boxes, others):
 
 @njit(cache=True, nogil=True)
 def footprint_radii(boxes):
-    """Return the distance (K,) of the corners of boxes (K, 7) from their centres in x-y.
+    """Return the distance (K,) in x-y from the centre to the corners of each box (K, 7).
 
-    It is NaN for boxes without area or with a value that is not finite.
+    The distance is NaN for a box that has no area or a value that is not finite.
     """
     radii = np.full(len(boxes), np.nan)
     for i in range(len(boxes)):
@@ -292,18 +299,18 @@ def footprint_radii(boxes):
 
 
 @njit(cache=True, nogil=True)
-def overlap_area(a, b, reach, work):
+def overlap_area(a, b, max_distance, buffer):
     """Return the area in x-y where two boxes (7,) overlap.
 
     Args:
-        reach: sum of their footprint radii. The area is 0 if reach is NaN or the centres are
+        max_distance: sum of their footprint radii. The area is 0 if it is NaN or the centres are
             farther apart.
-        work: (4, MAX_CORNERS) float64 buffer, which is overwritten.
+        buffer: (4, MAX_CORNERS) float64, which is overwritten.
     """
     dx, dy = a[0] - b[0], a[1] - b[1]
-    if not dx * dx + dy * dy < reach * reach:
+    if not dx * dx + dy * dy < max_distance * max_distance:
         return 0.0
-    x, y, cut_x, cut_y = work[0], work[1], work[2], work[3]
+    x, y, cut_x, cut_y = buffer[0], buffer[1], buffer[2], buffer[3]
     cos, sin = math.cos(b[6]), math.sin(b[6])
     centre_x, centre_y = cos * dx + sin * dy, cos * dy - sin * dx
     cos, sin = math.cos(a[6] - b[6]), math.sin(a[6] - b[6])
@@ -323,21 +330,21 @@ def overlap_area(a, b, reach, work):
 
 
 @njit(cache=True, nogil=True)
-def _clip(u, v, count, sign, limit, kept_u, kept_v):
+def _clip(u, v, count, sign, limit, clipped_u, clipped_v):
     """Clip a convex polygon u, v with `count` corners to sign * u <= limit.
 
-    Writes the remaining corners to kept_u and kept_v and returns their number.
+    Writes the corners of the clipped polygon to clipped_u and clipped_v and returns their number.
     """
-    kept_count = 0
+    clipped_count = 0
     for k in range(count):
         next_corner = k + 1 if k + 1 < count else 0
         distance, next_distance = sign * u[k] - limit, sign * u[next_corner] - limit
         if distance <= 0:
-            kept_u[kept_count], kept_v[kept_count] = u[k], v[k]
-            kept_count += 1
+            clipped_u[clipped_count], clipped_v[clipped_count] = u[k], v[k]
+            clipped_count += 1
         if (distance < 0 and next_distance > 0) or (distance > 0 and next_distance < 0):
             fraction = distance / (distance - next_distance)
-            kept_u[kept_count] = sign * limit
-            kept_v[kept_count] = v[k] + fraction * (v[next_corner] - v[k])
-            kept_count += 1
-    return kept_count
+            clipped_u[clipped_count] = sign * limit
+            clipped_v[clipped_count] = v[k] + fraction * (v[next_corner] - v[k])
+            clipped_count += 1
+    return clipped_count

@@ -15,7 +15,7 @@ class Groups(NamedTuple):
     Attributes:
         rows: (M,) int64 rows of the points, cluster after cluster, each in the order of the input.
         start: (K + 1,) int64; cluster i has rows[start[i]:start[i + 1]].
-        numbers: (K,) int64 ids of the clusters.
+        numbers: (K,) int64 ids of the clusters, ascending.
     """
 
     rows: np.ndarray
@@ -46,10 +46,10 @@ def group_by_id(ids: np.ndarray, min_points: int = 1) -> Groups:
 
 
 def count_clusters(labels: np.ndarray) -> int:
-    """Return the number of clusters, K, of labels (N,) between 0 and K.
+    """Return the number of clusters K, given the labels (N,) of the points between 0 and K.
 
     Raises:
-        InputError: K is larger than N, so arrays of K rows could exceed the memory. Call
+        InputError: K is larger than N, so arrays with K rows could exceed the memory. Call
             renumber_ids() first to close the gaps.
     """
     count = int(labels.max(initial=0))
@@ -61,34 +61,38 @@ def count_clusters(labels: np.ndarray) -> int:
     return count
 
 
-def group_points(xyz: np.ndarray, labels: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (M, 3) of some clusters, one cluster after the other, and their starts (K + 1,).
+def group_points(xyz: np.ndarray, labels: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Collect the points of some clusters.
 
     Args:
-        labels: (N,) ids, 0 for no cluster, at most N.
-        wanted: (K,) ids of the clusters, without duplicates.
+        xyz: (N, 3) points.
+        labels: (N,) cluster id of each point, at most N, 0 for no cluster.
+        ids: (K,) ids of the clusters, without duplicates.
+
+    Returns:
+        The points (M, 3), cluster after cluster, and the starts (K + 1,) of the clusters.
     """
-    group_of_id = np.full(count_clusters(labels) + 1, -1)
-    group_of_id[wanted] = np.arange(len(wanted))
-    group = group_of_id[labels]
-    members = np.flatnonzero(group >= 0)
-    members = members[np.argsort(group[members], kind="stable")]
-    sizes = np.bincount(group[members], minlength=len(wanted))
+    group_by_id = np.full(count_clusters(labels) + 1, -1)
+    group_by_id[ids] = np.arange(len(ids))
+    groups = group_by_id[labels]
+    members = np.flatnonzero(groups >= 0)
+    members = members[np.argsort(groups[members], kind="stable")]
+    sizes = np.bincount(groups[members], minlength=len(ids))
     return xyz.take(members, axis=0), _cumulate(sizes)
 
 
 def renumber_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Renumber cluster ids from any source to 1..K without gaps.
 
-    Ids that are not finite or not above 0 mean no cluster. The same holds for 2^32 - 1 as uint32,
-    which some nodes write for -1.
+    Ids that are not finite or not positive mean no cluster; so does 2^32 - 1 as uint32, which some
+    nodes write for -1.
 
     Args:
         ids: (N,) integers, or floats with integer values.
 
     Returns:
-        labels (N,) int32: 1..K, 0 for no cluster.
-        numbers (K,) int64: the original ids, ascending.
+        labels: (N,) int32, 1..K, 0 for no cluster.
+        numbers: (K,) int64 original ids, ascending.
 
     Raises:
         InputError: an id has a fraction or is too large for float64 to hold exactly, or the type of
@@ -101,12 +105,12 @@ def renumber_ids(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ids = np.where(np.isfinite(ids) & (ids > 0), ids, 0).astype(np.float64)
         if not (ids == np.floor(ids)).all() or ids.max(initial=0) > 2.0**53:
             raise InputError(
-                "the column of cluster ids has values that are not whole numbers; give whole numbers, 0 for no cluster"
+                "the column of cluster ids has values that are not whole numbers; write whole numbers, 0 for no cluster"
             )
     elif ids.dtype.kind not in "iub":
-        raise InputError(f"the column of cluster ids is of type {ids.dtype}; give whole numbers")
+        raise InputError(f"the column of cluster ids has the type {ids.dtype}; write whole numbers")
     ids = ids.astype(np.int64)
-    if ids.max(initial=0) <= len(ids):  # counting avoids a sort, as for our own ids
+    if ids.max(initial=0) <= len(ids):  # true for ids of this package; counting avoids a sort
         ids = np.maximum(ids, 0)
         is_used = np.bincount(ids, minlength=1) > 0
         is_used[0] = False

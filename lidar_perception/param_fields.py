@@ -1,4 +1,4 @@
-"""Declaration of parameters: dataclass fields with unit, range and description.
+"""Declaration of parameters as dataclass fields with unit, range and description.
 
 Values are checked on construction. Groups may be nested; the fields of inner groups have dotted
 names, such as ground.cloth.resolution.
@@ -14,10 +14,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import field, fields
 from typing import Any
 
-from lidar_perception.types import did_you_mean, valid_names
+from lidar_perception.types import list_valid_names, suggest_name
 
 MAX_INT = 2**31 - 1
-SHORT_REPR = reprlib.Repr()  # shows refused values in one line
+SHORT_REPR = reprlib.Repr()  # formats invalid values for error messages of one line
 SHORT_REPR.maxstring = SHORT_REPR.maxother = SHORT_REPR.maxlong = 80
 SHORT_REPR.maxlevel = 2
 
@@ -35,7 +35,7 @@ def param(
     """Declare a parameter: a dataclass field with metadata for ROS, YAML, command line and docs.
 
     Args:
-        default: default value; a type means an empty list of that type.
+        default: default value, or a type for an empty list with items of that type.
         doc: description, one or more sentences.
         low, high: inclusive limits.
         fixed: True if the parameter cannot change while a node runs.
@@ -57,32 +57,32 @@ class Params:
         self.check()
 
     def check(self) -> None:
-        """Check conditions between fields; raise ValueError if one does not hold."""
+        """Check conditions that involve several fields; raise ValueError if one is violated."""
 
 
 def _check_value(f: dataclasses.Field[Any], value: Any) -> Any:
-    """Return the value, converted to the type of the field's default. ValueError if invalid."""
+    """Return the value, converted to the type of the field's default. Raises ValueError if invalid."""
     default, limits = f.default, f.metadata
     if isinstance(default, tuple):
         if isinstance(value, str) or not hasattr(value, "__iter__"):
-            raise ValueError(f"{f.name} = {SHORT_REPR.repr(value)} must be a list of {limits['item'].__name__}")
+            raise ValueError(f"{f.name} = {SHORT_REPR.repr(value)} must be a list of {limits['item'].__name__} values")
         return tuple(_check_scalar(f, limits["item"], item) for item in value)
     value = _check_scalar(f, type(default), value)
     if limits["choices"] and value not in limits["choices"]:
         raise ValueError(
             f"{f.name} = {value!r} must be one of {', '.join(limits['choices'])}"
-            + did_you_mean(value, limits["choices"])
+            + suggest_name(value, limits["choices"])
         )
     return value
 
 
-def _check_scalar(f: dataclasses.Field[Any], kind: type[Any], value: Any) -> Any:
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+def _check_scalar(f: dataclasses.Field[Any], scalar_type: type[Any], value: Any) -> Any:
+    if scalar_type is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**63 else math.inf if value > 0 else -math.inf
-    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise ValueError(f"{f.name} = {SHORT_REPR.repr(value)} must be of type {kind.__name__}")
+    if not isinstance(value, scalar_type) or (scalar_type is int and isinstance(value, bool)):
+        raise ValueError(f"{f.name} = {SHORT_REPR.repr(value)} must be of type {scalar_type.__name__}")
     low, high = f.metadata["low"], f.metadata["high"]
-    if kind is float and math.isnan(value):
+    if scalar_type is float and math.isnan(value):
         raise ValueError(f"{f.name} is not a number (NaN)")
     if (low is not None and value < low) or (high is not None and value > high):
         bounds = f"{'-inf' if low is None else low} .. {'inf' if high is None else high}"
@@ -92,7 +92,7 @@ def _check_scalar(f: dataclasses.Field[Any], kind: type[Any], value: Any) -> Any
 
 
 def _walk_fields(params: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
-    """Yield (dotted name, value, field) of every parameter of a group or a dataclass of groups."""
+    """Yield (dotted name, value, field) for every parameter of a group or a dataclass of groups."""
     for f in fields(params):
         value = getattr(params, f.name)
         if dataclasses.is_dataclass(value):
@@ -110,20 +110,20 @@ def flatten(params: Any) -> dict[str, Any]:
 
 
 def collect_fields(params: Any) -> dict[str, dataclasses.Field[Any]]:
-    """Return the fields of all parameters by dotted name, with the values of params as defaults."""
+    """Return the fields of all parameters by dotted name, with the values in `params` as defaults."""
     return {name: _with_default(f, value) for name, value, f in _walk_fields(params)}
 
 
 def _with_default(f: dataclasses.Field[Any], value: Any) -> dataclasses.Field[Any]:
     if f.default == value:
         return f
-    changed = copy.copy(f)
-    changed.default = value
-    return changed
+    new_field = copy.copy(f)
+    new_field.default = value
+    return new_field
 
 
 def describe_fields(fields: Mapping[str, dataclasses.Field[Any]]) -> list[str]:
-    """Return lines of text with the name, default, unit and description of each field."""
+    """Return lines of help text with the name, default, unit and description of each field."""
     lines = []
     for name, f in fields.items():
         default = list(f.default) if isinstance(f.default, tuple) else f.default
@@ -133,27 +133,27 @@ def describe_fields(fields: Mapping[str, dataclasses.Field[Any]]) -> list[str]:
 
 
 def with_values(params: Any, values: Mapping[str, Any]) -> Any:
-    """Return params with other values, given by dotted name: {'clustering.dbscan.min_samples': 5}.
+    """Return a copy of params with other values, such as {'clustering.dbscan.min_samples': 5}.
 
     Raises:
         ValueError: a parameter is unknown, or a value is invalid.
     """
-    known = collect_fields(params)
-    if unknown := [name for name in values if name not in known]:
-        raise ValueError(f"unknown parameter {unknown[0]!r}{valid_names(unknown[0], known)}")
+    valid_names = collect_fields(params)
+    if unknown := [name for name in values if name not in valid_names]:
+        raise ValueError(f"unknown parameter {unknown[0]!r}{list_valid_names(unknown[0], valid_names)}")
     return _replace_values(params, values, "")
 
 
 def _replace_values(params: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    changed = {}
+    new_values = {}
     for f in fields(params):
-        inner, name = getattr(params, f.name), prefix + f.name
-        if dataclasses.is_dataclass(inner):
-            changed[f.name] = _replace_values(inner, values, f"{name}.")
+        old_value, name = getattr(params, f.name), prefix + f.name
+        if dataclasses.is_dataclass(old_value):
+            new_values[f.name] = _replace_values(old_value, values, f"{name}.")
         elif name in values:
-            changed[f.name] = values[name]
+            new_values[f.name] = values[name]
     try:
-        return dataclasses.replace(params, **changed)
+        return dataclasses.replace(params, **new_values)
     except ValueError as error:
         # Errors of inner groups already have the full name.
         raise ValueError(f"{prefix}{error}") from None

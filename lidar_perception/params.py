@@ -1,7 +1,7 @@
 """Parameters of the nodes, composed of the parameter groups of the algorithms.
 
-Each number is defined once, in the params.py of its package, as a field of a frozen dataclass. The
-ROS parameters with their descriptors, the check of YAML files, the command-line flags and the
+Each parameter is defined once, in the params.py of its package, as a field of a frozen dataclass.
+The ROS parameters with their descriptors, the checks of YAML files, the command-line flags and the
 tables in docs/ are generated from these fields. A value outside its range raises ValueError.
 """
 
@@ -28,7 +28,7 @@ from lidar_perception.wire.params import InputParams, ViewParams
 
 @dataclass(frozen=True)
 class ReceptionParams(Params):
-    """Reception of clouds, and the limits of its diagnostics."""
+    """Parameters for receiving clouds, and the limits of the diagnostics."""
 
     reliability: str = param(
         "auto",
@@ -39,14 +39,15 @@ class ReceptionParams(Params):
     )
     queue: int = param(
         1,
-        "Number of clouds that wait while one is processed; older ones are dropped and counted. 1: only the newest.",
+        "Maximum number of clouds that wait while one is processed; older ones are dropped and counted. 1: "
+        "only the newest cloud.",
         low=1,
         high=1000,
     )
     max_wait: float = param(
         10.0,
-        "Maximum time that a cloud waits for data that it needs, such "
-        "as the camera calibration with view.enabled, or a transform.",
+        "Maximum time that a cloud waits for other data, such as a "
+        "transform or, with view.enabled, the camera calibration.",
         unit="s",
         low=0.0,
         high=3600.0,
@@ -58,7 +59,7 @@ class ReceptionParams(Params):
         low=0.0,
         high=1000.0,
     )
-    min_rate: float = param(0.7, "WARN below this fraction of the rate.", low=0.0, high=1.0)
+    min_rate: float = param(0.7, "WARN if clouds arrive at less than this fraction of the rate.", low=0.0, high=1.0)
     error_after: float = param(
         2.0,
         "ERROR after this time without a cloud, and at least three periods of the rate.",
@@ -108,13 +109,13 @@ class ReceptionParams(Params):
 
 @dataclass(frozen=True)
 class MarkerParams(Params):
-    """Boxes for RViz and Foxglove."""
+    """Parameters of markers for RViz and Foxglove."""
 
     marker_lifetime: float = param(
         2.0,
         "Lifetime of markers after their last update, at least "
-        "2.5 periods of the rate (`input.rate`), so that those of a "
-        "dead node disappear; 0: no limit.",
+        "2.5 periods of the rate (`input.rate`), so that the markers "
+        "of a dead node disappear; 0: no limit.",
         unit="s",
         low=0.0,
         high=1e6,
@@ -123,14 +124,14 @@ class MarkerParams(Params):
 
 @dataclass(frozen=True)
 class TrackMarkerParams(MarkerParams):
-    """Boxes and trails of tracks."""
+    """Parameters of markers with boxes and trails of tracks."""
 
     trail: float = param(2.0, "Duration of the drawn path of a track; 0: no path.", unit="s", low=0.0, high=60.0)
 
 
 @dataclass(frozen=True)
 class OptionalTracking(TrackingParams):
-    """Tracking in the process of a detector."""
+    """Parameters of tracking within a detector node."""
 
     enabled: bool = param(False, "Also publish tracks of the detections on ~/output/tracks.", fixed=True)
 
@@ -142,14 +143,15 @@ class CloudNodeParams(Params):
     input: ReceptionParams = ReceptionParams()
     base_frame: str = param(
         "",
-        "A frame on the ground, such as base_footprint. Height, roll and "
-        "pitch of the sensor come from TF instead of ground.sensor_pose, and "
-        "all computations use the levelled cloud. Empty: off.",
+        "A frame on the ground, such as base_footprint. If set, height, roll "
+        "and pitch of the sensor come from TF instead of ground.sensor_pose, "
+        "and all computations use the levelled cloud. Empty: off.",
         fixed=True,
     )
     autostart: bool = param(
         True,
-        "Configure and activate at the start. false: left to a lifecycle manager, such as Nav2's, or `ros2 lifecycle`.",
+        "Configure and activate the node at the start. false: a lifecycle manager, such as Nav2's, or "
+        "`ros2 lifecycle` does it.",
         fixed=True,
     )
 
@@ -160,7 +162,10 @@ class BoxNodeParams(CloudNodeParams):
 
     output: MarkerParams = MarkerParams()
     target_frame: str = param(
-        "", "Frame of the published boxes, by TF at the stamp of their cloud. Empty: the cloud's frame.", fixed=True
+        "",
+        "Frame of the published boxes; they are transformed with TF at the stamp of their cloud. Empty: the "
+        "cloud's frame.",
+        fixed=True,
     )
 
 
@@ -171,8 +176,8 @@ class GroundExtraParams(CloudNodeParams):
     range: str = param(
         "all",
         "Segment only the points that a detector with this range reads, see `fused.range`; "
-        "the others have 2 in `in_view`. Launch files and `demo` set it if all detectors have the "
-        "same range. The outputs ground, nonground and obstacles always cover the whole cloud.",
+        "the other points have 2 in `in_view`. Launch files and `demo` set it if all detectors have "
+        "the same range. The outputs ground, nonground and obstacles always cover the full cloud.",
         choices=("all", "ahead", "around"),
     )
     obstacles: ObstacleParams = ObstacleParams()
@@ -196,7 +201,7 @@ class PerceptionExtraParams(DetectionNodeParams):
 
 @dataclass(frozen=True)
 class TrackerExtraParams(CloudNodeParams):
-    """Additional parameters of tracker. Its queue is longer, as no detection may be skipped."""
+    """Additional parameters of tracker. Its queue is longer, so that no detections are skipped."""
 
     input: ReceptionParams = ReceptionParams(queue=10)
     output: TrackMarkerParams = TrackMarkerParams()
@@ -235,9 +240,9 @@ class TrackerNodeParams:
 
 @dataclass(frozen=True)
 class PlayerParams(Params):
-    """Replay of a bag."""
+    """Parameters of bag_player, which replays a bag."""
 
-    bag: str = param("", "Folder of the bag, or one .mcap or .db3 file, or .bag of ROS 1.", fixed=True)
+    bag: str = param("", "Folder of the bag, or a single .mcap, .db3 or ROS 1 .bag file.", fixed=True)
     rate: float = param(1.0, "Speed of the replay; 2.0 is twice as fast as recorded.", low=0.01, high=100.0)
     loop: bool = param(False, "Start again at the end.")
     start_offset: float = param(
@@ -252,30 +257,35 @@ class PlayerParams(Params):
     )
     wait_for: tuple[str, ...] = param(
         str,
-        "Topics that must have a subscriber before the first "
-        "message, or COUNT subscribers: TOPIC:=COUNT. Topics of "
-        "other nodes are allowed. Empty: the bag's clouds.",
+        "Topics that must have a subscriber, or COUNT subscribers "
+        "with TOPIC:=COUNT, before the first message is sent. Topics "
+        "of other nodes are allowed. Empty: the bag's clouds.",
         fixed=True,
     )
     follow: tuple[str, ...] = param(
         str,
         "Topics of detections (MarkerArray): the next cloud is "
-        "sent once all of them have answered the previous ones, so "
-        "that none is lost; meanwhile the bag's time is paused. "
-        "Empty: play in real time, like a sensor.",
+        "sent when the detections of the previous clouds have arrived "
+        "on all of them, so that no cloud is lost; meanwhile the bag's "
+        "time is paused. Empty: play in real time, like a sensor.",
         fixed=True,
     )
     ahead: int = param(
         1,
-        "With `follow`: maximum number of clouds without an answer. The nodes "
-        "need an `input.queue` of at least this size. 0: play in real time; "
-        "answers are only timed.",
+        "With `follow`: maximum number of clouds whose detections have not "
+        "arrived yet. The nodes need an `input.queue` of at least this size. "
+        "0: play in real time, and only measure when the detections arrive.",
         low=0,
         high=1000,
         fixed=True,
     )
     follow_timeout: float = param(
-        10.0, "Maximum wait for an answer; missing answers are counted.", unit="s", low=0.1, high=3600.0, fixed=True
+        10.0,
+        "Maximum time to wait for the detections of a cloud; missing ones are counted.",
+        unit="s",
+        low=0.1,
+        high=3600.0,
+        fixed=True,
     )
     wait_timeout: float = param(
         10.0, "Start without subscribers after this time; 0: do not wait.", unit="s", low=0.0, high=3600.0, fixed=True
@@ -284,7 +294,7 @@ class PlayerParams(Params):
 
 @dataclass(frozen=True)
 class RecorderParams(Params):
-    """Recording of topics to a rosbag2 bag."""
+    """Parameters of bag_recorder, which records topics to a rosbag2 bag."""
 
     bag: str = param("", "Folder to create for the bag.", fixed=True)
     topics: tuple[str, ...] = param(str, "Topics to record.", fixed=True)
@@ -298,16 +308,16 @@ class RecorderParams(Params):
 
 @dataclass(frozen=True)
 class EvaluatorParams(Params):
-    """Scores of detections against ground truth."""
+    """Parameters of the evaluator, which scores detections against ground truth."""
 
     stages: tuple[str, ...] = param(("final",), "Inputs to score; each NAME is the topic ~/input/NAME.", fixed=True)
     timing: tuple[str, ...] = param(
-        str, "Topics with times in ms (std_msgs/Float64), of which the median is reported.", fixed=True
+        str, "Topics with run times in ms (std_msgs/Float64); their medians are reported.", fixed=True
     )
     file: str = param(
         "", "JSON file for the scores, written at the end and every few seconds; empty: none.", fixed=True
     )
     classes: tuple[str, ...] = param(tuple(DETECTED), f"Classes to score, of {', '.join(DETECTED)}.", fixed=True)
     only_with_pedestrians: bool = param(
-        True, "Score Pedestrian only in frames with a Pedestrian in the ground truth (protocol of the STM-CPA paper)."
+        True, "Score pedestrians only in frames with a labelled pedestrian, as in the protocol of the STM-CPA paper."
     )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidar_perception.classes import CLASSES, PEDESTRIAN, class_name
+from lidar_perception.classes import CLASSES, PEDESTRIAN, find_class_name
 from lidar_perception.intensity import to_unit
 
 __all__ = [
@@ -25,13 +25,13 @@ __all__ = [
     "InputError",
     "InputWarning",
     "PointCloud",
-    "usable_returns",
+    "are_usable_returns",
 ]
 
 MAX_RANGE = 1e5  # metres; points beyond this range are invalid returns
 MIN_NAME_SIMILARITY = 0.6  # minimum similarity of a misspelt name to the right one, 0..1 as in difflib
-MIN_PREFIX = 3  # characters that a misspelt name shares with the right one
-MAX_NUMBER = 1e9  # larger numbers in labels are corrupt
+MIN_PREFIX = 3  # number of first characters that a misspelt name must share with the right one
+MAX_NUMBER = 1e9  # larger numbers in labels are considered corrupt
 SENSOR_HEIGHT = 1.73  # height of KITTI's sensor above the road in metres; default of anchors and simulation
 
 
@@ -47,13 +47,13 @@ class InputWarning(UserWarning):
     """A problem in input that can still be used. The message is one line."""
 
 
-def closest_name(name: object, known: Iterable[str]) -> str | None:
-    """Return the known name that is closest to a misspelt or shortened one, or None.
+def find_closest_name(name: object, valid_names: Iterable[str]) -> str | None:
+    """Return the valid name that is closest to a misspelt or shortened one, or None.
 
     Names that begin with `name` are preferred, then names with a similar spelling, then names with
     the same first characters.
     """
-    target, by_spelling = _normalise(str(name)), {_normalise(n): n for n in known}
+    target, by_spelling = _normalise(str(name)), {_normalise(n): n for n in valid_names}
     same_prefix = [n for n in by_spelling if n[:MIN_PREFIX] == target[:MIN_PREFIX]]
     matches = (
         [n for n in same_prefix if n.startswith(target)]
@@ -67,33 +67,34 @@ def _normalise(name: str) -> str:
     return name.lower().replace("_", "-")
 
 
-def unknown_name(what: str, name: object, known: Iterable[str]) -> InputError:
-    """Return an error that lists the closest match and all valid names.
+def make_unknown_name_error(noun: str, name: object, valid_names: Iterable[str]) -> InputError:
+    """Return an error with the closest match and a list of all valid names.
 
     Args:
-        what: kind of the named thing, such as "sensor".
+        noun: what the name stands for, such as "sensor".
         name: the unknown name.
-        known: all valid names.
+        valid_names: all valid names.
     """
-    return InputError(f"there is no {what} {str(name)[:80]!r}{valid_names(name, known)}")
+    return InputError(f"unknown {noun} {str(name)[:80]!r}{list_valid_names(name, valid_names)}")
 
 
-def valid_names(name: object, known: Iterable[str]) -> str:
+def list_valid_names(name: object, valid_names: Iterable[str]) -> str:
     """Return the end of a message about an unknown name, with the closest match and all names."""
-    known = list(known)
-    guess = did_you_mean(name, known)
-    return f"{guess} Valid names: {', '.join(known)}" if guess else (f"; valid names: {', '.join(known)}")
+    valid_names = list(valid_names)
+    suggestion = suggest_name(name, valid_names)
+    names_text = ", ".join(valid_names)
+    return f"{suggestion} Valid names: {names_text}" if suggestion else f"; valid names: {names_text}"
 
 
-def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return "; did you mean 'X'?", or "" if no known name is similar."""
-    guess = closest_name(name, known)
+def suggest_name(name: object, valid_names: Iterable[str]) -> str:
+    """Return "; did you mean 'X'?", or "" if no valid name is similar."""
+    guess = find_closest_name(name, valid_names)
     return f"; did you mean {guess!r}?" if guess else ""
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """The usable points (see usable_returns) of one cloud.
+    """The usable points (see are_usable_returns) of one cloud.
 
     Attributes:
         xyz: (N, 3) float32, C-contiguous, metres in frame_id.
@@ -111,11 +112,11 @@ class PointCloud:
         shape = np.shape(self.xyz)
         if len(shape) != 2 or shape[1] != 3:
             raise InputError(
-                f"xyz of a PointCloud has shape {shape}, not (N, 3); PointCloud.of takes points (N, 3) or (N, 4)"
+                f"xyz of a PointCloud has shape {shape}, expected (N, 3); PointCloud.of accepts points (N, 3) or (N, 4)"
             )
         if self.intensity is not None and np.shape(self.intensity) != shape[:1]:
             raise InputError(
-                f"intensity has shape {np.shape(self.intensity)} for {shape[0]} points; give ({shape[0]},) or None"
+                f"intensity has shape {np.shape(self.intensity)} for {shape[0]} points, expected ({shape[0]},)"
             )
 
     @staticmethod
@@ -126,7 +127,7 @@ class PointCloud:
         frame_id: str = "",
         intensity_max: float | None = None,
     ) -> PointCloud:
-        """Make a cloud of the usable points (see usable_returns) of a sensor.
+        """Make a cloud from the usable points (see are_usable_returns) of a sensor.
 
         Args:
             points: (N, 3) [x y z] or (N, 4) [x y z intensity] of any real type; metres, x forward,
@@ -136,22 +137,22 @@ class PointCloud:
                 for uint8, otherwise 1. Detectors report intensities with an implausible scale.
 
         Raises:
-            InputError: wrong shape or type. The message names the shape and the allowed ones.
+            InputError: an array has a wrong shape or type.
         """
         cloud = as_point_cloud(points, intensity, stamp_ns, frame_id, intensity_max)
-        usable = usable_returns(cloud.xyz)
-        return cloud if usable.all() else cloud.take(np.flatnonzero(usable))
+        is_usable = are_usable_returns(cloud.xyz)
+        return cloud if is_usable.all() else cloud.take(np.flatnonzero(is_usable))
 
     def __len__(self) -> int:
         return len(self.xyz)
 
     def take(self, indices: np.ndarray) -> PointCloud:
-        """Return the cloud of the points at indices (M,)."""
+        """Return a cloud with only the points at indices (M,)."""
         intensity = None if self.intensity is None else self.intensity.take(indices)
         return PointCloud(self.xyz.take(indices, axis=0), intensity, self.stamp_ns, self.frame_id)
 
     def points(self) -> np.ndarray:
-        """Return (N, 4) float32 [x y z intensity], with 0 for a missing intensity."""
+        """Return (N, 4) float32 [x y z intensity]; the intensity is 0 if it is missing."""
         intensity = np.zeros(len(self), np.float32) if self.intensity is None else self.intensity
         return np.column_stack([self.xyz, intensity])
 
@@ -163,9 +164,9 @@ def as_point_cloud(
     frame_id: str = "",
     intensity_max: float | None = None,
 ) -> PointCloud:
-    """Make a cloud of all points, including unusable ones; a PointCloud is returned unchanged.
+    """Make a cloud from all points, including unusable ones; a PointCloud is returned unchanged.
 
-    For arguments and errors see PointCloud.of.
+    Arguments and errors are those of PointCloud.of.
     """
     if isinstance(cloud, PointCloud):
         return cloud
@@ -188,13 +189,13 @@ def as_point_cloud(
                 if shape[0] in (3, 4)
                 else ""
             )
-        raise InputError(f"a cloud has shape {shape}; allowed are (N, 3) [x y z] and (N, 4) [x y z intensity]{remedy}")
+        raise InputError(f"a cloud has shape {shape}, expected (N, 3) [x y z] or (N, 4) [x y z intensity]{remedy}")
     if points.shape[1] == 4 and intensity is not None:
         raise InputError(
-            "the intensity is given twice, as a column of points (N, 4) and as intensity; pass points[:, :3]"
+            "the intensity is given both as column 3 of points (N, 4) and as `intensity`; pass points[:, :3]"
         )
     if intensity_max is not None and not 0 < intensity_max < np.inf:
-        raise InputError(f"intensity_max is {intensity_max:g}; it must be above 0: 1, 100 or 255 for most drivers")
+        raise InputError(f"intensity_max is {intensity_max:g}, but must be above 0: 1, 100 or 255 for most drivers")
     values = (
         points[:, 3]
         if points.shape[1] == 4
@@ -208,16 +209,16 @@ def as_point_cloud(
     return PointCloud(xyz, values, stamp_ns, frame_id)
 
 
-def _to_numbers(array: Any, what: str, allowed: str) -> np.ndarray:
+def _to_numbers(array: Any, noun: str, expected: str) -> np.ndarray:
     try:
         values = np.asarray(array)
     except (TypeError, ValueError, RuntimeError) as error:  # ragged lists, tensors on a GPU
         raise InputError(
-            f"{what} cannot be read as an array ({str(error).splitlines()[0]}); allowed: {allowed}"
+            f"{noun} cannot be converted to an array ({str(error).splitlines()[0]}); expected {expected}"
         ) from None
     if values.dtype.kind not in "fiu":
-        kind = f" of {values.dtype.name}" if isinstance(array, np.ndarray) else ""
-        raise InputError(f"{what} is {type(array).__name__}{kind}; allowed: {allowed}")
+        dtype_text = f" of {values.dtype.name}" if isinstance(array, np.ndarray) else ""
+        raise InputError(f"{noun} has type {type(array).__name__}{dtype_text}; expected {expected}")
     return values
 
 
@@ -227,16 +228,16 @@ def check_columns(count: int, **columns: ArrayLike | None) -> None:
         if column is not None and np.shape(column) != (count,):
             size = np.size(column)
             actual = f"{size} values" if size != count else f"shape {np.shape(column)}"
-            raise InputError(f"{name} has {actual} for {count} points")
+            raise InputError(f"{name} has {actual} for {count} points, expected one value per point")
 
 
-def usable_returns(xyz: np.ndarray) -> np.ndarray:
+def are_usable_returns(xyz: np.ndarray) -> np.ndarray:
     """Return (N,) bool: True for points that are finite, within MAX_RANGE and not at the origin.
 
     Drivers report missing returns as points at the origin.
     """
     with np.errstate(invalid="ignore", over="ignore"):
-        squared_range = np.einsum("ij,ij->i", xyz, xyz)  # NaN and inf survive
+        squared_range = np.einsum("ij,ij->i", xyz, xyz)  # keeps NaN and inf
         return (squared_range > 0.0) & (squared_range <= MAX_RANGE * MAX_RANGE)
 
 
@@ -248,8 +249,8 @@ class Detections:
         boxes: (K, 7) float32 [x y z l w h yaw].
         class_ids: (K,) int32 indices into CLASSES.
         scores: (K,) float32.
-        sources: of a combined detector, the probabilities (K,) float32 from each of its parts, by
-            name of the part; NaN for boxes without one. Empty for other detectors.
+        sources: probabilities (K,) float32 from each part of a combined detector, by the name of
+            the part; NaN for boxes that the part did not score. Empty for other detectors.
     """
 
     boxes: np.ndarray
@@ -263,20 +264,22 @@ class Detections:
 
         Args:
             boxes: (K, 7) [x y z l w h yaw] of any real type, or (7,) for one box.
-            class_ids: (K,) indices into CLASSES or names such as "Pedestrian", or one for all.
-            scores: (K,), or one for all.
+            class_ids: (K,) indices into CLASSES or names such as "Pedestrian", or one for all boxes.
+            scores: (K,), or one for all boxes.
 
         Raises:
-            InputError: wrong shape, or an unknown name.
+            InputError: an array has a wrong shape, or a class name is unknown.
         """
         rows = _to_numbers(boxes, "boxes", "numbers (K, 7) [x y z l w h yaw]")
         if rows.ndim > 2 or (rows.size and rows.shape[-1:] != (7,)):
-            raise InputError(f"boxes have shape {rows.shape}; allowed is (K, 7) [x y z l w h yaw]")
+            raise InputError(f"boxes have shape {rows.shape}, expected (K, 7) [x y z l w h yaw]")
         boxes = np.ascontiguousarray(rows, np.float32).reshape(-1, 7)
         count, columns = len(boxes), []
         for name, column in (("class_ids", _to_class_ids(class_ids)), ("scores", np.asarray(scores, np.float32))):
             if column.shape not in ((), (1,), (count,)):
-                raise InputError(f"{name} have shape {column.shape} for {count} boxes; give ({count},) or one number")
+                raise InputError(
+                    f"{name} have shape {column.shape} for {count} boxes, expected ({count},) or one number"
+                )
             columns.append(np.broadcast_to(column, count).copy())
         return Detections(boxes, columns[0], columns[1])
 
@@ -301,8 +304,8 @@ class Detections:
             {name: scores[index] for name, scores in self.sources.items()},
         )
 
-    def followed_by(self, others: Detections) -> Detections:
-        """Return these detections followed by the others; sources are dropped."""
+    def concatenate(self, others: Detections) -> Detections:
+        """Return these detections followed by the others, without sources."""
         return Detections(
             np.concatenate([self.boxes, others.boxes]),
             np.concatenate([self.class_ids, others.class_ids]),
@@ -315,14 +318,15 @@ def _to_class_ids(ids_or_names: ArrayLike) -> np.ndarray:
     if values.dtype.kind != "U":
         return np.asarray(ids_or_names, np.int32)
     for name in values.flat:
-        if class_name(name) not in CLASSES:
-            raise unknown_name("class", name, CLASSES)
-    return np.array(class_ids(values.flat), np.int32).reshape(values.shape)
+        if find_class_name(name) not in CLASSES:
+            raise make_unknown_name_error("class", name, CLASSES)
+    return np.array(find_class_ids(values.flat), np.int32).reshape(values.shape)
 
 
-def class_ids(names: Iterable[str]) -> list[int]:
-    """Return the indices into CLASSES of names in any spelling; unknown names are Misc."""
-    return [CLASSES.index(known if (known := class_name(name)) in CLASSES else "Misc") for name in names]
+def find_class_ids(names: Iterable[str]) -> list[int]:
+    """Return the indices into CLASSES of names in any spelling; unknown names become Misc."""
+    class_names = map(find_class_name, names)
+    return [CLASSES.index(name if name in CLASSES else "Misc") for name in class_names]
 
 
 @dataclass(frozen=True)
@@ -334,7 +338,8 @@ class GroundTruth:
         class_ids: (K,) int indices into CLASSES.
         extras: K dicts of optional fields: track_id, truncated, occluded, alpha, bbox [left top
             right bottom] in pixels.
-        notes: (class, extras) of objects without a 3D box, such as KITTI's DontCare regions.
+        notes: (class name, optional fields) of each object without a 3D box, such as KITTI's
+            DontCare regions.
     """
 
     boxes: np.ndarray
@@ -360,6 +365,6 @@ class GroundTruth:
     def labels(self) -> list[str]:
         return [CLASSES[i] for i in self.class_ids]
 
-    def of_class(self, class_id: int) -> np.ndarray:
+    def select_class(self, class_id: int) -> np.ndarray:
         """Return the boxes (M, 7) of one class."""
         return self.boxes[self.class_ids == class_id]

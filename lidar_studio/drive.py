@@ -20,7 +20,7 @@ from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.param_fields import with_values
 from lidar_perception.tracking.ego import is_valid_pose
-from lidar_perception.types import InputError, PointCloud, did_you_mean
+from lidar_perception.types import InputError, PointCloud, suggest_name
 from lidar_studio.interpolation import Motion
 from lidar_studio.journal import make_journal_header
 
@@ -198,7 +198,7 @@ def select_drive(recording: Recording, sequence: str | None = None) -> Drive:
         raise InputError(f"{recording.path} has {len(names)} drives; name one with --sequence: {names_text}")
     if sequence is not None and sequence not in names:
         raise InputError(
-            f"{recording.path} has no drive {sequence}; it has {names_text}" + did_you_mean(sequence, names)
+            f"{recording.path} has no drive {sequence}; it has {names_text}" + suggest_name(sequence, names)
         )
     selected = names[0] if sequence is None else sequence
     frames = [frame for frame in all_frames if frame.sequence == selected]

@@ -14,7 +14,7 @@ from lidar_perception.candidates.silhouette import compute_similarity
 from lidar_perception.classes import Size
 from lidar_perception.detectors.contract import FUSED
 from lidar_perception.geometry import centre_distances
-from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams
+from lidar_perception.tracking.params import MODEL_BY_CLASS_ID, TrackingParams
 from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
@@ -119,7 +119,7 @@ def find_objects(
         if name in CLASSES:
             distances = centre_distances(detections.boxes, box[None])[:, 0]
             others = distances > max(SAME_OBJECT_DISTANCE_M, box[3] / 3)
-            detections = detections[others].followed_by(Detections.of(box, CLASSES.index(name), PLACED_SCORE))
+            detections = detections[others].concatenate(Detections.of(box, CLASSES.index(name), PLACED_SCORE))
             candidates = np.append(candidates[others], False)
     return detections, candidates
 
@@ -133,7 +133,7 @@ def _find_people(survey: FrameSurvey, seeds: Sequence[SilhouetteSeed]) -> tuple[
         [complete_box(b, find_usual_size(CLASSES[PEDESTRIAN])) for b in survey.boxes[likely].astype(np.float64)]
     ).reshape(-1, 7)
     is_new = centre_distances(boxes, people).min(axis=1, initial=np.inf) > SAME_OBJECT_DISTANCE_M
-    objects = detections.followed_by(Detections.of(boxes[is_new], PEDESTRIAN, scores[likely][is_new]))
+    objects = detections.concatenate(Detections.of(boxes[is_new], PEDESTRIAN, scores[likely][is_new]))
     return objects, np.arange(len(objects)) >= len(detections)
 
 
@@ -153,11 +153,11 @@ def _add_similar_objects(
     min_distances = np.maximum(SAME_OBJECT_DISTANCE_M, boxes[:, None, 3] / 3)
     is_new = (centre_distances(boxes, detections.boxes) > min_distances).all(axis=1)
     classes = np.array([CLASSES.index(sizes[k].class_name) for k in best_seed[likely]], np.int32)
-    objects = detections.followed_by(Detections.of(boxes[is_new], classes[is_new], scores.max(axis=0)[likely][is_new]))
+    objects = detections.concatenate(Detections.of(boxes[is_new], classes[is_new], scores.max(axis=0)[likely][is_new]))
     return objects, np.append(candidates, np.ones(int(is_new.sum()), bool))
 
 
-NOT_VEHICLE_IDS = [i for i, kind in enumerate(KIND_OF_CLASS) if kind != KIND_OF_CLASS[0]]
+NOT_VEHICLE_IDS = [i for i, kind in enumerate(MODEL_BY_CLASS_ID) if kind != MODEL_BY_CLASS_ID[0]]
 
 
 def propose_tracks(

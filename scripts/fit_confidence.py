@@ -42,7 +42,7 @@ def select_pedestrians(frame: Frame) -> np.ndarray:
     """Return the labelled boxes (P, 7) of a simulated scan."""
     truth = frame.truth()
     assert truth is not None
-    return truth.of_class(PEDESTRIAN)
+    return truth.select_class(PEDESTRIAN)
 
 
 def collect_samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | None:

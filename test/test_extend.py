@@ -151,7 +151,7 @@ def test_class_needs_one_row_and_shipped_networks_still_work(copy, tmp_path):
     known, row = file.read_text(), '    ObjectClass("Truck", vehicle=True),\n'
     assert row in known
     file.unlink()  # a hard link to the original
-    numbers = "DetectionNumbers((8.0, 2.5, 3.2), 0.6, 0.45, (8.0, 2.5, 3.2), 5.0, 0.7, 0.5)"
+    numbers = "DetectionConstants((8.0, 2.5, 3.2), 0.6, 0.45, (8.0, 2.5, 3.2), 5.0, 0.7, 0.5)"
     file.write_text(known.replace(row, row.replace("vehicle", f"{numbers}, vehicle")))
     output = run(copy, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"))
     assert "2 frames" in output and "Truck" in output

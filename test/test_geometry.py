@@ -21,7 +21,7 @@ from lidar_perception.geometry import (
     wrap_angle,
     wrap_line,
 )
-from lidar_perception.types import MAX_RANGE, PointCloud, usable_returns
+from lidar_perception.types import MAX_RANGE, PointCloud, are_usable_returns
 
 seeds = st.integers(0, 2**32 - 1)
 angles = st.floats(-50, 50)
@@ -169,15 +169,15 @@ def test_horizontal_range_ignores_height_and_heading(seed, dtype):
 )
 def test_usable_returns_are_finite_near_and_not_the_origin(point, usable, dtype):
     xyz = np.array([[1, 1, 1], point, [2, 2, 2]], dtype)
-    found = usable_returns(xyz)
+    found = are_usable_returns(xyz)
     assert found.dtype == bool and found.tolist() == [True, usable, True]
 
 
 def test_usable_returns_accepts_strided_and_empty_arrays():
-    assert usable_returns(np.zeros((0, 3), np.float32)).shape == (0,)
+    assert are_usable_returns(np.zeros((0, 3), np.float32)).shape == (0,)
     wide = np.zeros((4, 6), np.float32)
     wide[2, 1] = 5
-    assert usable_returns(wide[:, :3]).tolist() == [False, False, True, False]
+    assert are_usable_returns(wide[:, :3]).tolist() == [False, False, True, False]
     assert len(PointCloud(wide[:, :3])) == 4
 
 

@@ -12,7 +12,7 @@ from lidar_perception.clustering.cluster import cluster, cluster_obstacles
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.intensity import (
-    REFERENCE_SHARES,
+    REFERENCE_LEVELS,
     REFERENCE_VALUES,
     StreamScale,
     find_scale_problem,
@@ -90,7 +90,7 @@ def test_the_scale_of_a_stream_never_falls(order):
     clouds = [UNIT, WHOLE[255], np.float32([0, 1, 1.2])]
     scale = StreamScale()
     found = [scale(clouds[i]) for i in order]
-    assert found == sorted(found) and scale.full == 255.0
+    assert found == sorted(found) and scale.full_scale == 255.0
 
 
 def test_dark_clouds_have_the_scale_of_their_stream():
@@ -120,12 +120,12 @@ def test_a_wrong_scale_is_reported_with_the_remedy(full):
     values = UNIT * np.float32(full)
     assert guess_scale(values) == full
     problem = find_scale_problem(values)
-    assert "input.intensity_max" in problem and f"divided by {full}, a guess" in problem
+    assert "input.intensity_max" in problem and f"full scale of {full} is assumed" in problem
     assert "PointCloud.of" in problem and "\n" not in problem
 
 
 def test_dark_intensities_are_reported():
-    assert "goes up to 0.02 " in find_scale_problem(UNIT * np.float32(0.02))
+    assert "highest intensity is 0.02," in find_scale_problem(UNIT * np.float32(0.02))
     assert find_scale_problem(UNIT[:100] * np.float32(0.02)) is None
     for fine in (None, UNIT, UNIT * 0, UNIT[:0], np.full(3000, 0.3)):
         assert find_scale_problem(fine) is None
@@ -143,7 +143,7 @@ def test_normalized_intensity_ignores_gain_and_gamma(change):
     assert (normalized[::10] == 0).all() and normalized.dtype == np.float32
     np.testing.assert_array_equal(normalize_intensity(intensity, np.arange(7, 900)), normalized[7:900])
     positive = normalized[normalized > 0]
-    np.testing.assert_allclose(np.quantile(positive, REFERENCE_SHARES), REFERENCE_VALUES, atol=0.02)
+    np.testing.assert_allclose(np.quantile(positive, REFERENCE_LEVELS), REFERENCE_VALUES, atol=0.02)
 
 
 def test_unusable_intensity_is_normalized_to_none():
@@ -171,9 +171,9 @@ CLOUD = np.random.default_rng(1).uniform([2, -9, -2, 0], [30, 9, 1, 1], (400, 4)
         (np.ones((9, 3), bool), "ndarray of bool"),
         (np.ones((9, 3), complex), "complex"),
         (np.ones(9, [("x", "f4"), ("y", "f4")]), "ndarray of void"),
-        ([[1, 2, 3], [1]], "as an array"),
-        ("drive.bag", "is str"),
-        (None, "is NoneType"),
+        ([[1, 2, 3], [1]], "to an array"),
+        ("drive.bag", "type str"),
+        (None, "type NoneType"),
         (7.0, r"shape \(\)"),
     ],
 )
@@ -264,7 +264,7 @@ def test_clusters_of_an_array_equal_those_of_its_frame():
         (np.ones((2, 8)), r"\(2, 8\)"),
         (np.ones(14), r"\(14,\)"),
         (np.ones((1, 2, 7)), r"\(1, 2, 7\)"),
-        ("box", "is str"),
+        ("box", "type str"),
     ],
 )
 def test_boxes_of_another_shape_are_refused(boxes, said):

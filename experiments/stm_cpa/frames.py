@@ -37,7 +37,7 @@ class LabelledFrame:
     @property
     def pedestrians(self) -> np.ndarray:
         """True boxes (M, 7) of the pedestrians."""
-        return self.truth.of_class(PEDESTRIAN)
+        return self.truth.select_class(PEDESTRIAN)
 
     def segment(self, params: PipelineParams) -> SegmentedCloud:
         """Run the pipeline up to the boxes of the clusters."""

@@ -8,7 +8,7 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from lidar_perception.types import did_you_mean, valid_names
+from lidar_perception.types import list_valid_names, suggest_name
 
 
 class Choice(click.ParamType):
@@ -28,7 +28,7 @@ class Choice(click.ParamType):
         names_by_spelling |= {_normalize(name): name for name in self.choices}
         if (match := names_by_spelling.get(_normalize(str(value)))) is not None:
             return match
-        self.fail(f"unknown value {value!r}{valid_names(str(value), self.choices)}", param, ctx)
+        self.fail(f"unknown value {value!r}{list_valid_names(str(value), self.choices)}", param, ctx)
 
     def get_metavar(self, param: Any, ctx: Any = None) -> str:
         return f"[{'|'.join(self.choices)}]"
@@ -74,7 +74,7 @@ class Command(click.Command):
                 for flag in (*param.opts, *param.secondary_opts)
                 if flag.startswith("-")
             ]
-            remedy = self.remedy(error.option_name) or did_you_mean(error.option_name, flags)
+            remedy = self.remedy(error.option_name) or suggest_name(error.option_name, flags)
             raise click.UsageError(
                 f"no such option {error.option_name}" + (remedy or f"; {ctx.command_path} --help lists them"), ctx
             ) from None
@@ -119,5 +119,5 @@ class Group(click.Group):
         name = args[0]
         if self.get_command(ctx, name) is None and not name.startswith("-"):
             commands = self.list_commands(ctx)
-            ctx.fail(f"unknown command {name!r}{valid_names(name, commands)}")
+            ctx.fail(f"unknown command {name!r}{list_valid_names(name, commands)}")
         return super().resolve_command(ctx, args)

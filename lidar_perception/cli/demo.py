@@ -48,7 +48,7 @@ from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.scoring.recorded import RecordedResult, read_results
 from lidar_perception.tracking import tracker
 from lidar_perception.tracking.ego import NO_SOURCE
-from lidar_perception.types import CLASSES, PEDESTRIAN, InputError, class_ids
+from lidar_perception.types import CLASSES, PEDESTRIAN, InputError, find_class_ids
 from lidar_perception.wire.messages import read_column, to_detections, to_point_cloud, to_truth
 from lidar_perception.wire.topics import POINTS
 from lidar_perception.wire.track_markers import read_trails
@@ -353,7 +353,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
     colors = None if ground is None else color_by_cluster(ground > 0, zeros if ids is None else renumber_ids(ids)[0])
     boxes = Boxes(
         detections.boxes,
-        np.array(class_ids(detections.labels), int),
+        np.array(find_class_ids(detections.labels), int),
         [str(i) if trails else "" for i in detections.ids],
         [trails.get(int(i), detections.boxes[k : k + 1, :3]) for k, i in enumerate(detections.ids)],
     )

@@ -26,7 +26,7 @@ from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.param_fields import collect_fields, describe_fields, with_values
 from lidar_perception.runs.terminal import errors
 from lidar_perception.tracking.params import TrackingParams
-from lidar_perception.types import InputError, did_you_mean
+from lidar_perception.types import InputError, suggest_name
 
 CANDIDATES = "candidates"
 CANDIDATE_NODES = "perception", "ground_segmentation", "clustering", "candidate_refinement"
@@ -96,7 +96,7 @@ def _suggest_parameter(name: str, fields: Fields) -> str:
     if members:
         return f", which is a group with {', '.join(members)}"
     matches = [each for each in fields if each.endswith(f".{name}")]
-    return f"; did you mean {matches[0]!r}?" if len(matches) == 1 else did_you_mean(name, fields)
+    return f"; did you mean {matches[0]!r}?" if len(matches) == 1 else suggest_name(name, fields)
 
 
 def _parse(name: str, f: Field[Any], text: str) -> Any:

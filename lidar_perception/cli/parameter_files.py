@@ -14,7 +14,7 @@ from lidar_perception.candidates.configurations import CONFIGURATIONS
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.node_parameters import describe_misspelt_parameters
 from lidar_perception.runs.files import read_text, shorten_error
-from lidar_perception.types import InputError, did_you_mean, valid_names
+from lidar_perception.types import InputError, list_valid_names, suggest_name
 
 MAX_BYTES, MAX_NAMES = 10**6, 10_000  # limits of a parameter file; YAML aliases turn few bytes into many names
 MAX_DEPTH = 20  # maximum nesting of groups
@@ -54,7 +54,7 @@ def read_parameters(
             raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for examples")
         if nodes is not None and not _is_for_nodes(str(node), nodes):
             name = str(node).rpartition("/")[2]
-            if name not in NODES and (suggestion := did_you_mean(name, nodes)):
+            if name not in NODES and (suggestion := suggest_name(name, nodes)):
                 lines.append(f"unknown node {name[:80]!r}{suggestion}")
             continue
         for name, value in _iterate_dotted(path, section.get("ros__parameters") or {}, visited):
@@ -72,7 +72,7 @@ def read_parameters(
 def _load_file(path: Path) -> dict[Any, Any]:
     if not path.exists():
         raise InputError(
-            f"cannot read the parameter file {path}: file not found" + valid_names(str(path), CONFIGURATIONS)
+            f"cannot read the parameter file {path}: file not found" + list_valid_names(str(path), CONFIGURATIONS)
         )
     try:
         content = yaml.safe_load(read_text(path, MAX_BYTES))

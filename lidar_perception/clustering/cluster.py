@@ -9,7 +9,7 @@ from lidar_perception.clustering.dbscan import distance_aware_dbscan
 from lidar_perception.clustering.density import adapt_to_density, compute_radii, measure_density
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import ClusteringParams
-from lidar_perception.types import PointCloud, as_point_cloud, check_columns, usable_returns
+from lidar_perception.types import PointCloud, are_usable_returns, as_point_cloud, check_columns
 
 
 def cluster(
@@ -30,7 +30,7 @@ def cluster(
         InputError: the array has another shape or type.
     """
     xyz = as_point_cloud(cloud).xyz
-    usable = usable_returns(xyz)
+    usable = are_usable_returns(xyz)
     if usable.all():
         return _cluster_usable(xyz, params, density)
     labels = np.zeros(len(xyz), np.int32)

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.geometry import horizontal_range
-from lidar_perception.types import usable_returns
+from lidar_perception.types import are_usable_returns
 
 CELL_DEG = 2.0  # the gap between the beams of a VLP-16
 MAX_SAMPLED = 30_000  # number of points to sample from a larger cloud
@@ -34,7 +34,7 @@ def measure_density(xyz: np.ndarray) -> float:
     """
     step = max(len(xyz) // MAX_SAMPLED, 1)
     sampled = np.ascontiguousarray(xyz[::step])
-    usable = usable_returns(sampled)
+    usable = are_usable_returns(sampled)
     if not usable.all():
         sampled = sampled.take(np.flatnonzero(usable), axis=0)
     if len(sampled) == 0:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.classes import BY_SIZE, CLASSES, DETECTED, MAX_DIAGONAL
+from lidar_perception.classes import CLASSES, CLASSES_BY_SIZE, DETECTED, MAX_DIAGONAL
 from lidar_perception.clustering.params import BOX_SHAPES
 from lidar_perception.clustering.rectangles import fit_rectangles, sort_by_cluster
 from lidar_perception.groups import count_clusters
@@ -110,7 +110,7 @@ def classify_by_diagonal(boxes: np.ndarray) -> np.ndarray:
     sides = np.asarray(boxes, np.float32).reshape(-1, 7)[:, 3:5]
     diagonal = np.hypot(sides[:, 0], sides[:, 1])  # in float32, so that 6.40 is not above 6.40
     ids = np.full(len(diagonal), -1, np.int32)
-    for name in reversed(BY_SIZE):
+    for name in reversed(CLASSES_BY_SIZE):
         ids[(diagonal >= DETECTED[name].min_diagonal) & (diagonal <= MAX_DIAGONAL)] = CLASSES.index(name)
     return ids
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.classes import class_name
+from lidar_perception.classes import find_class_name
 from lidar_perception.data.cloud_files import load_points, make_cloud_scale_reader
 from lidar_perception.data.frame import BOXES, Frame, Recording
 from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS
@@ -89,7 +89,7 @@ def read_labels(path: Path) -> GroundTruth | None:
                 f"{path}:{i} is not '{LINE_FORMAT}' with sizes above 0: {line[:200]!r}; correct or remove it"
             ) from None
         boxes.append(box)
-        names.append(class_name(" ".join(words[7:])))
+        names.append(find_class_name(" ".join(words[7:])))
     ids = to_class_ids(names)
     misc = CLASSES.index("Misc")
     return GroundTruth.of(boxes, ids, [{"class_name": name} if i == misc else {} for name, i in zip(names, ids)])

@@ -15,7 +15,7 @@ from lidar_perception.data.kitti.folder import read_velodyne
 from lidar_perception.data.kitti.write import format_numbers, write_velodyne
 from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import write_bytes
-from lidar_perception.types import InputError, usable_returns
+from lidar_perception.types import InputError, are_usable_returns
 
 UNLABELLED = (0, 1)  # labels "unlabelled" and "outlier" (such as a reflection)
 # Labels road, parking, sidewalk, other-ground, lane-marking, terrain.
@@ -87,7 +87,7 @@ def _read_point_truth(scan: Path, path: Path) -> PointTruth:
     labels = read_records(path, "label", np.uint32)[:, 0]  # upper 16 bits: instance; lower: class
     if len(labels) != len(cloud):
         raise InputError(f"{path} has {len(labels)} labels for the {len(cloud)} points of {scan}; download both again")
-    labels = labels.compress(usable_returns(cloud[:, :3]))
+    labels = labels.compress(are_usable_returns(cloud[:, :3]))
     return PointTruth((labels & 0xFFFF).astype(np.uint16), (labels >> 16).astype(np.uint16))
 
 

@@ -16,7 +16,7 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.tracking.drive_tracker import DriveTracker
 from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.trails import Trails
-from lidar_perception.types import CLASSES, Detections, InputError, class_ids
+from lidar_perception.types import CLASSES, Detections, InputError, find_class_ids
 
 TRAIL_S = 2.0  # duration of the path of a track, as in the nodes
 
@@ -89,7 +89,7 @@ def measure_records(open_: Callable[[], Detector], recording: Recording) -> Call
 
 def read_detections(record: Mapping[str, Any]) -> Detections:
     """Restore the detections of a record without rounding errors."""
-    detections = Detections.of(record["boxes"], class_ids(record["classes"]), record["scores"])
+    detections = Detections.of(record["boxes"], find_class_ids(record["classes"]), record["scores"])
     return replace(
         detections,
         sources={name: np.array(probabilities, np.float32) for name, probabilities in record["sources"].items()},

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidar_perception.intensity import find_scale_problem, guess_scale, to_unit
-from lidar_perception.types import Detections, PointCloud, as_point_cloud, check_columns, usable_returns
+from lidar_perception.types import Detections, PointCloud, are_usable_returns, as_point_cloud, check_columns
 
 Cloud = PointCloud | ArrayLike  # see PointCloud.of()
 FUSED = "fused"  # name of the default detector
@@ -96,7 +96,7 @@ def accept(
     check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
     ground = None if ground is None else np.asarray(ground, bool)
     cluster_ids = None if cluster_ids is None else np.asarray(cluster_ids)
-    if frame is not cloud and not (usable := usable_returns(frame.xyz)).all():
+    if frame is not cloud and not (usable := are_usable_returns(frame.xyz)).all():
         indices = np.flatnonzero(usable)
         frame = frame.take(indices)
         ground, cluster_ids = (column if column is None else column.take(indices) for column in (ground, cluster_ids))

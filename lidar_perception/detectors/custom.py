@@ -23,7 +23,15 @@ from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.ground.params import SensorPoseParams, set_sensor_height
 from lidar_perception.param_fields import Params
 from lidar_perception.robot.params import CropParams
-from lidar_perception.types import CLASSES, Detections, InputError, PointCloud, RunError, did_you_mean, unknown_name
+from lidar_perception.types import (
+    CLASSES,
+    Detections,
+    InputError,
+    PointCloud,
+    RunError,
+    make_unknown_name_error,
+    suggest_name,
+)
 
 ENTRY_POINTS = "lidar_perception.detectors"  # group of entry points: NAME = "module:Class"
 REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
@@ -208,7 +216,7 @@ def _find_class(reference: str) -> Callable[..., Any]:
     for name in class_name.split("."):
         if not hasattr(value, name):
             class_names = [key for key, candidate in vars(value).items() if isinstance(candidate, type)]
-            raise InputError(f"{module_name} has no class {class_name!r}{did_you_mean(class_name, class_names)}")
+            raise InputError(f"{module_name} has no class {class_name!r}{suggest_name(class_name, class_names)}")
         value = getattr(value, name)
     if not callable(value):
         raise InputError(f"{reference} is not a class but {type(value).__name__}")
@@ -233,7 +241,7 @@ def _find_classes(name: str, detector: Any) -> tuple[str, ...]:
     classes = tuple(getattr(detector, "classes", DETECTED))
     for class_name in classes:
         if class_name not in CLASSES:
-            raise unknown_name(f"class of {name}", class_name, CLASSES)
+            raise make_unknown_name_error(f"class of {name}", class_name, CLASSES)
     return classes
 
 

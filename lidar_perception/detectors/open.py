@@ -20,7 +20,7 @@ from lidar_perception.detectors.params import RANGE_CHOICES
 from lidar_perception.ground.params import set_sensor_height
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.compiling import report_compilation
-from lidar_perception.types import InputError, unknown_name
+from lidar_perception.types import InputError, make_unknown_name_error
 
 if TYPE_CHECKING:
     from lidar_perception.detectors.checkpoint import Header
@@ -87,7 +87,7 @@ def open_detector(
             not exist, or a parameter is unknown or out of range.
     """
     if range not in RANGE_CHOICES:
-        raise unknown_name("range", range, RANGE_CHOICES)
+        raise make_unknown_name_error("range", range, RANGE_CHOICES)
     kind, path = resolve_weights(weights)
     reference = None if kind in LOAD else find_reference(kind)
     arguments = {} if device == "auto" else {f"{kind}.device": device}
@@ -185,7 +185,7 @@ def resolve_weights(weights: str | Path) -> tuple[str, Path | None]:
     if name in LOAD or (not path.exists() and find_reference(name)):
         return name, None
     if path.name == name and not path.suffix and not path.exists():
-        raise unknown_name("detector or file of weights", name, [*LOAD, *entry_point_names()])
+        raise make_unknown_name_error("detector or file of weights", name, [*LOAD, *entry_point_names()])
     return find_kind(path), path
 
 

@@ -13,7 +13,7 @@ from lidar_perception.intensity import guess_scale, to_unit
 from lidar_perception.robot.crop import crop_frame
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placement import find_level_transform, make_tilted_pose
-from lidar_perception.types import PointCloud, as_point_cloud, usable_returns
+from lidar_perception.types import PointCloud, are_usable_returns, as_point_cloud
 
 METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
     "threshold": lambda xyz, intensity, p: segment_by_threshold(xyz, p.threshold, p.sensor_pose.height),
@@ -37,7 +37,7 @@ def segment_ground(cloud: PointCloud | ArrayLike, params: GroundParams = GroundP
         InputError: the array has another shape or type.
     """
     frame = as_point_cloud(cloud)
-    usable = usable_returns(frame.xyz)
+    usable = are_usable_returns(frame.xyz)
     if usable.all():
         return _segment(frame.xyz, frame.intensity, params)
     ground = np.zeros(len(frame), bool)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import wrap_angle
-from lidar_perception.types import CLASSES, MAX_RANGE, GroundTruth, InputError, class_ids
+from lidar_perception.types import CLASSES, MAX_RANGE, GroundTruth, InputError, find_class_ids
 
 NO_TRACK = -1
 OTHER_CLASS = "Misc"  # one of CLASSES, used for unknown classes
@@ -175,7 +175,7 @@ def to_ground_truth(labels: FrameLabels) -> GroundTruth:
     for k, (name, extra) in enumerate(zip(labels.class_names, labels.extra)):
         class_name = {} if name in CLASSES else {"class_name": name}
         extras.append({**extra, **class_name, **get_id_and_score(labels, k)})
-    return GroundTruth.of(labels.boxes, class_ids(labels.class_names), extras, labels.notes)
+    return GroundTruth.of(labels.boxes, find_class_ids(labels.class_names), extras, labels.notes)
 
 
 def get_id_and_score(labels: FrameLabels, k: int) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from lidar_perception.types import unknown_name
+from lidar_perception.types import make_unknown_name_error
 
 ALIASES = {"kitti-object": "kitti", "bag": "mcap", "bag-labels": "mcap-labels"}
 
@@ -20,5 +20,5 @@ def resolve_format(name: str, names: Iterable[str]) -> str:
     format_name = name.strip().lower().replace("_", "-")
     format_name, names = ALIASES.get(format_name, format_name), list(names)
     if format_name not in names:
-        raise unknown_name("format", name, names)
+        raise make_unknown_name_error("format", name, names)
     return format_name

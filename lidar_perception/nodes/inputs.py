@@ -215,7 +215,7 @@ class SeedInput:
                 ),
             )
         else:
-            people = truth.of_class(PEDESTRIAN)
+            people = truth.select_class(PEDESTRIAN)
             level = self.node.transforms.find_placement(cloud.header).level
             self.deliver(cloud, make_truth_source(people if level is None else transform_boxes(people, level)))
 

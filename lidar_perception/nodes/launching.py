@@ -48,7 +48,7 @@ from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.nodes.param_files import EVERY_NODE, describe_unknown_nodes, is_for, read_sections
 from lidar_perception.param_fields import flatten
 from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
-from lidar_perception.types import InputError, unknown_name
+from lidar_perception.types import InputError, make_unknown_name_error
 from lidar_perception.wire.topics import ODOMETRY, POINTS
 
 LAUNCH_ARGUMENTS = ("launch-prefix", "launch-prefix-filter")  # arguments that launch itself defines
@@ -208,7 +208,7 @@ def reject_unknown_arguments(given: list[Any], context: Any, known: Collection[s
                 f"'{name}' is not a launch argument but a parameter of "
                 f"{', '.join(nodes)}; set it in a parameter file, config:=FILE"
             )
-        raise unknown_name("launch argument", name, sorted(known))
+        raise make_unknown_name_error("launch argument", name, sorted(known))
 
 
 def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:

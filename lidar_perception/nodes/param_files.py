@@ -11,7 +11,7 @@ import yaml
 
 from lidar_perception.nodes import NODES
 from lidar_perception.runs.files import read_text, shorten_error
-from lidar_perception.types import InputError, closest_name
+from lidar_perception.types import InputError, find_closest_name
 
 MAX_BYTES = 10**6
 MAX_KEYS = 10_000  # limit needed because YAML anchors can nest a group in itself
@@ -80,7 +80,7 @@ def describe_unknown_nodes(path: str | Path, nodes: Collection[str], only_simila
         name = section.rpartition("/")[2]
         if any(is_for(section, node) for node in nodes) or name.endswith(tuple(NODES)):
             continue
-        guess = closest_name(name, [*nodes, *NODES])
+        guess = find_closest_name(name, [*nodes, *NODES])
         if guess in nodes or not only_similar:
             lines.append(
                 f"{path}: unknown node {name[:80]!r}; its parameters are ignored"

@@ -18,7 +18,7 @@ from lidar_perception.nodes.parameter_declaration import convert_to_declared_typ
 from lidar_perception.nodes.rclpy_compat import UnknownParameterError, parameter_names
 from lidar_perception.nodes.subscriptions import Inputs
 from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.types import closest_name
+from lidar_perception.types import find_closest_name
 
 
 class LidarNode(Node):
@@ -87,7 +87,7 @@ class LidarNode(Node):
 
     def _before_set(self, changes: list[Parameter]) -> list[Parameter]:
         if unknown := [c.name for c in changes if not self.has_parameter(c.name)]:
-            guess = closest_name(unknown[0], parameter_names(self))
+            guess = find_closest_name(unknown[0], parameter_names(self))
             raise UnknownParameterError(
                 f"{self.get_fully_qualified_name()} has no parameter "
                 f"{unknown[0][:80]!r}" + (f"; did you mean {guess!r}?" if guess else "")

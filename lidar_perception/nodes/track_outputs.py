@@ -126,16 +126,20 @@ class TrackOutputs:
         tracker, now = self.tracker, stamp / 1e9
         if self.count_history and not 0 <= now - self.count_history[-1][0] <= RATE_WINDOW_S:
             self.count_history.clear()  # time has jumped, or the clouds have no stamps
-        self.count_history.append((now, tracker.started, tracker.ended))
+        self.count_history.append((now, tracker.started_count, tracker.ended_count))
         while now - self.count_history[0][0] > RATE_WINDOW_S or len(self.count_history) > 1000:
             self.count_history.popleft()
         before, born, ended = self.count_history[0]
         self.node.diagnostics.counts.update(
-            ego=self.ego.source, tracks=reported, alive=tracker.alive, born=tracker.started, ended=tracker.ended
+            ego=self.ego.source,
+            tracks=reported,
+            alive=tracker.alive_count,
+            born=tracker.started_count,
+            ended=tracker.ended_count,
         )
         if now > before:
-            self.node.diagnostics.counts["born_per_s"] = f"{(tracker.started - born) / (now - before):.2f}"
-            self.node.diagnostics.counts["ended_per_s"] = f"{(tracker.ended - ended) / (now - before):.2f}"
+            self.node.diagnostics.counts["born_per_s"] = f"{(tracker.started_count - born) / (now - before):.2f}"
+            self.node.diagnostics.counts["ended_per_s"] = f"{(tracker.ended_count - ended) / (now - before):.2f}"
 
 
 def find_marker_lifetime_ns(node: LidarNode) -> int:

@@ -23,7 +23,7 @@ from lidar_perception.simulation.street import STREET_KINDS, StreetKind, draw_st
 from lidar_perception.simulation.terrain import Ground, surface_height
 from lidar_perception.simulation.traffic import populate
 from lidar_perception.simulation.trajectory import DRIVE_SECONDS, Trajectory
-from lidar_perception.types import CLASSES, InputError, did_you_mean
+from lidar_perception.types import CLASSES, InputError, suggest_name
 
 MAX_PEOPLE = 100  # maximum factor for the number of people; creating a street then takes 3 s
 EGO_HALF_SIZE_M = (3.0, 1.1)  # half length and half width of the area kept clear for the ego vehicle
@@ -51,14 +51,14 @@ class Scenes(NamedTuple):
             raise InputError(
                 f"unknown scene {unknown[0]!r}: must be one of "
                 f"{', '.join(SCENE_TYPES)}, or several separated by commas"
-                f"{did_you_mean(unknown[0], SCENE_TYPES)}"
+                f"{suggest_name(unknown[0], SCENE_TYPES)}"
             )
         for name in names:
             if self.kind is not None and self.kind not in SCENE_TYPES[name].kinds:
                 raise InputError(
                     f"kind = {self.kind!r} must be one of "
                     f"{', '.join(SCENE_TYPES[name].kinds)} where scene is {name}"
-                    f"{did_you_mean(self.kind, SCENE_TYPES[name].kinds)}"
+                    f"{suggest_name(self.kind, SCENE_TYPES[name].kinds)}"
                 )
         return [SCENE_TYPES[name] for name in names]
 

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from lidar_perception.runs.files import read_text, shorten_error
-from lidar_perception.types import SENSOR_HEIGHT, InputError, did_you_mean
+from lidar_perception.types import SENSOR_HEIGHT, InputError, suggest_name
 
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster where available
 MAX_BYTES = 1 << 20  # maximum size of a sensor file
@@ -363,6 +363,6 @@ def _find_by_name(name: str) -> Sensor:
     if _normalize_name(name) not in PRESET_FILES:
         raise InputError(
             f"unknown sensor {name!r}: must be one of {', '.join(SENSOR_NAMES)}, a "
-            f".yaml file, or {GENERIC_FORMAT}{did_you_mean(name, SENSOR_NAMES)}"
+            f".yaml file, or {GENERIC_FORMAT}{suggest_name(name, SENSOR_NAMES)}"
         )
     return _load_preset(_normalize_name(name))

@@ -1,4 +1,4 @@
-"""Tracker for a recording: restarts at each drive and reads the sensor's poses."""
+"""Tracker for recordings, which restarts at each drive and reads the poses of the sensor."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, InputError
 
-MAX_POSE_CHECKS = 50  # frames at the start of a recording that are searched for a pose
+MAX_POSE_CHECKS = 50  # maximum number of frames at the start of a recording to search for a pose
 
 
 class DriveTracker:
@@ -42,8 +42,8 @@ class DriveTracker:
         self.ego = choose_ego_source(recording, ego)
         self.tracker, self._read_pose = Tracker(params), make_pose_reader(self.ego)
         self.drive, self.has_pose = "", True
-        self._last = "", -1  # sequence and stamp of the previous frame
-        self._number = 0  # number of the drive
+        self._last_frame = "", -1  # sequence and stamp of the previous frame
+        self._drive_number = 0
 
     def __call__(self, frame: Frame, detections: Detections) -> Tracks:
         """Update the tracks with a frame and return them in its LiDAR frame.
@@ -51,13 +51,13 @@ class DriveTracker:
         Raises:
             InputError: The pose of the frame cannot be read.
         """
-        sequence, stamp_ns = self._last
+        sequence, stamp_ns = self._last_frame
         if frame.sequence != sequence or not (frame.sequence or is_same_drive(stamp_ns, frame.stamp_ns)):
             self.tracker.reset()
             self._read_pose = make_pose_reader(self.ego)
-            self._number += 1
-        self._last = frame.sequence, frame.stamp_ns
-        self.drive = frame.sequence or f"drive {self._number}"
+            self._drive_number += 1
+        self._last_frame = frame.sequence, frame.stamp_ns
+        self.drive = frame.sequence or f"drive {self._drive_number}"
         pose = self._read_pose(frame)
         self.has_pose = pose is not None or self.ego == NO_SOURCE
         return self.tracker(detections, frame.stamp_ns, pose)
@@ -84,7 +84,7 @@ def choose_ego_source(recording: Recording, source: str = "auto") -> str:
 def has_valid_pose(frame: Frame) -> bool:
     """Return True if a frame has a valid pose.
 
-    If the clocks of odometry and clouds differ, no frame has one.
+    If the clocks of odometry and clouds differ, no frame has a valid pose.
     """
     try:
         return is_valid_pose(frame.pose())

@@ -1,7 +1,7 @@
-"""Motion of the sensor: sources of poses, checks, and extrapolation over missing poses.
+"""Ego motion: sources of the sensor's poses, validity checks, and extrapolation of missing poses.
 
 A pose is a (4, 4) float64 matrix that transforms from the sensor's frame to a fixed frame. Without
-poses the fixed frame is the sensor's own, and velocities are relative to the sensor.
+poses, the sensor's frame is used as fixed frame, and velocities are relative to the sensor.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from scipy.spatial.transform import Rotation
 from lidar_perception.data.frame import Frame
 from lidar_perception.types import InputError
 
-MAX_SPEED = 100.0  # in m/s; a faster pose change is a jump
+MAX_SPEED = 100.0  # maximum speed of the sensor in m/s; a faster pose change is a jump
 MAX_ROTATION_ERROR = 1e-2  # maximum element of R R^T - I in a valid pose
 SOURCES = ("recording", "odometry", "tf", "kiss_icp")  # sources of poses, best first
 NO_SOURCE = "none"
-# Cell sizes of KISS-ICP's downsampling, in map voxels, and the minimum points for coarse registration
-MAP_CELL, FINE_CELL, COARSE_CELL = 0.5, 1.5, 3.0
-MIN_COARSE_POINTS = 300
-CONVERGENCE = 1e-3  # in m and rad; KISS-ICP stops at a smaller step
+MAP_CELL, FINE_CELL, COARSE_CELL = 0.5, 1.5, 3.0  # cell sizes of KISS-ICP's downsampling, in map voxels
+MIN_COARSE_POINTS = 300  # minimum number of points to register a scan at the coarse resolution
+CONVERGENCE = 1e-3  # step in m and rad below which KISS-ICP stops
 
 
 @dataclass(frozen=True)
@@ -31,9 +30,9 @@ class Ego:
     """Motion state of the sensor.
 
     Attributes:
-        pose: (4, 4) current pose, extrapolated if the measured pose is missing.
+        pose: (4, 4) current pose, extrapolated if no pose was measured.
         velocity: (3,) m/s in the sensor's frame, from the last two measured poses.
-        rotation: (3,) angular velocity as a rotation vector, rad/s, from the same poses.
+        rotation: (3,) angular velocity as a rotation vector, rad/s, from the same two poses.
         missing_s: Time since the last measured pose.
         has_pose: True after the first measured pose.
     """
@@ -51,7 +50,7 @@ class Ego:
 
 
 def is_valid_pose(pose: np.ndarray | None) -> bool:
-    """Return True for a finite, rigid (4, 4) pose."""
+    """Return True if a pose is a finite, rigid (4, 4) transform."""
     if pose is None or np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
         return False
     rotation = np.asarray(pose, float)[:3, :3]
@@ -59,10 +58,10 @@ def is_valid_pose(pose: np.ndarray | None) -> bool:
 
 
 def advance_ego(ego: Ego, pose: np.ndarray | None, seconds: float, max_gap: float) -> Ego:
-    """Return the motion state `seconds` later, with the pose measured then.
+    """Return the motion state `seconds` later, given the pose measured at that time.
 
     If the pose is missing (None), the sensor is assumed to keep its velocity for max_gap seconds
-    and then to stand still.
+    and then to stop.
     """
     if pose is not None:
         pose = np.asarray(pose, np.float64)
@@ -102,8 +101,7 @@ def choose_source(requested: str, available: Collection[str]) -> str:
 def choose_recorded_source(has_poses: bool, requested: str = "auto") -> str:
     """Choose the source of poses for recorded frames.
 
-    A source other than "auto" is returned unchanged; it raises an error on use if it is not
-    available.
+    A source other than "auto" is returned unchanged, even if it is not available.
 
     Args:
         has_poses: True if the recording has poses.
@@ -113,9 +111,9 @@ def choose_recorded_source(has_poses: bool, requested: str = "auto") -> str:
 
 
 def make_pose_reader(source: str) -> Callable[[Frame], np.ndarray | None]:
-    """Make a function frame -> pose (4, 4) or None, to be called for a drive's frames in order.
+    """Return a function that returns the pose (4, 4) of a frame, or None.
 
-    KISS-ICP loads each frame.
+    Call it for the frames of a drive in order. With KISS-ICP, it loads each frame.
 
     Raises:
         InputError: The source is kiss_icp, which is not installed.
@@ -148,7 +146,8 @@ class Odometry:
             from kiss_icp.voxelization import voxel_down_sample
         except ImportError:
             raise InputError(
-                "ego motion from scans needs kiss-icp; run pip install 'lidar_perception[odometry]'"
+                "kiss-icp, which estimates ego motion from scans, is not installed; run "
+                "pip install 'lidar_perception[odometry]'"
             ) from None
         config = KISSConfig()
         config.mapping.voxel_size, config.data.deskew = voxel, False
@@ -156,12 +155,12 @@ class Odometry:
         config.registration.convergence_criterion = CONVERGENCE
 
         def voxelize(scan: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            # points for registration, and points for the map
-            mapped = voxel_down_sample(scan, MAP_CELL * voxel)
-            coarse = voxel_down_sample(mapped, COARSE_CELL * voxel)
-            if len(coarse) >= MIN_COARSE_POINTS:
-                return coarse, mapped
-            return voxel_down_sample(mapped, FINE_CELL * voxel), mapped
+            """Return the points for registration, and the points for the map."""
+            map_points = voxel_down_sample(scan, MAP_CELL * voxel)
+            coarse_points = voxel_down_sample(map_points, COARSE_CELL * voxel)
+            if len(coarse_points) >= MIN_COARSE_POINTS:
+                return coarse_points, map_points
+            return voxel_down_sample(map_points, FINE_CELL * voxel), map_points
 
         self._icp = KissICP(config)
         self._icp.voxelize = voxelize

@@ -1,9 +1,9 @@
 """Batched extended Kalman filters of N objects on the ground.
 
-The state is [x y vx vy heading turn] in metres, seconds and radians in a fixed frame. The motion
-model is a coordinated turn with Cartesian velocity (Li and Jilkov, IEEE TAES 2003, Section V.B);
-with zero turn rate and turn variance it is the constant velocity model. means are (N, 6),
-covariances (N, 6, 6), both float64; N may be 0.
+The state is [x y vx vy heading turn_rate] in metres, seconds and radians in a fixed frame. The
+motion model is a coordinated turn with Cartesian velocity (Li and Jilkov, IEEE TAES 2003, Section
+V.B); with zero turn rate and turn rate variance it is the constant velocity model. means are
+(N, 6), covariances (N, 6, 6), both float64; N may be 0.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import numpy as np
 
 from lidar_perception.geometry import wrap_angle, wrap_line
 
-X, Y, VX, VY, HEADING, TURN = range(6)
-MEASURED = np.array([X, Y, HEADING])
-MIN_OPPOSING_SCORE = 1.0  # sum of scores of opposite measured headings that flips a heading
-MIN_TURN_RAD = 1e-4  # rotation per step below which the series of sin(a) / a is used
+X, Y, VX, VY, HEADING, TURN_RATE = range(6)
+MEASURED = np.array([X, Y, HEADING])  # measured elements of the state
+MIN_OPPOSING_SCORE = 1.0  # sum of the scores of opposite headings at which a heading is reversed
+MIN_TURN_RAD = 1e-4  # rotation per step below which sin(a) / a is computed as a series
 
 
 def predict(
@@ -28,13 +28,14 @@ def predict(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Predict means and covariances `seconds` (0 or more) ahead.
 
-    acceleration, turning and wandering (N,) are noise densities, see MotionParams.
+    Args:
+        acceleration, turning, wandering: (N,) noise densities, see MotionParams.
     """
     t, count = seconds, len(means)
-    _, _, vx, vy, _, turn = means.T
-    angle = turn * t
+    _, _, vx, vy, _, turn_rate = means.T
+    angle = turn_rate * t
     is_straight = np.abs(angle) < MIN_TURN_RAD
-    divisor = np.where(is_straight, 1.0, turn)
+    divisor = np.where(is_straight, 1.0, turn_rate)
     sin, cos = np.sin(angle), np.cos(angle)
     forward_factor = np.where(is_straight, t, sin / divisor)
     lateral_factor = np.where(is_straight, angle * t / 2, (1.0 - cos) / divisor)
@@ -51,12 +52,12 @@ def predict(
     f[:, X, VY], f[:, Y, VX] = -lateral_factor, lateral_factor
     f[:, VX, VX] = f[:, VY, VY] = cos
     f[:, VX, VY], f[:, VY, VX] = -sin, sin
-    f[:, X, TURN] = forward_derivative * vx - lateral_derivative * vy
-    f[:, Y, TURN] = lateral_derivative * vx + forward_derivative * vy
-    f[:, VX, TURN], f[:, VY, TURN] = -t * predicted_means[:, VY], t * predicted_means[:, VX]
-    f[:, HEADING, TURN] = t
+    f[:, X, TURN_RATE] = forward_derivative * vx - lateral_derivative * vy
+    f[:, Y, TURN_RATE] = lateral_derivative * vx + forward_derivative * vy
+    f[:, VX, TURN_RATE], f[:, VY, TURN_RATE] = -t * predicted_means[:, VY], t * predicted_means[:, VX]
+    f[:, HEADING, TURN_RATE] = t
     predicted_covariances = f @ covariances @ f.transpose(0, 2, 1)
-    for value, rate, density in ((X, VX, acceleration), (Y, VY, acceleration), (HEADING, TURN, turning)):
+    for value, rate, density in ((X, VX, acceleration), (Y, VY, acceleration), (HEADING, TURN_RATE, turning)):
         variance_density = density * density
         predicted_covariances[:, value, value] += variance_density * t**3 / 3
         predicted_covariances[:, value, rate] += variance_density * t * t / 2
@@ -67,14 +68,18 @@ def predict(
 
 
 def update(
-    means: np.ndarray, covariances: np.ndarray, measured: np.ndarray, noise: np.ndarray
+    means: np.ndarray, covariances: np.ndarray, measurements: np.ndarray, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Update with measurements (N, 3) [x y heading] with standard deviations noise (N, 3).
+    """Update the states with measured positions and headings.
 
-    Either the measured heading or its opposite is used, whichever is nearer to the state's heading,
-    because detectors confuse front and rear. flip_reversed_headings() decides which is the front.
+    Detectors confuse front and rear, so the measured heading or its opposite is used, whichever is
+    closer to the heading of the state. flip_reversed_headings() determines the front.
+
+    Args:
+        measurements: (N, 3) [x y heading].
+        noise: (N, 3) standard deviations of the measurements.
     """
-    innovation = measured - means[:, MEASURED]
+    innovation = measurements - means[:, MEASURED]
     innovation[:, 2] = wrap_line(innovation[:, 2])
     cross_covariances = covariances[:, :, MEASURED]
     innovation_covariances = cross_covariances[:, MEASURED]
@@ -86,9 +91,13 @@ def update(
 
 
 def constrain_to_heading(means: np.ndarray, covariances: np.ndarray, slip: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Update with a measured lateral speed of 0 with standard deviations slip (N,), m/s.
+    """Update the states with the assumption that objects move along their heading.
 
-    Wheels and feet move forward, so this couples the heading with the direction of motion.
+    The lateral speed is treated as a measurement of 0, which couples the heading with the direction
+    of motion.
+
+    Args:
+        slip: (N,) standard deviation of the lateral speed, m/s.
     """
     sin, cos = np.sin(means[:, HEADING]), np.cos(means[:, HEADING])
     vx, vy = means[:, VX], means[:, VY]
@@ -104,27 +113,29 @@ def constrain_to_heading(means: np.ndarray, covariances: np.ndarray, slip: np.nd
 
 
 def flip_reversed_headings(
-    means: np.ndarray, agreement: np.ndarray, backwards: np.ndarray
+    means: np.ndarray, agreement: np.ndarray, max_reverse_speed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Reverse the headings that point backwards.
 
-    A heading is reversed if the object moves backwards faster than `backwards`, or if the measured
-    headings oppose it and the object does not move forward faster than `backwards`.
+    A heading is reversed if the object moves backwards faster than max_reverse_speed, or if the
+    measured headings oppose it and the object does not move forward faster than max_reverse_speed.
 
     Args:
         means: (N, 6) states.
         agreement: (N,) sum of the scores of measured headings that agree with the state, minus the
             sum of those that oppose it.
-        backwards: (N,) speed limit, m/s.
+        max_reverse_speed: (N,) m/s.
 
     Returns:
         The new means and agreements.
     """
     forward_speed = np.cos(means[:, HEADING]) * means[:, VX] + np.sin(means[:, HEADING]) * means[:, VY]
-    is_reversed = (forward_speed < -backwards) | (agreement < -MIN_OPPOSING_SCORE) & (forward_speed <= backwards)
-    flipped = means.copy()
-    flipped[:, HEADING] = wrap_angle(means[:, HEADING] + np.pi * is_reversed)
-    return flipped, np.where(is_reversed, -agreement, agreement)
+    is_reversed = (forward_speed < -max_reverse_speed) | (agreement < -MIN_OPPOSING_SCORE) & (
+        forward_speed <= max_reverse_speed
+    )
+    new_means = means.copy()
+    new_means[:, HEADING] = wrap_angle(means[:, HEADING] + np.pi * is_reversed)
+    return new_means, np.where(is_reversed, -agreement, agreement)
 
 
 def _normalize(means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -136,8 +147,9 @@ def _normalize(means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, 
 def rotate_covariances(covariances: np.ndarray, cos: float, sin: float, side: float = 1.0) -> np.ndarray:
     """Transform covariances to a frame in which the old x axis is [cos sin].
 
-    `side` is 1, or -1 if one of the frames is upside down, so that the old y axis points to the
-    right of the old x axis.
+    Args:
+        side: 1 if the old y axis is to the left of the old x axis in the new frame, -1 if it is to
+            the right because one of the frames is upside down.
     """
     rotation = np.diag([cos, side * cos, cos, side * cos, side, side])
     for a, b in ((X, Y), (VX, VY)):

@@ -1,4 +1,4 @@
-"""State of the tracks as one array per quantity, oldest track first, and the published tracks."""
+"""State of the tracks, with one array per quantity, and the tracks as they are published."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidar_perception.types import CLASSES, Detections
 
 @dataclass(frozen=True)
 class States:
-    """State of N tracks in the fixed frame.
+    """State of N tracks in the fixed frame, oldest track first.
 
     Attributes:
         ids: (N,) int64 track ids.
@@ -23,14 +23,14 @@ class States:
         size_weights: (N,) weight of that mean.
         class_evidence: (N, len(CLASSES)) sum of the scores by class.
         class_ids: (N,) int32 indices into CLASSES.
-        total: (N,) sum of the evidence, see existence.py.
+        evidence: (N,) sum of the evidence, see existence.py.
         observations: (N,) number of observations, see existence.py.
-        present: (N,) log odds of presence.
+        presence: (N,) log odds of presence.
         hits: (N,) number of hits, with exponential decay.
         tries: (N,) number of frames, with exponential decay.
         moving: (N,) probability of motion.
         ages: (N,) seconds since the first detection.
-        unseen: (N,) seconds since the last hit.
+        unseen_s: (N,) seconds since the last hit.
         heading_agreement: (N,) sum of the scores of measured headings that agree with the state,
             minus the sum of those that oppose it, with exponential decay.
     """
@@ -44,37 +44,37 @@ class States:
     size_weights: np.ndarray
     class_evidence: np.ndarray
     class_ids: np.ndarray
-    total: np.ndarray
+    evidence: np.ndarray
     observations: np.ndarray
-    present: np.ndarray
+    presence: np.ndarray
     hits: np.ndarray
     tries: np.ndarray
     moving: np.ndarray
     ages: np.ndarray
-    unseen: np.ndarray
+    unseen_s: np.ndarray
     heading_agreement: np.ndarray
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def take(self, indices: np.ndarray) -> States:
-        """Return the tracks at indices (M,)."""
+        """Return the states at indices (M,)."""
         return States(*(getattr(self, f.name)[indices] for f in fields(self)))
 
     def copy(self) -> States:
         """Return a copy with its own arrays."""
         return States(*(getattr(self, f.name).copy() for f in fields(self)))
 
-    def append(self, others: States) -> States:
-        """Return these tracks followed by `others`."""
+    def concatenate(self, others: States) -> States:
+        """Return these states followed by `others`."""
         return States(*(np.concatenate([getattr(self, f.name), getattr(others, f.name)]) for f in fields(self)))
 
     @staticmethod
     def none() -> States:
         """Return states of zero tracks."""
         shapes = {"means": (6,), "covariances": (6, 6), "sizes": (3,), "class_evidence": (len(CLASSES),)}
-        kinds = {"ids": np.int64, "class_ids": np.int32}
-        return States(*(np.zeros((0, *shapes.get(f.name, ())), kinds.get(f.name, np.float64)) for f in fields(States)))
+        dtypes = {"ids": np.int64, "class_ids": np.int32}
+        return States(*(np.zeros((0, *shapes.get(f.name, ())), dtypes.get(f.name, np.float64)) for f in fields(States)))
 
     def to_boxes(self) -> np.ndarray:
         """Return the boxes (N, 7) float64 [x y z l w h yaw]."""
@@ -89,10 +89,10 @@ class Tracks:
         ids: (K,) int64, starting at 1 and never reused.
         detections: Boxes and classes; a score is the probability that the object is real, of its
             class, and present.
-        velocities: (K, 2) m/s over ground along the sensor's x and y axes, or relative to the
-            sensor if there are no poses.
+        velocities: (K, 2) m/s over ground along the sensor's x and y axes; without poses, relative
+            to the sensor.
         moving: (K,) probability of motion, 0..1.
-        covariances: (K, 6, 6) of [x y vx vy heading turn].
+        covariances: (K, 6, 6) of [x y vx vy heading turn_rate].
         turn_rates: (K,) rad/s.
         height_variances: (K,) variance of z, m^2.
         seen: (K,) bool, False for tracks that are only predicted in this frame.

@@ -1,6 +1,6 @@
-"""Multi-object tracker: Kalman filters in a fixed frame, two-stage assignment, track existence.
+"""Multi-object tracker with Kalman filters, two-stage assignment and existence probabilities.
 
-It is deterministic: the same frames always give the same tracks.
+Tracks are estimated in a fixed frame. The same frames always give the same tracks.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ class Tracker:
     """Multi-object tracker: tracker(detections, stamp_ns, pose) -> Tracks.
 
     Attributes:
-        params: Parameters; they may be replaced between calls.
+        params: Parameters, which may be replaced between calls.
         problem: Description of a problem with the last frame, or None.
         frame_used: False if the last frame was ignored.
-        started: Number of tracks started so far.
-        ended: Number of tracks ended so far.
+        started_count: Number of tracks started so far.
+        ended_count: Number of tracks ended so far.
     """
 
     def __init__(self, params: TrackingParams = TrackingParams()) -> None:
         self.params = params
         self.problem: str | None = None
         self.frame_used = False
-        self.started = self.ended = 0
+        self.started_count = self.ended_count = 0
         self._states, self._ego = States.none(), Ego.unknown()
-        self._stamp: int | None = None
-        self._late: int | None = None  # stamp of the last frame if it was late
+        self._last_stamp: int | None = None
+        self._late_stamp: int | None = None  # stamp of the last frame if it was late
         self._next_id = 1
 
     @property
-    def alive(self) -> int:
+    def alive_count(self) -> int:
         """Number of tracks, including those that are not published yet."""
         return len(self._states)
 
@@ -51,16 +51,16 @@ class Tracker:
 
     def reset(self) -> None:
         """End all tracks; later tracks get new ids."""
-        self.ended += len(self._states)
-        self._states, self._ego, self._stamp = States.none(), Ego.unknown(), None
+        self.ended_count += len(self._states)
+        self._states, self._ego, self._last_stamp = States.none(), Ego.unknown(), None
 
     def __call__(self, detections: Detections, stamp_ns: int = 0, pose: np.ndarray | None = None) -> Tracks:
         """Update the tracks with one frame and return them.
 
         Boxes that are not finite or have no size are ignored. A frame with the same stamp as the
-        previous one, or with a slightly older stamp, is ignored. If a second frame follows such an
-        older frame, time is assumed to have restarted. A restart, or a jump of time or of the
-        sensor's pose, ends all tracks.
+        previous frame, or with a slightly older one, is ignored. If the frame after an older frame
+        continues from there, time is assumed to have restarted. A restart, or a jump of time or of
+        the sensor's pose, ends all tracks.
 
         Args:
             detections: Boxes in the sensor's frame.
@@ -75,16 +75,16 @@ class Tracker:
         """
         if not isinstance(detections, Detections):
             raise InputError(
-                f"a tracker takes Detections, not {type(detections).__name__}; give "
+                f"a tracker needs Detections, not {type(detections).__name__}; pass "
                 "detector(cloud).detections, or Detections.of(boxes, class_ids, "
                 "scores) with boxes (K, 7)"
             )
         self.problem = None
-        seconds = self._find_elapsed(int(stamp_ns))
+        seconds = self._compute_elapsed(int(stamp_ns))
         self.frame_used = seconds is not None
         if seconds is None:
-            return self._report(np.zeros(len(self._states), bool))
-        self._move_ego(pose, seconds)
+            return self._make_tracks(np.zeros(len(self._states), bool))
+        self._update_ego(pose, seconds)
         boxes, class_ids, scores = self._select_valid(detections)
         boxes = transform_boxes(boxes, self._ego.pose)
         states = predict(self._states, seconds, self.params)
@@ -94,7 +94,7 @@ class Tracker:
         is_unmatched[j] = False
         new_detections = np.flatnonzero(is_unmatched & (scores >= self.params.association.strong))
         old_count = len(states)
-        states = states.append(
+        states = states.concatenate(
             start_tracks(
                 self._next_id, boxes[new_detections], class_ids[new_detections], scores[new_detections], self.params
             )
@@ -104,30 +104,30 @@ class Tracker:
         is_seen[i], is_seen[old_count:] = True, True
         seen_ids = set(states.ids[is_seen].tolist())
         remaining = prune(states, self.params, self._ego.has_pose)
-        self.started += len(new_detections)
-        self.ended += len(states) - len(remaining)
+        self.started_count += len(new_detections)
+        self.ended_count += len(states) - len(remaining)
         self._states = remaining
-        return self._report(np.array([i in seen_ids for i in remaining.ids.tolist()], bool))
+        return self._make_tracks(np.array([i in seen_ids for i in remaining.ids.tolist()], bool))
 
     def predict(self, stamp_ns: int) -> Tracks:
-        """Predict the tracks to stamp_ns, for a lost or late frame, without changing the tracker.
+        """Predict the tracks at stamp_ns, for a lost or late frame, without changing the tracker.
 
-        The sensor is assumed to have kept its velocity. Returns the tracks in its frame.
+        The sensor is assumed to keep its velocity. Returns the tracks in its frame.
         """
         self.problem = None
-        seconds = 0.0 if self._stamp is None else (int(stamp_ns) - self._stamp) / 1e9
+        seconds = 0.0 if self._last_stamp is None else (int(stamp_ns) - self._last_stamp) / 1e9
         seconds = min(max(seconds, 0.0), self.params.max_gap)
         ego = advance_ego(self._ego, None, seconds, self.params.max_ego_gap)
         states = predict(self._states, seconds, self.params)
         return _to_sensor_frame(states, ego, np.zeros(len(states), bool), self.params)
 
-    def _find_elapsed(self, stamp: int) -> float | None:
-        """Return the seconds since the last frame, or None for a frame to ignore."""
+    def _compute_elapsed(self, stamp: int) -> float | None:
+        """Return the seconds since the last frame, or None if the frame must be ignored."""
         if stamp == 0:
             self.problem = f"the frames have no stamps: assuming {self.params.period:g} s per frame"
             return self.params.period
-        last_stamp, self._stamp = self._stamp, stamp
-        late_stamp, self._late = self._late, None
+        last_stamp, self._last_stamp = self._last_stamp, stamp
+        late_stamp, self._late_stamp = self._late_stamp, None
         if last_stamp is None:
             return self.params.period
         seconds = (stamp - last_stamp) / 1e9
@@ -136,43 +136,43 @@ class Tracker:
             return None
         has_restarted = late_stamp is not None and stamp > late_stamp  # for example a short bag in a loop
         if seconds < 0 and -seconds <= self.params.max_gap and not has_restarted:
-            self._stamp, self._late = last_stamp, stamp
+            self._last_stamp, self._late_stamp = last_stamp, stamp
             self.problem = f"a frame is {-seconds:.2f} s older than the previous one and is ignored"
             return None
         if seconds < 0 or seconds > self.params.max_gap:
             self.reset()
-            self._stamp = stamp
+            self._last_stamp = stamp
             self.problem = f"time jumped by {seconds:.2f} s: all tracks ended"
             return self.params.period
         return seconds
 
-    def _move_ego(self, pose: np.ndarray | None, seconds: float) -> None:
+    def _update_ego(self, pose: np.ndarray | None, seconds: float) -> None:
         valid_pose = pose if is_valid_pose(pose) else None
         if (
             valid_pose is not None
             and len(self._states)
             and (not self._ego.has_pose or is_jump(self._ego, valid_pose, seconds))
         ):
-            stamp, had_pose = self._stamp, self._ego.has_pose
+            stamp, had_pose = self._last_stamp, self._ego.has_pose
             self.reset()
-            self._stamp = stamp
+            self._last_stamp = stamp
             self.problem = (
                 "the sensor's pose jumped: all tracks ended"
                 if had_pose
-                else "the first pose arrived: all tracks ended and start again in the fixed frame"
+                else "the first pose arrived: all tracks ended, and new ones start in the fixed frame"
             )
         if valid_pose is None and (pose is not None or self._ego.has_pose):
             self.problem = (
                 "the pose is missing or not rigid: the sensor is assumed to keep its "
-                f"velocity for {self.params.max_ego_gap:g} s and then to stand; check "
-                "that odometry or TF is published, and often enough"
+                f"velocity for {self.params.max_ego_gap:g} s and then to stop; check that "
+                "odometry or TF is published often enough"
             )
         self._ego = advance_ego(self._ego, valid_pose, seconds, self.params.max_ego_gap)
 
     def _select_valid(self, detections: Detections) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the boxes (K, 7), class ids (K,) and scores (K,) of the valid detections.
 
-        At most max_detections are returned: those with the best scores.
+        At most max_detections are returned, those with the highest scores.
         """
         boxes, scores = detections.boxes.astype(np.float64), detections.scores.astype(np.float64)
         with np.errstate(invalid="ignore"):
@@ -186,19 +186,20 @@ class Tracker:
             )
         if not is_valid.all():
             self.problem = (
-                f"{(~is_valid).sum()} of {len(is_valid)} detections are ignored: not finite, "
-                f"without a size, or more than {MAX_RANGE / 1e3:g} km from the origin "
-                "of their frame; publish them in a frame nearby"
+                f"{(~is_valid).sum()} of {len(is_valid)} detections are ignored: they are not finite, "
+                f"have no size, or are more than {MAX_RANGE / 1e3:g} km from the origin "
+                "of their frame; publish them in a local frame"
             )
         indices = np.flatnonzero(is_valid & (scores >= self.params.min_score))
         if len(indices) > self.params.max_detections:
             self.problem = (
-                f"{len(indices)} detections are too many; only the best {self.params.max_detections} are used"
+                f"the frame has {len(indices)} detections; only the {self.params.max_detections} with the highest "
+                "scores are used"
             )
             indices = np.sort(indices[np.argsort(-scores[indices], kind="stable")[: self.params.max_detections]])
         return boxes[indices], detections.class_ids[indices], np.clip(scores[indices], 0.0, 1.0)
 
-    def _report(self, seen: np.ndarray) -> Tracks:
+    def _make_tracks(self, seen: np.ndarray) -> Tracks:
         return _to_sensor_frame(self._states, self._ego, seen, self.params)
 
 
@@ -206,7 +207,7 @@ def _to_sensor_frame(states: States, ego: Ego, seen: np.ndarray, params: Trackin
     """Return the tracks that are probable enough to publish, in the sensor's frame."""
     scores = compute_probabilities(states, params, ego.has_pose)
     indices = np.flatnonzero(
-        (scores >= params.report) & (seen | (to_probability(states.present) >= params.report_unseen))
+        (scores >= params.report) & (seen | (to_probability(states.presence) >= params.report_unseen))
     )
     published_states, to_sensor = states.take(indices), np.linalg.inv(ego.pose)
     cos, sin = (to_sensor[:2, 0] / max(np.hypot(*to_sensor[:2, 0]), 1e-9)).tolist()

@@ -212,8 +212,8 @@ def collect_samples(frame: Frame, proposals: Proposals, scan: int) -> Samples:
         order = np.flatnonzero((detections.class_ids == class_id) & in_view)
         order = order[np.argsort(-detections.scores[order], kind="stable")]
         name, boxes = CLASSES[class_id], detections.boxes[order]
-        hits = _match_boxes(boxes, truth.of_class(class_id), name)
-        similar = truth.of_class(CLASSES.index(NEIGHBOURS.get(name, name)))
+        hits = _match_boxes(boxes, truth.select_class(class_id), name)
+        similar = truth.select_class(CLASSES.index(NEIGHBOURS.get(name, name)))
         is_matched = np.zeros(hits.shape[1], bool)
         for i, hit, similar_hit in zip(order, hits, _match_boxes(boxes, similar, name)):
             unmatched = np.flatnonzero(hit & ~is_matched)

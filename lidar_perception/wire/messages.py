@@ -14,7 +14,15 @@ from lidar_perception.classes import ID_BY_ALIAS
 from lidar_perception.groups import renumber_ids
 from lidar_perception.intensity import INTENSITY_FIELDS, find_scale_problem, infer_full_scale, to_unit
 from lidar_perception.robot import poses
-from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError, PointCloud, class_ids, usable_returns
+from lidar_perception.types import (
+    CLASSES,
+    Detections,
+    GroundTruth,
+    InputError,
+    PointCloud,
+    are_usable_returns,
+    find_class_ids,
+)
 from lidar_perception.wire.topics import CAMERA_FRAME
 from msg_utils.markers import MarkedObjects, MarkerRow, make_marker_rows, rows_to_message, to_marker_array
 from msg_utils.point_cloud2 import CloudError, from_array, read_columns, read_xyz, to_array
@@ -57,7 +65,7 @@ def to_point_cloud(
     except CloudError as error:
         raise InputError(str(error)) from None
     intensity = None if raw_intensity is None else to_unit(raw_intensity[0], intensity_max or scale(*raw_intensity))
-    is_usable = usable_returns(coordinates)
+    is_usable = are_usable_returns(coordinates)
     if not is_usable.all():
         usable_indices = np.flatnonzero(is_usable)
         indices = usable_indices if indices is None else indices.take(usable_indices)
@@ -275,7 +283,7 @@ def to_truth(objects: MarkedObjects) -> GroundTruth:
         {"class_name": label, **extra} if label not in CLASSES else extra
         for label, extra in zip(objects.labels, objects.extras)
     ]
-    return GroundTruth.of(objects.boxes, class_ids(objects.labels), extras, objects.notes)
+    return GroundTruth.of(objects.boxes, find_class_ids(objects.labels), extras, objects.notes)
 
 
 def to_detections(objects: MarkedObjects) -> Detections:

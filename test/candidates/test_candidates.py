@@ -147,7 +147,7 @@ def test_refining_without_clusters_finds_no_candidates():
 def test_the_seeds_own_cluster_passes_every_stage():
     checked = 0
     for frame in open_recording(DATA / "kitti_object").frames[:12]:
-        truth = frame.truth().of_class(PEDESTRIAN)
+        truth = frame.truth().select_class(PEDESTRIAN)
         if len(truth) == 0:
             continue
         s = segment_cloud(frame.load())

@@ -292,7 +292,7 @@ def test_automatic_seed_is_most_likely_cluster_or_template():
 def test_best_finds_more_real_pedestrians_than_paper():
     hits = dict.fromkeys(("paper", "best"), 0)
     for frame in open_recording(DATA / "kitti_object"):
-        truth = frame.truth().of_class(PEDESTRIAN)
+        truth = frame.truth().select_class(PEDESTRIAN)
         if len(truth) == 0:
             continue
         for name, params in (("paper", PAPER), ("best", BEST)):

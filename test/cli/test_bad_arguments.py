@@ -10,7 +10,7 @@ from cli_samples import error_line, exit_of
 from samples import object_folder, write
 
 from lidar_perception.data.bag import BagWriter
-from lidar_perception.types import closest_name
+from lidar_perception.types import find_closest_name
 from lidar_perception.wire.topics import POINTS
 
 
@@ -190,7 +190,7 @@ def test_invalid_command_exits_with_2(arguments, words, monkeypatch, capsys):
     ],
 )
 def test_error_suggests_the_closest_name(name, known, closest):
-    assert closest_name(name, known) == closest
+    assert find_closest_name(name, known) == closest
 
 
 @pytest.mark.parametrize(

@@ -293,7 +293,7 @@ def test_boxes_of_real_cars_have_the_yaw_of_the_cars():
     errors = {"min_area": [], "l_shape": []}
     for frame in open_recording(DATA / "kitti_object"):
         xyz = frame.load().xyz
-        for car in frame.truth().of_class(CLASSES.index("Car")):
+        for car in frame.truth().select_class(CLASSES.index("Car")):
             inside = xyz[points_in_box(xyz, car)]
             for shape, found in errors.items() if len(inside) >= 30 else ():
                 yaw = apply_to_one(fit_boxes, inside, shape)[6]

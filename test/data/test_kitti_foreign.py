@@ -9,7 +9,7 @@ from samples import LABELS, object_folder, scene, write
 
 from lidar_perception.data.kitti.labels import parse_label, read_tracklets
 from lidar_perception.data.open import open_recording
-from lidar_perception.types import CLASSES, InputError, class_ids
+from lidar_perception.types import CLASSES, InputError, find_class_ids
 
 CAR = "Car 0.00 0 -1.50 580.00 160.00 660.00 230.00 1.50 1.60 3.90 0.00 1.65 12.00 -1.57"
 SPELLINGS = {
@@ -32,7 +32,7 @@ def test_class_names_are_recognised_in_any_spelling(text):
     assert parse_label(CAR.replace("Car", text))["class"] == name
     assert parse_label(CAR.replace("Car", text) + " 0.9")["score"] == 0.9
     if text != "Person":  # exists only in the tracking benchmark
-        assert [CLASSES[i] for i in class_ids([text])] == [name if name in CLASSES else "Misc"]
+        assert [CLASSES[i] for i in find_class_ids([text])] == [name if name in CLASSES else "Misc"]
     if name in CLASSES:
         assert parse_label(CAR.replace("Car", text), known_only=True)
     else:

@@ -170,4 +170,6 @@ def test_commands_report_the_scale_and_export_0_to_1(tmp_path, monkeypatch, capf
     object_files(tmp_path / "dark", [(0, dark)])
     assert exit_of(monkeypatch, "convert", tmp_path / "dark", "--out", tmp_path / "dark.bag") == 0
     output = " ".join(capfd.readouterr().err.split())
-    assert "intensity goes up to 0.01 where 1 is" in output and "input.intensity_max" in output
+    assert (
+        "the highest intensity is 0.01, but a full reflection should be 1" in output and "input.intensity_max" in output
+    )

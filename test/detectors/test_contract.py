@@ -96,8 +96,8 @@ def test_other_intensity_scale_is_reported_and_normalized(detectors, frame, name
     if name.startswith("STM-CPA") and "PointNet" not in name:  # these do not use intensity
         assert found.problem == expected.problem
     else:
-        assert f"divided by {full}, a guess" in found.problem and "PointCloud.of" in found.problem
-        assert "a guess" not in (expected.problem or "")
+        assert f"full scale of {full} is assumed" in found.problem and "PointCloud.of" in found.problem
+        assert "is assumed" not in (expected.problem or "")
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -447,5 +447,5 @@ def test_openpcdet_labels_are_read(tmp_path):
         labels = import_labels(given, "openpcdet", frames)
         assert [each.class_names for each in labels.frames] == [[], ["Car", "e-scooter"], []]
     assert labels.frames[1].boxes[0].tolist() == [12, 0, -0.98, 3.9, 1.6, 1.5, 0.1]
-    with pytest.raises(InputError, match="there is no format 'openpcdet'"):
+    with pytest.raises(InputError, match="unknown format 'openpcdet'"):
         export_labels(labels, "openpcdet", tmp_path / "out", frames)

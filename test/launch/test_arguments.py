@@ -20,7 +20,7 @@ NOTHING_STARTS = {"detectors": "dream"}
 @pytest.mark.parametrize(
     "name, given, words",
     [
-        ("fused", {"pionts": "/cloud"}, "no launch argument 'pionts'; did you mean 'points'?"),
+        ("fused", {"pionts": "/cloud"}, "unknown launch argument 'pionts'; did you mean 'points'?"),
         ("two_lidars", {"fused.scores.car": "0.7"}, "a parameter of fused_detector"),
         ("fused", {"launch-prefix": ""}, "'dream' is unknown"),
     ],

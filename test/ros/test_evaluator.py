@@ -146,7 +146,7 @@ def test_all_classes_are_scored_and_precision_at_the_end(with_camera, start, tmp
 @pytest.mark.parametrize(
     "values, words",
     [
-        ({"classes": ["Cart"]}, "no class 'Cart'; did you mean 'Car'"),
+        ({"classes": ["Cart"]}, "unknown class 'Cart'; did you mean 'Car'"),
         ({"stages": ["ground_truth"]}, "must be distinct names"),
         ({"stages": ["a", "a"]}, "must be distinct names"),
         ({"timing": ["foo"]}, "does not have the form"),

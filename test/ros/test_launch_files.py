@@ -225,11 +225,11 @@ def test_section_of_unknown_node_is_a_warning(section, words, launched, tmp_path
 @pytest.mark.parametrize(
     "name, given, words",
     [
-        ("fused", "pionts", "no launch argument 'pionts'; did you mean 'points'?"),
+        ("fused", "pionts", "unknown launch argument 'pionts'; did you mean 'points'?"),
         ("fused", "fused.scores.car", "a parameter of fused_detector; set it in a parameter file"),
-        ("detectors", "zzz", "no launch argument 'zzz'; valid names: ahead, autostart"),
+        ("detectors", "zzz", "unknown launch argument 'zzz'; valid names: ahead, autostart"),
         ("replay", "real_tme", "did you mean 'real_time'"),
-        ("replay", "namespace", "no launch argument 'namespace'"),
+        ("replay", "namespace", "unknown launch argument 'namespace'"),
         ("two_lidars", "lft", "did you mean 'left'"),
     ],
 )

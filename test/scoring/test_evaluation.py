@@ -260,7 +260,7 @@ def test_only_pedestrians_count():
 
 def test_labels_behind_the_camera_do_not_count():
     cloud, truth = crowd(0)
-    scan, people = PointCloud(cloud[:, :3], cloud[:, 3]), truth.of_class(PEDESTRIAN)
+    scan, people = PointCloud(cloud[:, :3], cloud[:, 3]), truth.select_class(PEDESTRIAN)
     ahead, behind, around = (
         Frame.of("a", scan, GroundTruth.of(own, [PEDESTRIAN] * len(own)), CALIBRATION)
         for own in (

@@ -104,7 +104,7 @@ def test_boxes_stand_on_ground_without_overlap(seed):
 
 def test_pedestrians_are_always_in_view():
     for scan in simulate_drive(33, 11, replace(COARSE, rate=2.5), CROWDED_ZONES):
-        boxes = scan.truth.of_class(PEDESTRIAN)
+        boxes = scan.truth.select_class(PEDESTRIAN)
         distance, bearing = np.hypot(boxes[:, 0], boxes[:, 1]), np.arctan2(boxes[:, 1], boxes[:, 0])
         seen = (np.abs(bearing) < np.radians(40)) & (distance > 6) & (distance < 35)
         assert seen.sum() >= 2

@@ -123,7 +123,7 @@ def test_clicked_car_is_a_seed_and_similar_cars_are_proposed(session):
     session.propose()
     frame = session.drive.frames[0]
     truth, scan = frame.truth(), session.drive.load_scan(0)
-    cars = truth.of_class(CAR)
+    cars = truth.select_class(CAR)
     inside = [scan.xyz[points_in_box(scan.xyz, b) & (scan.cluster_ids > 0)] for b in cars]
     seen = sorted(range(len(cars)), key=lambda k: -len(inside[k]))
     points = inside[seen[0]]

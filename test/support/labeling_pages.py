@@ -30,7 +30,7 @@ NEAR = 20.0  # metres
 def find_nearest_person(frame) -> np.ndarray:
     """Return the box (7,) of the labelled person within NEAR with the most points."""
     cloud = frame.load().xyz
-    boxes = [b for b in frame.truth().of_class(PEDESTRIAN) if math.hypot(b[0], b[1]) < NEAR]
+    boxes = [b for b in frame.truth().select_class(PEDESTRIAN) if math.hypot(b[0], b[1]) < NEAR]
     return max(boxes, key=lambda b: points_in_box(cloud, b).sum())
 
 

@@ -112,7 +112,7 @@ def test_tracker_keeps_id_and_position_over_missed_frames():
 def test_track_ends_when_object_is_gone():
     tracker = Tracker()
     track([cars(car(10))] * 5 + [Detections.none()] * 60, tracker=tracker)
-    assert (tracker.alive, tracker.started, tracker.ended) == (0, 1, 1)
+    assert (tracker.alive_count, tracker.started_count, tracker.ended_count) == (0, 1, 1)
 
 
 @pytest.mark.parametrize("rate", [5, 10, 20, 30])
@@ -125,7 +125,7 @@ def test_occluded_track_lasts_equally_long_at_any_rate(rate):
             tracker=tracker,
             stamps=[START + i * 10**9 // rate for i in range(len(frames) + 1)],
         )
-        return tracker.started
+        return tracker.started_count
 
     assert (started(1.4), started(2.0)) == (1, 2)
 
@@ -134,7 +134,7 @@ def test_weak_detections_continue_but_never_start_tracks():
     weak = TrackingParams().association.strong / 2
     tracker = Tracker()
     track([cars(car(10), scores=weak)] * 10, tracker=tracker)
-    assert (tracker.started, tracker.alive) == (0, 0)
+    assert (tracker.started_count, tracker.alive_count) == (0, 0)
     tracks = track(
         [cars(car(10))] * 10 + [cars(car(10), scores=weak)] * 3,
         tracker=tracker,
@@ -222,13 +222,13 @@ def test_missing_equal_late_and_jumping_stamps_are_handled():
 def test_short_loop_is_a_jump_not_late_frames():
     tracker, short = Tracker(), [START + i * TENTH for i in range(6)]
     tracks = track([cars(car(10))] * 18, tracker=tracker, stamps=short * 3)
-    assert tracker.ended == 2
+    assert tracker.ended_count == 2
     assert [t.ids.tolist()[-1] for t in tracks] == [1] * 7 + [2] * 6 + [3] * 5
     # several late frames in a row change nothing
     tracker = Tracker()
     stamps = [START + i * TENTH for i in (0, 1, 4, 3, 2, 5)]
     tracks = track([cars(car(10))] * 6, tracker=tracker, stamps=stamps)
-    assert tracks[-1].ids.tolist() == [1] and tracker.ended == 0
+    assert tracks[-1].ids.tolist() == [1] and tracker.ended_count == 0
 
 
 def test_missing_poses_are_extrapolated():
@@ -241,7 +241,7 @@ def test_missing_poses_are_extrapolated():
     tracker(frames[-1], START + 20 * TENTH, np.full((4, 4), np.nan))
     assert "pose is missing" in tracker.problem
     tracker(frames[-1], START + 21 * TENTH, pose(5000.0))
-    assert "pose jumped" in tracker.problem and tracker.alive == 1
+    assert "pose jumped" in tracker.problem and tracker.alive_count == 1
 
 
 def test_ego_motion_is_extrapolated_up_to_max_gap():
@@ -259,7 +259,7 @@ def test_invalid_boxes_are_ignored():
     bad = [car(np.nan), [*good[:3], 0.0, 1.8, 1.5, 0.0], car(np.inf), car(1e9)]
     tracker = Tracker()
     tracks = track([Detections.of([good, *bad], CAR, 0.9)] * 4, tracker=tracker)
-    assert tracker.started == 1 and "4 of 5" in tracker.problem
+    assert tracker.started_count == 1 and "4 of 5" in tracker.problem
     assert np.isfinite(tracks[-1].detections.boxes).all()
     tracker(Detections.of([good], CAR, np.nan), START + 5 * TENTH)
     assert "1 of 1" in tracker.problem
@@ -272,7 +272,7 @@ def test_ten_thousand_detections_stay_within_limits():
         boxes = np.tile(car(0), (10_000, 1))
         boxes[:, :2] = rng.uniform(-70, 70, (10_000, 2))
         tracks = tracker(Detections.of(boxes, rng.integers(0, 9, 10_000), rng.uniform(0, 1, 10_000)), START + i * TENTH)
-        assert tracker.alive <= 80 and len(tracks) <= 80
+        assert tracker.alive_count <= 80 and len(tracks) <= 80
         assert "too many" in tracker.problem
 
 

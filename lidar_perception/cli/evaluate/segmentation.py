@@ -24,7 +24,7 @@ from lidar_perception.clustering.params import CLUSTERING_METHODS
 from lidar_perception.ground.params import GROUND_METHODS
 from lidar_perception.runs.terminal import console, errors
 from lidar_perception.scoring.points.report import SegmentationParams
-from lidar_perception.types import valid_names
+from lidar_perception.types import list_valid_names
 
 
 class MethodList(click.ParamType):
@@ -36,7 +36,7 @@ class MethodList(click.ParamType):
         names = value if isinstance(value, tuple) else tuple(str(value).split(","))
         methods = GROUND_METHODS + CLUSTERING_METHODS
         if unknown := [name for name in names if name not in methods]:
-            self.fail(f"unknown method {unknown[0]!r}{valid_names(unknown[0], methods)}", param, ctx)
+            self.fail(f"unknown method {unknown[0]!r}{list_valid_names(unknown[0], methods)}", param, ctx)
         return names
 
 

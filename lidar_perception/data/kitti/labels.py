@@ -10,10 +10,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from lidar_perception.classes import class_name
+from lidar_perception.classes import find_class_name
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.runs.files import check_regular, read_text
-from lidar_perception.types import CLASSES, MAX_NUMBER, GroundTruth, InputError, class_ids
+from lidar_perception.types import CLASSES, MAX_NUMBER, GroundTruth, InputError, find_class_ids
 
 # Columns of a label file after the class, in order, stored in GroundTruth.extras.
 COLUMNS = ("truncated", "occluded", "alpha", "bbox", "dimensions", "location", "rotation_y")
@@ -87,7 +87,7 @@ def parse_label(line: str, path: Path | str = "label", number: int = 0, known_on
         raise InputError(
             f"{path}:{number} is not a KITTI label (a class and 14 or 15 numbers): {line[:200]!r}"
         ) from None
-    name = NAME_BY_TRACKING_NAME.get(text) or class_name(text)
+    name = NAME_BY_TRACKING_NAME.get(text) or find_class_name(text)
     if name not in CLASSES and known_only:
         raise InputError(f"{path}:{number} has the unknown class {text!r}; known classes: {', '.join(CLASSES)}")
     label = {
@@ -130,7 +130,7 @@ def to_ground_truth(labels: list[dict], lidar_to_camera: np.ndarray) -> GroundTr
         boxes.append(box)
         names.append(label["class"])
         extras.append(extra if names[-1] in CLASSES else {**extra, "class_name": names[-1]})
-    return GroundTruth.of(boxes, class_ids(names), extras, notes)
+    return GroundTruth.of(boxes, find_class_ids(names), extras, notes)
 
 
 def to_lidar_box(label: dict, to_lidar: np.ndarray) -> list[float] | None:
@@ -235,7 +235,7 @@ def read_tracklets(path: Path) -> dict[int, GroundTruth]:
                 extra = {"track_id": track, "occluded": int(occluded or 0), "truncated": truncated}
                 boxes, notes = frames.setdefault(first + i, ([], []))
                 if min(h, w, length) <= 0:
-                    notes.append((class_name(text), extra))
+                    notes.append((find_class_name(text), extra))
                 else:
                     boxes.append(([x, y, z + h / 2, length, w, h, yaw], text, extra))
     except (OSError, ElementTree.ParseError, ValueError, OverflowError) as error:
@@ -246,9 +246,10 @@ def read_tracklets(path: Path) -> dict[int, GroundTruth]:
 def _to_tracklet_truth(rows: list, notes: list) -> GroundTruth:
     boxes, texts, extras = (list(column) for column in zip(*rows)) if rows else ([], [], [])
     extras = [
-        extra if class_name(text) in CLASSES else {**extra, "class_name": text} for text, extra in zip(texts, extras)
+        extra if find_class_name(text) in CLASSES else {**extra, "class_name": text}
+        for text, extra in zip(texts, extras)
     ]
-    return GroundTruth.of(boxes, class_ids(texts), extras, notes)
+    return GroundTruth.of(boxes, find_class_ids(texts), extras, notes)
 
 
 def _parse_state(pose: ElementTree.Element, name: str) -> float | None:

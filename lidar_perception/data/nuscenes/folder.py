@@ -21,7 +21,7 @@ from lidar_perception.data.nuscenes.labels import NuscenesLabels, read_labels
 from lidar_perception.data.nuscenes.tables import Tables
 from lidar_perception.data.records import read_records
 from lidar_perception.intensity import to_unit
-from lidar_perception.types import GroundTruth, InputError, PointCloud, usable_returns
+from lidar_perception.types import GroundTruth, InputError, PointCloud, are_usable_returns
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 LIDAR_CHANNEL = "LIDAR_TOP"
@@ -55,7 +55,7 @@ def load_sweep(path: Path, rotation: np.ndarray, stamp_ns: int) -> PointCloud:
     """
     cloud = read_records(path, SWEEP_COLUMNS)
     off_vehicle = (np.abs(cloud[:, :2]) >= EGO_RADIUS_M).any(axis=1)
-    cloud = cloud.compress(off_vehicle & usable_returns(cloud[:, :3]), axis=0)
+    cloud = cloud.compress(off_vehicle & are_usable_returns(cloud[:, :3]), axis=0)
     xyz = (cloud[:, :3].astype(np.float64) @ rotation.T).astype(np.float32)
     return PointCloud(np.ascontiguousarray(xyz), to_unit(cloud[:, 3], FULL_REFLECTION), stamp_ns, LIDAR_FRAME)
 

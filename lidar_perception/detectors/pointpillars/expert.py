@@ -24,7 +24,7 @@ from lidar_perception.types import PointCloud
 
 MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # channels of the map, the same for every set of classes
 # Class -> index into MAP_KINDS; the last entry, -1, is for clusters without a class.
-CHANNELS = np.array([*(MAP_KINDS.index(row.moves_as) for row in TABLE), -1])
+CHANNELS = np.array([*(MAP_KINDS.index(row.motion_model) for row in TABLE), -1])
 
 
 @dataclass(frozen=True)

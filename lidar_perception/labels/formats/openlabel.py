@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.classes import class_name
+from lidar_perception.classes import find_class_name
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import COLUMNS, DONT_CARE
 from lidar_perception.labels.drive_labels import (
@@ -92,7 +92,7 @@ def _read_drive(path: Path, frames: list[Frame], where: str) -> tuple[list[Frame
         notes: list[tuple[str, dict[str, Any]]] = []
         for uid, element in frame_content.get("objects", {}).items():
             data = dict(element.get(DATA, {}))
-            object_class = class_name(str(objects.get(uid, {}).get("type", "")))
+            object_class = find_class_name(str(objects.get(uid, {}).get("type", "")))
             uid_field = {} if str(numbers[uid]) == uid else {UID: uid}
             cuboids = [
                 cuboid for cuboid in data.get(CUBOIDS, ()) if object_class != REGION_CLASS and parts.has_size(cuboid)
@@ -154,7 +154,7 @@ def _parse_track(cuboid: dict[str, Any], object_class: str, number: int) -> tupl
     """Return the class, track id and score of a cuboid."""
     values, _ = parts.parse_named_values(cuboid.get("attributes", {}))
     return (
-        class_name(values.get(TYPE, object_class)),
+        find_class_name(values.get(TYPE, object_class)),
         number if values.get(TRACKED, True) else NO_TRACK,
         values.get(SCORE, np.nan),
     )
@@ -221,7 +221,7 @@ def _make_content(
         """Return the data of an object in a frame; add the object if it is new."""
         if uid not in frames_by_object:
             known_object = objects.get(uid, {})
-            same_class = class_name(str(known_object.get("type", ""))) == object_class  # compared in any spelling
+            same_class = find_class_name(str(known_object.get("type", ""))) == object_class  # compared in any spelling
             objects[uid] = {
                 "name": f"{object_class} {uid}",
                 **known_object,
@@ -281,7 +281,7 @@ def _make_cuboid(labels: FrameLabels, k: int, object_class: str, lidar: str) -> 
     values = {name: v for name, v in extra.items() if name not in (UID, OTHER, OBJECT, ORIGINAL)}
     values |= {SCORE: float(labels.scores[k])} if np.isfinite(labels.scores[k]) else {}
     values |= {TRACKED: False} if labels.track_ids[k] == NO_TRACK else {}
-    values |= {TYPE: labels.class_names[k]} if labels.class_names[k] != class_name(object_class) else {}
+    values |= {TYPE: labels.class_names[k]} if labels.class_names[k] != find_class_name(object_class) else {}
     attributes = parts.to_named_values(values)
     for name, items in extra.get(OTHER, {}).items():
         attributes.setdefault(name, []).extend(items)

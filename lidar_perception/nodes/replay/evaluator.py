@@ -24,7 +24,7 @@ from lidar_perception.scoring.centres.report import CandidateReport, CandidateRe
 from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.kitti.camera_objects import select_in_image, to_scored_labels
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError, unknown_name
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError, make_unknown_name_error
 from lidar_perception.wire.messages import read_calibration, to_detections, to_truth
 from msg_utils.markers import MarkedObjects, from_marker_array
 
@@ -155,10 +155,10 @@ class Evaluator(LidarNode):
     ) -> None:
         class_id = CLASSES.index(name)
         suffix = "" if class_id == PEDESTRIAN else f", {name}"
-        boxes = truth.of_class(class_id)
+        boxes = truth.select_class(class_id)
         if len(boxes) or suffix or not self.params.only_with_pedestrians:
             result.update(
-                CandidateResult(boxes, {stage: objects.of_class(class_id) for stage, objects in stages.items()}, {})
+                CandidateResult(boxes, {stage: objects.select_class(class_id) for stage, objects in stages.items()}, {})
             )
         self.diagnostics.counts[f"scored{suffix}"] = result.frames
         self.diagnostics.counts.update(
@@ -268,7 +268,7 @@ def _check(params: EvaluatorParams) -> None:
         raise InputError(f"classes: choose one or more of {', '.join(DETECTED)}")
     for name in params.classes:
         if name not in DETECTED:
-            raise unknown_name("class", name, [*DETECTED])
+            raise make_unknown_name_error("class", name, [*DETECTED])
     if short := [topic for topic in params.timing if topic.count("/") < 2]:
         raise InputError(f"timing: {short[0]} does not have the form .../NODE/debug/WHAT")
     if params.file and (

@@ -30,7 +30,7 @@ MAX_TIMES = 10_000  # durations kept per step
 
 def select_pedestrians(truth: GroundTruth | None) -> np.ndarray:
     """Return the pedestrian boxes (M, 7) of labels; none if truth is None."""
-    return np.zeros((0, 7)) if truth is None else truth.of_class(PEDESTRIAN)
+    return np.zeros((0, 7)) if truth is None else truth.select_class(PEDESTRIAN)
 
 
 def load_pedestrians(frame: Frame, view: bool = True) -> np.ndarray:

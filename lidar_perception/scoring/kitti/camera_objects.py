@@ -10,7 +10,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.kitti.labels import to_labels
 from lidar_perception.data.kitti.write import project_boxes
 from lidar_perception.geometry import wrap_angle
-from lidar_perception.types import Detections, GroundTruth, InputError, class_ids
+from lidar_perception.types import Detections, GroundTruth, InputError, find_class_ids
 
 NO_ANGLE = -10.0  # KITTI's value for an unknown alpha
 # Truncation levels of the tracking layout: 0 inside, 1 at the image border, 2 ends of tracks;
@@ -109,7 +109,7 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
     bearing = np.arctan2(location[:, 0], location[:, 2])
     computed_alpha = np.where(is_3d, wrap_angle(rotation_y - bearing), np.nan)
     return CameraObjects(
-        class_ids=np.array(class_ids(label["class"] for label in labels), np.int32),
+        class_ids=np.array(find_class_ids(label["class"] for label in labels), np.int32),
         boxes=np.column_stack(
             [
                 location[:, 2],
