@@ -217,15 +217,15 @@ def test_intensity_scale_is_declared_or_inferred_from_the_type():
     for wrong, said in (
         (dict(intensity=raw[:9]), r"\(9,\) for 400 points"),
         (dict(intensity=raw[:, None]), r"\(400, 1\) for 400"),
-        (dict(intensity=["a"] * 400), "intensity is list"),
+        (dict(intensity=["a"] * 400), "intensity has type list"),
         (dict(intensity_max=0.0), "intensity_max is 0"),
         (dict(intensity_max=np.nan), "intensity_max is nan"),
     ):
         with pytest.raises(InputError, match=said):
             PointCloud.of(xyz, **wrong)
-    with pytest.raises(InputError, match="given twice"):
+    with pytest.raises(InputError, match="intensity is given both"):
         PointCloud.of(CLOUD, raw)
-    with pytest.raises(InputError, match=r"shape \(400, 4\), not \(N, 3\); PointCloud.of"):
+    with pytest.raises(InputError, match=r"shape \(400, 4\), expected \(N, 3\); PointCloud.of"):
         PointCloud(CLOUD)
 
 
@@ -274,7 +274,7 @@ def test_boxes_of_another_shape_are_refused(boxes, said):
 
 def test_error_of_the_tracker_names_the_expected_type():
     for wrong in (np.ones((2, 7)), None):
-        with pytest.raises(InputError, match=rf"not {type(wrong).__name__}; give detector"):
+        with pytest.raises(InputError, match=rf"not {type(wrong).__name__}; pass detector"):
             Tracker()(wrong)
     with pytest.raises(InputError, match=r"scores have shape \(3,\) for 2 boxes"):
         Detections.of(np.ones((2, 7)), 1, [1, 1, 1])
