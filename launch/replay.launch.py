@@ -3,7 +3,7 @@
     ros2 launch lidar_perception replay.launch.py bag:=drive scores:=scores.json
     ros2 launch lidar_perception replay.launch.py bag:=drive detectors:=fused,pointpillars
 
-The arguments of detectors.launch.py are valid, too, except namespace and name_prefix.
+The arguments of detectors.launch.py are also valid, except namespace and name_prefix.
 """
 
 from pathlib import Path
@@ -26,15 +26,19 @@ from launch_ros.actions import Node
 from launch import LaunchDescription
 from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.graph import (
-    FINAL,
-    choose_cloud_topic,
+    FINAL_STAGE,
     configure_evaluator,
     list_awaited_topics,
     list_result_topics,
     relative_name,
 )
-from lidar_perception.nodes.launch_parameters import add_arguments, list_parameter_files, split_detectors
-from lidar_perception.nodes.launching import ARGUMENTS, find_given_arguments, reject_unknown_arguments
+from lidar_perception.nodes.launch_parameters import (
+    add_arguments,
+    choose_cloud_topic,
+    list_parameter_files,
+    split_detectors,
+)
+from lidar_perception.nodes.launching import ARGUMENTS, find_argument_names, reject_unknown_arguments
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.wire.clouds import CLOUD_TYPES
 from lidar_perception.wire.topics import POINTS, TF_STATIC
@@ -54,37 +58,38 @@ VALUES = (
 )
 HERE = Path(__file__).resolve().parent
 CONFIG = HERE.parent / "config" / "replay.param.yaml"
-# The protocol of the STM-CPA paper, for the candidates.
+# Evaluation protocol of the STM-CPA paper, used if the candidates are replayed.
 PAPER_CONFIG = HERE.parent / "config" / "replay_candidates.param.yaml"
-GLOBAL = {TF_STATIC, "/tf", "/clock", "/diagnostics"}
-LAST_FRAME_DELAY_S = 1.0
-# Fixed, as the player and the evaluator rely on it; launch passes all given arguments on to an
-# included file.
-GRAPH = {"namespace": "", "name_prefix": ""}
+GLOBAL_TOPICS = {TF_STATIC, "/tf", "/clock", "/diagnostics"}  # topics that are never remapped
+LAST_FRAME_DELAY_S = 1.0  # time for the last frame to be scored after the bag has ended
+# Arguments that the user cannot set, because the player and the evaluator rely on these values. They
+# are passed on because launch would otherwise pass on the user's values to the included file.
+FIXED_ARGUMENTS = {"namespace": "", "name_prefix": ""}
 
 
-def replay(context, given):
-    reject_unknown_arguments(given, context, {*VALUES, "rviz", *ARGUMENTS} - GRAPH.keys())
+def replay(context, argument_names):
+    reject_unknown_arguments(argument_names, context, {*VALUES, "rviz", *ARGUMENTS} - FIXED_ARGUMENTS.keys())
     value = {k: context.perform_substitution(LaunchConfiguration(k)) for k in VALUES}
     single, detectors = value["single"] == "true", split_detectors(value["detectors"])
-    own = [str(CONFIG), *([str(PAPER_CONFIG)] if "candidates" in detectors else [])]
-    files = [*own, *list_parameter_files(value["config"])]
-    use_large_shared_memory()  # set here, so that the nodes do not take the player for a driver
+    package_files = [str(CONFIG), *([str(PAPER_CONFIG)] if "candidates" in detectors else [])]
+    files = [*package_files, *list_parameter_files(value["config"])]
+    use_large_shared_memory()  # set here because the nodes would treat the player as a sensor driver
     with Bag(value["bag"]) as bag:
-        clouds = choose_cloud_topic(value["bag"], bag.topics, value["points"])
-        played = [t for t, kind in bag.topics.items() if t == clouds or kind not in CLOUD_TYPES]
+        cloud_topic = choose_cloud_topic(value["bag"], bag.topics, value["points"])
+        topics = [t for t, kind in bag.topics.items() if t == cloud_topic or kind not in CLOUD_TYPES]
     sim_time = {"use_sim_time": value["use_sim_time"] == "true"}
     log_level = ["--log-level", value["log_level"]]
     remap, scoring = configure_evaluator(value["scores"], single, detectors)
-    finals = [relative_name(list_result_topics(single, name)[FINAL]) for name in detectors]
+    detection_topics = [relative_name(list_result_topics(single, name)[FINAL_STAGE]) for name in detectors]
     real_time = value["real_time"] == "true"
-    # launch cannot determine the type of an empty list.
-    follow = {} if real_time else {"follow": finals}
-    clouds_for = len(detectors) if single else 1  # subscribers of the clouds
-    waits = [
-        *list_awaited_topics(detectors, single, clouds_for),
-        *(f"{final}:={1 if real_time else 2}" for final in finals),
-    ]  # evaluator, player
+    # Left out if empty, because launch cannot determine the type of an empty list.
+    follow = {} if real_time else {"follow": detection_topics}
+    cloud_subscribers = len(detectors) if single else 1
+    detection_subscribers = 1 if real_time else 2  # the evaluator, and the player if it follows
+    wait_for = [
+        *list_awaited_topics(detectors, single, cloud_subscribers),
+        *(f"{topic}:={detection_subscribers}" for topic in detection_topics),
+    ]
     player = Node(
         package="lidar_perception",
         executable="bag_player",
@@ -97,13 +102,13 @@ def replay(context, given):
                 "bag": value["bag"],
                 "rate": float(value["rate"]),
                 "loop": value["loop"] == "true",
-                "topics": played,
+                "topics": topics,
                 **follow,
-                "wait_for": waits,
+                "wait_for": wait_for,
             },
         ),
-        # Relative, so that they go into a namespace if this file is included in one.
-        remappings=[(t, relative_name(POINTS if t == clouds else t)) for t in played if t not in GLOBAL],
+        # Relative names, which follow the namespace if this file is included in one.
+        remappings=[(t, relative_name(POINTS if t == cloud_topic else t)) for t in topics if t not in GLOBAL_TOPICS],
         ros_arguments=log_level,
     )
     evaluator = Node(
@@ -120,7 +125,7 @@ def replay(context, given):
         PythonLaunchDescriptionSource(str(HERE / "detectors.launch.py")),
         launch_arguments={
             "points": relative_name(POINTS),
-            **GRAPH,
+            **FIXED_ARGUMENTS,
             "config": ",".join(files),
             "detectors": value["detectors"],
             **{k: LaunchConfiguration(k) for k in ("single", "rviz", "use_sim_time", "log_level")},
@@ -129,9 +134,9 @@ def replay(context, given):
     configurations = context.launch_configurations
     return [
         *(
-            LogInfo(msg=f"{name}:={configurations[name]} is not an argument of replay.launch.py")
-            for name, fixed in GRAPH.items()
-            if configurations.get(name, fixed) != fixed
+            LogInfo(msg=f"{name}:={configurations[name]} is ignored: it is not an argument of replay.launch.py")
+            for name, fixed_value in FIXED_ARGUMENTS.items()
+            if configurations.get(name, fixed_value) != fixed_value
         ),
         player,
         evaluator,
@@ -141,18 +146,19 @@ def replay(context, given):
 
 
 def generate_launch_description():
-    given = find_given_arguments()
+    argument_names = find_argument_names()
     return LaunchDescription(
         [
             DeclareLaunchArgument("bag", description="Folder of the bag."),
             DeclareLaunchArgument(
                 "detectors",
                 default_value="candidates",
-                description="Comma-separated detectors to replay and to score: "
-                "candidates, pointpillars, pointnet, fused.",
+                description="Comma-separated detectors to run and score: candidates, pointpillars, pointnet, fused.",
             ),
             DeclareLaunchArgument(
-                "points", default_value="", description="Topic of the clouds; may be empty if the bag has only one."
+                "points",
+                default_value="",
+                description="Topic of the clouds in the bag; may be empty if the bag has only one cloud topic.",
             ),
             DeclareLaunchArgument("rate", default_value="1.0", description="Speed factor of the replay."),
             DeclareLaunchArgument(
@@ -180,8 +186,8 @@ def generate_launch_description():
                 "real_time",
                 default_value="false",
                 choices=["true", "false"],
-                description="Play at the rate of the sensor; false: send a cloud "
-                "once the clouds before it have results.",
+                description="true: play the clouds at the rate of the sensor; false: send a cloud "
+                "once the previous ones have results, so that none is lost.",
             ),
             DeclareLaunchArgument(
                 "use_sim_time",
@@ -189,12 +195,12 @@ def generate_launch_description():
                 choices=["true", "false"],
                 description="Take the time from /clock.",
             ),
-            DeclareLaunchArgument("log_level", default_value="info", description="debug, info, ..."),
+            DeclareLaunchArgument("log_level", **ARGUMENTS["log_level"]),
             *(
                 DeclareLaunchArgument(name, **options)
                 for name, options in ARGUMENTS.items()
-                if name not in (*VALUES, "rviz", *GRAPH)
+                if name not in (*VALUES, "rviz", *FIXED_ARGUMENTS)
             ),
-            OpaqueFunction(function=lambda context: replay(context, given)),
+            OpaqueFunction(function=lambda context: replay(context, argument_names)),
         ]
     )

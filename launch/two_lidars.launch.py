@@ -11,7 +11,7 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
-from lidar_perception.nodes.launching import ARGUMENTS, find_given_arguments, reject_unknown_arguments
+from lidar_perception.nodes.launching import ARGUMENTS, find_argument_names, reject_unknown_arguments
 
 GRAPH = Path(__file__).resolve().parent / "detectors.launch.py"
 SIDES = ("left", "right")
@@ -34,10 +34,11 @@ SHARED = {
 
 
 def generate_launch_description():
-    given, known = find_given_arguments(), {*SIDES, *SHARED, *ARGUMENTS} - {"namespace", "points"}
+    argument_names = find_argument_names()
+    valid_names = {*SIDES, *SHARED, *ARGUMENTS} - {"namespace", "points"}
     return LaunchDescription(
         [
-            OpaqueFunction(function=lambda context: reject_unknown_arguments(given, context, known)),
+            OpaqueFunction(function=lambda context: reject_unknown_arguments(argument_names, context, valid_names)),
             *(
                 DeclareLaunchArgument(
                     side,

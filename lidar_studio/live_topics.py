@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from lidar_perception.data.to_bag import MARKERS
 from lidar_perception.types import InputError
 from lidar_perception.wire.clouds import POINT_CLOUD
-from lidar_perception.wire.topics import FOUND, POINTS, TRUTH
+from lidar_perception.wire.topics import DETECTIONS, POINTS, TRUTH
 from lidar_perception.wire.topics import TRACKS as TRACKED
 from lidar_studio.live_graph import BOXES, LABELS, TRACKS
 from lidar_studio.results import CLUSTERED_TOPICS
@@ -16,7 +16,7 @@ from lidar_studio.results import CLUSTERED_TOPICS
 ARRAY = "vision_msgs/msg/Detection3DArray"
 # Suffixes of cloud topics, those with the most columns first.
 CLOUD_ENDINGS = tuple(topic.lstrip("/") for topic in (*CLUSTERED_TOPICS, "/ground_segmentation/output/points", POINTS))
-KIND_BY_ENDING = {FOUND: BOXES, TRACKED: TRACKS, TRUTH: LABELS}
+KIND_BY_ENDING = {DETECTIONS: BOXES, TRACKED: TRACKS, TRUTH: LABELS}
 ARRAY_SUFFIX = "_3d"  # suffix of the Detection3DArray topic that accompanies a topic of markers
 
 

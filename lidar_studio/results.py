@@ -29,7 +29,7 @@ from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, assig
 from lidar_perception.scoring.recorded import read_objects_by_stamp
 from lidar_perception.types import Detections, GroundTruth, InputError
 from lidar_perception.wire.messages import FullScale, read_cluster_ids, read_column, to_detections, to_point_cloud
-from lidar_perception.wire.topics import FOUND, TRACKS, TRUTH
+from lidar_perception.wire.topics import DETECTIONS, TRACKS, TRUTH
 from lidar_studio.drive import Drive, Scan, segment_frame, to_scan
 from msg_utils.markers import MarkedObjects
 
@@ -207,7 +207,7 @@ def read_recorded_results(poses: BagPoses, stamps: list[int]) -> Results:
     topics = {
         topic
         for topic, kind in bag.topics.items()
-        if kind == MARKERS and topic != TRUTH and topic.endswith((FOUND, TRACKS))
+        if kind == MARKERS and topic != TRUTH and topic.endswith((DETECTIONS, TRACKS))
     }
     objects_by_topic = read_objects_by_stamp(bag, sorted(topics))
     index_by_stamp = {stamp: i for i, stamp in enumerate(stamps)}
@@ -251,7 +251,7 @@ def _to_probability(value: Any) -> float:
 
 def name_source(topic: str) -> str:
     """Return the node's name, such as fused_detector for /fused_detector/output/detections."""
-    return topic.strip("/").removesuffix(FOUND)
+    return topic.strip("/").removesuffix(DETECTIONS)
 
 
 def _make_source(detections_by_frame: Mapping[int, Detections]) -> Source:

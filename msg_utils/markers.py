@@ -4,7 +4,7 @@ Each box is a CUBE marker: pose and scale are the box, ns is the label, text is 
 the score and other fields. An object without a 3D box (KITTI's DontCare) is stored as the text of a
 DELETE marker, which is not drawn. Each array deletes the markers of the previous array that it does
 not contain, so that no marker becomes stale or flickers. An array without objects has one DELETE
-marker, which carries the header.
+marker that carries the header.
 """
 
 from __future__ import annotations

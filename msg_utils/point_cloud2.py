@@ -29,14 +29,17 @@ def compute_dtype(msg: Any) -> np.dtype:
             or point_step is above MAX_STEP.
     """
     if msg.point_step > MAX_STEP:
-        raise CloudError(f"point_step = {msg.point_step} is more than {MAX_STEP} bytes a point; the message is broken")
+        raise CloudError(
+            f"point_step is {msg.point_step}, but at most {MAX_STEP} bytes per point are supported; "
+            "the message is corrupt"
+        )
     order = ">" if msg.is_bigendian else "<"
     names, formats, offsets = [], [], []
     for f in msg.fields:
         if not f.name:
             continue
         if f.datatype not in DATATYPES:
-            raise CloudError(f"field '{f.name}' has datatype {f.datatype}; sensor_msgs/PointField knows 1 to 8")
+            raise CloudError(f"field '{f.name}' has datatype {f.datatype}; sensor_msgs/PointField defines 1 to 8")
         if f.name in names:
             raise CloudError(f"field '{f.name}' exists twice; give each field a unique name")
         base = np.dtype(order + DATATYPES[f.datatype])
@@ -45,7 +48,7 @@ def compute_dtype(msg: Any) -> np.dtype:
         offsets.append(f.offset)
         if f.offset + base.itemsize * max(f.count, 1) > msg.point_step:
             raise CloudError(
-                f"field '{f.name}' at offset {f.offset} reaches past point_step = "
+                f"field '{f.name}' at offset {f.offset} extends beyond point_step = "
                 f"{msg.point_step}; the driver's field offsets are wrong"
             )
     return np.dtype(dict(names=names, formats=formats, offsets=offsets, itemsize=msg.point_step))
@@ -63,7 +66,7 @@ def to_array(msg: Any) -> np.ndarray:
     if count == 0:
         return np.zeros(0, compute_dtype(msg) if msg.point_step else np.dtype([]))
     if msg.point_step == 0:
-        raise CloudError(f"point_step is 0 for {count} points; the message is broken")
+        raise CloudError(f"point_step is 0 for {count} points; the message is corrupt")
     dtype = compute_dtype(msg)
     data, row_bytes = np.frombuffer(msg.data, np.uint8), msg.width * msg.point_step
     row_step = compute_row_step(msg)
@@ -72,9 +75,9 @@ def to_array(msg: Any) -> np.ndarray:
     required_bytes = (msg.height - 1) * row_step + row_bytes
     if len(data) < required_bytes:
         raise CloudError(
-            f"data has {len(data)} bytes where height {msg.height} x width "
-            f"{msg.width} x point_step {msg.point_step} needs {required_bytes}; "
-            "the message was cut"
+            f"data has {len(data)} bytes, but height {msg.height} x width "
+            f"{msg.width} x point_step {msg.point_step} requires {required_bytes}; "
+            "the message is truncated"
         )
     rows = np.ndarray((msg.height, msg.width), dtype, data, strides=(row_step, msg.point_step))
     rows.flags.writeable = False
@@ -102,7 +105,7 @@ def read_columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
         if name not in (points.dtype.names or ()):
             raise CloudError(f"the cloud has no field '{name}'; it has {', '.join(points.dtype.names or ()) or 'none'}")
         if points.dtype[name].shape:
-            raise CloudError(f"field '{name}' has count > 1; a single number is needed")
+            raise CloudError(f"field '{name}' has count > 1; expected one number per point")
     columns = np.empty((len(points), len(names)), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes inf
         for i, name in enumerate(names):
@@ -119,7 +122,7 @@ def read_xyz(points: np.ndarray) -> np.ndarray:
     xyz = read_columns(points, ("x", "y", "z"))
     for name in "xyz":
         if points.dtype[name].kind != "f":
-            raise CloudError(f"field '{name}' is of type {points.dtype[name]}; metres as float32 or float64 are needed")
+            raise CloudError(f"field '{name}' has type {points.dtype[name]}; expected metres as float32 or float64")
     return xyz
 
 
@@ -193,7 +196,7 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
         fields.append(make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code, count=1))
         layout[name] = (offset, kind)
         offset += kind.itemsize
-    # A step that is a multiple of 4 bytes keeps float fields aligned in every point.
+    # A point_step that is a multiple of 4 bytes keeps float fields aligned in every point.
     point_step = offset if offset == msg.point_step else -(-offset // 4) * 4
     data = np.zeros((len(points), point_step), np.uint8)
     if len(points):

@@ -237,7 +237,7 @@ def test_eps_has_one_value_more_than_range_limits():
 
 @pytest.mark.parametrize("limits", [(30.0, 15.0), (15.0, 15.0)])
 def test_range_limits_must_ascend(limits):
-    with pytest.raises(ValueError, match=r"range_limits = \[.*must ascend"):
+    with pytest.raises(ValueError, match=r"range_limits = \[.*must be in ascending order"):
         DbscanParams(range_limits=limits)
 
 

@@ -19,7 +19,7 @@ from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import BoxParams, ClusteringParams
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.ground.threshold import compute_inlier_share, fit_plane
+from lidar_perception.ground.threshold import compute_inlier_fraction, fit_plane
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.compiling import report_compilation
 from lidar_perception.types import PointCloud
@@ -58,7 +58,7 @@ def warm_up_ground(params: GroundParams, view: ViewParams = ViewParams()) -> Non
     segment_ground(cloud, params)
     plane = fit_plane(cloud.xyz)
     if plane is not None:
-        compute_inlier_share(cloud.xyz, plane)
+        compute_inlier_fraction(cloud.xyz, plane)
 
 
 def warm_up_clustering(params: ClusteringParams, boxes: BoxParams) -> None:

@@ -39,7 +39,7 @@ from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice, open_detector
 from lidar_perception.groups import renumber_ids
 from lidar_perception.nodes import require_rclpy
-from lidar_perception.nodes.graph import FINAL, SINGLE_PROCESS_NODES, cloud_topic, list_result_topics
+from lidar_perception.nodes.graph import FINAL_STAGE, SINGLE_PROCESS_NODES, find_result_cloud_topic, list_result_topics
 from lidar_perception.runs.compiling import compile_in_background
 from lidar_perception.runs.files import make_folder, write_text
 from lidar_perception.runs.terminal import console, errors, show_progress
@@ -162,7 +162,7 @@ def demo(
         real_time=real_time,
         processes=processes,
     )
-    final = list_result_topics(single, detector)[FINAL]
+    final = list_result_topics(single, detector)[FINAL_STAGE]
     detections, tracks = read_results(out / "result", final, TRACKS)
     calibration = next(iter(replayed)).calibration()
     if detector == CANDIDATES:
@@ -174,7 +174,7 @@ def demo(
     write_text(out / "scores.json", json.dumps(content, indent=1))
     picture = _draw_best(
         out,
-        cloud_topic(single, detector),
+        find_result_cloud_topic(single, detector),
         _select_drawn_objects(detections, detector),
         next(iter(replayed)).sensor_height,
     )

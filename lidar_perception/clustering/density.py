@@ -10,8 +10,8 @@ from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.geometry import horizontal_range
 from lidar_perception.types import are_usable_returns
 
-CELL_DEG = 2.0  # the gap between the beams of a VLP-16
-MAX_SAMPLED = 30_000  # number of points to sample from a larger cloud
+CELL_DEG = 2.0  # side of a cell, equal to the spacing of a VLP-16's beams
+MAX_SAMPLED = 30_000  # approximate number of points to sample from a larger cloud
 MAX_WIDENING = 4.0  # maximum factor by which neighbourhoods widen
 MIN_CLUSTER_POINTS = 3  # lower limit of min_size; that of min_samples is one less
 # A widened radius of the local threshold, and a widened eps at the end of its band, in multiples of

@@ -6,14 +6,14 @@ its description:
 
 - Threshold d_i of point i. global: alpha times the mean distance of all N points to their nearest
   neighbour (Eq. 6). local: alpha times the mean distance to the other points within `radius`
-  (Eq. 11), 0 without any. fixed: `distance`, as in plain Euclidean clustering. The first two are
-  rounded to float32, so that the order of summation does not matter.
+  (Eq. 11), 0 if there are none. fixed: `distance`, as in plain Euclidean clustering. The first two
+  are rounded to float32, so that the order of summation does not matter.
 - A point is a core point if at least beta ln N points (MinPts, Eq. 7), itself included, lie within
   its d_i.
 - Two core points are linked if their distance is within either threshold (Eq. 8). Clusters are the
   connected sets. Any other point joins the nearest core point whose threshold reaches it (if several
   are equally near, the one with the least x, then y, then z); otherwise it is in no cluster.
-- With `curvature`, core points on uneven surfaces count as other points, see curvature.py.
+- With `curvature`, core points on uneven surfaces are treated as other points, see curvature.py.
 - Clusters of fewer than min_size points are dropped. Then clusters are merged if their centres
   (means) are closer than gamma (D_i + D_j) / 2, where D is the diagonal of the axis-aligned box
   (Eq. 9). All pairs are compared before merging, and merging is transitive.
@@ -23,9 +23,9 @@ the number of points. If the grid needs more than MAX_DISTANCES_PER_POINT, becau
 a neighbourhood but are out of reach of each other, a k-d tree finds the same clusters.
 
 Only the local threshold needs every pair. It is exact up to MAX_WORK_PER_POINT distances per point
-(scans of KITTI take less than 1,700, one of a Pandar64 among near surfaces 21,000) and MAX_WORK per
-cloud, twice as many as the densest known scan needs. For denser clouds it uses a sample of each
-cell, which depends on the points alone.
+(KITTI scans need less than 1,700, a Pandar64 scan close to surfaces needs 21,000) and MAX_WORK per
+cloud, twice what the densest known scan needs. For denser clouds it uses a sample of each cell that
+does not depend on the order of the points.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ from lidar_perception.clustering.tree import (
 # to their nearest neighbours.
 SAMPLE_SIZE, FIRST_CELL_MEDIANS = 64, 5
 MAX_BRUTE_FORCE = 20_000_000  # number of distances above which points are sorted into larger cells
-MAX_WORK = 2**32  # maximum distances per cloud for local thresholds
-MAX_WORK_PER_POINT = 2**15  # maximum distances per point for local thresholds
+MAX_WORK = 2**32  # maximum number of distances per cloud for local thresholds
+MAX_WORK_PER_POINT = 2**15  # maximum number of distances per point for local thresholds
 
 
 def cluster_euclidean(
@@ -75,8 +75,8 @@ def cluster_euclidean(
 
     Args:
         xyz: (N, 3) float32 in metres; N may be 0. Distances are computed in float64.
-        max_distances: maximum distances per point on the grid; beyond it, the tree is used.
-        max_work: maximum distances for the local threshold; beyond it, a sample is used.
+        max_distances: maximum number of distances per point on the grid; beyond it, the tree is used.
+        max_work: maximum number of distances for the local threshold; beyond it, a sample is used.
         radii: (N,) radius of each point for the local threshold, instead of params.radius.
 
     Returns:

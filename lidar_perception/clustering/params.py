@@ -17,8 +17,8 @@ class DbscanParams(Params):
     eps: tuple[float, ...] = param(
         (0.15, 0.30, 0.50),
         "Neighbourhood radius in each range band, "
-        "one more than range_limits. Change both in one call of "
-        "set_parameters_atomically while a node runs.",
+        "one more value than range_limits. While a node runs, set both in one call of "
+        "set_parameters_atomically.",
         unit="m",
         low=0.001,
         high=100.0,
@@ -35,11 +35,11 @@ class DbscanParams(Params):
         if len(self.eps) != len(self.range_limits) + 1:
             raise ValueError(
                 f"eps has {len(self.eps)} values for {len(self.range_limits)} "
-                "range_limits; give one more eps than range_limits (of a running "
-                "node both in one call of set_parameters_atomically)"
+                "range_limits; give one more eps than range_limits (while a node "
+                "runs, set both in one call of set_parameters_atomically)"
             )
         if any(b <= a for a, b in zip(self.range_limits, self.range_limits[1:])):
-            raise ValueError(f"range_limits = {list(self.range_limits)} must ascend")
+            raise ValueError(f"range_limits = {list(self.range_limits)} must be in ascending order")
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class EuclideanParams(Params):
         "one for each point, from its neighbours (Eq. 11). fixed: `distance`.",
         choices=("global", "local", "fixed"),
     )
-    distance: float = param(0.5, "Distance threshold for threshold: fixed.", unit="m", low=0.001, high=10.0)
+    distance: float = param(0.5, "Distance threshold if threshold is fixed.", unit="m", low=0.001, high=10.0)
     alpha: float = param(1.2, "Factor of the distance threshold (Eq. 6 and 11).", low=0.01, high=100.0)
     beta: float = param(
         0.5,
-        "MinPts = beta ln N: number of points within the threshold, "
-        "including the point itself, for a core point (Eq. 7).",
+        "Factor of MinPts = beta ln N, the minimum number of points within the "
+        "threshold, including the point itself, for a core point (Eq. 7).",
         low=0.0,
         high=1000.0,
     )
@@ -69,19 +69,19 @@ class EuclideanParams(Params):
         high=10.0,
     )
     radius: float = param(0.5, "Radius of the neighbourhood for the local threshold.", unit="m", low=0.001, high=10.0)
-    min_size: int = param(10, "Smaller clusters are dropped.", low=1, high=MAX_INT)
+    min_size: int = param(10, "Minimum number of points of a cluster.", low=1, high=MAX_INT)
     curvature: float = param(
         0.0,
-        "Curvature-consistent growing: clusters grow only from points "
-        "whose surface variation (0 to 1/3) is within this of the mean within "
-        "`radius`; 0: from all core points.",
+        "Curvature-consistent growing: clusters grow only from core points "
+        "whose surface variation (0 to 1/3) differs by at most this value from the mean "
+        "within `radius`; 0: from all core points.",
         low=0.0,
         high=1.0,
     )
 
 
 CLUSTERING_METHODS = ("dbscan", "euclidean")
-FULL_DENSITY = 10.0  # points per square degree required by our values; the HDL-64E has 13 to 16
+FULL_DENSITY = 10.0  # points per square degree from which our parameter values apply; an HDL-64E has 13 to 16
 
 
 @dataclass(frozen=True)
@@ -115,13 +115,13 @@ class BoxParams(Params):
 
     shape: str = param(
         "axis_aligned",
-        "axis_aligned: along x and y (STM-CPA paper). min_area: "
-        "the smallest rectangle. l_shape: along the two visible sides.",
+        "axis_aligned: aligned with x and y (STM-CPA paper). min_area: "
+        "the smallest rectangle. l_shape: aligned with the two visible sides.",
         choices=BOX_SHAPES,
     )
     plane: str = param(
         "least_squares",
-        "Plane at the bottom of the boxes. least_squares: fitted "
-        "to all ground points. ransac: fitted to most of them (STM-CPA paper).",
+        "Ground plane on which the boxes stand. least_squares: fitted "
+        "to all ground points. ransac: fitted to the inliers (STM-CPA paper).",
         choices=("least_squares", "ransac"),
     )

@@ -1,7 +1,7 @@
-"""Boxes and ellipses of clusters, and a class by size.
+"""Box and ellipse fitting, and size-based classification of clusters.
 
-Clusters are finite points (N, 3) float32 with labels (N,) int32, 0 for no cluster, 1..K; K = 0
-gives no rows. Ids are contiguous by contract, but an id without points still gets a row of zeros.
+Clusters are finite points (N, 3) float32 with labels (N,) int32: 0 for no cluster, 1..K for the
+clusters. Labels should be contiguous; one without points gets a row of zeros.
 """
 
 from __future__ import annotations
@@ -54,6 +54,9 @@ def fit_boxes(xyz: np.ndarray, labels: np.ndarray, shape: str) -> np.ndarray:
         lowest and the highest point. min_area and l_shape have l >= w and yaw in [-pi/2, pi/2).
         Coincident points have l = w = yaw = 0; collinear points have w = 0 and yaw along the line.
         The result does not depend on the order of the points.
+
+    Raises:
+        ValueError: the shape is unknown.
     """
     if shape not in BOX_SHAPES:
         raise ValueError(f"shape = {shape!r} must be one of {', '.join(BOX_SHAPES)}")
@@ -117,6 +120,6 @@ def classify_by_diagonal(boxes: np.ndarray) -> np.ndarray:
 
 def _fold_direction(yaw: np.ndarray) -> np.ndarray:
     """Wrap the directions of lines to [-pi/2, pi/2) float32."""
-    half = np.float32(np.pi / 2)
+    limit = np.float32(np.pi / 2)
     folded = ((yaw + np.pi / 2) % np.pi - np.pi / 2).astype(np.float32)
-    return np.where(folded >= half, -half, folded)  # values just below pi/2 round up to it
+    return np.where(folded >= limit, -limit, folded)  # values just below pi/2 round up to it

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 CUBES_PER_REACH = 32
-# Fraction of the reach: both points of a pair may be a cube's diagonal away from the one kept.
+# Fraction of the reach: each point of a pair may be a cube's diagonal away from its representative.
 SLACK = 2 * 3**0.5 / CUBES_PER_REACH
 MAX_DISTANCES_PER_POINT = 2_000
 MIN_DISTANCES = 2**30  # minimum budget of a search in distances, about a second

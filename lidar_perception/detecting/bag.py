@@ -15,7 +15,7 @@ from lidar_perception.detecting.results import FrameResult
 from lidar_perception.types import Detections, InputError, PointCloud
 from lidar_perception.wire.array_codec import encode_detection_array, encode_markers
 from lidar_perception.wire.messages import make_detection_rows
-from lidar_perception.wire.topics import FOUND, TRACKS
+from lidar_perception.wire.topics import DETECTIONS, TRACKS
 from lidar_perception.wire.track_markers import make_track_rows
 from msg_utils.markers import MarkerRow, list_marker_keys
 
@@ -32,7 +32,7 @@ class Bag:
         self.run, self.clouds = run, clouds
         self.needs_scans = clouds
         self.path = run.out / "bag"
-        self.found = f"/{run.header['detector']}_detector{FOUND}"
+        self.found = f"/{run.header['detector']}_detector{DETECTIONS}"
         self.tracks = f"/tracker{TRACKS}" if tracked else None
         self.bag = BagWriter(self.path, force=True)
         self._shown: dict[str, Any] = {}

@@ -77,7 +77,7 @@ class NormalizedView:
     def flatten(self, surface: GroundSurface) -> NormalizedView:
         """Move all points vertically, so that the ground is SENSOR_HEIGHT below the sensor everywhere."""
         xyz = self.frame.xyz.copy()
-        xyz[:, 2] -= surface.at(xyz) + SENSOR_HEIGHT
+        xyz[:, 2] -= surface.height_at(xyz) + SENSOR_HEIGHT
         return replace(self, frame=replace(self.frame, xyz=xyz))
 
     def take(self, column: np.ndarray | None) -> np.ndarray | None:

@@ -20,8 +20,8 @@ from lidar_perception.ground.params import ClothParams
 
 GRID_LEVELS = 6  # number of grids of the solver, each twice as coarse as the previous one
 TOLERANCE_M = 0.001  # maximum movement of a particle in the last step
-SUNK_WINDOWS = (2, 6)  # half widths, in cells, of the squares around a cell that may be sunk
-SUNK_DEPTH_M = 0.4  # depth below the surroundings from which an isolated lowest point is a reflection
+SUNK_WINDOWS = (2, 6)  # half widths, in cells, of the windows in which a cell is compared with its neighbours
+SUNK_DEPTH_M = 0.4  # minimum depth of a reflection below its surroundings
 
 
 class Cloth(NamedTuple):
@@ -122,9 +122,9 @@ def _find_lowest_points(xyz, max_range, x0, y0, scale, rows, columns):
 def _drop_sunk_cells(lowest, depth):
     """Mark cells with reflections below the ground as UNOBSERVED.
 
-    These are the cells whose lowest point is lower by `depth` than those of all cells around them
-    except at most one. They would pull the cloth down for metres around them. The wider window is
-    for large ranges, where few neighbouring cells have points.
+    A cell is dropped if its lowest point is more than `depth` below the lowest points of all
+    neighbouring cells except at most one. It would pull the cloth down for metres around it. The
+    wider window is for large ranges, where few neighbouring cells have points.
     """
     rows, columns = lowest.shape
     sunk_cells = []

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 UNOBSERVED = np.float32(np.inf)
-REACH_CELLS, STEP_M = 6, 0.05  # maximum gap and step over which the ground continues
+REACH_CELLS, STEP_M = 6, 0.05  # maximum gap, and maximum step in height, over which the ground continues
 # Squared distance, row offset and column offset of the cells around a cell, nearest first.
 NEIGHBOURS = np.array(
     sorted(
@@ -22,8 +22,8 @@ NEIGHBOURS = np.array(
 def find_climbing_cells(lowest, height, threshold, slope):
     """Find the cells that continue the ground uphill from the cells that the cloth touches.
 
-    Some roads begin to climb more steeply than the cloth can bend between two rings of points.
-    Objects on the road begin above the slope of the road.
+    Some roads begin to climb more steeply than the cloth can bend between two rings of points. The
+    lowest points of objects on the road lie above its slope, so objects are not included.
 
     A cell continues the ground if its lowest point is at most STEP_M plus `slope` per cell above
     the lowest point of the nearest ground cell, at most REACH_CELLS away (of equally near cells,
@@ -37,7 +37,7 @@ def find_climbing_cells(lowest, height, threshold, slope):
         slope: rise per cell in metres.
 
     Returns:
-        (R, C) bool: True for these cells, False for the cells that the cloth touches.
+        (R, C) bool: True for these cells, False for all others, including those that the cloth touches.
     """
     rows, columns = lowest.shape
     is_ground, is_climbing = np.zeros(lowest.shape, np.bool_), np.zeros(lowest.shape, np.bool_)

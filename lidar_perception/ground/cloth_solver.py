@@ -2,8 +2,8 @@
 
 Each height of a grid (R, C) obeys height <= obstacle. It either touches its obstacle or equals the
 mean of its four neighbours plus its lift. Beyond the border, the sheet is level. A smoothing pass
-has a short reach, but coarser grids move distant cells, so a few cycles suffice (Brandt and Cryer,
-SIAM J. Sci. Stat. Comput. 4(4), 1983).
+affects only nearby cells, but coarser grids propagate it, so a few cycles suffice (Brandt and
+Cryer, SIAM J. Sci. Stat. Comput. 4(4), 1983).
 
 Arrays in this module have a border of one cell. "Unobserved" cells have no obstacle (inf).
 """

@@ -46,9 +46,9 @@ class ThresholdParams(Params):
 
     max_height: float = param(
         0.43,
-        "The plane is fitted to points below this height above the "
-        "ground at the sensor. 0.43 m, for a sensor at 1.73 m, is the "
-        "paper's z < -1.3.",
+        "Maximum height, above the ground at the sensor, of the points to which "
+        "the plane is fitted. For a sensor at 1.73 m, 0.43 m is the paper's "
+        "z < -1.3.",
         unit="m",
         low=-10.0,
         high=100.0,
@@ -67,7 +67,7 @@ class ThresholdParams(Params):
         low=1,
         high=100_000,
     )
-    max_slope: float = param(30.0, "Steeper planes are rejected.", unit="deg", low=0.0, high=89.0)
+    max_slope: float = param(30.0, "Maximum slope of the plane.", unit="deg", low=0.0, high=89.0)
     seed: int = param(0, "Seed of the random trials.", low=0, high=MAX_INT)
 
 
@@ -82,7 +82,7 @@ class PatchworkParams(Params):
     )
     seed_distance: float = param(
         0.125,
-        "Points up to this height above the lowest ones initialize the plane of a sector.",
+        "Maximum height above the lowest points of the points that initialize the plane of a sector.",
         unit="m",
         low=0.001,
         high=2.0,
@@ -110,7 +110,7 @@ class ClothParams(Params):
     )
     curvature: float = param(
         0.1,
-        "Bending of the cloth under gravity if nothing supports it; lower is stiffer.",
+        "Curvature of the unsupported cloth under gravity; a lower value makes the cloth stiffer.",
         unit="1/m",
         low=0.0001,
         high=10.0,
@@ -126,9 +126,9 @@ class ClothParams(Params):
     def check(self) -> None:
         if (cells := (2 * self.max_range / self.resolution) ** 2) > 4_000_000:
             raise ValueError(
-                f"resolution = {self.resolution} m over max_range = {self.max_range} "
-                f"m makes {cells:.0f} particles, more than 4 million; raise the one "
-                "or lower the other"
+                f"resolution = {self.resolution} m and max_range = {self.max_range} "
+                f"m need {cells:.0f} particles, more than the maximum of 4 million; "
+                "increase resolution or decrease max_range"
             )
 
 
@@ -158,7 +158,7 @@ class ObstacleParams(Params):
 
     min_height: float = param(
         0.0,
-        "Minimum height of obstacles above the ground around them; 0: points below the ground count, too.",
+        "Minimum height of obstacles above the ground around them; 0: no limit, points below the ground are obstacles.",
         unit="m",
         low=0.0,
         high=100.0,

@@ -1,9 +1,8 @@
 """Ground segmentation by Patchwork++ (Lee, Lim, Myung, IROS 2022), as in paper B's V1.
 
-The labels are those of the authors' library (pypatchworkpp 1.4.1) for one cloud, except for a few
-points whose distance from a limit is a rounding error. Unlike the library, this code releases the
-GIL, prints nothing and does not adapt limits from cloud to cloud, so the same cloud always has the
-same ground.
+The labels equal those of the authors' library (pypatchworkpp 1.4.1) for a single cloud, except for a
+few points within rounding error of a limit. Unlike the library, this code releases the GIL, prints
+nothing and does not adapt limits from cloud to cloud, so the same cloud always gets the same labels.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from lidar_perception.geometry import counting_sort
 from lidar_perception.ground.params import PatchworkParams
 
 # Constants of the Patchwork++ library; comments give their names there.
-RINGS, SECTORS = (2, 4, 4, 4), (16, 32, 54, 32)  # of each zone: num_rings_each_zone, ...sectors...
+RINGS, SECTORS = (2, 4, 4, 4), (16, 32, 54, 32)  # by zone: num_rings_each_zone, num_sectors_each_zone
 PATCHES = sum(rings * sectors for rings, sectors in zip(RINGS, SECTORS))
 MIN_PATCH_POINTS = 10  # num_min_pts
 ITERATIONS = 3  # num_iter
@@ -28,8 +27,8 @@ MIN_SEED_HEIGHT = -1.2  # adaptive_seed_selection_margin, in sensor heights
 VERTICAL_SEED_DISTANCE, VERTICAL_DISTANCE = 0.25, 0.1  # th_seeds_v, th_dist_v, metres
 MAX_NOISE_DEG, MAX_NOISE_INTENSITY = -15.0, 0.2  # RNR_ver_angle_thr, RNR_intensity_thr
 MIN_NOISE_DEPTH = 0.8  # minimum depth of reflections below the ground, metres
-MAX_LINE_RATIO = 8.0  # max eigenvalue ratio of a patch that can be reverted
-MANY_POINTS = 1500  # a flat patch with more points is reverted
+MAX_LINE_RATIO = 8.0  # maximum ratio of the two largest eigenvalues of a patch that is reverted to ground
+MANY_POINTS = 1500  # number of ground points above which a flat patch is reverted to ground
 
 OTHER, GROUND, REMOVED = 0, 1, 2  # states of a point in its patch
 
@@ -362,7 +361,7 @@ def _find_kernel(m, eigenvalue, kernel, column):
 
 @njit(cache=True, nogil=True)
 def _compute_flatness_limit(flatness, count):
-    """Return the flatness below which a patch stays ground; 0 for fewer than two patches."""
+    """Return the flatness below which a candidate remains ground; 0 for fewer than two patches."""
     if count < 2:
         return 0.0
     total, squares = 0.0, 0.0

@@ -9,7 +9,7 @@ from numba import njit
 from scipy import ndimage
 
 CELL_M = 2.0  # width of the square cells whose mean heights define the surface
-MIN_POINTS = 3  # minimum ground points of a cell to have a height
+MIN_POINTS = 3  # minimum number of ground points for a cell to have a height
 SMOOTHING_M = 2.4  # standard deviation of the Gaussian that smooths the heights
 MIN_WEIGHT = 1e-3  # minimum weight of a smoothed height; other cells get the height of the nearest cell
 
@@ -25,8 +25,8 @@ class GroundSurface(NamedTuple):
     heights: np.ndarray
     first: tuple[float, float]
 
-    def at(self, xy: np.ndarray) -> np.ndarray:
-        """Return the height (K,) float64 of the ground at places (K, 2 or more) [x y ...]."""
+    def height_at(self, xy: np.ndarray) -> np.ndarray:
+        """Return the height (K,) float64 of the ground at positions (K, 2 or more) [x y ...]."""
         return _interpolate(self.heights, np.asarray(xy), *self.first)
 
 
@@ -34,7 +34,7 @@ def fit_ground_surface(ground: np.ndarray, default: float) -> GroundSurface:
     """Fit a surface to ground points (G, 3).
 
     The mean heights of cells are smoothed. Cells without ground points, for example under cars, get
-    the height of the cells around them, or otherwise of the nearest cell.
+    the height of the cells around them, or if those have none, of the nearest cell.
 
     Args:
         ground: finite points of a limited area, because memory grows with the area.

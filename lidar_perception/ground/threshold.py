@@ -14,8 +14,8 @@ from lidar_perception.types import SENSOR_HEIGHT
 MIN_POINTS = 3
 SAMPLE_SIZE = 2048  # number of points used to compare trial planes; the fit uses all points
 CONFIDENCE = 0.9999  # probability of drawing at least one triple without outliers
-MIN_SINE = 1e-3  # min sine of the angle in a trial's triangle; thin triangles do not define a plane
-MAX_REFINEMENTS = 50  # a few suffice; bounds the rare case that the inliers cycle
+MIN_SINE = 1e-3  # minimum sine of the angle in a trial's triangle; thin triangles do not define a plane
+MAX_REFINEMENTS = 50  # ends the rare case of inliers that alternate; a few refinements are typical
 
 
 def segment_by_threshold(
@@ -24,9 +24,10 @@ def segment_by_threshold(
     """Segment the ground of finite points (N, 3).
 
     Returns:
-        (N,) bool, True = ground. separate = "height": the low points, less than max_height above
-        the ground at the sensor. separate = "plane": the points within inlier_distance of the plane
-        with the most low points; all False if there is no such plane (too few points, or too steep).
+        (N,) bool, True = ground. separate = "height": the low points, that is, those less than
+        max_height above the ground at the sensor. separate = "plane": the points within
+        inlier_distance of the plane with the most low points; all False if there is no such plane
+        (too few points, or too steep).
     """
     if params.separate == "height":
         return _is_low(xyz, params, sensor_height)
@@ -96,15 +97,15 @@ def fit_plane(xyz: np.ndarray) -> np.ndarray | None:
     return _solve_plane(_compute_moments(xyz, np.zeros(3), np.inf))
 
 
-def compute_inlier_share(xyz: np.ndarray, plane: np.ndarray, params: ThresholdParams = ThresholdParams()) -> float:
-    """Return the fraction of the points (N, 3) below max_height that are within inlier_distance.
+def compute_inlier_fraction(xyz: np.ndarray, plane: np.ndarray, params: ThresholdParams = ThresholdParams()) -> float:
+    """Return the fraction of the low points (N, 3) that are within inlier_distance of the plane.
 
-    Both are measured from the plane. The fraction shows how well a plane describes the ground; it is
-    0 if no point is below max_height.
+    Low points are less than max_height above the plane. The fraction shows how well the plane
+    describes the ground; it is 0 if there are no low points.
     """
     height = height_above_plane(xyz, plane)
-    low = height < params.max_height
-    return float((np.abs(height[low]) <= params.inlier_distance).mean()) if low.any() else 0.0
+    is_low = height < params.max_height
+    return float((np.abs(height[is_low]) <= params.inlier_distance).mean()) if is_low.any() else 0.0
 
 
 def height_above_plane(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ RATE_INTERVALS = 10  # number of intervals whose mean gives the current rate
 class Arrivals:
     """Count received, dropped and lost clouds (sent = received + dropped + lost).
 
-    Publishers number their messages (publication_sequence_number). A gap counts as lost on the way
+    Publishers number their messages (publication_sequence_number). A gap counts as lost in transit
     or, if the queue was full, as dropped from the queue.
     """
 
@@ -23,7 +23,7 @@ class Arrivals:
         self.depth = depth
         self.sent = self.dropped = self.lost = 0
         self.sequence: int | None = None  # number of the last cloud
-        self.window: deque[tuple[int, int, int]] = deque([(0, 0, 0)], WINDOW + 1)
+        self.window: deque[tuple[int, int, int]] = deque([(0, 0, 0)], WINDOW + 1)  # (sent, lost, dropped)
         self.stamps: deque[tuple[int, int]] = deque(maxlen=RATE_SAMPLES + 1)  # (sequence number, time of sending in ns)
         self.learned: float | None = None  # expected rate, Hz
 
@@ -31,17 +31,17 @@ class Arrivals:
         """Count messages.
 
         Args:
-            infos: message infos of rclpy, of all messages that were waiting, oldest first.
-            dropped: how many of them are not processed.
+            infos: rclpy's message infos of all messages that were in the queue, oldest first.
+            dropped: number of these messages that are not processed.
             one_publisher: False with several publishers, whose numbers cannot be compared.
         """
-        full = len(infos) >= self.depth
+        queue_was_full = len(infos) >= self.depth
         for i, info in enumerate(infos):
             number, gap = info["publication_sequence_number"], 0
             if one_publisher and number and self.sequence is not None and number > self.sequence:
                 gap = number - self.sequence - 1
             self.sequence = (number or None) if one_publisher else None
-            if full and i == 0:
+            if queue_was_full and i == 0:
                 self.dropped += gap
             else:
                 self.lost += gap
@@ -55,26 +55,26 @@ class Arrivals:
             self.learned = 1e9 / period if period > 0 else None
 
     def record_interruption(self, dropped: int) -> None:
-        """Count the waiting clouds as dropped, and ignore the clouds until the next one."""
+        """Count the waiting clouds as dropped, and do not count the gap until the next cloud."""
         self.dropped += dropped
         self.sequence = None
         self.stamps.clear()
         self.reset_window()
 
     def reset_window(self) -> None:
-        """Restart the window of count_recent(), because the cause of earlier drops is over."""
+        """Restart the window of count_recent() when the cause of earlier drops is gone."""
         self.window.clear()
         self.window.append((self.sent, self.lost, self.dropped))
 
     def count_recent(self) -> tuple[int, int, int]:
-        """Return (sent, lost, dropped) of the last WINDOW sent clouds, or more after a long gap."""
-        now = self.window[-1]
-        before = next((w for w in reversed(self.window) if now[0] - w[0] >= WINDOW), self.window[0])
-        sent, lost, dropped = (a - b for a, b in zip(now, before))
+        """Return (sent, lost, dropped) of the last WINDOW sent clouds, or of more after a long gap."""
+        end = self.window[-1]
+        start = next((counts for counts in reversed(self.window) if end[0] - counts[0] >= WINDOW), self.window[0])
+        sent, lost, dropped = (last - first for last, first in zip(end, start))
         return sent, lost, dropped
 
     def measure_rate(self) -> float | None:
-        """Return the present rate of sent clouds in Hz, or None while too few have arrived."""
+        """Return the current rate of sent clouds in Hz, or None while too few have arrived."""
         if len(self.stamps) <= RATE_INTERVALS:
             return None
         (n0, t0), (n1, t1) = self.stamps[-1 - RATE_INTERVALS], self.stamps[-1]

@@ -1,4 +1,4 @@
-"""Activation of a lifecycle node without a lifecycle manager, and a warning if the manager is missing."""
+"""Activation of a lifecycle node without a lifecycle manager, and a warning if no manager activates it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 
 from lidar_perception.nodes.diagnostics import OK, WARN
 
+SUCCESS = TransitionCallbackReturn.SUCCESS
 CHECK_PERIOD_S = 1.0
 MIN_RETRY_PERIOD_S = 5.0
 RETRY_FACTOR = 10.0  # ratio of the retry period to the duration of an attempt
@@ -17,10 +18,10 @@ UNCONFIGURED = "not configured"
 
 
 class Autostart:
-    """Activates a node and retries after a failure, as a missing file may appear.
+    """Activates a node, and retries after a failure because a missing file may have appeared.
 
-    With the parameter autostart false, the node is left to a lifecycle manager instead, and a
-    diagnostic warns if none has requested anything, for example after a restart of the node.
+    If the parameter autostart is false, a lifecycle manager activates the node. A diagnostic warns
+    if no request of a manager arrives, for example after a restart of the node.
 
     Args:
         node: the node.
@@ -41,9 +42,9 @@ class Autostart:
             node.get_logger().info(f"{UNCONFIGURED}: waiting for a lifecycle manager, because autostart is false")
             self.unmanaged_since = monotonic()
             return
-        begin, success = monotonic(), TransitionCallbackReturn.SUCCESS
-        is_configured = node.state_label() == "inactive" or node.trigger_configure() == success
-        if is_configured and node.trigger_activate() == success:
+        begin = monotonic()
+        is_configured = node.state_label() == "inactive" or node.trigger_configure() == SUCCESS
+        if is_configured and node.trigger_activate() == SUCCESS:
             if self.retry_at is not None:
                 node.get_logger().info("ready")
             self.retry_at = None
@@ -52,20 +53,20 @@ class Autostart:
             self.retry_at = now + max(MIN_RETRY_PERIOD_S, RETRY_FACTOR * (now - begin))
 
     def check(self) -> None:
-        """Retry a failed start, and report that no manager has requested anything."""
+        """Retry a failed start, and report a missing lifecycle manager."""
         if self.retry_at is not None and monotonic() > self.retry_at:
             self.start()
         if self.unmanaged_since is not None and monotonic() - self.unmanaged_since > MANAGER_TIMEOUT_S:
-            self.node.diagnostics.report(*self._describe_unmanaged())
+            self.node.diagnostics.report(*self._describe_missing_manager())
 
-    def _describe_unmanaged(self) -> tuple[bytes, str]:
-        """Return the diagnostic of a node that has had no transition request."""
+    def _describe_missing_manager(self) -> tuple[bytes, str]:
+        """Return the level and message for a node that has not received a transition request."""
         topics = [self.node.resolve_topic_name(f"~/input/{name}") for name in self.inputs]
-        if not (published := [topic for topic in topics if self.node.count_publishers(topic)]):
+        if not (active_topics := [topic for topic in topics if self.node.count_publishers(topic)]):
             return OK, UNCONFIGURED
         return WARN, (
             f"{UNCONFIGURED} by any lifecycle manager, but there is a publisher on "
-            f"{published[0]}: a manager does not notice that a node was restarted; "
+            f"{active_topics[0]}: a manager does not notice that a node was restarted; "
             f"restart the manager, or run `ros2 lifecycle set {self.node.get_fully_qualified_name()} configure`, "
             "then activate"
         )

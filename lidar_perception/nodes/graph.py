@@ -24,62 +24,59 @@ import yaml
 from lidar_perception.candidates.params import STEPS
 from lidar_perception.runs.machine import count_cores
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
-from lidar_perception.wire.clouds import diagnose_packets, find_cloud_topics
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
 Graph = Mapping[str, Mapping[str, str]]  # node -> its topic remappings
 
 
 def relative_name(topic: str) -> str:
-    """Return the topic without its leading slash, so that it follows the namespace of its node."""
+    """Remove the leading slash of a topic, so that the topic is in the namespace of its node."""
     return topic.lstrip("/")
 
 
-CAMERA = {"~/input/camera_info": relative_name(CAMERA_INFO), "~/input/extrinsics": relative_name(EXTRINSICS)}
+CAMERA_INPUTS = {"~/input/camera_info": relative_name(CAMERA_INFO), "~/input/extrinsics": relative_name(EXTRINSICS)}
 TRUTH_INPUT = {"~/input/ground_truth": relative_name(TRUTH)}
-CLOUDS = {"~/input/points": relative_name(POINTS)}
+CLOUD_INPUT = {"~/input/points": relative_name(POINTS)}
+CLUSTERED_CLOUD_INPUT = {"~/input/points": "clustering/output/points"}
 ODOMETRY_INPUT = {"~/input/odometry": relative_name(ODOMETRY)}
 TRACKER = "tracker"
 MAX_CORES_FOR_ONE_PROCESS = 4
 SEPARATOR = "---"  # separates the arguments of nodes that share a process
-FINAL = "final"  # name of a detector's last stage, whose boxes are the detections
-CLUSTERED = {"~/input/points": "clustering/output/points"}
+FINAL_STAGE = "final"  # name of a detector's last stage, whose boxes are the detections
 
 # Nodes for ground and clusters, shared by all detectors.
 EXPERTS = {
-    "ground_segmentation": {**CLOUDS, **CAMERA},
+    "ground_segmentation": {**CLOUD_INPUT, **CAMERA_INPUTS},
     "clustering": {"~/input/points": "ground_segmentation/output/points"},
 }
 # Detector -> its node downstream of EXPERTS.
 DETECTOR_NODES = {
-    "candidates": {"candidate_refinement": {**CLUSTERED, **TRUTH_INPUT}},
-    "pointpillars": {"pointpillars_detector": CLUSTERED},
-    "pointnet": {"pointnet_detector": CLUSTERED},
-    "fused": {"fused_detector": CLUSTERED},
+    "candidates": {"candidate_refinement": {**CLUSTERED_CLOUD_INPUT, **TRUTH_INPUT}},
+    "pointpillars": {"pointpillars_detector": CLUSTERED_CLOUD_INPUT},
+    "pointnet": {"pointnet_detector": CLUSTERED_CLOUD_INPUT},
+    "fused": {"fused_detector": CLUSTERED_CLOUD_INPUT},
 }
 # Detector -> its standalone node, which computes ground and clusters itself.
 SINGLE_PROCESS_NODES = {
-    "candidates": {"perception": {**CLOUDS, **TRUTH_INPUT, **CAMERA}},
-    "pointpillars": {"pointpillars_detector": CLOUDS},
-    "pointnet": {"pointnet_detector": CLOUDS},
-    "fused": {"fused_detector": CLOUDS},
+    "candidates": {"perception": {**CLOUD_INPUT, **TRUTH_INPUT, **CAMERA_INPUTS}},
+    "pointpillars": {"pointpillars_detector": CLOUD_INPUT},
+    "pointnet": {"pointnet_detector": CLOUD_INPUT},
+    "fused": {"fused_detector": CLOUD_INPUT},
 }
-
-
 # Detectors with a network, each with a parameter group of the same name.
 NETWORKS = tuple(name for name, nodes in SINGLE_PROCESS_NODES.items() if f"{name}_detector" in nodes)
 
 
 def build_graph(detectors: Sequence[str], single: bool = False, tracking: bool = False) -> dict[str, Mapping[str, str]]:
-    """Return the nodes of one or several detectors, each node once.
+    """Return the graph of one or more detectors; nodes that they share appear once.
 
     Args:
         detectors: names of detectors, keys of DETECTOR_NODES.
-        single: each detector finds ground and clusters itself, in one process.
+        single: let each detector compute ground and clusters itself, in one process.
         tracking: add a tracker for each detector.
 
     Returns:
-        {node: {its topic: remapped topic}}
+        {node: {topic: remapped topic}}
 
     Raises:
         InputError: a detector is unknown.
@@ -87,57 +84,58 @@ def build_graph(detectors: Sequence[str], single: bool = False, tracking: bool =
     for name in detectors:
         if name not in DETECTOR_NODES:
             raise InputError(f"detectors: '{name}' is unknown; choose from {', '.join(DETECTOR_NODES)}")
-    parts = [(SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[name] for name in detectors]
+    graphs = [] if single else [EXPERTS]
+    graphs += [(SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[name] for name in detectors]
     if tracking:
-        parts += [{tracker: _remap_tracker(name, single)} for tracker, name in find_trackers(detectors).items()]
-    return {k: v for part in ([] if single else [EXPERTS]) + parts for k, v in part.items()}
+        graphs += [{tracker: _remap_tracker(name, single)} for tracker, name in find_trackers(detectors).items()]
+    return {node: remap for graph in graphs for node, remap in graph.items()}
 
 
 def find_expert_range(detectors: Sequence[str], params: Mapping[str, Any]) -> str:
-    """Return the parameter range of ground_segmentation: the range that all detectors have.
+    """Return the value of the parameter `range` of ground_segmentation.
 
     Args:
         detectors: names of detectors.
-        params: parameters of the detectors. Packaged weights see ahead with the range auto.
+        params: parameters of the detectors. With range auto, the packaged weights detect ahead.
 
     Returns:
-        ahead or around; all if a detector needs the whole cloud, has its own weights, or another
-        range than the others.
+        ahead or around if all detectors use that range; all if the ranges differ, or if a detector
+        needs the full cloud or has weights of its own.
     """
     ranges = set()
     for name in detectors:
-        chosen = params.get(f"{name}.range", "auto")
+        detection_range = params.get(f"{name}.range", "auto")
         is_known = name in ("fused", "pointpillars") and not params.get(f"{name}.weights")
-        ranges.add(("ahead" if chosen == "auto" else chosen) if is_known else "all")
+        ranges.add(("ahead" if detection_range == "auto" else detection_range) if is_known else "all")
     return ranges.pop() if len(ranges) == 1 else "all"
 
 
 def find_trackers(detectors: Sequence[str]) -> dict[str, str]:
-    """Return the detector of each tracker, by the name of the tracker."""
+    """Return {tracker node: detector whose boxes it tracks}."""
     return {f"{name}_{TRACKER}" if len(detectors) > 1 else TRACKER: name for name in detectors}
 
 
 def _remap_tracker(detector: str, single: bool) -> dict[str, str]:
     detections = f"{find_result_node(detector, single)}/output/detections"
-    return {"~/input/detections": detections, **CLOUDS, **ODOMETRY_INPUT}
+    return {"~/input/detections": detections, **CLOUD_INPUT, **ODOMETRY_INPUT}
 
 
 def find_executable(node: str) -> str:
-    """Return the executable of a node of a graph."""
+    """Return the executable that runs a node of a graph."""
     return TRACKER if node.endswith(f"_{TRACKER}") else node
 
 
 def add_node_prefix(graph: Graph, prefix: str) -> dict[str, dict[str, str]]:
     """Return the graph with a prefix on the names of its nodes and of the topics between them."""
 
-    def renamed(topic: str) -> str:
+    def add_prefix(topic: str) -> str:
         return prefix + topic if topic.partition("/")[0] in graph else topic
 
-    return {prefix + node: {a: renamed(b) for a, b in remap.items()} for node, remap in graph.items()}
+    return {prefix + node: {old: add_prefix(new) for old, new in remap.items()} for node, remap in graph.items()}
 
 
-STAGES, SINGLE = build_graph(["candidates"]), build_graph(["candidates"], single=True)
-POINTPILLARS, POINTNET = build_graph(["pointpillars"]), build_graph(["pointnet"])
+CANDIDATES_GRAPH = build_graph(["candidates"])
+SINGLE_PROCESS_CANDIDATES = build_graph(["candidates"], single=True)
 
 
 def find_result_node(detector: str, single: bool = False) -> str:
@@ -147,14 +145,14 @@ def find_result_node(detector: str, single: bool = False) -> str:
 
 
 def list_result_topics(single: bool = False, detector: str = "candidates") -> dict[str, str]:
-    """Return the topic of detections by stage, without a namespace; networks have one stage."""
+    """Return {stage: topic of its detections}, without a namespace; networks have one stage."""
     node = find_result_node(detector, single)
-    before = ("stage1", "stage2") if detector == "candidates" else ()
-    return {**{stage: f"/{node}/debug/{stage}" for stage in before}, FINAL: f"/{node}/output/detections"}
+    early_stages = ("stage1", "stage2") if detector == "candidates" else ()
+    return {**{stage: f"/{node}/debug/{stage}" for stage in early_stages}, FINAL_STAGE: f"/{node}/output/detections"}
 
 
-def cloud_topic(single: bool = False, detector: str = "candidates") -> str:
-    """Return the topic of the cloud that has all columns."""
+def find_result_cloud_topic(single: bool = False, detector: str = "candidates") -> str:
+    """Return the topic of the clouds that have all columns that the graph adds."""
     if not single:
         return "/clustering/output/points"
     if detector != "candidates":
@@ -163,33 +161,34 @@ def cloud_topic(single: bool = False, detector: str = "candidates") -> str:
 
 
 def list_stages(detectors: Sequence[str], single: bool = False) -> dict[str, str]:
-    """Return the topic of detections of each stage of one detector, or of each of several."""
+    """Return {stage: topic of its detections} for one detector; {detector: topic} for several."""
     if len(detectors) == 1:
         return list_result_topics(single, detectors[0])
-    return {name: list_result_topics(single, name)[FINAL] for name in detectors}
+    return {name: list_result_topics(single, name)[FINAL_STAGE] for name in detectors}
 
 
 def list_timing_topics(detectors: Sequence[str] = ("candidates",), single: bool = False) -> list[str]:
-    """Return the topics with the times of the nodes, and of single steps of the candidates."""
+    """Return the topics of the processing times of all nodes, and of the steps of the candidates."""
     topics = [f"/{node}/debug/processing_time_ms" for node in build_graph(detectors, single)]
     if "candidates" in detectors:
-        steps, last = (STEPS, "perception") if single else (STEPS[-3:], "candidate_refinement")
-        topics += [f"/{last}/debug/{step}_ms" for step in steps]
+        steps = STEPS if single else STEPS[-3:]
+        topics += [f"/{find_result_node('candidates', single)}/debug/{step}_ms" for step in steps]
     return topics
 
 
 def configure_evaluator(
     file: Path | str, single: bool = False, detectors: Sequence[str] = ("candidates",)
 ) -> tuple[dict[str, str], dict[str, Any]]:
-    """Return the remapping and the parameters of an evaluator of all stages.
+    """Return the remapping and the parameters of an evaluator that scores all stages.
 
-    The candidates alone are scored as in the STM-CPA paper: pedestrians, and all labels. Networks
-    see more than the labels, which are those of the camera image.
+    Candidates alone are scored as in the STM-CPA paper: only pedestrians, against all labels.
+    Networks also detect objects outside the camera image, where there are no labels, so the
+    evaluator gets the camera to ignore those.
     """
     topics, only_candidates = list_stages(detectors, single), [*detectors] == ["candidates"]
     remap = (
         TRUTH_INPUT
-        | ({} if only_candidates else CAMERA)
+        | ({} if only_candidates else CAMERA_INPUTS)
         | {f"~/input/{k}": relative_name(v) for k, v in topics.items()}
     )
     timing = [*map(relative_name, list_timing_topics(detectors, single))]
@@ -204,11 +203,11 @@ def configure_evaluator(
 def runs_in_one_process(processes: str | bool | None) -> bool:
     """Return True if the nodes of a graph run in one process.
 
-    One process takes less memory and CPU time, several use many cores better.
+    One process needs less memory and CPU time; several make better use of many cores.
 
     Args:
-        processes: one process for each node, "true" or "false"; "auto" or None: on a machine with
-            more than MAX_CORES_FOR_ONE_PROCESS cores.
+        processes: "true": one process per node; "false": one process for all nodes; "auto" or None:
+            one process for all nodes on a machine with up to MAX_CORES_FOR_ONE_PROCESS cores.
     """
     if processes in ("auto", None):
         return count_cores() <= MAX_CORES_FOR_ONE_PROCESS
@@ -216,64 +215,41 @@ def runs_in_one_process(processes: str | bool | None) -> bool:
 
 
 def find_connected_outputs(graph: Graph) -> dict[str, set[str]]:
-    """Return the topics of each node that another node of the graph subscribes to, without a
-    namespace."""
-    subscribed = {f"/{relative_name(topic)}" for remap in graph.values() for topic in remap.values()}
-    return {node: {t for t in subscribed if t.startswith(f"/{node}/")} for node in graph}
+    """Return {node: its outputs to which another node of the graph subscribes}, without a namespace."""
+    inputs = {f"/{relative_name(topic)}" for remap in graph.values() for topic in remap.values()}
+    return {node: {topic for topic in inputs if topic.startswith(f"/{node}/")} for node in graph}
 
 
 def list_awaited_topics(
     detectors: Sequence[str] = ("candidates",), single: bool = False, points: int = 1, truth: int = 1
 ) -> list[str]:
-    """Return the parameter wait_for of bag_player for a graph.
+    """Return the value of bag_player's parameter wait_for for a graph.
 
-    It waits for subscribers of the clouds and of the labels, and for one subscriber of each result
-    and of each topic between the nodes.
+    The player then waits for the subscribers of the clouds and of the labels, and for one
+    subscriber of each result and of each topic between the nodes.
 
     Args:
         points: number of subscribers of the clouds.
         truth: number of subscribers of the labels, besides the seed input of the candidates.
     """
-    between = sorted(set().union(*find_connected_outputs(build_graph(detectors, single)).values()))
+    internal_topics = sorted(set().union(*find_connected_outputs(build_graph(detectors, single)).values()))
     truth += "candidates" in detectors
     topics = [
         f"{POINTS}:={points}",
         f"{TRUTH}:={truth}",
-        *between,
+        *internal_topics,
         *(topic for name in detectors for topic in list_result_topics(single, name).values()),
     ]
     return [*map(relative_name, topics)]
 
 
-def choose_cloud_topic(bag: str, types: Mapping[str, str], wanted: str = "") -> str:
-    """Return the cloud topic of a bag: the wanted one, or the only one if wanted is empty.
-
-    Raises:
-        InputError: there is no such topic, or there are several; the message lists them.
-    """
-    clouds = find_cloud_topics(types)
-    if wanted in clouds or (not wanted and len(clouds) == 1):
-        return wanted or clouds[0]
-    if not clouds:
-        raise InputError(
-            f"{bag} has no clouds: none of its topics is a sensor_msgs/PointCloud2"
-            f"{'; ' + problem if (problem := diagnose_packets(types)) else ''}"
-        )
-    has = f"it has {', '.join(clouds)}"
-    raise InputError(
-        f"{bag} has no cloud on {wanted}; {has}"
-        if wanted
-        else f"{bag}: give the topic of the clouds with points:=TOPIC; {has}"
-    )
-
-
-_domain_locks: list[Any] = []  # lock files of our domains, held open until this process ends
+_domain_locks: list[Any] = []  # lock files of the reserved domains, open until this process ends
 
 
 def reserve_domain() -> int:
     """Reserve an unused ROS domain from 1 to 100 on this machine, until this process ends.
 
-    The ports of higher domains are ephemeral ports of other programs.
+    The ports of higher domains may be in use as ephemeral ports of other programs.
 
     Raises:
         InputError: all domains are in use.
@@ -295,22 +271,30 @@ def reserve_domain() -> int:
 
 
 class Processes:
-    """Context manager for node processes that log to a folder; it ends them with SIGINT."""
+    """Context manager for node processes, which end with it.
+
+    Args:
+        logs: folder for the parameters and the output of each process.
+        domain: ROS domain, limited to this machine; None for that of the environment.
+
+    Attributes:
+        running: {name: Popen object} of all started processes.
+    """
 
     def __init__(self, logs: Path, domain: int | None = None):
         self.logs = logs
         self.environment = dict(os.environ)
         if domain is not None:
             self.environment.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
-        self.running: dict[str, Any] = {}  # Popen objects of the running processes
-        self._gathered: list[list[str]] | None = None  # node arguments collected by together()
+        self.running: dict[str, Any] = {}
+        self._shared_arguments: list[list[str]] | None = None  # arguments of the nodes in share_process()
 
     def __enter__(self) -> Processes:
         self.logs.mkdir(parents=True, exist_ok=True)
         return self
 
     def start(self, node: str, remap: Mapping[str, str], params: Mapping[str, Any], namespace: str = "") -> None:
-        """Start a node of a graph; with a namespace its key in `running` is NAMESPACE.NODE."""
+        """Start a node of a graph. Its key in `running` is NODE, or NAMESPACE.NODE."""
         values = {k: list(v) if isinstance(v, tuple) else v for k, v in params.items()}
         values = {k: v for k, v in values.items() if v != []}  # an empty list has no type in YAML
         name = f"{namespace}.{node}" if namespace else node
@@ -323,33 +307,36 @@ class Processes:
         }
         remapping = [word for rule in rules.items() for word in ("-r", ":=".join(rule))]
         arguments = [find_executable(node), "--ros-args", "--params-file", str(file), *remapping]
-        if self._gathered is None:
+        if self._shared_arguments is None:
             self.run_node(name, arguments)
         else:
-            self._gathered.append(arguments)
+            self._shared_arguments.append(arguments)
 
     @contextmanager
-    def together(self, name: str) -> Iterator[None]:
-        """Start the nodes for which start() is called inside in one process of this name."""
-        parts: list[list[str]] = []
-        self._gathered = parts
+    def share_process(self, name: str) -> Iterator[None]:
+        """Run the nodes that are started inside the with block in one process of this name."""
+        nodes: list[list[str]] = []
+        self._shared_arguments = nodes
         yield
-        self._gathered = None
-        self.run_node(name, [word for part in parts for word in (SEPARATOR, *part)][1:])
+        self._shared_arguments = None
+        self.run_node(name, [word for arguments in nodes for word in (SEPARATOR, *arguments)][1:])
 
     def run_node(self, name: str, arguments: Sequence[str]) -> None:
         """Start one of the executables of this package."""
         self.run(name, [sys.executable, "-m", "lidar_perception.nodes.main", *arguments])
 
     def run(self, name: str, command: Sequence[str]) -> None:
-        """Start any program with its output in the log file."""
+        """Start any program, with its output in NAME.log."""
         with open(self.logs / f"{name}.log", "w") as log:
             self.running[name] = subprocess.Popen(
                 command, env=self.environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
             )
 
     def check(self, *finished: str) -> None:
-        """Raise InputError with the last log line if a node that is not in `finished` has ended."""
+        """Raise InputError with the last log line of a node that has ended.
+
+        finished: nodes that may have ended with exit code 0.
+        """
         for node, process in self.running.items():
             code = process.poll()
             if code is not None and (node not in finished or code):
@@ -359,8 +346,8 @@ class Processes:
     def has_ended(self, node: str) -> bool:
         return self.running[node].poll() is not None
 
-    def memory_mb(self) -> dict[str, float]:
-        """Return the proportional set size of each running node in MB; empty without /proc."""
+    def measure_memory_mb(self) -> dict[str, float]:
+        """Return the proportional set size of each running process in MB; empty without /proc."""
         sizes = {}
         for node, process in self.running.items():
             try:
@@ -370,8 +357,8 @@ class Processes:
                 continue
         return sizes
 
-    def cpu_seconds(self) -> dict[str, float]:
-        """Return the CPU time of each running process; empty without /proc."""
+    def measure_cpu_seconds(self) -> dict[str, float]:
+        """Return the CPU time of each running process in seconds; empty without /proc."""
         seconds = {}
         for node, process in self.running.items():
             try:  # proc(5): fields 14 (utime) and 15 (stime); the text after the name starts with field 3
@@ -382,7 +369,7 @@ class Processes:
         return seconds
 
     def stop(self, timeout: float = 5.0) -> dict[str, int]:
-        """Send SIGINT to all processes, SIGKILL after timeout seconds; return the exit codes."""
+        """Send SIGINT to all processes, and SIGKILL after `timeout` seconds; return {name: exit code}."""
         for process in self.running.values():
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)

@@ -11,7 +11,7 @@ from lidar_perception.candidates.warm_up import warm_up_ground
 from lidar_perception.detectors.normalized_view import NormalizedView, segment_view_ground
 from lidar_perception.detectors.pointpillars.config import RANGES
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.ground.threshold import compute_inlier_share, fit_plane
+from lidar_perception.ground.threshold import compute_inlier_fraction, fit_plane
 from lidar_perception.nodes.diagnostics import OK, WARN
 from lidar_perception.nodes.inputs import CameraInput
 from lidar_perception.nodes.interfaces import CLOUD
@@ -70,7 +70,7 @@ class GroundSegmentation(ManagedNode):
         self._publish_parts(msg, visible_frame, visible, params, ground if self.node_params.range == "all" else None)
         plane = fit_plane(segmented.xyz.compress(ground, axis=0))
         if plane is not None:
-            share = compute_inlier_share(segmented.xyz, plane)
+            share = compute_inlier_fraction(segmented.xyz, plane)
             self.diagnostics.counts.update(
                 plane=" ".join(f"{v:.4f}" for v in plane),
                 plane_inlier_share=f"{share:.3f}",

@@ -1,8 +1,9 @@
-"""Parameters of the nodes of a launch file: parameter files and launch arguments."""
+"""Conversion of launch arguments to parameter files, parameters and topics of nodes."""
 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import yaml
 from lidar_perception.nodes.graph import DETECTOR_NODES, NETWORKS
 from lidar_perception.nodes.param_files import EVERY_NODE, is_for, read_sections
 from lidar_perception.types import InputError
+from lidar_perception.wire.clouds import diagnose_packets, find_cloud_topics
 
 CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet", "fused": "fused"}
 
@@ -31,15 +33,15 @@ def list_parameter_files(config: str, experts: str = "") -> list[str]:
     return files
 
 
-def add_arguments(files: list[str], node: str, given: dict[str, Any]) -> list[Any]:
-    """Return the parameters of a launch node: its files, overridden by the values `given`."""
-    # launch writes `given` under /**, but rcl prefers sections that name the node.
-    named = [
+def add_arguments(files: list[str], node: str, values: dict[str, Any]) -> list[Any]:
+    """Return the `parameters` of a launch node: its files, overridden by these values."""
+    # launch writes the values under /**, but rcl prefers sections that name the node.
+    node_sections = [
         section for file in files for section in read_sections(file) if section != EVERY_NODE and is_for(section, node)
     ]
-    if not given or not named:
-        return [*files, *filter(None, [given])]
-    return [*files, given, write_section(*named, values=given)]
+    if not values or not node_sections:
+        return [*files, *filter(None, [values])]
+    return [*files, values, write_section(*node_sections, values=values)]
 
 
 def write_section(*names: str, values: dict[str, Any]) -> str:
@@ -53,46 +55,46 @@ def split_detectors(text: str) -> list[str]:
     """Return the names in a comma-separated list; raise InputError if it is empty."""
     detectors = [name.strip() for name in text.split(",") if name.strip()]
     if not detectors:
-        raise InputError(f"detectors is empty; give one or more of {','.join(DETECTOR_NODES)}")
+        raise InputError(f"detectors is empty; choose one or more of {', '.join(DETECTOR_NODES)}")
     return detectors
 
 
 def list_argument_parameters(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, Any]:
     """Return the parameters of a node that are set by launch arguments."""
-    given: dict[str, Any] = {}
+    params: dict[str, Any] = {}
     if value["use_sim_time"]:
-        given["use_sim_time"] = value["use_sim_time"] == "true"
+        params["use_sim_time"] = value["use_sim_time"] == "true"
     if value["tracking"] == value["single"] == "true":
-        given["tracking.enabled"] = True
+        params["tracking.enabled"] = True
     if value["autostart"] == "false":
-        given["autostart"] = False
+        params["autostart"] = False
     if value["reliability"]:
-        given["input.reliability"] = value["reliability"]
+        params["input.reliability"] = value["reliability"]
     if value["deskew"]:
-        given["input.deskew"] = value["deskew"]
+        params["input.deskew"] = value["deskew"]
     if value["ahead"]:
-        given["input.ahead"] = _parse_degrees(value["ahead"])
-    given |= {name: value[name] for name in ("base_frame", "target_frame") if value[name]}
+        params["input.ahead"] = _parse_degrees(value["ahead"])
+    params |= {name: value[name] for name in ("base_frame", "target_frame") if value[name]}
     detector = node.removesuffix("_detector")
     if detector in NETWORKS:
         weights = _parse_weights(value["weights"], [d for d in detectors if d in NETWORKS])
-        for name, chosen in (("weights", weights.get(detector)), ("device", value["device"])):
-            if chosen:
-                given[f"{detector}.{name}"] = chosen
+        for name, text in (("weights", weights.get(detector)), ("device", value["device"])):
+            if text:
+                params[f"{detector}.{name}"] = text
         if value["range"] and detector != "pointnet":
-            given[f"{detector}.range"] = value["range"]
-    return given
+            params[f"{detector}.range"] = value["range"]
+    return params
 
 
 def _parse_degrees(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise InputError(f"ahead:={text} is not a number of degrees") from None
+        raise InputError(f"ahead:={text} is not a number; give an angle in degrees") from None
 
 
 def _parse_weights(text: str, networks: list[str]) -> dict[str, str]:
-    """Parse FILE or NAME=FILE,NAME=FILE to the file of each network."""
+    """Parse FILE, or NAME=FILE,NAME=FILE, to {network: file}."""
     if not text:
         return {}
     if len(networks) == 1 and not text.startswith(f"{networks[0]}="):
@@ -103,3 +105,29 @@ def _parse_weights(text: str, networks: list[str]) -> dict[str, str]:
             f"weights: '{unknown[0]}' is not one of {', '.join(networks)}; for several networks use NAME=FILE,NAME=FILE"
         )
     return pairs
+
+
+def choose_cloud_topic(bag: str, types: Mapping[str, str], topic: str = "") -> str:
+    """Return the topic if it is a cloud topic of a bag; if it is empty, the bag's only cloud topic.
+
+    Args:
+        bag: path of the bag, for messages.
+        types: {topic: its type} of the bag.
+        topic: requested topic.
+
+    Raises:
+        InputError: there is no such topic, or there are several; the message lists them.
+    """
+    clouds = find_cloud_topics(types)
+    if topic in clouds or (not topic and len(clouds) == 1):
+        return topic or clouds[0]
+    if not clouds:
+        raise InputError(
+            f"{bag} has no clouds: no topic has the type sensor_msgs/PointCloud2"
+            f"{'; ' + problem if (problem := diagnose_packets(types)) else ''}"
+        )
+    raise InputError(
+        f"{bag} has no clouds on {topic}; choose from {', '.join(clouds)}"
+        if topic
+        else f"{bag} has several cloud topics ({', '.join(clouds)}); choose one with points:=TOPIC"
+    )

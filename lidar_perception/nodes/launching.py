@@ -1,7 +1,7 @@
-"""Arguments and nodes of the launch files, in one process or one for each node.
+"""Arguments and nodes of the launch files; the nodes share one process or have one each.
 
-The parameters of a node come from the package's own file, then from the files that the user gives,
-then from the other arguments; later values override earlier ones.
+The parameters of a node come from the package's own file, then from the user's files, then from the
+other launch arguments; later values override earlier ones.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from launch_ros.actions import Node
 from launch import LaunchDescription
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.graph import (
+    CANDIDATES_GRAPH,
     DETECTOR_NODES,
     EXPERTS,
     NETWORKS,
     ODOMETRY_INPUT,
     SEPARATOR,
-    SINGLE,
+    SINGLE_PROCESS_CANDIDATES,
     SINGLE_PROCESS_NODES,
-    STAGES,
     TRACKER,
     add_node_prefix,
     build_graph,
@@ -52,13 +52,13 @@ from lidar_perception.types import InputError, make_unknown_name_error
 from lidar_perception.wire.topics import ODOMETRY, POINTS
 
 LAUNCH_ARGUMENTS = ("launch-prefix", "launch-prefix-filter")  # arguments that launch itself defines
-RESPAWN_DELAY_S = 2.0  # long enough that a node that cannot start does not fill the log
+RESPAWN_DELAY_S = 2.0  # keeps a node that cannot start from filling the log
 
-SWITCHES: dict[str, Any] = dict(default_value="false", choices=["true", "false"])
+SWITCH: dict[str, Any] = dict(default_value="false", choices=["true", "false"])
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "namespace": dict(
         default_value="",
-        description="Namespace of all nodes and topics, to tell several sensors apart; /diagnostics, /tf and /clock "
+        description="Namespace of all nodes and topics, for use with several sensors; /diagnostics, /tf and /clock "
         "stay global.",
     ),
     "name_prefix": dict(default_value="", description="Prefix of all node names."),
@@ -68,7 +68,9 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
         description="Parameter input.reliability: auto, reliable or best_effort; empty: as in the parameter file.",
     ),
     "base_frame": dict(
-        default_value="", description="Parameter base_frame: TF gives the mounting; empty: as in the parameter file."
+        default_value="",
+        description="Parameter base_frame: frame on the ground below the robot, from which TF gives the pose of the "
+        "sensor; empty: as in the parameter file.",
     ),
     "target_frame": dict(
         default_value="",
@@ -82,7 +84,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "ahead": dict(
         default_value="",
         description="Parameter input.ahead: viewing direction of the "
-        "detectors, degrees from the x axis of the clouds; empty: as in the parameter "
+        "detectors, in degrees from the x axis of the clouds; empty: as in the parameter "
         "file.",
     ),
     "range": dict(
@@ -96,13 +98,13 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     ),
     "experts": dict(
         default_value="",
-        description="Parameters of ground and clusters: name of the "
+        description="Parameters of ground segmentation and clustering: name of the "
         "detector whose config/*.param.yaml they use (empty: the first one), or a "
         "parameter file that is loaded last.",
     ),
     "weights": dict(
         default_value="",
-        description="Checkpoint of the network, NAME=FILE,NAME=FILE "
+        description="Checkpoint of the network; NAME=FILE,NAME=FILE "
         "for several networks; empty: as in the parameter file, or the packaged one.",
     ),
     "device": dict(
@@ -110,54 +112,54 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
         description="Device of the networks: auto, cpu, cuda or cuda:N; empty: as in the parameter file.",
     ),
     "tracking": dict(
-        **SWITCHES,
-        description="Track the detections of each detector, in a tracker "
-        "node; with `single` in the process of the detector.",
+        **SWITCH,
+        description="Track the detections of each detector in a tracker node, or with `single` in the detector itself.",
     ),
     "odometry": dict(
         default_value=relative_name(ODOMETRY), description="Topic of the odometry for the trackers and deskew."
     ),
-    "single": dict(**SWITCHES, description="Run each detector in one process that also computes ground and clusters."),
+    "single": dict(**SWITCH, description="Run each detector in one process that also computes ground and clusters."),
     "processes": dict(
         default_value="auto",
         choices=["auto", "true", "false"],
         description="true: "
-        "one process for each node; false: one process for all nodes, which saves "
-        "memory; auto: one process on machines with up to four cores.",
+        "one process per node; false: one process for all nodes, which saves "
+        "memory; auto: false on machines with up to four cores, otherwise true.",
     ),
     "autostart": dict(
         default_value="true",
         choices=["true", "false"],
-        description="false: a lifecycle manager configures and activates the nodes.",
+        description="true: the nodes activate themselves; false: a lifecycle manager configures and activates them.",
     ),
     "respawn": dict(
-        **SWITCHES,
+        **SWITCH,
         description="Restart a node that has ended, for example after a "
-        "crash; with autostart:=false the restarted node is not configured.",
+        "crash; with autostart:=false the lifecycle manager must configure it again.",
     ),
-    "rviz": dict(**SWITCHES, description="Start RViz with config/lidar_perception.rviz in the same namespace."),
+    "rviz": dict(**SWITCH, description="Start RViz with config/lidar_perception.rviz in the same namespace."),
     "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: velodyne, as in the RViz file."),
     "use_sim_time": dict(
         default_value="",
         choices=["", "true", "false"],
-        description="Take the time from /clock; empty: as in the parameter file, else false.",
+        description="Take the time from /clock; empty: as in the parameter file, otherwise false.",
     ),
-    "log_level": dict(default_value="info", description="debug, info, ..."),
+    "log_level": dict(default_value="info", description="Minimum level of log messages: debug, info, warn, error."),
 }
 
 
 def make_launch_description(config_folder: Path, detectors: str) -> LaunchDescription:
-    """Describe the launch of ground segmentation, clustering and detectors.
+    """Return the launch description of ground segmentation, clustering and detectors.
+
+    Its launch arguments are `detectors` and ARGUMENTS.
 
     Args:
         config_folder: folder with the parameter files of the package.
-        detectors: default of the launch argument `detectors`, comma-separated; the others are
-            ARGUMENTS.
+        detectors: default of the launch argument `detectors`, comma-separated.
     """
-    given = find_given_arguments()
+    argument_names = find_argument_names()
 
-    def nodes(context: Any) -> list[Any]:
-        reject_unknown_arguments(given, context, ["detectors", *ARGUMENTS])
+    def make_actions(context: Any) -> list[Any]:
+        reject_unknown_arguments(argument_names, context, ["detectors", *ARGUMENTS])
         value = {k: context.perform_substitution(LaunchConfiguration(k)) for k in ("detectors", *ARGUMENTS)}
         processes = create_nodes(value, config_folder)
         files = list_parameter_files(value["config"], value["experts"])
@@ -172,14 +174,14 @@ def make_launch_description(config_folder: Path, detectors: str) -> LaunchDescri
                 default_value=detectors,
                 description=f"Comma-separated detectors: {', '.join(DETECTOR_NODES)}.",
             ),
-            *(DeclareLaunchArgument(name, **what) for name, what in ARGUMENTS.items()),
-            OpaqueFunction(function=nodes),
+            *(DeclareLaunchArgument(name, **options) for name, options in ARGUMENTS.items()),
+            OpaqueFunction(function=make_actions),
         ]
     )
 
 
-def find_given_arguments() -> list[Any]:
-    """Return the names of the arguments given to the launch file that calls this function.
+def find_argument_names() -> list[Any]:
+    """Return the names of the arguments that were passed to the launch file that calls this function.
 
     They come from the command line or from the including file, as text or as launch substitutions.
     Only the IncludeLaunchDescription that loads the file knows them: the launch context mixes them
@@ -194,36 +196,39 @@ def find_given_arguments() -> list[Any]:
     return []
 
 
-def reject_unknown_arguments(given: list[Any], context: Any, known: Collection[str]) -> None:
-    """Raise InputError for the first name that is not an argument, with the closest valid name."""
-    for parts in given:
+def reject_unknown_arguments(names: list[Any], context: Any, valid_names: Collection[str]) -> None:
+    """Raise InputError for the first name that is not valid; the message suggests the closest valid name.
+
+    names: text, or lists of launch substitutions.
+    """
+    for parts in names:
         name = "".join(
             part if isinstance(part, str) else context.perform_substitution(part)
             for part in (parts if isinstance(parts, list | tuple) else [parts])
         )
-        if name in known or name in LAUNCH_ARGUMENTS:
+        if name in valid_names or name in LAUNCH_ARGUMENTS:
             continue
         if nodes := [node for node in NODES if name in find_node_parameters(node)]:
             raise InputError(
                 f"'{name}' is not a launch argument but a parameter of "
                 f"{', '.join(nodes)}; set it in a parameter file, config:=FILE"
             )
-        raise make_unknown_name_error("launch argument", name, sorted(known))
+        raise make_unknown_name_error("launch argument", name, sorted(valid_names))
 
 
 def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
-    """Return the launch nodes, one for each process, for the values of the arguments."""
+    """Return one launch node per process, given the values of the launch arguments."""
     graph, detectors, single = _graph(value), _detectors(value), value["single"] == "true"
-    prefix, users = value["name_prefix"], list_parameter_files(value["config"])
+    prefix, user_files = value["name_prefix"], list_parameter_files(value["config"])
     files = {
-        node: [_locate_own_file(name, config_folder), *users]
+        node: [_find_package_file(name, config_folder), *user_files]
         for name in detectors
         for node in (SINGLE_PROCESS_NODES if single else DETECTOR_NODES)[name]
     }
     files |= {node: _list_expert_files(value, config_folder) for node in EXPERTS}
-    files |= {node: [str(config_folder / f"{TRACKER}.param.yaml"), *users] for node in find_trackers(detectors)}
+    files |= {node: [str(config_folder / f"{TRACKER}.param.yaml"), *user_files] for node in find_trackers(detectors)}
     topics = {relative_name(POINTS): value["points"], relative_name(ODOMETRY): value["odometry"]}
-    viewer = [_viewer(value, config_folder)] if value["rviz"] == "true" else []
+    viewer = [_make_rviz_node(value, config_folder)] if value["rviz"] == "true" else []
     common = {
         "package": "lidar_perception",
         "namespace": value["namespace"] or None,
@@ -241,7 +246,7 @@ def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
                 *(_list_expert_range(value, files) if base == "ground_segmentation" else ()),
             ],
             # A parameter file may make any node read odometry; other nodes ignore the remapping.
-            remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_INPUT}.items()],
+            remappings=[(old, topics.get(new, new)) for old, new in {**remap, **ODOMETRY_INPUT}.items()],
         )
         for node, remap in graph.items()
     ]
@@ -252,9 +257,9 @@ def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
 
 
 def _list_arguments(executable: str, name: str, parameters: list[Any], remappings: list[tuple[str, str]]) -> list[str]:
-    """Return the arguments of a node in a process with others, see nodes.main.run."""
+    """Return the command-line arguments of a node that shares its process, see nodes.main.run."""
     rules = [("__node", name), *remappings]
-    files = [each if isinstance(each, str) else write_section(EVERY_NODE, values=each) for each in parameters]
+    files = [item if isinstance(item, str) else write_section(EVERY_NODE, values=item) for item in parameters]
     return [
         executable,
         "--ros-args",
@@ -270,74 +275,75 @@ def _graph(value: dict[str, str]) -> dict[str, dict[str, str]]:
 
 
 def describe_conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
-    """Return a line for each detector whose own file has other parameters of ground and clusters
-    than the file in use; none if the user has chosen that file."""
-    detectors, given = _detectors(value), value["experts"]
+    """Return a line for each detector whose package file has other parameters of ground and clusters
+    than are used; none if the user has chosen a file."""
+    detectors, experts = _detectors(value), value["experts"]
     if value["single"] == "true":
         return (
             ["experts has no effect: with single:=true each detector computes ground and clusters itself"]
-            if given
+            if experts
             else []
         )
-    if given not in ("", *CONFIGS):
+    if experts not in ("", *CONFIGS):
         return []
-    chosen, users = given or detectors[0], list_parameter_files(value["config"])
-    numbers = {
-        name: _read_expert_parameters([_locate_own_file(name, config_folder), *users]) for name in (chosen, *detectors)
+    active_detector, user_files = experts or detectors[0], list_parameter_files(value["config"])
+    params = {
+        name: _read_expert_parameters([_find_package_file(name, config_folder), *user_files])
+        for name in (active_detector, *detectors)
     }
     lines = []
     for name in detectors:
-        others = [f"{key} {number}" for key, number in numbers[name].items() if number != numbers[chosen][key]]
-        if others:
+        differences = [f"{key} {v}" for key, v in params[name].items() if v != params[active_detector][key]]
+        if differences:
             lines.append(
-                f"ground and clusters use the parameters of {chosen}; those of {name} differ: {', '.join(others)}. "
-                "Choose with experts:=NAME or experts:=FILE"
+                f"ground and clusters use the parameters of {active_detector}; those of {name} differ: "
+                f"{', '.join(differences)}. Choose with experts:=NAME or experts:=FILE"
             )
     return lines
 
 
-def _locate_own_file(detector: str, config_folder: Path) -> str:
+def _find_package_file(detector: str, config_folder: Path) -> str:
     return str(config_folder / f"{CONFIGS[detector]}.param.yaml")
 
 
 def _list_expert_files(value: dict[str, str], config_folder: Path) -> list[str]:
-    """Return the parameter files of ground and clusters."""
-    chosen = value["experts"] if value["experts"] in CONFIGS else _detectors(value)[0]
-    users = list_parameter_files(value["config"], value["experts"])
-    return [_locate_own_file(chosen, config_folder), *users]
+    """Return the parameter files of ground segmentation and clustering."""
+    detector = value["experts"] if value["experts"] in CONFIGS else _detectors(value)[0]
+    user_files = list_parameter_files(value["config"], value["experts"])
+    return [_find_package_file(detector, config_folder), *user_files]
 
 
 def _read_expert_parameters(files: list[str]) -> dict[str, Any]:
-    """Return the parameters of ground and clusters with these files."""
-    known = {
+    """Return the parameters of ground and clusters that result from these files."""
+    defaults = {
         key: list(v) if isinstance(v, tuple) else v
         for group in (GroundNodeParams(), ClusteringNodeParams())
         for key, v in flatten(group).items()
         if key.startswith(("ground.", "clustering."))
     }
-    given = {
-        key: number
+    settings = {
+        key: v
         for file in files
         for section, values in read_sections(file).items()
         if any(is_for(section, node) for node in EXPERTS)
-        for key, number in values.items()
+        for key, v in values.items()
     }
-    return known | {k: v for k, v in given.items() if k in known}
+    return defaults | {k: v for k, v in settings.items() if k in defaults}
 
 
 def _list_expert_range(value: dict[str, str], files: dict[str, list[str]]) -> list[dict[str, str]]:
-    """Return the parameter range of ground_segmentation if it is not the default or in a file.
+    """Return the parameter `range` of ground_segmentation, [] if it is the default or set in a file.
 
-    files: parameter files of each node.
+    files: {node: its parameter files}
     """
 
     def read(node: str) -> dict[str, Any]:
         sections = [item for file in files[node] for item in read_sections(file).items()]
         return {
-            key: given
+            key: v
             for section, values in sections
             if is_for(section, value["name_prefix"] + node)
-            for key, given in values.items()
+            for key, v in values.items()
         }
 
     params, detectors = read("ground_segmentation"), _detectors(value)
@@ -345,19 +351,19 @@ def _list_expert_range(value: dict[str, str], files: dict[str, list[str]]) -> li
         return []
     for node in [f"{name}_detector" for name in detectors if name in NETWORKS]:
         params |= read(node) | list_argument_parameters(value, node, detectors)
-    chosen = find_expert_range(detectors, params)
-    return [] if chosen == "all" else [{"range": chosen}]
+    ground_range = find_expert_range(detectors, params)
+    return [] if ground_range == "all" else [{"range": ground_range}]
 
 
 def _detectors(value: dict[str, str]) -> list[str]:
     return split_detectors(value["detectors"])
 
 
-def _viewer(value: dict[str, str], config_folder: Path) -> Node:
-    """Return the RViz node, with the same topic names as the other nodes."""
+def _make_rviz_node(value: dict[str, str], config_folder: Path) -> Node:
+    """Return the RViz node, remapped to the topics of the launched nodes."""
     file = config_folder / "lidar_perception.rviz"
     frame = ["-f", value["rviz_frame"]] if value["rviz_frame"] else []
-    renamed = {topic: _rename_rviz_topic(topic, value) for _, topic in read_rviz_topics(file)}
+    remap = {topic: _rename_rviz_topic(topic, value) for _, topic in read_rviz_topics(file)}
     return Node(
         package="rviz2",
         executable="rviz2",
@@ -366,7 +372,7 @@ def _viewer(value: dict[str, str], config_folder: Path) -> Node:
         arguments=["-d", str(file), *frame],
         output="screen",
         parameters=[{"use_sim_time": value["use_sim_time"] == "true"}],
-        remappings=[(a, b) for a, b in renamed.items() if a != b],
+        remappings=[(old, new) for old, new in remap.items() if old != new],
     )
 
 
@@ -385,7 +391,7 @@ def _rename_rviz_topic(topic: str, value: dict[str, str]) -> str:
         return value["points"]
     if node == TRACKER:  # the tracker follows the first detector
         node = next(iter(SINGLE_PROCESS_NODES[detectors[0]] if single else find_trackers(detectors)))
-    elif single and node in STAGES:
-        node = next(iter(SINGLE))
-    ours = node in {*build_graph([*DETECTOR_NODES]), *find_trackers(detectors), *SINGLE}
-    return (value["name_prefix"] if ours else "") + node + slash + rest
+    elif single and node in CANDIDATES_GRAPH:
+        node = next(iter(SINGLE_PROCESS_CANDIDATES))
+    is_ours = node in {*build_graph([*DETECTOR_NODES]), *find_trackers(detectors), *SINGLE_PROCESS_CANDIDATES}
+    return (value["name_prefix"] if is_ours else "") + node + slash + rest

@@ -24,9 +24,9 @@ BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABL
 MAX_HOLD_S = 1.0  # time during which newer clouds do not replace a waiting one
 RETRY_PERIOD_S = 5.0  # pause before waiting again after a timeout
 RETRY_DURATION_S = 0.3  # duration of the renewed wait
-# Number of missed periods after which the state becomes ERROR and STALE, respectively.
+# Numbers of missed periods after which the state becomes ERROR and STALE.
 SILENT_PERIODS, STALE_PERIODS = 3.0, 6.0
-# Kind of publisher -> (hint when no clouds arrive, hint when too few arrive).
+# Kind of publisher -> (hint if no clouds arrive, hint if too few arrive).
 QUESTIONS = {
     "sensor": ("is the sensor{} connected and running?", "is the sensor{} overloaded?"),
     "detector": (
@@ -43,22 +43,23 @@ class Reception:
     """A subscription to clouds, or to arrays made from clouds.
 
     It is RELIABLE if all publishers offer that, because a best-effort subscriber receives less than
-    half of the 2 MB clouds of an ordinary driver. A BEST_EFFORT publisher, also a later one, makes
-    it BEST_EFFORT, as its clouds would not arrive otherwise. qos_overrides take precedence.
+    half of the 2 MB clouds of a typical driver. It becomes BEST_EFFORT as soon as one publisher
+    offers only that, because those clouds would not arrive otherwise. qos_overrides take
+    precedence.
 
-    If the only publisher of the topic is a node of the same process, its messages come by a link
-    instead of a subscription, see links.py.
+    If the only publisher of the topic is a node of the same process, its messages arrive through a
+    link instead of a subscription, see links.py.
 
     Args:
         node: the node that subscribes, a LidarNode or a plain node, which has no links.
         kind: class of the message.
         name: name of the topic.
-        deliver: called with each of the newest input.queue clouds, as CDR or as a message of a
-            link, and with whether the cloud may wait. Returns what the cloud still needs, or None.
-            A cloud that may wait (up to input.max_wait seconds) and needs something is delivered
-            again at retry().
+        deliver: called with (cloud, may_wait) for each of the newest input.queue clouds; the cloud
+            is CDR, or a message from a link. Returns a description of the data that the cloud still
+            needs, or None. A cloud that may wait (up to input.max_wait seconds) and needs data is
+            delivered again at retry().
         params: returns the current parameters of the group input.
-        what: name of one message in diagnostics.
+        what: noun for one message in diagnostics.
     """
 
     def __init__(
@@ -82,12 +83,12 @@ class Reception:
         self.adapt_trigger = node.create_guard_condition(self.adapt)
         self.link_trigger = node.create_guard_condition(self._take_linked)
         self.last_time: float | None = None  # monotonic time of the last cloud
-        self.needs: str | None = None  # data that the waiting or the last cloud still needs
+        self.needs: str | None = None  # data that the oldest waiting cloud, or the last cloud, still needs
         self.needed_since: float | None = None  # monotonic time at which that need arose
-        self.waiting_since: float | None = None  # monotonic time of arrival of the first waiting cloud
+        self.waiting_since: float | None = None  # monotonic time of arrival of the oldest waiting cloud
         self.output: Output | None = None  # in-process source of the topic, used instead of a subscription
         self.subscription: Any = None
-        self.last_publishers: list[Any] = []  # the publishers last seen, if any
+        self.last_publishers: list[Any] = []  # most recent non-empty list of publishers
         self.arrivals = Arrivals()
 
     @property
@@ -95,14 +96,14 @@ class Reception:
         return self.subscription is not None or self.output is not None
 
     def open(self) -> None:
-        """Subscribe."""
+        """Start to receive clouds."""
         if self.links is not None:
             self.links.watch(self.topic, self._on_link_change)
         self._connect()
         self.adapt()
 
     def close(self) -> None:
-        """End the subscription. Waiting clouds are dropped; later ones do not count as lost."""
+        """Stop receiving clouds. Waiting clouds are dropped; later ones do not count as lost."""
         if self.links is not None:
             self.links.unwatch(self.topic, self._on_link_change)
         self._disconnect()
@@ -158,7 +159,7 @@ class Reception:
         return self.node.get_publishers_info_by_topic(self.topic)
 
     def adapt(self) -> None:
-        """Connect again if the publishers are others, or offer another reliability, than before."""
+        """Reconnect if the publishers, or the reliability that they offer, have changed."""
         if not self.is_open:
             return
         if self._find_output() is not self.output:
@@ -169,16 +170,16 @@ class Reception:
         if self.output is not None:
             self.last_publishers = self.publishers() or self.last_publishers
             return
-        wanted, publishers = self.params().reliability, self.publishers()
+        setting, publishers = self.params().reliability, self.publishers()
         self.last_publishers = publishers or self.last_publishers
-        offered = {info.qos_profile.reliability for info in publishers}
-        if wanted == "auto" and offered:
-            chosen = RELIABLE if offered == {RELIABLE} else BEST_EFFORT
+        offers = {info.qos_profile.reliability for info in publishers}
+        if setting == "auto" and offers:
+            reliability = RELIABLE if offers == {RELIABLE} else BEST_EFFORT
         else:
-            chosen = {"reliable": RELIABLE, "best_effort": BEST_EFFORT}.get(wanted, self.reliability)
-        if self.fixed or chosen == self.reliability:
+            reliability = {"reliable": RELIABLE, "best_effort": BEST_EFFORT}.get(setting, self.reliability)
+        if self.fixed or reliability == self.reliability:
             return
-        self.reliability = chosen
+        self.reliability = reliability
         self.node.destroy_subscription(self.subscription)
         self._subscribe()
         self.node.get_logger().info(f"{self.topic} is now received {self._reliability_label()}")
@@ -189,12 +190,12 @@ class Reception:
         return self.subscription.qos_profile.reliability.name.lower().replace("_", " ")
 
     def _on_message(self, data: bytes, info: dict) -> None:
-        """Take all messages from the middleware, which does not count the ones it drops."""
-        taken = [(data, info), *take_messages(self.subscription, self.kind)]
-        self._accept(taken, one_publisher=len(self.publishers()) < 2)
+        """Take all messages from the middleware, which would drop some of them without counting."""
+        messages = [(data, info), *take_messages(self.subscription, self.kind)]
+        self._accept(messages, one_publisher=len(self.publishers()) < 2)
 
     def _receive(self, message: Any, info: dict) -> None:
-        """Keep a message of a link; called in the thread of its publisher."""
+        """Queue a message of a link; called in the thread of its publisher."""
         self.linked.append((message, info))
         _trigger(self.link_trigger)
 
@@ -202,12 +203,12 @@ class Reception:
         _trigger(self.adapt_trigger)
 
     def _take_linked(self) -> None:
-        if taken := [self.linked.popleft() for _ in range(len(self.linked))]:
-            self._accept(taken, one_publisher=True)
+        if messages := [self.linked.popleft() for _ in range(len(self.linked))]:
+            self._accept(messages, one_publisher=True)
 
-    def _accept(self, taken: list[tuple[Any, dict]], one_publisher: bool) -> None:
-        """Keep the newest messages, count all and deliver the first one."""
-        self.waiting.extend(message for message, _ in taken)
+    def _accept(self, messages: list[tuple[Any, dict]], one_publisher: bool) -> None:
+        """Count the messages (message, info), keep the newest ones and deliver the oldest of these."""
+        self.waiting.extend(message for message, _ in messages)
         # Newer clouds do not replace one that has waited for its pose only briefly. Otherwise no
         # cloud would ever be processed if poses arrive later than the next cloud.
         is_held = self.waiting_since is not None and monotonic() - self.waiting_since < MAX_HOLD_S
@@ -217,7 +218,7 @@ class Reception:
             self.waiting.popleft()
             self.waiting_since = self.waiting_since if is_held else None
         self.waiting.extendleft(oldest)
-        self.arrivals.add([info for _, info in taken], dropped, one_publisher)
+        self.arrivals.add([info for _, info in messages], dropped, one_publisher)
         self._deliver_one()
 
     def _deliver_one(self) -> None:
@@ -239,16 +240,18 @@ class Reception:
             self.deliver_trigger.trigger()
 
     def _may_wait(self, elapsed: float) -> bool:
-        """Return True while a cloud may still wait for its input.
+        """Return True if a cloud may wait for its input.
 
-        elapsed: seconds since a cloud last had all its inputs. After max_wait, clouds wait only
-        from time to time, in case the input comes back.
+        After max_wait, clouds wait only from time to time, in case the input has come back.
+
+        Args:
+            elapsed: seconds since a cloud last had all its inputs.
         """
         excess = elapsed - self.params().max_wait
         return excess < 0 or excess % RETRY_PERIOD_S > RETRY_PERIOD_S - RETRY_DURATION_S
 
     def retry(self) -> None:
-        """Deliver the waiting cloud again: its input may have arrived, or its time may be over."""
+        """Deliver the waiting cloud again: its input may have arrived, or its wait may be over."""
         if self.waiting and self.needs is not None:
             self.deliver_trigger.trigger()
 
@@ -266,7 +269,7 @@ class Reception:
         }
 
     def expected_rate(self) -> float | None:
-        """Return input.rate or the rate of the first clouds in Hz; None after too few clouds."""
+        """Return the expected rate in Hz: input.rate, or the rate of the first clouds; None before that."""
         return self.params().rate or self.arrivals.learned
 
     def problems(self) -> list[Problem]:
@@ -281,12 +284,12 @@ class Reception:
                 (
                     "publishers",
                     WARN,
-                    f"{len(publishers)} publishers on {self.topic} "
-                    f"({names}): their {self.what}s are mixed; remap all but one",
+                    f"{len(publishers)} publishers on {self.topic} ({names}), "
+                    f"so their {self.what}s are mixed; remap all but one",
                 )
             )
-        if unheard := self._find_unheard_publisher(publishers):
-            problems.append(unheard)
+        if problem := self._find_incompatible_publisher(publishers):
+            problems.append(problem)
         if self.waiting and self.needs is not None:
             return [*problems, ("waiting", WARN, f"the {self.what} on {self.topic} waits for {self.needs}")]
         if silence := self._find_silence():
@@ -297,12 +300,12 @@ class Reception:
                 (
                     "rate",
                     WARN,
-                    f"{rate:.1f} Hz on {self.topic} where {expected:.1f} Hz "
+                    f"{rate:.1f} Hz on {self.topic}, but {expected:.1f} Hz "
                     f"are expected (input.rate): {self._list_questions()[1]}",
                 )
             )
         sent, lost, dropped = self.arrivals.count_recent()
-        total = max(sent, WINDOW)  # so that one lost cloud of the first two does not count as 50 %
+        total = max(sent, WINDOW)  # so that one loss among the first two clouds does not count as 50 %
         if lost > params.max_lost * total:
             remedy = self._suggest_remedy(publishers or self.last_publishers)
             problems.append(
@@ -313,23 +316,23 @@ class Reception:
                 (
                     "dropped",
                     WARN,
-                    f"{dropped} of the last {sent} {self.what}s on "
-                    f"{self.topic} were dropped for newer ones: processing takes longer "
-                    "than their period on this machine, or they wait for poses",
+                    f"{dropped} of the last {sent} {self.what}s on {self.topic} were dropped in "
+                    "favour of newer ones: this machine cannot process them as fast as they arrive, "
+                    "or they wait for poses",
                 )
             )
         return problems
 
     def _find_silence(self) -> Problem | None:
-        """Return a problem if clouds have stopped; a slow sensor is not silent between clouds."""
+        """Return a problem if no cloud has arrived for longer than a slow sensor needs for one."""
         params, expected = self.params(), self.expected_rate()
         period = 1 / expected if expected else 0.0
-        silent = monotonic() - (self.last_time or monotonic())
-        error = max(params.error_after, SILENT_PERIODS * period)
-        stale = max(params.stale_after, STALE_PERIODS * period)
-        if silent <= error:
+        silence = monotonic() - (self.last_time or monotonic())
+        error_limit = max(params.error_after, SILENT_PERIODS * period)
+        stale_limit = max(params.stale_after, STALE_PERIODS * period)
+        if silence <= error_limit:
             return None
-        kind, level, limit = ("stale", STALE, stale) if silent > stale else ("silent", ERROR, error)
+        kind, level, limit = ("stale", STALE, stale_limit) if silence > stale_limit else ("silent", ERROR, error_limit)
         return (
             kind,
             level,
@@ -347,8 +350,8 @@ class Reception:
             kind = "node" if self.topic.endswith("/output/points") else "sensor"
         return [question.format(f" {', '.join(names)}" if names else "") for question in QUESTIONS[kind]]
 
-    def _find_unheard_publisher(self, publishers: list[Any]) -> Problem | None:
-        """Return a problem for best-effort publishers that adapt() may not adapt to."""
+    def _find_incompatible_publisher(self, publishers: list[Any]) -> Problem | None:
+        """Return a problem for best-effort publishers if the parameters demand a reliable subscription."""
         names = [_name(p) for p in publishers if p.qos_profile.reliability == BEST_EFFORT]
         adapts = not self.fixed and self.params().reliability != "reliable"
         if not names or adapts or self.output is not None or (self.subscription.qos_profile.reliability != RELIABLE):
@@ -359,32 +362,30 @@ class Reception:
             else "set input.reliability to auto"
         )
         return (
-            "unheard",
+            "incompatible",
             WARN,
-            f"{', '.join(sorted(names))} on {self.topic} offers best effort "
-            f"but the subscription is reliable, so no messages arrive: {remedy}, or let it "
-            "publish reliable",
+            f"{', '.join(sorted(names))} on {self.topic} offers only best effort, but the "
+            f"subscription is reliable, so no messages arrive: {remedy}, or make it publish reliable",
         )
 
     def _suggest_remedy(self, publishers: list[Any]) -> str:
-        offered = {p.qos_profile.reliability for p in publishers}
-        if BEST_EFFORT in offered:
+        if BEST_EFFORT in {p.qos_profile.reliability for p in publishers}:
             sysctl = (
-                (f", or set net.core.rmem_max to {4 * SOCKET_BUFFER} (sysctl) and start this node again")
+                f", or set net.core.rmem_max to {4 * SOCKET_BUFFER} (sysctl) and restart this node"
                 if read_socket_buffer_size() < SOCKET_BUFFER
                 else ""
             )
             return (
-                f"let {_name(publishers[0])} publish reliable, or start it with "
+                f"make {_name(publishers[0])} publish reliable, or start it with "
                 f"FASTRTPS_DEFAULT_PROFILES_FILE={FASTDDS_PROFILE}{sysctl}"
             )
         if self.output is None and self.subscription.qos_profile.reliability == BEST_EFFORT:
-            return "receive it reliable: input.reliability auto, and no qos_overrides"
-        return "raise the depth of the publisher's queue; between machines also net.core.rmem_max (sysctl)"
+            return "make the subscription reliable: set input.reliability to auto, and remove the qos_overrides"
+        return "increase the depth of the publisher's queue; between machines also net.core.rmem_max (sysctl)"
 
 
 def _trigger(guard: Any) -> None:
-    """Trigger a guard condition of a node, which another thread may be destroying."""
+    """Trigger a guard condition of a node that another thread may be destroying."""
     with suppress(InvalidHandle):
         guard.trigger()
 

@@ -1,4 +1,4 @@
-"""Crop of a cloud: the robot's body, points that are too near or too far, and sectors."""
+"""Crop of a cloud by the box of the robot's body, by range and by azimuth sectors."""
 
 from __future__ import annotations
 

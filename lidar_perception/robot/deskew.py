@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from lidar_perception.robot.poses import invert_pose
 
-# Over a sweep of 0.1 s the poses are 24 us apart; a car at 30 m/s moves by 0.7 mm in that time.
+# In a sweep of 0.1 s, the poses are 24 us apart; a car at 30 m/s moves by 0.7 mm in that time.
 MAX_POSES = 4096
 
-# at (M,) seconds after the stamp -> poses (M, 4, 4) of the sensor in any fixed frame.
+# Function that returns the poses (M, 4, 4) of the sensor in any fixed frame at times (M,), in
+# seconds after the stamp.
 PoseLookup = Callable[[np.ndarray], np.ndarray]
 
 

@@ -43,6 +43,6 @@ class CropParams(Params):
                 "each min below its max"
             )
         if len(self.sectors) % 2:
-            raise ValueError(f"sectors = {list(self.sectors)} must be pairs: from, to, from, to")
+            raise ValueError(f"sectors = {list(self.sectors)} must have an even number of values: from, to, from, to")
         if 0.0 < self.max_range < self.min_range:
             raise ValueError(f"max_range = {self.max_range} must be 0, or at least min_range = {self.min_range}")

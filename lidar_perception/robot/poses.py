@@ -37,7 +37,7 @@ def check_pose(translation: ArrayLike, quaternion: ArrayLike, noun: str) -> tupl
     vector, rotation = np.asarray(translation, np.float64), np.asarray(quaternion, np.float64)
     norm = np.linalg.norm(rotation)
     if not np.isfinite(vector).all() or not abs(norm - 1.0) < UNIT_TOLERANCE:
-        raise InputError(f"{noun} has no unit quaternion, or is not finite; its publisher is wrong")
+        raise InputError(f"{noun} is not finite, or its quaternion is not normalized; fix its publisher")
     return vector, rotation / norm
 
 

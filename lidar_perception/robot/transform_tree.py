@@ -12,21 +12,22 @@ from lidar_perception.robot.poses import check_pose, interpolate_poses, invert_p
 from lidar_perception.types import InputError
 
 SECOND_NS = 10**9
-KEPT_NS = 10 * SECOND_NS  # history of each transform, as in tf2
-MAX_KEPT = 10_000  # maximum number of poses of each transform
+HISTORY_NS = 10 * SECOND_NS  # duration for which poses of a transform are stored, as in tf2
+MAX_HISTORY = 10_000  # maximum number of stored poses of a transform
 MAX_FRAMES = 10_000  # bounds the memory if a publisher makes a new name for every message
 JUMP_NS = SECOND_NS  # a stamp this far before the last one means that a bag has restarted
 MAX_LAG_S = 10.0  # a longer gap between a stamp and a transform means different clocks, not a lag
 CLOCKS = (
-    "are they stamped by different clocks? Let the driver stamp clouds with the computer's "
-    "time, synchronise the sensor (PTP), or set use_sim_time everywhere"
+    "do the stamps come from different clocks? Let the driver stamp clouds with the computer's "
+    "time, synchronize the sensor (PTP), or set use_sim_time for all nodes"
 )
 
 
 class MissingTransform(InputError):
-    """Error: two frames are not connected at a time.
+    """Two frames are not connected at the requested time.
 
-    `late` is True if the transform may still arrive because only the newest one is missing.
+    Attributes:
+        late: True if the transform may still arrive, because only the newest one is missing.
     """
 
     def __init__(self, message: str, late: bool = False):
@@ -35,7 +36,7 @@ class MissingTransform(InputError):
 
 
 class _Link:
-    """Poses of a frame in its parent: one static pose, the recent poses, or all of them."""
+    """Poses of a frame in its parent: one static pose, the recent poses, or all poses."""
 
     def __init__(self, parent: str, static: bool, keeps_all: bool):
         self.parent, self.static, self.keeps_all = parent, static, keeps_all
@@ -55,9 +56,9 @@ class _Link:
         if self.keeps_all:
             return
         expired_count = 0
-        while self.times[-1] - self.times[expired_count] > KEPT_NS or len(self.times) - expired_count > MAX_KEPT:
+        while self.times[-1] - self.times[expired_count] > HISTORY_NS or len(self.times) - expired_count > MAX_HISTORY:
             expired_count += 1
-        if expired_count > len(self.times) // 10:  # deleting moves the whole list, so it is not done with every message
+        if expired_count > len(self.times) // 10:  # not for every message, because deleting moves the list
             del self.times[:expired_count], self.values[:expired_count]
 
     def interpolate(self, at: np.ndarray, name: str, max_gap: float | None) -> np.ndarray:
@@ -96,7 +97,7 @@ class _Link:
         selection = slice(first, last + 1)
         gap = max((b - a for a, b in pairwise(times[selection])), default=0) / SECOND_NS
         if max_gap is not None and gap > max_gap:
-            raise MissingTransform(f"two transforms of {name} are {gap:.3f} s apart at the time needed")
+            raise MissingTransform(f"two transforms of {name} are {gap:.3f} s apart at the requested time")
         return selection
 
 
@@ -104,7 +105,7 @@ class TransformTree:
     """Frames and their poses in their parent frames.
 
     Poses are interpolated between stamps, and extrapolated only with max_gap. Transforms are kept
-    for KEPT_NS. If a stamp is at least JUMP_NS older than the last one of its frame, a bag has
+    for HISTORY_NS. If a stamp is at least JUMP_NS older than the last one of its frame, a bag has
     restarted: moving transforms are discarded, static ones are kept. With keeps_all, for
     recordings, nothing is discarded.
     """
@@ -141,15 +142,17 @@ class TransformTree:
         parent, child = parent.lstrip("/"), child.lstrip("/")
         name = f"'{parent}' -> '{child}'"
         if not parent or not child or parent == child:
-            raise InputError(f"the transform {name} must be between two frames with names")
+            raise InputError(
+                f"the transform {name} must connect two frames with different, non-empty names; fix its publisher"
+            )
         value = np.concatenate(check_pose(translation, quaternion, f"the transform {name}"))
         link = self._links.get(child)
         if link is None and len(self._links) >= MAX_FRAMES:
-            raise InputError(f"more than {MAX_FRAMES} frames in the tree; '{child}' is left out")
+            raise InputError(f"more than {MAX_FRAMES} frames in TF; ignoring '{child}'")
         if link is None or (link.parent, link.static) != (parent, static):
             link = self._links[child] = _Link(parent, static, self._keeps_all)
-        went_back = bool(link.times) and stamp_ns <= link.times[-1] - JUMP_NS
-        if went_back and not static and not self._keeps_all:
+        has_jumped_back = bool(link.times) and stamp_ns <= link.times[-1] - JUMP_NS
+        if has_jumped_back and not static and not self._keeps_all:
             self.forget()
             link = self._links[child] = _Link(parent, static, self._keeps_all)
         link.add(stamp_ns, value)

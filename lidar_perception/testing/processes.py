@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lidar_perception.nodes.graph import CLOUDS, Graph, Processes, build_graph, relative_name
+from lidar_perception.nodes.graph import CLOUD_INPUT, Graph, Processes, build_graph, relative_name
 from lidar_perception.param_fields import flatten
 from lidar_perception.testing.forking import ForkedNode
 from lidar_perception.wire.topics import POINTS
@@ -65,7 +65,7 @@ class NodesUnderTest(Processes):
         """
         values = {} if params is None else (params if isinstance(params, Mapping) else flatten(params))
         graph = {
-            node: {a: points if b == CLOUDS["~/input/points"] else b for a, b in remap.items()}
+            node: {a: points if b == CLOUD_INPUT["~/input/points"] else b for a, b in remap.items()}
             for node, remap in build_graph(detectors, single).items()
         }
         for node, remap in graph.items():

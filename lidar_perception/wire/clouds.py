@@ -86,7 +86,7 @@ def diagnose_packets(topics: Mapping[str, str]) -> str | None:
         package, _, name = kind.replace("/msg/", "/").partition("/")
         if driver := DRIVER_BY_PACKAGE.get(package):
             return (
-                f"{kind} on {topic} carries raw packets of a sensor, which cannot be read: "
+                f"{kind} on {topic} contains raw sensor packets, which cannot be read: "
                 f"play the bag to {driver} and record the clouds that it publishes"
             )
         if package == "sensor_msgs" and name in ("PointCloud", "LaserScan"):
@@ -101,7 +101,7 @@ def _check_compression(msg: Any) -> str:
     name: str = msg.format.strip().lower()
     if name not in COMPRESSIONS:
         raise InputError(
-            f"cloud compression '{name}' is not supported; supported are "
+            f"cloud compression '{name}' is not supported, only "
             f"{' and '.join(COMPRESSIONS)}: play the bag to 'ros2 run "
             "point_cloud_transport republish --ros-args -p in_transport:="
             f"{name or 'NAME'} -p out_transport:=raw' and record its output"

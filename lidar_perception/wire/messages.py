@@ -28,7 +28,7 @@ from msg_utils.markers import MarkedObjects, MarkerRow, make_marker_rows, rows_t
 from msg_utils.point_cloud2 import CloudError, from_array, read_columns, read_xyz, to_array
 from msg_utils.stamps import to_ns
 
-# Values of the column in_view: segmented, or not segmented because no detector reads the point.
+# Values of the column in_view: segmented, and in view but not segmented because no detector uses the point.
 IN_VIEW, OUT_OF_RANGE = 1, 2
 MAX_ID = 2**31  # marker ids are int32
 FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.infer_full_scale
@@ -191,7 +191,7 @@ def read_calibration(info: Any, transform: Any) -> Calibration:
     if info.header.frame_id != parent:  # the message has the camera's pose in the LiDAR frame, so invert it
         if info.header.frame_id != child:
             raise InputError(
-                f"CameraInfo is in frame '{info.header.frame_id}' but the transform links '{parent}' and '{child}'"
+                f"CameraInfo is in frame '{info.header.frame_id}', but the transform connects '{parent}' and '{child}'"
             )
         lidar_to_camera = poses.invert_pose(lidar_to_camera)
     return make_calibration(info, lidar_to_camera)
@@ -206,7 +206,7 @@ def make_calibration(info: Any, lidar_to_camera: np.ndarray) -> Calibration:
     intrinsics = np.asarray(info.p, float).reshape(3, 4)
     if intrinsics[0, 0] <= 0 or info.width == 0 or info.height == 0:
         raise InputError(
-            "CameraInfo has no projection matrix P or no image size; calibrate the camera or set view.enabled to false"
+            "CameraInfo has no projection matrix P or no image size; calibrate the camera, or set view.enabled to false"
         )
     return Calibration(intrinsics, lidar_to_camera, int(info.width), int(info.height))
 

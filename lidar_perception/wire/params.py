@@ -14,9 +14,9 @@ class InputParams(Params):
     intensity_max: float = param(
         0.0,
         "Intensity of a full reflection: 1 for KITTI, 255 for "
-        "Velodyne and nuScenes. 0: 255 for fields of 8 bits; otherwise "
+        "Velodyne and nuScenes. 0: 255 for 8-bit fields; otherwise "
         "the smallest of 1 (floats), 100 (floats with fractions), 255, "
-        "1023, 4095 and 65535 that is not exceeded in all clouds so far.",
+        "1023, 4095 and 65535 that no cloud has exceeded so far.",
         low=0.0,
         high=1e9,
     )
@@ -28,7 +28,6 @@ class ViewParams(Params):
 
     enabled: bool = param(
         False,
-        "Keep only points in the camera's view. Needs the camera's "
-        "calibration: CameraInfo and the transform from the LiDAR, both "
-        "latched.",
+        "Keep only points in the camera's view. Requires the camera's "
+        "calibration: CameraInfo and the transform from the LiDAR.",
     )

@@ -9,7 +9,7 @@ IMAGE = "/camera/image/compressed"
 TF, TF_STATIC = "/tf", "/tf_static"
 ODOMETRY = "/odom"  # nav_msgs/Odometry, the usual name
 CLICK = "/clicked_point"  # topic that RViz and Foxglove publish
-FOUND, TRACKS = "/output/detections", "/output/tracks"  # suffixes of a node's topics
+DETECTIONS, TRACKS = "/output/detections", "/output/tracks"  # suffixes of the topics of a node
 
 ODOMETRY_FRAME = "odom"  # fixed frame, REP-105
 LIDAR_FRAME = "velodyne"

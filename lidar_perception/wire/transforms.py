@@ -9,8 +9,8 @@ from lidar_perception.types import InputError
 from msg_utils.stamps import to_ns
 
 TF_MESSAGE, ODOMETRY_MESSAGE = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry"
-# Frame names in the tree of an odometry: the names of the message's fields, as their contents may
-# be equal or empty.
+# Frame names in the tree of an odometry. They are the names of the message's fields, because the
+# contents of these fields may be equal or empty.
 MOVING, FIXED = "child_frame_id", "header.frame_id"
 
 

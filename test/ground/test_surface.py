@@ -18,10 +18,10 @@ def test_surface_of_a_plane_is_the_plane(seed, along, across):
     ground = np.column_stack([xy, xy @ [along, across] - 1.7])
     holes = np.hypot(*(xy - [5, 5]).T) > 2.0  # like the hole under a car
     places = np.concatenate([rng.uniform(-25, 25, (10, 2)), [[5, 5]]])
-    heights = fit_ground_surface(ground[holes], 0.0).at(places)
+    heights = fit_ground_surface(ground[holes], 0.0).height_at(places)
     np.testing.assert_allclose(heights, places @ [along, across] - 1.7, atol=0.05)
     mixed = rng.permutation(ground[holes])
-    np.testing.assert_allclose(fit_ground_surface(mixed, 0.0).at(places), heights, atol=1e-9)
+    np.testing.assert_allclose(fit_ground_surface(mixed, 0.0).height_at(places), heights, atol=1e-9)
 
 
 @given(SEEDS, st.floats(-300, 300), st.floats(-300, 300))
@@ -32,19 +32,19 @@ def test_shifting_points_shifts_the_surface(seed, z, cells):
     places = rng.uniform(-50, 50, (20, 2))
     surface = fit_ground_surface(ground, 0.0)
     np.testing.assert_allclose(
-        fit_ground_surface(ground + shift, 0.0).at(places + shift[:2]), surface.at(places) + z, atol=1e-6
+        fit_ground_surface(ground + shift, 0.0).height_at(places + shift[:2]), surface.height_at(places) + z, atol=1e-6
     )
-    heights = surface.at(places)
+    heights = surface.height_at(places)
     assert heights.min() >= ground[:, 2].min() and heights.max() <= ground[:, 2].max()
-    far = surface.at(places + [10_000, 0])
-    np.testing.assert_allclose(far, surface.at(places + [20_000, 0]))
+    far = surface.height_at(places + [10_000, 0])
+    np.testing.assert_allclose(far, surface.height_at(places + [20_000, 0]))
 
 
 def test_surface_without_enough_points_has_the_default_height():
     places = np.array([[0.0, 0.0], [50.0, -3.0]])
     for count in (0, MIN_POINTS - 1):
         surface = fit_ground_surface(np.zeros((count, 3)), -1.5)
-        np.testing.assert_array_equal(surface.at(places), [-1.5, -1.5])
+        np.testing.assert_array_equal(surface.height_at(places), [-1.5, -1.5])
     one = fit_ground_surface(np.full((MIN_POINTS, 3), 0.5), -1.5)
-    np.testing.assert_allclose(one.at(places), [0.5, 0.5])
-    assert one.at(places[:0]).shape == (0,)
+    np.testing.assert_allclose(one.height_at(places), [0.5, 0.5])
+    assert one.height_at(places[:0]).shape == (0,)

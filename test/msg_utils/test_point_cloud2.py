@@ -260,8 +260,8 @@ def test_xyz_beyond_float32_is_infinite_without_a_warning():
     [
         ([("y", "f4"), ("z", "f4")], "no field 'x'; it has y, z"),
         ([("x", "f4", (2,)), ("y", "f4"), ("z", "f4")], "field 'x' has count > 1"),
-        ([("x", "i4"), ("y", "f4"), ("z", "f4")], "field 'x' is of type int32"),
-        ([("x", "f4"), ("y", "f4"), ("z", "u1")], "field 'z' is of type uint8"),
+        ([("x", "i4"), ("y", "f4"), ("z", "f4")], "field 'x' has type int32"),
+        ([("x", "f4"), ("y", "f4"), ("z", "u1")], "field 'z' has type uint8"),
     ],
 )
 def test_error_names_the_field_that_is_not_a_float(dtype, words):
@@ -294,16 +294,16 @@ def test_row_step_of_0_or_of_the_whole_cloud_is_accepted(make, height, width, st
 @pytest.mark.parametrize(
     "change, words",
     [
-        (dict(width=4), "data has 24 bytes where height 1 x width 4 x point_step 8 needs 32"),
-        (dict(height=2, width=2), "data has 24 bytes where height 2 .* needs 32"),
-        (dict(height=2, width=1, row_step=20), "data has 24 bytes .* needs 28"),
+        (dict(width=4), "data has 24 bytes, but height 1 x width 4 x point_step 8 requires 32"),
+        (dict(height=2, width=2), "data has 24 bytes, but height 2 .* requires 32"),
+        (dict(height=2, width=1, row_step=20), "data has 24 bytes.* requires 28"),
         (dict(height=3, width=1, row_step=7), "row_step = 7 is less than width x point_step = 8"),
         (dict(point_step=0), "point_step is 0 for 3 points"),
-        (dict(point_step=6), "field 'b' at offset 4 reaches past point_step = 6"),
+        (dict(point_step=6), "field 'b' at offset 4 extends beyond point_step = 6"),
         (dict(names="aa"), "field 'a' exists twice"),
         (dict(datatypes=(7, 9)), "field 'b' has datatype 9"),
         (dict(datatypes=(0, 7)), "field 'a' has datatype 0"),
-        (dict(count=2), "field 'b' at offset 4 reaches past point_step = 8"),
+        (dict(count=2), "field 'b' at offset 4 extends beyond point_step = 8"),
     ],
 )
 def test_error_names_the_broken_part_of_a_cloud(make, change, words):
@@ -333,7 +333,7 @@ def test_huge_point_step_is_reported_with_and_without_points(make, height, width
     fields = [field(make, name, 4 * i) for i, name in enumerate("xyz")]
     msg = message(make, fields, np.zeros(12, np.uint8), height=height, width=width, point_step=2**32 - 1, row_step=0)
     for read in (to_array, lambda m: add_columns(m, make, ground=np.zeros(0, "u1"))):
-        with pytest.raises(CloudError, match="point_step = 4294967295"):
+        with pytest.raises(CloudError, match="point_step is 4294967295"):
             read(msg)
 
 

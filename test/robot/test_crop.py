@@ -136,7 +136,7 @@ def test_cropped_message_has_points_of_cropped_frame():
         ({"body": (0.0, 1.0)}, "must be empty or"),
         ({"body": (1.0, 0.0, 0.0, 1.0, 1.0, 1.0)}, "min below its max"),
         ({"body": (0.0, 0.0, 0.0, 1.0, 1.0, float("inf"))}, "finite"),
-        ({"sectors": (1.0,)}, "pairs"),
+        ({"sectors": (1.0,)}, "even number of values"),
         ({"min_range": 5.0, "max_range": 4.0}, "at least min_range"),
     ],
 )

@@ -131,7 +131,7 @@ def test_gaps_longer_than_max_gap_are_not_bridged():
     assert error.value.late
     tree.set("odom", "base", START + 2 * SECOND_NS, [2, 0, 0], [0, 0, 0, 1])
     assert np.isfinite(tree.lookup("odom", "base", START + SECOND_NS)).all()
-    with pytest.raises(MissingTransform, match="s apart at the time"):
+    with pytest.raises(MissingTransform, match="s apart at the requested time"):
         tree.lookup("odom", "base", START + SECOND_NS, 0.5)
     # At its own stamp a pose is known.
     assert tree.lookup("odom", "base", START + SECOND_NS // 10, 0.0)[0, 3] == 1
@@ -194,7 +194,7 @@ def test_inserting_old_stamps_takes_logarithmic_time():
 
 def test_memory_is_bounded(monkeypatch):
     """Time, number of poses and number of frames are bounded."""
-    monkeypatch.setattr(transform_tree, "MAX_KEPT", 100)
+    monkeypatch.setattr(transform_tree, "MAX_HISTORY", 100)
     monkeypatch.setattr(transform_tree, "MAX_FRAMES", 3)
     tree = TransformTree()
     for i in range(5000):
@@ -212,12 +212,12 @@ def test_memory_is_bounded(monkeypatch):
 @pytest.mark.parametrize(
     "change, words",
     [
-        (dict(quaternion=[0, 0, 0, 0]), "no unit quaternion"),
-        (dict(quaternion=[0, 0, 0, 1.5]), "no unit quaternion"),
-        (dict(quaternion=[0, 0, float("nan"), 1]), "no unit quaternion"),
+        (dict(quaternion=[0, 0, 0, 0]), "not normalized"),
+        (dict(quaternion=[0, 0, 0, 1.5]), "not normalized"),
+        (dict(quaternion=[0, 0, float("nan"), 1]), "not normalized"),
         (dict(translation=[0, float("inf"), 0]), "not finite"),
-        (dict(child="a"), "two frames with names"),
-        (dict(child=""), "two frames with names"),
+        (dict(child="a"), "different, non-empty names"),
+        (dict(child=""), "different, non-empty names"),
     ],
 )
 def test_invalid_transform_is_rejected_and_not_stored(change, words):

@@ -12,7 +12,7 @@ from ros_samples import CLOUD, MARKERS, PAPER
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
-from lidar_perception.nodes.graph import SINGLE, STAGES
+from lidar_perception.nodes.graph import CANDIDATES_GRAPH, SINGLE_PROCESS_CANDIDATES
 from lidar_perception.nodes.interfaces import LATCHED, SENSOR_DATA
 from lidar_perception.param_fields import flatten
 from lidar_perception.scoring.centres.report import make_seed_source, select_pedestrians
@@ -32,7 +32,9 @@ def offline(frame):
 
 
 @pytest.mark.parametrize(
-    "graph, qos", [(STAGES, LATCHED), (SINGLE, SENSOR_DATA)], ids=["three nodes, latched", "one node, a driver's"]
+    "graph, qos",
+    [(CANDIDATES_GRAPH, LATCHED), (SINGLE_PROCESS_CANDIDATES, SENSOR_DATA)],
+    ids=["three nodes, latched", "one node, a driver's"],
 )
 def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, qos, processes, peer, drive_bag):
     frame, expected = next((f, e) for f in open_recording(drive_bag) if len(e := offline(f)))

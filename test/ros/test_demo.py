@@ -21,7 +21,7 @@ from lidar_perception.cli.demo import RECORD, demo
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.nodes.graph import FINAL, list_result_topics
+from lidar_perception.nodes.graph import FINAL_STAGE, list_result_topics
 from lidar_perception.nodes.replay import graph_replay
 from lidar_perception.scoring.recorded import read_results
 from lidar_perception.types import InputError
@@ -42,7 +42,7 @@ def test_demo_scores_like_offline_in_one_or_many_processes(drive_bag, make_bag, 
         outcome = CliRunner().invoke(demo, ["--data", str(bag), *arguments, "--out", str(out)])
         assert outcome.exit_code == 0, outcome.output
         scores = json.loads((out / "scores.json").read_text())
-        (found,) = read_results(out / "result", list_result_topics(False, "fused")[FINAL])
+        (found,) = read_results(out / "result", list_result_topics(False, "fused")[FINAL_STAGE])
         assert {f.stamp_ns for f in found} == frames.keys() and scores["results"] == len(frames)
         for answer in found:
             assert_equal(answer.published, expected[answer.stamp_ns])

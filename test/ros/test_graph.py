@@ -14,7 +14,7 @@ from ros_samples import PAPER
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
-from lidar_perception.nodes.graph import cloud_topic, list_result_topics
+from lidar_perception.nodes.graph import find_result_cloud_topic, list_result_topics
 from lidar_perception.nodes.replay.graph_replay import replay
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.report import CandidateReport, make_seed_source, measure_frame, select_pedestrians
@@ -93,7 +93,7 @@ def test_published_cloud_has_all_fields_and_offline_columns(run, offline, drive_
     with Bag(drive_bag) as bag:
         sent = {to_point_cloud(m)[0].stamp_ns: m for _, _, m in bag.messages({POINTS})}
     with Bag(out / "result") as bag:
-        clouds = [m for _, _, m in bag.messages({cloud_topic(single)})]
+        clouds = [m for _, _, m in bag.messages({find_result_cloud_topic(single)})]
     assert len(clouds) == len(sent)
     for msg in clouds:
         frame, indices = to_point_cloud(msg)

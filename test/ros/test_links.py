@@ -144,7 +144,7 @@ NODES = ("ground_segmentation", "clustering", "tracker")
 
 
 def start_together(processes, **params):
-    with processes.together("graph"):
+    with processes.share_process("graph"):
         for node in NODES:
             processes.start(node, build_graph(["pointnet"], tracking=True)[node], params.get(node, {}))
 

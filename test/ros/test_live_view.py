@@ -15,7 +15,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 from browsing import browsing
 from robot_messages import mount_pose, transforms
 
-from lidar_perception.nodes.graph import SINGLE
+from lidar_perception.nodes.graph import SINGLE_PROCESS_CANDIDATES
 from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, has_tf
 from lidar_perception.robot.poses import transform_boxes
 from lidar_perception.wire.codec import encode, make_bag_message
@@ -65,7 +65,7 @@ def received(shared_processes, shared_peer, view, drive_bag):
     )
     assert view.json("api/drive")["frames"] == []
     arrays = shared_peer.listen(FOUND, MARKERS)
-    for node, remap in SINGLE.items():
+    for node, remap in SINGLE_PROCESS_CANDIDATES.items():
         shared_processes.start(
             node, remap, {"seed.source": "ground_truth", "view.enabled": False, "tracking.enabled": True}
         )

@@ -20,7 +20,7 @@ from ros_samples import CLOUD, MARKERS, cloud
 
 from lidar_perception.nodes import reception as reception_module
 from lidar_perception.nodes.arrivals import RATE_INTERVALS
-from lidar_perception.nodes.graph import STAGES
+from lidar_perception.nodes.graph import CANDIDATES_GRAPH
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.interfaces import LATCHED
 from lidar_perception.nodes.interfaces import RELIABLE as RELIABLE_QOS
@@ -97,7 +97,7 @@ def test_clouds_of_drivers_with_other_qos_are_received(processes, peer):
         assert done() - 30 > 15  # a plain rclpy subscriber receives a third
     if value("lost"):
         log = (processes.logs / f"{NODE}.log").read_text()
-        assert log.count("were lost in transit; let /driver publish reliable") == 1
+        assert log.count("were lost in transit; make /driver publish reliable") == 1
     peer.set_parameter(f"/{NODE}", "input.error_after", 1000)
     peer.set_parameter(f"/{NODE}", "input.stale_after", 1000)
     peer.wait(lambda: "no cloud" not in peer.get_message(NODE), "no limit")
@@ -157,7 +157,7 @@ def test_sensors_in_two_namespaces_are_separate(two_sensors, shared_peer):
         peer.send(talker, cloud(street, stamp), lambda s=side: found[s], f"the result of {side}")
         assert {to_ns(m.markers[0].header.stamp) for m in found[side]} == {stamp}
         assert found[side][0].markers[0].lifetime.sec == 2  # so that boxes of a dead node disappear
-    own = {f"{side}/{node}": (side, f"{side}/lidar") for side in SIDES for node in STAGES}
+    own = {f"{side}/{node}": (side, f"{side}/lidar") for side in SIDES for node in CANDIDATES_GRAPH}
     peer.wait(lambda: own.keys() <= peer.diagnostics.keys(), "diagnostics of all")
     assert all(peer.diagnostics[name].hardware_id in ids for name, ids in own.items())
     peer.wait(
@@ -251,7 +251,7 @@ def test_incompatible_publisher_is_reported_with_remedy(start, monkeypatch, valu
         monkeypatch.setattr(reception, "publishers", lambda there=there: there)
         reception.adapt()
         asked = reception.subscription.qos_profile.reliability
-        said = [text for kind, _, text in reception.problems() if kind == "unheard"]
+        said = [text for kind, _, text in reception.problems() if kind == "incompatible"]
         assert bool(said) == (asked == RELIABLE and BEST_EFFORT in offered)
         assert all(text.startswith("/best_effort on /") and remedy in text for text in said)
         assert bool(said) == (remedy != "" and BEST_EFFORT in offered)
@@ -284,7 +284,7 @@ def test_source_of_losses_is_named_after_it_has_ended(start, monkeypatch):
             [{"publication_sequence_number": number, "source_timestamp": number} for number in (1, 3)], 0
         )
         (said,) = (text for kind, _, text in reception.problems() if kind == "lost")
-        assert "let /driver publish reliable" in said
+        assert "make /driver publish reliable" in said
 
 
 @pytest.mark.parametrize(

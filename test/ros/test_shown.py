@@ -21,7 +21,7 @@ from lidar_perception.ground.params import ObstacleParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.nodes import load_node_class
 from lidar_perception.nodes.external_node import create_context, shut_down_context
-from lidar_perception.nodes.graph import DETECTOR_NODES, SINGLE, build_graph
+from lidar_perception.nodes.graph import DETECTOR_NODES, SINGLE_PROCESS_CANDIDATES, build_graph
 from lidar_perception.wire.messages import to_point_cloud
 from lidar_perception.wire.topics import POINTS
 from msg_utils.point_cloud2 import to_array
@@ -73,7 +73,7 @@ def graph(domain):
     nodes, types, offered = [], {}, {}
     for name, remap in {
         **build_graph([*DETECTOR_NODES]),
-        **SINGLE,
+        **SINGLE_PROCESS_CANDIDATES,
         **build_graph(["candidates"], tracking=True),
     }.items():
         rules = [word for rule in remap.items() for word in ("-r", ":=".join(rule))]

@@ -22,7 +22,7 @@ from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointnet.params import STEPS as POINTNET_STEPS
 from lidar_perception.detectors.pointpillars.detector import STEPS as POINTPILLARS_STEPS
 from lidar_perception.detectors.pointpillars.detector import load_detector
-from lidar_perception.nodes.graph import POINTNET, POINTPILLARS, build_graph
+from lidar_perception.nodes.graph import build_graph
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.wire.codec import make_bag_message
@@ -181,7 +181,7 @@ def _fused_clouds():
 
 POINTPILLARS_NODE = DetectorUnderTest(
     "pointpillars_detector",
-    POINTPILLARS,
+    build_graph(["pointpillars"]),
     CONFIG / "pointpillars.param.yaml",
     eager(),
     load_detector,
@@ -192,7 +192,7 @@ POINTPILLARS_NODE = DetectorUnderTest(
 )
 POINTNET_NODE = DetectorUnderTest(
     "pointnet_detector",
-    POINTNET,
+    build_graph(["pointnet"]),
     CONFIG / "pointnet.param.yaml",
     pointnet_samples.eager(),
     load_pointnet_detector,

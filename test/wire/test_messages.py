@@ -46,12 +46,12 @@ def test_extrinsics_are_read_in_either_direction(make):
     [
         (
             lambda info, tf: setattr(info.header, "frame_id", "rear"),
-            "'rear' but the transform links 'velodyne' and 'camera_optical'",
+            "'rear', but the transform connects 'velodyne' and 'camera_optical'",
         ),
         (lambda info, tf: setattr(info, "width", 0), "no image size"),
         (lambda info, tf: setattr(info, "p", np.zeros(12)), "no projection matrix"),
-        (lambda info, tf: setattr(tf.transform.rotation, "w", 5.0), "no unit quaternion"),
-        (lambda info, tf: setattr(tf.transform.rotation, "w", float("nan")), "no unit quaternion"),
+        (lambda info, tf: setattr(tf.transform.rotation, "w", 5.0), "not normalized"),
+        (lambda info, tf: setattr(tf.transform.rotation, "w", float("nan")), "not normalized"),
         (lambda info, tf: setattr(tf.transform.translation, "y", float("nan")), "not finite"),
         (lambda info, tf: setattr(info, "p", np.full(12, np.nan)), "not finite"),
         (lambda info, tf: setattr(info, "p", np.r_[info.p[:11], np.inf]), "not finite"),

@@ -233,7 +233,7 @@ class FusedDetector(NetworkDetector):
                 name: float(scored.scores[class_ids == CLASSES.index(name)].max(initial=0.0)) for name in self.classes
             }
         boxes = move_cars_to_points(selected.boxes, selected.class_ids, proposals.obstacles, settings.on_points)
-        heights = proposals.surface.at(boxes)
+        heights = proposals.surface.height_at(boxes)
         boxes[:, 2] += heights + SENSOR_HEIGHT
         moved = replace(selected, boxes=move_to_ground(boxes, heights, settings.on_ground).astype(np.float32))
         return moved[remove_duplicates(moved, settings)], {}

@@ -14,14 +14,14 @@ from rich.text import Text
 
 from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.graph import (
-    FINAL,
+    FINAL_STAGE,
     TRACKER,
     Processes,
     build_graph,
-    cloud_topic,
     configure_evaluator,
     find_connected_outputs,
     find_expert_range,
+    find_result_cloud_topic,
     list_awaited_topics,
     list_result_topics,
     relative_name,
@@ -110,11 +110,11 @@ def replay(
     )
     if scored := detector == "candidates":
         nodes["evaluator"] = configure_evaluator(scores.resolve(), single)
-    recorded = [cloud_topic(single, detector), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
+    recorded = [find_result_cloud_topic(single, detector), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
     nodes["bag_recorder"] = {}, {"bag": str((out / "result").resolve()), "topics": recorded}
     one_process = runs_in_one_process(processes)
-    with Processes(out / "logs", domain) as running, GraphMonitor(domain, stages[FINAL]) as monitor:
-        with running.together(GRAPH) if one_process else nullcontext():
+    with Processes(out / "logs", domain) as running, GraphMonitor(domain, stages[FINAL_STAGE]) as monitor:
+        with running.share_process(GRAPH) if one_process else nullcontext():
             for node in graph:
                 running.start(node, *nodes[node])
         for node in nodes.keys() - graph.keys():
@@ -132,7 +132,7 @@ def replay(
         cloud_subscribers = 1 + (poses == "kiss_icp") + (POINTS in recorded)
         rules = list_awaited_topics([detector], single, cloud_subscribers, 1 + scored)
         # The detections have four subscribers: monitor, recorder, tracker, evaluator.
-        rules += [f"{relative_name(stages[FINAL])}:={3 + scored}"]
+        rules += [f"{relative_name(stages[FINAL_STAGE])}:={3 + scored}"]
         rules += [relative_name(ODOMETRY)] if poses == "recording" else []
         first, last = CpuTimes(), CpuTimes()  # CPU times at the first and the last result
         running.start(
@@ -158,7 +158,7 @@ def replay(
                     if not first.frames:
                         first.read(monitor.frames, running)
                 if 2 * monitor.frames > clouds and not memory:
-                    memory.update(running.memory_mb())
+                    memory.update(running.measure_memory_mb())
                 return monitor.frames >= clouds
 
             while not finished() and (monitor.frames != before or not running.has_ended("bag_player")):
@@ -203,7 +203,7 @@ class CpuTimes:
     def read(self, frames: int, running: Processes) -> None:
         """Read the times at a number of results; processes that have ended keep theirs."""
         self.frames = frames
-        self.seconds.update(running.cpu_seconds(), watch=process_time())
+        self.seconds.update(running.measure_cpu_seconds(), watch=process_time())
 
     def ms_per_frame(self, earlier: CpuTimes) -> dict[str, float]:
         """Return {process: its CPU time per result since an earlier reading, in ms}."""
