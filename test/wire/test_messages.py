@@ -55,7 +55,7 @@ def test_extrinsics_are_read_in_either_direction(make):
         (lambda info, tf: setattr(tf.transform.translation, "y", float("nan")), "not finite"),
         (lambda info, tf: setattr(info, "p", np.full(12, np.nan)), "not finite"),
         (lambda info, tf: setattr(info, "p", np.r_[info.p[:11], np.inf]), "not finite"),
-        (lambda info, tf: setattr(info, "width", 2**32 - 1), "4294967295 x 375 pixels"),
+        (lambda info, tf: setattr(info, "width", 2**32 - 1), "image size 4294967295 x 375 is out of range"),
     ],
 )
 def test_unusable_camera_raises_input_error(make, change, words):
