@@ -58,7 +58,7 @@ class Output:
             for receive in receivers:
                 receive(message, info)
         if self.always_publishes or self.publisher.get_subscription_count():
-            self.publisher.publish(_to_cdr(message))
+            self.publisher.publish(to_cdr(message))
 
     def close(self) -> None:
         """End the links of this publisher."""
@@ -100,12 +100,19 @@ class Outputs:
         return []
 
 
-def _to_cdr(message: Any) -> bytes:
+def to_cdr(message: Any) -> bytes:
+    """Return the CDR of a message of an Output."""
     if isinstance(message, bytes):
         return message
     if isinstance(message, MarkerRows):
         return encode_markers(message.rows, message.header, message.lifetime_ns)
     return encode(message)
+
+
+def find_only_output(node: Node, links: Links | None, topic: str) -> Output | None:
+    """Return the output of this process that is the only publisher of a topic, or None."""
+    output = None if links is None else links.find_output(topic)
+    return output if output is not None and len(node.get_publishers_info_by_topic(topic)) < 2 else None
 
 
 class Links:

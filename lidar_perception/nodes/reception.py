@@ -15,7 +15,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from lidar_perception.nodes.arrivals import DEPTH, WINDOW, Arrivals
 from lidar_perception.nodes.diagnostics import ERROR, STALE, WARN, Problem
-from lidar_perception.nodes.links import Links, Output
+from lidar_perception.nodes.links import Links, Output, find_only_output
 from lidar_perception.nodes.rclpy_compat import InvalidHandle, parameter_overrides, take_messages
 from lidar_perception.nodes.shared_memory import SOCKET_BUFFER, read_socket_buffer_size
 from lidar_perception.params import ReceptionParams
@@ -114,7 +114,7 @@ class Reception:
 
     def _connect(self) -> None:
         """Link to an output of this process, or subscribe."""
-        self.output = self._find_output()
+        self.output = find_only_output(self.node, self.links, self.topic)
         if self.output is None or self.links is None:
             self._subscribe()
         else:
@@ -129,11 +129,6 @@ class Reception:
         if self.subscription is not None:
             self.node.destroy_subscription(self.subscription)
         self.output = self.subscription = None
-
-    def _find_output(self) -> Output | None:
-        """Return the output of this process that is the only publisher of the topic, or None."""
-        output = None if self.links is None else self.links.find_output(self.topic)
-        return output if output is not None and len(self.publishers()) < 2 else None
 
     def _subscribe(self) -> None:
         """Subscribe with a queue in the middleware for clouds that arrive during work."""
@@ -162,7 +157,7 @@ class Reception:
         """Reconnect if the publishers, or the reliability that they offer, have changed."""
         if not self.is_open:
             return
-        if self._find_output() is not self.output:
+        if find_only_output(self.node, self.links, self.topic) is not self.output:
             self._disconnect()
             self._connect()
             self.arrivals.record_interruption(0)

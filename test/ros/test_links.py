@@ -13,12 +13,14 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 
+from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.clustering import Clustering
 from lidar_perception.nodes.external_node import create_context, shut_down_context
 from lidar_perception.nodes.graph import build_graph
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.interfaces import LATCHED, RELIABLE
 from lidar_perception.nodes.links import Links, Output
+from lidar_perception.nodes.replay.bag_recorder import BagRecorder
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.types import Detections
 from lidar_perception.wire.codec import decode, encode, make_bag_message
@@ -110,6 +112,30 @@ def test_link_ends_with_its_nodes(graph):
     graph.ground.trigger_configure()
     graph.spin()
     assert graph.reception.output is graph.ground.points
+
+
+def test_recorder_gets_linked_messages_without_dds(graph, monkeypatch, tmp_path):
+    recorder = BagRecorder(
+        context=graph.context,
+        links=graph.ground.links,
+        cli_args=["--ros-args", "-p", f"bag:={tmp_path}/bag", "-p", f"topics:=['{GROUND_POINTS}']"],
+    )
+    published = []
+    monkeypatch.setattr(graph.ground.points.publisher, "publish", published.append)
+    graph.ground.on_points(make_cloud())
+    other = graph.clustering.create_publisher(load_message_class(CLOUD), GROUND_POINTS, RELIABLE)
+    recorder._discover()  # with a second publisher, all messages come by DDS
+    assert not recorder.link_by_topic and recorder.subscription_by_topic
+    graph.clustering.destroy_publisher(other)
+    recorder._discover()
+    assert recorder.link_by_topic and not recorder.subscription_by_topic
+    graph.ground.on_points(make_cloud(10**18 + 1))
+    recorder.close()
+    recorder.destroy_node()
+    with Bag(tmp_path / "bag") as bag:
+        messages = [message for _, _, message in bag.messages({GROUND_POINTS})]
+    assert [m.header.stamp.nanosec for m in messages] == [0, 1] and not published
+    assert {f.name for f in messages[0].fields} >= {"ground", "in_view"}
 
 
 def test_tracker_reads_the_same_objects_from_rows_and_from_cdr():

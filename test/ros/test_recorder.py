@@ -77,7 +77,8 @@ def test_slow_recorder_drops_and_reports_messages(monkeypatch, start, tmp_path):
         lambda self, kind, topic, received, *_, **__: kept.append(received),
     )
     node = start(bag_recorder.BagRecorder, **{"bag": str(tmp_path / "bag"), "topics": ["/a"], "use_sim_time": True})
-    node._subscribe("/a", None)
+    node.kind_by_topic["/a"] = None
+    node._subscribe("/a")
     try:
         for _ in range(10):
             kept[-1](bytes(40))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+from functools import partial
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -11,6 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, BagWriter
 from lidar_perception.nodes.diagnostics import OK, WARN
+from lidar_perception.nodes.links import Output, Receive, find_only_output, to_cdr
 from lidar_perception.nodes.runtime import LidarNode
 from lidar_perception.params import RecorderParams
 from lidar_perception.types import InputError
@@ -26,7 +28,8 @@ DISCOVERY_PERIOD_S = 0.2  # between searches for topics without a publisher so f
 class BagRecorder(LidarNode):
     """Writes the bytes of messages to a bag, which is complete when the node has ended.
 
-    A separate thread compresses and writes them.
+    A separate thread compresses and writes them. Messages of nodes in the same process come by
+    links, see links.py, and that thread serializes them as well.
     """
 
     writes_files = True
@@ -38,10 +41,14 @@ class BagRecorder(LidarNode):
         self.writer = BagWriter(self.params.bag, compression=self.params.compression)
         self.writer.__enter__()
         self.waiting = list(dict.fromkeys(map(self.resolve_topic_name, self.params.topics)))
+        self.kind_by_topic: dict[str, type] = {}  # of the recorded topics
         self.subscription_by_topic: dict[str, Any] = {}
+        self.link_by_topic: dict[str, tuple[Output, Receive]] = {}
         self.incompatible: set[str] = set()  # topics with a publisher of weaker QoS
         self.queue: queue.Queue = queue.Queue()
-        self.queued, self.written = 0, 0  # bytes; each counter is updated by one thread only
+        # Bytes; only clouds count among linked messages. Each counter is updated by one thread, or with the lock.
+        self.queued, self.written = 0, 0
+        self.lock = threading.Lock()
         self.diagnostics.counts.update(lost=0, dropped=0)
         self.reported = 0  # number of lost and dropped messages already reported
         self.failure: Exception | None = None
@@ -67,14 +74,15 @@ class BagRecorder(LidarNode):
                     f"{topic} is not recorded: {types[topic][0]} is unknown or not installed on this machine"
                 )
                 continue
-            self._subscribe(topic, kind)
-            latched = self.subscription_by_topic[topic].qos_profile.durability == LATCHED
+            self.kind_by_topic[topic] = kind
+            self._subscribe(topic)
+            subscription = self.subscription_by_topic.get(topic)
+            latched = subscription is not None and subscription.qos_profile.durability == LATCHED
             self.queue.put(("topic", topic, types[topic][0], LATCHED_QOS if latched else SENSOR_QOS))
-        while self.incompatible:
-            topic = self.incompatible.pop()
-            before = self.subscription_by_topic[topic]
-            self.destroy_subscription(before)
-            self._subscribe(topic, before.msg_type)
+        for topic in self.kind_by_topic:
+            if topic in self.incompatible or self._find_output(topic) is not self.link_by_topic.get(topic, (None,))[0]:
+                self._unsubscribe(topic)
+                self._subscribe(topic)
         missing = self.diagnostics.counts["lost"] + self.diagnostics.counts["dropped"]
         if missing > self.reported:
             self.reported = missing
@@ -99,8 +107,18 @@ class BagRecorder(LidarNode):
         except (ModuleNotFoundError, AttributeError):
             return None
 
-    def _subscribe(self, topic: str, kind: type) -> None:
-        """Subscribe with a QoS that all present publishers match."""
+    def _find_output(self, topic: str) -> Output | None:
+        """Return the output of this process to link to, or None; latched messages come by DDS."""
+        output = find_only_output(self, self.links, topic)
+        return None if output is None or output.always_publishes else output
+
+    def _subscribe(self, topic: str) -> None:
+        """Link to an output of this process, or subscribe with a QoS that all present publishers match."""
+        receive = partial(self._enqueue, topic)
+        if self.links is not None and (output := self._find_output(topic)) is not None:
+            self.link_by_topic[topic] = output, receive
+            self.links.connect(output, receive)
+            return
         offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
         qos = QoSProfile(  # several publishers may each have latched a message
             depth=DEPTH,
@@ -111,26 +129,36 @@ class BagRecorder(LidarNode):
             ),
             durability=(LATCHED if all(q.durability == LATCHED for q in offered) else DurabilityPolicy.VOLATILE),
         )
-
-        def enqueue(data: bytes) -> None:
-            waiting = self.queued - self.written
-            if waiting and waiting + len(data) > MAX_QUEUED:
-                self.diagnostics.counts["dropped"] += 1
-                return
-            self.diagnostics.counts["frames"] += 1
-            self.queued += len(data)
-            self.queue.put(("message", topic, self.get_clock().now().nanoseconds, data))
-
+        on_message: Any = receive  # rclpy's type annotation lacks functools.partial
         self.subscription_by_topic[topic] = self.create_subscription(
-            kind,
+            self.kind_by_topic[topic],
             topic,
-            enqueue,
+            on_message,
             qos,
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(
                 message_lost=self.diagnostics.count_lost, incompatible_qos=lambda _: self.incompatible.add(topic)
             ),
         )
+
+    def _unsubscribe(self, topic: str) -> None:
+        self.incompatible.discard(topic)
+        if (subscription := self.subscription_by_topic.pop(topic, None)) is not None:
+            self.destroy_subscription(subscription)
+        if self.links is not None and (link := self.link_by_topic.pop(topic, None)) is not None:
+            self.links.disconnect(*link)
+
+    def _enqueue(self, topic: str, message: Any, _: Any = None) -> None:
+        """Queue a message for the writing thread; for links, this is called in the threads of the publishers."""
+        size = len(message if isinstance(message, bytes) else getattr(message, "data", b""))
+        with self.lock:
+            waiting = self.queued - self.written
+            if waiting and waiting + size > MAX_QUEUED:
+                self.diagnostics.counts["dropped"] += 1
+                return
+            self.diagnostics.counts["frames"] += 1
+            self.queued += size
+        self.queue.put(("message", topic, self.get_clock().now().nanoseconds, message, size))
 
     def _write(self) -> None:
         try:
@@ -139,8 +167,9 @@ class BagRecorder(LidarNode):
                 if what == "topic":
                     self.writer.add_topic(topic, *rest)
                 else:
-                    self.writer.write(topic, *rest)
-                    self.written += len(rest[1])
+                    stamp, message, size = rest
+                    self.writer.write(topic, stamp, to_cdr(message))
+                    self.written += size
         except Exception as error:  # such as a full disk; the timer ends the node
             self.failure = error
 

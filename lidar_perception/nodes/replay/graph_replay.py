@@ -115,10 +115,10 @@ def replay(
     one_process = runs_in_one_process(processes)
     with Processes(out / "logs", domain) as running, GraphMonitor(domain, stages[FINAL_STAGE]) as monitor:
         with running.share_process(GRAPH) if one_process else nullcontext():
-            for node in graph:
+            for node in (*graph, "bag_recorder"):
                 running.start(node, *nodes[node])
-        for node in nodes.keys() - graph.keys():
-            running.start(node, *nodes[node])
+        if scored:
+            running.start("evaluator", *nodes["evaluator"])
         outputs = find_connected_outputs({node: remap for node, (remap, _) in nodes.items()})
         with errors.status("starting the nodes"):
             ready = monitor.spin_until(lambda: monitor.is_connected(outputs), START_TIMEOUT_S, running.check)
