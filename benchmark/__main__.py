@@ -88,14 +88,17 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     """
     keep_freed_memory()
     recordings = [open_recording(path) for path in data]
-    recording = next((candidate for candidate in recordings if {BOXES, CAMERA} <= candidate.has), recordings[0])
+    recording = next((candidate for candidate in recordings if {BOXES, CAMERA} <= candidate.contents), recordings[0])
     recording.require(BOXES, "benchmark")
     recording.require(CAMERA, "benchmark")
     frames = [f for f in recording if len(select_pedestrians(f.truth()))]
     if not frames:
         raise InputError(f"{recording.path} has no frame with a Pedestrian label")
     labelled = [
-        f for candidate in recordings if POINT_LABELS in candidate.has for f in choose_evenly(candidate.frames, count)
+        f
+        for candidate in recordings
+        if POINT_LABELS in candidate.contents
+        for f in choose_evenly(candidate.frames, count)
     ]
     warm_up()
     content: dict[str, Any] = {

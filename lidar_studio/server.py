@@ -102,7 +102,7 @@ class PageContent:
             "path": str(self.drive.recording.path),
             "frames": frames,
             "layout": self.drive.recording.layout,
-            "has": sorted(self.drive.recording.has),
+            "has": sorted(self.drive.recording.contents),
         }
 
 

@@ -141,7 +141,7 @@ def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Ca
         return lambda frame: frame
     from lidar_perception.data import bag_frames, cloud_folder
 
-    if not any(layout.is_layout(recording.path) for layout in (bag_frames, cloud_folder)):
+    if not any(layout.can_open(recording.path) for layout in (bag_frames, cloud_folder)):
         raise InputError(
             f"{recording.path} ({recording.layout}) already has level clouds; --robot and --deskew require bags or "
             "cloud files"
@@ -157,7 +157,7 @@ def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Ca
     from lidar_perception.data.bag import BagHandle
     from lidar_perception.data.bag_poses import BagPoses
 
-    if not bag_frames.is_layout(recording.path):
+    if not bag_frames.can_open(recording.path):
         raise InputError(f"{recording.path} is not a bag, so it has no odometry or TF, which --deskew needs")
     first = recording.frames[len(recording) // 2]
     poses = BagPoses(BagHandle(recording.path), first.load().frame_id).lookup

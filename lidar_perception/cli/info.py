@@ -89,7 +89,7 @@ def _describe_recording(path: Path) -> dict[str, Any]:
         "summary": str(recording),
         "layout": recording.layout,
         "frames": len(recording),
-        "has": sorted(recording.has),
+        "has": sorted(recording.contents),
         "drives": sorted({frame.sequence for frame in recording if frame.sequence}),
         "start_ns": min(frame.stamp_ns for frame in recording) if recording.has_times else None,
         "first_cloud": {

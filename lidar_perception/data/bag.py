@@ -1,4 +1,4 @@
-"""Reading of bags (MCAP, SQLite3, ROS 1) and writing of MCAP bags, without ROS."""
+"""Reader of bags (MCAP, SQLite3, ROS 1) and writer of MCAP bags, without ROS."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ from lidar_perception.wire.compression import decompress_message
 
 __all__ = ["LATCHED_QOS", "SENSOR_QOS", "Bag", "BagHandle", "BagWriter"]
 
-# A KITTI cloud has 1.9 MB. Chunks of several clouds compress better and are faster to read.
+# Chunks of several clouds compress better and are faster to read; a KITTI cloud has 1.9 MB.
 CHUNK_BYTES = 8 * 2**20
-MAX_SHOWN = 3  # maximum number of differences between metadata.yaml and the files listed in a warning
+MAX_SHOWN = 3  # maximum number of differences between metadata.yaml and the files in a warning
 COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-# mcap always uses level 3 (mcap/writer.py, Writer.__finalize_chunk). Level 1 takes half the time
-# for a cloud and gives about the same size.
+# mcap always uses level 3 (mcap/writer.py, Writer.__finalize_chunk). For clouds, level 1 takes half
+# the time and gives about the same size.
 _library: Any = mcap.writer
 _library.zstandard = SimpleNamespace(compress=partial(zstandard.compress, level=1))
 
@@ -69,8 +69,8 @@ class BagWriter:
     """Writer of a rosbag2 folder with one MCAP file, checksums and metadata.yaml.
 
     Use it as a context manager. The folder is named NAME.incomplete until it is complete, and only
-    one process can write it. After an exception, it remains as a valid bag with the messages
-    written so far. Raises InputError if the disk is full.
+    one process can write it. After an exception, the incomplete folder remains as a valid bag with
+    the messages written so far. Raises InputError if the disk is full.
 
     Args:
         path: folder of the bag.
@@ -91,11 +91,11 @@ class BagWriter:
         check_unused(self.path, self.force)
         if self.path.exists():
             if not (self.path / "metadata.yaml").is_file():
-                raise InputError(f"{self.path} is not a bag and is not overwritten; give another name")
+                raise InputError(f"{self.path} exists and is not a bag, so it is not overwritten; give another name")
             refuse_other_files(self.path, ("metadata.yaml", "*.mcap*", "*.db3*"))
 
     def __enter__(self) -> BagWriter:
-        with ExitStack() as stack, self._name_write_error():
+        with ExitStack() as stack, self._convert_write_errors():
             stack.enter_context(lock_folder(self.partial))
             self._check_target()  # another process may have written the file in the meantime
             for old in self.partial.iterdir():
@@ -108,7 +108,7 @@ class BagWriter:
         return self
 
     @contextmanager
-    def _name_write_error(self) -> Iterator[None]:
+    def _convert_write_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -146,13 +146,13 @@ class BagWriter:
         """
         channel = self.channels[topic]
         raw = message if isinstance(message, bytes) else encode(message)
-        with self._name_write_error():
+        with self._convert_write_errors():
             self.mcap.add_message(channel, stamp_ns, raw, stamp_ns)
         self.topics[list(self.channels).index(topic)]["message_count"] += 1
         self.times.append(stamp_ns)
 
     def __exit__(self, error_type, error, traceback) -> None:
-        with self.open, self._name_write_error():
+        with self.open, self._convert_write_errors():
             try:
                 self._finish()
             except OSError:
@@ -200,8 +200,8 @@ class BagWriter:
 class Bag:
     """A bag open for reading. Use it as a context manager.
 
-    A bag is a rosbag2 folder, a folder of ROS 1 bags, or one storage file. Topics, counts and times
-    come from its files; an InputWarning lists differences to metadata.yaml.
+    A bag is a rosbag2 folder, a folder of ROS 1 bags, or a single storage file. Topics, counts and
+    times come from the files; an InputWarning lists differences from metadata.yaml.
 
     Args:
         warn: False to suppress these warnings.
@@ -210,7 +210,8 @@ class Bag:
         topics: type of each readable topic, by its name.
         counts: number of messages of each readable topic, by its name.
         unreadable: topics in an unsupported encoding, by name.
-        start_ns, end_ns: time of the first message, and after the last one; 0 without messages.
+        start_ns, end_ns: time of the first message, and 1 ns after the last one; 0 without
+            messages.
 
     Raises:
         InputError: the bag is damaged, or the path is not a bag. Checksums and counts are verified;
@@ -226,7 +227,7 @@ class Bag:
             self.topics: dict[str, str] = {}
             self.counts: dict[str, int] = {}
             self.unreadable: dict[str, Topic] = {}
-            recorded, problems = self._take_topics()
+            recorded, problems = self._collect_topics()
             times = [file.times for _, file in self.files if file.times is not None]
             self.start_ns = min((first for first, _ in times), default=0)
             self.end_ns = max((last + 1 for _, last in times), default=0)
@@ -247,12 +248,12 @@ class Bag:
                 warnings.warn(problem, InputWarning, stacklevel=2)
             self.close = stack.pop_all().close
 
-    def _take_topics(self) -> tuple[Counter[str], list[str]]:
-        """Set topics, counts and unreadable.
+    def _collect_topics(self) -> tuple[Counter[str], list[str]]:
+        """Collect the topics of the files into `topics`, `counts` and `unreadable`.
 
         Returns:
             The number of messages of every topic, readable or not, and a warning for each topic
-            with several types, of which the most frequent one is read.
+            with several types. Only the most frequent type of such a topic is read.
         """
         recorded, problems = Counter[str](), []
         counts_by_topic: dict[str, Counter[str]] = {}
@@ -266,10 +267,10 @@ class Bag:
         for name, counts_by_type in counts_by_topic.items():
             self.unreadable.pop(name, None)
             (self.topics[name], self.counts[name]), *others = counts_by_type.most_common()
-            if left_out := [f"{count} of {type_name}" for type_name, count in others if count]:
+            if ignored := [f"{count} of {type_name}" for type_name, count in others if count]:
                 problems.append(
                     f"{self.path}: {name} has messages of several types; only "
-                    f"{self.topics[name]} is read, not {', '.join(left_out)}"
+                    f"{self.topics[name]} is read, not {', '.join(ignored)}"
                 )
         return recorded, problems
 
@@ -289,7 +290,7 @@ class Bag:
 
     @property
     def content(self) -> str:
-        """Topics with their types, as text."""
+        """Text that lists the topics with their types."""
         others = {name: f"{topic.type} as {topic.encoding}" for name, topic in self.unreadable.items()}
         return (
             ", ".join(f"{topic} ({type_name})" for topic, type_name in sorted({**others, **self.topics}.items()))
@@ -305,18 +306,18 @@ class Bag:
             dict.fromkeys(
                 profile
                 for _, file in self.files
-                for each in file.topics
-                if each.name == topic
-                for profile in parse_profiles(each.qos)
+                for file_topic in file.topics
+                if file_topic.name == topic
+                for profile in parse_profiles(file_topic.qos)
             )
         )
 
     def require(self, topic: str) -> None:
-        """Raise InputError, with the available topics, if the bag lacks a topic."""
+        """Raise InputError, which lists the available topics, if the bag lacks a topic."""
         if other := self.unreadable.get(topic):
             raise InputError(
                 f"{self.path} has {other.type} as {other.encoding} on {topic}; this "
-                "encoding is not supported: record it with ROS 2"
+                "encoding is not supported: record the topic with ROS 2"
             )
         if topic not in self.topics:
             raise InputError(f"{self.path} has no topic {topic}; it has {self.content}")
@@ -377,8 +378,8 @@ class Bag:
 class BagHandle:
     """A bag that stays open, for reading single messages without reading its index again.
 
-    Each process and each thread opens its own bag, because SQLite requires it. The bag is closed
-    with the thread, or when the handle is deleted. Only the first one emits warnings.
+    Each process and each thread opens the bag separately, because SQLite requires it, and only the
+    first emits warnings. The bag is closed when the thread ends or the handle is deleted.
     """
 
     def __init__(self, path: Path, warn: bool = True):

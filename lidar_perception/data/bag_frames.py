@@ -30,27 +30,28 @@ from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, INSTANCE, POIN
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import SECOND_NS
 
-# Topics required by the kind of content.
+# Topics that a bag must have for each kind of content.
 TOPICS_BY_CONTENT = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}}
 
 
-def is_layout(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Return True for a bag file, or a folder with one."""
     if path.is_file():
-        return not is_cloud(path)  # the only other single files are clouds
+        return not is_cloud(path)  # other single files are not supported
     return (path / METADATA_FILE).is_file() or bool(list_storage_files(path))
 
 
 def choose_cloud_topic(bag: Bag, points: str = "") -> str:
     """Choose the topic of the clouds: `points` if given, otherwise /points, otherwise the only one.
 
-    Raises InputError if there is no such topic, or if the choice is ambiguous.
+    Raises InputError if the bag has no such topic, or if the choice is ambiguous.
     """
     cloud_topics = find_cloud_topics(bag.topics)
-    recorded = [topic for topic in cloud_topics if bag.counts[topic]]
-    if not points and POINTS not in recorded and len(recorded) > 1:
+    recorded_topics = [topic for topic in cloud_topics if bag.counts[topic]]
+    if not points and POINTS not in recorded_topics and len(recorded_topics) > 1:
         raise InputError(
-            f"{bag.path} has clouds on {', '.join(recorded)}; choose a topic, as in {bag.path}:{recorded[0]}"
+            f"{bag.path} has clouds on {', '.join(recorded_topics)}; choose a topic, as in "
+            f"{bag.path}:{recorded_topics[0]}"
         )
     if not points and not cloud_topics:
         others = {name: topic.type for name, topic in bag.unreadable.items()} | bag.topics
@@ -58,14 +59,14 @@ def choose_cloud_topic(bag: Bag, points: str = "") -> str:
             f"{bag.path} has no sensor_msgs/PointCloud2 and no other clouds: "
             + (diagnose_packets(others) or f"it has {bag.content}. Record the cloud topic of the sensor's driver")
         )
-    chosen = points or (recorded[0] if recorded and POINTS not in recorded else POINTS)
-    bag.require(chosen)
-    if bag.topics[chosen] not in CLOUD_TYPES:
+    topic = points or (recorded_topics[0] if recorded_topics and POINTS not in recorded_topics else POINTS)
+    bag.require(topic)
+    if bag.topics[topic] not in CLOUD_TYPES:
         raise InputError(
-            f"{bag.path} has {bag.topics[chosen]} on {chosen} instead of clouds; "
-            + (diagnose_packets({chosen: bag.topics[chosen]}) or f"choose another topic, as in {bag.path}:/points")
+            f"{bag.path} has {bag.topics[topic]} on {topic} instead of clouds; "
+            + (diagnose_packets({topic: bag.topics[topic]}) or f"choose another topic, as in {bag.path}:/points")
         )
-    return chosen
+    return topic
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
@@ -78,38 +79,44 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     has_point_labels = False
     frames.check_readable()
     with suppress(InputError):  # a damaged cloud is reported when it is read
-        has_point_labels = frames.first is not None and frames.decode_labelled(frames.first[1]) is not None
-    has = frozenset(content for content, required in TOPICS_BY_CONTENT.items() if required <= topics) | {
+        has_point_labels = (
+            frames.first_message is not None and frames.decode_labelled_cloud(frames.first_message[1]) is not None
+        )
+    contents = frozenset(content for content, required in TOPICS_BY_CONTENT.items() if required <= topics) | {
         *[POINT_LABELS] * has_point_labels,
-        *[POSES] * frames.poses.available,
+        *[POSES] * frames.poses.has_poses,
     }
-    return Recording(path, f"{bag.layout}, clouds on {points}", frames, has, has_sensor_height=False, has_times=True)
+    return Recording(
+        path, f"{bag.layout}, clouds on {points}", frames, contents, has_sensor_height=False, has_times=True
+    )
 
 
 class BagFrames(Sequence):
     """The frames of a bag in order of time; native() of a frame returns its message.
 
-    When iterating, the bag is read once, and each frame holds its cloud. A frame that is accessed
-    by index, except the first one, reads its cloud when needed; the first such access reads the
-    times of all clouds.
+    Iteration reads the bag once, and each frame holds its cloud. A frame that is accessed by index,
+    except the first one, reads its cloud when needed; the first such access reads the times of all
+    clouds.
     """
 
-    def __init__(self, handle: BagHandle, points: str, kind: str, count: int, sensor_height: float = SENSOR_HEIGHT):
-        self.handle, self.points, self.kind, self.clouds = handle, points, kind, count
+    def __init__(
+        self, handle: BagHandle, points: str, message_type: str, count: int, sensor_height: float = SENSOR_HEIGHT
+    ):
+        self.handle, self.points, self.message_type, self.cloud_count = handle, points, message_type, count
         self.path, self.sensor_height = handle.path, sensor_height
 
     def with_sensor_height(self, sensor_height: float) -> BagFrames:
         """Return the frames with another sensor height above the ground, in metres."""
-        return BagFrames(self.handle, self.points, self.kind, self.clouds, sensor_height)
+        return BagFrames(self.handle, self.points, self.message_type, self.cloud_count, sensor_height)
 
     def check_readable(self) -> None:
         """Raise InputError if the compression of the clouds is not supported."""
-        if self.first is not None:
-            with self._error_context(self.first[0]):
-                check_readable(self.first[1], self.kind)
+        if self.first_message is not None:
+            with self._add_error_context(self.first_message[0]):
+                check_readable(self.first_message[1], self.message_type)
 
     def __len__(self) -> int:
-        return self.clouds
+        return self.cloud_count
 
     def __iter__(self) -> Iterator[Frame]:
         stamp_counts: Counter[int] = Counter()
@@ -119,30 +126,30 @@ class BagFrames(Sequence):
                 stamp_counts[stamp] += 1
                 yield self._make_frame(i, time, stamp, stamp_counts[stamp], partial(bytes, data))
 
-    def stamps(self) -> np.ndarray:
-        """Return the stamps (count,) int64 ns of all clouds; the whole bag is read once."""
+    def read_stamps(self) -> np.ndarray:
+        """Return the stamps (count,) int64 ns of all clouds; the first call reads the entire bag."""
         return np.array([row[2] for row in self._index], np.int64)
 
-    def message(self, i: int) -> Any:
+    def read_message(self, i: int) -> Any:
         """Return cloud i as a PointCloud2 with all recorded columns."""
         time, earlier_count, *_ = self._index[i]
-        return decode_cloud(self._read(time, earlier_count), self.kind)
+        return decode_cloud(self._read(time, earlier_count), self.message_type)
 
     def __getitem__(self, i):
         if isinstance(i, slice):
-            return [self[k] for k in range(*i.indices(self.clouds))]
-        if not -self.clouds <= i < self.clouds:
+            return [self[k] for k in range(*i.indices(self.cloud_count))]
+        if not -self.cloud_count <= i < self.cloud_count:
             raise IndexError(i)
-        i %= self.clouds
-        if i == 0 and self.first is not None:
-            time, data = self.first
+        i %= self.cloud_count
+        if i == 0 and self.first_message is not None:
+            time, data = self.first_message
             return self._make_frame(0, time, self._stamp(data, time), 1, lambda: data)
         time, earlier_count, stamp, occurrence = self._index[i]
         return self._make_frame(i, time, stamp, occurrence, partial(self._read, time, earlier_count))
 
     @cached_property
     def _index(self) -> list[tuple[int, int, int, int]]:
-        """For each cloud: log time, number of earlier clouds with this time, stamp, and number of
+        """Row for each cloud: log time, number of earlier clouds with this time, stamp, and number of
         clouds with this stamp so far."""
         time_counts: Counter[int] = Counter()
         stamp_counts: Counter[int] = Counter()
@@ -160,9 +167,9 @@ class BagFrames(Sequence):
 
     @cached_property
     def _annotations(self) -> tuple[dict[int, GroundTruth], list, list]:
-        """Labels by stamp, and calibrations and transforms by time, of the whole bag.
+        """Labels by stamp, and (time, message) of each calibration and transform in the bag.
 
-        They are small, and may come after their cloud.
+        All are read at once, because they may come after their cloud.
         """
         truth: dict[int, GroundTruth] = {}
         infos: list[tuple[int, Any]] = []
@@ -186,7 +193,7 @@ class BagFrames(Sequence):
         return tuple(sorted(file for file in self.path.iterdir() if file.is_file() and file.suffix != ".yaml"))
 
     @cached_property
-    def first(self) -> tuple[int, bytes] | None:
+    def first_message(self) -> tuple[int, bytes] | None:
         """Time and serialized message of the first cloud; None without clouds."""
         raw = self.handle.bag().raw_messages({self.points})
         return next(((time, bytes(data)) for _, time, data in raw), None)
@@ -210,9 +217,9 @@ class BagFrames(Sequence):
     def full_scale(self) -> float:
         """Intensity of a full reflection, the same for all frames.
 
-        It is inferred from the first clouds, because others would require reading the whole bag.
+        It is inferred from the first clouds, because reading others would take too long.
         """
-        return infer_scale(self._first_clouds(), lambda data: read_raw_intensity(decode_cloud(data, self.kind)))
+        return infer_scale(self._first_clouds(), lambda data: read_raw_intensity(decode_cloud(data, self.message_type)))
 
     def _first_clouds(self) -> Iterator[bytes]:
         with suppress(InputError):  # reported when the frame is read
@@ -222,10 +229,10 @@ class BagFrames(Sequence):
     @cached_property
     def poses(self) -> BagPoses:
         """Poses of the frame_id of the first cloud."""
-        return BagPoses(self.handle, _read_frame_id(self.first[1]) if self.first else "")
+        return BagPoses(self.handle, _read_frame_id(self.first_message[1]) if self.first_message else "")
 
     def _make_frame(self, i: int, time: int, stamp: int, occurrence: int, data: Callable[[], bytes]) -> Frame:
-        name = str(stamp) if occurrence == 1 else f"{stamp}-{occurrence}"  # stamps may repeat
+        name = str(stamp) if occurrence == 1 else f"{stamp}-{occurrence}"  # clouds may have equal stamps
         return Frame(
             name,
             stamp,
@@ -237,37 +244,37 @@ class BagFrames(Sequence):
             index=i,
             sensor_height=self.sensor_height,
             files=self.files,
-            native=lambda: decode_cloud(data(), self.kind),
+            native=lambda: decode_cloud(data(), self.message_type),
             intensity_max=lambda: self.full_scale,
         )
 
     def _load(self, time: int, data: Callable[[], bytes]) -> PointCloud:
-        with self._error_context(time):
-            return to_point_cloud(decode_cloud(data(), self.kind), self.full_scale)[0]
+        with self._add_error_context(time):
+            return to_point_cloud(decode_cloud(data(), self.message_type), self.full_scale)[0]
 
     @contextmanager
-    def _error_context(self, time: int) -> Iterator[None]:
+    def _add_error_context(self, time: int) -> Iterator[None]:
         """Add the cloud's topic and time to an InputError."""
         try:
             yield
         except InputError as error:
             raise InputError(f"{self.path}, topic {self.points} at {time} ns: {error}") from None
 
-    def decode_labelled(self, data: bytes) -> Any:
+    def decode_labelled_cloud(self, data: bytes) -> Any:
         """Decode a serialized cloud with point labels; None if it has none or is malformed."""
         with suppress(InputError):
-            msg = decode_cloud(data, self.kind)
+            msg = decode_cloud(data, self.message_type)
             if {SEMANTIC, INSTANCE} <= {f.name for f in msg.fields}:
                 return msg
         return None
 
     def _read_point_truth(self, time: int, data: Callable[[], bytes]) -> PointTruth | None:
-        if (msg := self.decode_labelled(data())) is None:
+        if (msg := self.decode_labelled_cloud(data())) is None:
             return None
-        with self._error_context(time):
+        with self._add_error_context(time):
             indices = to_point_cloud(msg)[1]
             classes, instances = (read_column(msg, name, indices) for name in (SEMANTIC, INSTANCE))
-        assert classes is not None and instances is not None  # see decode_labelled
+        assert classes is not None and instances is not None  # see decode_labelled_cloud
         return PointTruth(classes.astype(np.uint16), instances.astype(np.uint16))
 
     def _read_truth(self, stamp: int) -> GroundTruth | None:
@@ -297,5 +304,5 @@ def _read_frame_id(data: bytes) -> str:
 
 def _find_latest(messages: list, time: int) -> Any:
     """Return the last message up to a time; the first message if all are later."""
-    after = bisect_right(messages, time, key=itemgetter(0))
-    return messages[max(after - 1, 0)][1] if messages else None
+    next_index = bisect_right(messages, time, key=itemgetter(0))
+    return messages[max(next_index - 1, 0)][1] if messages else None

@@ -1,8 +1,8 @@
-"""Reading of rosbag2's metadata.yaml, versions 1 to 9, and of QoS profiles.
+"""Reader of rosbag2's metadata.yaml, versions 1 to 9, and of QoS profiles.
 
 The file is often incomplete or wrong: people edit it, `ros2 bag reindex` recreates it, and it may
-belong to other files. Therefore only file names and QoS are read from it, and the rest is compared
-with the files.
+describe other storage files. Therefore only file names and QoS are used from it, and the rest is
+compared with the storage files.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from lidar_perception.types import InputError
 
 METADATA_FILE = "metadata.yaml"
 MAX_BYTES = 2**26
-TOLERANCE_NS = 10**6  # maximum difference between times in metadata.yaml and in the files
+TOLERANCE_NS = 10**6  # tolerated difference between times in metadata.yaml and in the files
 
-# QoS keys and values of rosbag2. Late subscribers get the last message of a latched topic.
+# QoS profiles with the keys and values of rosbag2. Late subscribers of a latched topic get its last message.
 SENSOR_QOS = dict(history="keep_last", depth=10, reliability="reliable", durability="volatile")
 LATCHED_QOS = dict(history="keep_last", depth=1, reliability="reliable", durability="transient_local")
 
@@ -40,14 +40,14 @@ _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # faster, but opti
 
 @dataclass
 class Metadata:
-    """The readable part of a metadata.yaml.
+    """The valid content of a metadata.yaml.
 
     Attributes:
         files: names of the storage files.
         topics: type and number of messages of each topic, by its name.
         qos: offered profiles by topic, as YAML text or parsed.
-        start_ns, duration_ns: None if not given.
-        compression: format of compressed files or messages, "" without compression.
+        start_ns, duration_ns: start and duration of the bag; None if not given.
+        compression: format of compressed files or messages; "" without compression.
         problems: errors in the file, one sentence each.
     """
 
@@ -61,7 +61,7 @@ class Metadata:
 
 
 def read_metadata(folder: Path) -> Metadata:
-    """Read the metadata.yaml of a bag folder; empty if there is none, or if `folder` is a file."""
+    """Read the metadata.yaml of a bag folder; the result is empty if the file does not exist."""
     metadata, path = Metadata(), folder / METADATA_FILE
     if not path.is_file():
         return metadata
@@ -86,7 +86,7 @@ def read_metadata(folder: Path) -> Metadata:
 
 
 def add_differences(metadata: Metadata, counts: Mapping[str, int], start_ns: int, duration_ns: int) -> None:
-    """Add each difference to the message counts and times of the files to metadata.problems."""
+    """Compare the metadata with the message counts and times in the files; add differences to problems."""
     for topic, (_, count) in metadata.topics.items():
         if count != counts.get(topic, 0):
             metadata.problems.append(f"it declares {count} messages on {topic}, the files have {counts.get(topic, 0)}")
@@ -107,15 +107,15 @@ def _read_number(tree: Mapping[str, Any], *keys: str) -> int:
 
 
 def complete_profile(qos: dict[str, Any]) -> dict[str, Any]:
-    """Return a profile such as SENSOR_QOS with all policies that rosbag2 writes."""
+    """Extend a profile such as SENSOR_QOS by the other policies that rosbag2 writes."""
     return {**qos, **_OTHER_POLICIES}
 
 
 def parse_profiles(profiles: Any) -> list[Qos]:
-    """Return the profiles of a topic, given as YAML text or parsed; [] if they cannot be parsed.
+    """Parse the profiles of a topic, given as YAML text or lists of dicts; return [] if they are invalid.
 
-    Only history, depth, reliability and durability are read. Writers represent durations in many
-    ways (numbers, "infinite", left out), and nodes do not need them.
+    Only history, depth, reliability and durability are read. Durations are ignored: nodes do not
+    need them, and writers represent them in many ways (numbers, "infinite", left out).
     """
     try:
         profiles = yaml.safe_load(profiles) if isinstance(profiles, str) else profiles

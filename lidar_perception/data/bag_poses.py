@@ -1,4 +1,4 @@
-"""Poses of the sensor of a bag, from its odometry and TF."""
+"""Poses of the sensor in a bag, from odometry and TF."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from lidar_perception.wire.topics import ODOMETRY, ODOMETRY_FRAME, TF, TF_STATIC
 from lidar_perception.wire.transforms import FIXED, MOVING, ODOMETRY_MESSAGE, TF_MESSAGE, add_odometry, add_transforms
 from msg_utils.markers import MarkedObjects
 
-FILTERED = "/odometry/filtered"  # topic of robot_localization
+FILTERED_ODOMETRY = "/odometry/filtered"  # topic of robot_localization
 MIN_TF_MESSAGES = 500  # /tf messages to read before looking for the sensor's parent frames
-MAX_POSE_GAP_S = 0.5  # maximum gap between two poses, and before the first and after the last one
+MAX_POSE_GAP_S = 0.5  # maximum gap between poses for interpolation, and maximum time of extrapolation
 
 
 def choose_odometry_topic(topics: Mapping[str, str]) -> str:
@@ -30,26 +30,26 @@ def choose_odometry_topic(topics: Mapping[str, str]) -> str:
         topics: {topic: type}.
     """
     odometry_topics = [name for name, type_name in topics.items() if type_name == ODOMETRY_MESSAGE]
-    preferred = [name for name in (ODOMETRY, FILTERED) if name in odometry_topics]
+    preferred = [name for name in (ODOMETRY, FILTERED_ODOMETRY) if name in odometry_topics]
     return preferred[0] if preferred else odometry_topics[0] if len(odometry_topics) == 1 else ""
 
 
 class BagPoses:
     """Poses of the clouds' frame in a fixed frame, interpolated at any time.
 
-    The source is chosen like in the tracker with ego.source auto. With odometry, poses come from
-    the odometry and the TF from its child frame to the sensor; if TF does not connect the two, they
-    are assumed to coincide. Without odometry, poses come from TF: in odom if that is an ancestor of
-    the sensor, otherwise in the topmost frame in which the sensor moves.
+    The source is chosen as in the tracker with ego.source auto. With odometry, poses come from the
+    odometry and the TF from its child frame to the sensor; if TF does not connect the two frames,
+    they are assumed to coincide. Without odometry, poses come from TF: in odom if that is an
+    ancestor of the sensor, otherwise in the topmost frame in which the sensor moves.
     """
 
     def __init__(self, handle: BagHandle, frame_id: str):
         self.handle, self.path, self.frame_id = handle, handle.path, frame_id.lstrip("/")
-        self.invalid_count = 0  # transforms and odometry messages without a valid pose
+        self.invalid_count = 0  # number of transforms and odometry messages without a valid pose
         bag = self.handle.bag()
         topics = {name: type_name for name, type_name in bag.topics.items() if bag.counts[name]}
-        self.transforms = {name for name in (TF, TF_STATIC) if topics.get(name) == TF_MESSAGE}
-        self.odometry = choose_odometry_topic(topics)
+        self.transform_topics = {name for name in (TF, TF_STATIC) if topics.get(name) == TF_MESSAGE}
+        self.odometry_topic = choose_odometry_topic(topics)
 
     def __call__(self, stamp_ns: int) -> np.ndarray | None:
         """Return the pose (4, 4) at a time, or None if it is unknown."""
@@ -61,75 +61,79 @@ class BagPoses:
     def lookup(self, times: np.ndarray) -> np.ndarray:
         """Return the poses (M, 4, 4) at times (M,) ns, M > 0.
 
-        Raises MissingTransform if one of them is unknown.
+        Raises MissingTransform if a pose is unknown.
         """
-        if self.odometry:
-            if self.frame_id == self._first.header.frame_id.lstrip("/"):  # the clouds are already in a fixed frame
+        if self.odometry_topic:
+            if self.frame_id == self._first_odometry.header.frame_id.lstrip(
+                "/"
+            ):  # the clouds are already in a fixed frame
                 return np.tile(np.eye(4), (len(times), 1, 1))
-            return self.odometry_poses(times) @ self._sensor_in_odometry_child(times)
-        if not self.fixed:
+            return self.lookup_odometry(times) @ self._sensor_in_odometry_child(times)
+        if not self.fixed_frame:
             raise MissingTransform(
                 f"{self.path} has neither odometry nor a TF in which '{self.frame_id}' moves; record one of them"
             )
-        return self._tree.lookup_many(self.fixed, self.frame_id, times, MAX_POSE_GAP_S)
+        return self._tree.lookup_many(self.fixed_frame, self.frame_id, times, MAX_POSE_GAP_S)
 
     @cached_property
-    def available(self) -> bool:
+    def has_poses(self) -> bool:
         """True if the bag has poses."""
-        return bool(self.odometry or self.fixed)
+        return bool(self.odometry_topic or self.fixed_frame)
 
     @property
     def needs_no_tf(self) -> bool:
-        """True if nodes need no TF: there are no poses, or /odom is the sensor's own odometry."""
-        return not self.available or (self.odometry == ODOMETRY and self.odometry_child == self.frame_id)
+        """True if nodes need no TF: the bag has no poses, or /odom is the odometry of the sensor frame."""
+        return not self.has_poses or (self.odometry_topic == ODOMETRY and self.odometry_child_frame == self.frame_id)
 
     @cached_property
-    def odometry_child(self) -> str:
+    def odometry_child_frame(self) -> str:
         """Child frame of the odometry; "" without odometry."""
-        return self._first.child_frame_id.lstrip("/") if self.odometry else ""
+        return self._first_odometry.child_frame_id.lstrip("/") if self.odometry_topic else ""
 
     @cached_property
-    def _first(self) -> Any:
+    def _first_odometry(self) -> Any:
         """First odometry message."""
-        return next(msg for *_, msg in self.handle.bag().messages({self.odometry}))
+        return next(msg for *_, msg in self.handle.bag().messages({self.odometry_topic}))
 
     @cached_property
-    def fixed(self) -> str:
+    def fixed_frame(self) -> str:
         """TF frame in which the sensor moves; "" if no ancestor of the sensor moves."""
         moving = [
-            self._above[i + 1] for i, frame in enumerate(self._above[:-1]) if not self._first_transforms.is_fixed(frame)
+            self._ancestors[i + 1]
+            for i, frame in enumerate(self._ancestors[:-1])
+            if not self._first_transforms.is_fixed(frame)
         ]
         return ODOMETRY_FRAME if ODOMETRY_FRAME in moving else moving[-1] if moving else ""
 
     def find_mount(self, base: str) -> np.ndarray | None:
-        """Return the pose (4, 4) of the sensor in a frame of the robot; None if it is not fixed."""
+        """Return the pose (4, 4) of the sensor in a frame of the robot; None if it is not constant."""
         base_chain = self._list_parents(base)
-        common = next((frame for frame in self._above if frame in base_chain), None)
+        common = next((frame for frame in self._ancestors if frame in base_chain), None)
         if common is None or not all(
             map(
                 self._first_transforms.is_fixed,
-                (*self._above[: self._above.index(common)], *base_chain[: base_chain.index(common)]),
+                (*self._ancestors[: self._ancestors.index(common)], *base_chain[: base_chain.index(common)]),
             )
         ):
             return None
         return self._first_transforms.lookup(base, self.frame_id, 0)
 
     @property
-    def base(self) -> str:
+    def base_frame(self) -> str:
         """Frame of the robot: the odometry's child frame, or without odometry the topmost frame in
-        which the sensor is fixed; "" without TF."""
-        if self.odometry_child and self.odometry_child != self.frame_id:
-            return self.odometry_child
+        which the pose of the sensor is constant; "" without TF."""
+        if self.odometry_child_frame and self.odometry_child_frame != self.frame_id:
+            return self.odometry_child_frame
         # Stop at the first moving link, because odom may be static in a map above it.
-        fixed = len([*takewhile(self._first_transforms.is_fixed, self._above[:-1])])
-        return self._above[fixed] if fixed else ""
+        fixed_count = len([*takewhile(self._first_transforms.is_fixed, self._ancestors[:-1])])
+        return self._ancestors[fixed_count] if fixed_count else ""
 
     def lookup_frame(self, frame_id: str, stamp_ns: int) -> np.ndarray:
         """Return the pose (4, 4) of another frame in the clouds' frame at a time.
 
-        Raises MissingTransform if it is unknown.
+        Raises MissingTransform if the pose is unknown.
         """
-        if self.odometry and frame_id.lstrip("/") == self._first.header.frame_id.lstrip("/"):
+        if self.odometry_topic and frame_id.lstrip("/") == self._first_odometry.header.frame_id.lstrip("/"):
             return invert_pose(self.lookup(np.array([stamp_ns]))[0])
         return self._tree.lookup(self.frame_id, frame_id, stamp_ns, MAX_POSE_GAP_S)
 
@@ -148,14 +152,16 @@ class BagPoses:
             pose = self.lookup_frame(objects.frame_id, objects.stamp_ns)
         except MissingTransform as error:
             raise InputError(
-                f"{self.path}: the boxes on {topic} are in '{objects.frame_id}', the "
-                f"clouds in '{self.frame_id}': {error}; record TF or odometry "
-                "too"
+                f"{self.path}: cannot transform the boxes on {topic} from '{objects.frame_id}' to the frame of the "
+                f"clouds '{self.frame_id}': {error}; record TF or odometry too"
             ) from None
         return replace(objects, boxes=transform_boxes(objects.boxes, pose))
 
-    def odometry_poses(self, times: np.ndarray) -> np.ndarray:
-        """Return the odometry's poses (M, 4, 4) at times (M,) ns. MissingTransform if unknown."""
+    def lookup_odometry(self, times: np.ndarray) -> np.ndarray:
+        """Return the odometry's poses (M, 4, 4) at times (M,) ns.
+
+        Raises MissingTransform if a pose is unknown.
+        """
         return self._odometry.lookup_many(FIXED, MOVING, times, MAX_POSE_GAP_S)
 
     def _sensor_in_odometry_child(self, times: np.ndarray) -> np.ndarray:
@@ -164,16 +170,16 @@ class BagPoses:
         Returns:
             (4, 4) if it is fixed, otherwise (M, 4, 4) at times (M,) ns; identity without TF.
         """
-        if not {*self._above} & {*self._list_parents(self.odometry_child)}:
+        if not {*self._ancestors} & {*self._list_parents(self.odometry_child_frame)}:
             return np.eye(4)
-        if (pose := self.find_mount(self.odometry_child)) is not None:
+        if (pose := self.find_mount(self.odometry_child_frame)) is not None:
             return pose
-        return self._tree.lookup_many(self.odometry_child, self.frame_id, times, MAX_POSE_GAP_S)
+        return self._tree.lookup_many(self.odometry_child_frame, self.frame_id, times, MAX_POSE_GAP_S)
 
     @cached_property
     def _odometry(self) -> TransformTree:
         tree = TransformTree(keeps_all=True)
-        for _, _, msg in self.handle.bag().messages({self.odometry} - {""}):
+        for _, _, msg in self.handle.bag().messages({self.odometry_topic} - {""}):
             try:
                 add_odometry(tree, msg)
             except InputError:
@@ -182,21 +188,21 @@ class BagPoses:
 
     @cached_property
     def _first_transforms(self) -> TransformTree:
-        """Static transforms, and moving ones until an ancestor of the sensor moves."""
+        """Static transforms, and those on /tf until an ancestor of the sensor moves."""
         tree = TransformTree(keeps_all=True)
         bag = self.handle.bag()
-        for _, _, msg in bag.messages({TF_STATIC} & self.transforms):
+        for _, _, msg in bag.messages({TF_STATIC} & self.transform_topics):
             self._add(tree, msg, True)
-        for i, (_, _, msg) in enumerate(bag.messages({TF} & self.transforms)):
+        for i, (_, _, msg) in enumerate(bag.messages({TF} & self.transform_topics)):
             if i >= MIN_TF_MESSAGES and (
-                self.odometry or not all(map(tree.is_fixed, _find_chain(tree, self.frame_id)))
+                self.odometry_topic or not all(map(tree.is_fixed, _find_chain(tree, self.frame_id)))
             ):
-                break  # later messages may only concern the wheels
+                break  # later transforms may only be those of the wheels
             self._add(tree, msg, False)
         return tree
 
     @cached_property
-    def _above(self) -> list[str]:
+    def _ancestors(self) -> list[str]:
         return self._list_parents(self.frame_id)
 
     def _list_parents(self, frame: str) -> list[str]:
@@ -204,12 +210,12 @@ class BagPoses:
 
     @cached_property
     def _tree(self) -> TransformTree:
-        """All transforms above the sensor and above the child frame of the odometry."""
+        """All transforms of the sensor, of the odometry's child frame, and of their ancestors."""
         tree = TransformTree(keeps_all=True)
-        above = {*self._above, *self._list_parents(self.odometry_child)}
-        for topic, _, msg in self.handle.bag().messages(self.transforms):
+        frames = {*self._ancestors, *self._list_parents(self.odometry_child_frame)}
+        for topic, _, msg in self.handle.bag().messages(self.transform_topics):
             msg.transforms[:] = [
-                transform for transform in msg.transforms if transform.child_frame_id.lstrip("/") in above
+                transform for transform in msg.transforms if transform.child_frame_id.lstrip("/") in frames
             ]
             self._add(tree, msg, topic == TF_STATIC)
         return tree

@@ -1,4 +1,4 @@
-"""Reading of point cloud files (.pcd, .ply, .npy, .bin) with all their columns."""
+"""Reader of point cloud files (.pcd, .ply, .npy, .bin) with all their columns."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from msg_utils.point_cloud2 import from_array, read_xyz
 from msg_utils.stamps import make_header
 
 KITTI_COLUMNS = "x y z intensity"
-MAX_COLUMNS = 16  # maximum columns of a .npy file; an array with more is probably transposed
-MAX_RING = 256
+MAX_COLUMNS = 16  # maximum number of columns of a .npy file; an array with more is probably transposed
+MAX_RING = 256  # upper limit of the ring numbers in a .bin file with five columns
 SAMPLE_SIZE = 2000  # number of points from which the columns of a .bin file are inferred
-MAX_NEGATIVE_SHARE = 0.1  # maximum fraction of negative intensities for a plausible assumption about the columns
+MAX_NEGATIVE_FRACTION = 0.1  # maximum fraction of negative intensities if the assumed columns are right
 REFLECTANCE = ("reflectance", "remission")  # other names for the intensity
 
 
@@ -35,7 +35,7 @@ def is_cloud(path: Path) -> bool:
 
 
 def make_cloud_scale_reader(files: Sequence[Path]) -> Callable[[], float]:
-    """Return a function that infers the intensity scale of files, see make_scale_reader."""
+    """Return a function that infers the intensity scale of point cloud files, see make_scale_reader."""
     return make_scale_reader(files, lambda file: read_raw_intensity(to_message(file)))
 
 
@@ -60,22 +60,27 @@ def load_points(file: Path, stamp_ns: int, frame_id: str = "", *, scale: Callabl
 
 
 def check_range(points: np.ndarray, source: object) -> None:
-    """Raise InputError, which names `source`, if all finite points are beyond MAX_RANGE."""
+    """Raise InputError if all finite points are beyond MAX_RANGE.
+
+    Args:
+        points: structured array with x, y and z.
+        source: name of the cloud in the error message.
+    """
     coordinates = read_xyz(points)
     max_coordinates = np.abs(coordinates[np.isfinite(coordinates).all(axis=1)]).max(axis=1, initial=0)
     if len(max_coordinates) and max_coordinates.min() > MAX_RANGE / 2:
         x, y = (round(float(points[axis][0]), -3) for axis in "xy")
         raise InputError(
-            f"{source}: all points are beyond {MAX_RANGE / 1000:g} km, probably in "
+            f"{source}: all points are beyond {MAX_RANGE / 1000:g} km, so they are probably in "
             f"map coordinates (UTM); subtract an offset, such as {x:.0f} {y:.0f}, "
-            "from x y and save it again"
+            "from x y and save the cloud again"
         )
 
 
 def to_message(file: Path, stamp_ns: int = 0, frame_id: str = "") -> Any:
     """Read a file as a PointCloud2 (class of rosbags) with all its columns."""
     points = read_points(file)
-    # PointCloud2 has no 64-bit integers; as float64, times keep their microseconds.
+    # PointCloud2 has no 64-bit integers. Times keep their microseconds as float64.
     fields = [
         (name, points.dtype[name].base.str.replace("i8", "f8").replace("u8", "f8"), points.dtype[name].shape)
         for name in points.dtype.names or ()
@@ -89,8 +94,9 @@ def to_message(file: Path, stamp_ns: int = 0, frame_id: str = "") -> Any:
 def read_points(file: Path) -> np.ndarray:
     """Read a file with one of SUFFIXES as a structured array (N,) with all columns.
 
-    Names are converted to lower case, CloudCompare's prefix "scalar_" is removed, and REFLECTANCE
-    becomes "intensity". Raises InputError if the file cannot be read, or has no x, y or z.
+    Column names are converted to lower case, CloudCompare's prefix "scalar_" is removed, and the
+    names in REFLECTANCE become "intensity". Raises InputError if the file cannot be read, or lacks
+    x, y or z.
     """
     points = _rename_columns(READERS[file.suffix.lower()](file))
     if missing := {"x", "y", "z"} - set(points.dtype.names or ()):
@@ -122,10 +128,10 @@ def read_npy(file: Path) -> np.ndarray:
     """Read a .npy file: (N, 3) [x y z], (N, 4) [x y z intensity] or more, or a structured array.
 
     Returns:
-        (N,) structured array with the first four columns, or all fields of a structured one.
+        (N,) structured array with the first four columns, or with all fields of a structured array.
 
     Raises:
-        InputError: the array has another shape or type.
+        InputError: the file cannot be read, or the array has a wrong shape or type.
     """
     try:
         array = np.array(np.load(check_regular(file), mmap_mode="r", allow_pickle=False))
@@ -140,7 +146,7 @@ def read_npy(file: Path) -> np.ndarray:
         SyntaxError,
         TokenError,
         RecursionError,
-    ) as error:  # the header is Python source, so that parsing raises many types
+    ) as error:  # the header is Python source, so parsing raises errors of many types
         raise InputError(
             f"{file} is not a readable .npy file ({shorten_error(error)}); save it again with numpy.save"
         ) from None
@@ -158,7 +164,7 @@ def read_npy(file: Path) -> np.ndarray:
 def _read_bin(file: Path) -> np.ndarray:
     """Read a .bin file of float32 with KITTI's four columns, or nuScenes' five (the last is ring).
 
-    The number of columns is inferred from the values. Raises InputError if neither fits.
+    The number of columns is inferred from the values. Raises InputError if neither number fits.
     """
     if file.stat().st_size % 20 == 0:
         cloud = read_records(file, SWEEP_COLUMNS)
@@ -168,16 +174,16 @@ def _read_bin(file: Path) -> np.ndarray:
                 return _to_structured(cloud, SWEEP_COLUMNS)
     cloud = read_records(file, KITTI_COLUMNS)
     intensity = cloud[:SAMPLE_SIZE, 3]
-    if np.count_nonzero(intensity < 0) > MAX_NEGATIVE_SHARE * len(intensity):
+    if np.count_nonzero(intensity < 0) > MAX_NEGATIVE_FRACTION * len(intensity):
         raise InputError(
-            f"{file} does not have the columns {KITTI_COLUMNS} or {SWEEP_COLUMNS} as float32: many "
-            "intensities would be negative; save it as .pcd, which names its columns"
+            f"{file} does not have the columns {KITTI_COLUMNS} or {SWEEP_COLUMNS} as float32, because many "
+            "intensities would be negative; save the cloud as .pcd, which names its columns"
         )
     return _to_structured(cloud, KITTI_COLUMNS)
 
 
 def _to_structured(cloud: np.ndarray, columns: str) -> np.ndarray:
-    """View an array (N, C) as (N,) with named columns; surplus names are ignored."""
+    """View an array (N, C) as a structured array (N,) with the first C of the column names."""
     names = columns.split()[: cloud.shape[1]]
     return np.ascontiguousarray(cloud).view([(name, cloud.dtype) for name in names]).reshape(-1)
 

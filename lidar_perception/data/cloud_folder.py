@@ -18,7 +18,7 @@ NANOSECOND_DIGITS = 9
 
 
 def list_cloud_files(path: Path) -> list[Path]:
-    """Return the point cloud file at a path, or all in a folder.
+    """Return the point cloud file at a path, or all point cloud files in a folder.
 
     They are sorted by the times or numbers in their names (2 before 10).
     """
@@ -30,16 +30,16 @@ def list_cloud_files(path: Path) -> list[Path]:
     )
 
 
-def is_layout(path: Path) -> bool:
-    """Return True for a point cloud file, or a folder that contains any."""
+def can_open(path: Path) -> bool:
+    """Return True for a point cloud file, or a folder with such files."""
     return bool(list_cloud_files(path))
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
     """Open the clouds as one drive without labels.
 
-    Stamps are the Unix times in all file names (in seconds, as 1700000000.1, or in ms, us or ns);
-    without them, 10 Hz is assumed.
+    Stamps are the Unix times in the file names (in seconds, such as 1700000000.1, or in ms, us or
+    ns). If a file name has no time, a rate of 10 Hz is assumed.
     """
     files = list_cloud_files(path)
     names = [file.stem for file in files]
@@ -84,16 +84,16 @@ def _parse_stamps(files: list[Path]) -> list[int]:
     as_decimals = [seconds_ns + int(f"{fraction:0<9}"[:9]) for seconds_ns, fraction in parts]
     # Until perception_pcl 2.6.2, pointcloud_to_pcd wrote SECONDS.NANOSECONDS without leading zeros:
     # https://github.com/ros-perception/perception_pcl/pull/481
-    shorter = [f for f in fractions if len(f) < NANOSECOND_DIGITS]
+    short_fractions = [f for f in fractions if len(f) < NANOSECOND_DIGITS]
     if (
-        not shorter
-        or len(shorter) == len(fractions)
+        not short_fractions
+        or len(short_fractions) == len(fractions)
         or any((f.startswith("0") and f != "0") or len(f) > NANOSECOND_DIGITS for f in fractions)
     ):
         return as_decimals
     as_nanoseconds = [seconds_ns + int(fraction or 0) for seconds_ns, fraction in parts]
     spreads = [np.ptp(np.diff(sorted(stamps))) for stamps in (as_decimals, as_nanoseconds)]
-    if any(f.endswith("0") for f in shorter) or spreads[1] < spreads[0]:
+    if any(f.endswith("0") for f in short_fractions) or spreads[1] < spreads[0]:
         return as_nanoseconds
     return as_decimals
 
@@ -101,8 +101,8 @@ def _parse_stamps(files: list[Path]) -> list[int]:
 def _split_name(file: Path) -> tuple[int, str] | None:
     """Return the integer part of the timestamp in a file name, in ns, and its fractional digits.
 
-    None if it is not a timestamp; frames of KITTI's raw drives also have ten digits, but start
-    with 0.
+    Returns None if the name is not a timestamp. The names of frames in KITTI's raw drives also have
+    ten digits, but start with 0.
     """
     seconds, _, fraction = file.name.removesuffix(file.suffix).partition(".")
     if (

@@ -1,4 +1,4 @@
-"""Frames and recordings: the common form of all data sets, bags and simulated drives.
+"""Frames and recordings, the common interface of all data sets, bags and simulated drives.
 
 Files are read only when their content is used.
 """
@@ -24,8 +24,8 @@ class PointTruth:
     """Labels of the N points of a frame.
 
     Attributes:
-        classes: (N,) uint16, numbered as in SemanticKITTI; 0 = unlabelled.
-        instances: (N,) uint16, 0 = none.
+        classes: (N,) uint16 class of each point, numbered as in SemanticKITTI; 0 = unlabelled.
+        instances: (N,) uint16 instance of each point; 0 = none.
     """
 
     classes: np.ndarray
@@ -36,8 +36,8 @@ def return_none() -> None:
     """Return None, for data that a recording does not contain."""
 
 
-def fixed_scale() -> float:
-    """Return 0, for formats that define the scale of the intensity."""
+def return_zero() -> float:
+    """Return 0, for formats that fix the scale of the intensity."""
     return 0.0
 
 
@@ -48,19 +48,19 @@ class Frame:
     Its functions read files, and raise InputError if a file is missing or malformed.
 
     Attributes:
-        name: unique within the recording.
+        name: name of the frame, unique within the recording.
         load: returns the usable points.
         truth: returns the labelled objects in the LiDAR frame, or None.
         point_truth: returns the labels of the points of load(), or None.
         calibration: returns the calibration of the camera, or None.
         pose: returns the pose (4, 4) float64 of the LiDAR in a fixed frame, metres, or None.
-        sequence: name of the drive, "" without drives.
+        sequence: name of the drive; "" if the recording has no drives.
         index: number of the frame in its drive.
-        sensor_height: metres above the ground.
-        points, image: files, or None.
+        sensor_height: height of the sensor above the ground in metres.
+        points, image: files of the scan and the camera image, or None.
         files: all files with points, labels and calibration, existing or not; () if unknown.
         native: data for the evaluation protocol of this data set.
-        intensity_max: returns the intensity of a full reflection; 0 if the format defines it.
+        intensity_max: returns the intensity of a full reflection; 0 if it is fixed by the format.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Frame:
     image: Path | None = None
     files: tuple[Path, ...] = ()
     native: Any = None
-    intensity_max: Callable[[], float] = fixed_scale
+    intensity_max: Callable[[], float] = return_zero
 
     def camera(self) -> Camera | None:
         """Return the camera of the frame; None without a calibration."""
@@ -85,7 +85,7 @@ class Frame:
         return None if calibration is None else calibration.camera()
 
     def with_cached_scan(self) -> Frame:
-        """Return the frame with a scan that is read once and then cached."""
+        """Return a copy of the frame that reads its scan once and then caches it."""
         return replace(self, load=cache(self.load))
 
     @staticmethod
@@ -148,20 +148,21 @@ class Recording:
 
     Attributes:
         layout: description of the recognised layout.
-        has: content of at least some frames: BOXES, POINT_LABELS, CAMERA and POSES.
-        missing_scans: (name, reason) of labels without a scan.
-        reopen: opens the recording again, also in another process; it has the arguments of
+        frames: all frames.
+        contents: BOXES, POINT_LABELS, CAMERA and POSES, each if at least some frames have it.
+        missing_scans: (name, reason) of each label without a scan.
+        reopen: opens the recording again, also in another process; it takes the arguments of
             data.open.open_recording.
-        has_sensor_height: the recording states the sensor height; otherwise that of KITTI is
-            assumed.
-        is_sequential: frames follow each other in time; otherwise they are unrelated.
-        has_times: stamps were recorded; otherwise 10 Hz is assumed.
+        has_sensor_height: True if the recording states the sensor height; otherwise KITTI's height
+            is assumed.
+        is_sequential: True if the frames follow each other in time, False if they are unrelated.
+        has_times: True if the stamps were recorded; otherwise 10 Hz is assumed.
     """
 
     path: Path
     layout: str
     frames: Sequence[Frame]
-    has: frozenset[str] = frozenset()
+    contents: frozenset[str] = frozenset()
     missing_scans: tuple[tuple[str, str], ...] = ()
     reopen: Callable[..., Recording] | None = None
     has_sensor_height: bool = True
@@ -177,26 +178,29 @@ class Recording:
     def __str__(self) -> str:
         """Return a one-line description."""
         count = f"{len(self)} frame{'' if len(self) == 1 else 's'}"
-        return ", ".join((f"{self.path}: {self.layout}", count, *sorted(self.has)))
+        return ", ".join((f"{self.path}: {self.layout}", count, *sorted(self.contents)))
 
-    def require(self, content: str, verb: str) -> None:
-        """Raise InputError if no frame has the content, such as BOXES, that `verb` needs."""
-        if content not in self.has:
-            raise InputError(f"{self.path} ({self.layout}) has no {content.removeprefix('a ')}, which {verb} needs")
+    def require(self, content: str, command: str) -> None:
+        """Raise InputError if no frame has the content, such as BOXES, that a command needs."""
+        if content not in self.contents:
+            raise InputError(f"{self.path} ({self.layout}) has no {content.removeprefix('a ')}, which {command} needs")
 
     def select(self, names: Sequence[str]) -> Recording:
-        """Return the frames with these names, in this order. InputError for unknown names."""
+        """Return a recording of the frames with these names, in this order.
+
+        Raises InputError if a name is unknown.
+        """
         numbers = {frame.name: i for i, frame in enumerate(self.frames)}
         if unknown := [name for name in names if name not in numbers]:
             raise InputError(
-                f"{self.path} has no frame {unknown[0]} ({len(unknown)} unknown); its "
-                f"first is {next(iter(numbers), 'none')}"
+                f"{self.path} has no frame {unknown[0]} ({len(unknown)} unknown names); its first frame is "
+                f"{next(iter(numbers), 'none')}"
             )
         return replace(self, frames=[self.frames[numbers[name]] for name in names], missing_scans=())
 
 
 def is_same_drive(previous_ns: int, stamp_ns: int) -> bool:
-    """Return True if the stamp of a frame continues the drive of the previous one."""
+    """Return True if a frame belongs to the same drive as the previous one, given their stamps."""
     return 0 <= stamp_ns - previous_ns <= MAX_GAP_S * 1e9
 
 
@@ -207,8 +211,8 @@ def split_drives(frames: Sequence[Frame]) -> dict[str, list[list[int]]]:
     """
     drives: dict[str, list[list[int]]] = {}
     for number, frame in enumerate(frames):
-        runs = drives.setdefault(frame.sequence, [])
-        if not runs or not is_same_drive(frames[runs[-1][-1]].stamp_ns, frame.stamp_ns):
-            runs.append([])
-        runs[-1].append(number)
+        parts = drives.setdefault(frame.sequence, [])
+        if not parts or not is_same_drive(frames[parts[-1][-1]].stamp_ns, frame.stamp_ns):
+            parts.append([])
+        parts[-1].append(number)
     return drives

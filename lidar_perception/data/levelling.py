@@ -1,4 +1,4 @@
-"""Conversion of frames of a tilted or turned sensor to those of a level one with x ahead."""
+"""Conversion of frames from a tilted or rotated sensor to frames of a level sensor with x forward."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 
 @dataclass(frozen=True)
 class SensorMount:
-    """Mounting of a sensor, and the parameters that nodes use to read its clouds.
+    """Mounting of a sensor, and the parameters with which nodes read its clouds.
 
     Attributes:
-        height: metres above the ground; None: as in the recording.
+        height: metres above the ground; None to keep the height in the recording.
         roll, pitch: orientation of the sensor in radians, as in a URDF's rpy.
         ahead: direction of travel, counter-clockwise from the sensor's x axis, radians.
         crop: the robot's body in sensor coordinates.
-        intensity_max: intensity of a full reflection; 0: as in the recording.
+        intensity_max: intensity of a full reflection; 0 to keep the scale of the recording.
     """
 
     height: float | None = None
@@ -40,16 +40,17 @@ class SensorMount:
 
 
 def level_frame(frame: Frame, mount: SensorMount, poses: PoseLookup | None = None) -> Frame:
-    """Convert a frame of a bag or file to that of a level sensor at the same place, with x ahead.
+    """Convert a frame of a bag or file to a frame of a level sensor at the same place, with x forward.
 
     Labels, camera and pose are transformed too; boxes stay upright. If the cloud is rotated,
     "_level" is appended to its frame_id.
 
     Args:
         frame: frame whose native() returns its message.
-        poses: returns the poses (M, 4, 4) of the sensor at times (M,) ns, for the same motion
-            correction as input.deskew. load() raises InputError if a pose or the time column is
-            missing.
+        mount: mounting of the sensor.
+        poses: returns the poses (M, 4, 4) of the sensor at times (M,) ns. If given, clouds are
+            motion corrected as with input.deskew, and load() raises InputError if a pose or the
+            time column is missing.
     """
     rotation = find_level_transform(make_tilted_pose(mount.roll, mount.pitch), mount.ahead)
     inverse_rotation = np.eye(4) if rotation is None else invert_pose(rotation)

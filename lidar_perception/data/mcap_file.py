@@ -27,14 +27,14 @@ MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, CHUNK_INDEX, DATA_END = 7, 8, 15
 HEAD_BYTES = 64  # bytes to read from a record before its content
-RECORD = struct.Struct("<BQ")  # kind of record, and number of bytes that follow
+RECORD = struct.Struct("<BQ")  # record type, and number of bytes that follow
 FOOTER_BYTES = RECORD.size + 20
 NO_INDEX = (
     RECORD.pack(DATA_END, 4) + bytes(4) + RECORD.pack(FOOTER, 20) + bytes(20) + MAGIC
 )  # end of a file without an index
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, number, log time, publish time
 ENTRY_BYTES = 16  # bytes per message in a message index
-LOCATION = np.dtype([("time", np.int64), ("channel", np.uint16), ("at", np.int64), ("bytes", np.int64)])
+LOCATION = np.dtype([("time", np.int64), ("channel", np.uint16), ("offset", np.int64), ("bytes", np.int64)])
 
 
 @dataclass
@@ -44,14 +44,15 @@ class Chunk:
     Attributes:
         index_entry: the chunk's entry in an index, see _parse_chunk_index.
         start, end: times in its header, ns.
-        at: offset of its compressed data in the file.
+        offset: offset of the compressed data in the file.
+        crc: checksum of the decompressed data, 0 for none.
         counts: number of messages by channel.
     """
 
     index_entry: tuple[int, int, int, int, bytes, int, int]
     start: int
     end: int
-    at: int
+    offset: int
     crc: int
     counts: dict[int, int] = field(default_factory=dict)
 
@@ -76,8 +77,8 @@ class McapFile:
         self.chunks: list[Chunk] = []
         self.profile = ""
         try:
-            summary_at, end, summary = self._read_summary()
-            self.locations = self._scan_data_section(summary_at or end)
+            summary_offset, end, summary = self._read_summary()
+            self.locations = self._scan_data_section(summary_offset or end)
             self._check_summary(summary)
             self._complete_definitions()
             self.topics, self.times = self._make_topics(), self._find_times()
@@ -89,7 +90,7 @@ class McapFile:
         self.file.close()
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
-        """Yield (channel id, log time, data) of these channels for start <= time < stop, by time."""
+        """Yield (channel id, log time, data) of channels with start <= time < stop, in order of time."""
         channels = {*ids}
         sources: list[tuple[int, Callable[[], Stream]]] = [
             (chunk.start, partial(self._messages_in_chunk, chunk, channels, start, stop))
@@ -104,25 +105,25 @@ class McapFile:
 
     def _messages_in_chunk(self, chunk: Chunk, channels: set[int], start: int, stop: int) -> Stream:
         data, messages = self._read_chunk(chunk), []
-        for record_type, at, length in _iterate_records(partial(_slice, data), 0, len(data)):
+        for record_type, offset, length in _iterate_records(partial(_slice, data), 0, len(data)):
             if record_type == MESSAGE:
-                channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, at)
+                channel, _, time, _ = MESSAGE_HEAD.unpack_from(data, offset)
                 if not chunk.start <= time <= chunk.end:
                     raise ValueError("a chunk has messages outside its time range")
                 if channel in channels and start <= time < stop:
-                    messages.append((time, channel, at + MESSAGE_HEAD.size, at + length))
+                    messages.append((time, channel, offset + MESSAGE_HEAD.size, offset + length))
         messages.sort(key=itemgetter(0))
         for time, channel, begin, end in messages:
             yield channel, time, data[begin:end]
 
     def _messages_outside_chunks(self, channels: set[int], start: int, stop: int) -> Stream:
         begin, end = np.searchsorted(self.locations["time"], (start, stop))
-        for time, channel, at, size in self.locations[begin:end].tolist():
+        for time, channel, offset, size in self.locations[begin:end].tolist():
             if channel in channels:
-                yield channel, time, self._read(at, size)
+                yield channel, time, self._read(offset, size)
 
-    def _read(self, at: int, size: int) -> bytes:
-        return os.pread(self.file.fileno(), size, at)
+    def _read(self, offset: int, size: int) -> bytes:
+        return os.pread(self.file.fileno(), size, offset)
 
     def _read_summary(self) -> tuple[int, int, bytes]:
         """Return the offsets of the summary (0 without one) and of the footer, and the summary."""
@@ -136,15 +137,15 @@ class McapFile:
             or RECORD.unpack_from(footer) != (FOOTER, 20)
         ):
             raise ValueError("the footer is missing")
-        summary_at, _, checksum = struct.unpack_from("<QQI", footer, RECORD.size)
-        if summary_at == 0:
+        summary_offset, _, checksum = struct.unpack_from("<QQI", footer, RECORD.size)
+        if summary_offset == 0:
             return 0, end, b""
-        if not len(MAGIC) <= summary_at <= end:
+        if not len(MAGIC) <= summary_offset <= end:
             raise ValueError("the index is outside the file")
-        summary = self._read(summary_at, end - summary_at)
+        summary = self._read(summary_offset, end - summary_offset)
         if checksum and crc32(footer[: FOOTER_BYTES - 4], crc32(summary)) != checksum:
             raise ValueError("the checksum of the index is wrong")
-        return summary_at, end, summary
+        return summary_offset, end, summary
 
     def _scan_data_section(self, end: int) -> np.ndarray:
         """Read the head of each record in the data section, up to `end`.
@@ -152,36 +153,36 @@ class McapFile:
         Returns:
             The messages outside of chunks, (M,) LOCATION with ascending times.
         """
-        locations, end_of_last = [], len(MAGIC)
-        for record_type, at, length in _iterate_records(self._read, len(MAGIC), end):
-            end_of_last = at + length
+        locations, last_end = [], len(MAGIC)
+        for record_type, offset, length in _iterate_records(self._read, len(MAGIC), end):
+            last_end = offset + length
             if record_type == HEADER:
-                self.profile = _parse_string(self._read(at, length), 0)[0].decode(errors="replace")
+                self.profile = _parse_string(self._read(offset, length), 0)[0].decode(errors="replace")
             elif record_type == MESSAGE:
-                channel, _, time, _ = MESSAGE_HEAD.unpack(self._read(at, MESSAGE_HEAD.size))
-                locations.append((_check_time(time), channel, at + MESSAGE_HEAD.size, length - MESSAGE_HEAD.size))
+                channel, _, time, _ = MESSAGE_HEAD.unpack(self._read(offset, MESSAGE_HEAD.size))
+                locations.append((_check_time(time), channel, offset + MESSAGE_HEAD.size, length - MESSAGE_HEAD.size))
             elif record_type == CHUNK:
-                self.chunks.append(_parse_chunk(self._read(at, HEAD_BYTES), at, length))
+                self.chunks.append(_parse_chunk(self._read(offset, HEAD_BYTES), offset, length))
             elif record_type == MESSAGE_INDEX and self.chunks:
-                channel, size = struct.unpack("<HI", self._read(at, 6))
+                channel, size = struct.unpack("<HI", self._read(offset, 6))
                 if size:
                     self.chunks[-1].counts[channel] = size // ENTRY_BYTES
             elif record_type in (SCHEMA, CHANNEL):
-                self._add_definition(record_type, self._read(at, length))
+                self._add_definition(record_type, self._read(offset, length))
             elif record_type == DATA_END:
                 break
-        if end_of_last != end:
+        if last_end != end:
             raise ValueError("the data section does not end where the index begins")
         messages = np.array(locations, LOCATION)
         return messages[np.argsort(messages["time"], kind="stable")]
 
     def _check_summary(self, summary: bytes) -> None:
         indexed = []
-        for record_type, at, length in _iterate_records(partial(_slice, summary), 0, len(summary)):
+        for record_type, offset, length in _iterate_records(partial(_slice, summary), 0, len(summary)):
             if record_type in (SCHEMA, CHANNEL):
-                self._add_definition(record_type, summary[at : at + length])
+                self._add_definition(record_type, summary[offset : offset + length])
             elif record_type == CHUNK_INDEX:
-                indexed.append(_parse_chunk_index(summary[at : at + length]))
+                indexed.append(_parse_chunk_index(summary[offset : offset + length]))
         if indexed and sorted(indexed) != sorted(chunk.index_entry for chunk in self.chunks):
             raise ValueError("the index does not match the data")
 
@@ -213,17 +214,17 @@ class McapFile:
 
     def _scan_chunk(self, chunk: Chunk) -> None:
         data, counts = self._read_chunk(chunk), dict[int, int]()
-        for record_type, at, length in _iterate_records(partial(_slice, data), 0, len(data)):
+        for record_type, offset, length in _iterate_records(partial(_slice, data), 0, len(data)):
             if record_type in (SCHEMA, CHANNEL):
-                self._add_definition(record_type, data[at : at + length])
+                self._add_definition(record_type, data[offset : offset + length])
             elif record_type == MESSAGE:
-                (channel,) = struct.unpack_from("<H", data, at)
+                (channel,) = struct.unpack_from("<H", data, offset)
                 counts[channel] = counts.get(channel, 0) + 1
         chunk.counts = chunk.counts or counts
 
     def _read_chunk(self, chunk: Chunk) -> bytes:
         *_, compression, compressed_size, size = chunk.index_entry
-        data = decompress(self._read(chunk.at, compressed_size), compression.decode(), size)
+        data = decompress(self._read(chunk.offset, compressed_size), compression.decode(), size)
         if chunk.crc and crc32(data) != chunk.crc:
             raise ValueError("the checksum of a chunk is wrong")
         return data
@@ -256,7 +257,7 @@ class McapFile:
 def _iterate_records(read: Callable[[int, int], bytes], offset: int, end: int) -> Iterator[tuple[int, int, int]]:
     """Yield the type, the offset of the content, and the length of each record.
 
-    Raises ValueError if the last one extends beyond `end`.
+    Raises ValueError if the last record extends beyond `end`.
     """
     while offset < end:
         record_type, length = RECORD.unpack(read(offset, RECORD.size))
@@ -267,23 +268,23 @@ def _iterate_records(read: Callable[[int, int], bytes], offset: int, end: int) -
         offset += length
 
 
-def _slice(data: bytes, at: int, size: int) -> bytes:
-    return data[at : at + size]
+def _slice(data: bytes, offset: int, size: int) -> bytes:
+    return data[offset : offset + size]
 
 
-def _parse_chunk(head: bytes, at: int, length: int) -> Chunk:
-    """Parse the head of a chunk, whose content has `length` bytes and starts at `at`."""
+def _parse_chunk(head: bytes, offset: int, length: int) -> Chunk:
+    """Parse the head of a chunk, whose content has `length` bytes and starts at `offset`."""
     start, end, size, crc = struct.unpack_from("<QQQI", head)
     compression, sizes = _parse_string(head, 28)
     (compressed_size,) = struct.unpack_from("<Q", head, sizes)
     if size > MAX_BYTES:
         raise ValueError(f"a chunk declares a decompressed size of {size} bytes; at most {MAX_BYTES} are allowed")
-    begin, total = at - RECORD.size, RECORD.size + length
+    begin, total = offset - RECORD.size, RECORD.size + length
     return Chunk(
         (begin, total, start, end, compression, compressed_size, size),
         _check_time(start),
         _check_time(end),
-        at + sizes + 8,
+        offset + sizes + 8,
         crc,
     )
 
@@ -305,7 +306,7 @@ def _check_time(time: int) -> int:
     return time
 
 
-def _parse_string(record: bytes, at: int) -> tuple[bytes, int]:
+def _parse_string(record: bytes, offset: int) -> tuple[bytes, int]:
     """Parse a string; return it and the offset of its end."""
-    (length,) = struct.unpack_from("<I", record, at)
-    return record[at + 4 : at + 4 + length], at + 4 + length
+    (length,) = struct.unpack_from("<I", record, offset)
+    return record[offset + 4 : offset + 4 + length], offset + 4 + length

@@ -1,4 +1,4 @@
-"""Check of a sensor's mounting: its height and lean, measured from the ground in its clouds."""
+"""Check of the height and tilt of a sensor, which are measured from the ground in its clouds."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from lidar_perception.ground.segment import level_points
 from lidar_perception.ground.threshold import fit_plane_by_ransac, height_above_plane
 from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
-# The floor is fitted beyond the vehicle, and close enough for one plane.
+# Range of points that are used to fit the floor: beyond the vehicle, and close enough for one plane.
 MIN_RANGE_M, MAX_RANGE_M = 2.5, 12.0
 CELL_M = 0.5  # cell size of the grid; the lowest point of each cell is used
-FLOOR_PLANE = ThresholdParams(max_slope=10.0)
-STEEP_FLOOR_PLANE = ThresholdParams(max_slope=30.0)  # settings for a tilted sensor
-MIN_CELLS = 10
-MIN_FLOOR_SHARE = 0.25  # minimum fraction of cells whose lowest point is on the plane
+FLOOR_PLANE = ThresholdParams(max_slope=10.0)  # settings of the plane fit
+STEEP_FLOOR_PLANE = ThresholdParams(max_slope=30.0)  # settings of the plane fit for a tilted sensor
+MIN_CELLS = 10  # minimum number of cells with points to fit a plane
+MIN_FLOOR_FRACTION = 0.25  # minimum fraction of cells whose lowest point is on the plane
 FIRST_CLOUDS = 3  # number of clouds to check at the start of a recording
 HEIGHT_TOLERANCE_M = 0.25  # tolerance between the parameter and the measured height
-MAX_LEAN_DEG = 5.0  # maximum tilt that the slope of a road explains
+MAX_TILT_DEG = 5.0  # maximum measured tilt that the slope of a road can explain
 
 
 def measure_sensor_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPoseParams()) -> float | None:
     """Measure the height of the sensor above the ground around it, in metres.
 
-    The ground is the plane through most of the lowest points of the cells of a grid, so that dense
+    The ground is the plane through most of the lowest points in the cells of a grid, so that dense
     walls or vehicles do not outweigh it. The height is negative if the plane is overhead, which
-    happens if the sensor is upside down. None without such a plane.
+    happens if the sensor is upside down. Returns None if no such plane is found.
     """
     plane = _find_floor(level_points(xyz, pose))
     return None if plane is None else -float(plane[2])
 
 
 def find_height_problem(measured: float | None, pose: SensorPoseParams) -> str | None:
-    """Describe a wrong height in sensor_pose, with the remedy; None if it fits the measured one."""
+    """Describe a wrong height in sensor_pose, with the remedy; None if it matches the measured height."""
     if measured is None or abs(measured - pose.height) <= HEIGHT_TOLERANCE_M:
         return None
     if measured < 0:
@@ -52,7 +52,7 @@ def find_height_problem(measured: float | None, pose: SensorPoseParams) -> str |
 
 
 def load_first_clouds(recording: Recording) -> list[PointCloud]:
-    """Load the clouds for the check of a recording; [] if one of them cannot be read."""
+    """Load the first clouds of a recording for the checks; return [] if one of them cannot be read."""
     try:
         return [frame.load() for frame in islice(recording, FIRST_CLOUDS)]
     except InputError:
@@ -62,8 +62,8 @@ def load_first_clouds(recording: Recording) -> list[PointCloud]:
 def apply_measured_height(recording: Recording, clouds: Sequence[PointCloud]) -> Recording:
     """Reopen a recording with the sensor height that is measured in its first clouds.
 
-    The same recording is returned if it states the height, if its clouds disagree, or if the
-    height is about that of KITTI's sensor.
+    The recording is returned unchanged if it states the height, if the heights measured in its
+    clouds differ, or if the measured height is close to that of KITTI's sensor.
     """
     if recording.has_sensor_height or recording.reopen is None:
         return recording
@@ -79,22 +79,22 @@ def apply_measured_height(recording: Recording, clouds: Sequence[PointCloud]) ->
 def find_mount_problem(recording: Recording, clouds: Sequence[PointCloud]) -> str | None:
     """Describe a tilted or inverted sensor in the first clouds, with the remedy.
 
-    None if the sensor is level, or if fewer than two clouds show a floor.
+    Returns None if the sensor is level, or if a floor is found in fewer than two clouds.
     """
     floors = _find_floors(clouds, STEEP_FLOOR_PLANE)
     if len(floors) < 2:
         return None
     height = -float(np.median(floors[:, 2]))
-    lean = float(np.median(np.degrees(np.arctan(np.hypot(*floors[:, :2].T)))))
-    if height >= 0 and lean <= MAX_LEAN_DEG:
+    tilt = float(np.median(np.degrees(np.arctan(np.hypot(*floors[:, :2].T)))))
+    if height >= 0 and tilt <= MAX_TILT_DEG:
         return None
     finding = (
-        f"its sensor leans by {lean:.0f} degrees against the ground"
+        f"the sensor is tilted by {tilt:.0f} degrees against the ground"
         if height >= 0
-        else f"the ground seems to be {-height:.2f} m above its sensor, so it is mounted upside down"
+        else f"the ground seems to be {-height:.2f} m above the sensor, so the sensor is mounted upside down"
     )
     return (
-        f"{finding}, but detectors expect z to point up; measure it with setup, and make a level bag "
+        f"{finding}, but detectors expect z to point up; measure the mounting with setup, and make a level bag "
         f"with convert {recording.path} --robot robot/robot.param.yaml --out level.bag"
     )
 
@@ -108,24 +108,24 @@ def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.nd
     if plane is None:
         return None
     on_plane = np.abs(height_above_plane(lowest, plane)) <= params.inlier_distance
-    return plane if on_plane.mean() >= MIN_FLOOR_SHARE else None
+    return plane if on_plane.mean() >= MIN_FLOOR_FRACTION else None
 
 
 def _find_lowest_points(xyz: np.ndarray) -> np.ndarray:
-    """Return the lowest points (K, 3) of the cells around the sensor."""
+    """Return the lowest point in each cell around the sensor, (K, 3)."""
     squared_range = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
     nearby = xyz.compress((squared_range >= MIN_RANGE_M**2) & (squared_range <= MAX_RANGE_M**2), axis=0)
     side = 2 * round(MAX_RANGE_M / CELL_M) + 1
     column, row = np.floor((nearby[:, :2] + MAX_RANGE_M) / CELL_M).astype(np.int64).T
-    cell = row * side + column
-    low = np.full(side * side, np.inf, nearby.dtype)
-    np.minimum.at(low, cell, nearby[:, 2])
-    lowest = np.flatnonzero(nearby[:, 2] == low[cell])
-    return nearby[lowest[np.unique(cell[lowest], return_index=True)[1]]]
+    cells = row * side + column
+    min_z = np.full(side * side, np.inf, nearby.dtype)
+    np.minimum.at(min_z, cells, nearby[:, 2])
+    lowest = np.flatnonzero(nearby[:, 2] == min_z[cells])
+    return nearby[lowest[np.unique(cells[lowest], return_index=True)[1]]]
 
 
 def _find_floors(clouds: Sequence[PointCloud], params: ThresholdParams = FLOOR_PLANE) -> np.ndarray:
-    """Return the planes (K, 3) of the clouds that have a floor."""
+    """Return the planes (K, 3) of the floors in those clouds that have one."""
     return np.array(
         [plane for cloud in clouds if len(cloud) if (plane := _find_floor(cloud.xyz, params)) is not None]
     ).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Opening of recordings: recognition of their layout, and the stored height of their sensor."""
+"""Opening of recordings in any supported layout, and the stored height of their sensor."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from lidar_perception.runs.files import read_text, write_text
 from lidar_perception.runs.resumable_folder import INCOMPLETE_NAME, RECORD_NAME
 from lidar_perception.types import InputError
 
-# Modules with is_layout(path) and open_layout(path, ...), and a description of the folder. The
-# first one whose is_layout returns True opens the path. A new format is one line here.
+# Modules with can_open(path) and open_layout(path, ...), and a description of the folder. The
+# first one whose can_open returns True opens the path. To add a format, add a line here.
 LAYOUTS = {
     bag_frames: "",
     semantickitti: "",
@@ -80,11 +80,11 @@ def open_recording(
         path: a bag (rosbag2 or ROS 1), a folder in one of LAYOUTS or one of its inner folders, a
             .pcd, .ply, .npy or .bin file, or a folder of such files. The path of a bag may end with
             a topic (see split_topic).
-        split: file with names of frames or sequences, one per line; only these are read, in its
+        split: file with names of frames or sequences, one per line; only these are read, in this
             order.
-        points: topic of the clouds of a bag, if it is neither /points nor the only one.
+        points: topic of the clouds of a bag, if it is neither /points nor the only cloud topic.
         scans: False to include frames of KITTI that have labels but no scan.
-        sensor_height: metres above the ground, instead of that of the recording.
+        sensor_height: metres above the ground, to replace the height in the recording.
 
     Raises:
         InputError: the path cannot be opened.
@@ -125,13 +125,13 @@ def describe_formats() -> str:
 
 
 def find_layout(path: Path) -> ModuleType | None:
-    """Return the module of LAYOUTS for a path, or None.
+    """Return the module in LAYOUTS that can open a path, or None.
 
-    For unsupported formats in CONVERTERS, raise InputError that names a converter.
+    Raises InputError, which names a converter, for an unsupported format in CONVERTERS.
     """
     if not (path.is_file() and path.suffix.lower() in CONVERTERS):
         for layout in LAYOUTS:
-            if layout.is_layout(path):
+            if layout.can_open(path):
                 return layout
     for file in [path] if path.is_file() else islice(path.rglob("*"), MAX_FILES):
         if file.suffix.lower() in CONVERTERS:
@@ -147,7 +147,7 @@ def split_topic(path: str | Path) -> tuple[Path, str]:
 
 
 def _select_split(recording: Recording, split: Path) -> Recording:
-    """Return the frames or sequences listed in a split file, without duplicates."""
+    """Return a recording of the frames and sequences listed in a split file, without duplicates."""
     names = read_text(split, noun="the split").split()
     sequences: dict[str, list[str]] = {}
     frames: dict[str, None] = {}
@@ -156,7 +156,7 @@ def _select_split(recording: Recording, split: Path) -> Recording:
         sequences.setdefault(frame.sequence, []).append(frame.name)
     first = next(iter(frames), "none")
     if not names:
-        raise InputError(f"{split} is empty; it needs one frame per line, such as {first}")
+        raise InputError(f"{split} is empty; write the name of a frame or sequence on each line, such as {first}")
     selected: dict[str, None] = {}
     unknown: list[str] = []
     for name in names:
@@ -165,8 +165,8 @@ def _select_split(recording: Recording, split: Path) -> Recording:
         unknown += [] if matches else [name]
     if unknown:
         raise InputError(
-            f"{split} names {unknown[0]} ({len(unknown)} unknown), which is not in "
-            f"{recording.path}; its first frame is {first}"
+            f"{split} lists {unknown[0]} ({len(unknown)} unknown names), which is not in "
+            f"{recording.path}; the first frame there is {first}"
         )
     return recording.select(list(selected))
 

@@ -1,4 +1,4 @@
-"""Finding and opening of the storage files of a bag."""
+"""Functions that find and open the storage files of a bag."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SUPPORTED = "give the folder of a rosbag2 bag, an .mcap, a .db3 or a ROS 1 .bag 
 
 
 def list_storage_files(folder: Path) -> list[Path]:
-    """Return the storage files in a folder by name; [] if there is no such folder."""
+    """Return the storage files in a folder, sorted by name; [] if the folder does not exist."""
     if not folder.is_dir():
         return []
     return sorted(file for file in folder.iterdir() if _suffix(file) in FORMATS and not file.is_dir())
@@ -41,11 +41,11 @@ def list_storage_files(folder: Path) -> list[Path]:
 def find_files(path: Path, metadata: Metadata) -> list[Path]:
     """Return the storage files of a bag.
 
-    These are the files listed in metadata.yaml, or without it, files whose names show that they are
-    parts of one bag. Differences are added to metadata.problems.
+    These are the files listed in metadata.yaml. Without it, they are the files in the folder if
+    their names show that they are parts of one bag. Differences are added to metadata.problems.
 
     Raises:
-        InputError: there is no bag, or there are several.
+        InputError: the folder has no bag, or several.
     """
     if not path.exists():
         raise InputError(f"the bag {path} does not exist")
@@ -71,19 +71,19 @@ def find_files(path: Path, metadata: Metadata) -> list[Path]:
         return [path / name for name in metadata.files]
     if not existing:
         raise InputError(
-            f"the bag {path} is truncated or damaged: its metadata.yaml names "
-            f"{', '.join(missing) or 'no file'}, and there is no storage file; copy "
-            "the whole folder again"
+            f"the bag {path} is truncated or damaged: its metadata.yaml lists "
+            f"{', '.join(missing) or 'no file'}, but the folder has no storage file; copy "
+            "the folder again"
         )
     if missing:
         metadata.problems.append(
-            f"it names {', '.join(missing)} instead of {', '.join(file.name for file in existing)}"
+            f"it lists {', '.join(missing)} instead of {', '.join(file.name for file in existing)}"
         )
     return existing
 
 
 def open_file(path: Path, stack: ExitStack) -> StorageFile:
-    """Open a storage file, to be closed by the stack. InputError if it is damaged."""
+    """Open a storage file, which the stack closes. Raises InputError if it is damaged."""
     try:
         source = _decompress(path, stack) if _read_head(path).startswith(ZSTD_MAGIC) else path
         head = _read_head(source)
@@ -93,13 +93,13 @@ def open_file(path: Path, stack: ExitStack) -> StorageFile:
     if not suffix:
         if _suffix(path) not in FORMATS:
             raise InputError(f"{path} is not a bag; {SUPPORTED}")
-        raise InputError(describe_damage(path, "it does not start as such a file does" if head else "it is empty"))
+        raise InputError(describe_damage(path, "its first bytes are wrong" if head else "it is empty"))
     try:
         file = stack.enter_context(closing(FORMATS[suffix][1](source)))
         for topic in file.topics:
             if not all(isinstance(text, str) for text in (topic.name, topic.type, topic.encoding)):
                 raise ValueError(f"topic {topic.name!r} has the type {topic.type!r}")
-        # Some writers omit "msg", or the encoding if it is that of ROS 2.
+        # Some writers omit "msg" in types, or the encoding of ROS 2 messages.
         file.topics = [
             topic._replace(type=re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", topic.type), encoding=topic.encoding or "cdr")
             for topic in file.topics
@@ -136,7 +136,7 @@ def _are_parts_of_one_bag(files: list[Path]) -> bool:
 
 
 def _decompress(path: Path, stack: ExitStack) -> Path:
-    """Decompress a file to a temporary copy that is removed when the stack is closed; return it."""
+    """Decompress a file to a temporary file, which the stack removes, and return its path."""
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
     target = folder / path.name.removesuffix(COMPRESSED_SUFFIX)
     try:
@@ -162,8 +162,8 @@ def _diagnose_foreign_mcap(path: Path, file: McapFile) -> str:
     if file.profile == "ros2" or "cdr" in encodings:
         return ""
     if file.profile == "ros1" or "ros1" in encodings:
-        return f"{path} has ROS 1 messages in MCAP; give the .bag that it was converted from"
+        return f"{path} is an MCAP file with ROS 1 messages; give the .bag file that it was converted from"
     return (
-        f"{path} is an MCAP file without ROS 2 messages (profile {file.profile!r}), as written "
-        "by Foxglove and others; give clouds as sensor_msgs/PointCloud2 in a ROS 2 bag"
+        f"{path} is an MCAP file without ROS 2 messages (profile {file.profile!r}), for example "
+        "from Foxglove; give clouds as sensor_msgs/PointCloud2 in a ROS 2 bag"
     )

@@ -19,7 +19,7 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 LINE_FORMAT = "x y z dx dy dz heading class"
 
 
-def is_layout(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Return True for a folder with points/*.npy and labels/ or ImageSets/."""
     return bool(_list_scans(path)) and any((path / name).is_dir() for name in ("labels", "ImageSets"))
 
@@ -31,7 +31,8 @@ def _list_scans(path: Path) -> list[Path]:
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
     """Open the clouds in order of their names; only file lists are read.
 
-    The clouds may be unrelated. The files in ImageSets/ can be used as split files.
+    The frames are not assumed to follow each other in time. The files in ImageSets/ can be used as
+    split files.
     """
     files = _list_scans(path)
     scale = make_cloud_scale_reader(files)
@@ -86,7 +87,7 @@ def read_labels(path: Path) -> GroundTruth | None:
                 raise ValueError
         except ValueError:
             raise InputError(
-                f"{path}:{i} is not '{LINE_FORMAT}' with sizes above 0: {line[:200]!r}; correct or remove it"
+                f"{path}:{i} is not a label ({LINE_FORMAT}, with positive sizes): {line[:200]!r}; correct or remove it"
             ) from None
         boxes.append(box)
         names.append(find_class_name(" ".join(words[7:])))

@@ -21,8 +21,8 @@ def read_pcd(path: Path) -> np.ndarray:
 
     Returns:
         (N,) structured array with the fields and types of the file; a field with COUNT > 1 is an
-        array. Fields named "_" are padding and left out, like those with COUNT 0. An integer field
-        whose text has fractions becomes float32.
+        array. Fields named "_" (padding) and fields with COUNT 0 are left out. An integer field
+        with fractional numbers in an ascii file becomes float32.
 
     Raises:
         InputError: the file is not a PCD file, or truncated.
@@ -66,7 +66,7 @@ def _parse_points(content: bytes) -> np.ndarray:
         header["POINTS"][0] if "POINTS" in header else int(header["WIDTH"][0]) * int(header.get("HEIGHT", ["1"])[0])
     )
     if not 0 <= point_count * layout.itemsize <= MAX_CLOUD_BYTES:
-        raise ValueError(f"it declares {point_count} points")
+        raise ValueError(f"the number of points is invalid: {point_count}")
     data, data_format = content[start:], header["DATA"][0].lower()
     if data_format == "ascii":
         points = parse_text_points(data, layout, point_count)
@@ -75,24 +75,24 @@ def _parse_points(content: bytes) -> np.ndarray:
     elif data_format == "binary_compressed":
         points = _parse_compressed_points(data, layout, point_count)
     else:
-        raise ValueError(f"unknown kind of DATA: {data_format}")
+        raise ValueError(f"unknown DATA format: {data_format}")
     used_fields = [name for name in names if not name.startswith("_") and layout[name].itemsize]
     return points if len(used_fields) == len(names) else points[used_fields]
 
 
 def parse_binary_points(data: bytes, layout: np.dtype, point_count: int) -> np.ndarray:
-    """Return `point_count` records of type `layout`. Raises ValueError if the data are too short."""
+    """Parse `point_count` records of type `layout`. Raises ValueError if the data are too short."""
     if len(data) < point_count * layout.itemsize:
         raise ValueError(f"it is truncated: {len(data)} of {point_count * layout.itemsize} bytes")
     return np.frombuffer(data, layout, point_count)
 
 
 def parse_text_points(data: bytes, layout: np.dtype, point_count: int) -> np.ndarray:
-    """Parse numbers given point by point as text.
+    """Parse points written as text, one number after the other.
 
     Returns:
-        (point_count,) structured array with the types of the layout. An integer field whose text
-        has fractions becomes float32.
+        (point_count,) structured array with the types of the layout. An integer field with
+        fractional numbers becomes float32.
 
     Raises:
         ValueError: the text is too short, or a number does not fit its type.
@@ -117,13 +117,13 @@ def parse_text_points(data: bytes, layout: np.dtype, point_count: int) -> np.nda
 
 
 def _parse_numbers(words: np.ndarray, dtype: np.dtype, name: str) -> np.ndarray:
-    """Return words as numbers of the given type, or as float32 if they have fractions."""
+    """Convert words to numbers of the given type, or to float32 if they have fractions."""
     if dtype.kind == "f":
         return words.astype("f8").astype(dtype)
     try:
         numbers = words.astype(dtype.kind + "8")  # float64 would lose the last digits of 64-bit times
     except ValueError:
-        numbers = words.astype("f8")  # some writers write 12.000000 or 0.35 for a uint8
+        numbers = words.astype("f8")  # some programs write 12.000000 or 0.35 for a uint8
         if not np.array_equal(numbers, np.floor(numbers)):
             return numbers.astype("<f4")
     limits = np.iinfo(dtype)
@@ -133,7 +133,10 @@ def _parse_numbers(words: np.ndarray, dtype: np.dtype, name: str) -> np.ndarray:
 
 
 def _parse_compressed_points(data: bytes, layout: np.dtype, point_count: int) -> np.ndarray:
-    """Parse binary_compressed: LZF (or plain if LZF saved nothing), field by field."""
+    """Parse binary_compressed data, which are stored field by field.
+
+    They are compressed with LZF, or plain if LZF would not make them smaller.
+    """
     compressed_size, size = struct.unpack_from("<II", data)
     if size != point_count * layout.itemsize or len(data) < 8 + compressed_size:
         raise ValueError("it is truncated: the sizes of the compressed points do not match")
@@ -155,9 +158,9 @@ def _parse_compressed_points(data: bytes, layout: np.dtype, point_count: int) ->
 
 
 def decompress_lzf(data: bytes, size: int) -> bytes:
-    """Decompress LZF data of `size` bytes. Raises ValueError if the result has another size.
+    """Decompress LZF data to `size` bytes. Raises ValueError if the result has another size.
 
-    Each step copies a literal run, or a run of earlier output.
+    Each step of the loop copies a literal run, or repeats a run of earlier output.
     """
     out, i = bytearray(), 0
     while i < len(data):
@@ -171,15 +174,15 @@ def decompress_lzf(data: bytes, size: int) -> bytes:
         if length == 7:
             length += data[i]
             i += 1
-        back = len(out) - ((control & 31) << 8 | data[i]) - 1
+        run_start = len(out) - ((control & 31) << 8 | data[i]) - 1
         i += 1
-        if back < 0:
+        if run_start < 0:
             raise ValueError("the compressed points are damaged")
         length += 2
-        if len(out) - back >= length:
-            out += out[back : back + length]
+        if len(out) - run_start >= length:
+            out += out[run_start : run_start + length]
         else:  # the run overlaps its own output
-            piece = bytes(out[back:])
+            piece = bytes(out[run_start:])
             out += (piece * (length // len(piece) + 1))[:length]
         if len(out) > size:
             break

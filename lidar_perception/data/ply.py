@@ -36,7 +36,7 @@ def read_ply(path: Path) -> np.ndarray:
     """Read the vertices of a PLY file.
 
     Returns:
-        (N,) structured array with their properties, in their types, little-endian.
+        (N,) structured array with the properties and types of the file, little-endian.
 
     Raises:
         InputError: the file is not a PLY file, truncated, or has a list property in the vertices,
@@ -54,7 +54,7 @@ def read_ply(path: Path) -> np.ndarray:
 
 def _parse_vertices(content: bytes) -> np.ndarray:
     if not content.startswith(b"ply"):
-        raise ValueError("it does not start with ply")
+        raise ValueError("the first line is not 'ply'")
     order, is_text, start = "", False, 0
     elements: list[tuple[str, int, list[tuple[str, str]]]] = []
     while True:
@@ -82,7 +82,7 @@ def _parse_vertices(content: bytes) -> np.ndarray:
             raise ValueError(f"the property {lists[0]} of {name} elements is a list")
         layout = np.dtype([(property_name, order + DTYPE_CODES[type_name]) for property_name, type_name in properties])
         if not 0 <= element_count * layout.itemsize <= MAX_CLOUD_BYTES:
-            raise ValueError(f"it declares {element_count} points")
+            raise ValueError(f"the number of points is invalid: {element_count}")
         if name == "vertex":
             parse = parse_text_points if is_text else parse_binary_points
             points = parse(data, layout, element_count)

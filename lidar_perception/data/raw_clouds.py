@@ -1,4 +1,4 @@
-"""Clouds of any recording with all columns that the driver wrote."""
+"""Clouds of any recording as messages with all columns that the driver wrote."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
 
-PAIR_DISTANCE = 8  # distance in clouds, see choose_clouds
+PAIR_DISTANCE = 8  # number of clouds from the first to the second cloud of a wide pair, see choose_clouds
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,13 @@ class RawClouds:
     """Clouds in order of time.
 
     Attributes:
+        path: path of the recording.
         layout: description of the recognised layout.
+        count: number of clouds.
         stamps_ns: stamps of all clouds; None if they were not recorded.
         load: load(i) returns cloud i as a PointCloud2 (class of rosbags), or raises InputError.
-        poses: poses of the clouds of a bag.
-        topic: topic of the clouds of a bag.
+        poses: poses of the sensor in a bag.
+        topic: topic of the clouds in a bag.
     """
 
     path: Path
@@ -82,7 +84,13 @@ def _open_bag(path: Path, topic: str) -> RawClouds:
         raise InputError(f"{path} has no clouds on {topic}; record it again")
     frames = bag_frames.BagFrames(handle, topic, bag.topics[topic], bag.counts[topic])
     return RawClouds(
-        path, f"{bag.layout}, clouds on {topic}", len(frames), frames.stamps(), frames.message, frames.poses, topic
+        path,
+        f"{bag.layout}, clouds on {topic}",
+        len(frames),
+        frames.read_stamps(),
+        frames.read_message,
+        frames.poses,
+        topic,
     )
 
 
@@ -106,9 +114,9 @@ def _to_message(frame: Frame) -> Any:
 def choose_clouds(count: int, max_count: int) -> list[int]:
     """Choose up to `max_count` of `count` clouds, in evenly spread pairs; return their numbers.
 
-    The two clouds of a pair show the robot's motion, and the pairs cover different places. The
-    clouds of a pair are alternately adjacent, for fast robots, and PAIR_DISTANCE apart, for slow
-    ones.
+    The two clouds of a pair show the robot's motion, and the pairs cover different places. Every
+    other pair consists of adjacent clouds, for fast robots; in the other pairs, the clouds are
+    PAIR_DISTANCE apart, for slow robots.
     """
     if count <= max_count or max_count < 2:
         return list(range(min(count, max_count)))

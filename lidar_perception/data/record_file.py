@@ -1,4 +1,4 @@
-"""File that contains only complete records, even if the disk becomes full."""
+"""Output file that contains only complete records, even if the disk becomes full."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 
 
 class RecordFile:
-    """Output stream. Use it as a context manager.
+    """Output stream of records. Use it as a context manager.
 
-    Each write() is a record. If a record does not fit on the disk, no part of it remains in the
-    file; this and all later calls raise OSError.
+    Each write() writes one record. If a record does not fit on the disk, no part of it remains in
+    the file, and this and all later calls raise OSError.
     """
 
     def __init__(self, path: Path):
@@ -49,7 +49,7 @@ class RecordFile:
         """Do nothing: writes are not buffered."""
 
     def sync(self) -> None:
-        """Wait until everything is on the disk."""
+        """Flush the file to disk."""
         os.fsync(self.file.fileno())
 
     def close_with(self, end: bytes) -> None:

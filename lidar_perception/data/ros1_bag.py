@@ -23,11 +23,11 @@ class Ros1File:
     """A .bag file open for reading, see StorageFile.
 
     Topics whose type does not exist in Jazzy cannot be read; their encoding is "ros1". Fields that
-    ROS 1 does not have are empty.
+    the ROS 1 message lacks are empty.
     """
 
     def __init__(self, path: Path):
-        # Undocumented in rosbags: if it changes, only ROS 1 bags are affected.
+        # This table is undocumented in rosbags. If it changes, only ROS 1 bags are affected.
         from rosbags.convert.converter import STATIC_MSGTYPE_RENAMES
 
         self.reader = AnyReader([path])
@@ -61,7 +61,7 @@ class Ros1File:
         self.reader.close()
 
     def messages(self, ids: Collection[int], start: int, stop: int) -> Stream:
-        """Yield (topic id, time, CDR bytes) of these topics for start <= time < stop, by time."""
+        """Yield (topic id, time, CDR bytes) of topics with start <= time < stop, in order of time."""
         connections = [self.recorded[topic_id] for topic_id in ids]
         for connection, time, data in self.reader.messages(connections, start, stop):
             yield connection.id, time, bytes(self.converters[connection.id](data))

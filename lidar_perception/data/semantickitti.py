@@ -37,15 +37,13 @@ THINGS = {
 MOVING = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
 
 
-def is_layout(path: Path) -> bool:
-    """Return True for a folder of KITTI odometry (see odometry.is_layout) with labels."""
-    return odometry.is_layout(path) and any(
-        (sequence / "labels").is_dir() for sequence in odometry.list_sequences(path)
-    )
+def can_open(path: Path) -> bool:
+    """Return True for a folder of KITTI odometry (see odometry.can_open) with labels."""
+    return odometry.can_open(path) and any((sequence / "labels").is_dir() for sequence in odometry.list_sequences(path))
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the labelled scans in order; only the file lists and the times are read.
+    """Open the labelled scans in order; only file lists and times are read.
 
     Sequences without a labels folder, such as the test sequences, are left out.
     """
@@ -81,7 +79,8 @@ def _add_point_truth(frame: Frame) -> Frame:
 def _read_point_truth(scan: Path, path: Path) -> PointTruth:
     """Return the labels of the usable points.
 
-    Raises InputError if a file is missing or truncated, or if their sizes differ.
+    Raises InputError if a file is missing or truncated, or if the numbers of points and labels
+    differ.
     """
     cloud = read_velodyne(scan)
     labels = read_records(path, "label", np.uint32)[:, 0]  # upper 16 bits: instance; lower: class
@@ -92,7 +91,7 @@ def _read_point_truth(scan: Path, path: Path) -> PointTruth:
 
 
 def write_scan(folder: Path, number: int, cloud: np.ndarray, semantic: np.ndarray, instance: np.ndarray) -> None:
-    """Write scan and labels to a sequence folder.
+    """Write a scan and its labels to a sequence folder.
 
     Args:
         cloud: (N, 4) [x y z reflectance].
@@ -104,10 +103,11 @@ def write_scan(folder: Path, number: int, cloud: np.ndarray, semantic: np.ndarra
 
 
 def format_pose(pose: np.ndarray, calibration: Calibration) -> str:
-    """Return the line of poses.txt for a scan.
+    """Format the line of a scan in poses.txt, which contains the poses of the camera.
 
     Args:
-        pose: (4, 4) pose of the LiDAR in the frame of the first scan; the file stores the camera's.
+        pose: (4, 4) pose of the LiDAR in the frame of the first scan.
+        calibration: calibration of the camera.
     """
     to_camera = calibration.lidar_to_camera
     camera_pose = to_camera @ pose @ np.linalg.inv(to_camera)
@@ -115,7 +115,6 @@ def format_pose(pose: np.ndarray, calibration: Calibration) -> str:
 
 
 def format_calibration(calibration: Calibration) -> str:
-    """Return the text of calib.txt: the projections of four identical cameras and the LiDAR's
-    pose."""
+    """Format calib.txt, with the projections of four identical cameras and the pose of the LiDAR."""
     rows = {**{f"P{i}": calibration.intrinsics for i in range(4)}, "Tr": calibration.lidar_to_camera[:3]}
     return "".join(f"{name}: {format_numbers(matrix)}\n" for name, matrix in rows.items())

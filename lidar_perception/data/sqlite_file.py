@@ -1,4 +1,4 @@
-"""Reader of rosbag2's SQLite files (.db3) of all ROS 2 distributions, even if recording was killed."""
+"""Reader of rosbag2's SQLite files (.db3) of all ROS 2 distributions, including incomplete ones."""
 
 from __future__ import annotations
 
@@ -71,9 +71,7 @@ class SqliteFile:
             Topic(topic_id, name, type_name, encoding, qos, spans.get(topic_id, (0,))[0])
             for topic_id, name, type_name, encoding, qos in rows
         ]
-        with_messages = [spans[topic.id] for topic in self.topics if topic.id in spans]
+        topic_spans = [spans[topic.id] for topic in self.topics if topic.id in spans]
         self.times = (
-            (min(first for _, first, _ in with_messages), max(last for *_, last in with_messages))
-            if with_messages
-            else None
+            (min(first for _, first, _ in topic_spans), max(last for *_, last in topic_spans)) if topic_spans else None
         )

@@ -16,7 +16,7 @@ Stream = Iterator[Message]  # sorted by time
 
 
 class Topic(NamedTuple):
-    """A topic of one file, which may have several topics of the same name.
+    """A topic of a file; a file may have several topics with the same name.
 
     Attributes:
         id: topic id of its messages.

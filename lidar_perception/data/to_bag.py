@@ -1,4 +1,4 @@
-"""Writing of labelled frames to a rosbag2 bag, on the topics that nodes and evaluation expect."""
+"""Writer of labelled frames to a rosbag2 bag, on the topics that nodes and evaluation expect."""
 
 from __future__ import annotations
 
@@ -50,16 +50,19 @@ def write_bag(
     clouds: bool = True,
     detections_3d: bool = False,
 ) -> int:
-    """Write frames to a bag in order, and return their number.
+    """Write frames to a bag in order, and return the number of written frames.
 
-    The calibration is written, latched, before the first scan and whenever it changes: as
-    CameraInfo, TransformStamped and TF. Poses are written as odometry of the sensor, and point
+    The calibration is written to latched topics (CameraInfo, TransformStamped and TF) before the
+    first scan and whenever it changes. Poses are written as odometry of the sensor, and point
     labels as columns of their cloud.
 
     Args:
-        images: True to write the PNG files of the camera.
-        skipped: list to which the errors of unreadable frames are added; if None, the first error
-            is raised.
+        path: folder of the bag.
+        frames: frames to write.
+        images: True to write the PNG images of the camera.
+        force: True to replace an existing bag.
+        skipped: list to which the errors of unreadable frames are added. If it is None, the first
+            error is raised.
         clouds: False to write everything except clouds.
         detections_3d: True to write the labelled boxes as Detection3DArray as well.
 
@@ -83,7 +86,7 @@ def write_bag(
 
 
 class FrameContent(NamedTuple):
-    """Content of a frame for a bag; None for missing parts."""
+    """Content of a frame that is written to a bag; missing parts are None."""
 
     header: Any
     stamp_ns: int
@@ -101,7 +104,7 @@ class FrameWriter:
         self, bag: BagWriter, *, images: bool = False, clouds: bool = True, detections_3d: bool = False
     ) -> None:
         self.bag, self.images, self.clouds, self.detections_3d = bag, images, clouds, detections_3d
-        self._marker_keys: frozenset[tuple[str, int]] = frozenset()  # keys of the markers of the last labels
+        self._marker_keys: frozenset[tuple[str, int]] = frozenset()  # keys of the last label markers
         self._labelled_stamps: set[int] = set()
         self._calibration: Calibration | None = None  # last calibration written
         bag.add_topic(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", LATCHED_QOS)
@@ -114,16 +117,17 @@ class FrameWriter:
             bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
 
     def read(self, frame: Frame) -> FrameContent:
-        """Read the content of a frame. InputError if it cannot be read or stored in a bag."""
+        """Read the content of a frame. Raises InputError if it cannot be read or stored in a bag."""
         scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
         pose, columns = frame.pose(), frame.point_truth() if self.clouds else None
         if frame.stamp_ns < 0:
             raise InputError(
-                f"{frame.name}: its stamp is before 1970, which a bag cannot store; set the clock of the sensor"
+                f"{frame.name}: the stamp is before 1970, which a bag cannot store; set the clock of the sensor"
             )
         if truth is not None and frame.stamp_ns in self._labelled_stamps:
             raise InputError(
-                f"{frame.name}: another labelled scan has the same stamp, so labels could not be assigned to scans"
+                f"{frame.name}: another labelled scan has the same stamp, so the labels would be ambiguous; "
+                "correct the stamps"
             )
         header = make_header(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, make_bag_message)
         image = frame.image if self.images and frame.image and frame.image.exists() else None
@@ -138,7 +142,7 @@ class FrameWriter:
         )
 
     def write(self, content: FrameContent) -> None:
-        """Write the content of a frame. InputError if the bag cannot be written."""
+        """Write the content of a frame. Raises InputError if the bag cannot be written."""
         bag, (header, stamp_ns, calibration, pose, truth, image, points) = self.bag, content
         if calibration is not None and not calibration.equals(self._calibration):
             self._calibration = calibration
@@ -159,7 +163,7 @@ class FrameWriter:
 
 
 def to_point_array(scan: PointCloud, labels: PointTruth | None = None) -> np.ndarray:
-    """Return a structured array (N,) with the fields of POINT and, with labels, of POINT_LABELS."""
+    """Make a structured array (N,) with the fields of POINT and, with labels, of POINT_LABELS."""
     fields = POINT.descr[: 4 if scan.intensity is not None else 3]
     points = np.empty(len(scan), fields + (POINT_LABELS.descr if labels else []))
     for i, axis in enumerate("xyz"):
@@ -172,17 +176,17 @@ def to_point_array(scan: PointCloud, labels: PointTruth | None = None) -> np.nda
 
 
 def _make_detections(markers: Any, header: Any) -> Any:
-    """Convert label markers to a Detection3DArray; track ids are kept if they are unique."""
+    """Convert label markers to a Detection3DArray, with the track ids if they are unique."""
     objects = from_marker_array(markers)
-    tracks = [track for extra in objects.extras if (track := extra.get("track_id")) is not None]
-    has_unique_ids = len(set(tracks)) == len(objects)
+    track_ids = [track_id for extra in objects.extras if (track_id := extra.get("track_id")) is not None]
+    has_unique_ids = len(set(track_ids)) == len(objects)
     return to_detection_array(
         objects.boxes,
         objects.labels,
         objects.scores.tolist(),
         header=header,
         make=make_bag_message,
-        ids=tracks if has_unique_ids else None,
+        ids=track_ids if has_unique_ids else None,
     )
 
 

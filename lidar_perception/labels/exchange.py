@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.data.bag_frames import is_layout as is_bag
+from lidar_perception.data.bag_frames import can_open as is_bag
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.raw import TRACKLETS
 from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels

@@ -76,7 +76,7 @@ def choose_ego_source(recording: Recording, source: str = "auto") -> str:
     if source != "auto":
         return source
     return choose_recorded_source(
-        POSES in recording.has
+        POSES in recording.contents
         and (not has_odometry() or any(map(has_valid_pose, islice(recording.frames, MAX_POSE_CHECKS))))
     )
 

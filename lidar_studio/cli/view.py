@@ -148,14 +148,14 @@ def _open_content(
     points: str | None,
     sequence: str | None,
 ) -> PageContent:
-    from lidar_perception.data.bag_frames import is_layout
+    from lidar_perception.data.bag_frames import can_open
     from lidar_perception.data.open import split_topic
     from lidar_studio import results as result_sources
     from lidar_studio.drive import require_clouds, select_drive
     from lidar_studio.server import PageContent
 
     path, topic = split_topic(path)
-    is_bag = path.exists() and is_layout(path)
+    is_bag = path.exists() and can_open(path)
     if is_bag:
         points = points or topic or result_sources.choose_points_topic(path)
         recording = open_and_describe(path, points=points)

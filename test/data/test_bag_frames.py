@@ -73,7 +73,7 @@ def test_indexed_frame_is_read_when_it_is_loaded(written, tmp_path):
 
 def test_has_lists_only_recorded_content(tmp_path):
     write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
-    assert open_recording(tmp_path / "bag").has == set()
+    assert open_recording(tmp_path / "bag").contents == set()
 
 
 @each_recording
@@ -81,7 +81,7 @@ def test_converted_bag_equals_the_recording(tmp_path, kind):
     recording = open_recording(MADE[kind][0](tmp_path / kind))
     assert write_bag(tmp_path / "made", recording) == len(recording)
     bag = open_recording(tmp_path / "made")
-    assert bag.has == recording.has
+    assert bag.contents == recording.contents
     for frame, read in zip(recording, bag, strict=True):
         expected, got = frame.load(), read.load()
         assert np.array_equal(got.xyz, expected.xyz)
@@ -105,7 +105,7 @@ def test_converted_bag_equals_the_recording(tmp_path, kind):
                 assert a.keys() == b.keys()
                 np.testing.assert_equal([a.get("track_id"), a.get("category")], [b.get("track_id"), b.get("category")])
     with Bag(tmp_path / "made") as converted:  # the calibration is written when it changes
-        assert converted.counts[CAMERA_INFO] == (CAMERA in recording.has) * (1 + (kind == "bag"))
+        assert converted.counts[CAMERA_INFO] == (CAMERA in recording.contents) * (1 + (kind == "bag"))
 
 
 def test_unreadable_scan_is_skipped_and_reported(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from robot_bags import CLOUDS, ON_BASE, START, base_at, check, mount, moving, moving_tf, recorded, stamps, tf, transform
 from scipy.spatial.transform import Rotation
 
-from lidar_perception.data.bag_poses import FILTERED, choose_odometry_topic
+from lidar_perception.data.bag_poses import FILTERED_ODOMETRY, choose_odometry_topic
 from lidar_perception.data.frame import POSES
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
@@ -30,7 +30,7 @@ def wheel_transforms():
     "parts",
     [
         (moving(ODOMETRY), mount()),
-        (moving(FILTERED), mount()),
+        (moving(FILTERED_ODOMETRY), mount()),
         (moving("/kiss/odometry"), mount()),
         (moving_tf(), mount()),
         (moving(ODOMETRY), moving("/wheels", "wheels"), moving_tf(), mount()),
@@ -65,11 +65,11 @@ def test_clouds_in_the_odometry_frame_do_not_move(tmp_path):
 
 
 def test_converted_bag_has_sensor_odometry(tmp_path):
-    robot = recorded(tmp_path / "robot", moving(FILTERED), mount())
+    robot = recorded(tmp_path / "robot", moving(FILTERED_ODOMETRY), mount())
     write_bag(tmp_path / "ours", robot)
     ours = open_recording(tmp_path / "ours")
     check(ours)
-    assert ours.frames.poses.needs_no_tf and ours.frames.poses.odometry == ODOMETRY
+    assert ours.frames.poses.needs_no_tf and ours.frames.poses.odometry_topic == ODOMETRY
 
 
 def test_sensor_that_rotates_on_the_robot_has_correct_poses(tmp_path):
@@ -89,9 +89,9 @@ def test_sensor_that_rotates_on_the_robot_has_correct_poses(tmp_path):
 
 def test_no_pose_is_guessed(tmp_path):
     fixed = recorded(tmp_path / "fixed", mount())  # static transforms only
-    assert POSES not in fixed.has and [frame.pose() for frame in fixed] == [None] * CLOUDS
+    assert POSES not in fixed.contents and [frame.pose() for frame in fixed] == [None] * CLOUDS
     two = recorded(tmp_path / "two", moving("/left"), moving("/right"))
-    assert POSES not in two.has
+    assert POSES not in two.contents
     short = recorded(
         tmp_path / "short",
         moving(ODOMETRY, "lidar", seconds=-1),
@@ -118,11 +118,11 @@ def test_no_pose_is_guessed(tmp_path):
             )
         ],
     )
-    assert POSES not in circle.has
+    assert POSES not in circle.contents
     other = recorded(
         tmp_path / "other", [(TF, "std_msgs/msg/String", START, make_bag_message("std_msgs/msg/String", data="text"))]
     )
-    assert POSES not in other.has
+    assert POSES not in other.contents
 
 
 def test_invalid_poses_are_skipped_and_counted(tmp_path):
@@ -138,7 +138,7 @@ def test_invalid_poses_are_skipped_and_counted(tmp_path):
 
 def test_odometry_topic_is_the_usual_one_or_the_only_one():
     kind = ODOMETRY_MESSAGE
-    assert choose_odometry_topic({"/b": kind, ODOMETRY: kind, FILTERED: kind}) == ODOMETRY
-    assert choose_odometry_topic({"/b": kind, FILTERED: kind}) == FILTERED
+    assert choose_odometry_topic({"/b": kind, ODOMETRY: kind, FILTERED_ODOMETRY: kind}) == ODOMETRY
+    assert choose_odometry_topic({"/b": kind, FILTERED_ODOMETRY: kind}) == FILTERED_ODOMETRY
     assert choose_odometry_topic({"/b": kind, ODOMETRY: "std_msgs/msg/String"}) == "/b"
     assert choose_odometry_topic({"/b": kind, "/c": kind}) == choose_odometry_topic({}) == ""

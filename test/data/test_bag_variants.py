@@ -323,7 +323,7 @@ def set_counts(info, count):
         (lambda info: info.pop("duration"), "KeyError: 'duration'"),
         (
             lambda info: info.update(relative_file_paths=["a.mcap", "b.mcap"]),
-            "it names a.mcap, b.mcap instead of drive.mcap",
+            "it lists a.mcap, b.mcap instead of drive.mcap",
         ),
         (lambda info: info.clear(), "KeyError: 'relative_file_paths'"),
     ],

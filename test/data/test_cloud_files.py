@@ -129,7 +129,7 @@ def test_ply_elements_before_the_vertices_are_skipped(tmp_path):
 @pytest.mark.parametrize(
     "content, words",
     [
-        (b"", "does not start with ply"),
+        (b"", "the first line is not 'ply'"),
         (b"ply\nformat ascii 1.0\n", "end_header is missing"),
         (b"ply\nformat ascii 1.0\nend_header\n", "element vertex is missing"),
         (b"ply\nelement vertex 1\nproperty float x\nend_header\n1\n", "line format is missing"),

@@ -38,7 +38,7 @@ def test_odometry_can_be_opened_with_any_of_its_files(tmp_path):
         (root / f"sequences/{sequence}/times.txt").unlink()
         (root / f"poses/{sequence}.txt").unlink()
     recording = open_recording(tmp_path)
-    assert recording.has == {CAMERA} and not recording.has_times
+    assert recording.contents == {CAMERA} and not recording.has_times
     assert np.diff(stamps(recording)).tolist() == [PERIOD_NS, GAP_NS]
     assert recording.frames[0].pose() is None
     assert len(open_recording(root / "sequences/00")) == 2
@@ -57,7 +57,7 @@ def test_times_since_1970_are_stamps(tmp_path):
 @pytest.mark.parametrize(
     "text, words",
     [
-        ("0\n", "has only 1 lines, but there is a scan 1; download"),
+        ("0\n", "has only 1 lines, so scan 1 has no time; download"),
         ("0\nlater\n", "not a number of seconds"),
         ("0\nnan\n", "not a number of seconds"),
     ],
@@ -114,7 +114,7 @@ def test_kitti360_has_recorded_times(tmp_path):
 def test_kitti360_has_lidar_poses_and_a_camera(tmp_path, poses):
     root = add_calibration(kitti360_folder(tmp_path), poses)
     recording = open_recording(root)
-    assert recording.has == {CAMERA, POSES}
+    assert recording.contents == {CAMERA, POSES}
     first, second, last = recording.frames
     assert second.pose() is None
     for frame in (first, last):
@@ -158,7 +158,7 @@ def test_openpcdet_accepts_more_columns_and_no_labels(tmp_path):
     for label in (root / "labels").iterdir():
         label.unlink()
     recording = open_recording(root)
-    assert recording.has == set() and recording.frames[0].truth() is None
+    assert recording.contents == set() and recording.frames[0].truth() is None
     assert np.array_equal(recording.frames[0].load().points(), scene(0))
 
 
@@ -168,20 +168,20 @@ def test_openpcdet_accepts_more_columns_and_no_labels(tmp_path):
 def test_invalid_openpcdet_line_is_reported(tmp_path, line):
     root = openpcdet_folder(tmp_path)
     write(root / "labels/000000.txt", f"12 0 0 4 2 1 0 Car\n{line}\n")
-    with pytest.raises(InputError, match=r"000000\.txt:2 is not 'x y z dx dy dz heading class'"):
+    with pytest.raises(InputError, match=r"000000\.txt:2 is not a label \(x y z dx dy dz heading class"):
         open_recording(root).frames[0].truth()
-    assert BOXES in open_recording(root).has
+    assert BOXES in open_recording(root).contents
 
 
 @pytest.mark.parametrize(
     "file, content, words",
     [
-        ("dataset/poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 nan\n", "is not a rotation"),
-        ("dataset/poses/00.txt", "1 9 0 0 0 1 0 0 0 0 1 0\n", "is not a rotation"),
+        ("dataset/poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 nan\n", "is not a rigid transform"),
+        ("dataset/poses/00.txt", "1 9 0 0 0 1 0 0 0 0 1 0\n", "is not a rigid transform"),
         (
             "dataset/sequences/00/calib.txt",
             "P2: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 1 0 0 0 1 0 0 0 1 0 0 0\n",
-            "is not a rotation",
+            "is not a rigid transform",
         ),
     ],
 )

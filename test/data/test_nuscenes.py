@@ -192,7 +192,7 @@ def test_labels_have_names_and_attributes(root):
                 "vehicle.bicycle": "Cyclist" if names == ["cycle.with_rider"] else "Misc",
             }.get(category, "Pedestrian" if "pedestrian" in category else "Misc")
             assert label == expected
-        assert len(frame.native.labels().bicycle_racks()) == sum(
+        assert len(frame.native.labels().select_bicycle_racks()) == sum(
             folder.find_category(TABLES, row) == "static_object.bicycle_rack" for row in find_labels(frame)
         )
     assert len(set(tracks.values())) == len(tracks)
@@ -256,7 +256,7 @@ def put(table, **values):
         (drop("ego_pose", "s0k1topTrue"), "ego_pose.json has no row s0k1topTrue"),
         (drop("instance", "s0o0"), "the instance s0o0 of s0o0k"),
         (drop("category", "c0"), "has no category"),
-        (put("sample_annotation", prev="gone"), "the label gone, which another one links to"),
+        (put("sample_annotation", prev="gone"), "another label links to label gone, which is missing"),
         (put("sample_annotation", rotation=[0, 0, 0, 0]), "a rotation is not a quaternion"),
         (put("sample_annotation", rotation=[1e308, 0, 0, 0]), "a rotation is not a quaternion"),
         (put("ego_pose", rotation=[1e-200, 0, 0, 0]), "a rotation is not a quaternion"),
@@ -269,8 +269,8 @@ def put(table, **values):
             (put("sample", timestamp=time), "sample.json: row 0: timestamp is not a time")
             for time in (1e38, 10**38, -1, "now", None)
         ),
-        (put("sample_data", filename=7), "sample_data.json: row 0: filename is not a text"),
-        (put("scene", token=[]), "scene.json: row 0: token is not a text"),
+        (put("sample_data", filename=7), "sample_data.json: row 0: filename is not a string"),
+        (put("scene", token=[]), "scene.json: row 0: token is not a string"),
         (put("sample_annotation", attribute_tokens=5), "attribute_tokens is not a list"),
         (put("calibrated_sensor", rotation=[1, 0, 0, float("nan")]), "a rotation is not"),
     ],

@@ -35,7 +35,7 @@ def test_layouts_are_recognised_and_read(tmp_path, monkeypatch, kind):
     for part in inner:
         recording = open_recording(root / part)
         assert str(recording) == ", ".join([f"{root / part}: {description}", *sorted(has)])
-        assert recording.has == has and [frame.name for frame in recording] == names
+        assert recording.contents == has and [frame.name for frame in recording] == names
         for frame, reopened in zip(recording, recording.reopen().frames, strict=True):
             assert (frame.name, frame.stamp_ns) == (reopened.name, reopened.stamp_ns)
             assert len(frame.load()) and np.array_equal(frame.load().xyz, reopened.load().xyz)
@@ -150,7 +150,7 @@ def test_commands_measure_an_unknown_sensor_height(tmp_path, height, expected):
         ),
         (
             lambda p: nuscenes_folder.save(nuscenes_root(p), nuscenes_folder.make_tables(), "v1.0-test", False),
-            "several versions; give one of them: .*v1.0-test",
+            "several versions; choose one of .*v1.0-test",
         ),
     ],
 )
@@ -184,7 +184,7 @@ def test_split_selects_frames_in_its_order_once(tmp_path, kind):
     assert len(recording.frames[0].load()) and str(recording).count("2 frames") == 1
     whole = open_recording(root)
     assert [f.name for f in whole.select(names[::-1])] == names[::-1]
-    with pytest.raises(InputError, match=rf"no frame x \(1 unknown\); its first is {names[0]}"):
+    with pytest.raises(InputError, match=rf"no frame x \(1 unknown names\); its first frame is {names[0]}"):
         whole.select([names[0], "x"])
 
 
@@ -210,8 +210,8 @@ def test_invalid_split_is_reported(tmp_path, written):
     for root in (object_folder(tmp_path / "kitti"), written):
         first = next(iter(open_recording(root))).name
         for text, words in (
-            ("", f"is empty; it needs one frame per line, such as {first}"),
-            (f"{first}\nx\ny\n", rf"names x \(2 unknown\), .* frame is {first}"),
+            ("", f"is empty; write the name of a frame or sequence on each line, such as {first}"),
+            (f"{first}\nx\ny\n", rf"lists x \(2 unknown names\), .* there is {first}"),
             (b"\xff\xfe\x00", "cannot read the split"),
         ):
             with pytest.raises(InputError, match=words) as error:

@@ -70,7 +70,7 @@ def test_simulated_data_set_survives_conversion(layout, made, tmp_path):
     summary = write_dataset(layout, bag, tmp_path / "back")
     assert summary.frames == len(recording)
     back = open_recording(tmp_path / "back")
-    assert (back.layout, back.has) == (recording.layout, recording.has)
+    assert (back.layout, back.contents) == (recording.layout, recording.contents)
     same_frames(recording, back)
     if layout != "semantickitti":  # label files are identical
         for file in (made / layout).glob("training/label_*/*.txt"):

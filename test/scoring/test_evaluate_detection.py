@@ -275,7 +275,7 @@ def test_split_selects_the_scored_frames(kitti, found, tmp_path):
 BAD = {
     "columns": (f"{PERSON} 0.9\n\n{WHOLE} 0.8 7\n", "000000.txt:3 is not a KITTI label"),
     "words": (PERSON.replace("1.80", "tall") + " 0.9", "000000.txt:1 is not a KITTI label"),
-    "score": (f"{PERSON} 0.9\n{WHOLE}", "000000.txt:2 is not a result"),
+    "score": (f"{PERSON} 0.9\n{WHOLE}", "000000.txt:2 has no score"),
     "too large": (f"{PERSON} 1e308", "000000.txt:1 is not a KITTI label"),
     "nan": (f"{PERSON} nan", "000000.txt:1 is not a KITTI label"),
     "class": (f"{PERSON} 0.9".replace("Pedestrian", "Walker"), "000000.txt:1 has the unknown class 'Walker'"),
@@ -299,7 +299,7 @@ def test_missing_files_and_labels_are_reported(kitti, found, tmp_path, monkeypat
     assert "cannot read the split" in error("--results", found, "--split", tmp_path / "none")
     split = write(tmp_path / "split.txt", "000001 000007 000008")
     line = error("--results", found, "--split", split)
-    assert "names 000007 (2 unknown)" in line and str(kitti) in line
+    assert "lists 000007 (2 unknown names)" in line and str(kitti) in line
     assert "is empty" in error("--results", found, "--split", write(split, "\n"))
     (found / "000001.txt").unlink()
     assert f"result file {found / '000001.txt'} does not exist" in error("--results", found)

@@ -106,7 +106,7 @@ def recorded(path, *parts, cloud=point):
 
 def check(recording, on_base=ON_BASE):
     """Assert that the poses are those of the base and the mount."""
-    assert POSES in recording.has
+    assert POSES in recording.contents
     for frame, stamp in zip(recording, stamps(), strict=True):
         np.testing.assert_allclose(frame.pose(), base_at(stamp) @ on_base, atol=1e-4)
 

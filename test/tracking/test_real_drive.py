@@ -38,7 +38,7 @@ def test_no_id_switches_on_real_drive(data, detector, ego):
     from lidar_perception.tracking.params import TrackingParams
 
     report, drive = TrackingReport(), open_recording(data / "kitti_tracking")
-    if ego == "auto" and POSES not in drive.has:
+    if ego == "auto" and POSES not in drive.contents:
         assert choose_ego_source(drive) == ("kiss_icp" if has_odometry() else "none")
     fill_report(report, drive, partial(measure_tracking, lambda: detector, TrackingParams(), ego), limit=FRAMES)
     cars = report.compute()["classes"]["Car"]

@@ -31,7 +31,7 @@ def with_recorded_setup(recording: Any, params: PipelineParams) -> PipelineParam
     from lidar_perception.data.frame import CAMERA
 
     params = with_recorded_height(recording, params)
-    if params.view.enabled and CAMERA not in recording.has:
+    if params.view.enabled and CAMERA not in recording.contents:
         errors.print(f"{recording.path} has no camera calibration: processing the full scan")
         return with_values(params, {"view.enabled": False})
     return params

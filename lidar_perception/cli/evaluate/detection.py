@@ -77,7 +77,7 @@ class DetectionRequest:
 
             for warning in check_weights(Path(self.detector.weights), recording.frames[0].sensor_height):
                 terminal_errors.print(warning)
-        if CAMERA not in recording.has and (self.results or self.write_results) is not None:
+        if CAMERA not in recording.contents and (self.results or self.write_results) is not None:
             terminal_errors.print(
                 f"{recording.path} has no camera calibration: result files are "
                 "in the frame of a nominal camera, as detect writes them",

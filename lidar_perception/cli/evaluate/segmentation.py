@@ -74,7 +74,7 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
     clustering_methods = tuple(name for name in CLUSTERING_METHODS if name in methods)
     # Open everything first, so that a typo in the last path does not cost an hour.
     recordings = [options.open_recording(None, path) for path in options.data]
-    labelled = [recording for recording in recordings if POINT_LABELS in recording.has]
+    labelled = [recording for recording in recordings if POINT_LABELS in recording.contents]
     for recording in recordings:
         if recording not in labelled:
             recording.require(BOXES, "evaluate segmentation")

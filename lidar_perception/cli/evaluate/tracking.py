@@ -48,7 +48,7 @@ def tracking(options: ScoringOptions, detector: DetectorChoice, tracking: Tracki
         detector.open, min_score=tracking.min_score, sensor_height=recording.frames[0].sensor_height
     )
     report, source = TrackingReport(), choose_ego_source(recording, ego)
-    if (ego, source) == ("auto", "kiss_icp") and POSES in recording.has:
+    if (ego, source) == ("auto", "kiss_icp") and POSES in recording.contents:
         console.print(
             Text("no pose", "yellow") + ": the first frames have no poses, so KISS-ICP is used; check that odometry, "
             "TF and clouds of the recording share one clock"

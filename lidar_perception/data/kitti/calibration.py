@@ -1,6 +1,7 @@
-"""KITTI's calibration files of the object, tracking, odometry and raw layouts.
+"""Reader of KITTI's calibration files in the object, tracking, odometry and raw layouts.
 
-Geiger et al., CVPR 2012 and IJRR 2013; the development kits' readme files define the matrices.
+Geiger et al., CVPR 2012 and IJRR 2013; the readme files of the development kits define the
+matrices.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from lidar_perception.camera import Calibration
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
-# Size of the rectified images by focal length. It depends on the recording day, and is not stored
-# in the calibration files of the object and tracking benchmarks.
+# Focal length of a recording day -> size of its rectified images, which the calibration files of the
+# object and tracking benchmarks do not store.
 IMAGE_SIZES = {
     721.5377: (1242, 375),
     707.0493: (1224, 370),
@@ -24,7 +25,7 @@ IMAGE_SIZES = {
     718.856: (1241, 376),
 }
 RAW_CALIB = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
-MAX_SKEW = 0.01  # tolerance of R R^T = I for a rounded rotation matrix
+MAX_SKEW = 0.01  # maximum element of R R^T - I for a rounded rotation matrix R
 
 
 def read_calibration(path: Path, image: Path | None = None) -> Calibration:
@@ -34,7 +35,7 @@ def read_calibration(path: Path, image: Path | None = None) -> Calibration:
         image: PNG file that gives the image size, if it exists.
 
     Raises:
-        InputError: a matrix is missing; the message names it and the file.
+        InputError: a matrix is missing or invalid.
     """
     values = read_matrices(path)
     intrinsics = get_matrix(values, path, "P2", (3, 4))
@@ -47,7 +48,7 @@ def read_calibration(path: Path, image: Path | None = None) -> Calibration:
 def read_odometry_calibration(path: Path, image: Path | None = None) -> Calibration:
     """Read calib.txt of a sequence of the odometry benchmark.
 
-    Its Tr is the pose of the LiDAR in the rectified camera frame. `image` and errors are as in
+    Tr is the pose of the LiDAR in the rectified camera frame. Arguments and errors are as in
     read_calibration.
     """
     values = read_matrices(path)
@@ -70,7 +71,7 @@ def read_raw_calibration(day: Path) -> Calibration:
 
 
 def read_matrices(path: Path) -> dict[str, np.ndarray]:
-    """Read the numbers in lines "NAME: ..." of a file. InputError if it cannot be read."""
+    """Read the numbers of each line "NAME: ..." of a file. Raises InputError if it cannot be read."""
     values = {}
     for line in read_text(path, noun="the calibration").splitlines():
         # Some names in the tracking benchmark have no colon.
@@ -83,11 +84,14 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
 
 
 def get_matrix(values: dict, path: Path, name: str, shape: tuple[int, ...], alternative: str = "") -> np.ndarray:
-    """Return the matrix called `name` or `alternative`. InputError if both are missing."""
+    """Return the matrix with a name or an alternative name.
+
+    Raises InputError if it is missing or invalid.
+    """
     matrix = values.get(name, values.get(alternative))
     if matrix is None or matrix.size != np.prod(shape) or not np.isfinite(matrix).all():
         raise InputError(
-            f"{path} has no {name} of {int(np.prod(shape))} finite numbers; download KITTI's calibration again"
+            f"{path} has no {name} with {int(np.prod(shape))} finite numbers; download KITTI's calibration again"
         )
     return matrix.reshape(shape)
 
@@ -98,14 +102,14 @@ def _make_pose(path: Path, rectify: np.ndarray, velodyne: np.ndarray) -> np.ndar
 
 
 def check_pose(pose: np.ndarray, path: Path) -> np.ndarray:
-    """Return a pose (4, 4); raise InputError that names the file if it is not rigid."""
+    """Return a pose (4, 4) from a file; raise InputError if it is not rigid."""
     rotation = pose[:3, :3]
     if not (
         np.isfinite(pose).all()
         and np.allclose(rotation @ rotation.T, np.eye(3), atol=MAX_SKEW)
         and np.linalg.det(rotation) > 0
     ):
-        raise InputError(f"a pose in {path} is not a rotation and translation; download it again")
+        raise InputError(f"a pose in {path} is not a rigid transform; download the file again")
     return pose
 
 

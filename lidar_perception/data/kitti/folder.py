@@ -23,7 +23,7 @@ START_NS = 1_316_995_200 * 10**9  # 26 September 2011, the first day of KITTI's 
 PERIOD_NS = 10**8  # the sensor rotates at 10 Hz
 GAP_NS = 10 * 10**9  # time inserted between the drives of a recording
 OBJECT_DATA = "object data"  # name of the layout with unrelated frames
-SCAN_FOLDERS = ("velodyne_reduced", "velodyne")  # folder names; the last one, with full scans, is preferred
+SCAN_FOLDERS = ("velodyne_reduced", "velodyne")  # names of scan folders; the last one, with full scans, is preferred
 
 
 def read_velodyne(path: Path) -> np.ndarray:
@@ -39,12 +39,12 @@ def load_velodyne(path: Path, stamp_ns: int, scale: Callable[[], float]) -> Poin
 def make_velodyne_scale_reader(scans: Sequence[Path]) -> Callable[[], float]:
     """Return a function that infers the intensity scale of .bin files, see make_scale_reader.
 
-    It is 1 for KITTI's own scans; other recordings in its layout may have another one.
+    The scale is 1 for KITTI's scans, but may differ for other recordings in the same layout.
     """
     return make_scale_reader(scans, lambda path: (read_velodyne(path)[:, 3], np.dtype(np.float32)))
 
 
-def is_layout(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Return True for a folder in the object or tracking layout, even without scans."""
     return any((folder / name).is_dir() for folder in (path / "training", path) for name in (*SCAN_FOLDERS, "label_2"))
 
@@ -59,23 +59,23 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
         scans: False to include frames of the object layout that have labels but no scan.
 
     Raises:
-        InputError: there are no scans; the message names the expected folders.
+        InputError: the folder has no scans.
     """
     names = SCAN_FOLDERS if scans else (*SCAN_FOLDERS, "label_2")
     folder = next(
         (folder for folder in (path / "training", path) if any((folder / name).is_dir() for name in names)), path
     )
-    tracking = (folder / "label_02").is_dir() or any(any(folder.glob(f"{name}/*/")) for name in SCAN_FOLDERS)
-    frames = _make_tracking_frames(folder) if tracking else _make_object_frames(folder, scans)
+    is_tracking = (folder / "label_02").is_dir() or any(any(folder.glob(f"{name}/*/")) for name in SCAN_FOLDERS)
+    frames = _make_tracking_frames(folder) if is_tracking else _make_object_frames(folder, scans)
     if not frames:
         raise InputError(
             f"{path} has no KITTI scans: expected training/velodyne/*.bin (object) or "
             "training/velodyne/0000/*.bin (tracking)"
         )
-    labelled = (folder / "label_02").is_dir() or (folder / "label_2").is_dir()
+    has_labels = (folder / "label_02").is_dir() or (folder / "label_2").is_dir()
     missing = (
         _find_missing_tracking_scans(folder, frames)
-        if tracking
+        if is_tracking
         else [
             (label.stem, str(label))
             for label in sorted(folder.glob("label_2/*.txt"))
@@ -84,11 +84,11 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
     )
     return Recording(
         path,
-        f"KITTI {'tracking data' if tracking else OBJECT_DATA}",
+        f"KITTI {'tracking data' if is_tracking else OBJECT_DATA}",
         frames,
-        frozenset({CAMERA} | ({BOXES} if labelled else set())),
+        frozenset({CAMERA} | ({BOXES} if has_labels else set())),
         tuple((name, f"{label} has no scan; download it again") for name, label in missing) if scans else (),
-        is_sequential=tracking,
+        is_sequential=is_tracking,
     )
 
 
@@ -181,24 +181,26 @@ def _read_tracking_truth(calibration: Callable[[], Calibration], label: Path) ->
 def make_truth_reader(
     path: Path, read: Callable[[Path], dict[int, GroundTruth]]
 ) -> Callable[[int], GroundTruth | None]:
-    """Return a function that returns the labels of a frame by its number, or None without a file.
+    """Return a function that returns the labels of a frame, given its number.
 
-    The label file of the drive is read once.
+    The label file of the drive is read once. If it does not exist, the function returns None.
     """
     labels = functools.cache(partial(read, path))
 
-    def truth(number: int) -> GroundTruth | None:
+    def read_truth(number: int) -> GroundTruth | None:
         return labels().get(number, _NO_OBJECTS) if path.exists() else None
 
-    return truth
+    return read_truth
 
 
 def parse_scan_number(scan: Path) -> int:
-    """Return the number in the file name of a scan. InputError if it is not a number."""
+    """Return the number in the file name of a scan. Raises InputError if the name is not a number."""
     try:
         return int(scan.stem)
     except ValueError:
-        raise InputError(f"{scan} is not a KITTI scan: its name is not a number; move it to another folder") from None
+        raise InputError(
+            f"{scan} is not a KITTI scan: its file name is not a number; move it to another folder"
+        ) from None
 
 
 _NO_OBJECTS = GroundTruth.of([], [])

@@ -1,4 +1,4 @@
-"""KITTI-360: raw scans of the Velodyne, with poses and the calibration of the left camera.
+"""KITTI-360 recordings: raw scans of the Velodyne, poses, and the calibration of the left camera.
 
 Liao et al., TPAMI 2022; the scripts at github.com/autonomousvision/kitti360Scripts define the
 matrices.
@@ -23,7 +23,7 @@ from lidar_perception.types import InputError
 SCAN_FOLDER, CALIBRATION_FOLDER, POSE_FILES = "data_3d_raw", "calibration", ("cam0_to_world.txt", "poses.txt")
 
 
-def is_layout(path: Path) -> bool:
+def can_open(path: Path) -> bool:
     """Return True for the folder with data_3d_raw/, for data_3d_raw/, and for a drive in it."""
     return _find_root(path) is not None
 
@@ -41,9 +41,9 @@ def _find_root(path: Path) -> Path | None:
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the scans of all drives in order of time; only the file lists and time stamps are read.
+    """Open the scans of all drives in order of time; only file lists and time stamps are read.
 
-    Poses come from data_poses/ and the camera from calibration/, if they exist.
+    Poses are read from data_poses/ and the camera from calibration/, if these folders exist.
     """
     root = _find_root(path)
     assert root is not None
@@ -131,7 +131,7 @@ def _get_pose(poses: Callable[[], dict[int, np.ndarray]], number: int) -> np.nda
 
 
 def _read_rows(path: Path, columns: int) -> np.ndarray:
-    """Read rows of numbers, (N, columns). Raises InputError if the file has other contents."""
+    """Read rows of numbers, (N, columns). Raises InputError if a row has another format."""
     rows = [line.split() for line in read_text(path, noun="the matrices").splitlines()]
     try:
         matrix = np.array([row for row in rows if row], float).reshape(-1, columns)

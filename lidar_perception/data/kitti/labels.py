@@ -1,6 +1,7 @@
 """Lossless conversion between KITTI's labels and GroundTruth in the LiDAR frame.
 
-The files are label_2 (object), label_02 (tracking) and tracklet_labels.xml (raw).
+KITTI has label files in the folders label_2 (object) and label_02 (tracking), and
+tracklet_labels.xml (raw).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from lidar_perception.types import CLASSES, MAX_NUMBER, GroundTruth, InputError,
 # Columns of a label file after the class, in order, stored in GroundTruth.extras.
 COLUMNS = ("truncated", "occluded", "alpha", "bbox", "dimensions", "location", "rotation_y")
 NAME_BY_TRACKING_NAME = {"Person": "Person_sitting"}  # name in the tracking benchmark -> name in the object benchmark
-# An unlabelled region: only its 2D box is known.
+# Columns of DontCare, an unlabelled region of which only the 2D box is known.
 DONT_CARE = {
     "track_id": -1,
     "truncated": -1.0,
@@ -31,12 +32,12 @@ DONT_CARE = {
 
 
 def read_object_labels(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
-    """Read the objects of a label_2 file, given the transform (4, 4) from LiDAR to camera."""
+    """Read the objects in a label_2 file, given the transform (4, 4) from LiDAR to camera."""
     return to_ground_truth([label for _, label in parse_lines(path)], lidar_to_camera)
 
 
 def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray, known_only: bool = False) -> dict[int, GroundTruth]:
-    """Read the objects of a label_02 file by frame number; frames without objects are left out."""
+    """Read the objects in a label_02 file by frame number; frames without objects are left out."""
     frames: dict[int, list[dict]] = {}
     for _, frame, label in parse_tracking_lines(path, known_only):
         frames.setdefault(frame, []).append(label)
@@ -47,7 +48,7 @@ def parse_lines(path: Path, known_only: bool = False) -> list[tuple[int, dict]]:
     """Parse all lines of a label_2 or result file.
 
     Returns:
-        (line number from 1, label as of parse_label) for each line.
+        (line number starting at 1, label as returned by parse_label) of each line.
     """
     return [(i, parse_label(line, path, i, known_only)) for i, line in _read_lines(path)]
 
@@ -56,7 +57,8 @@ def parse_tracking_lines(path: Path, known_only: bool = False) -> list[tuple[int
     """Parse all lines of a label_02 file.
 
     Returns:
-        (line number from 1, frame number, label as of parse_label with track_id) for each line.
+        (line number starting at 1, frame number, label as returned by parse_label, with track_id)
+        of each line.
     """
     labels = []
     for i, line in _read_lines(path):
@@ -71,16 +73,19 @@ def parse_tracking_lines(path: Path, known_only: bool = False) -> list[tuple[int
 
 
 def parse_label(line: str, path: Path | str = "label", number: int = 0, known_only: bool = False) -> dict:
-    """Parse a label line to a dict of class, COLUMNS, and score if the line has one.
+    """Parse a label line to a dict with the class, COLUMNS, and the score if the line has one.
 
-    The class is the name in CLASSES, ignoring case as KITTI's own program does, else the text of
-    the line. Raises InputError for other lines, and if known_only, for unknown classes.
+    The class is matched to CLASSES, ignoring case as KITTI's program does; an unknown name is kept
+    as written.
+
+    Raises:
+        InputError: the line is malformed, or known_only is set and the class is unknown.
     """
     words = line.split()
-    first = next((i for i, word in enumerate(words[1:], 1) if _is_number(word)), 1)
-    text = " ".join(words[:first])  # some tools write class names with spaces
+    first_number = next((i for i, word in enumerate(words[1:], 1) if _is_number(word)), 1)
+    text = " ".join(words[:first_number])  # some tools write class names with spaces
     try:
-        numbers = [float(w) for w in words[first:]]
+        numbers = [float(w) for w in words[first_number:]]
         if len(numbers) not in (14, 15) or not all(abs(n) <= MAX_NUMBER for n in numbers):
             raise ValueError
     except ValueError:
@@ -134,9 +139,11 @@ def to_ground_truth(labels: list[dict], lidar_to_camera: np.ndarray) -> GroundTr
 
 
 def to_lidar_box(label: dict, to_lidar: np.ndarray) -> list[float] | None:
-    """Return [x y z l w h yaw] of a label in the LiDAR frame; None without a 3D box.
+    """Return the box [x y z l w h yaw] of a label in the LiDAR frame; None if it has no 3D box.
 
-    `to_lidar` is the transform (4, 4) from camera to LiDAR.
+    Args:
+        label: result of parse_label.
+        to_lidar: (4, 4) transform from camera to LiDAR.
     """
     h, w, length = label["dimensions"]
     if min(h, w, length) <= 0:
@@ -148,9 +155,9 @@ def to_lidar_box(label: dict, to_lidar: np.ndarray) -> list[float] | None:
 
 
 def to_labels(truth: GroundTruth, lidar_to_camera: np.ndarray) -> list[dict]:
-    """Convert GroundTruth to labels, the inverse of to_ground_truth up to order (notes come last).
+    """Convert GroundTruth to labels: the inverse of to_ground_truth, except that notes come last.
 
-    Columns that extras lack are computed from the box; the 2D box is then zero.
+    Columns that are missing in extras are computed from the box; a missing 2D box is 0.
     """
     labels = []
     for box, name, extra in zip(truth.boxes, truth.labels, truth.extras):
@@ -165,15 +172,14 @@ def to_labels(truth: GroundTruth, lidar_to_camera: np.ndarray) -> list[dict]:
 
 
 def to_camera_box(box: np.ndarray, lidar_to_camera: np.ndarray) -> dict:
-    """Return dimensions, location, rotation_y and alpha of a LiDAR box (7,), the inverse of
-    to_lidar_box.
+    """Return the columns of a box (7,) in the LiDAR frame, the inverse of to_lidar_box.
 
     Truncation, occlusion and the 2D box are 0.
     """
     x, y, z, length, w, h, yaw = (float(v) for v in box)
     centre = lidar_to_camera @ [x, y, z, 1.0]
-    # Rotation about the camera's y axis that corresponds to this yaw in the LiDAR frame; the vertical axes
-    # of camera and LiDAR are not parallel.
+    # Find the rotation about the camera's y axis that corresponds to this yaw in the LiDAR frame. The
+    # vertical axes of camera and LiDAR are not parallel.
     right, ahead = lidar_to_camera[0, :2], lidar_to_camera[2, :2]
     rotation = float(
         np.arctan2(right[1] * np.cos(yaw) - right[0] * np.sin(yaw), ahead[1] * np.cos(yaw) - ahead[0] * np.sin(yaw))
@@ -193,17 +199,19 @@ def to_camera_box(box: np.ndarray, lidar_to_camera: np.ndarray) -> dict:
     }
 
 
-def format_label(label: dict, decimals: int = 2, whole: bool = True) -> str:
-    """Return the label_2 line of a label.
+def format_label(label: dict, decimals: int = 2, object_layout: bool = True) -> str:
+    """Format a label as a line of a label_2 file.
 
-    With `whole`, the -1, -10 and -1000 of DontCare are written as integers, as in the object
-    layout.
+    Args:
+        decimals: number of decimals.
+        object_layout: True to write the -1, -10 and -1000 of DontCare as integers, as in the object
+            layout.
     """
     numbers = [label["alpha"], *label["bbox"], *label["dimensions"], *label["location"], label["rotation_y"]] + (
         [label["score"]] if "score" in label else []
     )
     words = [label["class"], label["truncated"], str(label["occluded"]), *numbers]
-    if label["class"] == "DontCare" and whole:
+    if label["class"] == "DontCare" and object_layout:
         return " ".join(
             f"{w:g}" if w in (-1, -10, -1000) else f"{w:.{decimals}f}" if isinstance(w, float) else w for w in words
         )
@@ -211,14 +219,14 @@ def format_label(label: dict, decimals: int = 2, whole: bool = True) -> str:
 
 
 def read_tracklets(path: Path) -> dict[int, GroundTruth]:
-    """Read tracklet_labels.xml of a raw drive of KITTI, or exported by CVAT or Datumaro.
+    """Read a tracklet_labels.xml of KITTI's raw drives, or one exported by CVAT or Datumaro.
 
     Returns:
         The objects in the LiDAR frame by frame number. Unknown classes become Misc, with their name
         as class_name. Objects without a positive size become notes.
 
     Raises:
-        InputError: the file is not such an XML file.
+        InputError: the file cannot be read, or has another format.
     """
     frames: dict[int, tuple[list, list]] = {}
     try:
@@ -226,14 +234,14 @@ def read_tracklets(path: Path) -> dict[int, GroundTruth]:
         for track, item in enumerate(tracklets.iterfind("item")):
             text = _find_text(item, "objectType").strip()
             h, w, length = (float(_find_text(item, k)) for k in "hwl")
-            first = int(item.findtext("first_frame") or 0)
+            first_frame = int(item.findtext("first_frame") or 0)
             for i, pose in enumerate(_find_child(item, "poses").iterfind("item")):
                 x, y, z, yaw = (float(_find_text(pose, k)) for k in ("tx", "ty", "tz", "rz"))
                 occluded, truncated = (_parse_state(pose, k) for k in ("occlusion", "truncation"))
                 if truncated is None:
                     continue
                 extra = {"track_id": track, "occluded": int(occluded or 0), "truncated": truncated}
-                boxes, notes = frames.setdefault(first + i, ([], []))
+                boxes, notes = frames.setdefault(first_frame + i, ([], []))
                 if min(h, w, length) <= 0:
                     notes.append((find_class_name(text), extra))
                 else:
@@ -253,9 +261,9 @@ def _to_tracklet_truth(rows: list, notes: list) -> GroundTruth:
 
 
 def _parse_state(pose: ElementTree.Element, name: str) -> float | None:
-    """Return the occlusion or truncation of a pose; 0 if it has none.
+    """Return the occlusion or truncation of a pose; 0 if it is missing.
 
-    None for boxes with which Datumaro fills the gaps of a track; their states are names.
+    Returns None for the boxes with which Datumaro fills the gaps of a track; their states are names.
     https://github.com/openvinotoolkit/datumaro/blob/develop/src/datumaro/plugins/data_formats/kitti_raw/exporter.py
     """
     text = (pose.findtext(name) or "0").strip()

@@ -29,11 +29,11 @@ from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
 CALIBRATION_FILE, TIMES_FILE, POSES_FILE = SEQUENCE_FILES = ("calib.txt", "times.txt", "poses.txt")
-SINCE_1970 = 10**9  # in seconds; larger times are Unix times, others count from the start of the sequence
+MIN_UNIX_TIME_S = 10**9  # larger times are Unix times; smaller times count from the start of the sequence
 
 
-def is_layout(path: Path) -> bool:
-    """Return True for a folder with sequences/ or dataset/sequences/, for sequences/, and for a
+def can_open(path: Path) -> bool:
+    """Return True for a folder with sequences/ or dataset/sequences/, for sequences/, or for a single
     sequence."""
     return any((path / folder).is_dir() for folder in ("sequences", "dataset/sequences")) or any(
         map(_is_sequence, (path, *path.glob("*/")))
@@ -47,7 +47,7 @@ def _is_sequence(path: Path) -> bool:
 
 
 def list_sequences(path: Path) -> list[Path]:
-    """Return the sequence folders at a path that is_layout accepts, sorted by name."""
+    """Return the sequence folders at a path that can_open accepts, sorted by name."""
     path = path.absolute()
     for folder in (path / "dataset/sequences", path / "sequences"):
         if folder.is_dir():
@@ -56,9 +56,9 @@ def list_sequences(path: Path) -> list[Path]:
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the scans of sequences/NN/velodyne; only the file lists and the times are read.
+    """Open the scans of sequences/NN/velodyne; only file lists and times are read.
 
-    Poses come from sequences/NN/poses.txt or poses/NN.txt.
+    Poses are read from sequences/NN/poses.txt or poses/NN.txt.
     """
     sequences = [s for s in list_sequences(path) if any(s.glob("velodyne/*.bin"))]
     if not sequences:
@@ -72,17 +72,17 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
             "them too"
         )
     frames, has_times = make_frames(sequences)
-    has = {POSES} if any(find_pose_file(s) for s in sequences) else set()
+    contents = {POSES} if any(find_pose_file(s) for s in sequences) else set()
     if any((s / CALIBRATION_FILE).is_file() for s in sequences):
-        has.add(CAMERA)
-    return Recording(path, "KITTI odometry", frames, frozenset(has), has_times=has_times)
+        contents.add(CAMERA)
+    return Recording(path, "KITTI odometry", frames, frozenset(contents), has_times=has_times)
 
 
 def make_frames(sequences: list[Path]) -> tuple[list[Frame], bool]:
-    """Make the frames of sequences with scans, GAP_NS between two sequences.
+    """Make the frames of sequences, with a gap of GAP_NS between two sequences.
 
     Returns:
-        The frames, and True if the times of all of them are recorded; otherwise 10 Hz is assumed.
+        The frames, and True if the times of all frames are recorded; otherwise 10 Hz is assumed.
     """
     frames: list[Frame] = []
     has_times = True
@@ -99,14 +99,14 @@ def make_frames(sequences: list[Path]) -> tuple[list[Frame], bool]:
             if calib.is_file()
             else return_none
         )
-        if times and times[0] > SINCE_1970 * 10**9:
+        if times and times[0] > MIN_UNIX_TIME_S * 10**9:
             start = 0
         for scan in files:
             number = parse_scan_number(scan)
             if times and number >= len(times):
                 raise InputError(
-                    f"{sequence / TIMES_FILE} has only {len(times)} lines, but there is a scan {number}; "
-                    "download it again"
+                    f"{sequence / TIMES_FILE} has only {len(times)} lines, so scan {number} has no time; "
+                    "download the file again"
                 )
             stamp = start + (times[number] if times else (number - parse_scan_number(files[0])) * PERIOD_NS)
             frames.append(
@@ -137,7 +137,7 @@ def _read_times(path: Path) -> list[int]:
 
 
 def find_pose_file(sequence: Path) -> Path | None:
-    """Return the file with the poses of a sequence, or None."""
+    """Return the pose file of a sequence, or None."""
     files = (sequence / POSES_FILE, sequence.parents[1] / f"poses/{sequence.name}.txt")
     return next((file for file in files if file.is_file()), None)
 
@@ -146,8 +146,8 @@ def _read_poses(sequence: Path) -> tuple[np.ndarray, Path, list[str]] | None:
     """Read the poses of a sequence.
 
     Returns:
-        Pose (4, 4) of the LiDAR in the camera frame, the file of poses, and its lines. None without
-        a file of poses.
+        Pose (4, 4) of the LiDAR in the camera frame, the pose file, and its lines; None without a
+        pose file.
     """
     if (poses := find_pose_file(sequence)) is None:
         return None
@@ -160,7 +160,7 @@ def _read_poses(sequence: Path) -> tuple[np.ndarray, Path, list[str]] | None:
 def _parse_pose(poses: Callable[[], tuple[np.ndarray, Path, list[str]] | None], i: int) -> np.ndarray | None:
     """Return the pose (4, 4) of scan i in the frame of scan 0; None without poses.
 
-    Line i of the file has the pose of the camera. Raises InputError if it is missing or invalid.
+    Line i of the file is the pose of the camera. Raises InputError if it is missing or invalid.
     """
     if (content := poses()) is None:
         return None

@@ -32,8 +32,8 @@ SCAN_FOLDER = "velodyne_points/data"
 TRACKLETS, FRAME_LIST = "tracklet_labels.xml", "frame_list.txt"
 
 
-def is_layout(path: Path) -> bool:
-    """Return True for a drive, a day, and a folder of days."""
+def can_open(path: Path) -> bool:
+    """Return True for a drive, a day with drives, or a folder of days."""
     return bool(list_drives(path))
 
 
@@ -43,16 +43,16 @@ def list_drives(path: Path) -> list[Path]:
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the drives in order of time; only the file lists and time stamps are read."""
+    """Open the drives in order of time; only file lists and time stamps are read."""
     drives = list_drives(path.absolute())
-    with_camera = {drive: any((drive.parent / name).exists() for name in RAW_CALIB) for drive in drives}
+    has_camera = {drive: any((drive.parent / name).exists() for name in RAW_CALIB) for drive in drives}
     # A drive with a calibration comes from KITTI and has time stamps.
-    frames, has_times = make_frames(drives, need_stamps=with_camera)
+    frames, has_times = make_frames(drives, need_stamps=has_camera)
     if not frames:
         raise InputError(f"{path} has no KITTI scans: expected DATE/DRIVE_sync/{SCAN_FOLDER}/*.bin")
     labels = {drive: make_truth_reader(drive / TRACKLETS, read_tracklets) for drive in drives}
     calibrations = {
-        drive: functools.cache(partial(read_raw_calibration, drive.parent)) if with_camera[drive] else return_none
+        drive: functools.cache(partial(read_raw_calibration, drive.parent)) if has_camera[drive] else return_none
         for drive in drives
     }
     frames = [
@@ -69,20 +69,21 @@ def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recordin
         path,
         "KITTI raw drives",
         frames,
-        frozenset([CAMERA] * any(with_camera.values()) + [BOXES] * has_labels),
+        frozenset([CAMERA] * any(has_camera.values()) + [BOXES] * has_labels),
         has_times=has_times,
     )
 
 
 def make_frames(drives: Sequence[Path], need_stamps: dict[Path, bool] | None = None) -> tuple[list[Frame], bool]:
-    """Make the frames of drives with scans in SCAN_FOLDER, in order of time, without labels and camera.
+    """Make the frames of drives in order of time, without labels and camera.
 
     Args:
-        need_stamps: drives that must have time stamps, as {drive: True}.
+        drives: folders with scans in SCAN_FOLDER.
+        need_stamps: True for each drive that must have time stamps.
 
     Returns:
-        The frames, with the folder of the drive as `native`, and False if 10 Hz is assumed for a
-        drive without times.
+        The frames, with the folder of the drive as `native`, and False if a drive has no time
+        stamps and 10 Hz is assumed.
 
     Raises:
         InputError: required time stamps are missing.
@@ -116,7 +117,7 @@ def make_frames(drives: Sequence[Path], need_stamps: dict[Path, bool] | None = N
 
 
 def list_scans(drive: Path) -> list[Path]:
-    """Return the scans of a drive by name; one per name if it exists with several suffixes."""
+    """Return the scans of a drive, sorted by name, and only one of scans that differ in the suffix."""
     files = {
         file.stem: file
         for suffix in SUFFIXES
@@ -139,14 +140,15 @@ def _read_numbers(drive: Path, files: Sequence[Path]) -> list[int]:
         return [parse_scan_number(file) for file in files]
     numbers = read_frame_list(path)
     if unknown := [file.name for file in files if file.stem not in numbers]:
-        raise InputError(f"{path} does not name {unknown[0]}; export the drive again")
+        raise InputError(f"{path} does not list {unknown[0]}; export the drive again")
     return [numbers[file.stem] for file in files]
 
 
 def read_frame_list(path: Path) -> dict[str, int]:
-    """Read lines "NUMBER NAME"; return the numbers of scans by name without folder and suffix.
+    """Read a file with lines "NUMBER NAME" and return the number of each scan.
 
-    Raises InputError if a line has another format.
+    Scans are identified by their name without folder and suffix. Raises InputError if a line has
+    another format.
     """
     rows = [
         line.split(maxsplit=1)
@@ -156,20 +158,20 @@ def read_frame_list(path: Path) -> dict[str, int]:
     try:
         return {Path(name.strip()).name: int(number) for number, name in rows}
     except ValueError as error:
-        raise InputError(f"{path} has a line other than NUMBER NAME ({error}); export the drive again") from None
+        raise InputError(f"{path} has a line that is not NUMBER NAME ({error}); export the drive again") from None
 
 
 def _read_stamps(drive: Path, numbers: Sequence[int], required: bool) -> list[int]:
     """Read timestamps.txt of a drive, with lines such as 2011-09-26 13:02:25.594360375 (UTC).
 
-    Line i belongs to scan number i, and is blank if the scan is missing; in files without blank
+    Line i belongs to scan number i, and is blank if the scan is missing. In files without blank
     lines, the i-th line belongs to the i-th scan.
 
     Returns:
-        Stamps in ns of the scans with these numbers; [] if the file does not exist.
+        The stamps in ns of the scans with these numbers; [] if the file does not exist.
 
     Raises:
-        InputError: the file is malformed, or required and missing.
+        InputError: the file is malformed, or is required and does not exist.
     """
     path = drive / "velodyne_points/timestamps.txt"
     if not (required or path.exists()):
@@ -180,7 +182,7 @@ def _read_stamps(drive: Path, numbers: Sequence[int], required: bool) -> list[in
         stamp_lines = [lines[number] for number in numbers]
     elif len(stamp_lines) != len(numbers):
         missing = next(n for n in numbers if not (0 <= n < len(lines) and lines[n]))
-        raise InputError(f"{path} has {len(lines)} lines, but none for scan {missing}; download the drive again")
+        raise InputError(f"{path} has no line for scan {missing} ({len(lines)} lines); download the drive again")
     try:
         return [_parse_stamp(line) for line in stamp_lines]
     except ValueError as error:

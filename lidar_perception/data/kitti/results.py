@@ -1,7 +1,7 @@
-"""Result files of KITTI's object and tracking benchmarks.
+"""Reader and writer of result files of KITTI's object and tracking benchmarks.
 
-Object: one file per frame, with a label line and score per detection. Tracking: one file per
-sequence, with frame number and track id before the label.
+The object benchmark has one file per frame, with a label line and score per detection. The tracking
+benchmark has one file per sequence, with frame number and track id before the label.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lidar_perception.runs.files import write_text
 from lidar_perception.types import Detections, GroundTruth, InputError
 
 RESULT_FOLDER = "kitti"  # subfolder for result files in the folder of a run
-DECIMALS = 6  # with fewer, the order of weak scores and overlaps would change
+DECIMALS = 6  # number of decimals; fewer would change the order of low scores and overlaps
 
 
 def find_result_folder(folder: Path) -> Path:
@@ -33,7 +33,7 @@ def find_result_folder(folder: Path) -> Path:
 
 
 def choose_calibration(frame: Frame) -> tuple[Calibration, bool]:
-    """Return the calibration for the result file of a frame, and True if it is a nominal one."""
+    """Return the calibration for the result file of a frame, and True if it is the nominal camera."""
     try:
         calibration = frame.calibration()
     except InputError:
@@ -52,21 +52,22 @@ def read_results(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
     """
     if not path.exists():
         raise InputError(
-            f"the result file {path} does not exist; a frame without detections needs "
-            "an empty file, and --split selects the frames to score"
+            f"the result file {path} does not exist; add an empty file if the frame has no detections, "
+            "or choose the frames to score with --split"
         )
     labels = []
     for number, label in parse_lines(path, known_only=True):
         if "score" not in label:
-            raise InputError(f"{path}:{number} is not a result: the score, the 15th number after the class, is missing")
+            raise InputError(f"{path}:{number} has no score, the 15th number after the class; add it")
         labels.append(label)
     return to_ground_truth(labels, lidar_to_camera)
 
 
 def write_results(path: Path, detections: Detections, calibration: Calibration) -> None:
-    """Write the result file of one frame. InputError if it cannot be written.
+    """Write the result file of one frame. Raises InputError if it cannot be written.
 
-    Truncation and occlusion are -1. The 2D box is the projected box; it is 0 outside the image.
+    Truncation and occlusion are -1. The 2D box is the projection of the 3D box, or 0 if it is
+    outside the image.
     """
     write_text(
         path, "".join(format_label(label, DECIMALS) + "\n" for label in _to_result_labels(detections, calibration))

@@ -1,9 +1,9 @@
-"""Writing of scans and labels in KITTI's object and tracking layouts.
+"""Writer of scans and labels in KITTI's object and tracking layouts.
 
-The development kits' readme files define the columns. KITTI labels what its colour camera sees:
-here every object that is partly in the image. Compared with the 250 labels of 57 frames of KITTI,
-the worst edge of a 2D box differs by 0.35 pixels (median; 90 %: 1.6), and the truncation by 0.06 at
-most.
+The readme files of the development kits define the columns. KITTI labels the objects that its
+colour camera sees; here, these are all objects that are at least partly in the image. On the 250
+labels of 57 KITTI frames, the worst edge of a computed 2D box differs from the label by 0.35 pixels
+(median; 90th percentile 1.6), and the truncation by at most 0.06.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ MIN_DEPTH_M = 0.1  # minimum distance from the camera of points in the image
 MIN_PIXELS = 2  # minimum width and height of a 2D box
 TRACKING_NAME_BY_NAME = {name: alias for alias, name in NAME_BY_TRACKING_NAME.items()}
 
-# Twelve edges between the corners of box_corners: bottom, top, vertical.
+# Twelve edges as pairs of corners (see box_corners): bottom, top, vertical.
 EDGES = np.array([(i + up, (i + 1) % 4 + up) for up in (0, 4) for i in range(4)] + [(i, i + 4) for i in range(4)])
-# Pose of the IMU of KITTI's car, 0.81 m behind the LiDAR, required in calibration files.
+# Pose of the IMU in KITTI's car, 0.81 m behind the LiDAR, which calibration files must contain.
 IMU_TO_LIDAR = np.column_stack([np.eye(3), [-0.81, 0.32, -0.80]])
 
 
@@ -33,47 +33,48 @@ def project_boxes(boxes: np.ndarray, calibration: Calibration) -> tuple[np.ndarr
 
     Returns:
         2D boxes (K, 4) [left top right bottom] in pixels, clipped to the image, and the fraction
-        (K,) of each unclipped 2D box that is outside the image. NaN and 1 for a box that is not in
-        the image.
+        (K,) of each unclipped 2D box that is outside the image. For a box that is not in the image,
+        they are NaN and 1.
     """
     corners = np.concatenate([box_corners(boxes), np.ones((len(boxes), 8, 1))], axis=2)
     ends = (corners @ calibration.lidar_to_camera.T)[:, EDGES]  # (K, 12, 2, 4)
-    others = ends[..., ::-1, :]
-    depth, other = ends[..., 2], others[..., 2]
-    crosses = (depth < MIN_DEPTH_M) & (other > MIN_DEPTH_M)
-    to_plane = (MIN_DEPTH_M - depth) / np.where(crosses, other - depth, 1.0)
-    clipped = np.where(crosses[..., None], ends + to_plane[..., None] * (others - ends), ends)
-    in_front = ((depth >= MIN_DEPTH_M) | crosses)[..., None]
-    pixels = clipped @ calibration.intrinsics.T
+    other_ends = ends[..., ::-1, :]
+    depth, other_depth = ends[..., 2], other_ends[..., 2]
+    is_crossing = (depth < MIN_DEPTH_M) & (other_depth > MIN_DEPTH_M)
+    fraction = (MIN_DEPTH_M - depth) / np.where(is_crossing, other_depth - depth, 1.0)
+    clipped_ends = np.where(is_crossing[..., None], ends + fraction[..., None] * (other_ends - ends), ends)
+    in_front = ((depth >= MIN_DEPTH_M) | is_crossing)[..., None]
+    pixels = clipped_ends @ calibration.intrinsics.T
     pixels = pixels[..., :2] / np.where(in_front, pixels[..., 2:], 1.0)
     low = np.where(in_front, pixels, np.inf).min(axis=(1, 2))
     high = np.where(in_front, pixels, -np.inf).max(axis=(1, 2))
-    last = np.array([calibration.width, calibration.height]) - 1
-    clipped_low, clipped_high = np.clip(low, 0, last), np.clip(high, 0, last)
+    max_pixel = np.array([calibration.width, calibration.height]) - 1
+    clipped_low, clipped_high = np.clip(low, 0, max_pixel), np.clip(high, 0, max_pixel)
     in_image = ((clipped_high - clipped_low) >= MIN_PIXELS).all(axis=1)
     with np.errstate(invalid="ignore"):
-        outside = 1 - np.prod(clipped_high - clipped_low, axis=1) / np.prod(high - low, axis=1)
+        outside_fraction = 1 - np.prod(clipped_high - clipped_low, axis=1) / np.prod(high - low, axis=1)
     boxes_2d = np.concatenate([clipped_low, clipped_high], axis=1)
-    return np.where(in_image[:, None], boxes_2d, np.nan), np.where(in_image, outside, 1.0)
+    return np.where(in_image[:, None], boxes_2d, np.nan), np.where(in_image, outside_fraction, 1.0)
 
 
 def keep_visible_objects(truth: GroundTruth, calibration: Calibration) -> GroundTruth:
-    """Return the objects that are partly in the image, with bbox and truncated as in KITTI."""
-    boxes, outside = project_boxes(truth.boxes, calibration)
-    visible = np.flatnonzero(np.isfinite(boxes[:, 0]))
-    extras = [dict(truth.extras[i], bbox=boxes[i].tolist(), truncated=float(outside[i])) for i in visible]
-    return GroundTruth.of(truth.boxes[visible], truth.class_ids[visible], extras)
+    """Return the objects that are at least partly in the image, with bbox and truncated as in KITTI."""
+    boxes_2d, outside_fractions = project_boxes(truth.boxes, calibration)
+    indices = np.flatnonzero(np.isfinite(boxes_2d[:, 0]))
+    extras = [dict(truth.extras[i], bbox=boxes_2d[i].tolist(), truncated=float(outside_fractions[i])) for i in indices]
+    return GroundTruth.of(truth.boxes[indices], truth.class_ids[indices], extras)
 
 
 def format_object_labels(truth: GroundTruth, calibration: Calibration) -> str:
-    """Return the text of a label_2 file, with two decimals."""
+    """Format the text of a label_2 file, with two decimals."""
     return "".join(f"{format_label(label)}\n" for label in to_labels(truth, calibration.lidar_to_camera))
 
 
 def format_tracking_labels(number: int, truth: GroundTruth, calibration: Calibration) -> str:
-    """Return the lines of a frame in a label_02 file, with six decimals; each extra has a track_id.
+    """Format the lines of a frame in a label_02 file, with six decimals.
 
-    Truncation is a level here: 0, 1 or 2 for a fraction of about 0, 0.5 or 1.
+    Each dict in truth.extras must have a track_id. Truncation is written as a level: 0, 1 or 2 for
+    fractions near 0, 0.5 and 1.
     """
     return "".join(
         format_tracking_line(
@@ -84,13 +85,13 @@ def format_tracking_labels(number: int, truth: GroundTruth, calibration: Calibra
 
 
 def format_tracking_line(number: int, track: int, label: dict) -> str:
-    """Return a label as a line of the tracking benchmark's files, with six decimals."""
+    """Format a label as a line in the files of the tracking benchmark, with six decimals."""
     name = TRACKING_NAME_BY_NAME.get(label["class"], label["class"])
-    return f"{number} {track} {format_label({**label, 'class': name}, 6, whole=False)}\n"
+    return f"{number} {track} {format_label({**label, 'class': name}, 6, object_layout=False)}\n"
 
 
 def format_calibration(calibration: Calibration) -> str:
-    """Return the text of a calib file, with four identical rectified cameras."""
+    """Format the text of a calib file, with four identical rectified cameras."""
     matrices = {
         **{f"P{i}": calibration.intrinsics for i in range(4)},
         "R0_rect": np.eye(3),
@@ -101,17 +102,17 @@ def format_calibration(calibration: Calibration) -> str:
 
 
 def format_numbers(matrix: np.ndarray) -> str:
-    """Return the numbers of a matrix row by row, in KITTI's format."""
+    """Format the numbers of a matrix row by row, as in KITTI."""
     return " ".join(f"{value:.12e}" for value in np.ravel(matrix))
 
 
 def write_velodyne(path: Path, cloud: np.ndarray) -> None:
-    """Write a cloud (N, 4) [x y z reflectance] as .bin file. InputError if that fails."""
+    """Write a cloud (N, 4) [x y z reflectance] to a .bin file. Raises InputError if that fails."""
     write_bytes(path, np.ascontiguousarray(cloud, np.float32).tobytes())
 
 
 def write_object(root: Path, number: int, cloud: np.ndarray, truth: GroundTruth, calibration: Calibration) -> None:
-    """Write velodyne, calib and label_2 of one frame of an object data set to root/training."""
+    """Write the files of one frame in velodyne/, calib/ and label_2/ of root/training."""
     write_object_text(root, number, cloud, format_object_labels(truth, calibration), calibration)
 
 

@@ -26,7 +26,7 @@ NAMES = (
     "traffic_cone",
     "barrier",
 )
-# Label category -> class; other categories, such as animals, have no class.
+# Category of a label -> class; other categories, such as animals, have no class.
 CATEGORIES = {
     "vehicle.car": "car",
     "vehicle.truck": "truck",
@@ -64,11 +64,11 @@ class GlobalBoxes:
         centres: (K, 3) metres.
         sizes: (K, 3) [l w h] metres.
         rotations: (K, 4) quaternions [w x y z].
-        class_ids: (K,) int into NAMES, -1 = none of them.
-        attributes: (K,) int into ATTRIBUTES, -1 = none.
+        class_ids: (K,) int indices into NAMES, -1 = another class.
+        attributes: (K,) int indices into ATTRIBUTES, -1 = none.
         velocities: (K, 2) m/s, NaN = unknown.
         scores: (K,), 0 for labels.
-        points: (K,) int, number of LiDAR and radar returns inside, -1 = not counted, as in
+        points: (K,) int, number of LiDAR and radar returns in the box, -1 = not counted, as for
             detections.
     """
 
@@ -85,22 +85,22 @@ class GlobalBoxes:
     def of(
         centres, sizes, rotations, class_ids, attributes=-1, velocities=np.nan, scores=0.0, points=-1
     ) -> GlobalBoxes:
-        """Make boxes with the right dtypes and shapes; columns with a default may be scalars."""
+        """Make boxes and convert dtypes and shapes; columns with a default may be scalars."""
         centres = np.asarray(centres, np.float64).reshape(-1, 3)
         count = len(centres)
 
-        def column(values, dtype, *shape):
+        def make_column(values, dtype, *shape):
             return np.broadcast_to(np.asarray(values, dtype), (count, *shape)).copy()
 
         return GlobalBoxes(
             centres,
             np.asarray(sizes, np.float64).reshape(count, 3),
             np.asarray(rotations, np.float64).reshape(count, 4),
-            column(class_ids, np.int32),
-            column(attributes, np.int32),
-            column(velocities, np.float64, 2),
-            column(scores, np.float64),
-            column(points, np.int32),
+            make_column(class_ids, np.int32),
+            make_column(attributes, np.int32),
+            make_column(velocities, np.float64, 2),
+            make_column(scores, np.float64),
+            make_column(points, np.int32),
         )
 
     @staticmethod
@@ -121,7 +121,7 @@ class GlobalBoxes:
         return len(self.centres)
 
     def __getitem__(self, index) -> GlobalBoxes:
-        """Return the boxes under a mask, slice or index array."""
+        """Return the boxes selected by a mask, slice or index array."""
         return GlobalBoxes(*(getattr(self, field.name)[index] for field in dataclasses.fields(self)))
 
     @property
@@ -132,7 +132,7 @@ class GlobalBoxes:
 
 
 def are_valid_rotations(rotations: np.ndarray) -> np.ndarray:
-    """Return a mask (K,) of the quaternions (K, 4) that to_matrices accepts."""
+    """Return (K,) bool: True for quaternions (K, 4) that to_matrices accepts."""
     with np.errstate(over="ignore"):
         length = np.linalg.norm(rotations, axis=1)
     return (length > 0) & (length <= MAX_NUMBER)
@@ -153,9 +153,9 @@ def to_quaternions(rotations: np.ndarray) -> np.ndarray:
 
 
 def to_local_boxes(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
-    """Transform boxes to a frame with the given pose (4, 4) in the global frame.
+    """Transform boxes to the frame with this pose (4, 4) in the global frame.
 
-    Boxes that are tilted in that frame, as on a slope, become upright.
+    Boxes that are tilted in that frame, for example on a slope, become upright.
 
     Returns:
         (K, 7) float64 [x y z l w h yaw].
@@ -167,7 +167,7 @@ def to_local_boxes(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
 
 
 def are_tilted(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
-    """Return a mask (K,) of the boxes that to_local_boxes makes upright."""
+    """Return (K,) bool: True for boxes that are tilted, which to_local_boxes makes upright."""
     upright = to_global_boxes(to_local_boxes(boxes, pose), pose)[2]
     alignment = np.abs((upright * boxes.rotations).sum(axis=1))
     return alignment < (1 - 1e-12) * np.linalg.norm(boxes.rotations, axis=1)

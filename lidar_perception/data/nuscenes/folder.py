@@ -1,8 +1,8 @@
-"""nuScenes folders: the key frames of its LiDAR, scene by scene.
+"""nuScenes folders: the key frames of the LiDAR, scene by scene.
 
-LIDAR_TOP has x to the right and y ahead, and may be slightly tilted. Frames have their origin at
-the sensor and the axes of the vehicle (x forward, y left, z up): points are rotated by the
-calibration, but not translated, so that the ground is sensor_height below the origin.
+The sensor LIDAR_TOP has x to the right and y forward, and may be slightly tilted. Frames have their
+origin at the sensor and the axes of the vehicle (x forward, y left, z up): points are rotated by
+the calibration, but not translated, so that the ground is sensor_height below the origin.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 
 LIDAR_CHANNEL = "LIDAR_TOP"
 SWEEP_COLUMNS = "x y z intensity ring"  # columns of a .pcd.bin file, float32
-EGO_RADIUS_M = 1.0  # points closer than this in both x and y are on the vehicle itself
+EGO_RADIUS_M = 1.0  # distance in x and in y within which points are on the ego vehicle
 FULL_REFLECTION = 255  # maximum value of the intensity column
 
 
@@ -38,7 +38,7 @@ class KeyFrame:
         token: token of the sample.
         pose: (4, 4) pose of the frame in the global frame.
         ego: (3,) position of the vehicle in the global frame.
-        labels: returns the labels in the global frame; None if the version has none.
+        labels: returns the labels in the global frame; None if the version has no labels.
     """
 
     token: str
@@ -48,7 +48,7 @@ class KeyFrame:
 
 
 def load_sweep(path: Path, rotation: np.ndarray, stamp_ns: int) -> PointCloud:
-    """Load the usable points of a .pcd.bin file that are not on the vehicle itself.
+    """Load the usable points of a .pcd.bin file that are not on the ego vehicle.
 
     Args:
         rotation: (3, 3) rotation from the sensor's axes to those of the frame.
@@ -65,20 +65,20 @@ def _read_truth(key: KeyFrame) -> GroundTruth | None:
     return None if labels is None else labels.to_ground_truth(key.pose)
 
 
-def is_layout(path: Path) -> bool:
-    """Return True for a nuScenes folder, and for the folder of a version in it."""
+def can_open(path: Path) -> bool:
+    """Return True for a nuScenes folder, or for the folder of a version in it."""
     return bool(_list_versions(path)) or (path / "sample_data.json").is_file()
 
 
 def open_layout(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """Open the key frames of a data set: ROOT/VERSION, or ROOT if it has only one version."""
+    """Open the key frames of a data set. The path is ROOT/VERSION, or ROOT if it has only one version."""
     if (path / "sample_data.json").is_file():
         root, version = path.absolute().parent, path.absolute().name
     else:
         root, (version, *others) = path, _list_versions(path)
         if others:
             raise InputError(
-                f"{path} has several versions; give one of them: "
+                f"{path} has several versions; choose one of "
                 + ", ".join(str(path / name) for name in (version, *others))
             )
     frames = open_nuscenes(root, version)
@@ -95,7 +95,8 @@ def _list_versions(root: Path) -> list[str]:
 def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
     """Return the key frames of ROOT/VERSION, in the order of the scene table and of time.
 
-    Sweeps and labels are read later. Raises InputError for a missing or invalid folder or table.
+    Sweeps and labels are read later. Raises InputError if the folder or a table is missing or
+    invalid.
     """
     tables = Tables(root, version)
     names = dict(tables.rows("scene", "token", "name"))
@@ -145,15 +146,17 @@ def _get_frame_labels(all_labels: Callable, number: int) -> NuscenesLabels | Non
 
 
 def _make_sensor_pose(ego: np.ndarray, mount: np.ndarray) -> np.ndarray:
-    """Return the pose (4, 4) with the sensor's position and the vehicle's axes."""
+    """Return the pose (4, 4) at the sensor's position with the vehicle's axes."""
     pose = ego.copy()
     pose[:3, 3] += ego[:3, :3] @ mount[:3, 3]
     return pose
 
 
 def _read_sweeps(tables: Tables, times: dict[str, int]) -> dict[str, tuple[str, int, str, str]]:
-    """Return file, time in us, ego pose token and calibration token of the sweep of each key
-    frame."""
+    """Return the sweep of each key frame, by sample token.
+
+    A sweep is (file, time in us, ego pose token, calibration token).
+    """
     sensors = {token for token, channel in tables.rows("sensor", "token", "channel") if channel == LIDAR_CHANNEL}
     mounts = {token for token, sensor in tables.rows("calibrated_sensor", "token", "sensor_token") if sensor in sensors}
     sweeps = {
@@ -178,7 +181,8 @@ def _read_sweeps(tables: Tables, times: dict[str, int]) -> dict[str, tuple[str, 
 
 
 def _read_poses(tables: Tables, table: str, tokens: set[str]) -> dict[str, np.ndarray]:
-    """Return the poses (4, 4) in a table by token: sensor to vehicle, or vehicle to global."""
+    """Return the poses (4, 4) in a table by token: of the sensor in the vehicle's frame, or of the
+    vehicle in the global frame."""
     rows = {token: row for token, *row in tables.rows(table, "token", "translation", "rotation") if token in tokens}
     if missing := tokens - rows.keys():
         raise InputError(

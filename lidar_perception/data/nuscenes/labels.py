@@ -1,4 +1,4 @@
-"""Labels of nuScenes: all boxes of all key frames, as columns."""
+"""Labels of nuScenes: the boxes of all key frames, stored as columns."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lidar_perception.types import CLASSES, GroundTruth, InputError
 LABEL_TABLE = "sample_annotation"
 BLOCK_SIZE = 4096  # number of labels converted to columns at a time
 BIKE_RACK = "static_object.bicycle_rack"
-MAX_TIME_S = 1.5  # maximum time between two labels to derive a velocity; doubled with a label in between
+MAX_TIME_S = 1.5  # maximum time between adjacent labels from which a velocity is computed
 # nuScenes class -> class in types.CLASSES; a bicycle with a rider is a Cyclist, others are Misc.
 CLASS_BY_NAME = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian"}
 
@@ -33,9 +33,9 @@ class NuscenesLabels:
 
     Attributes:
         boxes: boxes with their numbers of LiDAR and radar points.
-        categories: (K,) int into category_names.
-        lidar_points: (K,) int.
-        instances: (K,) int, the same for an object in all frames.
+        categories: (K,) int indices into category_names.
+        lidar_points: (K,) int, number of LiDAR points in the box.
+        instances: (K,) int, number of the object, the same in all frames.
     """
 
     boxes: GlobalBoxes
@@ -48,7 +48,7 @@ class NuscenesLabels:
         return len(self.boxes)
 
     def __getitem__(self, index) -> NuscenesLabels:
-        """Return the labels under a mask, slice or index array."""
+        """Return the labels selected by a mask, slice or index array."""
         return NuscenesLabels(
             self.boxes[index],
             self.categories[index],
@@ -57,23 +57,23 @@ class NuscenesLabels:
             self.instances[index],
         )
 
-    def bicycle_racks(self) -> GlobalBoxes:
-        """Return the bicycle racks."""
-        names = np.array([name == BIKE_RACK for name in self.category_names], bool)
-        return self.boxes[names[self.categories]]
+    def select_bicycle_racks(self) -> GlobalBoxes:
+        """Return the boxes of bicycle racks."""
+        is_rack = np.array([name == BIKE_RACK for name in self.category_names], bool)
+        return self.boxes[is_rack[self.categories]]
 
     def to_ground_truth(self, pose: np.ndarray) -> GroundTruth:
-        """Convert the labels of one frame to its own coordinates.
+        """Convert the labels of one frame to the coordinates of the frame.
 
-        extras: detection_name (None if the category has no class in the detection task), category,
-        lidar_points, points (LiDAR and radar), velocity (2,) m/s in the global frame, attribute,
-        track_id, and for a tilted box rotation (4,) [w x y z] in the global frame.
+        The extras are detection_name (None if the category has no class in the detection task),
+        category, lidar_points, points (LiDAR and radar), velocity (2,) m/s in the global frame,
+        attribute, track_id, and for a tilted box rotation (4,) [w x y z] in the global frame.
 
         Args:
             pose: (4, 4) pose of the frame in the global frame.
         """
         boxes, extras, ids = self.boxes, [], []
-        tilted = are_tilted(boxes, pose)
+        is_tilted = are_tilted(boxes, pose)
         for i in range(len(self)):
             name = NAMES[boxes.class_ids[i]] if boxes.class_ids[i] >= 0 else None
             attribute = boxes.attributes[i]
@@ -88,7 +88,7 @@ class NuscenesLabels:
                     "velocity": boxes.velocities[i].tolist(),
                     "track_id": int(self.instances[i]),
                     "attribute": ATTRIBUTES[attribute] if attribute >= 0 else None,
-                    **({"rotation": boxes.rotations[i].tolist()} if tilted[i] else {}),
+                    **({"rotation": boxes.rotations[i].tolist()} if is_tilted[i] else {}),
                 }
             )
         return GroundTruth.of(to_local_boxes(boxes, pose), ids, extras)
@@ -100,11 +100,12 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
     All frames of a scene must be given, because velocities are computed from adjacent frames.
 
     Args:
+        tables: tables of the data set.
         times: time in us of each key frame, by its sample token.
 
     Returns:
-        The labels of each key frame, in the given order; None if the version has none, such as the
-        test split.
+        The labels of each key frame, in the given order; None if the version has no labels, such as
+        the test split.
 
     Raises:
         InputError: a table is invalid.
@@ -122,7 +123,7 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
         token: (number, category_by_token.get(category, -1))
         for number, (token, category) in enumerate(tables.rows("instance", "token", "category_token"))
     }
-    own_links, links, in_frames, of_objects, of_categories = (array("q") for _ in range(5))
+    label_numbers, links, frame_numbers, object_numbers, category_numbers = (array("q") for _ in range(5))
     tokens: dict[str, int] = {}  # token -> number of the label, in order of first occurrence
     fields = ("translation", "size", "rotation")
     block, blocks = [], []
@@ -143,26 +144,25 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
         number, category = instances.get(instance, (-1, -1))
         if category < 0:
             raise InputError(
-                f"{tables.path(LABEL_TABLE)}: the instance {instance} of {token} is not in "
-                "the table of instances, or has no category; download the tables "
-                "again"
+                f"{tables.path(LABEL_TABLE)}: the instance {instance} of label {token} is not in "
+                "the instance table, or has no category; download the tables again"
             )
-        own_links.append(tokens.setdefault(token, len(tokens)))
+        label_numbers.append(tokens.setdefault(token, len(tokens)))
         links.extend([tokens.setdefault(other, len(tokens)) if other else -1 for other in (previous_token, next_token)])
-        in_frames.append(frame_by_token[sample])
-        of_objects.append(number)
-        of_categories.append(category)
+        frame_numbers.append(frame_by_token[sample])
+        object_numbers.append(number)
+        category_numbers.append(category)
         block.append((*box, (lidar, radar, attributes.get(str(labels[0]), -1) if labels else -1)))
         if len(block) == BLOCK_SIZE:
             blocks.append(_to_columns(tables, block))
             block.clear()
-    if not own_links:
+    if not label_numbers:
         return None
     numbers = np.concatenate([*blocks, _to_columns(tables, block)])
     centres, sizes, rotations, counts = np.split(numbers, (3, 6, 10), axis=1)
-    frames, neighbours = np.array(in_frames), _link_neighbours(tables, tokens, own_links, links)
+    frames, neighbours = np.array(frame_numbers), _link_neighbours(tables, tokens, label_numbers, links)
     seconds = np.fromiter(times.values(), np.int64, len(times))[frames] * 1e-6
-    categories, classes = np.array(of_categories), [CATEGORIES.get(name) for name in names.values()]
+    categories, classes = np.array(category_numbers), [CATEGORIES.get(name) for name in names.values()]
     class_ids = np.array([NAMES.index(name) if name else -1 for name in classes])[categories]
     boxes = GlobalBoxes.of(
         centres,
@@ -174,7 +174,7 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
         points=counts[:, 0] + counts[:, 1],
     )
     all_labels = NuscenesLabels(
-        boxes, categories, tuple(names.values()), counts[:, 0].astype(np.int32), np.array(of_objects)
+        boxes, categories, tuple(names.values()), counts[:, 0].astype(np.int32), np.array(object_numbers)
     )
     order = np.argsort(frames, kind="stable")
     bounds = np.searchsorted(frames[order], np.arange(1, len(times)))
@@ -185,25 +185,29 @@ def _link_neighbours(tables: Tables, tokens: dict[str, int], numbers: array, lin
     """Return the rows (K, 2) of the previous and next label of the same object, -1 = none.
 
     Args:
+        tables: tables of the data set, for error messages.
         tokens: number of each label, by its token.
-        numbers: (K,) numbers of the labels.
+        numbers: (K,) number of the label in each row.
         links: (2 K,) numbers of the previous and next labels, -1 = none.
     """
     link_pairs = np.array(links).reshape(-1, 2)
-    row_of = np.full(len(tokens) + 1, -1)  # the last element serves link -1 (no label)
-    row_of[numbers] = np.arange(len(numbers))
-    neighbours = row_of[link_pairs]
+    row_by_number = np.full(len(tokens) + 1, -1)  # the last element is for the link -1 (no label)
+    row_by_number[numbers] = np.arange(len(numbers))
+    neighbours = row_by_number[link_pairs]
     if (missing := (neighbours < 0) & (link_pairs >= 0)).any():
         token = next(token for token, number in tokens.items() if number == link_pairs[missing][0])
         raise InputError(
-            f"{tables.path(LABEL_TABLE)}: the label {token}, which another one links to, is missing; download it again"
+            f"{tables.path(LABEL_TABLE)}: another label links to label {token}, which is missing; download it again"
         )
     return neighbours
 
 
 def _to_columns(tables: Tables, block: list[tuple]) -> np.ndarray:
-    """Return (B, 13) float64: centre, size w l h, quaternion, points of LiDAR and radar,
-    attribute."""
+    """Convert B labels to columns (B, 13) float64.
+
+    The columns are centre, size w l h, quaternion, number of LiDAR points, number of radar points,
+    and attribute.
+    """
     fields = (("translation", 3), ("size", 3), ("rotation", 4), ("count of points", 3))
     return np.hstack(
         [tables.numbers(LABEL_TABLE, name, [row[i] for row in block], width) for i, (name, width) in enumerate(fields)]
@@ -211,15 +215,15 @@ def _to_columns(tables: Tables, block: list[tuple]) -> np.ndarray:
 
 
 def _compute_velocities(centres: np.ndarray, seconds: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-    """Compute velocities (K, 2) m/s from the previous to the next label of the same object.
+    """Compute velocities (K, 2) m/s from the previous and the next label of the same object.
 
-    Without a previous or next label, the label itself is used. NaN if there is neither, or if they
-    are too far apart in time.
+    If one of them is missing, the label itself is used instead. The velocity is NaN if both are
+    missing or if the labels are too far apart in time.
     """
     indices = np.arange(len(centres))
     first, last = (np.where(rows >= 0, rows, indices) for rows in neighbours.T)
     time = seconds[last] - seconds[first]
     max_time = np.where((neighbours >= 0).all(axis=1), 2 * MAX_TIME_S, MAX_TIME_S)
-    valid = (time > 0) & (time <= max_time)
+    is_valid = (time > 0) & (time <= max_time)
     distance = (centres[last] - centres[first])[:, :2]
-    return np.divide(distance, time[:, None], out=np.full_like(distance, np.nan), where=valid[:, None])
+    return np.divide(distance, time[:, None], out=np.full_like(distance, np.nan), where=is_valid[:, None])

@@ -1,4 +1,7 @@
-"""Result files of nuScenes' detection task: one JSON file with a list of boxes per key frame."""
+"""Reader and writer of result files of nuScenes' detection task.
+
+A result file is a JSON file with a list of boxes per key frame.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from lidar_perception.runs.files import check_regular, shorten_error, write_text
 from lidar_perception.types import CLASSES, MAX_NUMBER, Detections, InputError
 
 MAX_BOXES = 500  # maximum number of boxes per frame
-# Our class -> nuScenes name; bicycles of nuScenes include their riders.
+# Class of this package -> nuScenes class; nuScenes' bicycles include their riders.
 NAME_BY_CLASS = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle"}
 META = {"use_camera": False, "use_lidar": True, "use_radar": False, "use_map": False, "use_external": True}
 
@@ -23,15 +26,13 @@ META = {"use_camera": False, "use_lidar": True, "use_radar": False, "use_map": F
 def to_results(detections: Detections, frame: Frame) -> GlobalBoxes:
     """Convert detections of a frame to global boxes, without velocity and attribute.
 
-    Keeps only classes in NAME_BY_CLASS, and at most the MAX_BOXES boxes with the highest scores.
-    Raises InputError if a number is not finite.
+    Only classes in NAME_BY_CLASS and the MAX_BOXES boxes with the highest scores are kept. Raises
+    InputError if a number is not finite.
     """
     if not (np.isfinite(detections.boxes).all() and np.isfinite(detections.scores).all()):
-        raise InputError(
-            f"{frame.name}: a box or score of the detector is not finite; its weights or its input are broken"
-        )
-    class_id_by_ours = np.array([NAMES.index(NAME_BY_CLASS[name]) if name in NAME_BY_CLASS else -1 for name in CLASSES])
-    class_ids = class_id_by_ours[detections.class_ids]
+        raise InputError(f"{frame.name}: a box or score of the detector is not finite; check its weights and its input")
+    nuscenes_ids = np.array([NAMES.index(NAME_BY_CLASS[name]) if name in NAME_BY_CLASS else -1 for name in CLASSES])
+    class_ids = nuscenes_ids[detections.class_ids]
     selected = np.flatnonzero(class_ids >= 0)
     selected = selected[np.argsort(-detections.scores[selected], kind="stable")][:MAX_BOXES]
     return GlobalBoxes.of(
@@ -42,10 +43,10 @@ def to_results(detections: Detections, frame: Frame) -> GlobalBoxes:
 
 
 def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:
-    """Write the boxes by sample token.
+    """Write a result file with the boxes by sample token.
 
-    Unknown velocities are NaN, which nuscenes-devkit scores as an error of 1, but strict JSON
-    parsers reject.
+    Unknown velocities are written as NaN. nuscenes-devkit scores them as an error of 1, but strict
+    JSON parsers reject them.
     """
     rows = {
         token: [
@@ -75,38 +76,41 @@ def format_boxes(token: str, centres: np.ndarray, sizes: np.ndarray, rotations: 
 
 
 def read_results(path: Path, frames: Sequence[Frame]) -> dict[str, GlobalBoxes]:
-    """Read the boxes of frames, by frame name. InputError for missing frames or invalid boxes."""
+    """Read the boxes of frames by frame name. Raises InputError if a frame is missing or a box is invalid."""
     try:
         content = json.loads(check_regular(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"cannot read the results {path}: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a JSON file ({shorten_error(error)}); write the results again") from None
+        raise InputError(f"{path} is not a JSON file ({shorten_error(error)}); export the results again") from None
     results = content.get("results") if isinstance(content, dict) else None
     if not isinstance(results, dict):
         raise InputError(
-            f"{path} has no 'results'; it needs them in the format of nuScenes' "
-            'detection task: {"meta": ..., "results": {sample token: [boxes]}}'
+            f"{path} has no 'results'; expected the format of nuScenes' "
+            'detection task, {"meta": ..., "results": {sample token: [boxes]}}'
         )
     if missing := [f for f in frames if f.native.token not in results]:
         raise InputError(
             f"{path} has no boxes for {missing[0].name}, sample "
             f"{missing[0].native.token} (missing: {len(missing)} of {len(frames)} "
-            "frames); a frame without detections needs an empty list, and --split "
-            "selects the scenes to score"
+            "frames); add an empty list for a frame without detections, or choose the "
+            "scenes to score with --split"
         )
     return {frame.name: _parse_boxes(f"{path}: {frame.name}", results[frame.native.token]) for frame in frames}
 
 
-def _parse_boxes(where: str, rows: list) -> GlobalBoxes:
+def _parse_boxes(source: str, rows: list) -> GlobalBoxes:
+    """Parse the boxes of a frame; `source` is the file and frame for error messages."""
     if not isinstance(rows, list) or len(rows) > MAX_BOXES:
-        raise InputError(f"{where} needs a list of at most {MAX_BOXES} boxes; leave out those with the lowest scores")
+        raise InputError(
+            f"{source} is not a list of at most {MAX_BOXES} boxes; leave out the boxes with the lowest scores"
+        )
     for number, row in enumerate(rows, 1):
         if isinstance(row, dict) and row.get("detection_name", NAMES[0]) not in NAMES:
             raise InputError(
-                f"{where}, box {number}: the class {row['detection_name']!r} is not "
-                f"one of nuScenes' classes {', '.join(NAMES)}; rename or leave out "
-                "such boxes"
+                f"{source}, box {number}: the class {row['detection_name']!r} is not "
+                f"one of nuScenes' classes {', '.join(NAMES)}; rename the class or leave out "
+                "the box"
             )
     try:
         boxes = GlobalBoxes.of(
@@ -120,23 +124,23 @@ def _parse_boxes(where: str, rows: list) -> GlobalBoxes:
         )
     except KeyError as error:
         raise InputError(
-            f"{where}: a box has no {error}; boxes need sample_token, translation, "
+            f"{source}: a box has no {error}; boxes need sample_token, translation, "
             "size, rotation, velocity, detection_name, detection_score and "
             "attribute_name"
         ) from None
     except (ValueError, TypeError, OverflowError) as error:
-        raise InputError(f"{where}: a box is malformed ({error}); write the results again") from None
+        raise InputError(f"{source}: a box is malformed ({error}); export the results again") from None
     numbers = np.column_stack([boxes.centres, boxes.sizes, boxes.scores])
-    invalid = ~(
+    is_invalid = ~(
         (np.abs(numbers) <= MAX_NUMBER).all(axis=1)
         & (boxes.sizes > 0).all(axis=1)
         & are_valid_rotations(boxes.rotations)
         & ~(np.abs(boxes.velocities) > MAX_NUMBER).any(axis=1)
     )
-    if invalid.any():
+    if is_invalid.any():
         raise InputError(
-            f"{where}, box {np.flatnonzero(invalid)[0]}: translation, size, rotation "
-            f"and score must be finite and within {MAX_NUMBER:g}, sizes above 0, the "
-            "rotation a quaternion, and the velocity finite or NaN"
+            f"{source}, box {np.flatnonzero(is_invalid)[0]}: translation, size, rotation "
+            f"and score must be finite and within {MAX_NUMBER:g}, sizes must be positive, the "
+            "rotation must be a quaternion, and the velocity finite or NaN"
         )
     return boxes

@@ -1,4 +1,4 @@
-"""Tables of nuScenes: JSON lists of rows.
+"""Reader of nuScenes' tables, which are JSON lists of rows.
 
 The tables of trainval have more than a gigabyte, of which LiDAR frames need one percent. Therefore
 rows are decoded one by one, and only the required fields are kept.
@@ -42,7 +42,7 @@ TYPE_BY_FIELD: dict[str, type] = {
     "timestamp": int,
     "attribute_tokens": list,
 }
-PROBLEM_BY_TYPE = {str: "not a text", int: "not a time in microseconds", list: "not a list"}
+PROBLEM_BY_TYPE = {str: "not a string", int: "not a time in microseconds", list: "not a list"}
 
 
 class Tables:
@@ -70,8 +70,8 @@ class Tables:
     def rows(self, table: str, *fields: str) -> Iterator[tuple]:
         """Yield the values of two or more fields, row by row.
 
-        Raises InputError if the table is missing, truncated or damaged, and if a field of a row is
-        missing or has another type.
+        Raises InputError if the table is missing or damaged, or if a field of a row is missing or
+        has the wrong type.
         """
         typed_columns = [
             (column, TYPE_BY_FIELD[field]) for column, field in enumerate(fields) if field in TYPE_BY_FIELD
@@ -82,7 +82,8 @@ class Tables:
             except (KeyError, TypeError):
                 missing = next(f for f in fields if not isinstance(row, dict) or f not in row)
                 raise InputError(
-                    f"{self.path(table)}: row {number} has no {missing}; is it a table of nuScenes? download it again"
+                    f"{self.path(table)}: row {number} has no {missing}, so it is not a table of nuScenes; "
+                    "download it again"
                 ) from None
             for column, type_ in typed_columns:
                 if not isinstance(values[column], type_) or (type_ is int and not 0 <= values[column] < MAX_TIME_US):
@@ -126,9 +127,9 @@ class Tables:
             ) from None
 
     def numbers(self, table: str, field: str, values: list, width: int) -> np.ndarray:
-        """Return the values of a field as (K, width) float64.
+        """Convert the values of a field to an array (K, width) float64.
 
-        Raises InputError unless each has `width` finite numbers.
+        Raises InputError unless each value has `width` finite numbers.
         """
         try:
             column = np.array(values, np.float64).reshape(len(values), -1)

@@ -49,7 +49,7 @@ def select_boxes(
     labels = key.labels()
     if labels is None:
         return KeyFrameResult(key.token, boxes, None, None, ms, problem)
-    racks = labels.bicycle_racks()
+    racks = labels.select_bicycle_racks()
     return KeyFrameResult(
         key.token,
         boxes,

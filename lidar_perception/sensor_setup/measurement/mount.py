@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidar_perception.data.mount_check import MAX_LEAN_DEG
+from lidar_perception.data.mount_check import MAX_TILT_DEG
 from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.ground.threshold import fit_plane, fit_plane_by_ransac, height_above_plane
 from lidar_perception.robot.placement import make_tilted_pose
@@ -87,8 +87,8 @@ class Mount(NamedTuple):
 
     @property
     def is_level(self) -> bool:
-        """True if the sensor's z axis points up, within MAX_LEAN_DEG (the slope of roads)."""
-        return bool(self.normal[2] >= np.cos(np.radians(MAX_LEAN_DEG)))
+        """True if the sensor's z axis points up, within MAX_TILT_DEG (the slope of roads)."""
+        return bool(self.normal[2] >= np.cos(np.radians(MAX_TILT_DEG)))
 
 
 def find_ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:

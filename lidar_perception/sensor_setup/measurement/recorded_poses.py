@@ -70,19 +70,19 @@ def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int], stamps_n
         numbers: Numbers of the clouds whose poses are looked up.
         stamps_ns: Stamps of all clouds, ns; None if they have none.
     """
-    if poses is None or stamps_ns is None or not (poses.base or poses.odometry):
+    if poses is None or stamps_ns is None or not (poses.base_frame or poses.odometry_topic):
         return NO_POSES
-    base = poses.base
+    base = poses.base_frame
     mount = poses.find_mount(base) if base else None
     by_cloud = {}
     # Odometry without child_frame_id may be of another frame than the base.
-    has_child = not poses.odometry or poses.odometry_child
+    has_child = not poses.odometry_topic or poses.odometry_child_frame
     for number in numbers if has_child else ():
         pose = _find_base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))
         if pose is not None:
             by_cloud[number] = pose
     problem = ""
-    if 2 * len(by_cloud) < len(numbers) and poses.available:
+    if 2 * len(by_cloud) < len(numbers) and poses.has_poses:
         problem = f"{len(numbers) - len(by_cloud)} of {len(numbers)} clouds have no pose at their time"
         if not has_child:
             problem = "the odometry has no child_frame_id"
@@ -90,9 +90,9 @@ def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int], stamps_n
 
 
 def _find_base_pose(poses: BagPoses, stamp_ns: int, mount: np.ndarray | None) -> np.ndarray | None:
-    if poses.odometry_child == poses.base:
+    if poses.odometry_child_frame == poses.base_frame:
         try:
-            return poses.odometry_poses(np.array([stamp_ns]))[0]
+            return poses.lookup_odometry(np.array([stamp_ns]))[0]
         except MissingTransform:
             return None
     pose = poses(stamp_ns)
