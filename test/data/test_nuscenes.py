@@ -254,7 +254,7 @@ def put(table, **values):
         (put("sample", token="s0k1"), "sample.json has rows with the same token"),
         (drop("sample_data", "s0k1topTrue"), "no LIDAR_TOP for 1 of 8 key frames, such as s0k1"),
         (drop("ego_pose", "s0k1topTrue"), "ego_pose.json has no row s0k1topTrue"),
-        (drop("instance", "s0o0"), "the instance s0o0 of s0o0k"),
+        (drop("instance", "s0o0"), "the instance s0o0 of label s0o0k"),
         (drop("category", "c0"), "has no category"),
         (put("sample_annotation", prev="gone"), "another label links to label gone, which is missing"),
         (put("sample_annotation", rotation=[0, 0, 0, 0]), "a rotation is not a quaternion"),
