@@ -78,7 +78,7 @@ def _find_ground_height(scan: Scan, box: Array) -> float:
     nearby = ground[np.hypot(*(ground[:, :2] - box[:2]).T) < MAX_GROUND_DISTANCE_M]
     if len(nearby) < MIN_GROUND_POINTS:
         return np.nan
-    return float(fit_ground_surface(nearby, float(np.median(nearby[:, 2]))).at(box[None])[0])
+    return float(fit_ground_surface(nearby, float(np.median(nearby[:, 2]))).height_at(box[None])[0])
 
 
 def resize_box(box: Array, size: Array) -> Array:
