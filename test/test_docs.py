@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from lidar_perception.nodes import NODES, load_node_class
-from lidar_perception.nodes.main import help_text
+from lidar_perception.nodes.main import make_help_text
 from lidar_perception.nodes.node_parameters import find_node_parameters
 from lidar_perception.param_fields import collect_fields
 
@@ -29,7 +29,7 @@ def generate():
 
 @pytest.mark.parametrize("name", NODES)
 def test_help_of_a_node_names_every_parameter(name):
-    text = help_text(name)
+    text = make_help_text(name)
     assert all(f"  {key} (" in text for key in find_node_parameters(name))
 
 

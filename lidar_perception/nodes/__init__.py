@@ -1,4 +1,7 @@
-"""rclpy nodes: convert, call the core, publish. The only part of the package that needs ROS."""
+"""rclpy nodes, which convert messages, call the core and publish results.
+
+Only this part of the package needs ROS.
+"""
 
 import importlib
 from typing import Any

@@ -23,7 +23,10 @@ from msg_utils.stamps import to_ns
 
 
 class CandidateRefinement(ManagedNode):
-    """Ground snapping, height filter, STM and CPA on a cloud with `ground` and `cluster_id`."""
+    """Fits boxes on the ground, then applies the height filter, STM and CPA.
+
+    The clouds must have the columns `ground` and `cluster_id`.
+    """
 
     def __init__(self, **options: Any):
         super().__init__("candidate_refinement", RefinementNodeParams(), DetectionNodeParams(), **options)

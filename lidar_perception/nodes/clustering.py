@@ -22,7 +22,7 @@ from msg_utils.stamps import to_ns
 
 
 class Clustering(ManagedNode):
-    """Distance-aware DBSCAN or adaptive Euclidean clustering of the points outside the ground.
+    """Distance-aware DBSCAN or adaptive Euclidean clustering of the points that are not ground.
 
     Boxes are computed only while there are subscribers.
     """

@@ -1,4 +1,4 @@
-"""Base class of the detector nodes: loading, running and diagnosing a network."""
+"""Base class of detector nodes, which load a network, run it and report problems."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from msg_utils.stamps import to_ns
 
 @dataclass(frozen=True)
 class NetworkLoader:
-    """Loads the detector of a node.
+    """Functions that load the detector of a node.
 
     Attributes:
-        group: name of its parameter group, a NetworkParams.
-        steps: timed steps.
+        group: name of the detector's parameter group, a NetworkParams.
+        steps: names of the steps whose times are published.
         find_weights: returns the path of the weights for the parameters of the group, without
             importing torch; raises InputError if the file does not exist.
         load: loads a detector from (weights, device, parameters of the node) and warms it up;
             raises InputError if the weights cannot be used.
-        describe_network: returns the name of a network, from its configuration.
-        allows_custom: the parameter weights may be the module:Class of a custom detector.
+        describe_network: returns the name of a network, given its configuration.
+        allows_custom: True if the parameter weights may be the module:Class of a custom detector.
     """
 
     group: str
@@ -48,9 +48,9 @@ class NetworkLoader:
 
 
 class DetectorNode(ManagedNode):
-    """~/input/points -> ~/output/detections.
+    """Detects objects with a network: ~/input/points -> ~/output/detections.
 
-    Without a network the node publishes nothing, as an empty array would mean an empty scene.
+    Without a network, the node publishes nothing, because an empty array would mean an empty scene.
     """
 
     def __init__(self, name: str, params: Any, loader: NetworkLoader, **options: Any):
@@ -87,19 +87,19 @@ class DetectorNode(ManagedNode):
         with report_compilation(self.get_logger().info, whole_detector=True):
             detector = self._load_on_device()
         self._set_detector(detector, self.loader.describe_network(detector.networks[0].config))
-        if detector.warning:  # not the state, which tells what the node waits for
+        if detector.warning:  # not reported as the state, which shows what the node waits for
             self.diagnostics.counts["doubt"] = detector.warning
             self.get_logger().warning(detector.warning)
         if detector.fallback:
             self.diagnostics.report(WARN, detector.fallback)
 
     def _load_on_device(self) -> Any:
-        """Load the detector; on the CPU if CUDA is missing and cpu_fallback is set."""
+        """Load the detector, on the CPU if CUDA is missing and cpu_fallback is set."""
         network_params, fallback = self._network_params(self.params), None
         weights = self.loader.find_weights(network_params)
         from lidar_perception.detectors.devices import find_device
 
-        # One thread is the default, by the environment that main.py sets.
+        # main.py sets the default to one thread.
         set_thread_count(network_params.threads or count_cores())
         device = network_params.device
         if device.startswith("cuda") and network_params.cpu_fallback:
@@ -123,21 +123,23 @@ class DetectorNode(ManagedNode):
                 ground=None if ground is None else ground > 0,
                 cluster_ids=None if clusters is None else clusters[0],
             )
-            weak = result.detections
+            tracked = result.detections  # includes weak detections for the tracker
             if self.results.tracks is not None:
-                result = replace(result, detections=weak[network_params.scores.passes(weak)])
-            tracking_problem = self.results.publish(msg.header, result.detections, result.timings, frame.xyz, weak=weak)
+                result = replace(result, detections=tracked[network_params.scores.passes(tracked)])
+            tracking_problem = self.results.publish(
+                msg.header, result.detections, result.timings, frame.xyz, tracked=tracked
+            )
         self._diagnose(frame, result, params, tracking_problem)
 
     def _lower_thresholds(self, params: Any, network_params: NetworkParams) -> Any:
-        """Return params with thresholds that include the weak detections for the tracker."""
+        """Return params with lower score thresholds if a tracker uses the weak detections."""
         if self.results.tracks is None:
             return params
         low = network_params.scores.with_maximum(self.node_params.tracking.min_score)
         return replace(params, **{self.loader.group: replace(network_params, scores=low)})
 
     def _diagnose(self, frame: PointCloud, result: DetectionResult, params: Any, tracking_problem: str | None) -> None:
-        # The problem of the detector includes those of the intensity.
+        # result.problem includes problems of the intensity.
         problem = join_problems(
             result.problem, self.sensor.check_height(frame, params.ground.sensor_pose), tracking_problem
         )

@@ -1,4 +1,4 @@
-"""Diagnostics of a node: its state, counts, times and problems."""
+"""Diagnostics of a node: state, counts, times and problems."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ OK, WARN, ERROR, STALE = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticS
 WAITING = "waiting for input"
 LOG_PERIOD_S = 60.0  # pause before the same problem is logged again
 MAX_LOGGED_KINDS = 1000  # maximum number of message kinds whose last log time is stored
-TIMED_FRAMES = 100  # number of frames for the median processing time
-ADDED_COUNTS = ("lost", "dropped")  # values that are summed over all sources
+TIMED_FRAMES = 100  # number of frames over which the median processing time is computed
+SUMMED_COUNTS = ("lost", "dropped")  # values that are summed over all sources
 
 Problem = tuple[str, bytes, str]  # (kind, level, message)
 
 
 class DiagnosticSource(Protocol):
-    """A part of a node with its own diagnostic values and problems."""
+    """Part of a node that reports its own diagnostic values and problems."""
 
     def values(self) -> dict[str, Any]:
         """Return the values for the diagnostics."""
@@ -51,9 +51,9 @@ class Diagnostics:
         self.sources: list[DiagnosticSource] = []
         self.state = (WARN, WAITING)
         self.reset()
-        self._present: set[str] = set()  # kinds of the current problems
-        self._logged: dict[str, float] = {}  # kind of message -> time of its last log line
-        self._last_logged = ""
+        self._present_kinds: set[str] = set()  # kinds of the present problems
+        self._log_times: dict[str, float] = {}  # kind of message -> time when it was last logged
+        self._last_logged_kind = ""
         self.publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._processing_time = node.create_publisher(Float64, "~/debug/processing_time_ms", 10)
 
@@ -74,8 +74,8 @@ class Diagnostics:
         if stamp_ns < self.last_stamp_ns - JUMP_NS:
             self.counts["time_went_back"] = self.counts.get("time_went_back", 0) + 1
             self.node.get_logger().info(
-                "time jumped back, as when a bag restarts; dropping pending data (logged once, counted in "
-                "/diagnostics)",
+                "time jumped back, for example because a bag has restarted; dropping pending data (logged once, "
+                "counted in /diagnostics)",
                 once=True,
             )
         self.last_stamp_ns = stamp_ns
@@ -89,12 +89,13 @@ class Diagnostics:
     def report(self, level: bytes, message: str, expected: bool = False) -> None:
         """Set the state.
 
-        A message that differs from the last one in more than its numbers is logged and published at
-        once. Expected states, such as waiting for input after the start, are logged as information.
+        A message that differs from the last one in more than its numbers is logged and published
+        immediately. Expected states, such as waiting for input after the start, are logged as
+        information.
         """
-        kind, before = _mask_numbers(message), (self.state[0], _mask_numbers(self.state[1]))
+        kind, previous = _mask_numbers(message), (self.state[0], _mask_numbers(self.state[1]))
         self.state = (level, message)
-        if (level, kind) != before:
+        if (level, kind) != previous:
             self._log_rarely(kind, OK if expected else level, message)
             self.publish()
 
@@ -103,7 +104,7 @@ class Diagnostics:
         values = dict(self.counts, last_stamp_ns=self.last_stamp_ns)
         for source in self.sources:
             for key, value in source.values().items():
-                values[key] = values.get(key, 0) + value if key in ADDED_COUNTS else value
+                values[key] = values.get(key, 0) + value if key in SUMMED_COUNTS else value
         if self._times_ms:
             values["processing_ms_median"] = f"{np.median(self._times_ms):.1f}"
         level, message = self.state
@@ -130,27 +131,33 @@ class Diagnostics:
         if self.node.get_node_names_and_namespaces().count((name, namespace)) > 1:
             message = (
                 f"another node is also called {self.node.get_fully_qualified_name()}, "
-                "so their topics and parameters are mixed; stop one, or change its namespace"
+                "so their topics and parameters are mixed; stop one of them, or change its namespace"
             )
             problems.append(("name", WARN, message))
-        before, self._present = self._present, {kind for kind, _, _ in problems}
+        previous_kinds, self._present_kinds = self._present_kinds, {kind for kind, _, _ in problems}
         for kind, level, message in problems:
-            if kind not in before:
+            if kind not in previous_kinds:
                 self._log_rarely(kind, level, message)
         return problems
 
     def _log_rarely(self, kind: str, level: bytes, message: str) -> None:
-        """Log a problem at most once in LOG_PERIOD_S, and an OK state unless it was logged last, so
-        that the log always ends with the current state."""
+        """Log a problem at most once per LOG_PERIOD_S, and an OK state unless it was logged last.
+
+        The log therefore always ends with the current state.
+        """
         now = monotonic()
-        if kind != self._last_logged if level == OK else now - self._logged.get(kind, -LOG_PERIOD_S) >= LOG_PERIOD_S:
-            if len(self._logged) > MAX_LOGGED_KINDS:
-                self._logged.clear()
-            self._logged[kind], self._last_logged = now, kind
+        if level == OK:
+            is_due = kind != self._last_logged_kind
+        else:
+            is_due = now - self._log_times.get(kind, -LOG_PERIOD_S) >= LOG_PERIOD_S
+        if is_due:
+            if len(self._log_times) > MAX_LOGGED_KINDS:
+                self._log_times.clear()
+            self._log_times[kind], self._last_logged_kind = now, kind
             self._log(level, message)
 
     def _log(self, level: bytes, message: str) -> None:
-        if level == OK:  # one call for each level: rclpy binds the level to the calling line
+        if level == OK:  # separate calls, because rclpy does not allow one line to log at several levels
             self.node.get_logger().info(message)
         elif level == WARN:
             self.node.get_logger().warning(message)

@@ -1,4 +1,4 @@
-"""Poses of the sensor for tracking, from the source in the parameter ego.source."""
+"""Poses of the sensor for tracking, from the source that the parameter ego.source selects."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ MAX_OFFSET_NS = 10 * SECOND_NS  # a larger offset of odometry and detections mea
 
 
 class EgoInput:
-    """Poses of the sensor in a fixed frame at the stamps of its frames.
+    """Provides the pose of the sensor in a fixed frame at the stamp of each of its frames.
 
     Args:
         node: node with transforms.
         params: returns the current parameters of the group ego.
-        clouds: the node itself subscribes to clouds, which wait for their poses, and passes them to
-            find_pose(). Otherwise KISS-ICP subscribes to ~/input/points.
+        clouds: True if the node subscribes to clouds, which wait for their poses, and passes them to
+            find_pose(). False: subscribe to ~/input/points for KISS-ICP.
 
     Attributes:
         source: current source of the poses, see choose_source.
-        is_mounting_known: the pose of the sensor in the child frame of the odometry is available.
+        is_mounting_known: True if the pose of the sensor in the child frame of the odometry is known.
     """
 
     def __init__(self, node: LidarNode, params: Callable[[], EgoParams], clouds: bool):
@@ -50,17 +50,17 @@ class EgoInput:
         self.scans = TransformTree()
         self.scan_ns, self.scan_frame = 0, ""  # stamp and frame of the last scan given to KISS-ICP
         self.is_disconnected = False  # True if TF has no transform from the scan's frame to the detections' frame
-        self.icp_restarts = 0  # counted because each restart has a new origin
+        self.icp_restarts = 0  # counted because the origin of the poses changes with each restart
         self.icp_ms: deque[float] = deque(maxlen=TIMED_SCANS)  # CPU time of KISS-ICP for the last scans
         self.pose_problem = ""  # why the last frame has no pose
         self.without_ns: int | None = None  # stamp of the first frame without a pose (ego.source auto)
         self.late_since: float | None = None  # monotonic time at which poses began to be late
-        wanted = params().source
-        if wanted in ("auto", "odometry"):
+        setting = params().source
+        if setting in ("auto", "odometry"):
             self.transforms.subscribe_to_odometry()
-        elif wanted == "tf":
+        elif setting == "tf":
             self.transforms.subscribe_to_tf()
-        elif wanted == "kiss_icp":
+        elif setting == "kiss_icp":
             self._start_icp()
         if clouds:
             self.transforms.more_needs.append(self.find_missing_pose)
@@ -84,10 +84,10 @@ class EgoInput:
         return pose
 
     def find_missing_pose(self, header: Any) -> str | None:
-        """Return what a frame with this header waits for: its pose if poses arrive late, or None.
+        """Return a description of the pose if a frame with this header should wait for it, or None.
 
-        Consecutive frames together wait ego.max_wait seconds at most, as a newer frame may replace
-        the waiting one. After a timeout, frames do not wait for PAUSE_S seconds.
+        A newer frame may replace the waiting one, so the limit ego.max_wait applies to consecutive
+        frames together. After a timeout, frames do not wait for PAUSE_S seconds.
         """
         stamp = to_ns(header.stamp)
         try:
@@ -99,46 +99,48 @@ class EgoInput:
                 now, max_wait = monotonic(), self.params().max_wait
                 self.late_since = self.late_since or now
                 may_wait = (now - self.late_since) % (max_wait + PAUSE_S) < max_wait
-                return "the pose of its time" if may_wait else None
+                return "the pose at its stamp" if may_wait else None
         self.late_since = None
         return None
 
     def find_problem(self, frame_id: str, stamp: int) -> str | None:
         """Return the problem of the last frame's poses with its remedy, or None."""
-        wanted, odometry_child = self.params().source, self.transforms.odometry_child
-        last = self.transforms.odometry_ns
-        if self.source == "odometry" and last is not None:
+        setting, odometry_child = self.params().source, self.transforms.odometry_child
+        odometry_ns = self.transforms.odometry_ns
+        if self.source == "odometry" and odometry_ns is not None:
             topic = self.node.resolve_topic_name("~/input/odometry")
-            silent = monotonic() - self.transforms.odometry_arrival
-            if silent > ODOMETRY_TIMEOUT_S and stamp - last > self.params().max_gap * SECOND_NS:
-                return f"no odometry on {topic} for {silent:.0f} s: assuming a sensor at rest; is the odometry running?"
-            if silent <= ODOMETRY_TIMEOUT_S and abs(last - stamp) > MAX_OFFSET_NS:
+            silence = monotonic() - self.transforms.odometry_arrival
+            if silence > ODOMETRY_TIMEOUT_S and stamp - odometry_ns > self.params().max_gap * SECOND_NS:
                 return (
-                    f"the odometry on {topic} is stamped {abs(last - stamp) / SECOND_NS:.0f} s "
-                    f"{'ahead of' if last > stamp else 'behind'} the detections, so its poses are ignored: do both "
-                    "use the same clock (use_sim_time)?"
+                    f"no odometry on {topic} for {silence:.0f} s: assuming a sensor at rest; is the odometry running?"
                 )
-        if wanted == "tf" and self.source != "tf":
+            if silence <= ODOMETRY_TIMEOUT_S and abs(odometry_ns - stamp) > MAX_OFFSET_NS:
+                return (
+                    f"the stamps of the odometry on {topic} are {abs(odometry_ns - stamp) / SECOND_NS:.0f} s "
+                    f"{'ahead of' if odometry_ns > stamp else 'behind'} the detections, so its poses are ignored: do "
+                    "both use the same clock (use_sim_time)?"
+                )
+        if setting == "tf" and self.source != "tf":
             fixed = self.node.node_params.input.fixed_frame
             return (
                 f"TF does not connect '{frame_id}' with '{fixed}' (input.fixed_frame): tracks "
                 "are relative to the sensor"
             )
-        if wanted in ("odometry", "kiss_icp") and self.source != wanted:
-            topic = "odometry" if wanted == "odometry" else "points"
+        if setting in ("odometry", "kiss_icp") and self.source != setting:
+            topic = "odometry" if setting == "odometry" else "points"
             return (
                 f"no pose from {self.node.resolve_topic_name(f'~/input/{topic}')} yet: "
                 "tracks are relative to the sensor"
             )
         if not self.is_mounting_known and frame_id:
             return (
-                f"the odometry describes '{odometry_child}', the detections are in '{frame_id}', "
+                f"the odometry is for '{odometry_child}', the detections are in '{frame_id}', "
                 "and TF does not connect them: they are assumed to coincide"
                 + ("; its child_frame_id is empty" if not odometry_child else "")
             )
         if self.source == "kiss_icp" and self.is_disconnected:
             return (
-                f"KISS-ICP moves with '{self.scan_frame}', the detections are in '{frame_id}', "
+                f"KISS-ICP gives poses of '{self.scan_frame}', the detections are in '{frame_id}', "
                 "and TF does not connect them: tracks are relative to the sensor"
             )
         if self.pose_problem:
@@ -146,15 +148,15 @@ class EgoInput:
         return None
 
     def _select_source(self, frame_id: str, stamp: int) -> str:
-        """Store the best available source that ego.source allows in self.source; return it."""
-        wanted, available = self.params().source, {self.source}
+        """Set self.source to the best available source that ego.source allows, and return it."""
+        setting, available = self.params().source, {self.source}
         if self.transforms.odometry_ns is not None:
             available.add("odometry")
         if self.scan_ns:
             available.add("kiss_icp")
-        if choose_source(wanted, {"tf", *available}) == "tf" != self.source and (self._is_connected(frame_id, stamp)):
+        if choose_source(setting, {"tf", *available}) == "tf" != self.source and self._is_connected(frame_id, stamp):
             available.add("tf")
-        self.source, self.is_mounting_known = choose_source(wanted, available), True
+        self.source, self.is_mounting_known = choose_source(setting, available), True
         if self.source == "odometry":
             self.is_mounting_known = self.transforms.is_connected_to_odometry(frame_id)
             if not self.is_mounting_known:
@@ -172,7 +174,7 @@ class EgoInput:
         return True
 
     def _uses_scans(self) -> bool:
-        """Return True while there is no better source than scans."""
+        """Return True while scans are the best source."""
         return self.source in (NO_SOURCE, "kiss_icp")
 
     def _look_up(self, source: str, frame_id: str, stamp: int, max_gap: float | None) -> np.ndarray | None:
@@ -187,7 +189,7 @@ class EgoInput:
         return self.transforms.sensor_poses(source, frame_id, at, max_gap)[0]
 
     def _pose_on_scan(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
-        """Return the (4, 4) pose of a frame in that of the scans at times (1,) ns."""
+        """Return the (4, 4) pose of a frame in the frame of the scans at times (1,) ns."""
         if not frame_id or frame_id == self.scan_frame:
             self.is_disconnected = False
             return np.eye(4)
@@ -201,7 +203,7 @@ class EgoInput:
         return poses[0]
 
     def _try_next_source(self, stamp: int, has_pose: bool) -> None:
-        """With auto, use TF if there is no odometry, and KISS-ICP if TF has no pose either."""
+        """With ego.source auto, subscribe to TF without odometry, and start KISS-ICP without both."""
         if self.source in ("odometry", "tf") or has_pose:
             self.without_ns = None
             return

@@ -20,14 +20,13 @@ from visualization_msgs.msg import MarkerArray
 from lidar_perception.nodes.interfaces import RELIABLE
 
 DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-SETTLE_S, MAX_SETTLE_S = 0.1, 3.0  # seconds
+SETTLE_S, MAX_SETTLE_S = 0.1, 3.0  # time without changes after which the ROS graph has settled, and its limit
 
 
 def create_context(domain: int | None) -> Context:
-    """Create a ROS context without signal handlers, to be ended by shut_down_context().
+    """Create a ROS context without signal handlers. End it with shut_down_context().
 
-    Args:
-        domain: ROS domain; None for that of the environment.
+    domain: ROS domain; None for the domain of the environment.
     """
     context = Context()
     rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
@@ -40,7 +39,7 @@ def to_parameters(values: Mapping[str, Any]) -> list[Parameter]:
 
 
 def to_values(answers: Iterable[Any]) -> list[Any]:
-    """Convert the parameter messages in an answer of get_parameters to Python values."""
+    """Convert the parameter messages of a get_parameters response to Python values."""
     return [parameter_value_to_python(answer) for answer in answers]
 
 
@@ -48,23 +47,23 @@ def shut_down_context(context: Context, *nodes: Node) -> None:
     """Destroy all nodes of a context and shut it down once the ROS graph has settled.
 
     The graph has settled after SETTLE_S seconds without a change, at the latest after MAX_SETTLE_S.
-    Fast DDS as in the wheels may deadlock, with the interpreter lock held, if the last node of a
-    context is destroyed while Fast DDS learns that another process leaves
+    The Fast DDS of the wheels may deadlock while it holds the interpreter lock, if the last node of
+    a context is destroyed while Fast DDS is notified that another process has left
     (https://github.com/eProsima/Fast-DDS/issues/6513).
     """
     if nodes:
-        end, since, seen = monotonic() + MAX_SETTLE_S, monotonic(), _graph_state(nodes[0])
-        while (now := monotonic()) < min(end, since + SETTLE_S):
+        end, last_change, state = monotonic() + MAX_SETTLE_S, monotonic(), _read_graph_state(nodes[0])
+        while (now := monotonic()) < min(end, last_change + SETTLE_S):
             sleep(SETTLE_S / 10)
-            if seen != (seen := _graph_state(nodes[0])):
-                since = now
+            if state != (state := _read_graph_state(nodes[0])):
+                last_change = now
     for node in nodes:
         node.destroy_node()
     context.try_shutdown()
 
 
-def _graph_state(node: Node) -> tuple[Any, ...]:
-    """Return the nodes on the domain, and the numbers of endpoints of each topic."""
+def _read_graph_state(node: Node) -> tuple[Any, ...]:
+    """Return the nodes on the domain, and the numbers of publishers and subscribers of each topic."""
     return (
         sorted(node.get_node_names_and_namespaces()),
         [
@@ -80,12 +79,13 @@ class ExternalNode:
     The node has its own ROS context without signal handlers and is spun by spin_until().
 
     Args:
-        domain: ROS domain; None for that of the environment.
+        domain: ROS domain; None for the domain of the environment.
         name: name of the node.
 
     Attributes:
         diagnostics: {node: its last DiagnosticStatus}
-        poll_s: longest time between two looks at the condition of spin_until(); messages end it.
+        poll_s: maximum time between two checks of the condition in spin_until(); a message triggers
+            an earlier check.
     """
 
     poll_s = 0.02
@@ -110,16 +110,16 @@ class ExternalNode:
             self.diagnostics[status.name] = status
 
     def get_message(self, node: str) -> str:
-        """Return the last diagnostic message of a node, "" before the first one."""
+        """Return the last diagnostic message of a node; "" if there is none yet."""
         return self.diagnostics[node].message if node in self.diagnostics else ""
 
     def get_value(self, node: str, key: str) -> str | None:
-        """Return a value of the last diagnostic of a node, or None."""
+        """Return a value from the last diagnostic status of a node, or None."""
         status = self.diagnostics.get(node)
         return next((v.value for v in status.values if v.key == key), None) if status else None
 
     def is_connected(self, outputs: Mapping[str, set[str]]) -> bool:
-        """Return True if by the diagnostics each of the outputs {node: topics} has a subscriber."""
+        """Return True if every output {node: topics} has a subscriber, according to the diagnostics."""
         return all(
             node in self.diagnostics
             and all(int(self.get_value(node, f"subscribers of {topic}") or 0) for topic in topics)
@@ -129,7 +129,7 @@ class ExternalNode:
     def spin_until(
         self, condition: Callable[[], Any], timeout: float, on_spin: Callable[[], None] = lambda: None
     ) -> bool:
-        """Spin until condition() holds; return False if it does not within timeout seconds.
+        """Spin until condition() is true; return False after `timeout` seconds.
 
         on_spin() is called before each spin.
         """
@@ -160,13 +160,13 @@ class GraphMonitor(ExternalNode):
 
 @contextmanager
 def _localhost_discovery():
-    """Limit discovery to this machine for contexts that are created inside."""
-    before = os.environ.get(DISCOVERY_RANGE)
+    """Limit discovery to this machine for contexts that are created inside the with block."""
+    previous = os.environ.get(DISCOVERY_RANGE)
     os.environ[DISCOVERY_RANGE] = "LOCALHOST"
     try:
         yield
     finally:
-        if before is None:
+        if previous is None:
             del os.environ[DISCOVERY_RANGE]
         else:
-            os.environ[DISCOVERY_RANGE] = before
+            os.environ[DISCOVERY_RANGE] = previous

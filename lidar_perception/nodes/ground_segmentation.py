@@ -55,7 +55,7 @@ class GroundSegmentation(ManagedNode):
             visible = usable.take(indices)
             if self.node_params.range == "all":
                 segmented, indices, ground = (visible_frame, visible, segment_ground(visible_frame, params.ground))
-            else:  # same fallback as in the detector
+            else:  # segmented like in the detector, with the same fallback
                 view = NormalizedView.of(visible_frame, params.ground.sensor_pose, **RANGES[self.node_params.range])
                 segmented, indices, ground = (
                     view.frame,
@@ -70,10 +70,10 @@ class GroundSegmentation(ManagedNode):
         self._publish_parts(msg, visible_frame, visible, params, ground if self.node_params.range == "all" else None)
         plane = fit_plane(segmented.xyz.compress(ground, axis=0))
         if plane is not None:
-            share = compute_inlier_fraction(segmented.xyz, plane)
+            inlier_fraction = compute_inlier_fraction(segmented.xyz, plane)
             self.diagnostics.counts.update(
                 plane=" ".join(f"{v:.4f}" for v in plane),
-                plane_inlier_share=f"{share:.3f}",
+                plane_inlier_share=f"{inlier_fraction:.3f}",
                 ground_share=f"{ground.mean():.3f}",
             )
         problem = diagnose_empty(len(frame), ground) or self.sensor.find_problem(frame, params)
@@ -82,7 +82,7 @@ class GroundSegmentation(ManagedNode):
     def _publish_parts(
         self, msg: Any, frame: PointCloud, indices: np.ndarray, params: Any, ground: np.ndarray | None
     ) -> None:
-        """Publish ~/output/ground, nonground and obstacles if anybody subscribes.
+        """Publish ~/output/ground, nonground and obstacles if they have subscribers.
 
         Args:
             msg: the cloud.
@@ -95,7 +95,7 @@ class GroundSegmentation(ManagedNode):
             return
         if ground is None:
             ground = segment_ground(frame, params.ground)
-        for publisher, chosen in ((self.ground, ground), (self.nonground, ~ground)):
+        for publisher, mask in ((self.ground, ground), (self.nonground, ~ground)):
             if publisher.get_subscription_count():
-                publisher.publish(from_array(to_array(msg).take(indices[chosen]), msg.header, make_bag_message))
+                publisher.publish(from_array(to_array(msg).take(indices[mask]), msg.header, make_bag_message))
         self.obstacles.publish(msg, frame.xyz, ground, indices)

@@ -1,4 +1,4 @@
-"""Compiled thread that ends the process after a signal, even while DDS is stuck."""
+"""Compiled thread that ends the process after a signal, even if DDS is stuck."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit, types
 
 REACTION_S = 5.0  # time to finish the current work
-# Time for DDS to shut down after the results are written. An interrupted shutdown may leave a port in
-# shared memory that others wait for. launch sends SIGTERM after 5 s.
+# Time for DDS to shut down after the results are written. An interrupted shutdown may leave a
+# shared-memory port for which other processes wait. launch sends SIGTERM after 5 s.
 TEARDOWN_S = 3.0
 RUNNING, CLOSING, CLOSED = range(3)
 TICK_S = 0.02
@@ -30,8 +30,8 @@ def start_guard(signals: int, pipe: int) -> np.ndarray:
     until its end.
 
     Args:
-        signals: descriptor of signalfd(2).
-        pipe: descriptor of the writing end.
+        signals: file descriptor from signalfd(2).
+        pipe: file descriptor of the writing end of the pipe.
 
     Returns:
         (2,) int64 state for the caller to set: phase, and exit code when CLOSED.

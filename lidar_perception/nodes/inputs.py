@@ -34,14 +34,14 @@ from msg_utils.stamps import to_ns
 
 
 class CameraInput:
-    """The camera from ~/input/camera_info and ~/input/extrinsics, or from TF."""
+    """Camera calibration from ~/input/camera_info, and from ~/input/extrinsics or TF."""
 
     def __init__(self, node: LidarNode):
         self.node = node
         self.info: Any = None
         self.transforms: dict[tuple[str, str], Any] = {}
-        # A latched subscription gets earlier messages, but none of a camera driver, which publishes
-        # volatile and often best effort.
+        # The latched subscription receives messages sent before it existed. The second one is for
+        # camera drivers, which publish volatile and often best effort.
         node.inputs.subscribe("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED, SENSOR_DATA)
         node.inputs.subscribe(
             "extrinsics", "geometry_msgs/msg/TransformStamped", self._on_transform, LATCHED, SENSOR_DATA
@@ -54,7 +54,7 @@ class CameraInput:
         self.transforms[msg.header.frame_id, msg.child_frame_id] = msg
 
     def find_missing_input(self, cloud: Any) -> str | None:
-        """Return what a cloud waits for; None if it can be cropped, or need not be."""
+        """Return a description of the data that a cloud needs to be cropped, or None."""
         params = self.node.params.view
         if not params.enabled or self.get(cloud.header, params) is not None:
             return None
@@ -67,9 +67,9 @@ class CameraInput:
         )
 
     def get(self, header: Any, params: ViewParams) -> Camera | None:
-        """Return the camera for the points of a cloud in the level frame, or None.
+        """Return the camera for points in the level frame of a cloud.
 
-        None while view is disabled, and until the pose of the camera is available.
+        Returns None if view.enabled is false, or while the calibration is incomplete.
         """
         if not params.enabled or self.info is None:
             return None
@@ -89,7 +89,7 @@ class CameraInput:
 
 
 class StampMatcher:
-    """Matches clouds with the messages of another topic that have the same stamp.
+    """Pairs clouds with the messages of another topic that have the same stamp.
 
     A cloud is delivered with its partner, or without one if a later partner or too many clouds have
     arrived. If time jumps back, all pending messages are dropped.
@@ -108,12 +108,12 @@ class StampMatcher:
         self.partners: OrderedDict[int, Any] = OrderedDict()
 
     def add_cloud(self, stamp_ns: int, msg: Any) -> None:
-        self._drop_later(stamp_ns)
+        self._drop_if_time_jumped_back(stamp_ns)
         self.clouds[stamp_ns] = msg
         self._flush()
 
     def add_partner(self, stamp_ns: int, msg: Any) -> None:
-        self._drop_later(stamp_ns)
+        self._drop_if_time_jumped_back(stamp_ns)
         self.partners[stamp_ns] = msg
         while len(self.partners) > 20 * self.capacity:
             self.partners.popitem(last=False)
@@ -122,20 +122,20 @@ class StampMatcher:
     def _flush(self) -> None:
         while self.clouds:
             stamp, cloud = next(iter(self.clouds.items()))
-            newest = next(reversed(self.partners), None)
+            newest_partner = next(reversed(self.partners), None)
             partner = self.partners.get(stamp)
-            late = newest is not None and newest > stamp
-            if partner is None and not late and len(self.clouds) <= self.capacity:
+            is_late = newest_partner is not None and newest_partner > stamp
+            if partner is None and not is_late and len(self.clouds) <= self.capacity:
                 return
             del self.clouds[stamp]
             self.deliver(cloud, partner)
 
     def clear(self) -> None:
         """Drop all pending messages."""
-        self._drop_later(-JUMP_NS - 1)
+        self._drop_if_time_jumped_back(-JUMP_NS - 1)
 
-    def _drop_later(self, stamp_ns: int) -> None:
-        """Drop all pending messages if the last one is from before a jump back to stamp_ns."""
+    def _drop_if_time_jumped_back(self, stamp_ns: int) -> None:
+        """Drop all pending messages if they are more than JUMP_NS ahead of stamp_ns."""
         for pending in (self.clouds, self.partners):
             if pending and next(reversed(pending)) > stamp_ns + JUMP_NS:
                 if pending is self.clouds:
@@ -144,7 +144,7 @@ class StampMatcher:
 
 
 class SeedInput:
-    """Provides the seed pedestrian for each cloud, from the source in the parameters.
+    """Provides seed pedestrians for each cloud, from the source that the parameters select.
 
     deliver(cloud message, seed source) is called for each cloud, in order. The seed source raises
     InputError while there is no seed.
@@ -198,8 +198,8 @@ class SeedInput:
         objects = from_marker_array(msg)
         if not objects.stamp_ns:
             raise InputError(
-                "labels without a header.stamp match no cloud; for a frame without "
-                "objects send a DELETEALL with its header"
+                "labels without a header.stamp cannot be matched to a cloud; for a frame without "
+                "objects, send a DELETEALL marker with the header of the frame"
             )
         self.matcher.add_partner(objects.stamp_ns, to_truth(objects))
 
@@ -209,10 +209,7 @@ class SeedInput:
     def _deliver_with_truth(self, cloud: Any, truth: Any) -> None:
         if truth is None:
             self.deliver(
-                cloud,
-                _raise_missing(
-                    "no ground truth with the stamp of this cloud; is it published with the same header.stamp?"
-                ),
+                cloud, _raise_missing("no ground truth for this cloud; is it published with the same header.stamp?")
             )
         else:
             people = truth.select_class(PEDESTRIAN)
@@ -229,7 +226,7 @@ class SeedInput:
             try:
                 seed = self._make_clicked_seed(self.new_clicks[0], header, segmented)
             except InputError:
-                if len(self.new_clicks) == 1:  # the message stays until the next click
+                if len(self.new_clicks) == 1:  # report the problem until the next click
                     raise
             else:
                 self.clicked_seeds = (*self.clicked_seeds, seed)
@@ -248,8 +245,8 @@ class SeedInput:
             pose = self.node.transforms.to_level(header, frame_id)
         except MissingTransform as error:
             raise InputError(
-                f"the clicked point is in frame '{frame_id}' but the cloud in "
-                f"'{header.frame_id}' ({error}); choose the cloud's frame as fixed frame and click again"
+                f"the clicked point is in frame '{frame_id}' and the cloud in '{header.frame_id}' ({error}); "
+                "set the fixed frame of the viewer to the cloud's frame and click again"
             ) from None
         point = transform_points(np.array([[p.x, p.y, p.z]]), pose)[0]
         (seed,) = make_click_source(point, self.params)(segmented)

@@ -18,19 +18,19 @@ from lidar_perception.wire.codec import encode, warm_up_type
 from msg_utils.markers import MarkerRows
 from msg_utils.messages import load_message_class
 
-Receive = Callable[[Any, dict[str, int]], None]  # called with a message and its info, see Output
+Receive = Callable[[Any, dict[str, int]], None]  # function that receives a message and its message info
 
 
 class Output:
-    """A publisher that also passes its messages to the nodes of its process that are linked to it.
+    """A publisher that also passes its messages to linked nodes in the same process.
 
-    Messages are of rosbags' class, MarkerRows, or CDR. Linked nodes share them and must not change
-    them. They are serialized and published on DDS while somebody outside of the process subscribes,
-    and always in a process with one node.
+    Messages are rosbags messages, MarkerRows or CDR. Linked nodes share them and must not modify
+    them. Messages are serialized and published on DDS only while there are subscribers in other
+    processes, or always if the process has one node.
 
     Args:
-        publisher: of rclpy.
-        links: None in a process with one node.
+        publisher: publisher of rclpy.
+        links: links of the process; None if it has one node.
     """
 
     def __init__(self, publisher: Any, links: Links | None):
@@ -48,7 +48,7 @@ class Output:
         return name
 
     def get_subscription_count(self) -> int:
-        """Return the number of subscribers, inside and outside of the process."""
+        """Return the number of subscribers inside and outside the process."""
         return len(self.receivers) + int(self.publisher.get_subscription_count())
 
     def publish(self, message: Any) -> None:
@@ -74,7 +74,7 @@ class Outputs:
         self.items: list[Output] = []
 
     def advertise(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE) -> Output:
-        """Create a publisher of ~/output/TOPIC, or of any name that starts with ~ or /."""
+        """Create a publisher of ~/output/TOPIC, or of the topic itself if it starts with ~ or /."""
         warm_up_type(type_name)
         publisher = self.node.create_publisher(
             load_message_class(type_name),
@@ -86,7 +86,7 @@ class Outputs:
         return self.items[-1]
 
     def clear(self) -> None:
-        """End the links of all outputs and forget them; their publishers are destroyed elsewhere."""
+        """Close and remove all outputs; their publishers are destroyed elsewhere."""
         for output in self.items:
             output.close()
         self.items = []
@@ -96,7 +96,7 @@ class Outputs:
         return {f"subscribers of {output.topic_name}": output.get_subscription_count() for output in self.items}
 
     def problems(self) -> list[Problem]:
-        """Return no problems: missing subscribers are normal."""
+        """Return an empty list, because missing subscribers are normal."""
         return []
 
 
@@ -116,22 +116,22 @@ def find_only_output(node: Node, links: Links | None, topic: str) -> Output | No
 
 
 class Links:
-    """The outputs of the nodes of one process, and the inputs that may be linked to them."""
+    """Outputs of all nodes of a process, and callbacks of the inputs that may be linked to them."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._outputs: dict[str, tuple[Output, ...]] = {}
-        self._waiting: dict[str, tuple[Callable[[], None], ...]] = {}  # callbacks to call when the outputs change
+        self._watchers: dict[str, tuple[Callable[[], None], ...]] = {}  # topic -> callbacks of watch()
 
     def add(self, output: Output) -> None:
-        """Add an output and tell the inputs of its topic."""
+        """Add an output and notify the inputs of its topic."""
         topic = output.topic_name
         with self._lock:
             self._outputs[topic] = (*self._outputs.get(topic, ()), output)
         self._notify(topic)
 
     def remove(self, output: Output) -> None:
-        """Remove an output and tell the inputs of its topic."""
+        """Remove an output and notify the inputs of its topic."""
         topic = output.topic_name
         with self._lock:
             self._outputs[topic] = tuple(o for o in self._outputs.get(topic, ()) if o is not output)
@@ -139,21 +139,21 @@ class Links:
         self._notify(topic)
 
     def _notify(self, topic: str) -> None:
-        for on_change in self._waiting.get(topic, ()):
+        for on_change in self._watchers.get(topic, ()):
             on_change()
 
     def watch(self, topic: str, on_change: Callable[[], None]) -> None:
-        """Call on_change(), in any thread, when an output of the topic comes or goes."""
+        """Call on_change(), in any thread, when an output of the topic is added or removed."""
         with self._lock:
-            self._waiting[topic] = (*self._waiting.get(topic, ()), on_change)
+            self._watchers[topic] = (*self._watchers.get(topic, ()), on_change)
 
     def unwatch(self, topic: str, on_change: Callable[[], None]) -> None:
-        """End watch()."""
+        """Stop calling on_change(), see watch()."""
         with self._lock:
-            self._waiting[topic] = tuple(c for c in self._waiting.get(topic, ()) if c != on_change)
+            self._watchers[topic] = tuple(c for c in self._watchers.get(topic, ()) if c != on_change)
 
     def find_output(self, topic: str) -> Output | None:
-        """Return the output of a topic if there is exactly one in this process, else None."""
+        """Return the output of a topic if this process has exactly one; otherwise None."""
         outputs = self._outputs.get(topic, ())
         return outputs[0] if len(outputs) == 1 else None
 

@@ -1,8 +1,8 @@
 """Entry point of all node executables: block signals, compile, then start ROS.
 
-Threads that a library starts before the signals are blocked, such as those of OpenBLAS, do not
-block them, and a signal would end the process there. So this module imports only the standard
-library at its top, and the functions import the rest.
+Signals must be blocked before a library such as OpenBLAS starts threads. Otherwise these threads
+would not block them, and a signal would end the process. This module therefore imports only the
+standard library at its top; the functions import everything else.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 STOP_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 
 
-def help_text(name: str) -> str:
-    """Return the text of --help: usage and parameters of a node."""
+def make_help_text(name: str) -> str:
+    """Return the text of --help, with the usage and the parameters of a node."""
     from lidar_perception.nodes.node_parameters import find_node_parameters
     from lidar_perception.param_fields import describe_fields
 
@@ -36,15 +36,15 @@ def help_text(name: str) -> str:
 
 
 def run(name: str, arguments: list[str]) -> int:
-    """Run a node until it is done or gets SIGINT or SIGTERM; return its exit code.
+    """Run nodes until they are done or a signal (SIGINT or SIGTERM) arrives; return the exit code.
 
-    The code is 0 after a signal, and 2 if the node cannot start.
+    The exit code is 0 after a signal, and 2 if a node cannot start.
 
     Args:
-        name: executable of the node.
-        arguments: the same name, then arguments for ROS. After `---` may come another node for
-            the same process, and last, without a name, arguments of the process, such as
-            `--ros-args --log-level debug`.
+        name: executable of the first node.
+        arguments: the same name, followed by its ROS arguments. Further nodes for the same process
+            may follow, each after `---`. Arguments for the whole process, such as
+            `--ros-args --log-level debug`, come last, after another `---`.
     """
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     begin = perf_counter()
@@ -58,11 +58,11 @@ def run(name: str, arguments: list[str]) -> int:
     stop = Stop(STOP_SIGNALS)
     if {"-h", "--help"} & set(arguments[1:]):
         try:
-            print(help_text(name), flush=True)
+            print(make_help_text(name), flush=True)
         except BrokenPipeError:  # output piped to `head`: keep Python from flushing again at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    nodes, shared = split_arguments(arguments)
+    nodes, process_arguments = split_arguments(arguments)
     from lidar_perception.nodes.shared_memory import is_fed_by_driver, use_large_shared_memory
 
     use_large_shared_memory(any(map(is_fed_by_driver, nodes)))
@@ -77,16 +77,19 @@ def run(name: str, arguments: list[str]) -> int:
 
     from lidar_perception.runs.compiling import report_compilation
 
-    say = get_logger(_logger_name(nodes[0])).info
-    with report_compilation(say):
-        classes = [load_node_class(each[0]) for each in nodes]
-    if len(nodes) == 1 and not shared:
-        return _spin(classes[0], nodes[0], begin, stop)
-    return _spin_together(list(zip(classes, nodes)), shared, begin, stop)
+    with report_compilation(get_logger(_find_logger_name(nodes[0])).info):
+        classes = [load_node_class(node[0]) for node in nodes]
+    if len(nodes) == 1 and not process_arguments:
+        return _run_nodes([(classes[0], nodes[0], {})], nodes[0], begin, stop)
+    from lidar_perception.nodes.links import Links
+
+    links = Links()
+    node_specs = [(cls, node, {"cli_args": node[1:], "links": links}) for cls, node in zip(classes, nodes)]
+    return _run_nodes(node_specs, process_arguments, begin, stop)
 
 
 def split_arguments(arguments: list[str]) -> tuple[list[list[str]], list[str]]:
-    """Return the arguments of each node, and those of the process."""
+    """Return the arguments of each node, and the arguments of the process."""
     from lidar_perception.nodes.graph import SEPARATOR
 
     parts: list[list[str]] = [[]]
@@ -99,72 +102,57 @@ def split_arguments(arguments: list[str]) -> tuple[list[list[str]], list[str]]:
     return nodes, [word for part in parts if part not in nodes for word in part]
 
 
-def _logger_name(arguments: list[str]) -> str:
-    """Return the logger name of a node with these arguments before the node exists.
+def _find_logger_name(arguments: list[str]) -> str:
+    """Return the logger name that a node with these arguments will have.
 
-    It is the remapped name of the node, or that of the executable, with the namespace.
+    It is the remapped name of the node, or the name of the executable, with the namespace.
     """
     rules = [
-        b.rpartition(":__")[2].removeprefix("__").partition(":=")
-        for a, b in pairwise(arguments)
-        if a in ("-r", "--remap")
+        rule.rpartition(":__")[2].removeprefix("__").partition(":=")
+        for option, rule in pairwise(arguments)
+        if option in ("-r", "--remap")
     ]
-    given = {key: value for key, _, value in rules if re.fullmatch(r"[A-Za-z_/][\w/]*", value)}
-    name = given.get("node") or given.get("name") or arguments[0]
-    return ".".join([*filter(None, given.get("ns", "").split("/")), name])
+    names = {key: value for key, _, value in rules if re.fullmatch(r"[A-Za-z_/][\w/]*", value)}
+    name = names.get("node") or names.get("name") or arguments[0]
+    return ".".join([*filter(None, names.get("ns", "").split("/")), name])
 
 
 def _find_misspelt_sections(arguments: list[str], node: str) -> list[str]:
-    """Return a line for each section of the parameter files whose name is close to this node's."""
+    """Return a warning for each section of the parameter files with almost the name of this node."""
     from lidar_perception.nodes.param_files import describe_unknown_nodes
     from lidar_perception.types import InputError
 
     lines = []
-    for path in [b for a, b in pairwise(arguments) if a == "--params-file"]:
-        with suppress(InputError):  # for example a file too large for us; rcl has already read it
+    for path in [value for option, value in pairwise(arguments) if option == "--params-file"]:
+        with suppress(InputError):  # for example a file that is too large for us; rcl has already read it
             lines += describe_unknown_nodes(path, [node], only_similar=True)
     return lines
 
 
 def _exit_process(nodes: list[LidarNode]) -> None:
-    """End the process while its work, such as a compilation, still runs."""
+    """End the process immediately, even during work such as a compilation."""
     import rclpy
     from rclpy.logging import LoggingSeverity
 
     with suppress(Exception):
         for node in nodes:
-            node.get_logger().set_level(LoggingSeverity.FATAL)  # the running work fails without its node
+            node.get_logger().set_level(LoggingSeverity.FATAL)  # work that still runs will log errors
             node.destroy_node()
         rclpy.try_shutdown()
     os._exit(0)
 
 
-def _spin(node_class: type, arguments: list[str], begin: float, stop: Stop) -> int:
-    """Create a node and spin it; return the exit code.
+def _run_nodes(
+    node_specs: list[tuple[type, list[str], dict[str, Any]]], process_arguments: list[str], begin: float, stop: Stop
+) -> int:
+    """Create nodes, spin each in its own thread, and return the exit code.
 
-    begin is the perf_counter() at the start of the process.
+    Args:
+        node_specs: (class, arguments, options of the class) of each node.
+        process_arguments: ROS arguments of the process.
+        begin: perf_counter() at the start of the process.
+        stop: signal handler of the process.
     """
-    return _run_nodes([(node_class, arguments, {})], arguments, begin, stop)
-
-
-def _spin_together(nodes: list[tuple[type, list[str]]], shared: list[str], begin: float, stop: Stop) -> int:
-    """Create linked nodes and spin each in its own thread; return the exit code.
-
-    shared: arguments for ROS that are not of one of the nodes.
-    """
-    from lidar_perception.nodes.links import Links
-
-    links = Links()
-    return _run_nodes(
-        [(node_class, arguments, {"cli_args": arguments[1:], "links": links}) for node_class, arguments in nodes],
-        shared,
-        begin,
-        stop,
-    )
-
-
-def _run_nodes(given: list[tuple[type, list[str], dict[str, Any]]], shared: list[str], begin: float, stop: Stop) -> int:
-    """Create nodes of these classes, arguments and options, spin them, and return the exit code."""
     import rclpy
     from rclpy.exceptions import NameValidationException, ParameterException
     from rclpy.logging import get_logger
@@ -174,46 +162,47 @@ def _run_nodes(given: list[tuple[type, list[str], dict[str, Any]]], shared: list
     from lidar_perception.runs.files import convert_os_errors
     from lidar_perception.types import InputError
 
-    log = get_logger(_logger_name(given[0][1]))
+    log = get_logger(_find_logger_name(node_specs[0][1]))
     nodes: list[LidarNode] = []
     code = 1
-    kept: BaseException | None = None  # keeps the entities of a node that failed to start
+    start_error: BaseException | None = None  # its traceback keeps the entities of a node alive until shutdown
 
-    def end() -> None:
+    def stop_nodes() -> None:
         for node in nodes:
             node.stop.set_result(None)
 
     try:
-        stop.on_signal = lambda: None  # a signal must now let DDS shut down, see stop.requested
-        rclpy.init(args=shared, signal_handler_options=SignalHandlerOptions.NO)
-        for node_class, arguments, options in given:
-            log = get_logger(_logger_name(arguments))
+        stop.on_signal = lambda: None  # from now on DDS must shut down after a signal, see stop.requested
+        rclpy.init(args=process_arguments, signal_handler_options=SignalHandlerOptions.NO)
+        for node_class, arguments, options in node_specs:
+            log = get_logger(_find_logger_name(arguments))
             with convert_os_errors():
                 nodes.append(node_class(**options))
-        stop.on_signal = end
+        stop.on_signal = stop_nodes
         if not any(node.writes_files for node in nodes):
             stop.force_exit = lambda: _exit_process(nodes)
         if stop.requested:
-            end()
+            stop_nodes()
         if len(nodes) == 1:
-            _spin_node(nodes[0], given[0][1], begin)
+            _spin_node(nodes[0], node_specs[0][1], begin)
         else:
             with ThreadPoolExecutor(len(nodes)) as pool:
-                spinning = [
-                    pool.submit(_spin_node, node, arguments, begin) for node, (_, arguments, _) in zip(nodes, given)
+                futures = [
+                    pool.submit(_spin_node, node, arguments, begin)
+                    for node, (_, arguments, _) in zip(nodes, node_specs)
                 ]
-                if any(future.exception() for future in wait(spinning, None, FIRST_EXCEPTION).done):
-                    end()
-            for node, future in zip(nodes, spinning):
+                if any(future.exception() for future in wait(futures, None, FIRST_EXCEPTION).done):
+                    stop_nodes()
+            for node, future in zip(nodes, futures):
                 log = node.get_logger()
                 future.result()
         code = 0
     except UnknownROSArgsError as error:
         log.fatal(f"unknown argument after --ros-args: {error}")
-        kept, code = error, 2
+        start_error, code = error, 2
     except (InputError, ValueError, ParameterException, NameValidationException, RCLError) as error:
         log.fatal(" ".join(str(error).split()))
-        kept, code = error, 2
+        start_error, code = error, 2
     finally:
         stop.begin_closing()
         for node in nodes:
@@ -225,13 +214,13 @@ def _run_nodes(given: list[tuple[type, list[str], dict[str, Any]]], shared: list
         stop.finish_closing(code)
         for node in nodes:
             node.destroy_node()
-        del kept  # DDS shuts down; the guard ends the process if it hangs
+        del start_error  # DDS shuts down; the guard ends the process if it hangs
         rclpy.try_shutdown()
     return code
 
 
 def _spin_node(node: LidarNode, arguments: list[str], begin: float) -> None:
-    """Start a node and spin it until it is to stop."""
+    """Start a node and spin it until it should stop."""
     from rclpy.executors import SingleThreadedExecutor
 
     from lidar_perception.nodes.node_parameters import describe_misspelt_parameters
@@ -239,7 +228,7 @@ def _spin_node(node: LidarNode, arguments: list[str], begin: float) -> None:
 
     undeclared = [name for name in parameter_overrides(node) if not node.has_parameter(name)]
     for line in [*describe_misspelt_parameters(undeclared), *_find_misspelt_sections(arguments, node.get_name())]:
-        node.get_logger().warning(line)  # logged before any long work
+        node.get_logger().warning(line)  # before the node starts, which may take long
     if not node.stop.done():
         node.start()
     if not node.stop.done():

@@ -1,4 +1,4 @@
-"""Base class of lifecycle nodes, which a lifecycle manager such as that of Nav2 can drive."""
+"""Base class of lifecycle nodes, which a lifecycle manager (such as Nav2's) can control."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from lidar_perception.types import InputError
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 INACTIVE = "not active"
+# Attribute of a node with a list of ROS entities -> method that destroys one of them.
 ENTITIES: dict[str, Any] = {
     "publishers": Node.destroy_publisher,
     "subscriptions": Node.destroy_subscription,
@@ -40,16 +41,15 @@ ENTITIES: dict[str, Any] = {
 
 
 class ManagedNode(LifecycleNodeMixin, LidarNode):
-    """A LidarNode with the states of a managed node.
+    """A LidarNode with a lifecycle, see https://design.ros2.org/articles/node_lifecycle.html.
 
-    See https://design.ros2.org/articles/node_lifecycle.html. A subclass only implements
-    configure(). Its inputs are open while the node is active. A cleanup undoes configure(), which
-    frees the memory of a network.
+    A subclass only implements configure(). Its inputs are open while the node is active. A cleanup
+    undoes configure(), which frees the memory of a network.
 
     Args:
         name: name of the node.
         params: see LidarNode.
-        node_params: see LidarNode; with autostart.
+        node_params: see LidarNode; must have the field autostart.
         watched_inputs: see Autostart.
         options: further arguments of LidarNode.
     """
@@ -67,7 +67,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         wrap_change_state(self, self._change)
 
     def configure(self) -> None:
-        """Make outputs and inputs, and load networks.
+        """Create outputs and inputs, and load networks.
 
         Raises:
             InputError: a file is missing or unusable.
@@ -93,11 +93,11 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         return {"lifecycle": self.state_label()}
 
     def problems(self) -> list[Problem]:
-        """Return no problems: every lifecycle state is allowed."""
+        """Return an empty list, because no lifecycle state is a problem."""
         return []
 
     def _change(self, change: Callable, request: Any, response: Any) -> Any:
-        """Refuse a transition that the current state does not allow; rclpy would end the node."""
+        """Change the state, or reject the request if the state does not allow it; rclpy would crash."""
         transition = request.transition.label or request.transition.id
         if transition in allowed_transitions(self):
             self.autostart.retry_at = None
@@ -118,12 +118,12 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         self._unconfigured = NodeSnapshot(self)
         if self.autostart.retry_at is None:
             self.diagnostics.report(WARN, "configuring", expected=True)
-        before = self.diagnostics.state
-        if problem := self._find_problem(self._configure):
+        state_before = self.diagnostics.state
+        if problem := self._run_step(self._configure):
             self._undo_configuration()
             self.diagnostics.report(ERROR, f"{UNCONFIGURED}, so this node publishes nothing: {problem}")
             return FAILURE
-        if self.diagnostics.state == before:
+        if self.diagnostics.state == state_before:
             self.diagnostics.state = (OK, INACTIVE)
         return SUCCESS
 
@@ -134,7 +134,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
             self.configure()
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        if problem := self._find_problem(self.inputs.open):
+        if problem := self._run_step(self.inputs.open):
             self.inputs.close()
             self.diagnostics.report(ERROR, f"{INACTIVE}: {problem}")
             return FAILURE
@@ -165,8 +165,8 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         if self._unconfigured is not None:
             self._unconfigured.restore()
 
-    def _find_problem(self, step: Callable[[], Any]) -> str | None:
-        """Run step() and return its error message; log the traceback of unexpected errors once."""
+    def _run_step(self, step: Callable[[], Any]) -> str | None:
+        """Run step() and return its error message, or None. Log the traceback of unexpected errors once."""
         try:
             with convert_os_errors():
                 step()
@@ -181,7 +181,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
 
 
 class NodeSnapshot:
-    """Attributes and ROS entities of a node at one time."""
+    """Snapshot of the attributes and ROS entities of a node."""
 
     def __init__(self, node: LidarNode):
         self.node = node
@@ -190,22 +190,22 @@ class NodeSnapshot:
         self.entities = [entity for kind in ENTITIES for entity in getattr(node, kind)]
 
     def restore(self) -> None:
-        """Delete all later attributes, inputs and outputs, and destroy all later ROS entities."""
+        """Remove the attributes, inputs, outputs and ROS entities that were created after the snapshot."""
         for name in set(vars(self.node)) - self.attributes:
             delattr(self.node, name)
         self.node.inputs.items = []
         self.node.outputs.clear()
         self.node.diagnostics.sources = [*self.sources]
         self.node.diagnostics.reset()
-        kept = [*self.entities, clock_subscription(self.node)]
+        preserved = [*self.entities, clock_subscription(self.node)]
         for kind, destroy in ENTITIES.items():
-            for entity in [e for e in getattr(self.node, kind) if e not in kept]:
+            for entity in [e for e in getattr(self.node, kind) if e not in preserved]:
                 destroy(self.node, entity)
         release_memory()
 
 
 def release_memory() -> None:
-    """Return free memory of Python, torch and the C library to the operating system and to CUDA."""
+    """Return unused memory of Python, torch and the C library to the operating system and to CUDA."""
     gc.collect()
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():

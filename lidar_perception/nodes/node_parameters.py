@@ -1,4 +1,4 @@
-"""Parameters of all nodes, and the detection of misspelt parameter names."""
+"""Parameters of all nodes, and detection of misspelt parameter names."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ MAX_NAMES = 200  # maximum number of names to check
 
 
 def find_node_parameters(name: str) -> dict[str, Any]:
-    """Return the dataclass field of each parameter of a node, with the default of the node."""
+    """Return {parameter: dataclass field with the node's default} of a node.
+
+    name: executable of the node.
+    """
     fields: dict[str, Any] = {}
     for path in NODES[name][1:]:
         module, _, params = path.rpartition(".")
@@ -26,18 +29,18 @@ def find_node_parameters(name: str) -> dict[str, Any]:
 
 
 def describe_misspelt_parameters(names: Iterable[str]) -> list[str]:
-    """Return a line for each parameter name that is close to one of ours, or in one of our groups.
+    """Return a warning for each unknown name that resembles one of our parameters or is in our groups.
 
-    Other unknown names may belong to other packages with parameters in the same file.
+    Other unknown names are accepted, because other packages may have parameters in the same file.
     """
     if not (names := [*islice(names, MAX_NAMES)]):
         return []
-    known = {name for node in NODES for name in find_node_parameters(node)}
-    groups = {name.partition(".")[0] for name in known if "." in name}
+    parameter_names = {name for node in NODES for name in find_node_parameters(node)}
+    groups = {name.partition(".")[0] for name in parameter_names if "." in name}
     lines = []
     for name in names:
-        matches = get_close_matches(name, known, 1, MIN_SIMILARITY)
-        if name not in known and (matches or (name.partition(".")[0] in groups and "." in name)):
+        matches = get_close_matches(name, parameter_names, 1, MIN_SIMILARITY)
+        if name not in parameter_names and (matches or (name.partition(".")[0] in groups and "." in name)):
             lines.append(
                 f"unknown parameter {name[:80]!r} is ignored"
                 + (f"; did you mean '{matches[0]}'?" if matches else "; --help lists all")

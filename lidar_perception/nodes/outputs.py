@@ -30,7 +30,8 @@ def to_output_frame(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[An
     """Transform boxes (K, 7) from the level frame of a cloud to the output frame.
 
     Returns:
-        Header in the output frame, and boxes; float64, as a map may be far from its origin.
+        The header in the output frame, and the boxes in float64, because coordinates in a map can be
+        large.
     """
     placement = node.transforms.find_placement(header)
     if placement.frame_id != header.frame_id:
@@ -39,7 +40,7 @@ def to_output_frame(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[An
 
 
 class ClusterBoxes:
-    """~/output/boxes, computed only while there are subscribers."""
+    """Publisher of ~/output/boxes, which are computed only while there are subscribers."""
 
     def __init__(self, node: LidarNode):
         self.node = node
@@ -49,7 +50,7 @@ class ClusterBoxes:
     def publish(self, header: Any, boxes: Callable[[], np.ndarray]) -> None:
         if self.publisher.get_subscription_count():
             header, output = to_output_frame(self.node, header, boxes())
-            ids = range(1, len(output) + 1)  # same ids as in the column cluster_id
+            ids = range(1, len(output) + 1)  # the ids in the column cluster_id
             rows = make_marker_rows(
                 output, ["cluster"] * len(output), ids=ids, previous=self.marker_keys, extras=_marker_texts(output, ids)
             )
@@ -58,7 +59,7 @@ class ClusterBoxes:
 
 
 def _marker_texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
-    """Return the text of each marker: the id, and the class by length and width alone."""
+    """Return the text of each marker: the id, and the class by the size of the box."""
     return [
         {"id": i, **({"size_class": CLASSES[c]} if c >= 0 else {})}
         for i, c in zip(ids, classify_by_diagonal(boxes), strict=True)
@@ -66,10 +67,10 @@ def _marker_texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
 
 
 class Obstacles:
-    """~/output/obstacles for a costmap, computed only while there are subscribers.
+    """Publisher of ~/output/obstacles for a costmap, computed only while there are subscribers.
 
-    The points outside the ground in the height band of the parameters, with x y z and, if the cloud
-    has it, intensity. The node has the groups node_params.obstacles and params.ground.
+    Obstacles are the non-ground points in the height band of the parameters, with x, y, z and, if
+    the cloud has it, intensity. The node must have node_params.obstacles and params.ground.
     """
 
     def __init__(self, node: LidarNode):
@@ -87,12 +88,12 @@ class Obstacles:
         if self.publisher.get_subscription_count():
             placement = self.node.transforms.find_placement(msg.header)
             params = self.node.transforms.with_mounting(self.node.params, placement)
-            chosen = find_obstacles(xyz, ground, self.node.node_params.obstacles, params.ground.sensor_pose)
+            is_obstacle = find_obstacles(xyz, ground, self.node.node_params.obstacles, params.ground.sensor_pose)
             self.publisher.publish(
                 make_xyz_cloud(
                     msg,
-                    placement.to_cloud_frame(xyz.compress(chosen, axis=0)),
-                    indices.compress(chosen),
+                    placement.to_cloud_frame(xyz.compress(is_obstacle, axis=0)),
+                    indices.compress(is_obstacle),
                     make_bag_message,
                 )
             )
@@ -113,8 +114,10 @@ class DetectionMarkers:
 
 
 class DetectionOutputs:
-    """~/output/detections, detections_3d if vision_msgs is installed, the time of each step, and
-    with the parameter tracking.enabled the tracks."""
+    """Publishers of detections, step times and, with tracking.enabled, tracks.
+
+    Detections are also published as detections_3d if vision_msgs is installed.
+    """
 
     def __init__(self, node: LidarNode, steps: tuple[str, ...]):
         self.node = node
@@ -136,23 +139,24 @@ class DetectionOutputs:
         ms: Mapping[str, float],
         xyz: np.ndarray,
         *,
-        weak: Detections | None = None,
+        tracked: Detections | None = None,
         clusters: np.ndarray | None = None,
     ) -> str | None:
-        """Publish detections in the level frame, and their tracks in the frame of the cloud.
+        """Publish detections that are in the level frame, and their tracks in the cloud's frame.
 
         Args:
             header: header of the cloud.
             detections: detections above the thresholds.
             ms: {step: its time in ms}.
             xyz: (N, 3) points in the level frame, for the tracker.
-            weak: all detections for the tracker, also those below the thresholds.
+            tracked: detections to track, including those below the thresholds; by default
+                `detections`.
             clusters: (K,) cluster_id of each detection.
 
         Returns:
             The problem of the tracker with its remedy, or None.
         """
-        cloud_header, tracked = header, detections if weak is None else weak
+        cloud_header, tracked = header, detections if tracked is None else tracked
         header, boxes = to_output_frame(self.node, header, detections.boxes)
         detections = replace(detections, boxes=boxes)
         self.markers.publish(header, detections, clusters)
@@ -172,24 +176,27 @@ class DetectionOutputs:
 
 
 class CandidateOutputs:
-    """The candidates as detections, and the earlier stages on ~/debug/stage1 and stage2."""
+    """Publishers of candidates as detections, and of earlier stages on ~/debug/stage1 and stage2."""
 
     def __init__(self, node: LidarNode, steps: tuple[str, ...] = ("height", "stm", "cpa")):
         self.node = node
         self.stages = {stage: DetectionMarkers(node, f"~/debug/{stage}") for stage in ("stage1", "stage2")}
         self.final = DetectionOutputs(node, steps)
 
-    def publish(self, header: Any, xyz: np.ndarray, find: Callable[[], Candidates], problem: str | None = None) -> None:
-        """Publish the candidates of find().
+    def publish(
+        self, header: Any, xyz: np.ndarray, find_candidates: Callable[[], Candidates], problem: str | None = None
+    ) -> None:
+        """Find candidates and publish them.
 
         Args:
             header: header of the cloud.
             xyz: (N, 3) points in the level frame.
-            find: returns the candidates; after an InputError none are published.
+            find_candidates: returns the candidates; if it raises InputError, empty arrays are
+                published.
             problem: a known problem of the frame, for the diagnostics.
         """
         try:
-            candidates = find()
+            candidates = find_candidates()
         except InputError as error:
             candidates, problem = Candidates.none(), problem or str(error)
         for stage, markers in self.stages.items():
@@ -207,10 +214,12 @@ class CandidateOutputs:
         if problem:
             self.node.diagnostics.report(WARN, problem)
         elif len(candidates.stage1) == 0:
-            self.node.diagnostics.report(WARN, "no cluster has the seed's height")
+            self.node.diagnostics.report(WARN, "no cluster has the height of the seed; choose another seed")
         elif len(candidates.final) == 0:
             self.node.diagnostics.report(
-                WARN, f"none of {len(candidates.stage1)} clusters of the seed's height resembles the seed"
+                WARN,
+                f"none of the {len(candidates.stage1)} clusters with the height of the seed matches it; "
+                "lower stm.threshold or choose another seed",
             )
         else:
             self.node.diagnostics.report(OK, "detecting")

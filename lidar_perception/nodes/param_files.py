@@ -1,4 +1,4 @@
-"""Reading of ROS parameter files, and matching of their sections to nodes."""
+"""ROS parameter files: reading, and matching of sections to nodes."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from lidar_perception.runs.files import read_text, shorten_error
 from lidar_perception.types import InputError, find_closest_name
 
 MAX_BYTES = 10**6
-MAX_KEYS = 10_000  # limit needed because YAML anchors can nest a group in itself
-MAX_LINES = 20  # maximum number of messages for one file
+MAX_KEYS = 10_000  # ends the reading of a group that contains itself through a YAML anchor
+MAX_LINES = 20  # maximum number of warnings for one file
 EVERY_NODE = "/**"
 
 
@@ -35,7 +35,7 @@ def read_sections(path: str | Path) -> dict[str, dict[str, Any]]:
             raise
         raise InputError(f"cannot read the parameter file {path}: {shorten_error(error)}") from None
     if not isinstance(content, dict):
-        raise InputError(f"{path} is not a parameter file; see config/ for examples")
+        raise InputError(f"{path} is not a ROS parameter file; see config/ for examples")
     visited = count()
     sections: dict[str, dict[str, Any]] = {}
     for node, group in _iterate_leaves(path, content, visited, "/", stop="ros__parameters"):
@@ -48,7 +48,7 @@ def read_sections(path: str | Path) -> dict[str, dict[str, Any]]:
 def _iterate_leaves(
     path: str | Path, group: dict, visited: Iterator[int], separator: str, prefix: str = "", stop: str | None = None
 ) -> Iterator[tuple[str, Any]]:
-    """Yield the joined name and the value of each leaf, or of each key `stop`."""
+    """Yield (joined name, value) of each leaf, or of each key `stop`."""
     for key, value in group.items():
         if next(visited) >= MAX_KEYS:
             raise InputError(f"{path} has more than {MAX_KEYS} entries")
@@ -61,15 +61,15 @@ def _iterate_leaves(
 
 
 def is_for(section: str, node: str) -> bool:
-    """Return True if a section is for a node of this name, in some namespace."""
+    """Return True if a section applies to nodes of this name in some namespace."""
     return section.rpartition("/")[2] in ("*", "**", node)
 
 
 def describe_unknown_nodes(path: str | Path, nodes: Collection[str], only_similar: bool = False) -> list[str]:
-    """Return a line for each section of a parameter file that applies to no node.
+    """Return a warning for each section of a parameter file that applies to no node.
 
-    Sections for other nodes of this package, also with a prefix, are accepted, as several graphs
-    may share a file.
+    Sections for other nodes of this package, with or without a prefix, are accepted, because several
+    graphs may share a file.
 
     Args:
         nodes: names of the nodes that are started with the file.

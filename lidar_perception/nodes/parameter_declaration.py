@@ -1,4 +1,4 @@
-"""Declaration of dataclass fields as ROS parameters with types, ranges and descriptions."""
+"""Declaration of dataclass fields as ROS parameters, with types, ranges and descriptions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TYPES = {
     str: Parameter.Type.STRING,
 }
 LISTS = {int: Parameter.Type.INTEGER_ARRAY, float: Parameter.Type.DOUBLE_ARRAY, str: Parameter.Type.STRING_ARRAY}
-# (given type, declared type) -> conversion of the value.
+# (type of the value, declared type) -> function that converts the value.
 TO_FLOATS: dict[tuple[Any, Any], Any] = {
     (Parameter.Type.INTEGER, Parameter.Type.DOUBLE): float,
     (Parameter.Type.INTEGER_ARRAY, Parameter.Type.DOUBLE_ARRAY): lambda v: [*map(float, v)],
@@ -39,11 +39,11 @@ def declare_parameters(node: Node, params: Any) -> Any:
         kind = _kind(f)
         value = list(f.default) if isinstance(f.default, tuple) else f.default
         if name in overrides:
-            given = convert_to_declared_type(overrides.pop(name), kind)
-            if given.value == []:
+            override = convert_to_declared_type(overrides.pop(name), kind)
+            if override.value == []:
                 value = []
             else:
-                overrides[name] = given
+                overrides[name] = override
         declared[name] = node.declare_parameter(name, kind if value == [] else value, _descriptor(f, kind)).value
         if declared[name] is None:
             store_empty_list(node, name, kind)
@@ -51,15 +51,15 @@ def declare_parameters(node: Node, params: Any) -> Any:
     return with_values(params, declared)
 
 
-def convert_to_declared_type(given: Parameter, kind: Parameter.Type) -> Parameter:
-    """Return a parameter with integers converted to float where the declared type is float, and
-    with an empty list, which has no type, converted to the declared type."""
+def convert_to_declared_type(parameter: Parameter, kind: Parameter.Type) -> Parameter:
+    """Convert integers to float if the declared type is float, and empty lists, which have no type."""
     if kind in LISTS.values() and (
-        given.type_ == Parameter.Type.NOT_SET or (given.type_.name.endswith("_ARRAY") and len(given.value) == 0)
+        parameter.type_ == Parameter.Type.NOT_SET
+        or (parameter.type_.name.endswith("_ARRAY") and len(parameter.value) == 0)
     ):
-        return Parameter(given.name, kind, [])
-    convert = TO_FLOATS.get((given.type_, kind))
-    return Parameter(given.name, kind, convert(given.value)) if convert else given
+        return Parameter(parameter.name, kind, [])
+    convert = TO_FLOATS.get((parameter.type_, kind))
+    return Parameter(parameter.name, kind, convert(parameter.value)) if convert else parameter
 
 
 def _kind(f: Any) -> Parameter.Type:

@@ -23,8 +23,11 @@ from msg_utils.stamps import to_ns
 
 
 class Perception(ManagedNode):
-    """Has the stages, parameters and results of the graph of single nodes, without copies between
-    them. ~/output/points, boxes and obstacles are computed only while there are subscribers."""
+    """Runs all stages of the candidate graph in one node, without copies of clouds between them.
+
+    Parameters and results are the same as in the graph. ~/output/points, boxes and obstacles are
+    computed only while there are subscribers.
+    """
 
     def __init__(self, **options: Any):
         super().__init__("perception", PipelineParams(), PerceptionExtraParams(), **options)

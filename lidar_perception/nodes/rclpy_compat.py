@@ -1,4 +1,4 @@
-"""Access to private parts of rclpy 7 (Jazzy), for which it has no public interface."""
+"""Access to private parts of rclpy 7 (Jazzy) that have no public interface."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ UnknownROSArgsError = rclpy_implementation.UnknownROSArgsError
 
 
 class UnknownParameterError(ParameterNotDeclaredException):
-    """A parameter is set but not declared; rclpy catches this and answers with its message.
+    """Raised for a parameter that is not declared; rclpy catches it and responds with its message.
 
     The message of rclpy itself is "Invalid access to undeclared parameter(s): []", because any()
     has consumed the generator of names (rclpy/node.py, _check_undeclared_parameters).
@@ -27,7 +27,7 @@ class UnknownParameterError(ParameterNotDeclaredException):
 
 
 def parameter_overrides(node: Node) -> dict[str, Parameter]:
-    """Return the mutable parameters that the user has set for this node, declared or not."""
+    """Return the parameters that the user has set for this node, declared or not; the dict is mutable."""
     overrides: dict[str, Parameter] = node._parameter_overrides
     return overrides
 
@@ -38,25 +38,25 @@ def parameter_names(node: Node) -> list[str]:
 
 
 def store_empty_list(node: Node, name: str, kind: Parameter.Type) -> None:
-    """Give a declared parameter an empty list as its value.
+    """Set a declared parameter to an empty list.
 
-    rclpy takes an empty list for one of bytes. A parameter that is declared by its type alone is
-    "not set", and get_parameters then returns no values at all for any of the names it is given.
+    rclpy interprets an empty list as a list of bytes. A parameter that is declared only by its type
+    is "not set", and get_parameters then returns no values at all for a request that names it.
     """
     node._parameters[name] = Parameter(name, kind, [])
 
 
 def clock_subscription(node: Node) -> Any:
-    """Return the subscription to /clock that rclpy makes while use_sim_time is set, or None."""
+    """Return the subscription to /clock that rclpy creates if use_sim_time is set, or None."""
     return node._time_source._clock_sub
 
 
 def take_messages(subscription: Any, message_type: type) -> Iterator[tuple[bytes, dict]]:
-    """Yield (bytes, message info) of all messages that wait in the middleware."""
+    """Yield (bytes, message info) of all messages in the queue of the middleware."""
     handle = subscription.handle
     with handle:
-        while taken := handle.take_message(message_type, True):
-            yield taken
+        while message := handle.take_message(message_type, True):
+            yield message
 
 
 def state_label(node: Any) -> str:
@@ -71,11 +71,11 @@ def allowed_transitions(node: Any) -> set[int | str]:
 
 
 def wrap_change_state(node: Any, wrapper: Callable[[Callable, Any, Any], Any]) -> None:
-    """Let wrapper(original callback, request, response) answer the service ~/change_state."""
+    """Replace the callback of ~/change_state by wrapper(original callback, request, response)."""
     original = node._service_change_state.callback
-    node._service_change_state.callback = lambda *call: wrapper(original, *call)
+    node._service_change_state.callback = lambda *arguments: wrapper(original, *arguments)
 
 
 def destroy_state_machine(node: Any) -> None:
-    """Free the state machine, which keeps a destroyed node in the graph until it is collected."""
+    """Destroy the state machine, which would keep a destroyed node in the ROS graph until collected."""
     node._state_machine.destroy_when_not_in_use()

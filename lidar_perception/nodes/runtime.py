@@ -28,21 +28,20 @@ class LidarNode(Node):
         name: name of the node.
         params: dataclass with the parameters of the algorithm. Its fields are declared as ROS
             parameters, and changes at run time are checked in the same way.
-        node_params: dataclass with the other parameters, such as CloudNodeParams or BoxNodeParams,
-            for nodes that subscribe to clouds.
-        links: links to the other nodes of the process, None if there are none.
+        node_params: dataclass with the other parameters of the node, such as BoxNodeParams.
+        links: links to the other nodes of the process; None if there are none.
         options: further arguments of rclpy.node.Node.
 
     Attributes:
         diagnostics: state, counts and times.
         inputs: subscriptions.
         outputs: publishers of results.
-        transforms: of type Transforms in nodes that subscribe to clouds.
-        stop: any thread may set this future to end the node.
+        transforms: a Transforms object in nodes that subscribe to clouds.
+        stop: future that ends the node; any thread may set it.
     """
 
     transforms: Any = None
-    writes_files: ClassVar[bool] = False  # True if close() writes files, so a signal must not cut off the work
+    writes_files: ClassVar[bool] = False  # True if close() writes files, which a signal must not interrupt
 
     def __init__(self, name: str, params: Any, node_params: Any = None, links: Links | None = None, **options: Any):
         super().__init__(name, **options)
@@ -58,7 +57,7 @@ class LidarNode(Node):
         self.add_steady_timer(1.0, self.publish_status)
 
     def start(self) -> None:
-        """Start the work of the node; called once before it spins."""
+        """Start the node; called once before it spins."""
 
     def is_ready(self) -> bool:
         """Return True once the node processes its input."""
@@ -69,14 +68,14 @@ class LidarNode(Node):
         executor.spin_until_future_complete(self.stop)
 
     def close(self) -> None:
-        """Write results that are still in memory; called once before the node is destroyed.
+        """Write the remaining results; called once before the node is destroyed.
 
         Raises:
             InputError: the results cannot be written.
         """
 
     def add_steady_timer(self, seconds: float, callback: Callable[[], None]) -> None:
-        """Call callback() periodically, also while the clock of a simulation stands still."""
+        """Call callback() periodically in real time, even if the simulated clock is paused."""
         self.create_timer(seconds, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def publish_status(self) -> None:

@@ -1,4 +1,4 @@
-"""Conversion of clouds to frames of the core, and checks of the sensor height and intensity."""
+"""Conversion of cloud messages to frames, and checks of the sensor height and the intensity."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ MEASURED_CLOUDS = 5  # number of clouds used to measure the sensor height
 
 
 class SensorCheck:
-    """Converts clouds to frames and checks the parameters of the sensor.
+    """Converts clouds to frames, and checks that the parameters describe the sensor.
 
     The sensor height is measured on the first clouds, and again after a change of sensor_pose. The
-    node has the parameter groups input, crop and ground.
+    node must have the parameter groups input, crop and ground.
     """
 
     def __init__(self, node: Any):
@@ -48,17 +48,17 @@ class SensorCheck:
         params = self.node.transforms.with_mounting(params, placement)
         self.node.diagnostics.counts.pop("cropped", None)
         if params.crop.enabled:
-            kept, frame = self.node.transforms.crop_frame(frame, params.crop, placement)
-            self.node.diagnostics.counts["cropped"] = len(indices) - len(kept)
-            indices, params = indices.take(kept), replace(params, crop=CropParams())
+            cropped_indices, frame = self.node.transforms.crop_frame(frame, params.crop, placement)
+            self.node.diagnostics.counts["cropped"] = len(indices) - len(cropped_indices)
+            indices, params = indices.take(cropped_indices), replace(params, crop=CropParams())
         return placement.level_frame(frame), indices, params
 
     def find_problem(self, frame: PointCloud, params: Any) -> str | None:
-        """Return what contradicts the parameters of read_frame(), with the remedy, or None."""
+        """Return a message if the frame contradicts the parameters from read_frame(), or None."""
         return self.check_height(frame, params.ground.sensor_pose) or find_scale_problem(frame.intensity)
 
     def check_height(self, frame: PointCloud, pose: SensorPoseParams) -> str | None:
-        """Return a problem if the measured sensor height differs from that in pose, or None."""
+        """Return a message if the measured sensor height differs from the height in pose, or None."""
         if pose != self.pose:
             self.pose, self.heights = pose, []
         if len(self.heights) < MEASURED_CLOUDS:

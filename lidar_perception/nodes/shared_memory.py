@@ -18,10 +18,10 @@ DRIVER_PROFILE, SOCKET_BUFFER = "fastdds_driver.xml", 2 * 2**20  # profile, and 
 
 
 def use_large_shared_memory(from_driver: bool = False) -> None:
-    """Let Fast DDS pass whole clouds through shared memory, see fastdds.xml.
+    """Configure Fast DDS to pass complete clouds through shared memory, see fastdds.xml.
 
-    A small /dev/shm, such as the 64 MB of a container, gets smaller segments. A profile that the
-    user has set is kept.
+    If /dev/shm is small, such as the 64 MB of a container, segments are smaller. A profile that the
+    user has set is not changed.
 
     Args:
         from_driver: receive clouds by UDP if the socket buffer can hold one, see
@@ -35,7 +35,7 @@ def use_large_shared_memory(from_driver: bool = False) -> None:
     except OSError:
         return
     free = memory.f_bavail * memory.f_frsize
-    profile = next((name for needed, name in PROFILES.items() if free >= needed), None)
+    profile = next((name for required, name in PROFILES.items() if free >= required), None)
     if profile != "fastdds.xml":
         print(
             f"/dev/shm has only {free / 2**20:.0f} MB free, so clouds above "
@@ -51,12 +51,12 @@ def use_large_shared_memory(from_driver: bool = False) -> None:
 
 
 def remove_dead_segments(folder: Path = SHARED_MEMORY) -> None:
-    """Remove the segments that killed processes of this user have left, and report it on stderr.
+    """Remove segments of killed processes of this user, and report it on stderr.
 
-    Fast DDS leaves them (67 MB per process with fastdds.xml) until /dev/shm is full and clouds get
-    lost. A living process holds a lock on the file NAME_el of its segment.
+    Fast DDS does not remove them (67 MB per process with fastdds.xml), so that /dev/shm fills up and
+    clouds are lost. A running process holds a lock on the file NAME_el of its segment.
     """
-    removed = size = 0
+    removed_count = size = 0
     for lock in folder.glob("fastrtps_*_el"):
         name = LOCK_NAME.fullmatch(lock.name)
         try:
@@ -70,18 +70,18 @@ def remove_dead_segments(folder: Path = SHARED_MEMORY) -> None:
                 size += segment.stat().st_size
                 segment.unlink()
                 lock.unlink()
-                removed += 1
+                removed_count += 1
         except OSError:  # in use, or already removed by another node
             continue
-    if removed:
+    if removed_count:
         print(
-            f"removed {removed} shared-memory segments ({size / 1e6:.0f} MB) that killed processes left in {folder}",
+            f"removed {removed_count} shared-memory segments ({size / 1e6:.0f} MB) of killed processes from {folder}",
             file=sys.stderr,
         )
 
 
 def read_socket_buffer_size() -> int:
-    """Return net.core.rmem_max, the maximum socket buffer in bytes; 0 if it is unknown."""
+    """Return the maximum size of a socket buffer (net.core.rmem_max) in bytes; 0 if it is unknown."""
     try:
         return int(Path("/proc/sys/net/core/rmem_max").read_text())
     except (OSError, ValueError):
@@ -89,5 +89,5 @@ def read_socket_buffer_size() -> int:
 
 
 def is_fed_by_driver(arguments: list[str]) -> bool:
-    """Return True if no argument names a cloud of our own nodes, NODE/output/points."""
+    """Return True if no argument names the cloud of another node of this package (NODE/output/points)."""
     return not any(word.endswith("/output/points") for word in arguments)

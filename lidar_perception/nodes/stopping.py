@@ -1,4 +1,4 @@
-"""Termination of a node process by a signal, also during its start or while DDS is stuck."""
+"""Termination of a node process by a signal, even during its start or while DDS is stuck."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ import signal
 import threading
 from collections.abc import Callable, Collection
 
-WORK_TIMEOUT_S = 0.7  # time for the current work before force_exit() ends the process
+WORK_TIMEOUT_S = 0.7  # time to finish the current work before force_exit() ends the process
 POLL_PERIOD_S = 0.05  # polling period while the guard is loading
 
 
 class Stop:
     """Handle signals in dedicated threads; all threads of the process must block the signals.
 
-    An exception in the main thread could be lost in a destructor, or interrupt work that must be
-    finished. Fast DDS can wait for a lock in shared memory that a dead process still holds, while
-    rclpy holds the interpreter lock, so that no Python thread runs. The compiled guard.py needs no
-    interpreter. It takes a second to load, and longer to compile; a Python thread waits for
-    signals until then.
+    An exception in the main thread, as raised by Python's signal handlers, could be lost in a
+    destructor, or interrupt work that must be finished. Fast DDS can wait for a lock in shared
+    memory that a dead process still holds while rclpy holds the interpreter lock, so that no Python
+    thread runs. The compiled guard.py needs no interpreter. It takes a second to load, and longer to
+    compile; a Python thread waits for signals until then.
 
     The node calls begin_closing() before it writes its results, and finish_closing() afterwards.
 
     Attributes:
-        on_signal: called at the first signal. It ends the process until it is replaced.
-        force_exit: called if the work continues for WORK_TIMEOUT_S seconds after the signal.
-        requested: a signal has arrived.
+        on_signal: function called at the first signal; by default it ends the process.
+        force_exit: function called if the work continues for WORK_TIMEOUT_S seconds after the signal.
+        requested: True once a signal has arrived.
     """
 
     def __init__(self, signals: Collection[signal.Signals]) -> None:
@@ -60,23 +60,23 @@ class Stop:
                     self.force_exit()
 
     def begin_closing(self) -> None:
-        """Suspend the time limit: the work is done, and the results are written now.
+        """Suspend the time limit while the results are written.
 
-        Does not return while force_exit() ends the process.
+        Does not return if force_exit() is ending the process.
         """
         with self._leaving:
             self._closing.set()
         self._state[0] = self._closing_phase
 
     def finish_closing(self, code: int) -> None:
-        """Let the process end with this code within guard.TEARDOWN_S seconds."""
+        """End the process with this code, at the latest after guard.TEARDOWN_S seconds."""
         self._state[:] = self._closed_phase, code
         self.on_signal = lambda: None
         os.kill(os.getpid(), signal.SIGTERM)  # wakes the guard in case no signal has
 
 
 def _relay_first_signal(arrived: int, loaded: threading.Event, pipe: int) -> None:
-    """Pass the first signal to the pipe until the guard is loaded."""
+    """Write to the pipe if a signal arrives before the guard is loaded."""
     while not loaded.is_set():
         if select.select([arrived], [], [], POLL_PERIOD_S)[0]:
             os.write(pipe, b"\0")

@@ -1,4 +1,4 @@
-"""Inputs of a node, which report messages that cannot be processed instead of ending the node."""
+"""Inputs of a node. A message that cannot be processed is reported and does not end the node."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 
-from lidar_perception.nodes.diagnostics import ADDED_COUNTS, ERROR, WARN, Problem
+from lidar_perception.nodes.diagnostics import ERROR, SUMMED_COUNTS, WARN, Problem
 from lidar_perception.nodes.interfaces import CLOUD
 from lidar_perception.nodes.reception import Reception
 from lidar_perception.types import InputError
@@ -25,7 +25,7 @@ class Inputs:
 
     Attributes:
         items: subscriptions, and other objects with open() and close().
-        is_open: new subscriptions are opened at once.
+        is_open: True if new subscriptions are opened immediately.
     """
 
     def __init__(self, node: Any):
@@ -45,15 +45,16 @@ class Inputs:
         """Subscribe to a topic.
 
         Args:
-            topic: ~/input/TOPIC, or with private=False the name itself.
+            topic: name below ~/input, or with private=False the full name.
             type_name: message type such as "std_msgs/msg/Bool".
-            callback: called with each message, in the class of rosbags that offline code reads from
-                bags. It is a view of the received bytes, which rclpy copies several times. Types
-                that rosbags does not know have the class of rclpy.
-            qos: each profile gets its own subscription, as one may not match all publishers.
-                Without any, the topic has a Reception.
-            private: the topic is below ~/input.
-            needs: returns what a cloud still waits for from another input, or None.
+            callback: called with each message. Its class is that of rosbags, which offline code
+                also uses; it is a view of the received bytes, whereas rclpy copies them several
+                times. Types that rosbags does not know have the class of rclpy.
+            qos: profiles, each for its own subscription, because one profile may not match all
+                publishers. Without any, the topic has a Reception.
+            private: True if the topic is below ~/input.
+            needs: returns a description of the data from another input that a cloud still needs, or
+                None.
         """
         name = f"~/input/{topic}" if private else topic
         warm_up_type(type_name)
@@ -92,39 +93,41 @@ class Inputs:
             reception.retry()
 
     def adapt(self) -> None:
-        """Adapt to the publishers, for middleware that reports no changes."""
+        """Adapt to changed publishers, for middleware that does not report changes."""
         for reception in self.receptions:
             reception.adapt()
 
     def values(self) -> dict[str, Any]:
-        """Return the values for the diagnostics; the first input wins for equal keys."""
+        """Return the values for the diagnostics. For equal keys, the value of the first input counts."""
         values: dict[str, Any] = {}
         for reception in self.receptions:
             for key, value in reception.values().items():
-                values[key] = values.get(key, 0) + value if key in ADDED_COUNTS else values.get(key, value)
+                values[key] = values.get(key, 0) + value if key in SUMMED_COUNTS else values.get(key, value)
         return values
 
     def problems(self) -> list[Problem]:
-        """Return the present problems of all clouds with their remedies."""
+        """Return the present problems of all receptions with their remedies."""
         return [problem for reception in self.receptions for problem in reception.problems()]
 
 
 @dataclass
 class _MessageHandler:
-    """Decodes the messages of a topic, passes them on and reports those that raise an error."""
+    """Decodes the messages of a topic, passes them to a callback and reports errors."""
 
     node: Any
     name: str
     type_name: str
     callback: Callable
     needs: Callable[[Any], str | None]
-    retries_clouds: bool  # waiting clouds may need the messages
+    retries_clouds: bool  # True if waiting clouds may need these messages
 
     def __call__(self, data: Any, may_wait: bool = False) -> str | None:
         """Handle a message, as CDR or decoded.
 
+        A cloud that may wait and still needs data is not passed to the callback.
+
         Returns:
-            What a cloud still waits for, or None. If it may wait, it is not passed on then.
+            A description of the data that a cloud still needs, or None.
         """
         missing = None
         try:
@@ -140,7 +143,7 @@ class _MessageHandler:
             self._report(str(error))
         except Exception as error:
             self.node.get_logger().error(traceback.format_exc())
-            self._report(f"{type(error).__name__}: {error}; this is a bug, please report it with the message")
+            self._report(f"{type(error).__name__}: {error}; this is a bug, please report it with this message")
         if self.retries_clouds:
             self.node.inputs.retry()
         return missing
@@ -155,8 +158,8 @@ class MessageInput:
     Args:
         handler: called with each message as CDR.
         qos: profile of the subscription.
-        is_first: qos_overrides apply to the subscription.
-        is_only: no subscription with another profile may match instead.
+        is_first: True for the first of several subscriptions, to which qos_overrides apply.
+        is_only: True if the topic has no other subscription, so an incompatible QoS is a problem.
     """
 
     def __init__(self, handler: _MessageHandler, qos: QoSProfile, is_first: bool, is_only: bool):
@@ -198,7 +201,7 @@ class MessageInput:
 
 
 def decode_message(data: bytes, type_name: str) -> Any:
-    """Decode CDR to the class of rosbags, or of rclpy for types that rosbags does not know."""
+    """Decode CDR to a rosbags message, or to an rclpy message if rosbags does not know the type."""
     if type_name in load_typestore().fielddefs:
         return decode(data, type_name)
     return deserialize_message(data, load_message_class(type_name))

@@ -1,4 +1,4 @@
-"""Tracking of detections and publishing of the tracks, for the tracker and the detector nodes."""
+"""Tracking of detections and publishing of tracks, for the tracker and the detector nodes."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from msg_utils.stamps import SECOND_NS, to_ns
 
 DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
 MIN_LIFETIME_PERIODS = 2.5  # minimum lifetime of markers, in periods of the input
-MAX_LIFETIME_S = 1e6  # fits into the 32-bit seconds of a Duration message
+MAX_LIFETIME_S = 1e6  # upper limit of that minimum; a Duration message has 32-bit seconds
 RATE_WINDOW_S = 10.0  # averaging window for the rates of new and ended tracks
 
 
 class TrackOutputs:
-    """~/output/tracks, and ~/output/tracks_3d where vision_msgs is installed.
+    """Tracker with publishers of ~/output/tracks, and of tracks_3d if vision_msgs is installed.
 
     Args:
         node: the node that publishes.
-        params: returns the current parameters with the groups tracking and ego.
-        clouds: the node subscribes to clouds, see EgoInput.
+        params: returns the current parameters, with the groups tracking and ego.
+        clouds: True if the node subscribes to clouds, see EgoInput.
     """
 
     def __init__(self, node: LidarNode, params: Callable[[], DetectionNodeParams | TrackerNodeParams], clouds: bool):
@@ -65,34 +65,34 @@ class TrackOutputs:
 
         Args:
             header: header of the frame.
-            detections: detections, also those with low scores.
+            detections: all detections, including those with low scores.
             xyz: (N, 3) scan of the frame, if the node subscribes to clouds.
 
         Returns:
             The problem of the frame with its remedy, or None.
         """
         stamp, tracker = to_ns(header.stamp), self.tracker
-        sensor_problem, before = self._check_sensor(header.frame_id), self.pose_source
+        sensor_problem, previous_source = self._check_sensor(header.frame_id), self.pose_source
         pose = self.ego.find_pose(header, xyz)
         self.pose_source = self.ego.source, self.ego.is_mounting_known, self.ego.icp_restarts
-        if before[0] != NO_SOURCE and before != self.pose_source:
+        if previous_source[0] != NO_SOURCE and previous_source != self.pose_source:
             tracker.reset()  # the fixed frame has changed
         problem = sensor_problem or self.ego.find_problem(header.frame_id, stamp)
         tracker.params = self.params().tracking
         tracks = tracker(detections, stamp, pose)
         if tracker.frame_used:
             self._send(header, stamp, tracks)
-        self._count(stamp, len(tracks))
+        self._update_counts(stamp, len(tracks))
         return tracker.problem or problem
 
     def _check_sensor(self, frame_id: str) -> str | None:
-        before, self.frame_id = self.frame_id, frame_id
-        if before in (None, frame_id):
+        previous, self.frame_id = self.frame_id, frame_id
+        if previous in (None, frame_id):
             return None
         self.tracker.reset()
         return (
-            f"detections in '{before}' and in '{frame_id}' are mixed, so tracks end at every change; start one "
-            "tracker for each sensor"
+            f"detections in the frames '{previous}' and '{frame_id}' are mixed, so tracks end at every change; "
+            "start one tracker for each sensor"
         )
 
     def _send(self, header: Any, stamp: int, tracks: Tracks) -> None:
@@ -122,30 +122,33 @@ class TrackOutputs:
                 )
             )
 
-    def _count(self, stamp: int, reported: int) -> None:
+    def _update_counts(self, stamp: int, track_count: int) -> None:
         tracker, now = self.tracker, stamp / 1e9
         if self.count_history and not 0 <= now - self.count_history[-1][0] <= RATE_WINDOW_S:
-            self.count_history.clear()  # time has jumped, or the clouds have no stamps
+            self.count_history.clear()  # time has jumped, or the frames have no stamps
         self.count_history.append((now, tracker.started_count, tracker.ended_count))
         while now - self.count_history[0][0] > RATE_WINDOW_S or len(self.count_history) > 1000:
             self.count_history.popleft()
-        before, born, ended = self.count_history[0]
+        begin, started_count, ended_count = self.count_history[0]
         self.node.diagnostics.counts.update(
             ego=self.ego.source,
-            tracks=reported,
+            tracks=track_count,
             alive=tracker.alive_count,
             born=tracker.started_count,
             ended=tracker.ended_count,
         )
-        if now > before:
-            self.node.diagnostics.counts["born_per_s"] = f"{(tracker.started_count - born) / (now - before):.2f}"
-            self.node.diagnostics.counts["ended_per_s"] = f"{(tracker.ended_count - ended) / (now - before):.2f}"
+        if now > begin:
+            self.node.diagnostics.counts["born_per_s"] = (
+                f"{(tracker.started_count - started_count) / (now - begin):.2f}"
+            )
+            self.node.diagnostics.counts["ended_per_s"] = f"{(tracker.ended_count - ended_count) / (now - begin):.2f}"
 
 
 def find_marker_lifetime_ns(node: LidarNode) -> int:
-    """Return the lifetime of the markers of a node, 0 for unlimited.
+    """Return the lifetime of the markers of a node in ns, 0 for unlimited.
 
-    It is at least MIN_LIFETIME_PERIODS periods of the input, for slow sensors.
+    It is at least MIN_LIFETIME_PERIODS periods of the input, so that the markers of slow sensors do
+    not flicker.
     """
     seconds = node.node_params.output.marker_lifetime
     rates = [rate for reception in node.inputs.receptions if (rate := reception.expected_rate())]

@@ -18,10 +18,10 @@ from msg_utils.stamps import to_ns
 
 
 class TrackerNode(ManagedNode):
-    """Tracks boxes over frames.
+    """Tracks boxes from frame to frame.
 
-    A frame without detections must be an array with its stamp: for markers, a DELETE or DELETEALL
-    with the header of the frame.
+    A frame without detections must be sent as an array with its stamp. A MarkerArray then contains a
+    DELETE or DELETEALL marker with the header of the frame.
     """
 
     def __init__(self, **options: Any):
@@ -46,7 +46,8 @@ class TrackerNode(ManagedNode):
     def on_markers(self, msg: Any) -> None:
         if not msg.markers:
             raise InputError(
-                "ignored an array without a marker, which has no stamp; send a DELETEALL with the header of the frame"
+                "ignored an array without markers, which has no stamp; send a DELETEALL marker with the header of "
+                "the frame"
             )
         self._track(find_header(msg), from_marker_array(msg))
 
@@ -60,8 +61,7 @@ class TrackerNode(ManagedNode):
         problems = [problem] if problem else []
         if unknown := find_unknown_classes(objects.labels):
             problems.append(
-                f"detections of the classes {', '.join(unknown)[:80]} are tracked as "
-                f"Misc: name them {', '.join(DETECTED)} in the ns of the markers or in "
-                "class_id"
+                f"detections of the unknown classes {', '.join(unknown)[:80]} are tracked as "
+                f"Misc; use {', '.join(DETECTED)} as ns of the markers or as class_id"
             )
         self.diagnostics.report(WARN if problems else OK, "; ".join(problems) or "tracking")

@@ -1,6 +1,6 @@
-"""TF and odometry of a node: the mounting and the motion of its sensor, and the output frame.
+"""TF and odometry for a node: mounting and motion of the sensor, and the output frame.
 
-The transform tree is our own, so that it is the same with and without tf2_ros.
+The package has its own transform tree, so that nodes behave the same with and without tf2_ros.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ NO_TF = "TF is not available because tf2_msgs is not installed; install the ROS 
 
 
 def has_tf() -> bool:
-    """Return True if the messages of TF are installed, which the wheels of ROS lack."""
+    """Return True if tf2_msgs is installed; the ROS wheels on PyPI do not include it."""
     return importlib.util.find_spec("tf2_msgs") is not None
 
 
 class Transforms:
-    """The frames that the parameters base_frame, target_frame and input of a node name.
+    """Transforms that the parameters base_frame, target_frame and input of a node require.
 
-    Where TF lacks a frame, the other parameters stay in force and a diagnostic names the frame.
+    If TF lacks one of these frames, a fallback is used and a diagnostic names the frame.
     """
 
     def __init__(self, node: Any):
@@ -56,12 +56,12 @@ class Transforms:
         self.odometry_child = self.odometry_frame = ""  # child frame and parent frame of the odometry
         self.odometry_ns: int | None = None  # stamp of the last odometry message
         self.odometry_arrival = self.ignored_arrival = -inf  # monotonic times of arrival
-        # Further checks of whether the inputs for a header are available.
+        # Functions that return what a cloud with this header still needs, or None.
         self.more_needs: list[Callable[[Any], str | None]] = []
         self.sweep: float | None = None  # time from the stamp to the last point of a cloud, in seconds
         self.problem_by_source: dict[str, str] = {}  # parameter that causes the problem -> message
         self.diagnostic_values: dict[str, Any] = {}
-        self._last: tuple[tuple[str, int], Placement] = (("", -1), Placement(""))
+        self._cached_placement: tuple[tuple[str, int], Placement] = (("", -1), Placement(""))
         self._connected_pairs: set[tuple[str, str]] = set()  # pairs of frames that TF has connected before
         self._has_tf_subscription = self._has_odometry_subscription = False
         self._installed = has_tf()
@@ -76,7 +76,7 @@ class Transforms:
 
     @property
     def is_used(self) -> bool:
-        """True if a parameter of the node depends on the frame of the clouds."""
+        """True if a parameter of the node requires TF or odometry."""
         return bool(self.base_frame or self.target_frame or self.node.node_params.input.deskew != "off")
 
     def subscribe_to_tf(self) -> None:
@@ -97,23 +97,26 @@ class Transforms:
         self.node.inputs.subscribe(topic, TF_MESSAGE, lambda m: self.on_tf(m, static), qos, private=False)
 
     def on_tf(self, msg: Any, static: bool) -> None:
-        """Add a tf2_msgs/TFMessage to the tree. Invalid transforms are skipped and reported."""
+        """Add a tf2_msgs/TFMessage to the tree. Invalid transforms are reported and not added."""
         try:
             add_transforms(self.tree, msg, static)
         finally:
             self._clear_cache()
 
     def on_odometry(self, msg: Any) -> None:
-        """Add a nav_msgs/Odometry. If several with different frames share the topic, the first one
-        is used as long as it arrives."""
-        now, child, frame = (monotonic(), msg.child_frame_id.lstrip("/"), msg.header.frame_id.lstrip("/"))
+        """Add a nav_msgs/Odometry.
+
+        If sources with different frames share the topic, the first one is used as long as it
+        publishes.
+        """
+        now, child, frame = monotonic(), msg.child_frame_id.lstrip("/"), msg.header.frame_id.lstrip("/")
         if (child, frame) != (self.odometry_child, self.odometry_frame):
             if now - self.odometry_arrival < ODOMETRY_TIMEOUT_S:
                 self.ignored_arrival = now
                 self.problem_by_source["odometry"] = (
-                    f"two odometry sources on {self.node.resolve_topic_name('~/input/odometry')}: that "
-                    f"of '{child}' in '{frame}' is ignored, that of '{self.odometry_child}' in "
-                    f"'{self.odometry_frame}' is used; publish them on separate topics"
+                    f"two odometry sources on {self.node.resolve_topic_name('~/input/odometry')}: the poses "
+                    f"of '{child}' in '{frame}' are ignored, those of '{self.odometry_child}' in "
+                    f"'{self.odometry_frame}' are used; publish them on separate topics"
                 )
                 return
             self.odometry = TransformTree()
@@ -125,12 +128,12 @@ class Transforms:
         self._clear_cache()
 
     def _clear_cache(self) -> None:
-        self._last = (("", -1), Placement(""))
+        self._cached_placement = (("", -1), Placement(""))
 
     # Inputs that a cloud needs
 
     def find_missing_input(self, cloud: Any) -> str | None:
-        """Return what a cloud waits for and may still arrive, or None."""
+        """Return a description of the data that a cloud should wait for, or None."""
         return self._find_missing_frame(cloud) or next(
             filter(None, (need(cloud.header) for need in self.more_needs)), None
         )
@@ -152,20 +155,20 @@ class Transforms:
     def _require_connection(self, frame: str, frame_id: str, stamp: int) -> None:
         """Raise MissingTransform if the frames are not connected.
 
-        The error is marked as late if they never were: a driver may be discovered before
-        robot_state_publisher.
+        The error is marked as late if they have never been connected, because the clouds of a
+        driver may arrive before the transforms of robot_state_publisher.
         """
         try:
             self.tree.lookup(frame, frame_id, stamp)
         except MissingTransform as error:
-            is_new = (frame, frame_id) not in self._connected_pairs and "TF" not in self.problem_by_source
-            raise MissingTransform(str(error), error.late or is_new) from None
+            is_first = (frame, frame_id) not in self._connected_pairs and "TF" not in self.problem_by_source
+            raise MissingTransform(str(error), error.late or is_first) from None
         self._connected_pairs.add((frame, frame_id))
 
     def _sweep_duration(self, cloud: Any) -> float:
         """Return the time from the stamp to the last point of a cloud, in seconds.
 
-        That of the last deskewed cloud, or of this one before there is one.
+        It is the time of the last deskewed cloud; before the first one, the time of this cloud.
         """
         if self.sweep is None:
             try:
@@ -180,48 +183,48 @@ class Transforms:
         key = header.frame_id, to_ns(header.stamp)
         if not (self.base_frame or self.target_frame or self.node.node_params.input.ahead):
             return Placement(header.frame_id)
-        if self._last[0] != key:
-            self._last = key, self._compute_placement(*key)
-        return self._last[1]
+        if self._cached_placement[0] != key:
+            self._cached_placement = key, self._compute_placement(*key)
+        return self._cached_placement[1]
 
     def _compute_placement(self, frame_id: str, stamp_ns: int) -> Placement:
         base = self._look_up("base_frame", self.base_frame, frame_id, stamp_ns)
         if base is not None and not 0.0 <= base[2, 3] <= 50.0:
             self.problem_by_source["base_frame"] = (
                 f"'{frame_id}' is {base[2, 3]:.2f} m above '{self.base_frame}', which must be on "
-                "the ground (as base_footprint is); using ground.sensor_pose"
+                "the ground (like base_footprint); using ground.sensor_pose"
             )
             base = None
         ahead = np.radians(self.node.node_params.input.ahead)
-        upright = base
-        if upright is None and ahead:  # the yaw rotation comes after levelling, so both are applied here
-            upright = self._configured_pose()
-            upright = np.eye(4) if upright is None else upright
-        level = None if upright is None else find_level_transform(upright, ahead)
+        sensor_pose = base
+        if sensor_pose is None and ahead:  # the yaw rotation comes after levelling, so both are applied here
+            sensor_pose = self._configured_pose()
+            sensor_pose = np.eye(4) if sensor_pose is None else sensor_pose
+        level = None if sensor_pose is None else find_level_transform(sensor_pose, ahead)
         target = self._look_up("target_frame", self.target_frame, frame_id, stamp_ns)
         if target is None:
             return Placement(frame_id, base, level, None if level is None else invert_pose(level))
         return Placement(self.target_frame, base, level, target if level is None else target @ invert_pose(level))
 
-    def _look_up(self, what: str, frame: str, frame_id: str, stamp_ns: int) -> np.ndarray | None:
-        """Return the pose of frame_id in the frame that the parameter `what` names, or None.
+    def _look_up(self, parameter: str, frame: str, frame_id: str, stamp_ns: int) -> np.ndarray | None:
+        """Return the pose of frame_id in `frame`, the value of this parameter; None if it is unknown.
 
         A missing transform is reported by problems().
         """
-        self.problem_by_source.pop(what, None)
+        self.problem_by_source.pop(parameter, None)
         if not frame:
             return None
         try:
             return self.tree.lookup(frame, frame_id, stamp_ns)
         except MissingTransform as error:
-            fallback = {"base_frame": "using ground.sensor_pose", "target_frame": f"results are in '{frame_id}'"}[what]
-            self.problem_by_source[what] = f"{what} '{frame}': {error}; {fallback}"
+            fallback = {"base_frame": "using ground.sensor_pose", "target_frame": f"results are in '{frame_id}'"}
+            self.problem_by_source[parameter] = f"{parameter} '{frame}': {error}; {fallback[parameter]}"
             return None
 
     def with_mounting(self, params: Any, placement: Placement) -> Any:
-        """Return the parameters of a node for a frame transformed by a placement.
+        """Return the parameters of a node for clouds in the level frame of a placement.
 
-        The sensor height comes from TF, or from params.ground.sensor_pose without a base_frame.
+        The sensor height comes from TF, or from params.ground.sensor_pose if TF does not provide it.
         """
         height = params.ground.sensor_pose.height
         if placement.base is not None:
@@ -234,17 +237,17 @@ class Transforms:
     def crop_frame(self, frame: PointCloud, crop: CropParams, placement: Placement) -> tuple[np.ndarray, PointCloud]:
         """Crop a frame, see robot.crop.crop_frame.
 
-        The body of the robot is not cropped while base_frame has no transform.
+        The robot's body is not removed while TF has no transform to base_frame.
         """
         self.problem_by_source.pop("crop.body", None)
         if crop.body and self.base_frame:
             if placement.base is None:
-                self.problem_by_source["crop.body"] = "crop.body is not cropped: the pose in base_frame is unknown"
+                self.problem_by_source["crop.body"] = "crop.body is not applied: the pose in base_frame is unknown"
                 crop = replace(crop, body=())
             elif crop.body[5] <= 0.0:
                 self.problem_by_source["crop.body"] = (
-                    f"crop.body ends {-crop.body[5]:.2f} m below the ground of '{self.base_frame}'"
-                    "; specify it in that frame, as the file of `setup` does"
+                    f"the top of crop.body is {-crop.body[5]:.2f} m below '{self.base_frame}'"
+                    "; specify the box in that frame, as `setup` does in its parameter file"
                 )
         level = placement.level
         pose = None if placement.base is not None else self._configured_pose()
@@ -253,7 +256,7 @@ class Transforms:
         return crop_frame(frame, crop, placement.base, level)
 
     def to_level(self, header: Any, frame_id: str) -> np.ndarray:
-        """Return the (4, 4) transform from a frame to the level frame of a cloud.
+        """Return the (4, 4) transform from a frame to the level frame of the cloud with this header.
 
         Raises:
             MissingTransform: TF does not connect the frames.
@@ -292,7 +295,7 @@ class Transforms:
         """Return the (M, 4, 4) poses of the child frame of the odometry at times (M,) ns.
 
         Raises:
-            MissingTransform: they are not available.
+            MissingTransform: the poses are not available.
         """
         if self.odometry_ns is None:
             topic = self.node.resolve_topic_name("~/input/odometry")
@@ -319,11 +322,11 @@ class Transforms:
             self.subscribe_to_tf()
             pose = self._configured_pose() if self.odometry_child == self.base_frame else None
             if pose is None:
-                raise MissingTransform(f"the odometry describes '{self.odometry_child}': {error}", error.late) from None
+                raise MissingTransform(f"the odometry is for '{self.odometry_child}': {error}", error.late) from None
             return pose[None]
 
     def is_connected_to_odometry(self, frame_id: str) -> bool:
-        """Return True if a frame is one of the odometry, or TF connects it with its child frame."""
+        """Return True if TF connects a frame with the odometry, or it is a frame of the odometry."""
         if frame_id.lstrip("/") in (self.odometry_child, self.odometry_frame):
             return True
         try:
@@ -333,7 +336,7 @@ class Transforms:
         return True
 
     def _configured_pose(self) -> np.ndarray | None:
-        """Return the pose of the sensor above the ground from the parameters, or None."""
+        """Return the pose of the sensor above the ground from ground.sensor_pose, or None."""
         ground = getattr(self.node.params, "ground", None)
         pose = ground and ground.sensor_pose
         return None if pose is None else make_tilted_pose(pose.roll, pose.pitch, pose.height)
@@ -341,40 +344,40 @@ class Transforms:
     def deskew_cloud(self, msg: Any) -> Any:
         """Return the cloud with its points motion-compensated to its stamp.
 
-        Points in the crop's body of the robot are not moved, as they move with the sensor. Without
-        poses or times of points, the cloud itself is returned and counted as not deskewed.
+        Points that the crop removes, such as those on the robot's body, are not moved. Without poses
+        or point times, the cloud itself is returned and counted as not deskewed.
         """
         if self.node.node_params.input.deskew == "off":
             return msg
         begin, counts = perf_counter(), self.node.diagnostics.counts
         self.problem_by_source.pop("deskew", None)
         try:
-            moved = self._move_points(msg)
+            deskewed = self._deskew_points(msg)
         except InputError as error:
             self.problem_by_source["deskew"] = f"input.deskew: {error}; clouds are not deskewed"
             counts["not_deskewed"] = counts.get("not_deskewed", 0) + 1
             return msg
         counts["deskewed"] = counts.get("deskewed", 0) + 1
         self.diagnostic_values["deskew_ms"] = f"{(perf_counter() - begin) * 1e3:.1f}"
-        return moved
+        return deskewed
 
-    def _move_points(self, msg: Any) -> Any:
+    def _deskew_points(self, msg: Any) -> Any:
         frame, indices = to_point_cloud(msg)
         crop = getattr(self.node.params, "crop", None)
         if crop is not None and crop.enabled:
-            kept, frame = self.crop_frame(frame, crop, self.find_placement(msg.header))
-            indices = indices.take(kept)
+            cropped_indices, frame = self.crop_frame(frame, crop, self.find_placement(msg.header))
+            indices = indices.take(cropped_indices)
 
-        def poses(at: np.ndarray) -> np.ndarray:
+        def look_up_poses(at: np.ndarray) -> np.ndarray:
             # Set before the lookup: after a failure, the next cloud waits for the end of its sweep.
             self.sweep = float(at.max() - frame.stamp_ns) / SECOND_NS
             return self.sensor_poses(self.node.node_params.input.deskew, frame.frame_id, at)
 
-        result = deskew_points(msg, frame, indices, poses)
+        result = deskew_points(msg, frame, indices, look_up_poses)
         if result is None:
             return msg
-        timed, moved, times = result
-        return replace_points(msg, make_bag_message, indices.take(timed), moved, times)
+        timed_indices, xyz, times = result
+        return replace_points(msg, make_bag_message, indices.take(timed_indices), xyz, times)
 
     # Diagnostics
 
@@ -383,5 +386,5 @@ class Transforms:
         return self.diagnostic_values
 
     def problems(self) -> list[Problem]:
-        """Return what the parameters need but is missing, each with its fallback."""
+        """Return the present problems, each with its fallback or remedy."""
         return [(kind, WARN, message) for kind, message in self.problem_by_source.items()]

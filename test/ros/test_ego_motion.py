@@ -91,7 +91,7 @@ def test_missing_odometry_to_sensor_transform_is_reported(start):
     drive(
         node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp)), [base_at(i) for i in range(10)]
     )
-    assert "odometry describes 'base', the detections are in 'lidar'" in node.diagnostics.state[1]
+    assert "odometry is for 'base', the detections are in 'lidar'" in node.diagnostics.state[1]
     node.transforms.on_tf(transforms(("base", "lidar", SENSOR, 0)), static=True)
     stamp = START + 10 * TENTH
     node.transforms.on_odometry(odometry(base_at(10), stamp))
@@ -150,11 +150,11 @@ def test_detector_cloud_waits_for_its_pose_with_timeout(start):
     clouds = [encode(message(xyz, START + i * TENTH)) for i in range(20)]
     assert deliver(clouds[0], True) is None  # no pose yet
     node.transforms.on_odometry(odometry(base_at(0), START, "lidar"))
-    assert deliver(clouds[1], True) == "the pose of its time"
+    assert deliver(clouds[1], True) == "the pose at its stamp"
     node.transforms.on_odometry(odometry(base_at(1), START + TENTH, "lidar"))
     assert deliver(clouds[1], True) is None and len(node.sent["tracks"]) == 2
     np.testing.assert_allclose(node.results.final.tracks.tracker.pose, base_at(1), atol=1e-9)
-    assert deliver(clouds[2], True) == "the pose of its time"
+    assert deliver(clouds[2], True) == "the pose at its stamp"
     assert node.set_parameters([Parameter("ego.max_wait", value=0.0)])[0].successful
     assert deliver(clouds[2], True) is None  # the waiting time has expired
     assert deliver(clouds[19], True) is None  # the odometry has stopped
@@ -234,7 +234,7 @@ def test_first_of_two_odometry_publishers_is_used(start, monkeypatch):
             node.transforms.on_odometry(odometry(base_at(3 * i), stamp + 1, "lidar", "map"))
 
     drive(node, send_odometry, [base_at(i) for i in range(8)])
-    assert "of 'lidar' in 'map' is ignored" in node.transforms.problems()[0][2]
+    assert "of 'lidar' in 'map' are ignored" in node.transforms.problems()[0][2]
     now[0] += transforms_module.ODOMETRY_TIMEOUT_S + 1
     node.transforms.on_odometry(odometry(base_at(0), START + 10 * TENTH, "lidar", "map"))
     assert node.transforms.odometry_frame == "map" and not node.transforms.problems()

@@ -40,7 +40,7 @@ def test_labels_may_be_late_and_lost_frames_count_once(start, late):
             node._add("ground_truth", array(i - late))
     given_up = count - MAX_INCOMPLETE_FRAMES if late > MAX_INCOMPLETE_FRAMES else 0
     assert node.diagnostics.counts["frames"] == count - given_up
-    assert node.diagnostics.counts["incomplete"] + len(node.waiting) == given_up
+    assert node.diagnostics.counts["incomplete"] + len(node.incomplete_frames) == given_up
 
 
 def test_detections_wait_for_their_labels_up_to_a_limit(start):
@@ -49,7 +49,7 @@ def test_detections_wait_for_their_labels_up_to_a_limit(start):
         for i in range(MAX_INCOMPLETE_FRAMES + 30):
             node._add(name, array(i))
     assert node.diagnostics.counts["frames"] == MAX_INCOMPLETE_FRAMES and node.diagnostics.counts["incomplete"] == 30
-    assert not node.waiting and node.diagnostics.counts["repeated"] == 30
+    assert not node.incomplete_frames and node.diagnostics.counts["repeated"] == 30
     assert node.diagnostics.state[1] == "scoring"
 
 

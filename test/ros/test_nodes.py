@@ -146,7 +146,7 @@ stop = SimpleNamespace(begin_closing=lambda: None, finish_closing=lambda code: N
 for given in sys.argv[1:]:
     kind = bag_player.BagPlayer if "bag" in given else perception.Perception
     arguments = ["x", "--ros-args", "-r", "__node:=front", "-r", "__ns:=/left", *given.split()]
-    print(main._spin(kind, arguments, 0.0, stop), flush=True)
+    print(main._run_nodes([(kind, arguments, {})], arguments, 0.0, stop), flush=True)
     print("---", file=sys.stderr, flush=True)
 """
     done = subprocess.run(

@@ -199,15 +199,15 @@ def test_bag_time_follows_the_rate_and_stops_while_paused(monkeypatch):
     from lidar_perception.params import PlayerParams
 
     player = bag_player.BagPlayer.__new__(bag_player.BagPlayer)
-    player.now_ns, player.anchor, player.paused, player.clock = START, 50.0, False, None
+    player.now_ns, player.anchor, player.is_paused, player.clock = START, 50.0, False, None
     player.params = PlayerParams(rate=2.5)
     monkeypatch.setattr(bag_player, "monotonic", lambda: 54.0)
     player._advance()
     assert player.now_ns == START + 10 * 10**9
-    player.paused = True
+    player.is_paused = True
     monkeypatch.setattr(bag_player, "monotonic", lambda: 99.0)
     player._advance()
-    player.paused, player.params = False, PlayerParams(rate=0.5)
+    player.is_paused, player.params = False, PlayerParams(rate=0.5)
     monkeypatch.setattr(bag_player, "monotonic", lambda: 101.0)
     player._advance()
     assert player.now_ns == START + 11 * 10**9
@@ -218,7 +218,7 @@ def test_clock_keeps_its_rate_between_rare_messages(monkeypatch):
     from lidar_perception.params import PlayerParams
 
     player, now, sent = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], []
-    player.now_ns, player.anchor, player.paused, player.steps = START, now[0], False, 0
+    player.now_ns, player.anchor, player.is_paused, player.steps = START, now[0], False, 0
     player.params, player.next_clock = PlayerParams(clock_hz=100.0), 0.0
     player.clock, player.stop = SimpleNamespace(publish=sent.append), Future()
     monkeypatch.setattr(bag_player, "monotonic", lambda: now[0])
@@ -288,11 +288,11 @@ BAD = {
     "nowhere": ({"bag": "/nowhere"}, "the bag /nowhere does not exist"),
     "topic": ({"topics": ["/other"]}, "no topic /other"),
     "remap": ({"remap": ["/text"]}, "OLD:=NEW"),
-    "bad_name": ({"remap": ["/text:=a b"]}, "'a b' is not a topic name"),
-    "no_name": ({"remap": ["/text:="]}, "'' is not a topic name"),
+    "bad_name": ({"remap": ["/text:=a b"]}, "'a b' is not a valid topic name"),
+    "no_name": ({"remap": ["/text:="]}, "'' is not a valid topic name"),
     "wait_for": ({"wait_for": ["/text:=x"]}, "must be TOPIC or TOPIC:=COUNT"),
     "offset": ({"start_offset": 60.0}, "start_offset 60 s is past the end"),
-    "types": ({"remap": [f"{POINTS}:={TRUTH}"]}, "would carry the types"),
+    "types": ({"remap": [f"{POINTS}:={TRUTH}"]}, "would have the types"),
     "rate": ({"rate": -1.0}, "rate"),
     "truncated": ({}, "truncated"),
 }
@@ -342,9 +342,9 @@ def test_looped_single_message_bag_is_not_played_in_a_busy_loop(monkeypatch, tmp
     from lidar_perception.params import PlayerParams
 
     player, now, sent, served = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], [], []
-    player.params, player.awaited, player.clock = PlayerParams(loop=True), {}, None
-    player.paused, player.steps, player.stop = False, 0, Future()
-    player.served_at, player._count_pace = 0.0, lambda: None
+    player.params, player.awaited_counts, player.clock = PlayerParams(loop=True), {}, None
+    player.is_paused, player.steps, player.stop = False, 0, Future()
+    player.last_service, player._count_pace = 0.0, lambda: None
     player.diagnostics = SimpleNamespace(report=lambda *_: None)
     player.pace = SimpleNamespace(wait_for_answers=lambda *_: None)
     player._wait_until_delivered = lambda: None

@@ -225,14 +225,14 @@ def test_body_crop_needs_a_known_frame(start):
     sensor = mount_pose(0.5, 0.0, 1.2, 0.0, 0.0, 0.0)  # the base's origin is behind it
     seen = transform_points(np.vstack([floor, [[0.3, 0.0, 0.8]], [[0.9, 0.0, 0.8]]]), invert_pose(sensor))
     give(node, message(seen))
-    assert not node.diagnostics.counts["cropped"] and "crop.body is not cropped" in problems(node)
+    assert not node.diagnostics.counts["cropped"] and "crop.body is not applied" in problems(node)
     node.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
     give(node, message(seen, START + 1))
     assert node.diagnostics.counts["cropped"] == 1 and "crop.body" not in problems(node)
     low = start(GroundSegmentation, base_frame="base", **{"crop.body": [-0.5, -0.4, -1.0, 0.5, 0.4, -0.2]})
     low.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
     give(low, message(seen))
-    assert "crop.body ends 0.20 m below the ground of 'base'" in problems(low)
+    assert "the top of crop.body is 0.20 m below 'base'" in problems(low)
 
 
 def test_odometry_without_tf_connection_is_still_used(start):

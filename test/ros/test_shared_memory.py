@@ -98,4 +98,4 @@ def test_only_shared_memory_of_killed_process_is_removed(capsys):
         assert not left
         assert all(segment.exists() for segment in others)
         living.kill()
-    assert "that killed processes left in /dev/shm" in capsys.readouterr().err
+    assert "of killed processes from /dev/shm" in capsys.readouterr().err

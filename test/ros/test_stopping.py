@@ -28,7 +28,7 @@ WRITES_LONG = (
 )
 ENDS_BY_ITSELF = "stop.begin_closing(); stop.finish_closing(2); hang()"
 REFUSED = """
-from lidar_perception.nodes.main import _spin
+from lidar_perception.nodes.main import _run_nodes
 from lidar_perception.types import InputError
 class Made:
     __del__ = lambda self: hang()
@@ -36,7 +36,7 @@ class Refused:
     def __init__(self):
         self.made = Made()  # as a node with invalid parameters does
         raise InputError("refused")
-sys.exit(_spin(Refused, ["node"], 0.0, stop))
+sys.exit(_run_nodes([(Refused, ["node"], {})], ["node"], 0.0, stop))
 """
 
 

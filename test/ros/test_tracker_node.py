@@ -198,7 +198,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     for late, words in (0, "same stamp as the previous one"), (3, "older than the previous one"):
         old = make_detection_markers(found, header(now - late * TENTH), make_bag_message)
         send(old, words, answered=False)
-    send(make_bag_message(MARKERS), "an array without a marker", answered=False)
+    send(make_bag_message(MARKERS), "an array without markers", answered=False)
     now += TENTH
     gone = make_bag_message("visualization_msgs/msg/Marker", header=header(now), action=DELETEALL)
     assert read(send(make_bag_message(MARKERS, markers=[gone])))[:2] == (now, [1])  # missed in one frame
@@ -225,7 +225,7 @@ def test_bad_frames_and_poses_are_reported(processes, peer):
     now += 6 * TENTH
     send(frame(cars(car(10 - 0.8 * 18))), "pose is missing")
     move([pose(0.8 * 19)], "base")
-    send(frame(cars(car(10 - 0.8 * 19))), "odometry describes 'base'")
+    send(frame(cars(car(10 - 0.8 * 19))), "odometry is for 'base'")
     processes.check()
     assert "Traceback" not in (processes.logs / f"{NODE}.log").read_text()
 

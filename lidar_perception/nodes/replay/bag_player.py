@@ -1,4 +1,4 @@
-"""Node that plays a bag: CDR bytes go from the file to DDS; other cloud types are converted."""
+"""Node that plays a bag. It publishes the recorded bytes; only other cloud types are converted."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from lidar_perception.wire.transforms import TF_MESSAGE
 from msg_utils.messages import make_ros_message
 from msg_utils.stamps import SECOND_NS, make_time
 
-SERVICE_PERIOD_S = 0.05  # minimum service period while the replay is behind schedule
-MIN_LOOP_S = 0.1
+SERVICE_PERIOD_S = 0.05  # period in which services are handled while the replay is behind schedule
+MIN_LOOP_S = 0.1  # minimum duration of one pass through the bag with the parameter loop
 ANSWER_POLL_S = 0.2  # polling period while waiting for answers; an answer ends the wait early
 UNCOUNTED_SUFFIXES = "_ms", "_3d"  # suffixes of topics whose subscribers the diagnostics do not list
 
 
 class BagPlayer(LidarNode):
-    """Plays a bag once, or in a loop, and ends with exit code 0.
+    """Plays a bag once and ends with exit code 0, or plays it in a loop.
 
-    Services (std_srvs/Trigger): ~/pause, ~/resume, ~/step (up to and including the next message of
-    the busiest topic). The speed is the parameter `rate`; ~/set_rate exists where
-    rosbag2_interfaces is installed.
+    Services (std_srvs/Trigger): ~/pause, ~/resume, and ~/step, which plays up to and including the
+    next cloud. The speed is the parameter `rate`; ~/set_rate exists if rosbag2_interfaces is
+    installed.
     """
 
     def __init__(self, **options: Any):
@@ -52,10 +52,10 @@ class BagPlayer(LidarNode):
             self.bag = Bag(self.params.bag)
         for warning in caught:
             self.get_logger().warning(str(warning.message))
-        # Topics with clouds that are published as PointCloud2
-        self.converted = {t for t in find_cloud_topics(self.bag.topics) if self.bag.topics[t] != POINT_CLOUD}
-        self.kinds = {t: POINT_CLOUD if t in self.converted else kind for t, kind in self.bag.topics.items()}
-        # True if each cloud waits for the answers to earlier ones.
+        # Topics whose clouds are converted to PointCloud2.
+        self.converted_topics = {t for t in find_cloud_topics(self.bag.topics) if self.bag.topics[t] != POINT_CLOUD}
+        self.kinds = {t: POINT_CLOUD if t in self.converted_topics else kind for t, kind in self.bag.topics.items()}
+        # True if clouds wait for the answers to earlier clouds.
         self.follows = bool(self.params.follow and self.params.ahead)
         self.names = self._select_topics()
         self.publishers_by_topic = {t: p for t in self.names if (p := self._make_publisher(t))}
@@ -64,7 +64,7 @@ class BagPlayer(LidarNode):
                 f"{self.params.bag}: nothing to play; no playable topic among "
                 f"{', '.join(self.bag.topics) or 'an empty bag'}"
             )
-        self.awaited = self._parse_wait_for()
+        self.awaited_counts = self._parse_wait_for()
         self.diagnostic_values: dict[str, dict[str, str]] = {}  # node -> key -> value
         self.start_ns = self.bag.start_ns + int(self.params.start_offset * SECOND_NS)
         if self.start_ns > self.bag.end_ns:
@@ -74,16 +74,16 @@ class BagPlayer(LidarNode):
                 f"{(self.bag.end_ns - self.bag.start_ns) / SECOND_NS:.1f} s long"
             )
         self.stop_ns = self.start_ns + int(self.params.duration * SECOND_NS) if self.params.duration else None
-        self.paused = self.params.start_paused
-        self.warned: set[str] = set()  # topics with skipped messages
-        self.steps = 0
+        self.is_paused = self.params.start_paused
+        self.warned_topics: set[str] = set()  # topics with skipped messages
+        self.steps = 0  # requested steps that are not played yet
         self.step_topic = max(
             self.publishers_by_topic, key=lambda t: (self.kinds[t] == POINT_CLOUD, self.bag.counts[t])
         )
         self.now_ns, self.anchor = self.start_ns, monotonic()
         self.pace = Pace(self, self.params.follow, self.params.ahead, self.params.follow_timeout)
         self.clock = self.params.clock_hz and self.create_publisher(Clock, "/clock", RELIABLE)
-        self.next_clock, self.served_at = 0.0, 0.0  # monotonic times
+        self.next_clock, self.last_service = 0.0, 0.0  # monotonic times
         for name, action in (("pause", self._pause), ("resume", self._resume), ("step", self._step)):
             self.create_service(Trigger, f"~/{name}", action)
         if importlib.util.find_spec("rosbag2_interfaces"):
@@ -92,7 +92,7 @@ class BagPlayer(LidarNode):
             self.create_service(SetRate, "~/set_rate", self._set_rate)
 
     def _select_topics(self) -> dict[str, str]:
-        """Return the topic on which each topic of the bag is played."""
+        """Return {topic of the bag: topic on which it is played}."""
         for topic in self.params.topics:
             self.bag.require(topic)
         names = {t: t for t in (self.params.topics or self.bag.topics)}
@@ -106,7 +106,7 @@ class BagPlayer(LidarNode):
         for topic, name in expanded.items():
             if kinds.setdefault(name, self.kinds[topic]) != self.kinds[topic]:
                 raise InputError(
-                    f"{name} would carry the types {kinds[name]} and {self.kinds[topic]}; remap {topic} to another name"
+                    f"{name} would have the types {kinds[name]} and {self.kinds[topic]}; remap {topic} to another name"
                 )
         return expanded
 
@@ -116,18 +116,18 @@ class BagPlayer(LidarNode):
             return self.resolve_topic_name(name, only_expand=True)
         except (ValueError, RuntimeError, NameValidationException) as error:
             reason = " ".join(str(error).split())
-            raise InputError(f"{what}: '{name}' is not a topic name ({reason})") from None
+            raise InputError(f"{what}: '{name}' is not a valid topic name ({reason})") from None
 
     def _parse_wait_for(self) -> dict[str, int]:
-        """Return the number of subscribers to wait for, by topic."""
-        awaited = {}
-        own = [self.names[t] for t in find_cloud_topics(self.bag.topics) if t in self.names]
-        for rule in self.params.wait_for or own:
+        """Return {topic: number of subscribers to wait for}."""
+        counts = {}
+        cloud_topics = [self.names[t] for t in find_cloud_topics(self.bag.topics) if t in self.names]
+        for rule in self.params.wait_for or cloud_topics:
             name, _, count = rule.partition(":=")
             if count and not count.isdecimal():
                 raise InputError(f"wait_for '{rule}' must be TOPIC or TOPIC:=COUNT")
-            awaited[self._expand_name(name, "wait_for")] = int(count or 1)
-        return awaited
+            counts[self._expand_name(name, "wait_for")] = int(count or 1)
+        return counts
 
     def _make_publisher(self, topic: str) -> Any:
         kind = self.kinds[topic]
@@ -143,14 +143,14 @@ class BagPlayer(LidarNode):
         return any(q.durability.name == "TRANSIENT_LOCAL" for q in self.bag.qos(topic))
 
     def _count_latched(self, topic: str) -> int:
-        """Return how many messages of a latched topic are valid at a time.
+        """Return the number of messages of a latched topic that are valid at a time.
 
-        The last one, except for transforms: each node sends its own, and all of them stay valid.
+        Only the last message is valid, except for transforms, which several nodes publish.
         """
         return STATIC_QOS.depth if self.bag.topics[topic] == TF_MESSAGE else 1
 
     def spin(self, executor: Executor) -> None:
-        """Play the bag; serve services and parameters between messages."""
+        """Play the bag, and handle services and parameters between messages."""
         self.serve = executor.spin_once
         self._wait_for_subscribers()
         self.diagnostics.report(OK, f"playing {self.params.bag}")
@@ -167,7 +167,7 @@ class BagPlayer(LidarNode):
         self._wait_until_delivered()
 
     def _wait_for_subscribers(self) -> None:
-        diagnostics = self.awaited and self.create_subscription(
+        diagnostics = self.awaited_counts and self.create_subscription(
             DiagnosticArray, "/diagnostics", self._on_status, RELIABLE
         )
         self._wait_until_connected()
@@ -181,7 +181,7 @@ class BagPlayer(LidarNode):
     def _wait_until_connected(self) -> None:
         give_up = monotonic() + self.params.wait_timeout
         while not self.stop.done():
-            missing = [t for t, count in self.awaited.items() if self._count_subscribers(t) < count]
+            missing = [t for t, count in self.awaited_counts.items() if self._count_subscribers(t) < count]
             missing += [t for t in self.params.follow if not self.count_publishers(t)]
             if not missing:
                 return
@@ -193,24 +193,24 @@ class BagPlayer(LidarNode):
                     "anyway",
                 )
                 return
-            self._publish_clock()  # the awaited node may itself be waiting for the clock
+            self._publish_clock()  # the awaited nodes may be waiting for the clock
             self.serve(timeout_sec=0.02)
 
     def _count_subscribers(self, topic: str) -> int:
         """Count the subscribers of a topic.
 
-        Matched subscribers if this node publishes the topic, or a node of this package that
-        reports them in its diagnostics; otherwise the discovered ones.
+        These are the matched subscribers for topics of this node, and of nodes of this package,
+        which report them in their diagnostics. For other topics, they are the discovered ones.
         """
-        resolved = self.resolve_topic_name(topic)
-        played = [p for p in self.publishers_by_topic.values() if p.topic_name == resolved]
-        if played:
-            return played[0].get_subscription_count()
-        node = resolved.rsplit("/", 2)[0]
-        if resolved.endswith(UNCOUNTED_SUFFIXES) or not self.count_publishers(f"{node}/debug/processing_time_ms"):
-            return self.count_subscribers(resolved)  # another package publishes the topic
+        name = self.resolve_topic_name(topic)
+        own_publishers = [p for p in self.publishers_by_topic.values() if p.topic_name == name]
+        if own_publishers:
+            return own_publishers[0].get_subscription_count()
+        node = name.rsplit("/", 2)[0]
+        if name.endswith(UNCOUNTED_SUFFIXES) or not self.count_publishers(f"{node}/debug/processing_time_ms"):
+            return self.count_subscribers(name)  # another package publishes the topic
         values = self.diagnostic_values.get(node, {})  # includes subscribers inside the node's process
-        return int(values.get(f"subscribers of {resolved}", 0))
+        return int(values.get(f"subscribers of {name}", 0))
 
     def _wait_until_delivered(self) -> None:
         from rclpy.duration import Duration
@@ -225,32 +225,32 @@ class BagPlayer(LidarNode):
         for topic, stamp, data in self.bag.raw_messages(self.publishers_by_topic, self.start_ns, self.stop_ns):
             if not self._wait_until(stamp, topic):
                 return
-            if (played := self._convert(topic, data)) is None:
+            if (message := self._convert(topic, data)) is None:
                 continue
             if topic == self.step_topic:
-                self._follow(played)
-            self.publishers_by_topic[topic].publish(played)
+                self._follow(message)
+            self.publishers_by_topic[topic].publish(message)
             self.diagnostics.counts["frames"] += topic == self.step_topic
             self.diagnostics.last_stamp_ns = stamp
 
     def _convert(self, topic: str, data: bytes) -> bytes | None:
-        """Return the CDR of a message as played, or None for a cloud that cannot be converted.
+        """Return the CDR to publish for a message, or None for a cloud that cannot be converted.
 
         The first such cloud of a topic is reported with a warning.
         """
-        if topic not in self.converted:
+        if topic not in self.converted_topics:
             return data
         try:
             return encode(decode_cloud(data, self.bag.topics[topic]))
         except InputError as error:
-            if topic not in self.warned:
+            if topic not in self.warned_topics:
                 self.get_logger().warning(f"messages on {topic} are skipped: {error}")
-            self.warned.add(topic)
+            self.warned_topics.add(topic)
             self.diagnostics.counts["left_out"] = self.diagnostics.counts.get("left_out", 0) + 1
             return None
 
     def _follow(self, cloud: bytes) -> None:
-        """Wait until the graph keeps up; the time of the bag stands still meanwhile."""
+        """Wait until the graph has caught up. The time of the bag does not advance while waiting."""
         if self.follows:
             self._advance()
             self.pace.wait_for_room(self._serve_answers, self.stop.done)
@@ -268,48 +268,48 @@ class BagPlayer(LidarNode):
                 latency_ms_p95=f"{latencies[int(0.95 * (len(latencies) - 1))]:.1f}",
             )
         if self.follows:
-            played = max((self.now_ns - self.start_ns) / SECOND_NS / self.params.rate, 1e-9)
+            duration = max((self.now_ns - self.start_ns) / SECOND_NS / self.params.rate, 1e-9)
             self.diagnostics.counts.update(
                 unanswered=self.pace.unanswered,
                 held_s=f"{self.pace.held:.2f}",
-                slower=f"{(played + self.pace.held) / played:.2f}",
+                slower=f"{(duration + self.pace.held) / duration:.2f}",
             )
 
     def _publish_latched(self) -> None:
         """Publish the latched messages that are valid at the start of the replay."""
-        before: dict[str, deque[bytes]] = {}
-        latched = {t for t in self.publishers_by_topic if self._is_latched(t)}
-        if self.start_ns > self.bag.start_ns and latched:
-            for topic, _, data in self.bag.raw_messages(latched, None, self.start_ns):
-                before.setdefault(topic, deque(maxlen=self._count_latched(topic))).append(data)
-        for topic, messages in before.items():
+        earlier_messages: dict[str, deque[bytes]] = {}
+        latched_topics = {t for t in self.publishers_by_topic if self._is_latched(t)}
+        if self.start_ns > self.bag.start_ns and latched_topics:
+            for topic, _, data in self.bag.raw_messages(latched_topics, None, self.start_ns):
+                earlier_messages.setdefault(topic, deque(maxlen=self._count_latched(topic))).append(data)
+        for topic, messages in earlier_messages.items():
             for data in messages:
-                if (played := self._convert(topic, data)) is not None:
-                    self.publishers_by_topic[topic].publish(played)
+                if (message := self._convert(topic, data)) is not None:
+                    self.publishers_by_topic[topic].publish(message)
 
     def _wait_until(self, stamp: int, topic: str) -> bool:
-        """Serve until it is time for stamp; return False if the node is to end."""
+        """Spin until the time of the bag is `stamp`; return False if the node should end."""
         while not self.stop.done():
             self._advance()
-            if self.steps and self.paused:
+            if self.steps and self.is_paused:
                 self.now_ns = stamp
                 self.steps -= topic == self.step_topic
                 return True
-            behind = (stamp - self.now_ns) / SECOND_NS / self.params.rate
-            late = behind <= 0 and not self.paused
-            if late and monotonic() - self.served_at < SERVICE_PERIOD_S:
+            remaining = (stamp - self.now_ns) / SECOND_NS / self.params.rate
+            is_late = remaining <= 0 and not self.is_paused
+            if is_late and monotonic() - self.last_service < SERVICE_PERIOD_S:
                 return True  # otherwise handle service calls first, however late the replay is
-            wait = 0.05 if self.paused else min(max(behind, 0.0), 0.05)
+            wait = 0.05 if self.is_paused else min(max(remaining, 0.0), 0.05)
             if self.clock:
                 wait = min(wait, max(self.next_clock - monotonic(), 0.0))
-            self.served_at = monotonic()
+            self.last_service = monotonic()
             self.serve(timeout_sec=wait)
         return False
 
     def _advance(self) -> None:
-        """Advance the time of the bag by the elapsed time at the present rate."""
+        """Advance the time of the bag by the elapsed time, multiplied by the rate."""
         now = monotonic()
-        if not self.paused:
+        if not self.is_paused:
             self.now_ns += int((now - self.anchor) * self.params.rate * SECOND_NS)
         self.anchor = now
         self._publish_clock()
@@ -322,16 +322,16 @@ class BagPlayer(LidarNode):
 
     def _pause(self, _: Any, response: Any) -> Any:
         self._advance()
-        self.paused = True
+        self.is_paused = True
         return _answer(response, "paused")
 
     def _resume(self, _: Any, response: Any) -> Any:
         self._advance()
-        self.paused = False
+        self.is_paused = False
         return _answer(response, "playing")
 
     def _step(self, _: Any, response: Any) -> Any:
-        if not self.paused:
+        if not self.is_paused:
             return _answer(response, "pause first", success=False)
         self.steps += 1
         return _answer(response, f"next message of {self.step_topic}")
@@ -354,19 +354,20 @@ def _answer(response: Any, message: str, success: bool = True) -> Any:
 
 
 def _qos(profiles: list, latched_count: int, lossless: bool) -> QoSProfile:
-    """Return a profile that offers what any publisher offered when the topic was recorded.
+    """Return a profile that matches all subscribers that the recorded publishers matched.
 
     Args:
-        profiles: recorded profiles of the publishers; reliable and volatile if empty.
-        latched_count: messages that a late subscriber gets of a latched topic, at least ten.
-        lossless: reliable in any case.
+        profiles: recorded profiles of the publishers; if empty, the result is reliable and volatile.
+        latched_count: number of messages of a latched topic that a late subscriber gets, at least
+            ten.
+        lossless: reliable even if the recorded publishers were not.
     """
     if not profiles:
         return RELIABLE
     best_effort = all(q.reliability.name == "BEST_EFFORT" for q in profiles) and not lossless
-    latched = any(q.durability.name == "TRANSIENT_LOCAL" for q in profiles)
+    is_latched = any(q.durability.name == "TRANSIENT_LOCAL" for q in profiles)
     return QoSProfile(
-        depth=max(latched_count * latched, 10, *(q.depth for q in profiles)),
+        depth=max(latched_count * is_latched, 10, *(q.depth for q in profiles)),
         reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if is_latched else DurabilityPolicy.VOLATILE,
     )

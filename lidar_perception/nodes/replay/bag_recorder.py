@@ -20,16 +20,16 @@ from lidar_perception.wire.codec import load_typestore
 from msg_utils.messages import load_message_class
 
 LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
-DEPTH = 100  # queue depth of each topic in DDS, for when the machine is busy
-MAX_QUEUED = 256 * 2**20  # maximum bytes waiting to be written; further messages are dropped and counted
-DISCOVERY_PERIOD_S = 0.2  # between searches for topics without a publisher so far
+DEPTH = 100  # queue depth of each subscription, large enough for a busy machine
+MAX_QUEUED = 256 * 2**20  # maximum number of bytes to be written; further messages are dropped and counted
+DISCOVERY_PERIOD_S = 0.2  # pause between searches for publishers of the remaining topics
 
 
 class BagRecorder(LidarNode):
-    """Writes the bytes of messages to a bag, which is complete when the node has ended.
+    """Writes messages to a bag, which is complete when the node has ended.
 
-    A separate thread compresses and writes them. Messages of nodes in the same process come by
-    links, see links.py, and that thread serializes them as well.
+    A separate thread compresses and writes them. Messages of nodes in the same process arrive
+    through links, see links.py; that thread also serializes them.
     """
 
     writes_files = True
@@ -41,12 +41,12 @@ class BagRecorder(LidarNode):
         self.writer = BagWriter(self.params.bag, compression=self.params.compression)
         self.writer.__enter__()
         self.waiting = list(dict.fromkeys(map(self.resolve_topic_name, self.params.topics)))
-        self.kind_by_topic: dict[str, type] = {}  # of the recorded topics
+        self.kind_by_topic: dict[str, type] = {}  # topic -> message class, for the recorded topics
         self.subscription_by_topic: dict[str, Any] = {}
         self.link_by_topic: dict[str, tuple[Output, Receive]] = {}
         self.incompatible: set[str] = set()  # topics with a publisher of weaker QoS
         self.queue: queue.Queue = queue.Queue()
-        # Bytes; only clouds count among linked messages. Each counter is updated by one thread, or with the lock.
+        # Numbers of bytes; of linked messages, only clouds count. One thread or the lock protects each counter.
         self.queued, self.written = 0, 0
         self.lock = threading.Lock()
         self.diagnostics.counts.update(lost=0, dropped=0)
@@ -99,7 +99,7 @@ class BagRecorder(LidarNode):
 
     @staticmethod
     def _find_class(type_name: str) -> type | None:
-        """Return the class of a type that can be received and written, or None."""
+        """Return the class of a message type; None if it cannot be received or written."""
         if type_name not in load_typestore().fielddefs:
             return None
         try:
@@ -108,19 +108,19 @@ class BagRecorder(LidarNode):
             return None
 
     def _find_output(self, topic: str) -> Output | None:
-        """Return the output of this process to link to, or None; latched messages come by DDS."""
+        """Return the output of this process to link to, or None; latched messages arrive through DDS."""
         output = find_only_output(self, self.links, topic)
         return None if output is None or output.always_publishes else output
 
     def _subscribe(self, topic: str) -> None:
-        """Link to an output of this process, or subscribe with a QoS that all present publishers match."""
+        """Link to an output of this process, or subscribe with a QoS compatible with all publishers."""
         receive = partial(self._enqueue, topic)
         if self.links is not None and (output := self._find_output(topic)) is not None:
             self.link_by_topic[topic] = output, receive
             self.links.connect(output, receive)
             return
         offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
-        qos = QoSProfile(  # several publishers may each have latched a message
+        qos = QoSProfile(
             depth=DEPTH,
             reliability=(
                 ReliabilityPolicy.RELIABLE
@@ -149,7 +149,7 @@ class BagRecorder(LidarNode):
             self.links.disconnect(*link)
 
     def _enqueue(self, topic: str, message: Any, _: Any = None) -> None:
-        """Queue a message for the writing thread; for links, this is called in the threads of the publishers."""
+        """Queue a message for the writing thread. For links, the threads of the publishers call this."""
         size = len(message if isinstance(message, bytes) else getattr(message, "data", b""))
         with self.lock:
             waiting = self.queued - self.written
@@ -179,4 +179,4 @@ class BagRecorder(LidarNode):
         try:
             self.writer.__exit__(type(self.failure) if self.failure else None, self.failure, None)
         except (InputError, OSError) as error:  # the partial file is kept
-            self.get_logger().error(f"{self.writer.partial} is not complete: {error}")
+            self.get_logger().error(f"{self.writer.partial} is incomplete: {error}")

@@ -1,5 +1,7 @@
-"""Node that scores detections against ground truth: by centre distance while it runs, and by
-KITTI's average precision at its end."""
+"""Node that scores detections against ground truth.
+
+It computes scores by centre distance while it runs, and KITTI's average precision when it ends.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +32,8 @@ from msg_utils.markers import MarkedObjects, from_marker_array
 
 WRITE_PERIOD_S = 5.0
 MAX_INCOMPLETE_FRAMES = 100
-MAX_DONE_STAMPS = 100_000  # enough for 2.8 hours at 10 Hz; takes 10 MB
-MAX_AP_FRAMES = 10_000  # maximum number of frames kept for the average precision
+MAX_DONE_STAMPS = 100_000  # enough for 2.8 hours at 10 Hz; uses 10 MB
+MAX_AP_FRAMES = 10_000  # maximum number of frames stored for the average precision
 LOSSLESS_QOS = QoSProfile(depth=1000)  # for small messages that must not be lost
 TRUTH = "ground_truth"
 
@@ -41,15 +43,15 @@ class Evaluator(LidarNode):
 
     Messages are matched by header.stamp. A frame counts once, even if its bag loops. Incomplete
     frames count as lost, never as missed objects. With a camera, labels and detections outside its
-    image are ignored, as KITTI has no labels there.
+    image are ignored, because KITTI has no labels there.
     """
 
     writes_files = True
 
     def __init__(self, **options: Any):
         super().__init__("evaluator", EvaluatorParams(), **options)
-        self.inputs_of_frame = (TRUTH, *self.params.stages)
-        _check(self.params)
+        self.frame_inputs = (TRUTH, *self.params.stages)
+        _check_params(self.params)
         # Pedestrian comes first because its scores are at the top level of the file.
         self.results = {
             name: CandidateReport()
@@ -58,16 +60,16 @@ class Evaluator(LidarNode):
         self.precision = {stage: DetectionReport() for stage in self.params.stages}
         self.camera_info: Any = None
         self.extrinsics: Any = None
-        self.calibration: Calibration | None = None  # read from both messages, until another one arrives
-        self.waiting: dict[int, dict[str, MarkedObjects]] = {}
-        self.done: dict[int, None] = {}  # ordered set of the stamps of scored and lost frames
-        self.unwritten: str | None = None  # reason why the file is not written
-        self.frame_mismatch: str | None = None  # description of the mismatch in the last frame
+        self.calibration: Calibration | None = None  # cached until a new camera message arrives
+        self.incomplete_frames: dict[int, dict[str, MarkedObjects]] = {}  # stamp -> input -> objects
+        self.done_stamps: dict[int, None] = {}  # ordered set of the stamps of scored and lost frames
+        self.write_error: str | None = None  # reason why the file cannot be written
+        self.frame_mismatch: str | None = None  # the frame_ids of the last frame if they differ
         self.diagnostics.counts.update(incomplete=0, repeated=0)
         self.diagnostics.sources.append(self)
         with lock_compilation(self.get_logger().info):
-            _warm_up()  # must precede the inputs, because bag_player starts once they exist
-        for name in self.inputs_of_frame:
+            _warm_up()  # before the inputs are created, because bag_player waits for these
+        for name in self.frame_inputs:
             self.inputs.subscribe(name, MARKERS, lambda m, n=name: self._add(n, m), LOSSLESS_QOS)
         for topic, kind in (
             ("camera_info", "sensor_msgs/msg/CameraInfo"),
@@ -94,12 +96,12 @@ class Evaluator(LidarNode):
                 "DELETE marker with the header of the frame"
             )
         stamp = objects.stamp_ns
-        if stamp in self.done:  # the bag was repeated, or the message is late
+        if stamp in self.done_stamps:  # the bag has restarted, or the message is late
             self.diagnostics.counts["repeated"] += 1
             return
-        frame = self.waiting.setdefault(stamp, {})
+        frame = self.incomplete_frames.setdefault(stamp, {})
         frame[name] = objects
-        if len(frame) == len(self.inputs_of_frame):
+        if len(frame) == len(self.frame_inputs):
             self._finish(stamp)
             with self.diagnostics.measure_frame(stamp):
                 self._score(frame)
@@ -109,23 +111,23 @@ class Evaluator(LidarNode):
                 if any(result.frames for result in self.results.values())
                 else "no frame with a Pedestrian yet",
             )
-        while len(self.waiting) > MAX_INCOMPLETE_FRAMES:
-            oldest = next(iter(self.waiting))
-            missing = [n for n in self.inputs_of_frame if n not in self.waiting[oldest]]
+        while len(self.incomplete_frames) > MAX_INCOMPLETE_FRAMES:
+            oldest = next(iter(self.incomplete_frames))
+            missing = [n for n in self.frame_inputs if n not in self.incomplete_frames[oldest]]
             self._finish(oldest)
             self.diagnostics.counts["incomplete"] += 1
             self.diagnostics.report(
                 WARN,
-                f"not scoring frames without a message on "
-                f"{self._topics(missing)} with the same header.stamp; stamps must be equal "
+                f"some frames are not scored because they have no message on "
+                f"{self._join_topics(missing)} with the same header.stamp; stamps must be equal "
                 "to the nanosecond",
             )
 
     def _finish(self, stamp: int) -> None:
-        del self.waiting[stamp]
-        self.done[stamp] = None
-        if len(self.done) > MAX_DONE_STAMPS:
-            del self.done[next(iter(self.done))]
+        del self.incomplete_frames[stamp]
+        self.done_stamps[stamp] = None
+        if len(self.done_stamps) > MAX_DONE_STAMPS:
+            del self.done_stamps[next(iter(self.done_stamps))]
 
     def _score(self, frame: dict[str, MarkedObjects]) -> None:
         truth, calibration = to_truth(frame[TRUTH]), self._read_calibration()
@@ -147,7 +149,7 @@ class Evaluator(LidarNode):
         self.frame_mismatch = (
             None
             if len({*names.values()}) == 1
-            else ", ".join(f"{self._topics([n])} in '{frame_id}'" for n, frame_id in names.items())
+            else ", ".join(f"{self._join_topics([n])} in '{frame_id}'" for n, frame_id in names.items())
         )
 
     def _score_class(
@@ -180,20 +182,20 @@ class Evaluator(LidarNode):
             self.calibration = read_calibration(self.camera_info, self.extrinsics)
         return self.calibration
 
-    def _topics(self, names: Iterable[str]) -> str:
+    def _join_topics(self, names: Iterable[str]) -> str:
         return " and ".join(self.resolve_topic_name(f"~/input/{name}") for name in names)
 
     def values(self) -> dict[str, Any]:
         """Return the values for the diagnostics."""
-        return {"waiting": len(self.waiting)}
+        return {"waiting": len(self.incomplete_frames)}
 
     def problems(self) -> list[Problem]:
-        """Return problems that falsify the scores or prevent writing them, with their remedies."""
-        found: list[Problem] = []
-        for name in self.inputs_of_frame:
-            topic = self._topics([name])
+        """Return the present problems with their remedies."""
+        problems: list[Problem] = []
+        for name in self.frame_inputs:
+            topic = self._join_topics([name])
             if (count := self.count_publishers(topic)) > 1:
-                found.append(
+                problems.append(
                     (
                         f"publishers of {name}",
                         WARN,
@@ -201,7 +203,7 @@ class Evaluator(LidarNode):
                     )
                 )
         if self.frame_mismatch:
-            found.append(
+            problems.append(
                 (
                     "frames",
                     WARN,
@@ -209,29 +211,29 @@ class Evaluator(LidarNode):
                     f"{self.frame_mismatch}; publish both in the same frame (target_frame)",
                 )
             )
-        if self.unwritten:
-            found.append(("file", ERROR, f"{self.unwritten}; retrying every {WRITE_PERIOD_S:g} s"))
-        return found
+        if self.write_error:
+            problems.append(("file", ERROR, f"{self.write_error}; retrying every {WRITE_PERIOD_S:g} s"))
+        return problems
 
     def write(self) -> None:
         """Write the scores so far to params.file, if it is set."""
         if self.params.file:
-            self._write(self._content())
+            self._write(self._compute_scores())
 
-    def _content(self) -> dict[str, Any]:
+    def _compute_scores(self) -> dict[str, Any]:
         first, *others = self.results
         return {
             **self.results[first].compute(),
-            "lost_frames": self.diagnostics.counts["incomplete"] + len(self.waiting),
+            "lost_frames": self.diagnostics.counts["incomplete"] + len(self.incomplete_frames),
             "classes": {name: self.results[name].compute() for name in others},
         }
 
     def _write(self, content: dict[str, Any]) -> None:
         try:
             write_text(self.params.file, json.dumps(content, indent=1))
-            self.unwritten = None
+            self.write_error = None
         except InputError as error:
-            self.unwritten = str(error)
+            self.write_error = str(error)
 
     def close(self) -> None:
         precision = {
@@ -243,13 +245,13 @@ class Evaluator(LidarNode):
                 row, ap = score.make_rows()["all"], precision[stage].get(name, {})
                 bev = ap.get("bev_relaxed", {}).get("moderate")
                 self.get_logger().info(
-                    f"{name}, {stage}: {row['tp']} found, {row['fp']} false, {row['fn']} missed "
-                    f"within 1 m, F1 {100 * row['f1']:.1f}" + (f"; BEV AP {bev['r40']:.1f}" if bev else "")
+                    f"{name}, {stage}, within 1 m: {row['tp']} true positives, {row['fp']} false positives, "
+                    f"{row['fn']} misses, F1 {100 * row['f1']:.1f}" + (f"; BEV AP {bev['r40']:.1f}" if bev else "")
                 )
         if self.params.file:
-            self._write({**self._content(), "ap": precision})
-        if self.unwritten:
-            raise InputError(f"the scores are lost: {self.unwritten}")
+            self._write({**self._compute_scores(), "ap": precision})
+        if self.write_error:
+            raise InputError(f"the scores are lost: {self.write_error}")
 
 
 def _warm_up() -> None:
@@ -260,8 +262,8 @@ def _warm_up() -> None:
     report.compute()
 
 
-def _check(params: EvaluatorParams) -> None:
-    """Raise InputError for parameters that prevent scoring or writing."""
+def _check_params(params: EvaluatorParams) -> None:
+    """Raise InputError for values that prevent scoring or writing the scores."""
     if TRUTH in params.stages or len({*params.stages}) < len(params.stages) or not params.stages:
         raise InputError(f"stages: {list(params.stages)} must be distinct names of inputs other than {TRUTH}")
     if not params.classes:
@@ -269,8 +271,8 @@ def _check(params: EvaluatorParams) -> None:
     for name in params.classes:
         if name not in DETECTED:
             raise make_unknown_name_error("class", name, [*DETECTED])
-    if short := [topic for topic in params.timing if topic.count("/") < 2]:
-        raise InputError(f"timing: {short[0]} does not have the form .../NODE/debug/WHAT")
+    if invalid := [topic for topic in params.timing if topic.count("/") < 2]:
+        raise InputError(f"timing: {invalid[0]} does not have the form .../NODE/debug/NAME")
     if params.file and (
         Path(params.file).is_dir() or (Path(params.file).parent.exists() and not Path(params.file).parent.is_dir())
     ):

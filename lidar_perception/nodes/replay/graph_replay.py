@@ -38,8 +38,8 @@ from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POIN
 GRAPH = "graph"  # name of the process that runs the nodes of a graph
 TRACKS = f"/{TRACKER}/output/tracks"
 START_TIMEOUT_S = 180.0  # time for all nodes to compile, start and discover each other
-AHEAD = 2  # number of clouds in flight, so that stages can work in parallel
-SILENCE_TIMEOUT_S = 10.0  # time without a result after the last cloud until the replay ends
+AHEAD = 2  # number of clouds in flight; two keep several stages busy
+SILENCE_TIMEOUT_S = 10.0  # the replay ends if no result arrives for this long after the last cloud
 
 
 def replay(
@@ -65,19 +65,19 @@ def replay(
         params: parameters of the detector, a dataclass.
         detector: name of the detector, see graph.DETECTOR_NODES.
         rate: speed of the replay, 1.0 for real time.
-        single: run the detector in one process.
-        real_time: send clouds at the rate of the sensor. Otherwise a cloud is sent once the clouds
-            before it have detections, so that none is lost on a slow machine.
-        processes: start one process for each node; False: one for all nodes of the graph; None:
-            see runs_in_one_process().
+        single: run the detector in one node that also computes ground and clusters.
+        real_time: send clouds at the rate of the sensor. Otherwise a cloud is sent once the previous
+            clouds have detections, so that none is lost on a slow machine.
+        processes: True: start one process per node; False: start one process for all nodes of the
+            graph; None: see runs_in_one_process().
 
     Returns:
         clouds, results (number of frames), latency_ms (median and p95 from sending a cloud to
         receiving its tracks in the player), memory_mb (proportional set size),
         memory_mb_by_process, cpu_ms_by_process (CPU time per cloud), stage_ms (median time of each
-        node per cloud), one_process, slower (slowdown of the replay against `rate`), poses (their
-        source for the tracker, see recorded_source), and for candidates the scores of the
-        evaluator.
+        node per cloud), one_process, slower (duration of the replay divided by its duration at
+        `rate`), poses (source of the tracker's poses, see choose_recorded_source), and for
+        candidates the scores of the evaluator.
 
     Raises:
         InputError: the nodes do not connect, or there is no result.
@@ -195,18 +195,18 @@ def replay(
 
 
 class CpuTimes:
-    """CPU time of the processes of a replay, and of this one as "watch", at a result."""
+    """CPU times of the processes of a replay, and of this process as "watch"."""
 
     def __init__(self) -> None:
         self.frames, self.seconds = 0, dict[str, float]()
 
     def read(self, frames: int, running: Processes) -> None:
-        """Read the times at a number of results; processes that have ended keep theirs."""
+        """Read the times when `frames` results have arrived; processes that have ended keep theirs."""
         self.frames = frames
         self.seconds.update(running.measure_cpu_seconds(), watch=process_time())
 
     def ms_per_frame(self, earlier: CpuTimes) -> dict[str, float]:
-        """Return {process: its CPU time per result since an earlier reading, in ms}."""
+        """Return {process: CPU time per result since an earlier reading, in ms}."""
         frames = max(self.frames - earlier.frames, 1)
         return {
             name: 1e3 * (seconds - earlier.seconds.get(name, 0.0)) / frames for name, seconds in self.seconds.items()

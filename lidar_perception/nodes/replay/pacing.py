@@ -1,4 +1,4 @@
-"""Flow control of a replay: the next cloud waits for the detections of the clouds before it."""
+"""Flow control of a replay: the next cloud is sent once the previous ones have detections."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from typing import Any
 from lidar_perception.nodes.interfaces import MARKERS, RELIABLE
 from msg_utils.messages import load_message_class
 
-MAX_WAITING = 1000  # maximum number of unanswered clouds and of timed answers
+MAX_WAITING = 1000  # maximum number of clouds that wait for answers, and of stored latencies
 SHORT_TIMEOUT_S = 1.0  # timeout for a detection after an earlier one has timed out
 
 
 class Pace:
-    """Clouds that have no detections yet on some topics.
+    """Tracks the clouds that have no detections yet, and limits their number.
 
-    Detections answer a cloud with their header.stamp. A cloud without an answer within `timeout`
-    seconds, or before the answer to a later cloud, counts as unanswered and is no longer awaited,
-    so that every replay ends.
+    Detections answer the cloud with the same header.stamp. A cloud without an answer within
+    `timeout` seconds, or before the answer to a later cloud, counts as unanswered and is no longer
+    awaited, so that every replay ends.
 
     Args:
         node: the node that subscribes to the topics.
         topics: topics of detections.
-        ahead: number of clouds that may be unanswered at a time; 0: any number, so that no cloud
-            waits and the answers are only timed.
-        timeout: seconds.
+        ahead: maximum number of clouds without an answer; 0: no limit, only measure latencies.
+        timeout: maximum time to wait for an answer, in seconds.
 
     Attributes:
-        latencies_ms: times from sending a cloud to the last of its answers.
+        latencies_ms: times from sending a cloud to its last answer.
+        unanswered: number of missing answers.
+        held: total time that clouds have waited, in seconds.
     """
 
     def __init__(self, node: Any, topics: Sequence[str], ahead: int, timeout: float):
@@ -49,7 +50,7 @@ class Pace:
             )  # CDR layout: 8 bytes, then the first marker's stamp
 
     def add_cloud(self, cloud: bytes) -> None:
-        """Register a cloud, as CDR, that is sent now."""
+        """Register a cloud (CDR) that is being sent."""
         if self.topics:
             stamp = bytes(cloud[4:12])
             self.waiting[stamp], self.sent[stamp] = set(self.topics), monotonic()
@@ -57,21 +58,20 @@ class Pace:
                 self._give_up()
 
     def add_answer(self, stamp: bytes, topic: str) -> None:
-        """Register detections on a topic; earlier clouds without any count as unanswered."""
+        """Register detections on a topic. Earlier clouds without an answer there count as unanswered."""
         if stamp not in self.waiting:
             return
         self.patience = self.timeout
-        for earlier in list(self.waiting):
-            left = self.waiting[earlier]
-            missed = topic in left and earlier != stamp
-            left.discard(topic)
-            self.unanswered += missed
-            if not left:
-                del self.waiting[earlier]
-                sent = self.sent.pop(earlier)
-                if earlier == stamp:
+        for cloud_stamp in list(self.waiting):
+            missing_topics = self.waiting[cloud_stamp]
+            self.unanswered += topic in missing_topics and cloud_stamp != stamp
+            missing_topics.discard(topic)
+            if not missing_topics:
+                del self.waiting[cloud_stamp]
+                sent = self.sent.pop(cloud_stamp)
+                if cloud_stamp == stamp:
                     self.latencies_ms.append((monotonic() - sent) * 1e3)
-            if earlier == stamp:
+            if cloud_stamp == stamp:
                 return
 
     def _give_up(self) -> None:
@@ -81,7 +81,7 @@ class Pace:
         del self.sent[oldest]
 
     def wait_for_room(self, serve: Callable[[], Any], is_stopped: Callable[[], bool]) -> None:
-        """Call serve() until another cloud may be sent, or is_stopped()."""
+        """Call serve() until another cloud may be sent, or until is_stopped()."""
         begin = monotonic()
         while self.ahead and len(self.waiting) >= self.ahead and not is_stopped():
             if monotonic() - begin > self.patience:
@@ -92,7 +92,7 @@ class Pace:
         self.held += monotonic() - begin
 
     def wait_for_answers(self, serve: Callable[[], Any], is_stopped: Callable[[], bool]) -> None:
-        """Call serve() until no cloud waits, or is_stopped(); the time does not count as held."""
+        """Call serve() until all clouds are answered, or until is_stopped(); not counted as held."""
         held, self.ahead = self.held, min(self.ahead, 1)
         while self.ahead and self.waiting and not is_stopped():
             self.wait_for_room(serve, is_stopped)
