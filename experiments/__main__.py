@@ -1,4 +1,4 @@
-"""python -m experiments VERB: the commands of this folder, which are imported only when called."""
+"""python -m experiments COMMAND: the commands of this folder, which are imported only when called."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import click
 
 from lidar_perception.cli.main import LazyGroup, run_cli
 
-COMMANDS = {  # verb -> (module.function, description in the overview)
+COMMANDS = {  # name -> (module.function, description in the overview)
     "compare": ("experiments.comparison.command.compare", "Run every detector on the same frames, side by side."),
     "realism": ("experiments.realism.command.realism", "Compare simulated scans with real ones."),
     "reproduce": ("experiments.framework.command.reproduce", "Reproduce the tables of a paper."),

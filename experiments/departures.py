@@ -1,4 +1,4 @@
-"""Departures from the three papers, and where each of their tables is measured.
+"""Departures from the three papers, and the command that measures each of their tables.
 
 docs/generate.py writes both into docs/explanation/papers.md.
 """
@@ -9,26 +9,26 @@ from typing import NamedTuple
 
 
 class Departure(NamedTuple):
-    """A place where we depart from a paper, or had to choose a reading.
+    """A place where this package departs from a paper, or where the text of the paper is ambiguous.
 
     Attributes:
         place: Letter of the paper, and section, equation, table or figure.
         paper: What the paper says.
-        here: What we do.
-        option: Setting that gives the paper's reading; empty without one.
+        package: What this package does.
+        option: Setting that follows the paper; empty if there is none.
     """
 
     place: str
     paper: str
-    here: str
+    package: str
     option: str = ""
 
 
-class Measured(NamedTuple):
-    """A table or figure of a paper, the command that measures it, and the data it needs."""
+class MeasuredTable(NamedTuple):
+    """A table or figure of a paper, the command that measures it, and the data that the command needs."""
 
     place: str
-    what: str
+    content: str
     command: str
     data: str
 
@@ -165,40 +165,40 @@ STM_CPA = "./lidar reproduce stm-cpa DATA --out DIR"
 EG = "./lidar reproduce eg-pointpillars DATA --out DIR"
 CLUSTERS = "./lidar reproduce clusters DATA --out DIR"
 MEASURED = (
-    Measured("A Table 1, 3 to 6, 8, 9", "pedestrians, stages, ranges, CPA steps, overlap, time", STM_CPA, KITTI),
-    Measured("A Figures 7, 8", "search of eps and `min_samples`, CPA by range", STM_CPA, KITTI),
-    Measured("A Table 7", "PointPillars V0 by centre distance on the same frames", STM_CPA, KITTI),
-    Measured("A Table 2, Section 3.5", "readings of window and PCA alignment", STM_CPA, KITTI),
-    Measured("B Table 2, Figure 13", "diagonals of boxes and clusters by class", EG, SIM),
-    Measured("B Table 5", "V0 to V4: AP of three classes and their mean", EG, SIM),
-    Measured("B Table 6", "gain, time, overhead, parameters", EG, SIM),
-    Measured("B Figure 20", "V0 and V4 side by side", EG, SIM),
-    Measured(
+    MeasuredTable("A Table 1, 3 to 6, 8, 9", "pedestrians, stages, ranges, CPA steps, overlap, time", STM_CPA, KITTI),
+    MeasuredTable("A Figures 7, 8", "search of eps and `min_samples`, CPA by range", STM_CPA, KITTI),
+    MeasuredTable("A Table 7", "PointPillars V0 by centre distance on the same frames", STM_CPA, KITTI),
+    MeasuredTable("A Table 2, Section 3.5", "readings of window and PCA alignment", STM_CPA, KITTI),
+    MeasuredTable("B Table 2, Figure 13", "diagonals of boxes and clusters by class", EG, SIM),
+    MeasuredTable("B Table 5", "V0 to V4: AP of three classes and their mean", EG, SIM),
+    MeasuredTable("B Table 6", "gain, time, overhead, parameters", EG, SIM),
+    MeasuredTable("B Figure 20", "V0 and V4 side by side", EG, SIM),
+    MeasuredTable(
         "B Tables 2, 5, 6, Figures 13, 20",
         "with the shipped weights, without training",
         EG.replace("rs ", "rs-shipped "),
         KITTI,
     ),
-    Measured("B Sections 1, 5", "V0 and V4 with 10, 25, 50 and 100 % of the labels", EG, SIM),
-    Measured(
+    MeasuredTable("B Sections 1, 5", "V0 and V4 with 10, 25, 50 and 100 % of the labels", EG, SIM),
+    MeasuredTable(
         "C Tables 2, 3, Figures 6, 8",
         "parameters; segmentation against other clusterings",
         CLUSTERS.replace("clusters", "clusters-segmentation"),
         "KITTI, nuScenes, or `sim`",
     ),
-    Measured(
+    MeasuredTable(
         "C Tables 2 to 6, 8, Figures 6, 8, 10",
         "all of these; radii, ablation, difficulties, fewer points and noise",
         CLUSTERS,
         "KITTI, nuScenes, or `sim`",
     ),
-    Measured(
+    MeasuredTable(
         "C Tables 6 to 8, Figure 10, gamma",
         "the same with the shipped weights of PointNet and PointPillars V0, without training",
         CLUSTERS.replace("clusters", "clusters-shipped"),
         "KITTI, nuScenes, or `sim`",
     ),
-    Measured(
+    MeasuredTable(
         "C Table 7", "scores of nuScenes with velocities of the tracker", CLUSTERS, "nuScenes, or simulated drives"
     ),
 )

@@ -11,7 +11,7 @@ from zlib import crc32
 
 import numpy as np
 
-from experiments.clusters.networks import Source, list_compared, list_sources
+from experiments.clusters.networks import Source, list_compared_sources, list_sources
 from experiments.framework.precision import to_record
 from experiments.framework.trained_models import TrainedModel
 from lidar_perception.clustering.cluster import cluster_obstacles
@@ -30,55 +30,59 @@ from lidar_perception.types import Detections, InputError, PointCloud
 
 
 class Change(NamedTuple):
-    """Share of the points that are left, and standard deviation of noise along the beams in
-    metres."""
+    """A change of a cloud.
 
-    share: float = 1.0
+    Attributes:
+        fraction: Fraction of the points that are kept.
+        noise: Standard deviation of noise along the beams, metres.
+    """
+
+    fraction: float = 1.0
     noise: float = 0.0
 
 
-CHANGES = {
+CHANGES = {  # changes of Table 8; the paper does not state the amount of noise
     "50 %": Change(0.5),
     "20 %": Change(0.2),
     "10 %": Change(0.1),
     "noise 2 cm": Change(noise=0.02),
     "noise 5 cm": Change(noise=0.05),
     "noise 10 cm": Change(noise=0.1),
-}  # changes of Table 8; the paper does not state the amount of noise
+}
 
 
 def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[str, Any]:
-    """Detect the objects of a frame with every detector, and with some in changed clouds.
+    """Detect the objects of a frame with every detector, and those of changed clouds with some.
 
     Returns:
         - truth: the labels, see framework.precision.to_record
         - found: name of a detector -> detections
         - changed: change -> name of a detector -> detections
-        - detector_ms: name of a detector -> duration of ground, clusters and network
-        - changed_ms: change -> name of a detector -> the same duration
+        - detector_ms: name of a detector -> total time of ground, clusters and network
+        - changed_ms: change -> name of a detector -> total time
 
     Raises:
-        InputError: the frame has no labels.
+        InputError: The frame has no labels.
     """
     truth, calibration = frame.truth(), frame.calibration()
     if truth is None:
         raise InputError(f"{frame.points or frame.name} has no labels; put the label files next to the scans")
 
     def detect(change: Change, sources: Mapping[str, Source]) -> tuple[dict[str, Any], dict[str, float]]:
-        found = detect_with_all(change_cloud(frame.load(), change, frame.name), sources, frame.sensor_height)
+        results = detect_with_all(change_cloud(frame.load(), change, frame.name), sources, frame.sensor_height)
         return (
             {
                 name: to_record(to_camera_objects(to_scored_labels(boxes), calibration))
-                for name, (boxes, _) in found.items()
+                for name, (boxes, _) in results.items()
             },
-            {name: round(ms, 3) for name, (_, ms) in found.items()},
+            {name: round(ms, 3) for name, (_, ms) in results.items()},
         )
 
-    found, times = detect(Change(), list_sources(models))
-    changed = {name: detect(change, list_compared(models)) for name, change in CHANGES.items()}
+    detections, times = detect(Change(), list_sources(models))
+    changed = {name: detect(change, list_compared_sources(models)) for name, change in CHANGES.items()}
     return {
         "truth": to_record(to_camera_objects(truth, calibration)),
-        "found": found,
+        "found": detections,
         "changed": {name: boxes for name, (boxes, _) in changed.items()},
         "detector_ms": times,
         "changed_ms": {name: ms for name, (_, ms) in changed.items()},
@@ -88,41 +92,42 @@ def measure_detection(frame: Frame, models: Mapping[str, TrainedModel]) -> dict[
 def detect_with_all(
     cloud: PointCloud, sources: Mapping[str, Source], height: float, range: str = "auto"
 ) -> dict[str, tuple[Detections, float]]:
-    """Run detectors on a cloud, whose ground and clusters are computed once for equal parameters.
+    """Run detectors on a cloud. Detectors with equal parameters share the ground and clusters.
 
     Args:
+        cloud: The cloud.
         sources: The detectors by name.
         height: Height of the sensor, metres.
-        range: Range of PointPillars, see open_detector; PointNet covers all directions.
+        range: Range of PointPillars, see open_detector. PointNet covers all directions.
 
     Returns:
-        Detections of each detector, and the milliseconds of ground, clusters and network.
+        For each detector its detections, and the total time of ground, clusters and network in ms.
     """
     ground: dict[GroundParams, tuple[np.ndarray, float]] = {}
     clusters: dict[tuple[GroundParams, ClusteringParams], tuple[np.ndarray, float]] = {}
-    found = {}
+    results = {}
     for name, source in sources.items():
         detector = open_network(source, height, range)
         if not isinstance(detector, PointNetDetector):
             result = detector(cloud)
-            found[name] = result.detections, sum(result.timings.values())
+            results[name] = result.detections, sum(result.timings.values())
             continue
         params = detector.params
         if params.ground not in ground:
             ground[params.ground] = _time(segment_ground, cloud, params.ground)
-        own, ground_ms = ground[params.ground]
+        ground_mask, ground_ms = ground[params.ground]
         key = params.ground, params.clustering
         if key not in clusters:
-            clusters[key] = _time(cluster_obstacles, cloud.xyz, own, params.clustering)
-        ids, clusters_ms = clusters[key]
-        result = detector(cloud, ground=own, cluster_ids=ids)
-        found[name] = result.detections, ground_ms + clusters_ms + sum(result.timings.values())
-    return found
+            clusters[key] = _time(cluster_obstacles, cloud.xyz, ground_mask, params.clustering)
+        cluster_ids, clusters_ms = clusters[key]
+        result = detector(cloud, ground=ground_mask, cluster_ids=cluster_ids)
+        results[name] = result.detections, ground_ms + clusters_ms + sum(result.timings.values())
+    return results
 
 
 @lru_cache(maxsize=64)
 def open_network(source: Source, height: float, range: str = "auto") -> NetworkDetector:
-    """Open a detector that returns detections of any score, as average precision needs."""
+    """Open a detector that also returns detections with low scores, which average precision needs."""
     kind, _ = resolve_weights(source.weights)
     settings: dict[str, Any] = {f"{kind}.warm_up": False}
     if source.gamma is not None:
@@ -140,8 +145,8 @@ def open_network(source: Source, height: float, range: str = "auto") -> NetworkD
 
 
 def change_cloud(cloud: PointCloud, change: Change, name: str) -> PointCloud:
-    """Return a cloud with fewer points or noise; the change depends on the name of the frame."""
-    cloud = thin_scan(cloud, change.share, name)
+    """Remove points from a cloud or add noise. The name of the frame is the random seed."""
+    cloud = thin_scan(cloud, change.fraction, name)
     if change.noise == 0.0:
         return cloud
     rng = np.random.default_rng(crc32(name.encode()))

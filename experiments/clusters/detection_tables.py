@@ -15,7 +15,7 @@ from experiments.clusters.networks import (
     OURS,
     RADII,
     READINGS,
-    list_compared,
+    list_compared_sources,
     list_sources,
     name_model,
 )
@@ -31,14 +31,14 @@ STRICT_3D, RELAXED_BEV, MEAN = 0, 1, len(CELLS)  # indices into the result of dr
 MAX_MS = 100.0  # frame period of KITTI's sensor, for Eq. 1
 MAP = ("mAP 3D [%]", "mAP BEV, relaxed [%]")
 ABOUT_MAP = (
-    "mAP is the mean of the average precision (KITTI, 40 recall points) of cars, "
-    "pedestrians and cyclists at three difficulties: 3D at an overlap of 0.7 and 0.5, and "
-    "BEV at 0.5 and 0.25. The paper does not name its protocol; its values are next to "
+    "mAP is the mean average precision (KITTI, 40 recall points) of cars, "
+    "pedestrians and cyclists at three difficulties: 3D at overlaps of 0.7 (Car) and 0.5, and "
+    "BEV at 0.5 (Car) and 0.25. The paper does not name its protocol; its values are shown next to "
     "3D."
 )
 ABOUT_SHIPPED = (
-    "Shipped: the weights of the package, trained for much longer, on other simulated scans and on no recorded one. "
-    "They detect with gamma 0; one row has the paper's 0.8 (Eq. 9)."
+    "Shipped: the weights of the package, trained for much longer and on other simulated scans, without recorded "
+    "scans. They use gamma 0; one row uses the paper's 0.8 (Eq. 9)."
 )
 Draws = Mapping[str, np.ndarray]  # network -> array (1 + R, 2, 10) from draw_cells()
 
@@ -46,43 +46,46 @@ Draws = Mapping[str, np.ndarray]  # network -> array (1 + R, 2, 10) from draw_ce
 def make_detection_sections(
     records: list[dict[str, Any]], data: str, models: Mapping[str, TrainedModel]
 ) -> list[Section]:
-    """Return Tables 6 and 8 of records of measure_detection(); with trained models also 4 and 5."""
+    """Make Tables 6 and 8 from the records of measure_detection(); with trained models also Tables 4 and 5."""
     names = [r["frame"] for r in records]
-    true = [r["truth"] for r in records]
+    labels = [r["truth"] for r in records]
     draws = _average_seeds(
         draw_cells(
             names,
             {
-                model: compare_records(true, [r["found"][model] for r in records])
+                model: compare_records(labels, [r["found"][model] for r in records])
                 for model in list_sources(models)
                 if all(model in r["found"] for r in records)
             },
             REPLICATES,
         )
     )
-    changed = {
+    changed_draws = {
         change: _average_seeds(
             draw_cells(
                 names,
                 {
-                    model: compare_records(true, [r["changed"][change][model] for r in records])
-                    for model in list_compared(models)
+                    model: compare_records(labels, [r["changed"][change][model] for r in records])
+                    for model in list_compared_sources(models)
                 },
                 REPLICATES,
             )
         )
         for change in CHANGES
     }
-    trained = [_make_ablation_section(draws, data, models), _make_radii_section(draws, data)] if models else []
-    return [*trained, _make_difficulty_section(draws, data), _make_change_section(draws, changed, records, data)]
+    return [
+        *([_make_ablation_section(draws, data, models), _make_radii_section(draws, data)] if models else []),
+        _make_difficulty_section(draws, data),
+        _make_change_section(draws, changed_draws, records, data),
+    ]
 
 
 def _average_seeds(draws: Draws) -> dict[str, np.ndarray]:
-    """Return the mean over the seeds of each network, by its name."""
-    by_network: dict[str, list[np.ndarray]] = {}
+    """Return the mean over the seeds of each network, by the name of the network."""
+    cells_by_network: dict[str, list[np.ndarray]] = {}
     for model, cells in draws.items():
-        by_network.setdefault(model.split(", seed")[0], []).append(cells)
-    return {network: np.mean(cells, axis=0) for network, cells in by_network.items()}
+        cells_by_network.setdefault(model.split(", seed")[0], []).append(cells)
+    return {network: np.mean(cells, axis=0) for network, cells in cells_by_network.items()}
 
 
 def _make_map_cells(draws: np.ndarray, published: float | None = None) -> tuple[Cell, ...]:
@@ -90,7 +93,7 @@ def _make_map_cells(draws: np.ndarray, published: float | None = None) -> tuple[
 
 
 def _make_gain_cells(draws: Draws, network: str, reference: str) -> Row:
-    """Return the difference of mAP BEV to the reference and its p value."""
+    """Return the BEV mAP of a network minus that of the reference, and its p value."""
     if network == reference or reference not in draws:
         return "", ""
     gain = draws[network][:, RELAXED_BEV, MEAN] - draws[reference][:, RELAXED_BEV, MEAN]
@@ -100,16 +103,16 @@ def _make_gain_cells(draws: Draws, network: str, reference: str) -> Row:
 
 def _make_ablation_section(draws: Draws, data: str, models: Mapping[str, TrainedModel]) -> Section:
     def make_row(network: str, reference: str, published: float | None) -> Row:
-        trained = [m for name, m in models.items() if name.startswith(f"{network}, seed ")]
-        minutes = float(np.mean([m.seconds for m in trained])) / 60
+        trained_models = [m for name, m in models.items() if name.startswith(f"{network}, seed ")]
+        minutes = float(np.mean([m.seconds for m in trained_models])) / 60
         return (
             network,
             *_make_map_cells(draws[network], published),
             *_make_gain_cells(draws, network, reference),
             Cell(minutes, paper=paper.MINUTES[data].get(network)),
-            str(trained[0].parameters),
-            str(trained[0].steps),
-            str(len(trained)),
+            str(trained_models[0].parameters),
+            str(trained_models[0].steps),
+            str(len(trained_models)),
         )
 
     header = (
@@ -130,10 +133,10 @@ def _make_ablation_section(draws: Draws, data: str, models: Mapping[str, Trained
         if name in draws
     ]
     note = (
-        "Every network is trained on the same scenes with the same number of steps. pointnet: "
+        "Every network is trained on the same scenes for the same number of steps. pointnet: "
         "PointNet without T-Net; pointnet2: PointNet++ with single-scale grouping. p: twice "
-        "the share of samples of frames with a difference of the other sign. It does not cover the "
-        "differences between trainings: they need several seeds (--seeds)."
+        "the fraction of the bootstrap samples in which the difference has the opposite sign. It does not include the "
+        "variation between trainings, which needs several seeds (--seeds)."
     )
     scenes = sorted({model.scenes for model in models.values()})
     text = f"Trained on {', '.join(map(str, scenes))} scenes. {ABOUT_MAP}" if scenes else ABOUT_MAP
@@ -166,7 +169,7 @@ def _make_radii_section(draws: Draws, data: str) -> Section:
     ]
     return Section(
         "Grouping radii (Table 4)",
-        "The text of the paper gives its best radii only. NDS of the trained network is in Table 7.",
+        "The text of the paper gives only its best radii. The NDS of the trained network is in Table 7.",
         (
             Table(
                 "table_4",
@@ -179,21 +182,23 @@ def _make_radii_section(draws: Draws, data: str) -> Section:
 
 
 def _make_difficulty_section(draws: Draws, data: str) -> Section:
-    by_level: list[Row] = []
-    by_class: list[Row] = []
+    level_rows: list[Row] = []
+    class_rows: list[Row] = []
     for network in (name for name in COMPARED if name in draws):
         cells = draws[network][:, :, :MEAN].reshape(-1, 2, len(SCORED), len(DIFFICULTIES))
         published = paper.TABLE_6.get(network, (None,) * 4) if data == "KITTI" else (None,) * 4
         for protocol, title in enumerate(MAP):
-            means = np.concatenate([_mean_of_classes(cells[:, protocol]), draws[network][:, protocol, MEAN:]], axis=1)
-            by_level.append((network, title, *make_cells(estimate(means), published if protocol == STRICT_3D else ())))
+            means = np.concatenate([_average_classes(cells[:, protocol]), draws[network][:, protocol, MEAN:]], axis=1)
+            level_rows.append(
+                (network, title, *make_cells(estimate(means), published if protocol == STRICT_3D else ()))
+            )
         for i, name in enumerate(SCORED):
-            known = paper.FIGURE_10.get(network, {}).get(name, (None,) * 3)
-            by_class.append(
+            class_values = paper.FIGURE_10.get(network, {}).get(name, (None,) * 3)
+            class_rows.append(
                 (
                     network,
                     name,
-                    *make_cells(estimate(cells[:, STRICT_3D, i]), known if data == "KITTI" else ()),
+                    *make_cells(estimate(cells[:, STRICT_3D, i]), class_values if data == "KITTI" else ()),
                     *make_cells(estimate(cells[:, RELAXED_BEV, i])),
                 )
             )
@@ -205,7 +210,7 @@ def _make_difficulty_section(draws: Draws, data: str) -> Section:
                 "table_6",
                 "Table 6: by difficulty, mean of the classes",
                 ("network", "", *(f"{level} [%]" for level in DIFFICULTIES), "mAP [%]"),
-                tuple(by_level),
+                tuple(level_rows),
             ),
             Table(
                 "figure_10",
@@ -216,50 +221,53 @@ def _make_difficulty_section(draws: Draws, data: str) -> Section:
                     *(f"3D {level} [%]" for level in DIFFICULTIES),
                     *(f"BEV, relaxed, {level} [%]" for level in DIFFICULTIES),
                 ),
-                tuple(by_class),
+                tuple(class_rows),
             ),
         ),
     )
 
 
-def _mean_of_classes(cells: np.ndarray) -> np.ndarray:
-    """Return the means (R, L) over the classes that have a value, of cells (R, C, L)."""
-    known = ~np.isnan(cells)
-    sums = np.where(known, cells, 0).sum(axis=1)
-    return np.divide(sums, known.sum(axis=1), out=np.full(sums.shape, np.nan), where=known.any(axis=1))
+def _average_classes(cells: np.ndarray) -> np.ndarray:
+    """Return the means (R, L) of cells (R, C, L) over the classes that have a value."""
+    has_value = ~np.isnan(cells)
+    sums = np.where(has_value, cells, 0).sum(axis=1)
+    return np.divide(sums, has_value.sum(axis=1), out=np.full(sums.shape, np.nan), where=has_value.any(axis=1))
 
 
 def _make_change_section(
-    draws: Draws, changed: Mapping[str, Draws], records: Sequence[Mapping[str, Any]], data: str
+    draws: Draws, changed_draws: Mapping[str, Draws], records: Sequence[Mapping[str, Any]], data: str
 ) -> Section:
     rows: list[Row] = []
     for network in (name for name in COMPARED if name in draws):
-        known = paper.TABLE_8[data].get(network, {})
-        model, before = name_model(network, 0), draws[network]
+        published = paper.TABLE_8[data].get(network, {})
+        model, all_points = name_model(network, 0), draws[network]
         for change in ("all points", *CHANGES):
-            own = before if change == "all points" else changed[change][network]
+            cells = all_points if change == "all points" else changed_draws[change][network]
             times = [
                 r["detector_ms"][model] if change == "all points" else r["changed_ms"][change][model] for r in records
             ]
             ms = float(np.median(times)) if times else np.nan
-            kept = 100 * np.divide(
-                own[:, :, MEAN], before[:, :, MEAN], out=np.full(own.shape[:2], np.nan), where=before[:, :, MEAN] > 0
+            retention = 100 * np.divide(
+                cells[:, :, MEAN],
+                all_points[:, :, MEAN],
+                out=np.full(cells.shape[:2], np.nan),
+                where=all_points[:, :, MEAN] > 0,
             )
             rows.append(
                 (
                     network,
                     change,
-                    *_make_map_cells(own, known.get(change)),
-                    *make_cells(estimate(kept[:, RELAXED_BEV:])),
+                    *_make_map_cells(cells, published.get(change)),
+                    *make_cells(estimate(retention[:, RELAXED_BEV:])),
                     Cell(None if np.isnan(ms) else ms),
                     "yes" if ms <= MAX_MS else "no",
                 )
             )
     return Section(
         "Fewer points and noise (Table 8, Eq. 1)",
-        "Points are left out at random; noise is "
-        "Gaussian, along the beams. Retention is Eq. 1 in our reading: the mAP that is left, in "
-        f"percent, where the time for a cloud is within {MAX_MS:g} ms, the period of a frame.",
+        "Points are removed at random; noise is "
+        "Gaussian, along the beams. Retention is our reading of Eq. 1: the remaining mAP in percent, "
+        f"provided that the time per cloud is within the frame period of {MAX_MS:g} ms.",
         (
             Table(
                 "table_8",

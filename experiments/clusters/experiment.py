@@ -1,4 +1,4 @@
-"""The experiments of paper C: its segmentation alone, the shipped detectors alone, and all tables."""
+"""The experiments of paper C: only its segmentation, only the shipped detectors, and all tables."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ DETECTION_SETTINGS = {
     "drives": [SIMULATED_DRIVES, SCANS],
 }
 NO_MODELS: Mapping[str, TrainedModel] = {}
-EPOCHS = 120  # for recorded frames; Table 1 of the paper, with the settings, is missing in its text
+EPOCHS = 120  # for recordings; our choice, because the text of the paper lacks Table 1 with the settings
 
 
 def measure_segmented_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def measure_segmented_frame(frames: Sequence[Frame], number: int) -> dict[str, A
 
 
 def make_segmentation_report(records: list[dict[str, Any]]) -> list[Section]:
-    """Return the report of measure_segmented_frame(); skipped frames are left out."""
+    """Make the report from the records of measure_segmented_frame(), without skipped frames."""
     records = [record for record in records if "skipped" not in record]
     return make_segmentation_sections(records, records[0]["data"] if records else "KITTI")
 
@@ -51,7 +51,7 @@ def make_segmentation_report(records: list[dict[str, Any]]) -> list[Section]:
 def measure_detected_frame(
     frames: Sequence[Frame], number: int, *, models: Mapping[str, TrainedModel] = NO_MODELS
 ) -> dict[str, Any]:
-    """Measure the detectors on frame `number`: see measure_detection(), and measure_drive() for `drive`."""
+    """Measure the detectors on frame `number`, see measure_detection() and, for `drive`, measure_drive()."""
     frame = frames[number]
     return {
         "frame": frame.name,
@@ -64,7 +64,7 @@ def measure_detected_frame(
 def make_detection_report(
     records: list[dict[str, Any]], *, models: Mapping[str, TrainedModel] = NO_MODELS
 ) -> list[Section]:
-    """Return the report of measure_detected_frame(); skipped frames are left out."""
+    """Make the report from the records of measure_detected_frame(), without skipped frames."""
     records = [record for record in records if "skipped" not in record]
     data = records[0]["data"] if records else "KITTI"
     return [*make_detection_sections(records, data, models), make_drive_section(records, data)]
@@ -73,24 +73,24 @@ def make_detection_report(
 def measure_frame(frames: Sequence[Frame], number: int, *, models: Mapping[str, TrainedModel]) -> dict[str, Any]:
     """Measure frame `number` and return its record.
 
-    It has the content of measure_detected_frame() and `segmentation`, see measure_segmentation(), or
-    None for a frame whose objects have too few points.
+    The record has the content of measure_detected_frame(), and `segmentation`: the result of
+    measure_segmentation(), or None if no object has enough points.
     """
     try:
         segmentation = measure_segmentation(frames[number])
-    except InputError:  # objects with points are detected nevertheless
+    except InputError:  # the detectors are measured even if the segmentation cannot be
         segmentation = None
     return {**measure_detected_frame(frames, number, models=models), "segmentation": segmentation}
 
 
 def make_sections(records: list[dict[str, Any]], *, models: Mapping[str, TrainedModel]) -> list[Section]:
-    """Return the report of the records of measure_frame(); skipped frames are left out."""
-    segmented = [{**r, **r["segmentation"]} for r in records if r.get("segmentation")]
-    return [*make_segmentation_report(segmented), *make_detection_report(records, models=models)]
+    """Make the report from the records of measure_frame(), without skipped frames."""
+    segmentation_records = [{**r, **r["segmentation"]} for r in records if r.get("segmentation")]
+    return [*make_segmentation_report(segmentation_records), *make_detection_report(records, models=models)]
 
 
 def _name_data(frame: Frame) -> str:
-    """Return the data set of paper.DATA_SETS whose values are shown."""
+    """Return the data set, one of paper.DATA_SETS, whose published values are shown for a frame."""
     return "nuScenes" if isinstance(frame.native, KeyFrame) else "KITTI"
 
 

@@ -1,5 +1,4 @@
-"""The networks of paper C's experiment: those that it trains, on the same scenes with the same steps,
-and detectors with the weights of the package."""
+"""Networks of the experiment of paper C: networks that it trains, and detectors with shipped weights."""
 
 from __future__ import annotations
 
@@ -17,7 +16,12 @@ from lidar_perception.training.params import PointNetTraining
 
 
 class Source(NamedTuple):
-    """A detector: its weights, and the gamma of its clustering (Eq. 9); None: as it was trained."""
+    """A detector.
+
+    Attributes:
+        weights: Checkpoint.
+        gamma: Gamma of its clustering (Eq. 9); None for the value it was trained with.
+    """
 
     weights: Path
     gamma: float | None = None
@@ -48,7 +52,7 @@ NETWORKS = (*REQUIRED, *(name for name in (*RADII, *READINGS) if name != OURS))
 
 
 def choose_networks(params: PointNetTraining, seed: int) -> Sequence[Model]:
-    """Return the networks to train with a seed, the most important ones first."""
+    """Return the networks to train with this seed, the most important ones first."""
     return [
         Model(name_model(name, seed), with_values(params, {"network": name, "seed": seed}), required=name in REQUIRED)
         for name in NETWORKS
@@ -56,16 +60,16 @@ def choose_networks(params: PointNetTraining, seed: int) -> Sequence[Model]:
 
 
 def name_model(network: str, seed: int) -> str:
-    """Return the name of a detector in the records: of a seed, if it is trained here."""
+    """Return the name of a detector in the records. Networks that are trained here have a seed in their name."""
     return network if network in SHIPPED else f"{network}, seed {seed}"
 
 
 def list_sources(models: Mapping[str, TrainedModel]) -> dict[str, Source]:
-    """Return all detectors by their names in the records."""
+    """Return all detectors by their name in the records."""
     return {**{name: Source(model.weights) for name, model in models.items()}, **SHIPPED}
 
 
-def list_compared(models: Mapping[str, TrainedModel]) -> dict[str, Source]:
-    """Return the detectors of COMPARED, of the first seed, by their names in the records."""
+def list_compared_sources(models: Mapping[str, TrainedModel]) -> dict[str, Source]:
+    """Return the detectors in COMPARED by their name in the records; trained ones with the first seed."""
     sources = list_sources(models)
     return {name: sources[name] for name in (name_model(n, 0) for n in COMPARED) if name in sources}

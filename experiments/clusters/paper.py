@@ -1,8 +1,8 @@
 """Published values of paper C (Zhang, Xi, Fang, Wang, PLOS One 2026, e0348581).
 
-Shares in percent, times in milliseconds per frame, on unknown hardware. The tables of the paper
-are pictures that its text lacks; these are the values that the text of Sections 3.1 and 3.2 states.
-The data sets are named as in DATA_SETS.
+Fractions in percent, times in milliseconds per frame, on unknown hardware. The text that we have
+lacks the tables, so these are only the values stated in Sections 3.1 and 3.2. The data sets are
+named as in DATA_SETS.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ SEGMENTATION: dict[str, dict[str, Values]] = {
     },
 }
 
-# Table 2: best values with their IoU and time; the text omits the other rows.
+# Table 2: best parameters. The text omits the other rows.
 BEST = {"alpha": 1.2, "beta": 0.5, "gamma": 0.8}
 
-# Detection: mAP in percent, protocol not stated. Table 5 also has minutes of training, of which
-# the text states those of the full network.
+# Detection: mAP in percent, protocol not stated. Of the training times in Table 5, the text states only
+# that of the full network.
 TABLE_4 = {"KITTI": (90.36, 81.07), "nuScenes": (89.03, 80.15)}  # mAP and NDS with radii of 0.1, 0.2 and 0.4 m
 TABLE_5 = {
     "KITTI": {
@@ -61,13 +61,13 @@ TABLE_5 = {
 }
 MINUTES = {"KITTI": {"improved": 12.32}, "nuScenes": {"improved": 12.81}}
 TABLE_6 = {"improved": (94.36, 91.24, 87.52, 91.04)}  # KITTI: easy, moderate, hard, mean
-# Figure 10, KITTI: class -> easy, moderate and hard
+# Figure 10, KITTI: network -> class -> AP at the difficulties easy, moderate and hard
 FIGURE_10: dict[str, dict[str, Values]] = {
     "improved": {"Car": (97.21, None, 90.89), "Pedestrian": (89.24, None, 76.61), "Cyclist": (None, None, 79.06)},
     "pointnet": {"Car": (88.92, None, 76.35), "Pedestrian": (75.68, None, 62.13), "Cyclist": (None, None, 65.13)},
 }
 TABLE_7 = {"map": 92.68, "ate": 0.298, "ase": 0.218, "nds": 83.45}  # `improved` network on nuScenes
-# Table 8: change -> mAP
+# Table 8: data set -> network -> change -> mAP
 TABLE_8: dict[str, dict[str, dict[str, float]]] = {
     "KITTI": {"improved": {"10 %": 84.37, "50 %": 91.85}, "pointnet": {"10 %": 68.21}},
     "nuScenes": {"improved": {"10 %": 82.15, "50 %": 90.03}},

@@ -1,8 +1,8 @@
-"""Clustering on a range image, the peer of paper C's fast channel clustering (FCC).
+"""Clustering on a range image, as a substitute for the fast channel clustering (FCC) in paper C.
 
 It follows Bogoslavskyi and Stachniss, "Fast Range Image-Based Segmentation of Sparse 3D Laser
-Scans for Online Operation" (IROS 2016): neighbouring pixels belong to one object where the line
-between them is steep enough as seen from the sensor.
+Scans for Online Operation" (IROS 2016): neighbouring pixels belong to the same object if the line
+between their points makes a large enough angle with the beam.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-STEPS = ((0, 1), (0, 2), (1, 0), (2, 0))  # (row, column) offsets of neighbours; an offset of 2 bridges a lost return
+# (row, column) offsets of neighbours. An offset of 2 bridges a missing return.
+NEIGHBOUR_OFFSETS = ((0, 1), (0, 2), (1, 0), (2, 0))
 
 
 @dataclass(frozen=True)
@@ -21,11 +22,11 @@ class RangeImageParams:
     """Parameters of the clustering on a range image.
 
     Attributes:
-        column, row: Width and height of a pixel, degrees. Rows without a point are left out, so
-            that a sensor with fewer beams has neighbouring rows.
-        min_angle: Pixels are linked if the line between them makes at least this angle with the
-            longer beam, degrees.
-        min_size: Smaller clusters are dropped.
+        column, row: Width and height of a pixel, degrees. Rows without points are removed, so that
+            the beams of a sensor with few beams are in neighbouring rows.
+        min_angle: Two pixels are linked if the line between their points makes at least this angle
+            with the longer beam, degrees.
+        min_size: Clusters with fewer points are dropped.
     """
 
     column: float = 0.2
@@ -35,9 +36,16 @@ class RangeImageParams:
 
 
 def cluster_range_image(xyz: np.ndarray, params: RangeImageParams = RangeImageParams()) -> np.ndarray:
-    """Cluster points (N, 3) float32, metres from the sensor, without ground, as (N,) int32 ids.
+    """Cluster the points of obstacles.
 
-    0 is no cluster, 1..K are clusters. The points of a pixel are in the cluster of the nearest one.
+    All points in a pixel get the cluster of the nearest one.
+
+    Args:
+        xyz: (N, 3) float32 points without ground in the sensor's frame, metres.
+        params: Parameters.
+
+    Returns:
+        (N,) int32 ids: 0 for points without a cluster, 1 to K for clusters.
     """
     if len(xyz) == 0:
         return np.zeros(0, np.int32)
@@ -49,31 +57,31 @@ def cluster_range_image(xyz: np.ndarray, params: RangeImageParams = RangeImagePa
     row = np.unique(elevation, return_inverse=True)[1].reshape(-1)
     pixel = row * columns + column
     order = np.lexsort((ranges, pixel))
-    filled, first = np.unique(pixel[order], return_index=True)
+    filled_pixels, first = np.unique(pixel[order], return_index=True)
     nearest = order[first]
     image = np.full((row.max() + 1, columns), -1)
-    image.ravel()[filled] = np.arange(len(filled))
+    image.ravel()[filled_pixels] = np.arange(len(filled_pixels))
     pairs = [
-        _link(image, xyz[nearest].astype(np.float64), ranges[nearest], down, right, np.radians(params.min_angle))
-        for down, right in STEPS
+        _link_pixels(image, xyz[nearest].astype(np.float64), ranges[nearest], down, right, np.radians(params.min_angle))
+        for down, right in NEIGHBOUR_OFFSETS
     ]
     a, b = np.concatenate(pairs, axis=1)
-    graph = coo_matrix((np.ones(len(a), bool), (a, b)), (len(filled), len(filled)))
+    graph = coo_matrix((np.ones(len(a), bool), (a, b)), (len(filled_pixels), len(filled_pixels)))
     component = connected_components(graph, directed=False)[1]
     label = np.empty(len(xyz), int)
-    label[order] = component[np.searchsorted(filled, pixel[order])]
-    kept = np.bincount(label) >= params.min_size
-    return np.where(kept, np.cumsum(kept), 0)[label].astype(np.int32)
+    label[order] = component[np.searchsorted(filled_pixels, pixel[order])]
+    is_cluster = np.bincount(label) >= params.min_size
+    return np.where(is_cluster, np.cumsum(is_cluster), 0)[label].astype(np.int32)
 
 
-def _link(
+def _link_pixels(
     image: np.ndarray, xyz: np.ndarray, ranges: np.ndarray, down: int, right: int, min_angle: float
 ) -> np.ndarray:
-    """Return pairs (2, E) of linked pixels, `down` rows and `right` columns apart."""
+    """Return pairs (2, E) of linked pixels that are `down` rows and `right` columns apart."""
     a, b = image[: len(image) - down], np.roll(image, -right, axis=1)[down:]
-    both = (a >= 0) & (b >= 0)
-    a, b = a[both], b[both]
-    far, near = np.maximum(ranges[a], ranges[b]), np.minimum(ranges[a], ranges[b])
-    cosine = np.clip((xyz[a] * xyz[b]).sum(axis=1) / (far * near), -1, 1)
-    angle = np.arctan2(near * np.sqrt(1 - cosine**2), far - near * cosine)
+    is_pair = (a >= 0) & (b >= 0)
+    a, b = a[is_pair], b[is_pair]
+    long_ranges, short_ranges = np.maximum(ranges[a], ranges[b]), np.minimum(ranges[a], ranges[b])
+    cosine = np.clip((xyz[a] * xyz[b]).sum(axis=1) / (long_ranges * short_ranges), -1, 1)
+    angle = np.arctan2(short_ranges * np.sqrt(1 - cosine**2), long_ranges - short_ranges * cosine)
     return np.stack([a, b])[:, angle >= min_angle]

@@ -1,4 +1,4 @@
-"""Segmentation before any network: measurement of one frame (paper C, Section 3.1)."""
+"""Measurement of the segmentation of one frame, without networks (paper C, Section 3.1)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PAPER = EuclideanParams()  # alpha 1.2, beta 0.5, gamma 0.8; threshold of Eq. 11
 
 @dataclass(frozen=True)
 class SegmentationStudy:
-    """Values that Table 2 varies one at a time; the paper gives only the best of them.
+    """Parameters that Table 2 varies one at a time. The paper gives only the best values.
 
     Attributes:
         curvature: Limit of curvature-consistent growing, see clustering/curvature.py.
@@ -43,42 +43,52 @@ class SegmentationStudy:
 STUDY = SegmentationStudy()
 
 
-def _euclidean(**changes: Any) -> Callable[[np.ndarray], np.ndarray]:
+def _make_euclidean(**changes: Any) -> Callable[[np.ndarray], np.ndarray]:
     params = ClusteringParams(method="euclidean", euclidean=with_values(PAPER, changes))
     return partial(cluster, params=params)
 
 
-# Name -> function of the points (N, 3) without ground. Differences are relative to the first one.
+# Name -> function that clusters points (N, 3) without ground. Differences are relative to the first method.
 METHODS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "Euclidean, fixed": _euclidean(threshold="fixed", distance=STUDY.distance, beta=0.0, gamma=0.0),
+    "Euclidean, fixed": _make_euclidean(threshold="fixed", distance=STUDY.distance, beta=0.0, gamma=0.0),
     "DBSCAN": partial(cluster, params=ClusteringParams(method="dbscan")),
     "range image": cluster_range_image,
-    "ours": _euclidean(),
-    "ours, Eq. 6": _euclidean(threshold="global"),
-    "ours, gamma 0": _euclidean(gamma=0.0),
-    "ours, gamma 0, curvature": _euclidean(gamma=0.0, curvature=STUDY.curvature),
+    "ours": _make_euclidean(),
+    "ours, Eq. 6": _make_euclidean(threshold="global"),
+    "ours, gamma 0": _make_euclidean(gamma=0.0),
+    "ours, gamma 0, curvature": _make_euclidean(gamma=0.0, curvature=STUDY.curvature),
 }
 SWEEPS: dict[str, dict[str, Callable[[np.ndarray], np.ndarray]]] = {
-    name: {f"{value:g}": _euclidean(**{name: value}) for value in getattr(STUDY, name)}
+    name: {f"{value:g}": _make_euclidean(**{name: value}) for value in getattr(STUDY, name)}
     for name in ("alpha", "beta", "gamma")
 }
-# Result of count_points() for one frame and method.
-COUNTS = ("points", "right", "both", "found", "true", "objects", "hits", "judged", "iou")
+# Names of the columns that count_points() returns.
+COUNT_COLUMNS = (
+    "points",
+    "right",
+    "right object points",
+    "found object points",
+    "object points",
+    "objects",
+    "hits",
+    "judged",
+    "iou",
+)
 
 
 def measure_segmentation(frame: Frame) -> dict[str, Any]:
-    """Cluster the points of a frame by every method, and compare with its labelled boxes.
+    """Cluster the points of a frame with every method, and compare the clusters with the labelled boxes.
 
-    The ground is that of the cloth for every method, found in the whole cloud, as are the clusters.
-    Only points in the camera's view are compared, if there is a camera, and none in regions
-    without labels.
+    All methods cluster the whole cloud without the ground that the cloth method finds. Only points
+    in the camera's view are compared, if there is a camera, and no points in regions without
+    labels.
 
     Returns:
-        methods and sweeps: name -> COUNTS, see count_points; and ms: the same names -> duration,
-        and that of `ground`.
+        `methods` and `sweeps`: name -> result of count_points(). `ms`: the same names and `ground`
+        -> duration.
 
     Raises:
-        InputError: the frame has no labels, or none of its objects has enough points.
+        InputError: The frame has no labels, or none of its objects has enough points.
     """
     truth = frame.truth()
     if truth is None:
@@ -86,9 +96,9 @@ def measure_segmentation(frame: Frame) -> dict[str, Any]:
     scan, camera = frame.load(), frame.camera()
     objects = find_objects_in_boxes(scan.xyz, truth)
     if camera is not None:
-        seen = camera.in_view(scan.xyz)
-        seen[seen] = ~find_unlabelled(truth, camera, scan.xyz[seen])
-        objects = select_counted(objects, seen)
+        is_compared = camera.in_view(scan.xyz)
+        is_compared[is_compared] = ~find_unlabelled(truth, camera, scan.xyz[is_compared])
+        objects = limit_to_points(objects, is_compared)
     if not objects.owner.any():
         raise InputError("no labelled object has enough points")
     ground, ms = _time("ground", partial(_segment, frame.sensor_height), scan)
@@ -103,71 +113,81 @@ def measure_segmentation(frame: Frame) -> dict[str, Any]:
     return {"methods": methods, "sweeps": sweeps, "ms": times}
 
 
-def select_counted(objects: Objects, seen: np.ndarray) -> Objects:
-    """Return the objects with only the points of a mask (N,) to be compared."""
+def limit_to_points(objects: Objects, mask: np.ndarray) -> Objects:
+    """Limit the comparison with objects to the points of a mask (N,)."""
     return Objects(
-        np.where(seen, objects.owner, 0),
-        np.where(seen, objects.region, 0),
-        objects.near & seen,
-        objects.counted & seen,
+        np.where(mask, objects.owner, 0),
+        np.where(mask, objects.region, 0),
+        objects.near & mask,
+        objects.counted & mask,
         objects.classes,
         objects.ranges,
     )
 
 
 def count_points(cluster_ids: np.ndarray, ground: np.ndarray, objects: Objects) -> list[float]:
-    """Compare the clusters (N,) of a frame with its objects, point by point.
+    """Compare the clusters of a frame with its objects, point by point.
 
-    Every object is paired with at most one cluster, pairs of the largest IoU first. A point counts
-    as found for the object whose cluster it is in, and as right if it belongs there: to that
-    object, or to no object and no paired cluster. Ground (N,) bool outside objects and the neutral
-    points at the bottom of boxes do not count, or the many points of the road would decide.
+    Every object is paired with at most one cluster; pairs with the largest IoU come first. A point
+    is found for the object whose cluster contains it. It is right if it belongs to that object, or
+    if it belongs to no object and is in no paired cluster. Ground outside objects and the neutral
+    points at the bottom of boxes are ignored, because the many points on the road would dominate.
+
+    Args:
+        cluster_ids: (N,) clusters.
+        ground: (N,) bool.
+        objects: Objects of the frame.
 
     Returns:
-        COUNTS: numbers of points that count, that are right, that are right and of an object, that
-        are found for an object, that are of an object; and of objects, of hits (IoU above one half)
-        and of judged clusters of score_clusters(); and the sum of the IoU of the objects.
+        Values of COUNT_COLUMNS: numbers of compared points, of right points, of right points on
+        objects, of points found for an object, of points on objects, of objects, of hits (IoU above
+        0.5), and of clusters that score_clusters() judges; and the sum of the objects' IoU.
     """
-    counted = objects.counted & ((objects.owner > 0) | ~ground)
-    counted &= (objects.owner > 0) == (objects.region > 0)
-    ids, owner = (a.compress(counted).astype(np.int64) for a in (cluster_ids, objects.owner))
-    cluster_of = pair_clusters(ids, owner, len(objects.classes))
-    object_of = np.zeros(int(ids.max(initial=0)) + 1, np.int64)
-    object_of[cluster_of[cluster_of > 0]] = np.flatnonzero(cluster_of > 0) + 1
-    found = object_of[ids]
+    is_compared = objects.counted & ((objects.owner > 0) | ~ground)
+    is_compared &= (objects.owner > 0) == (objects.region > 0)
+    ids, owner = (a.compress(is_compared).astype(np.int64) for a in (cluster_ids, objects.owner))
+    cluster_by_object = pair_clusters(ids, owner, len(objects.classes))
+    object_by_cluster = np.zeros(int(ids.max(initial=0)) + 1, np.int64)
+    object_by_cluster[cluster_by_object[cluster_by_object > 0]] = np.flatnonzero(cluster_by_object > 0) + 1
+    found_object = object_by_cluster[ids]
     score = score_clusters(cluster_ids, objects)
-    present = np.bincount(owner, minlength=len(objects.classes) + 1)[1:] > 0
-    right = found == owner
+    has_points = np.bincount(owner, minlength=len(objects.classes) + 1)[1:] > 0
+    is_right = found_object == owner
     return [
         len(ids),
-        int(right.sum()),
-        int((right & (owner > 0)).sum()),
-        int((found > 0).sum()),
+        int(is_right.sum()),
+        int((is_right & (owner > 0)).sum()),
+        int((found_object > 0).sum()),
         int((owner > 0).sum()),
-        int(present.sum()),
-        int((score.iou[present] > 0.5).sum()),
+        int(has_points.sum()),
+        int((score.iou[has_points] > 0.5).sum()),
         score.judged,
-        round(float(score.iou[present].sum()), 6),
+        round(float(score.iou[has_points].sum()), 6),
     ]
 
 
 def pair_clusters(ids: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
-    """Pair objects 1..count with clusters by the points (P,) of both, largest IoU first.
+    """Pair objects with clusters by their common points, largest IoU first.
+
+    Args:
+        ids: (P,) cluster of each point, 0 for none.
+        owner: (P,) object of each point, from 1; 0 for none.
+        count: Number of objects.
 
     Returns:
-        (count,) the cluster of each object, 0 for none.
+        (count,) cluster of each object, 0 for none.
     """
-    both = (ids > 0) & (owner > 0)
+    in_both = (ids > 0) & (owner > 0)
     width = int(ids.max(initial=0)) + 1
-    keys, common = np.unique(owner[both] * width + ids[both], return_counts=True)
-    thing, cluster_id = np.divmod(keys, width)
-    sizes, points = np.bincount(ids, minlength=width), np.bincount(owner, minlength=count + 1)
-    iou = common / (sizes[cluster_id] + points[thing] - common)
-    cluster_of, taken = np.zeros(count, np.int64), np.zeros(width, bool)
+    keys, common = np.unique(owner[in_both] * width + ids[in_both], return_counts=True)
+    object_ids, cluster_ids = np.divmod(keys, width)
+    cluster_sizes, object_sizes = np.bincount(ids, minlength=width), np.bincount(owner, minlength=count + 1)
+    iou = common / (cluster_sizes[cluster_ids] + object_sizes[object_ids] - common)
+    cluster_by_object, is_paired = np.zeros(count, np.int64), np.zeros(width, bool)
     for k in np.argsort(-iou, kind="stable"):
-        if cluster_of[thing[k] - 1] == 0 and not taken[cluster_id[k]]:
-            cluster_of[thing[k] - 1], taken[cluster_id[k]] = cluster_id[k], True
-    return cluster_of
+        if cluster_by_object[object_ids[k] - 1] == 0 and not is_paired[cluster_ids[k]]:
+            cluster_by_object[object_ids[k] - 1], is_paired[cluster_ids[k]] = cluster_ids[k], True
+    return cluster_by_object
 
 
 def _segment(height: float, scan: PointCloud) -> np.ndarray:
@@ -178,21 +198,21 @@ def _segment(height: float, scan: PointCloud) -> np.ndarray:
 def _measure(
     key: str, function: Callable[[np.ndarray], np.ndarray], scan: PointCloud, ground: np.ndarray, objects: Objects
 ) -> tuple[list[float], float]:
-    rest = scan.xyz.compress(~ground, axis=0)
-    found, ms = _time(key, function, rest)
+    obstacles = scan.xyz.compress(~ground, axis=0)
+    obstacle_ids, ms = _time(key, function, obstacles)
     ids = np.zeros(len(scan), np.int32)
-    ids[~ground] = found
+    ids[~ground] = obstacle_ids
     return count_points(ids, ground, objects), ms
 
 
-_warm: set[str] = set()  # keys of functions whose compiled code this process has loaded
+_warmed_up: set[str] = set()  # keys of functions whose compiled code this process has loaded
 
 
 def _time(key: str, function: Callable[[Any], np.ndarray], argument: Any) -> tuple[np.ndarray, float]:
     """Return the result of a function and its duration in milliseconds."""
-    if key not in _warm:
+    if key not in _warmed_up:
         function(argument)
-        _warm.add(key)
+        _warmed_up.add(key)
     start = perf_counter()
     result = function(argument)
     return result, round((perf_counter() - start) * 1e3, 3)

@@ -1,4 +1,4 @@
-"""The verb compare: every detector of the package on the same frames."""
+"""Command compare: run every detector of the package on the same frames."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from lidar_perception.cli.data import (
     scoring_options,
 )
 from lidar_perception.cli.options import (
-    Runs,
+    Algorithm,
     Settings,
     device_option,
-    make_candidate_runs,
-    make_runs,
+    make_candidate_algorithm,
+    make_detector_algorithm,
     range_option,
     settings_options,
 )
@@ -30,23 +30,23 @@ from lidar_perception.detectors.open import PARAMS
 from lidar_perception.runs.terminal import console, errors
 
 
-def _list_runs() -> list[Runs]:
-    """List the detectors that have parameters."""
-    return [make_candidate_runs(), *map(make_runs, PARAMS)]
+def _list_algorithms() -> list[Algorithm]:
+    """List the algorithms that have parameters."""
+    return [make_candidate_algorithm(), *map(make_detector_algorithm, PARAMS)]
 
 
 @click.command(cls=Command)
 @scoring_options()
 @path_option(
     "--weights",
-    "Additional detector: weights of PointPillars or PointNet, or a class of your own, module:Class; may be repeated.",
+    "Additional detector: weights of PointPillars or PointNet, or your own class, module:Class. May be repeated.",
     multiple=True,
 )
 @out_file_option("--png", "Draw F1 and mean AP against time.")
 @intervals_option
 @range_option
 @device_option
-@settings_options(lambda given: _list_runs(), candidates=True)
+@settings_options(lambda options: _list_algorithms(), candidates=True)
 def compare(
     options: ScoringOptions,
     weights: tuple[Path, ...],
@@ -56,12 +56,12 @@ def compare(
     settings: Settings,
     intervals: int,
 ) -> None:
-    """Run all detectors on the same frames, in turns, and print scores and times side by side.
+    """Run all detectors on the same frames, in rotating order, and print scores and times side by side.
 
     The detectors are STM-CPA (`paper` and `best`), PointPillars V0 to V4 in both sizes, PointNet
     and fused (the default detector). The tables show average precision, F1 of pedestrians by
     centre distance as in the STM-CPA paper, and ms per frame. Networks without weights are listed
-    as missing. With several --jobs the processes share the machine, and times are longer.
+    as missing. With several --jobs the processes share the machine, so times are longer.
 
     \b
     Examples:
@@ -69,26 +69,28 @@ def compare(
       ./lidar compare /data/kitti/tracking --intervals 200
       ./lidar compare training_data --weights v4.safetensors --limit 100
     """
-    from experiments.comparison.contenders import open_contenders, open_contenders_alone
+    from experiments.comparison.contenders import open_available_contenders, open_contenders
     from experiments.comparison.outcomes import ComparisonReport, start_comparison
     from experiments.comparison.report import draw_comparison, print_comparison
     from lidar_perception.data.frame import BOXES
     from lidar_perception.runs.machine import read_cpu_name
     from lidar_perception.scoring.kitti.tables import CENTRE_F1
 
-    runs = _list_runs() if settings else []
-    values = {run.name: chosen for run, chosen in zip(runs, settings.values(*runs))}
+    algorithms = _list_algorithms() if settings else []
+    values = {
+        algorithm.name: param_values for algorithm, param_values in zip(algorithms, settings.resolve(*algorithms))
+    }
     recording = options.open_recording(BOXES)
     with errors.status("loading detectors"):
         height = recording.frames[0].sensor_height
         contenders, missing = open_contenders(weights, device, height, range, values)
-    open_ = (
+    open_function = (
         (lambda: contenders)
         if options.in_this_process
-        else partial(open_contenders_alone, weights, device, height, range, values)
+        else partial(open_available_contenders, weights, device, height, range, values)
     )
     report = ComparisonReport(contenders, intervals, recording.is_sequential)
-    options.fill(report, recording, partial(start_comparison, open_), title="comparing")
+    options.fill(report, recording, partial(start_comparison, open_function), title="comparing")
     if not report.first.frames:
         raise no_labels_error(recording, report.skipped)
     centres = report.first.pedestrians.compute()

@@ -1,4 +1,4 @@
-"""The detectors that are compared: STM-CPA and the networks that have weights."""
+"""Contenders of the comparison: STM-CPA, and the networks that have weights."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.report import load_pedestrians
 from lidar_perception.types import CLASSES, PEDESTRIAN, SENSOR_HEIGHT, InputError
 
-NO_WEIGHTS = "the package has no weights for this detector; give some with --weights"
+NO_WEIGHTS = "the package has no weights for this detector; give a checkpoint with --weights"
 PERSON = CLASSES[PEDESTRIAN]
 CANDIDATES = "candidates"
 
@@ -60,9 +60,10 @@ class OpenedDetector:
 
 
 def make_contender(name: str, detector: Detector, source: str) -> Contender:
-    """Return a contender that runs one detector on all frames, and keeps boxes of low score."""
-    with_all_boxes = detector.with_min_score(MIN_SCORE)
-    return Contender(name, lambda frame: with_all_boxes, detector.classes, detector.min_scores.get(PERSON, 1.0), source)
+    """Return a contender that runs one detector on all frames and keeps boxes with low scores."""
+    detector_for_ap = detector.with_min_score(MIN_SCORE)
+    threshold = detector.min_scores.get(PERSON, 1.0)
+    return Contender(name, lambda frame: detector_for_ap, detector.classes, threshold, source)
 
 
 def open_contenders(
@@ -75,13 +76,14 @@ def open_contenders(
     """Open every detector of the package that has weights.
 
     Args:
-        weights: Files of more networks.
+        weights: Checkpoints of additional networks.
+        device: Device of the networks.
         sensor_height: Height of the sensor above the ground, metres.
         range: Range of the detectors that have one, see open_detector.
         settings: Parameters by kind of detector: candidates, pointpillars, pointnet, fused.
 
     Returns:
-        The opened detectors, and those that are missing.
+        The opened detectors, and the missing ones.
 
     Raises:
         InputError: Weights or parameters cannot be used.
@@ -98,35 +100,34 @@ def open_contenders(
             settings=settings.get(kind, {}),
         )
 
-    files, absent = _find_package_files()
+    files, missing_reasons = _find_package_files()
     opened: list[OpenedDetector] = []
     for path in [*files, *weights]:
         detector = open_one(path)
         if str(path) in LOAD or not isinstance(detector, NetworkDetector | CustomDetector):
-            raise InputError(f"{path} is already in the comparison; give different weights")
+            raise InputError(f"{path} is already in the comparison; give other weights")
         name = _make_name(detector, [FUSED, *(other.name for other in opened)])
         opened.append(OpenedDetector(name, detector, path))
-    found = [detector.to_contender() for detector in opened]
-    missing = [
-        Missing(name, reason) for name, reason in absent.items() if name not in [detector.name for detector in opened]
-    ]
+    contenders = [detector.to_contender() for detector in opened]
+    opened_names = [detector.name for detector in opened]
+    missing = [Missing(name, reason) for name, reason in missing_reasons.items() if name not in opened_names]
     try:
-        found.append(make_contender(FUSED, open_one(FUSED), "those of PointPillars and PointNet"))
+        contenders.append(make_contender(FUSED, open_one(FUSED), "those of PointPillars and PointNet"))
     except InputError as error:
         missing.append(Missing(FUSED, str(error)))
     paper, best = (
         with_values(set_sensor_height(params, sensor_height), settings.get(CANDIDATES, {})) for params in (PAPER, BEST)
     )
-    return [*_make_candidate_contenders(paper, best), *found], missing
+    return [*_make_candidate_contenders(paper, best), *contenders], missing
 
 
-def open_contenders_alone(*arguments: Any) -> list[Contender]:
-    """Return the contenders without the missing ones; can be sent to another process."""
+def open_available_contenders(*arguments: Any) -> list[Contender]:
+    """Return only the opened detectors of open_contenders. Worker processes can import this function."""
     return open_contenders(*arguments)[0]
 
 
 def _find_package_files() -> tuple[list[Path], dict[str, str]]:
-    """Return the weights in the package, and the names of missing ones with the reason."""
+    """Return the weights in the package, and {name of a detector without weights: reason}."""
     finders: dict[str, Callable[[], Path]] = {
         f"PointPillars {version} {size}": partial(
             find_pointpillars_weights, PointPillarsParams(version=version, size=size)
@@ -135,17 +136,17 @@ def _find_package_files() -> tuple[list[Path], dict[str, str]]:
         for version in VERSIONS
     }
     finders["PointNet"] = partial(find_pointnet_weights, PointNetParams())
-    files, absent = [], {}
+    files, missing_reasons = [], {}
     for name, find in finders.items():
         try:
             files.append(find())
         except InputError:
-            absent[name] = NO_WEIGHTS
-    return files, absent
+            missing_reasons[name] = NO_WEIGHTS
+    return files, missing_reasons
 
 
-def _make_name(detector: NetworkDetector | CustomDetector, used: Sequence[str]) -> str:
-    """Return the name of a detector, with a number if the name is used already."""
+def _make_name(detector: NetworkDetector | CustomDetector, used_names: Sequence[str]) -> str:
+    """Return the name of a detector, with a number if the name is already used."""
     if isinstance(detector, CustomDetector):
         name = detector.name
     elif detector.group in NETWORKS:
@@ -153,25 +154,27 @@ def _make_name(detector: NetworkDetector | CustomDetector, used: Sequence[str]) 
     else:
         name = detector.group
     base, number = name, 2
-    while name in used:
+    while name in used_names:
         name, number = f"{base} #{number}", number + 1
     return name
 
 
 def _make_candidate_contenders(paper: PipelineParams, best: PipelineParams) -> list[Contender]:
     """Return STM-CPA with the paper's seed, and `best` with the automatic seed."""
-    automatic = make_automatic_source(load_seeds(), best)
+    automatic_source = make_automatic_source(load_seeds(), best)
     return [
-        _make_seeded("STM-CPA paper", paper, _find_labelled_seed),
-        _make_seeded("STM-CPA best", best, _find_labelled_seed),
-        _make_seeded("STM-CPA best, auto", best, lambda frame: automatic),
+        _make_seeded_contender("STM-CPA paper", paper, _find_labelled_seed),
+        _make_seeded_contender("STM-CPA best", best, _find_labelled_seed),
+        _make_seeded_contender("STM-CPA best, auto", best, lambda frame: automatic_source),
     ]
 
 
-def _make_seeded(name: str, params: PipelineParams, find_seed: Callable[[Frame], SeedSource | None]) -> Contender:
+def _make_seeded_contender(
+    name: str, params: PipelineParams, find_seed: Callable[[Frame], SeedSource | None]
+) -> Contender:
     """Return a contender that needs a seed in each frame.
 
-    Without a camera it runs on the whole scan, as the other detectors do.
+    Without a camera it runs on the full scan, as the other detectors do.
     """
     uncropped = with_values(params, {"view.enabled": False})
 
@@ -183,15 +186,15 @@ def _make_seeded(name: str, params: PipelineParams, find_seed: Callable[[Frame],
             else CandidateDetector(seed, camera, uncropped if camera is None else params).with_min_score(MIN_SCORE)
         )
 
-    operating = CandidateDetector(_refuse, None, params).min_scores[PERSON]
-    return Contender(name, make_detector, (PERSON,), operating)
+    threshold = CandidateDetector(_raise_no_seed, None, params).min_scores[PERSON]
+    return Contender(name, make_detector, (PERSON,), threshold)
 
 
-def _refuse(segmented):
+def _raise_no_seed(segmented):
     raise InputError("there is no seed")
 
 
 def _find_labelled_seed(frame: Frame) -> SeedSource | None:
-    """Return the paper's seed, the nearest label; None in frames without a pedestrian."""
+    """Return the paper's seed, which is the nearest labelled pedestrian; None in frames without one."""
     truth = load_pedestrians(frame)
     return make_truth_source(truth) if len(truth) else None

@@ -1,13 +1,14 @@
 """Scores and times of all detectors on the same frames.
 
-Detectors take turns: each frame starts with another detector, so that a slow machine or warm caches
-affect all of them equally.
+Each frame starts with a different detector, so that a slow machine or warm caches affect all of them
+equally.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import count
 
 import numpy as np
 
@@ -26,72 +27,73 @@ class Contender:
     """A detector in the comparison.
 
     Attributes:
-        make_detector: Returns the detector for a frame, which keeps boxes of low score; None for a
-            frame that it cannot run on.
-        operating: Default threshold of its pedestrians.
-        source: Its weights; empty without any.
+        make_detector: Function that returns the detector for a frame, which keeps boxes with low
+            scores, or None if the detector cannot run on the frame.
+        threshold: Default score threshold for pedestrians.
+        source: Weights of the detector; empty if it has none.
     """
 
     name: str
     make_detector: Callable[[Frame], Detector | None]
     classes: tuple[str, ...] = SCORED
-    operating: float = 0.3
+    threshold: float = 0.3
     source: str = ""
 
 
 def start_comparison(
-    open_: Callable[[], list[Contender]], recording: Recording
+    open_function: Callable[[], list[Contender]], recording: Recording
 ) -> Callable[[Frame], dict[str, FrameDetections[Detections]] | None]:
-    """Return a function that runs every contender on a labelled frame, in turns.
+    """Return a function that runs every contender on a labelled frame, in rotating order.
 
-    It returns the results by name, or None for a frame without labels. The first frame is run
-    twice and counts once, because a first run also loads compiled code. With open_ bound, this is a
-    StartMeasurement of scoring.run.
+    It returns the results by name, or None for a frame without labels. Every contender first runs
+    on the first frame without being measured, because its first run also loads compiled code. With
+    open_function bound, this is a StartMeasurement of scoring.run.
     """
-    contenders, state = open_(), {"turn": 0}
+    contenders, measured = open_function(), count()
 
     def measure(frame: Frame) -> dict[str, FrameDetections[Detections]] | None:
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None:
             return None
         frame = Frame.of(frame.name, frame.load(), truth, calibration)  # read once for all detectors
-        if state["turn"] == 0:
+        number = next(measured)
+        if number == 0:
             for contender in contenders:
                 _detect(contender, frame)
-        order = rotate(contenders, state["turn"])
-        state["turn"] += 1
-        return {contender.name: _detect(contender, frame) for contender in order}
+        return {contender.name: _detect(contender, frame) for contender in rotate(contenders, number)}
 
     return measure
 
 
 def _detect(contender: Contender, frame: Frame) -> FrameDetections[Detections]:
-    """Run a contender on a frame and drop boxes that are not finite."""
+    """Run a contender on a frame, and drop boxes with non-finite values."""
     detector = contender.make_detector(frame)
     if detector is None:
         return FrameDetections(frame.name, frame.truth(), Detections.none(), frame.calibration())
     result = run_detector(detector, frame, frame.truth(), frame.calibration())
     boxes, scores = result.detections.boxes, result.detections.scores
-    sound = np.isfinite(np.column_stack([boxes, scores])).all(axis=1)
-    if sound.all():
+    is_finite = np.isfinite(np.column_stack([boxes, scores])).all(axis=1)
+    if is_finite.all():
         return result
-    return replace(result, detections=result.detections[sound], problem=f"{(~sound).sum()} boxes are not finite")
+    return replace(
+        result, detections=result.detections[is_finite], problem=f"{(~is_finite).sum()} boxes are not finite"
+    )
 
 
-def rotate(items: list, turn: int) -> list:
-    """Return the items in their order, starting with another one each turn."""
-    start = turn % max(len(items), 1)
+def rotate(items: list, count: int) -> list:
+    """Rotate a list to the left by `count` items."""
+    start = count % max(len(items), 1)
     return items[start:] + items[:start]
 
 
 @dataclass
 class ComparisonReport:
-    """The reports of all contenders, by name.
+    """Reports of all contenders, by name.
 
     Attributes:
         resamples: Number of resamples of the drives for intervals; 0 for no intervals.
         sequential: See DetectionReport.
-        skipped: Reasons of frames that could not be read.
+        skipped: For each frame that could not be read, the reason.
     """
 
     contenders: list[Contender]
@@ -105,7 +107,7 @@ class ComparisonReport:
 
     @property
     def first(self) -> DetectionReport:
-        """The report of the first contender; frames and labels are the same for all."""
+        """The report of the first contender. Its frames and labels are those of all contenders."""
         return next(iter(self.reports.values()))
 
     def update(self, results: dict[str, FrameDetections[Detections]]) -> None:
@@ -114,7 +116,7 @@ class ComparisonReport:
             self.reports[name].update(result)
 
     def compute(self) -> dict:
-        """Return the scores of the contenders, by name, and the number of labels, for JSON."""
+        """Return the scores of the contenders by name, and the number of labels, as a JSON-serialisable dict."""
         rows = {
             contender.name: summarize(contender, self.reports[contender.name], self.resamples)
             for contender in self.contenders
@@ -128,10 +130,11 @@ class ComparisonReport:
 
 
 def summarize(contender: Contender, report: DetectionReport, resamples: int = 0) -> dict:
-    """Return scores in percent, times in ms and counts of a contender, for JSON.
+    """Return scores in percent, times in ms and counts of a contender, as a JSON-serialisable dict.
 
-    failed lists frames that the detector refused, with the reason; their objects count as missed.
-    intervals are bootstrap intervals of `resamples` resamples of the drives; left out for 0.
+    `failed` lists the frames that the detector rejected, with the reason; their objects count as
+    misses. `intervals` has bootstrap intervals from `resamples` resamples of the drives; it is
+    missing if `resamples` is 0.
     """
     ap, centres = report.compute()["ap"], report.pedestrians
     precision = {
@@ -140,7 +143,7 @@ def summarize(contender: Contender, report: DetectionReport, resamples: int = 0)
         else None
         for name in ap
     }
-    scores = {"operating": contender.operating, "best": centres.find_best_score()}
+    scores = {"operating": contender.threshold, "best": centres.find_best_score()}
     intervals = (
         {
             "intervals": {
@@ -148,7 +151,7 @@ def summarize(contender: Contender, report: DetectionReport, resamples: int = 0)
                     name: rows if name in contender.classes else None
                     for name, rows in report.compute_intervals(resamples).items()
                 },
-                "f1": centres.compute_f1_interval(contender.operating, resamples, report.sequential),
+                "f1": centres.compute_f1_interval(contender.threshold, resamples, report.sequential),
             }
         }
         if resamples
@@ -172,7 +175,7 @@ def summarize(contender: Contender, report: DetectionReport, resamples: int = 0)
 
 
 def count_labels(report: DetectionReport) -> dict[str, dict[str, int]]:
-    """Count the labels by class and difficulty; the same for all contenders."""
+    """Count the labels by class and difficulty. They are the same for all contenders."""
     return {
         name: {level: row["objects"] if (row := rows["3d"][level]) else 0 for level in DIFFICULTIES}
         for name, rows in report.compute()["ap"].items()
@@ -180,10 +183,13 @@ def count_labels(report: DetectionReport) -> dict[str, dict[str, int]]:
 
 
 def compute_mean_moderate(precision: dict[str, dict | None], row: str) -> float | None:
-    """Return the mean over the classes; None if the detector lacks a class or there are no labels."""
-    known = [rows[row]["moderate"] for rows in precision.values() if rows is not None]
-    values = [value for value in known if value is not None]
-    return float(np.mean(values)) if values and len(known) == len(precision) else None
+    """Return the mean moderate AP over the classes.
+
+    None if the detector lacks a class, or no class has labels.
+    """
+    class_values = [rows[row]["moderate"] for rows in precision.values() if rows is not None]
+    values = [value for value in class_values if value is not None]
+    return float(np.mean(values)) if values and len(class_values) == len(precision) else None
 
 
 def _get_r40(level: dict | None) -> float | None:

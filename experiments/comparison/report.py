@@ -1,4 +1,4 @@
-"""Tables and a figure of the comparison of all detectors."""
+"""Tables and figure of the comparison of all detectors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from lidar_perception.scoring.tables import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SHORT = {"bev": "BEV", "3d": "3D", "bev_relaxed": "BEV", "3d_relaxed": "3D"}
+SHORT_NAMES = {"bev": "BEV", "3d": "3D", "bev_relaxed": "BEV", "3d_relaxed": "3D"}
 FAMILIES = {  # prefix of a name -> colour (Okabe and Ito, 2008) and marker; the first match is used
     "STM-CPA +": ("#cc79a7", "D"),
     "PP ": ("#cc79a7", "D"),
@@ -41,7 +41,7 @@ FAMILIES = {  # prefix of a name -> colour (Okabe and Ito, 2008) and marker; the
 
 
 def print_comparison(content: dict, console: Console) -> None:
-    """Print average precision, pedestrians by centre distance, times and missing detectors."""
+    """Print average precision, pedestrian scores by centre distance, times and missing detectors."""
     _print_precision(content, console)
     _print_pedestrians(content, console)
     _print_intervals(content, console)
@@ -55,7 +55,7 @@ def print_comparison(content: dict, console: Console) -> None:
 def _print_precision(content: dict, console: Console) -> None:
     titles = [title for name in SCORED for title in (name[:3], "", "", "")]
     table = make_table(f"AP (R40, moderate), {content['frames']} frames", "", *titles, width=5)
-    table.add_row("", *(SHORT[row] for _ in SCORED for row in AP_ROWS), style="dim")
+    table.add_row("", *(SHORT_NAMES[row] for _ in SCORED for row in AP_ROWS), style="dim")
     table.add_row(
         "overlap above",
         *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}" for name in SCORED for row in AP_ROWS),
@@ -76,8 +76,8 @@ def _print_precision(content: dict, console: Console) -> None:
         "Labels: "
         + ", ".join(f"{name} {n}{'*' * (0 < n < MIN_OBJECTS)}" for name, n in labels.items())
         + (
-            ". * too few for KITTI's 40 recall points, so AP is the area under the whole curve. A "
-            "dash: not a class of the detector, or no label."
+            ". * too few for KITTI's 40 recall points, so AP is the area under the complete curve. "
+            "-: the detector does not support the class, or there are no labels."
         )
     )
     console.print(table)
@@ -103,12 +103,12 @@ def _print_pedestrians(content: dict, console: Console) -> None:
         width=4,
     )
     for name, row in content["rows"].items():
-        used, best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
+        default, best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
         table.add_row(
             name,
-            f"{used['score']:.2f}",
-            *format_counts(used, "tp", "fp", "fn"),
-            *format_percent(used, "precision", "recall", "f1"),
+            f"{default['score']:.2f}",
+            *format_counts(default, "tp", "fp", "fn"),
+            *format_percent(default, "precision", "recall", "f1"),
             *format_percent(best, "f1"),
             format_number(best["score"]),
             format_number(row["ms"]),
@@ -119,10 +119,10 @@ def _print_pedestrians(content: dict, console: Console) -> None:
     for name, f1 in CENTRE_F1.items():
         table.add_row(f"paper: {name}", *[""] * 6, f"{100 * f1:.1f}", style="dim")
     table.caption = (
-        "score: the default threshold. best: the highest F1 at any threshold, which is `from`, on "
-        "these labels. ms: median of its frames. STM-CPA takes its seed from the labels, and so "
-        "knows which frames have a pedestrian; `auto` finds the seed itself. The paper's values "
-        "are of its 1779 frames."
+        "score: the default threshold. best: the highest F1 at any threshold on these labels; from: that threshold. "
+        "ms: median over frames. STM-CPA takes its seed from the labels, so it runs "
+        "only on frames with a pedestrian; `auto` finds the seed itself. The paper's values "
+        "are for its 1779 frames."
     )
     console.print(table)
 
@@ -131,27 +131,31 @@ def _print_intervals(content: dict, console: Console) -> None:
     rows = {name: row["intervals"] for name, row in content["rows"].items() if "intervals" in row}
     if not rows:
         return
-    shown = INTERVALS[0], INTERVALS[-1]
+    metrics = INTERVALS[0], INTERVALS[-1]
     table = make_table(
         f"{INTERVAL_PERCENT} % intervals, resampled by drive",
         "",
-        *(f"{name[:3]} {SHORT[row]}" for name in SCORED for row in shown),
+        *(f"{name[:3]} {SHORT_NAMES[row]}" for name in SCORED for row in metrics),
         "F1",
         width=7,
     )
     table.add_row(
         "overlap above",
-        *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}" for name in SCORED for row in shown),
+        *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}" for name in SCORED for row in metrics),
         style="dim",
         end_section=True,
     )
-    for name, own in rows.items():
+    for name, intervals in rows.items():
         table.add_row(
             name,
-            *(format_interval(own["ap"][kind] and own["ap"][kind][row]) for kind in SCORED for row in shown),
-            format_interval(own["f1"]),
+            *(
+                format_interval(intervals["ap"][kind] and intervals["ap"][kind][row])
+                for kind in SCORED
+                for row in metrics
+            ),
+            format_interval(intervals["f1"]),
         )
-    table.caption = "AP of moderate labels; F1 of pedestrians at the default threshold."
+    table.caption = "AP: moderate labels. F1: pedestrians at the default threshold."
     console.print(table)
 
 
@@ -159,7 +163,7 @@ def draw_comparison(path: str | Path, content: dict) -> None:
     """Write a PNG of pedestrian F1 and mean 3D AP against time per frame.
 
     Raises:
-        InputError: the file cannot be written.
+        InputError: The file cannot be written.
     """
     import matplotlib
 
@@ -210,16 +214,21 @@ def draw_comparison(path: str | Path, content: dict) -> None:
 
 
 def _draw(axes: Axes, points: dict[str, tuple[float, float, float]], legend: str, left_margin: float = 0.0) -> None:
-    """Draw points (ms, value, other value) by name on a log axis, with the names at the right.
+    """Draw points (ms, value, other value) on a logarithmic time axis, with their names at the right.
 
-    left_margin: share of the axis that stays free at the left.
+    Args:
+        axes: Matplotlib axes.
+        points: Points by name.
+        legend: Meaning of filled and hollow markers.
+        left_margin: Fraction of the axis that is kept free at the left.
     """
     axes.set(xscale="log", xlabel=f"ms per frame, median ({legend})", ylim=(-3, 103))
     axes.grid(color="#eeeeee", which="both", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     if not points:
-        axes.text(0.5, 0.5, "no detector of all three classes", transform=axes.transAxes, ha="center", color="#888888")
+        text = "no detector supports all three classes"
+        axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", color="#888888")
         return
     ms = [x for x, _, _ in points.values()]
     low, high = min(ms) / 1.6, max(ms) * 1.6
@@ -228,10 +237,10 @@ def _draw(axes: Axes, points: dict[str, tuple[float, float, float]], legend: str
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("")
     heights = spread_heights([y for _, y, _ in points.values()], -2, 102, 4.0)
-    for (name, (x, y, other)), height in zip(points.items(), heights):
-        color, marker = next(style for begin, style in FAMILIES.items() if name.startswith(begin))
-        axes.plot([x, x], [y, other], color=color, linewidth=0.8, alpha=0.6)
-        axes.plot(x, other, marker, color=color, markerfacecolor="white", markersize=6)
+    for (name, (x, y, other_y)), height in zip(points.items(), heights):
+        color, marker = next(style for prefix, style in FAMILIES.items() if name.startswith(prefix))
+        axes.plot([x, x], [y, other_y], color=color, linewidth=0.8, alpha=0.6)
+        axes.plot(x, other_y, marker, color=color, markerfacecolor="white", markersize=6)
         axes.plot(x, y, marker, color=color, markersize=6)
         axes.annotate(
             f"{name}  {y:.1f}",
@@ -258,9 +267,9 @@ def _make_ticks(low: float, high: float):
 
 
 def spread_heights(values: Sequence[float], low: float, high: float, gap: float) -> np.ndarray:
-    """Return heights (N,) close to the values (N,), in the same order and within low .. high.
+    """Return heights (N,) close to the values (N,), in the same order and between low and high.
 
-    They are at least gap apart, or less where there is no room for all. N is at least 1.
+    They are at least `gap` apart, or less if there is not enough room for all. N is at least 1.
     """
     from sklearn.isotonic import isotonic_regression
 

@@ -19,28 +19,28 @@ PERCENTILES = (5, 50, 95)
 
 
 def make_diagonal_section(records: list[dict[str, Any]]) -> Section:
-    """Return Table 2 and Figure 13 of records of measure_frame()."""
+    """Make Table 2 and Figure 13 from the records of measure_frame()."""
     tables = []
     for key, title in (("boxes", "Labelled boxes"), ("clusters", "Clusters of Patchwork++ and DBSCAN")):
         counts = np.array([count_classes(record[key]) for record in records], float).reshape(
             -1, len(NAMES) + 1, len(NAMES) + 1
         )
-        shares = bootstrap(counts, lambda sums: 100 * divide(sums, sums.sum(-1, keepdims=True)))
+        percentages = bootstrap(counts, lambda sums: 100 * divide(sums, sums.sum(-1, keepdims=True)))
         values = np.array([pair for record in records for pair in record[key]]).reshape(-1, 2)
         rows: list[Row] = []
         for i, name in enumerate((*NAMES, BACKGROUND)):
-            own = values[_find_class(values[:, 0]) == i, 1]
+            diagonals = values[_find_class_indices(values[:, 0]) == i, 1]
             if key == "boxes" and name == BACKGROUND:
                 continue
             limits = paper.TABLE_2.get(name)
-            ends = np.percentile(own, PERCENTILES) if len(own) else np.full(3, np.nan)
+            percentiles = np.percentile(diagonals, PERCENTILES) if len(diagonals) else np.full(3, np.nan)
             rows.append(
                 (
                     name,
-                    str(len(own)),
-                    *(Cell(v, digits=2) for v in nan_to_none(ends)),
+                    str(len(diagonals)),
+                    *(Cell(v, digits=2) for v in nan_to_none(percentiles)),
                     f"{limits[0]:.2f} to {limits[1]:.2f}" if limits else "none",
-                    *make_cells(shares[:, i]),
+                    *make_cells(percentages[:, i]),
                 )
             )
         header = (
@@ -52,29 +52,29 @@ def make_diagonal_section(records: list[dict[str, Any]]) -> Section:
         )
         tables.append(Table(f"table_2_{key}", title, header, tuple(rows)))
     text = (
-        "Table 2 classifies a cluster by the diagonal of its box in x-y. The paper shows the "
-        "diagonals of the labelled boxes of KITTI (Figure 13) and chose limits for clusters "
+        "Table 2 classifies a cluster by the BEV diagonal of its box. The paper shows the "
+        "diagonals of KITTI's labelled boxes (Figure 13); its limits for clusters were chosen "
         "by hand. Here a cluster has the class of the labelled box that contains most of its "
-        "points; all others are background."
+        "points; all other clusters are background."
     )
     return Section("Class by diagonal (Table 2, Figure 13)", text, tuple(tables), (_draw_histograms(records),))
 
 
-def _find_class(class_ids: np.ndarray) -> np.ndarray:
-    """Return the index into NAMES of classes (K,); len(NAMES) for all others."""
-    found = np.full(len(class_ids), len(NAMES))
+def _find_class_indices(class_ids: np.ndarray) -> np.ndarray:
+    """Return the index into NAMES of each class id (K,); len(NAMES) for other classes."""
+    indices = np.full(len(class_ids), len(NAMES))
     for i, name in enumerate(NAMES):
-        found[class_ids == CLASSES.index(name)] = i
-    return found
+        indices[class_ids == CLASSES.index(name)] = i
+    return indices
 
 
 def count_classes(pairs: list[list[float]]) -> list[list[int]]:
-    """Count true class by class of Table 2, (4, 4), the last of each being none."""
+    """Count objects by true class and by the class of Table 2, (4, 4). The last row and column are for no class."""
     values = np.array(pairs, float).reshape(-1, 2)
     boxes = np.zeros((len(values), 7))
     boxes[:, 3] = values[:, 1]
     counts = np.zeros((len(NAMES) + 1, len(NAMES) + 1), int)
-    np.add.at(counts, (_find_class(values[:, 0]), _find_class(classify_by_diagonal(boxes))), 1)
+    np.add.at(counts, (_find_class_indices(values[:, 0]), _find_class_indices(classify_by_diagonal(boxes))), 1)
     return counts.tolist()
 
 
@@ -83,12 +83,13 @@ def _draw_histograms(records: list[dict[str, Any]]) -> Figure:
     middles = (BINS[:-1] + np.diff(BINS) / 2).tolist()
     for key, title in (("boxes", "labelled boxes"), ("clusters", "clusters")):
         values = np.array([pair for record in records for pair in record[key]]).reshape(-1, 2)
-        counts = np.stack([np.histogram(values[_find_class(values[:, 0]) == i, 1], BINS)[0] for i in range(len(NAMES))])
-        shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+        class_indices = _find_class_indices(values[:, 0])
+        counts = np.stack([np.histogram(values[class_indices == i, 1], BINS)[0] for i in range(len(NAMES))])
+        histograms = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
         lines = []
-        for name, share in zip(NAMES, shares):
+        for name, histogram in zip(NAMES, histograms):
             low = paper.TABLE_2[name][0]
-            lines.append(Line(name, middles, share.tolist()))
-            lines.append(Line(f"{name}, limit", (low, low), (0.0, float(shares.max())), dashed=True))
+            lines.append(Line(name, middles, histogram.tolist()))
+            lines.append(Line(f"{name}, limit", (low, low), (0.0, float(histograms.max())), dashed=True))
         panels.append(Panel(title, "diagonal in x-y [m]", "fraction of the class", tuple(lines)))
     return Figure("figure_13", "Figure 13: diagonals by class, and the lower limits of Table 2", tuple(panels))

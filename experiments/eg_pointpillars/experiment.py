@@ -1,4 +1,4 @@
-"""Experiments of the EG-PointPillars paper: one trains its networks, one measures the shipped weights."""
+"""Experiments of the EG-PointPillars paper: with networks that are trained for it, and with the shipped weights."""
 
 from __future__ import annotations
 

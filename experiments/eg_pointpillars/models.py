@@ -1,4 +1,4 @@
-"""The networks of the experiment: five versions, and V0 and V4 trained with fewer labelled scenes."""
+"""Networks of the experiment: five versions, and V0 and V4 trained with fewer labelled scenes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.training.params import PointPillarsTraining
 
 TRAINING = PointPillarsTraining()
-# Full range, network size and number of epochs as in Section 4.1.
+# Full range; network size and number of epochs as in Section 4.1.
 PROTOCOL = {
     "size": "full",
     "score": "map",
@@ -24,52 +24,58 @@ PROTOCOL = {
     "ahead": 1000.0,
     "aside": 1000.0,
 }
-STUDIED = "v0", "v4"  # versions in the study of label counts
-SHARES = (0.1, 0.25, 0.5)  # fractions of the labelled scenes, in addition to all of them, in order of importance
-ALL_SHARES = (*SHARES, 1.0)
+COMPARED_VERSIONS = "v0", "v4"  # versions in the study of label counts
+FRACTIONS = (0.1, 0.25, 0.5)  # fractions of the labelled scenes, most important first
+ALL_FRACTIONS = (*FRACTIONS, 1.0)
 
 
 def choose_models(params: PointPillarsTraining, seed: int) -> list[Model]:
-    """Return the networks of a seed: all versions, then those of the study of labels."""
+    """Return the networks to train with this seed: all versions, then those with fewer labels."""
 
-    def make(version: str, share: float) -> Model:
+    def make_model(version: str, fraction: float) -> Model:
         return Model(
-            name_model(version, share, seed),
+            name_model(version, fraction, seed),
             with_values(params, {"version": version, "seed": seed}),
-            share,
-            required=share == 1.0,
+            fraction,
+            required=fraction == 1.0,
         )
 
     return [
-        *(make(version, 1.0) for version in VERSIONS),
-        *(make(version, share) for share in SHARES for version in STUDIED),
+        *(make_model(version, 1.0) for version in VERSIONS),
+        *(make_model(version, fraction) for fraction in FRACTIONS for version in COMPARED_VERSIONS),
     ]
 
 
 def read_shipped_models() -> dict[str, TrainedModel]:
     """Return the compact networks that ship with the package, by version.
 
-    Their steps, seconds and scenes are those of their last training.
+    Their steps, seconds and scenes are those of their last training run.
     """
-    shipped = {}
+    models = {}
     for version in VERSIONS:
         file = find_pointpillars_weights(PointPillarsParams(version=version, size="compact"))
-        last = read_header(file).training
+        training = read_header(file).training
         model = Model(version.upper(), with_values(TRAINING, {"version": version}))
-        shipped[model.name] = TrainedModel(
-            model, file, last["steps"], last["seconds"], last["steps"], last["scenes"], count_parameters(file)
+        models[model.name] = TrainedModel(
+            model,
+            file,
+            training["steps"],
+            training["seconds"],
+            training["steps"],
+            training["scenes"],
+            count_parameters(file),
         )
-    return shipped
+    return models
 
 
-def name_model(version: str, share: float, seed: int) -> str:
+def name_model(version: str, fraction: float, seed: int) -> str:
     """Return the name of a network, such as "V4, 25 % of the labels, seed 0"."""
-    labels = "" if share == 1.0 else f", {100 * share:g} % of the labels"
+    labels = "" if fraction == 1.0 else f", {100 * fraction:g} % of the labels"
     return f"{version.upper()}{labels}, seed {seed}"
 
 
 def group_seeds(models: Mapping[str, TrainedModel]) -> dict[tuple[str, float], list[str]]:
-    """Return (version, share of the labels) -> names of the networks of all seeds."""
+    """Group networks that differ only in the seed: (version, fraction of the labels) -> names."""
     groups: dict[tuple[str, float], list[str]] = {}
     for name, trained in models.items():
         params: Any = trained.model.params

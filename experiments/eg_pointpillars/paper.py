@@ -1,6 +1,6 @@
 """Published values of the EG-PointPillars paper (Ahn, Kim, Park, CMC 2026, 87(1), 84).
 
-Average precision in percent, times in milliseconds on one RTX 4090 of four.
+Average precision in percent, times in milliseconds on one of four RTX 4090 GPUs.
 """
 
 from __future__ import annotations
@@ -23,4 +23,4 @@ OVERHEAD_MS = {"v1": 0.8, "v2": 11.3, "v3": 19.4, "v4": 11.3}
 # Table 2: limits of the BEV diagonal of a cluster's box, in metres.
 TABLE_2 = {"Car": (3.00, 6.40), "Cyclist": (1.72, 2.99), "Pedestrian": (0.40, 1.71)}
 
-EPOCHS, VALIDATION_EPOCHS = 300, 5  # as in Section 4.1
+EPOCHS, VALIDATION_EPOCHS = 300, 5  # from Section 4.1

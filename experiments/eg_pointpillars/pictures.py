@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.eg_pointpillars.models import STUDIED, group_seeds
+from experiments.eg_pointpillars.models import COMPARED_VERSIONS, group_seeds
 from experiments.framework.experiment import Picture, Section
 from experiments.framework.precision import RELAXED_BEV, compare_records
 from experiments.framework.trained_models import TrainedModel
@@ -24,79 +24,79 @@ from lidar_perception.scoring.kitti.protocol import (
 )
 from lidar_perception.types import CLASSES, InputError
 
-SHOWN_SCORE = 0.3
-SIZE = (1280, 540)  # size of each half of the picture, in pixels
-BETTER, WORSE = 2, 1  # number of frames to show in which V4 makes fewer errors, and more errors
+MIN_SHOWN_SCORE = 0.3
+SIZE = (1280, 540)  # size of each half of a picture, in pixels
+MAX_BETTER, MAX_WORSE = 2, 1  # numbers of pictures in which V4 makes fewer errors than V0, and more errors
 
 
 def make_picture_sections(
     records: list[dict[str, Any]], frames: Sequence[Frame], models: Mapping[str, TrainedModel]
 ) -> list[Section]:
-    """Return Figure 20: the frames in which the errors of V0 and V4 differ most, both ways."""
+    """Make Figure 20 from the frames with the largest differences between the errors of V0 and V4."""
     groups = group_seeds(models)
-    if any((version, 1.0) not in groups for version in STUDIED):
+    if any((version, 1.0) not in groups for version in COMPARED_VERSIONS):
         return []
-    first, last = (groups[version, 1.0][0] for version in STUDIED)
-    measured = [record for record in records if "skipped" not in record]
+    v0, v4 = (groups[version, 1.0][0] for version in COMPARED_VERSIONS)
+    records = [record for record in records if "skipped" not in record]
     errors = {
-        name: [
-            count_errors(frame)
-            for frame in compare_records([r["true"] for r in measured], [r["found"][name] for r in measured])
-        ]
-        for name in (first, last)
+        name: {
+            record["frame"]: count_errors(frame)
+            for record, frame in zip(
+                records, compare_records([r["true"] for r in records], [r["found"][name] for r in records])
+            )
+        }
+        for name in (v0, v4)
     }
-    by_name = {record["frame"]: i for i, record in enumerate(measured)}
-    indices = [i for i, frame in enumerate(frames) if frame.name in by_name]
-    gain = np.array([errors[first][by_name[frames[i].name]] - errors[last][by_name[frames[i].name]] for i in indices])
+    measured_frames = [frame for frame in frames if frame.name in errors[v0]]
+    gain = np.array([errors[v0][frame.name] - errors[v4][frame.name] for frame in measured_frames])
     order = np.argsort(-gain, kind="stable")
     better, worse = order[gain[order] > 0], order[gain[order] < 0]
-    chosen = [*better[:BETTER], *worse[::-1][:WORSE]] or [*order[:1]]
+    picture_indices = [*better[:MAX_BETTER], *worse[::-1][:MAX_WORSE]] or [*order[:1]]
     pictures: list[Picture] = []
-    for k in chosen:
-        frame = frames[indices[k]]
-        counts = [errors[name][by_name[frame.name]] for name in (first, last)]
+    for k in picture_indices:
+        frame = measured_frames[k]
         pictures.append(
             Picture(
                 f"figure_20_{len(pictures) + 1}",
-                f"{frame.name}: {first} (above, errors: {counts[0]}) and {last} (below, errors: {counts[1]})",
-                np.concatenate([_draw(frame, models[name], name) for name in (first, last)], axis=0),
+                f"{frame.name}: {v0} (above, errors: {errors[v0][frame.name]}) and {v4} (below, errors: "
+                f"{errors[v4][frame.name]})",
+                np.concatenate([_draw(frame, models[name], name) for name in (v0, v4)], axis=0),
             )
         )
     text = (
-        f"Boxes with a score of at least {SHOWN_SCORE:g}; labels are dashed. V4 has fewer errors than V0 in "
-        f"{len(better)} frames and more in {len(worse)}. Up to {BETTER} frames of the first kind and {WORSE} of "
-        "the second are shown, those with the largest difference; the paper shows three of the first kind. An "
-        "error is a missed object or a wrong box, in BEV at the overlaps 0.5 (Car) and 0.25."
+        f"Boxes with a score of at least {MIN_SHOWN_SCORE:g}; labels are dashed. V4 makes fewer errors than V0 in "
+        f"{len(better)} frames and more in {len(worse)}. Of the frames with the largest differences, up to "
+        f"{MAX_BETTER} of the first kind and {MAX_WORSE} of the second are shown; the paper shows three of the first "
+        "kind. An error is a miss or a false positive, in BEV at overlaps of 0.5 (Car) and 0.25."
     )
     return [Section("V0 and V4 on the same frames (Figure 20)", text, figures=tuple(pictures))]
 
 
 def count_errors(frame: ComparedFrame) -> int:
-    """Count missed objects (moderate) and wrong boxes, with a score of at least SHOWN_SCORE."""
+    """Count moderate misses and false positives. Only boxes with a score of at least MIN_SHOWN_SCORE count."""
     overlaps = frame.overlaps[METRICS.index(RELAXED_BEV[0])]
     errors = 0
     for name in SCORED:
-        hit = overlaps > RELAXED_BEV[1][name]
-        own = frame.true.class_ids == CLASSES.index(name)
-        found = (
+        matches = overlaps > RELAXED_BEV[1][name]
+        is_detected = (
             (frame.found.class_ids == CLASSES.index(name))
-            & (frame.found.scores >= SHOWN_SCORE)
+            & (frame.found.scores >= MIN_SHOWN_SCORE)
             & (classify_detections(frame.found, name, "moderate") == COUNTED)
         )
-        wanted = classify_labels(frame.true, name, "moderate") == COUNTED
-        errors += int((wanted & ~hit[found].any(axis=0)).sum())
-        errors += int((found & ~hit[:, own].any(axis=1)).sum())
+        is_counted_label = classify_labels(frame.true, name, "moderate") == COUNTED
+        is_label = frame.true.class_ids == CLASSES.index(name)
+        errors += int((is_counted_label & ~matches[is_detected].any(axis=0)).sum())
+        errors += int((is_detected & ~matches[:, is_label].any(axis=1)).sum())
     return errors
 
 
 def _draw(frame: Frame, model: TrainedModel, title: str) -> np.ndarray:
-    """Draw a frame with the boxes of a network, (height, width, 3) uint8."""
+    """Draw a frame with the boxes of a network. Return pixels (height, width, 3) uint8."""
     scan, truth = frame.load(), frame.truth()
     try:
-        found = open_detector(str(model.weights), sensor_height=frame.sensor_height, min_score=SHOWN_SCORE)(
-            scan
-        ).detections
-        boxes = Boxes(found.boxes, found.class_ids, [f"{score:.2f}" for score in found.scores])
+        detector = open_detector(str(model.weights), sensor_height=frame.sensor_height, min_score=MIN_SHOWN_SCORE)
+        detections = detector(scan).detections
+        boxes = Boxes(detections.boxes, detections.class_ids, [f"{score:.2f}" for score in detections.scores])
     except InputError:
         boxes = Boxes()
     labels = (

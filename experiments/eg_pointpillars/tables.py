@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments.eg_pointpillars import paper
 from experiments.eg_pointpillars.diagonals import make_diagonal_section
-from experiments.eg_pointpillars.models import ALL_SHARES, STUDIED, group_seeds
+from experiments.eg_pointpillars.models import ALL_FRACTIONS, COMPARED_VERSIONS, group_seeds
 from experiments.framework.experiment import Cell, Figure, Panel, Row, Section, Table
 from experiments.framework.precision import CELLS, compare_records, draw_cells, from_record
 from experiments.framework.statistics import compute_sampled_p, estimate, make_cells, make_line, nan_to_none
@@ -19,35 +19,35 @@ from lidar_perception.scoring.kitti.protocol import COUNTED, SCORED, classify_la
 
 MEAN = len(CELLS)  # index of the mean column, see precision.compute_cells()
 STRICT, RELAXED = 0, 1  # indices into precision.PROTOCOLS
-MIN_AP = 20.0  # in percent; for a lower mean BEV AP the report says that the training was too short
-MIN_LABELS = 50  # labels of a class; the report says that fewer are too few to compare versions
+MIN_AP = 20.0  # percent; below this mean BEV AP the report says that the training was too short
+MIN_LABELS = 50  # with fewer labels of a class, the report says that they are too few to compare versions
 TITLES = {v: "V0, PointPillars" if v == "v0" else v.upper() for v in VERSIONS}
 MS_PARTS = ("total", "cpu", "experts", "network")  # times in the record of a frame
-GAIN = ("V0", "V4", "V4 above V0")
+LABEL_COLUMNS = ("V0", "V4", "V4 above V0")
 Draws = dict[tuple[str, float], np.ndarray]  # (version, fraction of the labels) -> array (1 + R, 2, 10)
 
 
 def make_sections(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> list[Section]:
-    """Return the report of the records of measure_frame(), with networks that were trained for it."""
+    """Make the report for networks that the experiment has trained, from the records of measure_frame()."""
     records = _drop_skipped(records)
-    by_model = draw_models(records, models)
-    draws = average_seeds(by_model, models)
+    model_draws = draw_models(records, models)
+    draws = average_seeds(model_draws, models)
     return [
         make_training_section(models),
         *make_version_sections(draws, records, models),
         make_label_section(draws),
-        *make_seed_sections(by_model, models),
+        *make_seed_sections(model_draws, models),
     ]
 
 
 def make_shipped_sections(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> list[Section]:
-    """Return the report of the records of measure_frame(), with the shipped weights."""
+    """Make the report for the shipped weights from the records of measure_frame()."""
     records = _drop_skipped(records)
     text = (
-        "These are the weights that ship with the package, of the size compact. They were trained on "
-        "simulated streets, each version for another number of steps and from other initial weights (the "
-        "research log lists them). So a difference between two versions is not the effect of the experts "
-        "alone. No network was trained on a real scan."
+        "These are the weights that ship with the package, in the size `compact`. They were trained on "
+        "simulated streets. The number of steps and the initial weights differ between versions (see the "
+        "research log), so a difference between two versions is not only the effect of the experts. "
+        "No network was trained on a real scan."
     )
     draws = average_seeds(draw_models(records, models), models)
     return [Section("What is measured", text), *make_version_sections(draws, records, models)]
@@ -65,15 +65,15 @@ def make_version_sections(
 
 
 def draw_models(records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> dict[str, np.ndarray]:
-    """Return the average precision of each network for samples of the frames, see draw_cells()."""
-    true = [record["true"] for record in records]
-    compared = {name: compare_records(true, [record["found"][name] for record in records]) for name in models}
-    return draw_cells([record["frame"] for record in records], compared)
+    """Compute the average precision of each network for samples of the frames, see draw_cells()."""
+    labels = [record["true"] for record in records]
+    frames_by_model = {name: compare_records(labels, [record["found"][name] for record in records]) for name in models}
+    return draw_cells([record["frame"] for record in records], frames_by_model)
 
 
-def average_seeds(by_model: Mapping[str, np.ndarray], models: Mapping[str, TrainedModel]) -> Draws:
-    """Return the mean over seeds of draw_models()."""
-    return {key: np.mean([by_model[name] for name in group], axis=0) for key, group in group_seeds(models).items()}
+def average_seeds(model_draws: Mapping[str, np.ndarray], models: Mapping[str, TrainedModel]) -> Draws:
+    """Average the result of draw_models() over seeds."""
+    return {key: np.mean([model_draws[name] for name in group], axis=0) for key, group in group_seeds(models).items()}
 
 
 def _drop_skipped(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -81,7 +81,7 @@ def _drop_skipped(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def make_training_section(models: Mapping[str, TrainedModel]) -> Section:
-    """Return the table of networks with their training data and length."""
+    """Return the section about the trained networks, their data and the length of their training."""
     rows: list[Row] = [
         (
             name,
@@ -109,12 +109,12 @@ def make_training_section(models: Mapping[str, TrainedModel]) -> Section:
 
 
 def _describe_training(params: Any) -> str:
-    """Return sentences about the parameters that all networks have in common; "" without networks."""
+    """Describe the parameters that all networks have in common. Empty if there are no networks."""
     if params is None:
         return ""
     sentences = [
-        f"All networks have the size {params.size}, a batch size of {params.batch} and the same number of "
-        "steps, and begin with random weights. Networks with all labels are trained on the same "
+        f"All networks have the size `{params.size}` and are trained with a batch size of {params.batch} for the same "
+        "number of steps, starting from random weights. Networks with all labels are trained on the same "
         "scenes. The weights with the best validation score are measured."
     ]
     if params.data.scans:
@@ -125,20 +125,21 @@ def _describe_training(params: Any) -> str:
         )
     if 0 < params.ahead < 100:
         sentences.append(
-            f"They were trained up to {params.ahead:g} m ahead and {params.aside:g} m to each side, and are measured "
-            "in the whole range."
+            f"They were trained up to {params.ahead:g} m ahead and {params.aside:g} m to each side, but are measured "
+            "in the full range."
         )
     sentences.append(
-        f"The paper trains {paper.EPOCHS} epochs with a validation every {paper.VALIDATION_EPOCHS}, on KITTI."
+        f"The paper trains for {paper.EPOCHS} epochs on KITTI and validates every {paper.VALIDATION_EPOCHS} epochs."
     )
     return " ".join(sentences)
 
 
-def make_table_5(draws: Draws, true: list[dict[str, Any]]) -> Section:
-    """Return Table 5 at the paper's overlaps, and in BEV at lower ones.
+def make_table_5(draws: Draws, labels: list[dict[str, Any]]) -> Section:
+    """Make Table 5 with the paper's overlaps, and the same table for BEV with lower overlaps.
 
     Args:
-        true: Records of the labels of all frames.
+        draws: Average precision of the networks.
+        labels: Records of the labels of all frames.
     """
     header = ("version", *(f"{name} {level}" for name, level in CELLS), "mean", "above V0", "p")
     tables = []
@@ -152,12 +153,12 @@ def make_table_5(draws: Draws, true: list[dict[str, Any]]) -> Section:
             if (version, 1.0) in draws
         ]
         tables.append(Table(name, title, header, tuple(rows)))
-    counts = count_labels(true)
+    counts = count_labels(labels)
     text = (
-        f"{len(true)} frames that no network was trained on, with "
+        f"{len(labels)} frames that no network was trained on, with "
         + ", ".join(f"{name} {count}" for name, count in counts.items())
         + " labels (moderate). R40, mean over seeds. Intervals and "
-        "p values: samples of the frames, the same for all versions, so that the differences "
+        "p values are from bootstrap samples of the frames, the same for all versions, so that differences "
         "are paired. The paper does not say which recall points it uses."
     )
     if few := [name for name, count in counts.items() if count < MIN_LABELS]:
@@ -166,56 +167,59 @@ def make_table_5(draws: Draws, true: list[dict[str, Any]]) -> Section:
     if not best >= MIN_AP:  # also true for NaN
         text = (
             "No version was trained long enough, or the frames have too few objects (mean BEV "
-            f"AP {best:.1f}), so neither the versions nor the study of labels can be compared. " + text
+            f"AP {best:.1f}), so neither the versions nor the numbers of labels can be compared. " + text
         )
     return Section("Versions (Table 5)", text, tuple(tables))
 
 
-def count_labels(true: list[dict[str, Any]]) -> dict[str, int]:
-    """Count the moderate labels of each class."""
-    objects = [from_record(record) for record in true]
-    return {name: sum(int((classify_labels(o, name, "moderate") == COUNTED).sum()) for o in objects) for name in SCORED}
+def count_labels(labels: list[dict[str, Any]]) -> dict[str, int]:
+    """Count the moderate labels of each class in the records of the labels of all frames."""
+    frames = [from_record(record) for record in labels]
+    return {
+        name: sum(int((classify_labels(objects, name, "moderate") == COUNTED).sum()) for objects in frames)
+        for name in SCORED
+    }
 
 
 def _make_version_cells(draws: Draws, version: str, index: int) -> tuple[Cell, ...]:
-    own = draws[version, 1.0][:, index]
-    strict = index == STRICT
+    version_draws = draws[version, 1.0][:, index]
+    is_strict = index == STRICT
     published = [paper.TABLE_5[version][name][i % 3] for i, (name, _) in enumerate(CELLS)]
-    cells = make_cells(estimate(own), [*published, paper.MAP[version]] if strict else ())
+    cells = make_cells(estimate(version_draws), [*published, paper.MAP[version]] if is_strict else ())
     if version == "v0" or ("v0", 1.0) not in draws:
         return (*cells, Cell(None), Cell(None))
-    gain = own[:, MEAN] - draws["v0", 1.0][:, index, MEAN]
+    gain = version_draws[:, MEAN] - draws["v0", 1.0][:, index, MEAN]
     return (
         *cells,
-        *make_cells(estimate(gain)[:, None], [paper.IMPROVEMENT[version]] if strict else ()),
+        *make_cells(estimate(gain)[:, None], [paper.IMPROVEMENT[version]] if is_strict else ()),
         Cell(nan_to_none([compute_sampled_p(gain)])[0], digits=3),
     )
 
 
 def make_table_6(draws: Draws, records: list[dict[str, Any]], models: Mapping[str, TrainedModel]) -> Section:
-    """Return Table 6: gain, time per frame, overhead and parameters."""
-    groups = {version: names for (version, share), names in group_seeds(models).items() if share == 1.0}
+    """Make Table 6: gain, time per frame, overhead and number of parameters."""
+    groups = {version: names for (version, fraction), names in group_seeds(models).items() if fraction == 1.0}
     ms = {version: _compute_medians(records, names) for version, names in groups.items()}
     rows: list[Row] = []
     for version, (total, cpu, experts, network) in ms.items():
         gain = draws[version, 1.0][0, STRICT, MEAN] - draws["v0", 1.0][0, STRICT, MEAN]
-        base = ms["v0"][0]
-        values = nan_to_none([gain, total, total - base, cpu, experts, network])
-        first = version == "v0"
+        base_ms = ms["v0"][0]
+        values = nan_to_none([gain, total, total - base_ms, cpu, experts, network])
+        is_base = version == "v0"
         rows.append(
             (
                 TITLES[version],
-                Cell(None if first else values[0], paper=paper.IMPROVEMENT.get(version), digits=2),
+                Cell(None if is_base else values[0], paper=paper.IMPROVEMENT.get(version), digits=2),
                 Cell(values[1], paper=paper.MS[version]),
-                Cell(None if first else values[2], paper=paper.OVERHEAD_MS.get(version)),
+                Cell(None if is_base else values[2], paper=paper.OVERHEAD_MS.get(version)),
                 *(Cell(value) for value in values[3:]),
                 Cell(models[groups[version][0]].parameters / 1e3),
             )
         )
     return Section(
         "Gain and time (Table 6)",
-        "Median time per frame on the machine named above; the paper's times are of a GPU. On a busy machine "
-        "look at the CPU time, which is that of all threads. On a CPU the versions without ground (V1, V2, V4) "
+        "Median time per frame on the machine named above; the paper's times are from a GPU. On a busy machine "
+        "compare the CPU time, summed over all threads. On a CPU the versions without ground points (V1, V2, V4) "
         "skip empty cells, so they can be faster than V0. The paper's overhead of V4 contradicts its "
         "Table 5, which gives 33.3 ms.",
         (
@@ -239,7 +243,7 @@ def make_table_6(draws: Draws, records: list[dict[str, Any]], models: Mapping[st
 
 
 def _compute_medians(records: list[dict[str, Any]], names: Sequence[str]) -> np.ndarray:
-    """Return the median over frames of MS_PARTS, the means over networks; NaN without frames."""
+    """Return the medians of MS_PARTS over frames, averaged over networks; NaN if there are no frames."""
     if not records:
         return np.full(len(MS_PARTS), np.nan)
     values = np.array([[[r["ms"][name][part] for name in names] for part in MS_PARTS] for r in records])
@@ -247,15 +251,18 @@ def _compute_medians(records: list[dict[str, Any]], names: Sequence[str]) -> np.
 
 
 def make_label_section(draws: Draws) -> Section:
-    """Return the study of labels: V0 and V4 with a part of the labelled scenes."""
-    title, shares = "Dependency on labels", [s for s in ALL_SHARES if all((v, s) in draws for v in STUDIED)]
-    if len(shares) < 2:
-        return Section(title, "Not measured: the budget was too short for networks with fewer labels.")
+    """Return the section about V0 and V4 trained with fractions of the labelled scenes."""
+    title, fractions = (
+        "Dependency on labels",
+        [s for s in ALL_FRACTIONS if all((v, s) in draws for v in COMPARED_VERSIONS)],
+    )
+    if len(fractions) < 2:
+        return Section(title, "Not measured: the budget was too short to train networks with fewer labels.")
     rows: list[Row] = []
-    for share in shares:
-        row: list[str | Cell] = [f"{100 * share:g} %"]
+    for fraction in fractions:
+        row: list[str | Cell] = [f"{100 * fraction:g} %"]
         for index in (STRICT, RELAXED):
-            first, last = (draws[version, share][:, index, MEAN] for version in STUDIED)
+            first, last = (draws[version, fraction][:, index, MEAN] for version in COMPARED_VERSIONS)
             row += [
                 *make_cells(np.stack([estimate(d) for d in (first, last, last - first)], axis=1)),
                 Cell(nan_to_none([compute_sampled_p(last - first)])[0], digits=3),
@@ -263,21 +270,25 @@ def make_label_section(draws: Draws) -> Section:
         rows.append(tuple(row))
     header = (
         "labelled scenes",
-        *(name for kind in ("3D", "BEV") for name in (*(f"{what}, {kind} [%]" for what in GAIN), f"p, {kind}")),
+        *(
+            name
+            for kind in ("3D", "BEV")
+            for name in (*(f"{column}, {kind} [%]" for column in LABEL_COLUMNS), f"p, {kind}")
+        ),
     )
-    left_out = [f"{100 * share:g} %" for share in ALL_SHARES if share not in shares]
+    left_out = [f"{100 * fraction:g} %" for fraction in ALL_FRACTIONS if fraction not in fractions]
     text = (
         "The paper claims that the experts reduce the dependency on "
-        "labels (Sections 1 and 5) and has no experiment for it. Here both networks get the same "
-        "part of the labelled scenes and the same number of steps. Mean AP over classes and "
-        "difficulties, overlaps as in the tables above."
+        "labels (Sections 1 and 5), but has no experiment on it. Here both networks are trained on the same "
+        "fraction of the labelled scenes for the same number of steps. Mean AP over classes and "
+        "difficulties, with the overlaps of the tables above."
     )
     if left_out:
-        text += f" Left out, as the budget was too short: {', '.join(left_out)}."
+        text += f" Left out because the budget was too short: {', '.join(left_out)}."
     return Section(
         title,
         text,
-        (Table("labels", "V0 and V4 by share of the labelled scenes", header, tuple(rows)),),
+        (Table("labels", "V0 and V4 by fraction of the labelled scenes", header, tuple(rows)),),
         _draw_label_figure(draws),
     )
 
@@ -286,24 +297,24 @@ def _draw_label_figure(draws: Draws) -> tuple[Figure, ...]:
     panels = []
     for index, title in ((STRICT, "3D, 0.7 / 0.5 / 0.5"), (RELAXED, "BEV, 0.5 / 0.25 / 0.25")):
         lines = []
-        for version in STUDIED:
-            shares = [share for share in ALL_SHARES if (version, share) in draws]
-            if shares:
-                values = np.stack([draws[version, share][:, index, MEAN] for share in shares], axis=1)
-                lines.append(make_line(version.upper(), [100 * s for s in shares], estimate(values)))
+        for version in COMPARED_VERSIONS:
+            fractions = [fraction for fraction in ALL_FRACTIONS if (version, fraction) in draws]
+            if fractions:
+                values = np.stack([draws[version, fraction][:, index, MEAN] for fraction in fractions], axis=1)
+                lines.append(make_line(version.upper(), [100 * s for s in fractions], estimate(values)))
         panels.append(Panel(title, "labelled scenes [%]", "mean AP", tuple(lines)))
-    return (Figure("labels", "Mean AP by share of the labelled scenes", tuple(panels)),)
+    return (Figure("labels", "Mean AP by fraction of the labelled scenes", tuple(panels)),)
 
 
-def make_seed_sections(by_model: Mapping[str, np.ndarray], models: Mapping[str, TrainedModel]) -> list[Section]:
-    """Return a section with the mean AP of each seed; none with one seed."""
+def make_seed_sections(model_draws: Mapping[str, np.ndarray], models: Mapping[str, TrainedModel]) -> list[Section]:
+    """Return a section with the mean AP of each seed; [] if there is only one seed."""
     groups = group_seeds(models)
     count = max(map(len, groups.values()), default=0)
     if count < 2:
         return []
     rows: list[Row] = [
-        (TITLES[version], f"{100 * share:g} %", *_list_seeds(by_model, names, count))
-        for (version, share), names in groups.items()
+        (TITLES[version], f"{100 * fraction:g} %", *_make_seed_cells(model_draws, names, count))
+        for (version, fraction), names in groups.items()
     ]
     header = ("version", "labels", *(f"seed {i}" for i in range(count)), "standard deviation")
     return [
@@ -315,8 +326,7 @@ def make_seed_sections(by_model: Mapping[str, np.ndarray], models: Mapping[str, 
     ]
 
 
-def _list_seeds(by_model: Mapping[str, np.ndarray], names: Sequence[str], count: int) -> tuple[Cell, ...]:
-    values = [by_model[name][0, STRICT, MEAN] for name in names]
-    spread = np.std(values, ddof=1) if len(values) > 1 else np.nan
-    shown = nan_to_none([*values, *[np.nan] * (count - len(values)), spread])
-    return tuple(map(Cell, shown))
+def _make_seed_cells(model_draws: Mapping[str, np.ndarray], names: Sequence[str], count: int) -> tuple[Cell, ...]:
+    values = [model_draws[name][0, STRICT, MEAN] for name in names]
+    deviation = np.std(values, ddof=1) if len(values) > 1 else np.nan
+    return tuple(map(Cell, nan_to_none([*values, *[np.nan] * (count - len(values)), deviation])))

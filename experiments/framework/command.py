@@ -23,7 +23,7 @@ from lidar_perception.cli.data import (
     out_folder_option,
     path_option,
 )
-from lidar_perception.cli.options import Runs, Settings, checked, device_option, settings_options
+from lidar_perception.cli.options import Algorithm, Settings, apply_values, device_option, settings_options
 from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.machine import count_cores, read_cpu_name
 from lidar_perception.types import InputError
@@ -45,11 +45,11 @@ EXPERIMENTS = {  # name -> "module:attribute" of an Experiment; the first is the
 }
 
 
-def _list_parameters(options: Mapping[str, Any]) -> list[Runs]:
+def _list_parameters(options: Mapping[str, Any]) -> list[Algorithm]:
     """Return the training parameters of the selected experiment, for --set help."""
     names = [word for word in options.get("words", ()) if word in EXPERIMENTS]
     training = load_experiment(names[0]).training if names else None
-    return [] if training is None else [Runs(names[0], collect_fields(training), None)]
+    return [] if training is None else [Algorithm(names[0], collect_fields(training), None)]
 
 
 @click.command(cls=Command)
@@ -58,14 +58,14 @@ def _list_parameters(options: Mapping[str, Any]) -> list[Runs]:
 @path_option(
     "--split",
     "Measure only the frames or sequences named in this file, one per line. "
-    "Experiments that train use the others for training.",
+    "Experiments that train networks use the other frames for training.",
 )
-@out_folder_option("Folder for the report; the same command resumes a run that was stopped.", required=True)
+@out_folder_option("Folder for the report. The same command resumes an interrupted run.", required=True)
 @click.option(
     "--budget",
     type=click.FloatRange(0, min_open=True),
     metavar="HOURS",
-    help="Time for training and measuring, which sets the number of steps of all "
+    help="Time budget for training and measuring, which determines the number of training steps of all "
     "networks. Default: 2 with `sim`, otherwise the paper's number of epochs.",
 )
 @click.option(
@@ -134,7 +134,7 @@ def reproduce(
     workers = jobs or count_cores()
     if experiment.training is None:
         refuse_options(
-            ("budget", "seeds", "device", "config", "given"),
+            ("budget", "seeds", "device", "config", "assignments"),
             f"requires an experiment that trains networks; {name} trains none",
         )
         recording = _open_recording(data, split, out)
@@ -164,7 +164,7 @@ def reproduce(
 
 
 def _open_recording(data: Path, split: Path | None, out: Path) -> Recording:
-    """Open the frames that an experiment without training measures."""
+    """Open the recording for an experiment that trains no networks."""
     from lidar_perception.data.frame import BOXES
 
     if str(data) != SIM:
@@ -199,12 +199,12 @@ def _make_request(
 
     assert experiment.training is not None and experiment.models is not None
     scenes = ExperimentScenes.split(str(data), split)
-    values = settings.values(Runs(experiment.name, collect_fields(experiment.training), None))[0]
+    values = settings.resolve(Algorithm(experiment.name, collect_fields(experiment.training), None))[0]
     has_steps = any(values.get(name) for name in ("steps", "epochs"))
     if scenes.is_simulated and not has_steps:
         budget = budget or DEFAULT_BUDGET_H
     protocol = experiment.protocol if budget is None and not has_steps else {}
-    params = checked(experiment.training, {**protocol, **values})
+    params = apply_values(experiment.training, {**protocol, **values})
     frames = TEST_SCANS if scenes.is_simulated else len(scenes.test)
     return ModelRequest(
         experiment.models, params, scenes, out, budget, seeds, device, jobs, min(frames, limit or frames)
@@ -218,7 +218,7 @@ def load_experiment(name: str) -> Experiment:
 
 
 def _split_words(words: tuple[str, ...], data: Path | None) -> tuple[str, Path]:
-    """Return the name of the experiment (the default if not given) and DATA.
+    """Split the arguments into the name of the experiment (or the default one) and DATA.
 
     Raises:
         UsageError: DATA is missing or given twice.

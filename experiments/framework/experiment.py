@@ -1,4 +1,4 @@
-"""Definition of an experiment, and the tables and figures of its report."""
+"""Definitions of an experiment, and of the tables and figures of its report."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cell:
-    """A measured value, its 95 % interval and the paper's value; None for unknown values.
+    """A measured value, its 95 % interval and the paper's value. Unknown values are None.
 
     Values are in the unit of their column, such as percent.
 
@@ -55,7 +55,7 @@ class Line:
 
     Attributes:
         low, high: 95 % interval of y.
-        dashed: Draw a dashed line, for the paper's values.
+        dashed: True to draw a dashed line, as for the paper's values.
     """
 
     label: str
@@ -78,7 +78,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of the report; `name` is the name of the PNG file without suffix."""
+    """A figure of the report. `name` is the name of the PNG file without its suffix."""
 
     name: str
     title: str
@@ -87,7 +87,7 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture in the report: pixels (height, width, 3) uint8; `name` is as in Figure."""
+    """A picture of the report, with pixels (height, width, 3) uint8. `name` is as in Figure."""
 
     name: str
     title: str
@@ -106,23 +106,25 @@ class Section:
 
 @dataclass(frozen=True)
 class Experiment:
-    """An experiment: measures a record per frame, and makes a report from all records.
+    """An experiment, which measures one record per frame and makes a report from all records.
 
     Attributes:
-        measure: measure(frames, i) returns the record of frame i, a JSON-serialisable dict. It may
-            read earlier frames. It raises InputError to skip the frame; the report counts and lists
-            skipped frames.
-        make_sections: make_sections(records) returns the report for the records of all frames, in
-            order. It is also called with the records of unfinished runs, and with an empty list.
-        settings: Everything that the records depend on. A run resumes only with equal settings.
-        training: Parameters of the detectors that the experiment trains; None: it trains none. With
+        measure: Function measure(frames, i) that returns the record of frame i, a JSON-serialisable
+            dict. It may read earlier frames. It raises InputError to skip the frame; the report
+            counts and lists skipped frames.
+        make_sections: Function make_sections(records) that makes the report from the records of all
+            frames, in order. It is also called with the records of unfinished runs, and with an
+            empty list.
+        settings: Everything that the records depend on. A run can only be resumed with equal
+            settings.
+        training: Parameters of the detectors to train, or None if the experiment trains none. With
             training, measure() and make_sections() also get models=, the trained models by name.
-        protocol: Training parameters of the paper, by dotted name. They are used for recorded
-            frames without a budget.
-        models: models(params, seed) returns the detectors to train for a seed, in order of
-            importance.
-        illustrate: illustrate(records, frames) returns sections with pictures of frames. It gets
-            models= too.
+        protocol: Training parameters of the paper, by dotted name. They are used for recordings
+            without a time budget.
+        models: Function models(params, seed) that returns the detectors to train for a seed, the
+            most important ones first.
+        illustrate: Function illustrate(records, frames) that makes sections with pictures of
+            frames. It also gets models=.
         has_models: True if the functions already have their models, see with_models().
 
     The functions are defined at module level, so that worker processes can import them.

@@ -14,7 +14,7 @@ MAX_COLUMNS = 3  # maximum number of panels side by side
 
 
 def encode_figure(figure: Figure | Picture, *, dark: bool = False) -> str:
-    """Return a figure as a data URL for a page."""
+    """Return a figure as a data URL for the HTML page."""
     kind, content = (
         ("png", _encode_picture(figure))
         if isinstance(figure, Picture)
@@ -92,7 +92,7 @@ def draw_figure(figure: Figure, kind: str = "svg", *, dark: bool = False) -> byt
 
 
 def _choose_colors(lines: tuple[Line, ...]) -> list[str]:
-    """Return a colour for each line; a dashed line "a, paper" has the colour of the line "a"."""
+    """Return a colour for each line. A dashed line "a, paper" gets the colour of the line "a"."""
     solid_labels = [line.label for line in lines if not line.dashed]
     color_by_label = {label: COLORS[i % len(COLORS)] for i, label in enumerate(solid_labels)}
     return [

@@ -1,8 +1,8 @@
-"""KITTI's average precision of several detectors on the same frames, with intervals.
+"""KITTI's average precision of several detectors on the same frames, with bootstrap intervals.
 
-measure() of an experiment stores the objects of a frame with to_record(). The report reads them and
-resamples the frames (bootstrap; Efron, 1979). The samples are the same for all detectors, so that
-differences are paired.
+While an experiment measures, it stores the objects of each frame with to_record(). The report reads
+these records and resamples the frames (bootstrap; Efron, 1979). All detectors are resampled in the
+same way, so that differences are paired.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ WIDTHS = {"boxes": 7, "regions": 4}
 
 
 def to_record(objects: CameraObjects) -> dict[str, Any]:
-    """Convert objects to a JSON-serialisable dict, without their observation angles."""
+    """Convert objects to a JSON-serialisable dict. Observation angles are not stored."""
     record = {name: np.round(getattr(objects, name), 4).tolist() for name in COLUMNS}
     if np.isfinite(objects.image_boxes).all():
         record["image_boxes"] = np.round(objects.image_boxes, 2).tolist()
@@ -43,7 +43,7 @@ def to_record(objects: CameraObjects) -> dict[str, Any]:
 
 
 def from_record(record: Mapping[str, Any]) -> CameraObjects:
-    """Convert a record to objects; their observation angles are NaN."""
+    """Convert a record to objects, whose observation angles are NaN."""
     count = len(record["class_ids"])
     columns = {
         name: np.array(record[name], float).reshape(-1, WIDTHS[name])
@@ -51,11 +51,11 @@ def from_record(record: Mapping[str, Any]) -> CameraObjects:
         else np.array(record[name], float)
         for name in COLUMNS
     }
-    pixels = record.get("image_boxes")
+    image_boxes = record.get("image_boxes")
     return CameraObjects(
         columns["class_ids"].astype(np.int32),
         columns["boxes"],
-        np.tile(NO_CAMERA, (count, 1)) if pixels is None else np.array(pixels, float).reshape(-1, 4),
+        np.tile(NO_CAMERA, (count, 1)) if image_boxes is None else np.array(image_boxes, float).reshape(-1, 4),
         np.full(count, np.nan),
         columns["truncated"],
         columns["occluded"].astype(int),
@@ -67,15 +67,19 @@ def from_record(record: Mapping[str, Any]) -> CameraObjects:
 def compare_records(
     label_records: Sequence[Mapping[str, Any]], detection_records: Sequence[Mapping[str, Any]]
 ) -> list[ComparedFrame]:
-    """Compare the records of labels and of detections of the same frames."""
-    return [compare_objects(from_record(t), from_record(f)) for t, f in zip(label_records, detection_records)]
+    """Compare the detections of each frame with its labels. Both arguments have one record per frame."""
+    return [
+        compare_objects(from_record(labels), from_record(detections))
+        for labels, detections in zip(label_records, detection_records)
+    ]
 
 
 def compute_cells(frames: list[ComparedFrame]) -> np.ndarray:
     """Compute the average precision (R40, percent) by PROTOCOLS and CELLS, and its mean.
 
     Returns:
-        (2, 10): one column per cell, and the mean in the last one; NaN for cells without labels.
+        (2, 10), with one column per cell and the mean in the last column; NaN for cells without
+        labels.
     """
     cells = np.full((len(PROTOCOLS), len(CELLS) + 1), np.nan)
     if not frames:
@@ -93,10 +97,10 @@ def compute_cells(frames: list[ComparedFrame]) -> np.ndarray:
 def draw_cells(
     names: Sequence[str], detectors: Mapping[str, list[ComparedFrame]], replicates: int = REPLICATES
 ) -> dict[str, np.ndarray]:
-    """Return the cells of each detector for all frames and for samples of them.
+    """Compute the cells of each detector for all frames and for random samples of the frames.
 
     Args:
-        names: Names of the frames; frames of one drive are drawn together.
+        names: Names of the frames. Frames of one drive are drawn together.
         detectors: Compared frames of each detector, in the order of `names`.
 
     Returns:

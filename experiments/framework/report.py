@@ -22,10 +22,10 @@ from experiments.framework.report_files import REPORT
 from lidar_perception.runs.files import write_bytes, write_text
 
 LEGEND = (
-    "A value, [its 95 % interval] by a bootstrap over frames, and the paper's value. An "
+    "Each cell has a value, [its 95 % interval] by a bootstrap over frames, and the paper's value. An "
     "interval from few frames, or from frames that all agree, is too narrow."
 )
-MAX_ROWS = 30  # longer tables are collapsed in the page
+MAX_ROWS = 30  # longer tables are collapsed in the HTML page
 MAX_NAMES = 10  # maximum number of frame names listed for one reason
 
 
@@ -35,7 +35,7 @@ def write_report(
     """Write report.html, .md and .json, tables/*.csv and figures/*.png into out.
 
     Args:
-        about: Facts about the run, by name.
+        about: Facts about the run, such as the data and the machine, by name.
 
     Returns:
         The path of the HTML page.
@@ -83,7 +83,7 @@ def group_skipped_frames(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def format_cell(cell: Cell) -> tuple[str, str, str]:
-    """Return the value, the interval and the paper's value as text; "" for unknown ones."""
+    """Format the value, the interval and the paper's value of a cell. Unknown ones are empty."""
     value, low, high, paper = (
         None if number is None else f"{number:.{cell.digits}f}"
         for number in (cell.value, cell.low, cell.high, cell.paper)
@@ -92,14 +92,14 @@ def format_cell(cell: Cell) -> tuple[str, str, str]:
 
 
 def is_number(cell: str | Cell) -> bool:
-    """Return True for a numeric cell, which is right-aligned."""
+    """Return True for a cell with a number. Such cells are right-aligned."""
     return isinstance(cell, Cell) or re.fullmatch(r"[-\d.]+", cell) is not None
 
 
 def to_html(
     experiment: Experiment, sections: list[Section], about: dict[str, str], skipped: list[dict[str, Any]]
 ) -> str:
-    """Return the report as one HTML page that needs no other file."""
+    """Return the report as one self-contained HTML page."""
     import jinja2
 
     template = jinja2.Template(
@@ -182,7 +182,9 @@ def to_csv(table: Table) -> str:
         [
             name
             for i, title in enumerate(table.header)
-            for name in ([title, *(f"{title} {end}" for end in ("low", "high", "paper"))] if has_values[i] else [title])
+            for name in (
+                [title, *(f"{title} {suffix}" for suffix in ("low", "high", "paper"))] if has_values[i] else [title]
+            )
         ]
     )
     for row in table.rows:
@@ -205,7 +207,7 @@ def to_csv(table: Table) -> str:
 def to_json_data(value: Any) -> Any:
     """Convert dataclasses to dicts, arrays and tuples to lists, and NaN to None.
 
-    The pixels of pictures are left out, because they are in PNG files.
+    The pixels of pictures are left out, because they are written as PNG files.
     """
     if isinstance(value, Picture):
         return {"name": value.name, "title": value.title}
@@ -223,11 +225,11 @@ def to_json_data(value: Any) -> Any:
 
 
 def print_report(sections: list[Section], skipped: list[dict[str, Any]], console: Console, max_rows: int = 20) -> None:
-    """Print tables with at most max_rows rows, without intervals, and the skipped frames."""
+    """Print the tables that have at most max_rows rows, without intervals, and the skipped frames."""
     for table in (table for section in sections for table in section.tables):
         if len(table.rows) <= max_rows:
             console.print(_make_grid(table))
-    console.print("In brackets: the paper's values. The report has the intervals.", style="dim")
+    console.print("Paper's values in brackets. See the report for intervals.", style="dim")
     for group in skipped:
         console.print(Text("skipped", "yellow") + f" {group['count']}: {group['reason']}")
 

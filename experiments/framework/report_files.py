@@ -6,7 +6,7 @@ import json
 from contextlib import suppress
 from pathlib import Path
 
-REPORT = "report.json"  # written before the tables and figures that it refers to
+REPORT = "report.json"  # written first, because it lists the tables and figures
 PAGES = ("report.html", "report.md", REPORT)
 FOLDERS = {"tables": ".csv", "figures": ".png"}
 
@@ -17,7 +17,7 @@ def list_report_files(folder: Path) -> list[Path]:
     Only tables and figures named in report.json are listed, so that other files are kept.
     """
     names = []
-    with suppress(OSError, ValueError, KeyError, TypeError):  # the report is missing, or not one of ours
+    with suppress(OSError, ValueError, KeyError, TypeError):  # the report is missing or has another format
         report = json.loads((folder / REPORT).read_text())
         names = [
             f"{folder_name}/{Path(item['name']).name}{suffix}"

@@ -1,4 +1,4 @@
-"""Run of an experiment over the frames of a recording, in several processes or on a cluster."""
+"""Running of an experiment over the frames of a recording, in several processes or on a cluster."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ def run_experiment(
     force: bool = False,
     limit: int | None = None,
 ) -> list[dict[str, Any]]:
-    """Measure the first `limit` frames of a recording, or all, and return their records in order.
+    """Measure the frames of a recording, or the first `limit` ones, and return their records in order.
 
-    Every record is written to out/frames.jsonl as soon as it is measured, and an interrupted run
-    resumes there. Apart from measured times, the records do not depend on jobs or dask.
+    Every record is written to out/frames.jsonl as soon as it is measured, so that an interrupted run
+    can be resumed. Apart from measured times, the records do not depend on jobs or dask.
 
     Args:
         jobs, dask: See scoring.run.results.
-        force: Delete the records of another run in out.
+        force: True to delete the records of another run in `out`.
 
     Returns:
-        One record for each frame. A frame that cannot be measured has {"frame": name, "skipped":
-        reason}. Labels without a scan come last.
+        One record for each frame. A frame that cannot be measured has the record {"frame": name,
+        "skipped": reason}. Labels without a scan come last.
 
     Raises:
-        InputError: out contains another run, or a process or the cluster fails.
+        InputError: `out` contains another run, or a process or the cluster fails.
     """
     with _open_run(experiment, recording, out, force) as journal:
         return _measure(experiment, recording, journal, jobs, dask, limit)
@@ -72,7 +72,7 @@ def run_with_models(
         InputError: See run_experiment, plan_training and train_models.
         KeyboardInterrupt: The training was stopped.
     """
-    with _open_run(experiment, recording, request.out, force, request.settings()) as journal:
+    with _open_run(experiment, recording, request.out, force, request.collect_settings()) as journal:
         trained_experiment = experiment.with_models(train_models(request, plan_training(request)))
         return trained_experiment, _measure(trained_experiment, recording, journal, request.jobs, dask, limit)
 
@@ -81,7 +81,7 @@ def run_with_models(
 def _open_run(
     experiment: Experiment, recording: Recording, out: Path, force: bool, training: dict[str, Any] | None = None
 ) -> Iterator[Journal]:
-    """Open the journal in out, see run_experiment."""
+    """Open the journal of the run in `out`, see run_experiment."""
     names = [frame.name for frame in recording]
     path = recording.path.resolve() if recording.path.exists() else recording.path  # a simulated data set has no path
     plan = {
@@ -100,7 +100,7 @@ def _open_run(
 def _measure(
     experiment: Experiment, recording: Recording, journal: Journal, jobs: int, dask: str | None, limit: int | None
 ) -> list[dict[str, Any]]:
-    """Measure the frames that the journal lacks, and return all records, see run_experiment."""
+    """Measure the frames that are not yet in the journal, and return all records, see run_experiment."""
     names = [frame.name for frame in recording]
     with threadpool_limits(1):
         fill_journal(

@@ -1,6 +1,6 @@
-"""Disjoint scenes of an experiment for training, validation and test.
+"""Disjoint scenes for the training, validation and test of an experiment.
 
-The scenes are simulated, or the frames of a labelled recording.
+The scenes are either simulated, or frames of a labelled recording.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from lidar_perception.runs.resuming import hash_names
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training.frames import LabelledFrames, open_labelled_frames
-from lidar_perception.training.params import PAPER_SHARE
+from lidar_perception.training.params import PAPER_VAL_FRACTION
 from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.training.sources import SIM
 from lidar_perception.types import InputError
 
-FIRST_TEST_SCENE = 40_000_000  # first seed; no training uses seeds near it
+FIRST_TEST_SCENE = 40_000_000  # seed of the first test scene, far from the seeds used for training
 TEST_SCANS = 120
 SPLIT_SEED = 0
 
@@ -37,7 +37,7 @@ class ExperimentScenes:
     Attributes:
         data: Path of a recording, or "sim".
         train, val, test: Names of the frames; empty for simulated scenes.
-        height: Height of the sensor above the ground in metres; None: as in the recording.
+        height: Height of the sensor above the ground in metres; None uses that of the recording.
     """
 
     data: str
@@ -52,12 +52,12 @@ class ExperimentScenes:
 
         Args:
             data: Path of a recording, or "sim".
-            test: File that lists the test frames; None: the same fraction as for validation.
-                KITTI's own test frames have no public labels.
+            test: File that lists the test frames. None draws as many frames as for validation,
+                because KITTI's own test frames have no public labels.
 
         Raises:
-            InputError: There are fewer than three labelled frames, a name is unknown, or simulated
-                scenes are to be split.
+            InputError: There are fewer than three labelled frames, a name is unknown, or `test` is
+                given for simulated scenes.
         """
         if data == SIM:
             if test is not None:
@@ -66,40 +66,42 @@ class ExperimentScenes:
         path = Path(data)
         frames = open_labelled_frames(path)
         if test is None:
-            training_frames, test_frames = frames.split(PAPER_SHARE, SPLIT_SEED)
+            training_frames, test_frames = frames.split(PAPER_VAL_FRACTION, SPLIT_SEED)
         else:
             test_frames = open_labelled_frames(path, test)
             training_frames = frames.exclude([test_frames], "train on")
-        train, val = training_frames.split(PAPER_SHARE * len(frames.frames) / len(training_frames.frames), SPLIT_SEED)
+        train, val = training_frames.split(
+            PAPER_VAL_FRACTION * len(frames.frames) / len(training_frames.frames), SPLIT_SEED
+        )
         return ExperimentScenes(data, _list_names(train), _list_names(val), _list_names(test_frames), frames.height)
 
     @property
     def is_simulated(self) -> bool:
         return self.data == SIM
 
-    def settings(self) -> dict[str, Any]:
-        """Return the identity of these scenes, for the settings of a run."""
+    def describe(self) -> dict[str, Any]:
+        """Return a description that identifies these scenes, for the settings of a run."""
         return {
             "data": self.data if self.is_simulated else str(Path(self.data).resolve()),
             **{name: hash_names(getattr(self, name)) for name in ("train", "val", "test")},
         }
 
-    def select_labelled(self, share: float) -> tuple[str, ...]:
-        """Return a fraction of the training frames; smaller fractions are subsets of larger ones."""
+    def select_labelled(self, fraction: float) -> tuple[str, ...]:
+        """Return a random fraction of the training frames. Smaller fractions are subsets of larger ones."""
         order = np.random.default_rng(SPLIT_SEED).permutation(len(self.train))
-        count = max(1, round(share * len(self.train)))
+        count = max(1, round(fraction * len(self.train)))
         return tuple(self.train[i] for i in np.sort(order[:count]))
 
-    def write_splits(self, folder: Path, share: float) -> tuple[Path, Path] | tuple[None, None]:
-        """Write files that list a fraction of the training frames, and the validation frames.
+    def write_splits(self, folder: Path, fraction: float) -> tuple[Path, Path] | tuple[None, None]:
+        """Write two files that list a fraction of the training frames, and the validation frames.
 
         Returns:
             The two files; None for simulated scenes.
         """
         if self.is_simulated:
             return None, None
-        files = folder / f"train-{100 * share:g}.txt", folder / "val.txt"
-        for file, names in zip(files, (self.select_labelled(share), self.val)):
+        files = folder / f"train-{100 * fraction:g}.txt", folder / "val.txt"
+        for file, names in zip(files, (self.select_labelled(fraction), self.val)):
             write_text(file, "\n".join(names))
         return files
 
@@ -108,32 +110,32 @@ class ExperimentScenes:
 
         Args:
             params: Training parameters, which define the simulated sensor and scenes.
-            cache: Folder of simulated scans.
-            count: Number of simulated scans, each in a different scene.
+            cache: Folder in which simulated scans are cached.
+            count: Number of simulated scans, each from a different scene.
         """
         if self.is_simulated:
-            return open_simulated(params, cache, count)
-        return open_selected(Path(self.data), self.test, self.height)
+            return open_simulated_scans(params, cache, count)
+        return open_selected_frames(Path(self.data), self.test, self.height)
 
 
 def _list_names(frames: LabelledFrames) -> tuple[str, ...]:
     return tuple(frame.name for frame in frames.frames)
 
 
-def open_selected(path: Path, names: Sequence[str], height: float | None) -> Recording:
-    """Open the frames of a recording with these names."""
+def open_selected_frames(path: Path, names: Sequence[str], height: float | None) -> Recording:
+    """Open a recording with only the frames that have these names."""
     recording = open_recording(path, sensor_height=height)
     frames = {frame.name: frame for frame in recording.frames[:]}
     return replace(
         recording,
         frames=[frames[name] for name in names],
         missing_scans=(),
-        reopen=partial(open_selected, path, names, height),
+        reopen=partial(open_selected_frames, path, names, height),
     )
 
 
-def open_simulated(params: Any, folder: Path, count: int) -> Recording:
-    """Return simulated test scans as a recording; each is computed once and cached on disk."""
+def open_simulated_scans(params: Any, folder: Path, count: int) -> Recording:
+    """Return simulated test scans as a recording. Each scan is computed once and cached on disk."""
     scenes = Scenes(None, params.data.val_people, params.scene)
     source = SimulatedScenes(
         FIRST_TEST_SCENE,
@@ -142,7 +144,7 @@ def open_simulated(params: Any, folder: Path, count: int) -> Recording:
         scenes,
         folder,
         params.data.cache_gb,
-        around=getattr(params, "range", "") == "around",
+        all_around=getattr(params, "range", "") == "around",
     )
     has = frozenset({BOXES, CAMERA} if scenes.camera else {BOXES})
     return Recording(
@@ -150,7 +152,7 @@ def open_simulated(params: Any, folder: Path, count: int) -> Recording:
         f"simulated {params.scene}",
         TestFrames(source),
         has,
-        reopen=partial(open_simulated, params, folder, count),
+        reopen=partial(open_simulated_scans, params, folder, count),
         is_sequential=False,
     )
 
@@ -167,13 +169,13 @@ class TestFrames(ComputedFrames):
         return len(self.source)
 
     def compute_frame(self, number: int) -> Frame:
-        read = cache(partial(self.source.frame, number))
-        scene, _ = self.source.locate(number)
+        load_frame = cache(partial(self.source.load_frame, number))
+        seed, _ = self.source.locate(number)
         return Frame(
-            f"scene {scene}",
+            f"scene {seed}",
             0,
-            lambda: read().load(),
-            lambda: read().truth(),
-            calibration=lambda: read().calibration(),
+            lambda: load_frame().load(),
+            lambda: load_frame().truth(),
+            calibration=lambda: load_frame().calibration(),
             sensor_height=self.source.sensor.height,
         )

@@ -9,16 +9,16 @@ import numpy as np
 
 from experiments.framework.experiment import Cell, Line
 
-MAX_DRAWS = 4_000_000  # maximum number of frames drawn at once; bounds the memory
+MAX_DRAWS = 4_000_000  # maximum number of frames drawn at once, to limit the memory
 
 
 @dataclass(frozen=True)
 class BootstrapParams:
-    """Parameters of the intervals.
+    """Parameters of bootstrap intervals.
 
     Attributes:
         replicates: Number of bootstrap samples.
-        level: Fraction of the replicates within the interval.
+        level: Fraction of the samples within the interval.
     """
 
     replicates: int = 2000
@@ -33,12 +33,12 @@ def bootstrap(
 
     Args:
         counts: (F, *C) counts of F frames.
-        compute: Converts sums of counts over frames (..., *C) to values (..., *V); NaN for a value
-            without cases.
+        compute: Function from sums of counts over frames (..., *C) to values (..., *V). It returns
+            NaN for a value without cases.
 
     Returns:
         (3, *V) float64: the value for all frames, and the low and high end of its interval; NaN if
-        undefined. Replicates without cases are ignored.
+        undefined. Samples without cases are ignored.
     """
     counts = np.asarray(counts, np.float64)
     frames, shape = len(counts), counts.shape[1:]
@@ -69,38 +69,37 @@ def compute_paired_p(
 
     Args:
         counts: (F, 2, *C) counts of both methods.
-        compute: see bootstrap().
+        compute: See bootstrap().
 
     Returns:
-        (*V) float64; NaN for values without cases, and without frames.
+        (*V) float64; NaN for values without cases, or if there are no frames.
     """
     counts = np.asarray(counts, np.float64)
     frames, shape = len(counts), counts.shape[2:]
     flat = counts.reshape(frames, 2, int(np.prod(shape)))
-    total, change = flat.sum(axis=(0, 1)), flat[:, 0] - flat[:, 1]
+    total, swap_change = flat.sum(axis=(0, 1)), flat[:, 0] - flat[:, 1]
 
-    def difference(first: np.ndarray) -> np.ndarray:
-        rows = first.shape[:-1]
-        return compute(first.reshape(*rows, *shape)) - compute((total - first).reshape(*rows, *shape))
+    def compute_difference(first_sums: np.ndarray) -> np.ndarray:
+        rows = first_sums.shape[:-1]
+        return compute(first_sums.reshape(*rows, *shape)) - compute((total - first_sums).reshape(*rows, *shape))
 
-    observed = np.abs(difference(flat[:, 0].sum(axis=0)))
+    observed = np.abs(compute_difference(flat[:, 0].sum(axis=0)))
     if frames == 0:
         return np.full(observed.shape, np.nan)
     rng, count_at_least = np.random.default_rng(params.seed), np.ones(observed.shape)
-    step = max(1, MAX_DRAWS // frames)
-    for first in range(0, params.replicates, step):
-        is_swapped = rng.random((min(step, params.replicates - first), frames)) < 0.5
-        differences = np.abs(difference(flat[:, 0].sum(axis=0) - is_swapped @ change))
+    batch_size = max(1, MAX_DRAWS // frames)
+    for start in range(0, params.replicates, batch_size):
+        is_swapped = rng.random((min(batch_size, params.replicates - start), frames)) < 0.5
+        differences = np.abs(compute_difference(flat[:, 0].sum(axis=0) - is_swapped @ swap_change))
         count_at_least += (differences >= observed - 1e-12).sum(axis=0)
     return np.where(np.isnan(observed), np.nan, count_at_least / (params.replicates + 1))
 
 
 def estimate(draws: np.ndarray, level: float = BootstrapParams.level) -> np.ndarray:
-    """Return values with their intervals (3, *V), like bootstrap(), from replicates.
+    """Return values with their intervals (3, *V), as bootstrap() does, from values of samples.
 
     Args:
-        draws: (1 + R, *V): the values of all frames, then those of R samples of the frames; NaN if
-            undefined.
+        draws: (1 + R, *V) values of all frames, then of R samples of the frames; NaN if undefined.
     """
     if len(draws) == 1:
         return np.stack([draws[0], *np.full((2, *draws[0].shape), np.nan)])
@@ -113,11 +112,10 @@ def compute_sampled_p(draws: np.ndarray) -> float:
     It is twice the fraction of the samples on the other side of 0, at least 2 / (R + 1).
 
     Args:
-        draws: (1 + R,) differences, see estimate(). Both parts of a difference come from the same
-            frames.
+        draws: (1 + R,) differences between two methods on the same frames, see estimate().
 
     Returns:
-        The p value; NaN without samples.
+        The p value; NaN if there are no samples.
     """
     samples = draws[1:][~np.isnan(draws[1:])]
     if len(samples) == 0 or np.isnan(draws[0]):
@@ -127,24 +125,24 @@ def compute_sampled_p(draws: np.ndarray) -> float:
 
 
 def _compute_limits(replicates: np.ndarray, level: float) -> np.ndarray:
-    """Return the ends (2, *V) of the interval of replicates (R, *V); NaN where all are NaN."""
-    empty = np.isnan(replicates).all(axis=0)
+    """Return the ends (2, *V) of the interval of replicates (R, *V), NaN where all replicates are NaN."""
+    is_all_nan = np.isnan(replicates).all(axis=0)
     ends = np.nanpercentile(
-        np.where(empty, 0.0, replicates),  # avoids NumPy's warning about all-NaN columns
+        np.where(is_all_nan, 0.0, replicates),  # avoids NumPy's warning about all-NaN columns
         [50 - 50 * level, 50 + 50 * level],
         axis=0,
     )
-    return np.where(empty, np.nan, ends)
+    return np.where(is_all_nan, np.nan, ends)
 
 
 def divide(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
-    """Return numerator / denominator; NaN where the denominator is 0."""
+    """Return numerator / denominator, or NaN where the denominator is 0."""
     numerator, denominator = np.broadcast_arrays(np.asarray(numerator, float), np.asarray(denominator, float))
     return np.divide(numerator, denominator, out=np.full(numerator.shape, np.nan), where=denominator != 0)
 
 
 def compute_rates(tp: np.ndarray, fp: np.ndarray, fn: np.ndarray) -> np.ndarray:
-    """Compute recall, precision and F1 (..., 3), in percent, from counts (...,); NaN without cases."""
+    """Compute recall, precision and F1 (..., 3), in percent, from counts (...,). NaN if there are no cases."""
     return 100 * np.stack([divide(tp, tp + fn), divide(tp, tp + fp), divide(2 * tp, 2 * tp + fp + fn)], axis=-1)
 
 
@@ -155,7 +153,7 @@ def make_cells(
 
     Args:
         paper: The paper's values in the same order; empty if unknown.
-        digits: Number of decimals of each value, or of all.
+        digits: Number of decimals of each value, or one number for all.
     """
     count = estimates.shape[1]
     paper = [*paper] or [None] * count
@@ -173,7 +171,7 @@ def make_line(label: str, x: Iterable[float], estimates: np.ndarray) -> Line:
 
 
 def stack_counts(rows: list, *shape: int) -> np.ndarray:
-    """Stack one entry per frame to (F, *shape) float64; F may be 0."""
+    """Stack one entry per frame to an array (F, *shape) float64. F may be 0."""
     return np.array(rows, np.float64).reshape(len(rows), *shape)
 
 

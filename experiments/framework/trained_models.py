@@ -1,10 +1,10 @@
-"""Training of an experiment's detectors: on the same scenes, within one budget, each only once.
+"""Training of all detectors of an experiment on the same scenes and within one time budget.
 
-    plan = plan_training(models, request)           # measured once, then read from a file
-    trained = train_models(models, request, plan)   # a finished model is not trained again
+    plan = plan_training(request)           # measured once, then read from a file
+    trained = train_models(request, plan)   # a finished model is not trained again
 
-Every model has a folder out/models/NAME-HASH with the hash of its configuration. An interrupted run
-resumes there.
+Every model has a folder out/models/NAME-HASH, where HASH is the hash of its configuration. An
+interrupted run is resumed there.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.runs.files import read_text, write_text
 from lidar_perception.runs.terminal import errors, format_duration
 from lidar_perception.training.params import PointNetTraining, PointPillarsTraining
-from lidar_perception.training.plan import Plan, Speed, fit_plan, training_durations
+from lidar_perception.training.plan import Plan, Speed, estimate_training_durations, fit_plan
 from lidar_perception.training.request import TrainingRequest
 from lidar_perception.types import InputError
 
 Training = PointPillarsTraining | PointNetTraining
 DEFAULT_BUDGET_H = 2.0  # default training budget with simulated scans
 MAX_SEEDS = 3
-STEPS_PER_SEED = 4000  # steps per model above which another seed is worth more
-MIN_MODEL_STEPS = 1000  # steps per model below which models that are not required are left out
+STEPS_PER_SEED = 4000  # if more steps per model fit into the budget, another seed is trained instead
+MIN_MODEL_STEPS = 1000  # if fewer steps per model fit into the budget, optional models are left out
 NORM_STATISTICS = ("running_mean", "running_var", "num_batches_tracked")
 
 
@@ -59,7 +59,7 @@ class TrainedModel:
 
     Attributes:
         weights: Checkpoint with the best validation score.
-        steps, seconds: Length of the training.
+        steps, seconds: Duration of the training.
         best_step: Step of the checkpoint.
         scenes: Number of training scenes.
         parameters: Number of learned parameters.
@@ -79,14 +79,15 @@ class ModelRequest:
     """Request to train the models of an experiment.
 
     Attributes:
-        models: models(params, seed) returns the models of a seed, in order of importance.
-        params: Training parameters of all models, with those given by the user.
-        scenes: The scenes.
+        models: Function models(params, seed) that returns the models of a seed, the most important
+            ones first.
+        params: Training parameters of all models, including those set by the user.
+        scenes: Scenes for training, validation and test.
         out: Folder of the experiment.
-        budget: Hours for everything; None: no limit, the parameters give the number of steps.
-        seeds: Number of seeds; None: up to MAX_SEEDS, so that each gets at least STEPS_PER_SEED
-            steps.
-        test_frames: Number of frames to measure afterwards.
+        budget: Time budget in hours for training and measuring. None: no limit; the parameters give
+            the number of steps.
+        seeds: Number of seeds. None: as many as get STEPS_PER_SEED steps each, up to MAX_SEEDS.
+        test_frames: Number of frames to measure after the training.
     """
 
     models: Callable[[Any, int], Sequence[Model]]
@@ -104,18 +105,18 @@ class ModelRequest:
         """Folder of all trained models."""
         return self.out / "models"
 
-    def settings(self) -> dict[str, Any]:
+    def collect_settings(self) -> dict[str, Any]:
         """Return everything that the trained models depend on, except this machine's speed."""
         return {
-            "params": self.params.fixed_settings(),
-            "scenes": self.scenes.settings(),
+            "params": self.params.get_fixed_settings(),
+            "scenes": self.scenes.describe(),
             "budget": self.budget,
             "seeds": self.seeds,
             "version": __version__,
         }
 
-    def to_training(self, model: Model, folder: Path) -> TrainingRequest:
-        """Return the training request for one model."""
+    def to_training_request(self, model: Model, folder: Path) -> TrainingRequest:
+        """Return the request to train one model in this folder."""
         split, val_split = self.scenes.write_splits(self.folder, model.label_share)
         return TrainingRequest(
             (self.scenes.data,),
@@ -132,14 +133,14 @@ class ModelRequest:
 
 @dataclass(frozen=True)
 class SharedPlan:
-    """Training plan that is shared by all models.
+    """Training plan shared by all models.
 
     Attributes:
         values: Training parameters by dotted name.
         seeds: Number of seeds.
-        durations: Expected training time of each model in seconds, by name; models that are not
-            trained are missing.
-        speeds: Measured durations of these models, by name.
+        durations: Expected training time of each model in seconds, by name. It does not contain
+            models that are not trained.
+        speeds: Measured speed of these models, by name.
     """
 
     values: dict[str, Any]
@@ -159,12 +160,12 @@ class SharedPlan:
 
 
 def plan_training(request: ModelRequest) -> SharedPlan:
-    """Return the plan of an experiment; it is measured once and then read from a file.
+    """Make the training plan of an experiment, or read it from a file if it was made before.
 
     Raises:
         InputError: The budget is too short, or no scene is usable.
     """
-    file = request.folder / f"plan-{_hash(request.settings())}.json"
+    file = request.folder / f"plan-{_hash(request.collect_settings())}.json"
     if file.exists():
         content = json.loads(read_text(file))
         speeds = {name: Speed(**speed) for name, speed in content.pop("speeds").items()}
@@ -183,7 +184,7 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
     from lidar_perception.training.trainers import make_trainer
 
     params, device = request.params, torch.device(find_device(request.device))
-    errors.print("measuring this machine with a few scenes of each network ...")
+    errors.print("benchmarking this machine on a few scenes of each network ...")
     models = request.models(params, 0)
     speed_by_params: dict[Any, Speed] = {}
     reduced: dict[str, Any] = {}
@@ -194,7 +195,7 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
             trainer = make_trainer(model.params)
             planner = Planner(
                 trainer,
-                request.to_training(model, request.folder),
+                request.to_training_request(model, request.folder),
                 model.params,
                 find_sensor(model.params.sensor, model.params.mount_height),
                 device,
@@ -202,12 +203,12 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
             sources = planner.open_few_scenes()
             speed_by_params[key] = planner.measure_speed(*sources)
             if model.label_share == 1.0 and data is None:
-                data, reduced = planner.count_scenes(*sources), trainer.reduced_range(params)
-    assert data is not None, "an experiment needs a model with all labels"
+                data, reduced = planner.count_scenes(*sources), trainer.find_reduced_range(params)
+    assert data is not None, "an experiment requires a model that is trained with all labels"
     speeds = {model.name: speed_by_params[replace(model.params, seed=0)] for model in models}
-    requested = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps, bool(reduced))
+    user_plan = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps, bool(reduced))
 
-    def fit(seeds: int) -> Plan:
+    def fit_seeds(seeds: int) -> Plan:
         hours = request.budget or DEFAULT_BUDGET_H
         measuring_s = request.test_frames * sum(s.frame for s in speeds.values()) / request.jobs
         return fit_plan(
@@ -215,29 +216,30 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
             request.jobs,
             _add_speeds(list(speeds.values()) * seeds),
             data,
-            requested,
+            user_plan,
             params.epochs,
         )
 
-    optional = [] if params.steps or params.epochs else [model for model in models if not model.required]
+    optional_models = [] if params.steps or params.epochs else [model for model in models if not model.required]
     while True:
         try:
-            plan = fit(request.seeds or 1)
-            if plan.steps >= MIN_MODEL_STEPS or not optional:
+            plan = fit_seeds(request.seeds or 1)
+            if plan.steps >= MIN_MODEL_STEPS or not optional_models:
                 break
         except InputError:
-            if not optional:
+            if not optional_models:
                 raise
-        last = optional.pop()
-        del speeds[last.name]
-        while optional and optional[-1].label_share == last.label_share < 1.0:  # compared with each other
-            del speeds[optional.pop().name]
+        dropped_model = optional_models.pop()
+        del speeds[dropped_model.name]
+        # Models with the same fraction of the labels are compared with each other, so all of them are dropped.
+        while optional_models and optional_models[-1].label_share == dropped_model.label_share < 1.0:
+            del speeds[optional_models.pop().name]
     seeds = request.seeds or min(max(plan.steps // STEPS_PER_SEED, 1), MAX_SEEDS)
     if seeds > (request.seeds or 1):
-        plan = fit(seeds)
+        plan = fit_seeds(seeds)
     if params.validate_epochs and not params.validate_steps:
         epoch = max(1, round((plan.scans + data.recorded) / data.batch))
-        plan = replace(plan, validate_steps=params.validation_steps(epoch))
+        plan = replace(plan, validate_steps=params.compute_validation_steps(epoch))
     values = {
         "steps": plan.steps,
         "validate_steps": plan.validate_steps,
@@ -245,9 +247,9 @@ def _make_plan(request: ModelRequest) -> SharedPlan:
         "data.val_scans": plan.val_scans,
         **(reduced if plan.part else {}),
     }
-    durations = {name: sum(training_durations(plan, speed, data)) for name, speed in speeds.items()}
+    durations = {name: sum(estimate_training_durations(plan, speed, data)) for name, speed in speeds.items()}
     errors.print(
-        f"{seeds} x {len(speeds)} networks of {plan.steps} steps: about "
+        f"training {seeds} x {len(speeds)} networks for {plan.steps} steps each: about "
         + format_duration(seeds * sum(durations.values()))
     )
     return SharedPlan(values, seeds, durations, speeds)
@@ -269,10 +271,10 @@ def train_models(request: ModelRequest, plan: SharedPlan) -> dict[str, TrainedMo
     """Train all models, or as many as fit into the budget, and return them by name.
 
     Raises:
-        KeyboardInterrupt: The run was stopped; it resumes with the same request.
+        KeyboardInterrupt: The run was stopped. The same request resumes it.
         InputError: A network cannot be trained.
     """
-    limit = math.inf if request.budget is None else 3600 * request.budget
+    limit_s = math.inf if request.budget is None else 3600 * request.budget
     trained: dict[str, TrainedModel] = {}
     for seed in range(plan.seeds):
         for first_model, model in zip(request.models(request.params, 0), request.models(request.params, seed)):
@@ -282,14 +284,14 @@ def train_models(request: ModelRequest, plan: SharedPlan) -> dict[str, TrainedMo
             planned_model = plan.apply(model)
             folder = request.folder / _name_folder(planned_model, request.scenes)
             if not (folder / "last.safetensors").exists():
-                spent_s = sum(done.seconds for done in trained.values())
-                optional = seed > 0 or not model.required
-                if optional and spent_s + plan.durations[first_model.name] > limit:
+                spent_s = sum(trained_model.seconds for trained_model in trained.values())
+                is_optional = seed > 0 or not model.required
+                if is_optional and spent_s + plan.durations[first_model.name] > limit_s:
                     errors.print(f"{model.name} is skipped because the budget is used up")
                     continue
                 errors.print(f"training {model.name}", style="bold")
                 _train(planned_model, request, folder, plan.speeds[first_model.name])
-            trained[model.name] = read_trained(planned_model, folder)
+            trained[model.name] = read_trained_model(planned_model, folder)
     return trained
 
 
@@ -299,13 +301,14 @@ def _train(model: Model, request: ModelRequest, folder: Path, speed: Speed) -> N
     from lidar_perception.training.trainers import make_trainer
 
     params = with_values(model.params, {"data.cache": str(request.out / "scans")})
-    result = start_training(make_trainer(params), request.to_training(model, folder), params, find_commit(), speed)
+    training_request = request.to_training_request(model, folder)
+    result = start_training(make_trainer(params), training_request, params, find_commit(), speed)
     if result is not None and result.progress.stopped:
         errors.print("stopped; run the same command again to resume")
         raise KeyboardInterrupt
 
 
-def read_trained(model: Model, folder: Path) -> TrainedModel:
+def read_trained_model(model: Model, folder: Path) -> TrainedModel:
     """Read the result of a finished training."""
     from lidar_perception.detectors.checkpoint import read_header
 
@@ -337,8 +340,8 @@ def count_parameters(weights: Path) -> int:
 def _name_folder(model: Model, scenes: ExperimentScenes) -> str:
     """Return the name of a model's folder, which depends on its entire training configuration."""
     settings = {
-        "params": model.params.fixed_settings(),
-        "scenes": scenes.settings(),
+        "params": model.params.get_fixed_settings(),
+        "scenes": scenes.describe(),
         "labelled": model.label_share,
         "version": __version__,
     }

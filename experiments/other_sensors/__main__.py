@@ -1,4 +1,4 @@
-"""python -m experiments.other_sensors: count found, false and missed objects by data set."""
+"""python -m experiments.other_sensors: count true positives, false positives and misses by data set."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ from lidar_perception.types import InputError
     help="Also evaluate KITTI object frames, with changed intensity.",
 )
 def main(data: Path, weights: str, min_score: float | None, kitti: Path | None) -> None:
-    """Count found / false / missed objects of DATA/DATASET/*.npz, as recorded and without
-    intensity.
+    """Count true positives / false positives / misses in DATA/DATASET/*.npz, with and without intensity.
 
     \b
     Example:
@@ -39,13 +38,14 @@ def main(data: Path, weights: str, min_score: float | None, kitti: Path | None) 
         sums = count_all(detector, clouds, with_intensity)
         click.echo("as recorded" if with_intensity else "without intensity")
         for dataset in sorted({dataset for dataset, _ in sums}):
-            click.echo(f"  {dataset:14}" + "".join(_cell(name, sums.get((dataset, name))) for name in MAX_DISTANCE_M))
-        total = {
-            name: sum((counts for (_, own), counts in sums.items() if own == name), Counts()) for name in MAX_DISTANCE_M
+            cells = (_format_cell(name, sums.get((dataset, name))) for name in MAX_DISTANCE_M)
+            click.echo(f"  {dataset:14}" + "".join(cells))
+        totals = {
+            name: sum((counts for (_, class_name), counts in sums.items() if class_name == name), Counts())
+            for name in MAX_DISTANCE_M
         }
-        click.echo(
-            "  all           " + "".join(f"{_cell(name, counts)} F1 {counts.f1:4.1f}" for name, counts in total.items())
-        )
+        cells = (f"{_format_cell(name, counts)} F1 {counts.f1:4.1f}" for name, counts in totals.items())
+        click.echo("  all           " + "".join(cells))
     if kitti is None:
         return
     for title, change in CHANGES.items():
@@ -53,7 +53,7 @@ def main(data: Path, weights: str, min_score: float | None, kitti: Path | None) 
         click.echo(f"KITTI, intensity {title}: " + ", ".join(f"{name} {value:.1f}" for name, value in scores.items()))
 
 
-def _cell(name: str, counts: Counts | None) -> str:
+def _format_cell(name: str, counts: Counts | None) -> str:
     text = "" if counts is None else f"{counts.found} / {counts.false} / {counts.missed}"
     return f"  {name} {text:16}"
 

@@ -1,4 +1,4 @@
-"""Found, false and missed objects of a detector on the frames of other sensors."""
+"""True positives, false positives and misses of a detector on frames of other sensors."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.geometry import centre_distances
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, PointCloud
 
-MAX_RANGE_M, MIN_POINTS = 40.0, 10  # limits of the objects that must be detected
-# Maximum distance from a detection's centre to its label.
+MAX_RANGE_M, MIN_POINTS = 40.0, 10  # objects farther away or with fewer points are ignored
+# Maximum distance between the centres of a detection and of its label.
 MAX_DISTANCE_M = {"Pedestrian": 1.0, "Cyclist": 1.0, "Car": 2.0}
 # Data set -> classes that it does not label.
 UNLABELLED = {"nuscenes_seg": ("Car", "Cyclist"), "aachen": ("Car", "Cyclist"), "logictronix": ("Cyclist",)}
@@ -24,9 +24,11 @@ class LabelledCloud:
     """A cloud with labels, raised so that the ground is SENSOR_HEIGHT below the origin.
 
     Attributes:
-        dataset, name: folder and file.
-        cloud: the cloud, with an intensity.
-        boxes: (K, 7) labelled boxes; names (K,) their classes; points (K,) points in each.
+        dataset, name: Names of the folder and of the file.
+        cloud: Cloud with intensity.
+        boxes: (K, 7) labelled boxes.
+        names: (K,) class of each box.
+        points: (K,) number of points in each box.
     """
 
     dataset: str
@@ -39,7 +41,7 @@ class LabelledCloud:
 
 @dataclass
 class Counts:
-    """Objects found, false detections and objects missed; scores of detections, right or not."""
+    """Numbers of true positives, false positives and misses."""
 
     found: int = 0
     false: int = 0
@@ -50,7 +52,7 @@ class Counts:
 
     @property
     def f1(self) -> float:
-        """F1 in percent, NaN without objects and detections."""
+        """F1 in percent; NaN if there are neither objects nor detections."""
         total = 2 * self.found + self.false + self.missed
         return 200 * self.found / total if total else float("nan")
 
@@ -58,51 +60,51 @@ class Counts:
 def read_clouds(folder: Path) -> Iterator[LabelledCloud]:
     """Yield the labelled clouds of folder/DATASET/*.npz, in the order of their paths.
 
-    The height of the sensor is that of the median labelled box that counts.
+    The median height of the bottoms of the labelled boxes is taken as the ground.
     """
     for path in sorted(folder.glob("*/*.npz")):
         with np.load(path, allow_pickle=False) as file:
             points, boxes, names, num = (file[key] for key in ("points", "boxes", "labels", "num"))
-        counted = _is_counted(boxes, num)
-        bottoms = boxes[counted if counted.any() else slice(None)]
-        lift = -SENSOR_HEIGHT - np.median(bottoms[:, 2] - bottoms[:, 5] / 2)
-        boxes = boxes + np.array([0, 0, lift, 0, 0, 0, 0])
-        cloud = PointCloud(points[:, :3] + np.array([0, 0, lift], np.float32), np.ascontiguousarray(points[:, 3]))
+        is_counted = _is_counted(boxes, num)
+        counted_boxes = boxes[is_counted if is_counted.any() else slice(None)]
+        shift = -SENSOR_HEIGHT - np.median(counted_boxes[:, 2] - counted_boxes[:, 5] / 2)
+        boxes = boxes + np.array([0, 0, shift, 0, 0, 0, 0])
+        cloud = PointCloud(points[:, :3] + np.array([0, 0, shift], np.float32), np.ascontiguousarray(points[:, 3]))
         yield LabelledCloud(path.parent.name, path.stem, cloud, boxes, names.astype(str), num)
 
 
 def count_detections(labelled: LabelledCloud, detections: Detections) -> dict[str, Counts]:
-    """Return the counts of each labelled class.
+    """Count true positives, false positives and misses of each labelled class.
 
-    The best detection within MAX_DISTANCE_M of an object finds it. Detections beyond MAX_RANGE_M
-    and those at an object with few points or far away do not count.
+    An object is matched by the detection with the highest score within MAX_DISTANCE_M. Ignored are
+    objects with few points or far away, detections near them, and detections beyond MAX_RANGE_M.
     """
     counts = {}
-    counted = _is_counted(labelled.boxes, labelled.points)
+    is_counted = _is_counted(labelled.boxes, labelled.points)
     for name, limit in MAX_DISTANCE_M.items():
         if name in UNLABELLED.get(labelled.dataset, ()):
             continue
-        own = detections[detections.class_ids == CLASSES.index(name)]
-        own = own[np.argsort(-own.scores, kind="stable")]
+        class_detections = detections[detections.class_ids == CLASSES.index(name)]
+        class_detections = class_detections[np.argsort(-class_detections.scores, kind="stable")]
         labels = np.flatnonzero(labelled.names == name)
-        near = centre_distances(own.boxes, labelled.boxes[labels])
-        taken = np.zeros(len(labels), bool)
-        false = 0
-        for row, box in zip(near, own.boxes):
-            free = np.flatnonzero((row <= limit) & ~taken)
-            if len(free):
-                taken[free[row[free].argmin()]] = True
+        distances = centre_distances(class_detections.boxes, labelled.boxes[labels])
+        is_matched = np.zeros(len(labels), bool)
+        false_positives = 0
+        for row, box in zip(distances, class_detections.boxes):
+            unmatched = np.flatnonzero((row <= limit) & ~is_matched)
+            if len(unmatched):
+                is_matched[unmatched[row[unmatched].argmin()]] = True
             elif np.hypot(box[0], box[1]) < MAX_RANGE_M and not (row <= limit).any():
-                false += 1
-        found = int((taken & counted[labels]).sum())
-        counts[name] = Counts(found, false, int(counted[labels].sum()) - found)
+                false_positives += 1
+        true_positives = int((is_matched & is_counted[labels]).sum())
+        counts[name] = Counts(true_positives, false_positives, int(is_counted[labels].sum()) - true_positives)
     return counts
 
 
 def count_all(
     detector: Detector, clouds: list[LabelledCloud], with_intensity: bool = True
 ) -> dict[tuple[str, str], Counts]:
-    """Return the counts by (data set, class), with the intensity as recorded or without."""
+    """Return the counts by (data set, class), with the recorded intensity or without intensity."""
     sums: dict[tuple[str, str], Counts] = {}
     for labelled in clouds:
         cloud = labelled.cloud if with_intensity else replace(labelled.cloud, intensity=None)

@@ -1,4 +1,4 @@
-"""KITTI's average precision of a detector with intact, distorted and missing intensity."""
+"""KITTI's average precision of a detector with recorded, distorted and missing intensity."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Change = Callable[[np.ndarray], np.ndarray | None]
 
 
 def quantize_dark(intensity: np.ndarray) -> np.ndarray:
-    """Return the intensity as of a sensor with a fifth of the gain, a gamma and 6 bits."""
+    """Return the intensity of a sensor with a fifth of the gain, a gamma of 1.5 and a resolution of 6 bits."""
     return np.round(0.2 * intensity**1.5 * 63) / np.float32(63)
 
 
@@ -33,26 +33,27 @@ CHANGES: dict[str, Change] = {
 
 
 def evaluate_kitti(detector: Detector, folder: Path, change: Change, every: int = 1) -> dict[str, float]:
-    """Return AP (R40, moderate, percent) of KITTI object frames after a change of the intensity."""
+    """Return the AP (R40, moderate, percent) on KITTI object frames with changed intensity."""
     report, recording = DetectionReport(), open_recording(folder)
-    low = detector.with_min_score(MIN_SCORE)
+    detector = detector.with_min_score(MIN_SCORE)
     for frame in recording.frames[::every]:
         cloud = frame.load()
         assert cloud.intensity is not None  # KITTI clouds have an intensity
         truth, calibration = frame.truth(), frame.calibration()
-        changed = Frame.of(frame.name, replace(cloud, intensity=change(cloud.intensity)), truth, calibration)
-        report.update(run_detector(low, changed, truth, calibration))
+        changed_frame = Frame.of(frame.name, replace(cloud, intensity=change(cloud.intensity)), truth, calibration)
+        report.update(run_detector(detector, changed_frame, truth, calibration))
     ap = report.compute()["ap"]
 
-    def score(name: str, row: str) -> float:
+    def get_ap(name: str, row: str) -> float:
         value = ap[name][row]["moderate"]
         return float("nan") if value is None else value["r40"]
 
-    found = {
-        "Car 3D .7": score("Car", "3d"),
-        "Car BEV .7": score("Car", "bev"),
-        "Pedestrian BEV .25": score("Pedestrian", "bev_relaxed"),
-        "Cyclist BEV .25": score("Cyclist", "bev_relaxed"),
+    return {
+        "Car 3D .7": get_ap("Car", "3d"),
+        "Car BEV .7": get_ap("Car", "bev"),
+        "Pedestrian BEV .25": get_ap("Pedestrian", "bev_relaxed"),
+        "Cyclist BEV .25": get_ap("Cyclist", "bev_relaxed"),
+        "mean BEV .5/.25/.25": float(
+            np.mean([get_ap(name, "bev_relaxed") for name in ("Car", "Pedestrian", "Cyclist")])
+        ),
     }
-    relaxed = [score(name, "bev_relaxed") for name in ("Car", "Pedestrian", "Cyclist")]
-    return {**found, "mean BEV .5/.25/.25": float(np.mean(relaxed))}

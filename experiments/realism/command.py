@@ -1,4 +1,4 @@
-"""The verb realism: compares simulated scans with real ones."""
+"""Command realism: compare simulated scans with real ones."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ from lidar_perception.simulation.sensor import find_sensor
     show_default=True,
     help="Number of pedestrians and cyclists relative to the default.",
 )
-@out_file_option("--json", "Write every curve to this file.")
-@out_file_option("--png", "Draw every curve into this file.")
+@out_file_option("--json", "Write all curves to this file.")
+@out_file_option("--png", "Draw all curves into this file.")
 def realism(
     data: Path,
     sensor: str,
@@ -58,7 +58,7 @@ def realism(
     json: Path | None,
     png: Path | None,
 ) -> None:
-    """Compare scans of simulated streets with the labelled ones of DATA, curve by curve.
+    """Compare scans of simulated streets with the labelled scans of DATA, curve by curve.
 
     \b
     Example:
@@ -67,12 +67,12 @@ def realism(
     model = find_sensor(sensor, mount_height)
     recording = open_and_describe(data)
     recording.require(BOXES, "realism")
-    chosen = select_frames(recording)
+    real_frames = select_frames(recording)
     warm_up()
-    measured = measure_scans(show_progress(chosen, "measuring real scans", len(chosen)), PAPER)
-    made = simulate_frames(seed, frames, model, frames_per_drive=1, scenes=Scenes(None, people, "street"))
-    simulated = measure_scans(show_progress(made, "measuring simulated scans", frames), PAPER)
-    content = {"data": str(data), "seed": seed, **compare_scans(measured, simulated)}
+    real = measure_scans(show_progress(real_frames, "measuring real scans", len(real_frames)), PAPER)
+    simulated_frames = simulate_frames(seed, frames, model, frames_per_drive=1, scenes=Scenes(None, people, "street"))
+    simulated = measure_scans(show_progress(simulated_frames, "measuring simulated scans", frames), PAPER)
+    content = {"data": str(data), "seed": seed, **compare_scans(real, simulated)}
     print_realism(content, console)
     write_json(json, content)
     if png:

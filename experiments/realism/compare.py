@@ -2,11 +2,11 @@
 
     compare_scans(measure_scans(real, protocol), measure_scans(simulated, protocol))
 
-A bin of a curve has the median and the 10 and 90 % quantiles of its samples (scans or objects).
-Bins are compared by the ratio of their medians, simulated over real. A bin is judged if it has
-MIN_SAMPLES real samples. It is right if its ratio is 0.8 .. 1.2, and wrong without simulated
-samples. It is plausible if it is right, or if the simulated median is in the 95 % interval of the
-real median.
+Each bin of a curve has the median and the 10 and 90 % quantiles of its samples (scans or objects).
+Bins are compared by the ratio of the simulated to the real median. Only bins with MIN_SAMPLES real
+samples are judged. A bin is right if its ratio is within RATIO_LIMITS, and wrong if it has no
+simulated samples. It is plausible if it is right, or if the simulated median is in the 95 % interval
+of the real median.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from experiments.realism.scan_statistics import (
     Curve,
     compute_object_rows,
     compute_scan_rows,
-    is_whole,
+    is_full_scan,
 )
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.refine import STAGES
@@ -37,32 +37,36 @@ from lidar_perception.scoring.centres.report import CandidateReport, measure_fra
 from lidar_perception.training.frames import may_have_labels
 from lidar_perception.types import InputError
 
-MAX_SCANS = 500  # maximum number of scans, evenly spaced in a longer recording
+MAX_SCANS = 500  # maximum number of scans; they are evenly spaced in longer recordings
 MIN_SAMPLES = 5
-WITHIN = (0.8, 1.2)
+RATIO_LIMITS = (0.8, 1.2)
 
 
 @dataclass
 class ScanMeasurements:
-    """Rows of every curve for one recording.
+    """Measurements of the scans of one recording.
 
     Attributes:
+        rows: Rows of each curve, see scan_statistics.
         report: Scores of the STM-CPA pipeline.
-        skipped: Reasons of scans that cannot be read.
+        scans, full_scans: Number of scans, and of those that cover all directions.
+        objects: Number of labelled objects by class.
+        skipped: For each scan that cannot be read, the reason.
     """
 
     rows: dict[str, list[np.ndarray]] = field(default_factory=lambda: {c: [] for c in CURVES})
     report: CandidateReport = field(default_factory=CandidateReport)
     scans: int = 0
-    whole_scans: int = 0
+    full_scans: int = 0
     objects: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CLASSES, 0))
     skipped: list[str] = field(default_factory=list)
 
     def update(self, frame: Frame, protocol: PipelineParams) -> None:
-        """Add one scan. A scan that is cropped to a camera's view counts for its objects only.
+        """Add one scan. Of a scan that is cropped to a camera's view, only the objects are measured.
 
         Args:
-            protocol: Parameters of the pipeline; the sensor height is that of the frame.
+            frame: The scan.
+            protocol: Parameters of the pipeline. The sensor height of the frame is used.
 
         Raises:
             InputError: The scan cannot be read.
@@ -73,8 +77,8 @@ class ScanMeasurements:
         scan = scan.take(np.lexsort(scan.xyz.T))
         frame = Frame.of(frame.name, scan, truth, calibration)
         self.scans += 1
-        if is_whole(scan):
-            self.whole_scans += 1
+        if is_full_scan(scan):
+            self.full_scans += 1
             self._extend(compute_scan_rows(scan, with_values(protocol, {"view.enabled": False})))
         if truth is not None:
             self._extend(compute_object_rows(scan, truth, frame.camera()))
@@ -90,10 +94,10 @@ class ScanMeasurements:
             self.rows[curve].extend(values)
 
     def to_dict(self) -> dict:
-        """Return the counts, for JSON."""
+        """Return the counts as a JSON-serialisable dict."""
         return {
             "scans": self.scans,
-            "whole_scans": self.whole_scans,
+            "whole_scans": self.full_scans,
             "objects": self.objects,
             "pedestrian_frames": self.report.frames,
             "skipped": self.skipped,
@@ -107,58 +111,58 @@ def select_frames(recording: Recording) -> list[Frame]:
         InputError: No scan has labels.
     """
     count = min(len(recording), MAX_SCANS)
-    chosen = np.linspace(0, len(recording) - 1, count).astype(int)
-    frames = [recording.frames[i] for i in chosen]
+    indices = np.linspace(0, len(recording) - 1, count).astype(int)
+    frames = [recording.frames[i] for i in indices]
     if not any(map(may_have_labels, frames)):
         raise InputError(
-            f"{recording.path} has no labels; give the training folder with label_2 "
+            f"{recording.path} has no labels; give a training folder with label_2 "
             "(object) or label_02 (tracking), or a raw drive with tracklets"
         )
     return frames
 
 
 def measure_scans(scans: Iterable[Frame], protocol: PipelineParams) -> ScanMeasurements:
-    """Measure every curve of the scans, and skip scans that cannot be read.
+    """Measure all curves of the scans. Scans that cannot be read are skipped.
 
     Raises:
         InputError: No scan can be read.
     """
-    measured = ScanMeasurements()
+    measurements = ScanMeasurements()
     for frame in scans:
         try:
-            measured.update(frame, protocol)
+            measurements.update(frame, protocol)
         except InputError as error:
-            measured.skipped.append(str(error))
-    if measured.skipped and not measured.scans:
-        raise InputError(f"none of the {len(measured.skipped)} scans can be read: {measured.skipped[0]}")
-    return measured
+            measurements.skipped.append(str(error))
+    if measurements.skipped and not measurements.scans:
+        raise InputError(f"cannot read any of the {len(measurements.skipped)} scans: {measurements.skipped[0]}")
+    return measurements
 
 
 def compare_scans(real: ScanMeasurements, simulated: ScanMeasurements) -> dict:
-    """Compare the curves of real and simulated scans, for JSON."""
+    """Compare the curves of real and simulated scans. Return a JSON-serialisable dict."""
     sides = {"real": real, "simulated": simulated}
-    tables = {side: measured.report.compute() for side, measured in sides.items()}
+    tables = {side: measurements.report.compute() for side, measurements in sides.items()}
     curves = {}
     for name, curve in CURVES.items():
         stage, _, score = name.partition(" ")
         columns = [
             _make_score_bins(tables[side].get(stage), score)
             if stage in STAGES
-            else _make_bins(measured.rows[name], curve)
-            for side, measured in sides.items()
+            else _make_bins(measurements.rows[name], curve)
+            for side, measurements in sides.items()
         ]
         bins = [_compare_bins(curve, *row) for row in zip(curve.bins, *columns)]
         curves[name] = {"title": curve.title, "axis": curve.axis, **_count_verdicts(bins), "bins": bins}
     all_bins = [b for curve in curves.values() for b in curve["bins"]]
     return {
-        **{side: measured.to_dict() for side, measured in sides.items()},
+        **{side: measurements.to_dict() for side, measurements in sides.items()},
         **_count_verdicts(all_bins),
         "curves": curves,
     }
 
 
 def compute_ratio(simulated: float | None, real: float | None) -> float | None:
-    """Return simulated / real; 1 if both are 0, None if one is missing or only real is 0."""
+    """Return simulated / real: 1 if both are 0, None if one is missing or only real is 0."""
     if simulated is None or real is None:
         return None
     if real == 0.0:
@@ -167,32 +171,39 @@ def compute_ratio(simulated: float | None, real: float | None) -> float | None:
 
 
 def compute_factor(bin_row: dict) -> float:
-    """Return the factor, at least 1, between the medians of a bin; inf if one is missing or 0."""
-    value = bin_row["ratio"]
-    if not value:
+    """Return the factor, at least 1, between the medians of a bin. inf if one is missing or 0."""
+    ratio = bin_row["ratio"]
+    if not ratio:
         return 1.0 if bin_row["within"] else math.inf
-    return max(value, 1 / value)
+    return max(ratio, 1 / ratio)
 
 
 def _compare_bins(curve: Curve, name: str, real: dict, simulated: dict) -> dict:
-    value, within, plausible = compute_ratio(simulated["median"], real["median"]), None, None
+    ratio, is_right, is_plausible = compute_ratio(simulated["median"], real["median"]), None, None
     if real["n"] >= MIN_SAMPLES and not curve.histogram:
-        within = plausible = value is not None and WITHIN[0] <= value <= WITHIN[1]
+        is_right = is_plausible = ratio is not None and RATIO_LIMITS[0] <= ratio <= RATIO_LIMITS[1]
         if simulated["n"]:
-            off = abs(simulated["median"] - real["median"])
+            difference = abs(simulated["median"] - real["median"])
             low, high = real["interval"] or (math.inf, -math.inf)
-            within = within or off <= curve.step * 1.001
-            plausible = within or low <= simulated["median"] <= high
-    return {"bin": name, "real": real, "simulated": simulated, "ratio": value, "within": within, "plausible": plausible}
+            is_right = is_right or difference <= curve.step * 1.001
+            is_plausible = is_right or low <= simulated["median"] <= high
+    return {
+        "bin": name,
+        "real": real,
+        "simulated": simulated,
+        "ratio": ratio,
+        "within": is_right,
+        "plausible": is_plausible,
+    }
 
 
 def _count_verdicts(bins: list[dict]) -> dict:
-    judged = [b["within"] for b in bins if b["within"] is not None]
+    verdicts = [b["within"] for b in bins if b["within"] is not None]
     return {
-        "within": sum(judged),
-        "judged": len(judged),
+        "within": sum(verdicts),
+        "judged": len(verdicts),
         "plausible": sum(b["plausible"] for b in bins if b["within"] is not None),
-        "share": sum(judged) / len(judged) if judged else None,
+        "share": sum(verdicts) / len(verdicts) if verdicts else None,
     }
 
 
@@ -212,13 +223,13 @@ def _summarize_bin(values: np.ndarray, histogram: bool) -> dict:
 
 
 def compute_median_interval(values: np.ndarray) -> list[float]:
-    """Return the 95 % interval of the median, of independent samples (N,).
+    """Return the 95 % confidence interval of the median of independent samples (N,).
 
-    Its ends are samples. Fewer than 6 samples give slightly less than 95 %.
+    Its ends are two of the samples. With fewer than 6 samples it covers slightly less than 95 %.
     """
     rank = max(int(binom.ppf(0.025, len(values), 0.5)) - 1, 0)
-    ordered = np.sort(values)
-    return [float(ordered[rank]), float(ordered[-1 - rank])]
+    sorted_values = np.sort(values)
+    return [float(sorted_values[rank]), float(sorted_values[-1 - rank])]
 
 
 def _make_row(
@@ -232,6 +243,6 @@ def _make_row(
 
 
 def _make_score_bins(table: dict | None, score: str) -> list[dict]:
-    """Return a score of all frames together, which has no spread; n is the number of cases."""
+    """Return the bins of a score over all frames. They have no spread; n is the number of cases."""
     counts = [sum(table[name][k] for k in SCORES[score]) if table else 0 for name in (*RANGE_NAMES, "all")]
     return [_make_row(n, table[name][score] if table and n else None) for name, n in zip((*RANGE_NAMES, "all"), counts)]

@@ -1,6 +1,6 @@
 """Statistics of a scan and its labelled objects, by range, angle or quantile.
 
-Each scan or object adds one row (B,) to a curve, with one value for each bin; NaN is no sample.
+Each scan or object adds one row (B,) to a curve, with one value per bin; NaN if there is no sample.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from lidar_perception.types import GroundTruth, PointCloud
 
 CLASSES = tuple(DETECTED)
 PERSON_HEIGHT = 1.7  # seed height in metres for the height filter in stage 1 of the STM-CPA paper
-SECTORS, MIN_SECTORS = 36, 27  # sectors of a revolution; a scan with points in fewer sectors is cropped to a view
+SECTORS, MIN_SECTORS = 36, 27  # a scan with points in fewer of the sectors of a revolution is cropped to a view
 MIN_POINTS = 5  # minimum number of points to measure an object's extent or intensity
-MIN_IN_BIN = 50  # minimum number of points in a range bin to measure its ground fraction
+MIN_BIN_POINTS = 50  # minimum number of points in a range bin to measure its ground fraction
 MAX_QUERIES, MIN_QUERIES = 600, 10  # number of points in a range bin whose neighbours are measured
 RANGES = np.array([0.0, 5, 10, 15, 20, 30, 40, 60, 80, np.inf])
 OBJECT_RANGES = np.array([0.0, 10, 20, 30, 45, 60])
@@ -36,13 +36,13 @@ ELEVATIONS = np.arange(-26.0, 4.1, 2.0)
 QUANTILES = (5, 25, 50, 75, 95)
 INTENSITIES = np.arange(20) * 0.05 - 0.005  # bin edges between the steps of KITTI's reflectance
 INTENSITY_STEP = 0.01
-ROUGH_STEP = 0.002  # bin width in metres
-BELT = 0.65  # fraction of an object's height; a car has windows above it
+ROUGH_STEP_M = 0.002  # smaller differences in roughness are ignored
+BELT_HEIGHT = 0.65  # fraction of an object's height above which a car has windows
 CAR_NAME = CLASSES[CAR]
 CAR_FROM = f"{CAR_NAME} from "
 # Directions from which a sensor sees only one face of a car, in degrees from its front.
 FACES = {"behind": (160.0, 180.0), "the side": (45.0, 135.0), "the front": (0.0, 20.0)}
-MIN_FACE_POINTS, FACE_QUANTILES, FACE_STEP = 20, (10, 25, 50), 0.01  # FACE_STEP in metres
+MIN_FACE_POINTS, FACE_QUANTILES, FACE_STEP_M = 20, (10, 25, 50), 0.01
 SCORES = {"precision": ("tp", "fp"), "recall": ("tp", "fn"), "f1": ("tp", "fp", "fn")}
 
 
@@ -52,18 +52,22 @@ def _name_bins(limits: np.ndarray) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Curve:
-    """A measured quantity over bins.
+    """A quantity measured in bins.
 
     Attributes:
-        log: The values span decades.
-        step: Resolution; smaller differences mean nothing.
-        histogram: The values are shares. Their mean is shown, and they are not judged.
+        title: Name of the quantity, with its unit.
+        bins: Names of the bins.
+        axis: Label of the axis of the bins.
+        log_scale: True to draw the values on a logarithmic scale.
+        step: Resolution. Smaller differences are ignored.
+        histogram: True if the values are the fractions of a histogram. Their mean is shown, and they
+            are not judged.
     """
 
     title: str
     bins: tuple[str, ...]
     axis: str = "range [m]"
-    log: bool = False
+    log_scale: bool = False
     step: float = 0.0
     histogram: bool = False
 
@@ -74,26 +78,30 @@ _BY_INTENSITY = tuple(f"{i * 0.05:.2f}" for i in range(20))
 _SURFACES = ("ground", "above ground", *CLASSES)
 CURVES = {
     "scan points": Curve("points per scan", ("all",), ""),
-    "points": Curve("points", _BY_RANGE, log=True),
-    "elevation": Curve("points", tuple(f"{a:g}..{a + 2:g}" for a in ELEVATIONS[:-1]), "elevation [deg]", log=True),
+    "points": Curve("points", _BY_RANGE, log_scale=True),
+    "elevation": Curve(
+        "points", tuple(f"{a:g}..{a + 2:g}" for a in ELEVATIONS[:-1]), "elevation [deg]", log_scale=True
+    ),
     "ground share": Curve("fraction of points on the ground", _BY_RANGE),
-    "roughness": Curve("scatter about the ground of 1 m2, 75 % [m]", _BY_RANGE, step=ROUGH_STEP),
+    "roughness": Curve("scatter about the ground of 1 m2, 75 % [m]", _BY_RANGE, step=ROUGH_STEP_M),
     "neighbour": Curve("distance to the nearest point [m]", _BY_RANGE),
     "clusters": Curve("clusters", _BY_RANGE),
     "person clusters": Curve("clusters as high as a person", _BY_RANGE),
     **{f"{name} density": Curve(f"{name}: points per square degree", _BY_OBJECT_RANGE) for name in CLASSES},
     **{
-        f"{what} intensity": Curve(f"intensity, {what}", _BY_QUANTILE, "quantile", step=INTENSITY_STEP)
-        for what in _SURFACES
+        f"{surface} intensity": Curve(f"intensity, {surface}", _BY_QUANTILE, "quantile", step=INTENSITY_STEP)
+        for surface in _SURFACES
     },
     **{
-        f"{what} intensity histogram": Curve(f"fraction of points, {what}", _BY_INTENSITY, "intensity", histogram=True)
-        for what in _SURFACES
+        f"{surface} intensity histogram": Curve(
+            f"fraction of points, {surface}", _BY_INTENSITY, "intensity", histogram=True
+        )
+        for surface in _SURFACES
     },
     **{
-        f"{name} {what}": Curve(f"{name}: {title}", _BY_OBJECT_RANGE, log="points" in what)
+        f"{name} {quantity}": Curve(f"{name}: {title}", _BY_OBJECT_RANGE, log_scale="points" in quantity)
         for name in CLASSES
-        for what, title in (
+        for quantity, title in (
             ("points", "points, not occluded"),
             ("points of all", "points, all"),
             ("height", "height seen / box"),
@@ -107,7 +115,7 @@ CURVES = {
             f"{CAR_FROM}{face}: depth of the points in the box [m]",
             tuple(f"{q}%" for q in FACE_QUANTILES),
             "quantile",
-            step=FACE_STEP,
+            step=FACE_STEP_M,
         )
         for face in FACES
     },
@@ -119,35 +127,35 @@ CURVES = {
 }
 
 
-def is_whole(frame: PointCloud) -> bool:
+def is_full_scan(frame: PointCloud) -> bool:
     """Return True if there are points all around the sensor, not only in a camera's view."""
-    turn = np.arctan2(frame.xyz[:, 1], frame.xyz[:, 0]) / (2 * np.pi) + 0.5
-    return len(np.unique((turn * SECTORS).astype(int) % SECTORS)) >= MIN_SECTORS
+    revolution = np.arctan2(frame.xyz[:, 1], frame.xyz[:, 0]) / (2 * np.pi) + 0.5
+    return len(np.unique((revolution * SECTORS).astype(int) % SECTORS)) >= MIN_SECTORS
 
 
 def compute_scan_rows(frame: PointCloud, params: PipelineParams = PipelineParams()) -> dict:
-    """Return the row (1, B) of each curve for one whole scan.
+    """Return the row (1, B) of each curve for one full scan.
 
-    params apply to the clusters; ground is segmented by the cloth method.
+    The ground is segmented with the cloth method, the clusters with `params`.
     """
     xyz, bins = frame.xyz, len(RANGES) - 1
-    reach = horizontal_range(xyz)
-    where, elevation = _find_bins(reach, RANGES), np.degrees(np.arctan2(xyz[:, 2], reach))
-    count = np.bincount(where, minlength=bins)
+    ranges = horizontal_range(xyz)
+    point_bins, elevation = _find_bins(ranges, RANGES), np.degrees(np.arctan2(xyz[:, 2], ranges))
+    counts = np.bincount(point_bins, minlength=bins)
     ground = segment_ground(frame, GroundParams(method="cloth"))
-    on_ground = np.bincount(where.compress(ground), minlength=bins)
+    ground_counts = np.bincount(point_bins.compress(ground), minlength=bins)
     boxes = segment_cloud(frame, params=params).boxes
-    at = _find_bins(horizontal_range(boxes), RANGES)
-    person = select_by_height(boxes, PERSON_HEIGHT, params.height)
+    box_bins = _find_bins(horizontal_range(boxes), RANGES)
+    is_person_height = select_by_height(boxes, PERSON_HEIGHT, params.height)
     rows = {
         "scan points": [len(xyz)],
-        "points": count,
+        "points": counts,
         "elevation": np.histogram(elevation, ELEVATIONS)[0],
-        "ground share": np.where(count >= MIN_IN_BIN, on_ground / np.maximum(count, 1), np.nan),
+        "ground share": np.where(counts >= MIN_BIN_POINTS, ground_counts / np.maximum(counts, 1), np.nan),
         "roughness": compute_roughness(xyz, RANGES),
-        "neighbour": _measure_neighbours(xyz, where),
-        "clusters": np.bincount(at, minlength=bins),
-        "person clusters": np.bincount(at[person], minlength=bins),
+        "neighbour": _measure_neighbours(xyz, point_bins),
+        "clusters": np.bincount(box_bins, minlength=bins),
+        "person clusters": np.bincount(box_bins[is_person_height], minlength=bins),
     }
     if frame.intensity is not None:
         for name, mask in (("ground", ground), ("above ground", ~ground)):
@@ -158,79 +166,84 @@ def compute_scan_rows(frame: PointCloud, params: PipelineParams = PipelineParams
 def compute_object_rows(frame: PointCloud, truth: GroundTruth, camera: Camera | None) -> dict:
     """Return the rows (K, B) of each curve for labelled objects with at least one point.
 
-    With a camera, only objects that it sees completely count: labels and cropped scans of KITTI
-    contain parts of the others. Objects labelled as occluded count for `points of all` and
-    intensity only.
+    With a camera, only objects that are completely in its view are measured, because KITTI's labels
+    and cropped scans contain only parts of other objects. Objects labelled as occluded are measured
+    only for `points of all` and intensity.
     """
     rows: dict[str, list] = {}
     bins = len(_BY_OBJECT_RANGE)
     for i, (box, name) in enumerate(zip(truth.boxes, truth.labels)):
-        at = _find_bins(horizontal_range(box[None]), OBJECT_RANGES)[0]
-        if name not in CLASSES or at == bins or not _is_seen_whole(camera, box):
+        bin_index = _find_bins(horizontal_range(box[None]), OBJECT_RANGES)[0]
+        if name not in CLASSES or bin_index == bins or not _is_in_view(camera, box):
             continue
-        inside = np.flatnonzero(points_in_box(frame.xyz, box))
-        if len(inside) == 0:
+        indices = np.flatnonzero(points_in_box(frame.xyz, box))
+        if len(indices) == 0:
             continue
-        values: dict[str, float] = {"points of all": len(inside)}
+        values: dict[str, float] = {"points of all": len(indices)}
         if truth.extras[i].get("occluded", 0) == 0:
-            values |= {"points": len(inside), "density": len(inside) / compute_square_degrees(box)}
-            if len(inside) >= MIN_POINTS:
-                own = to_box_frame(frame.xyz[inside].astype(float), box) / box[3:6]
-                values |= dict(zip(("length", "width", "height"), np.ptp(own, axis=0)))
-                values["above"] = (own[:, 2] > BELT - 0.5).mean()
-        new = {f"{name} {what}": np.where(np.arange(bins) == at, value, np.nan) for what, value in values.items()}
-        if frame.intensity is not None and len(inside) >= MIN_POINTS:
-            new |= _describe_intensity(name, frame.intensity[inside])
+            values |= {"points": len(indices), "density": len(indices) / compute_square_degrees(box)}
+            if len(indices) >= MIN_POINTS:
+                relative_points = to_box_frame(frame.xyz[indices].astype(float), box) / box[3:6]
+                values |= dict(zip(("length", "width", "height"), np.ptp(relative_points, axis=0)))
+                values["above"] = (relative_points[:, 2] > BELT_HEIGHT - 0.5).mean()
+        object_rows = {
+            f"{name} {quantity}": np.where(np.arange(bins) == bin_index, value, np.nan)
+            for quantity, value in values.items()
+        }
+        if frame.intensity is not None and len(indices) >= MIN_POINTS:
+            object_rows |= _describe_intensity(name, frame.intensity[indices])
         if name == CAR_NAME and truth.extras[i].get("occluded", 0) == 0:
-            new |= _measure_depths(frame.xyz[inside].astype(float), box)
-        for curve, row in new.items():
+            object_rows |= _measure_depths(frame.xyz[indices].astype(float), box)
+        for curve, row in object_rows.items():
             rows.setdefault(curve, []).append(row)
     return {curve: np.array(values) for curve, values in rows.items()}
 
 
 def _measure_depths(xyz: np.ndarray, box: np.ndarray) -> dict:
-    """Return quantiles of the distance between points (N, 3) of a car and the face that is seen.
+    """Return quantiles of the distance between points (N, 3) of a car and the visible face of its box.
 
-    Empty if the sensor sees two faces or there are too few points.
+    Empty if two faces are visible, or if there are too few points.
     """
     if len(xyz) < MIN_FACE_POINTS:
         return {}
-    sensor, own = to_box_frame(np.zeros((1, 3)), box)[0], to_box_frame(xyz, box)
+    sensor, relative_points = to_box_frame(np.zeros((1, 3)), box)[0], to_box_frame(xyz, box)
     angle = abs(np.degrees(np.arctan2(sensor[1], sensor[0])))
     for face, (low, high) in FACES.items():
         if low <= angle <= high:
             axis = int(face == "the side")
-            depth = box[3 + axis] / 2 - np.sign(sensor[axis]) * own[:, axis]
+            depth = box[3 + axis] / 2 - np.sign(sensor[axis]) * relative_points[:, axis]
             return {CAR_FROM + face: np.quantile(depth, np.array(FACE_QUANTILES) / 100)}
     return {}
 
 
 def compute_square_degrees(box: np.ndarray) -> float:
-    """Return the solid angle of a box (7,), as an upright rectangle, in square degrees."""
-    reach = np.hypot(box[0], box[1])
-    turned = box[6] - np.arctan2(box[1], box[0])
-    width = box[3] * abs(np.sin(turned)) + box[4] * abs(np.cos(turned))
-    return float(np.prod(np.degrees(2 * np.arctan2([width / 2, box[5] / 2], reach))))
+    """Return the solid angle in square degrees that a box (7,) covers, seen as an upright rectangle."""
+    distance = np.hypot(box[0], box[1])
+    relative_yaw = box[6] - np.arctan2(box[1], box[0])
+    width = box[3] * abs(np.sin(relative_yaw)) + box[4] * abs(np.cos(relative_yaw))
+    return float(np.prod(np.degrees(2 * np.arctan2([width / 2, box[5] / 2], distance))))
 
 
-def _is_seen_whole(camera: Camera | None, box: np.ndarray) -> bool:
+def _is_in_view(camera: Camera | None, box: np.ndarray) -> bool:
+    """Return True if the box is completely in the camera's view, or if there is no camera."""
     return camera is None or bool(camera.in_view(box_corners(box[None])[0]).all())
 
 
 def _find_bins(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """Return the index of the bin of each value (N,); len(limits) - 1 beyond the last bin."""
+    """Return the index of the bin of each value (N,), or len(limits) - 1 beyond the last bin."""
     return np.searchsorted(limits, values, side="right") - 1
 
 
-def _measure_neighbours(xyz: np.ndarray, where: np.ndarray) -> np.ndarray:
+def _measure_neighbours(xyz: np.ndarray, point_bins: np.ndarray) -> np.ndarray:
+    """Return the median distance to the nearest point in each range bin, measured at evenly spaced points."""
     row = np.full(len(RANGES) - 1, np.nan)
     tree = cKDTree(xyz)
     for i in range(len(row)):
-        members = np.flatnonzero(where == i)
-        spaced = np.linspace(0, len(members) - 1, min(len(members), MAX_QUERIES))
-        chosen = members[spaced.astype(int)]
-        if len(chosen) >= MIN_QUERIES:
-            row[i] = np.median(tree.query(xyz[chosen], k=2)[0][:, 1])
+        members = np.flatnonzero(point_bins == i)
+        positions = np.linspace(0, len(members) - 1, min(len(members), MAX_QUERIES))
+        queries = members[positions.astype(int)]
+        if len(queries) >= MIN_QUERIES:
+            row[i] = np.median(tree.query(xyz[queries], k=2)[0][:, 1])
     return row
 
 

@@ -1,4 +1,4 @@
-"""Measurement of the STM-CPA experiment on one frame: the counts of every table (Section 4)."""
+"""Measurement of the STM-CPA experiment on one frame: counts for all tables of the paper (Section 4)."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ NUMBERS = StmCpaParams()
 
 
 def measure_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:
-    """Measure frame `number` and return its record. Lists of five values are by RANGE_NAMES.
+    """Measure frame `number` and return its record. Lists of five values have one value per range in RANGE_NAMES.
 
     - pedestrians: number of labelled pedestrians
-    - no_seed: why there was no seed, or None. Without a seed nothing is found, and all pedestrians
-      are misses.
-    - stages: stage -> see count_stage()
-    - cpa: the same for each number of CPA steps
-    - readings: name in READINGS -> see count_stage(), of the last stage
-    - pointpillars: see count_stage(), of our PointPillars V0 at its default threshold
-    - overlap: stage -> see measure_overlaps()
+    - no_seed: reason why there is no seed, or None. Without a seed there are no detections, and all
+      pedestrians are misses.
+    - stages: stage -> result of count_stage()
+    - cpa: result of count_stage() for each number of CPA steps
+    - readings: name in READINGS -> result of count_stage() for the last stage
+    - pointpillars: result of count_stage() for our PointPillars V0 with its default threshold
+    - overlap: stage -> result of measure_overlaps()
     - search: [true positives, false positives] for each eps and each min_samples
     - clusters: number of clusters before and after the height filter
     - ms: time of each step, and stm_all, the time of STM on all clusters; None without a seed
@@ -51,18 +51,18 @@ def measure_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:
     labelled = load_labelled_frame(frame)
     truth = labelled.pedestrians
     segmented = labelled.segment(PAPER)
-    seed, no_seed, found, unfiltered = None, None, Candidates.none(), Candidates.none()
-    sweep = [found.final.boxes] * (NUMBERS.cpa_steps + 1)
-    readings = dict.fromkeys(READINGS, found.final.boxes)
+    seed, no_seed, candidates, unfiltered = None, None, Candidates.none(), Candidates.none()
+    sweep = [candidates.final.boxes] * (NUMBERS.cpa_steps + 1)
+    readings = dict.fromkeys(READINGS, candidates.final.boxes)
     try:
         seed = make_nearest_seed(segmented, labelled)
-        found = _refine(segmented, seed, PAPER)
+        candidates = _refine(segmented, seed, PAPER)
         unfiltered = _refine(segmented, seed, drop_height_filter())
         sweep = [_refine(segmented, seed, extend_cpa(steps)).final.boxes for steps in range(NUMBERS.cpa_steps + 1)]
         readings = {name: _refine(segmented, seed, params).final.boxes for name, params in READINGS.items()}
     except InputError as error:
         no_seed = str(error)
-    boxes = {stage: getattr(found, stage).boxes for stage in STAGES}
+    boxes = {stage: getattr(candidates, stage).boxes for stage in STAGES}
     return {
         "frame": frame.name,
         "pedestrians": _count_by_range(truth),
@@ -73,17 +73,17 @@ def measure_frame(frames: Sequence[Frame], number: int) -> dict[str, Any]:
         "pointpillars": count_stage(detect_pedestrians(labelled), truth, boxes["stage1"]),
         "overlap": {stage: measure_overlaps(boxes[stage], truth) for stage in STAGES},
         "search": search_clustering(segmented, seed, truth),
-        "clusters": [len(unfiltered.stage1), len(found.stage1)],
-        "ms": None if no_seed else {**segmented.ms, **found.ms, "stm_all": unfiltered.ms["stm"]},
+        "clusters": [len(unfiltered.stage1), len(candidates.stage1)],
+        "ms": None if no_seed else {**segmented.ms, **candidates.ms, "stm_all": unfiltered.ms["stm"]},
     }
 
 
 def detect_pedestrians(labelled: LabelledFrame) -> np.ndarray:
-    """Return the pedestrians (K, 7) that PointPillars V0 finds in the camera's view (Table 7)."""
-    seen = labelled.camera.in_view(labelled.cloud.xyz)
-    cloud = labelled.cloud.take(np.flatnonzero(seen))
-    found = open_pointpillars(labelled.height)(cloud).detections
-    return found.boxes[found.class_ids == PEDESTRIAN]
+    """Return the pedestrians (K, 7) that PointPillars V0 detects in the camera's view (Table 7)."""
+    in_view = labelled.camera.in_view(labelled.cloud.xyz)
+    cloud = labelled.cloud.take(np.flatnonzero(in_view))
+    detections = open_pointpillars(labelled.height)(cloud).detections
+    return detections.boxes[detections.class_ids == PEDESTRIAN]
 
 
 @cache
@@ -94,12 +94,12 @@ def open_pointpillars(height: float) -> Detector:
 
 
 def drop_height_filter() -> PipelineParams:
-    """Return the paper's parameters with STM on clusters of any height, and no CPA (Table 9)."""
+    """Return the paper's parameters without the height filter and without CPA (Table 9)."""
     return with_values(PAPER, {"height.tolerance": 100.0, "cpa.steps": 0})
 
 
 def extend_cpa(steps: int) -> PipelineParams:
-    """Return the paper's parameters with CPA at all far ranges (Table 5)."""
+    """Return the paper's parameters with this number of CPA steps at all far ranges (Table 5)."""
     return with_values(
         PAPER, {"cpa.steps": steps, "cpa.min_range": NUMBERS.cpa_min_range, "cpa.max_range": NUMBERS.cpa_max_range}
     )
@@ -108,19 +108,19 @@ def extend_cpa(steps: int) -> PipelineParams:
 def search_clustering(segmented: SegmentedCloud, seed: Seed | None, truth: np.ndarray) -> list[list[list[int]]]:
     """Count true and false positives by range for each eps and each min_samples (Section 4.2).
 
-    The same eps applies in all bands of range, which are clustered one by one as in the paper.
-    Clusters of the seed's height count, and hits are within search_distance. Without a seed
-    nothing is found.
+    The same eps is used in all range bands, which are clustered separately as in the paper. Only
+    clusters of the seed's height count as detections, and hits are within search_distance. Without
+    a seed there are no detections.
     """
     plane = fit_ground_plane(segmented.xyz.compress(segmented.ground, axis=0), PAPER.boxes)
     counts = []
     for eps in NUMBERS.search_eps:
         for min_samples in NUMBERS.search_min_samples:
-            found = np.zeros((0, 7))
+            boxes = np.zeros((0, 7))
             if seed is not None:
-                found = _find_clusters(segmented, plane, seed, eps, min_samples)
-            pairs = match_centres(found, truth, NUMBERS.search_distance)
-            tp, fp, *_ = count_by_range(found, truth, pairs)
+                boxes = _find_clusters(segmented, plane, seed, eps, min_samples)
+            pairs = match_centres(boxes, truth, NUMBERS.search_distance)
+            tp, fp, *_ = count_by_range(boxes, truth, pairs)
             counts.append([tp.tolist(), fp.tolist()])
     return counts
 
@@ -135,37 +135,44 @@ def _find_clusters(
     return boxes[select_by_height(boxes, seed.height, params.height)]
 
 
-def count_stage(found: np.ndarray, truth: np.ndarray, before: np.ndarray) -> dict[str, list]:
-    """Return tp, fp, fn, error (sum of centre errors, metres) and kept, by range.
+def count_stage(detections: np.ndarray, truth: np.ndarray, earlier_detections: np.ndarray) -> dict[str, list]:
+    """Count the hits and errors of a stage by range.
 
-    kept counts the pedestrians hit both by the boxes found (K, 7) and by those `before` (L, 7).
+    Args:
+        detections: (K, 7) boxes after the stage.
+        truth: (M, 7) labelled boxes.
+        earlier_detections: (L, 7) boxes after the first stage.
+
+    Returns:
+        Counts `tp`, `fp` and `fn`; `error`, the sum of centre errors in metres; and `kept`, the
+        number of pedestrians matched both by detections and by earlier detections.
     """
-    pairs = match_centres(found, truth)
-    tp, fp, fn, error = count_by_range(found, truth, pairs)
-    kept = np.intersect1d(pairs[1], match_centres(before, truth)[1])
+    pairs = match_centres(detections, truth)
+    tp, fp, fn, error = count_by_range(detections, truth, pairs)
+    kept_indices = np.intersect1d(pairs[1], match_centres(earlier_detections, truth)[1])
     return {
         "tp": tp.tolist(),
         "fp": fp.tolist(),
         "fn": fn.tolist(),
-        "kept": _count_by_range(truth[kept]),
+        "kept": _count_by_range(truth[kept_indices]),
         "error": np.round(error, 6).tolist(),
     }
 
 
-def measure_overlaps(found: np.ndarray, truth: np.ndarray) -> list[float]:
-    """Compare the hits among boxes found (K, 7) with their true boxes, of truth (M, 7).
+def measure_overlaps(detections: np.ndarray, truth: np.ndarray) -> list[float]:
+    """Measure the overlap of detections (K, 7) with the labels (M, 7) that they match.
 
     Returns:
-        The number of hits, the numbers with a 3D IoU of at least each of iou_limits, the same in
-        BEV, and the sums of the IoU in 3D and in BEV.
+        The number of hits, the number of hits with a 3D IoU of at least each of iou_limits, the
+        same in BEV, and the sums of the IoU in 3D and in BEV.
     """
-    i, j = match_centres(found, truth)
-    bev, space = (np.diagonal(iou) for iou in bev_and_3d_iou(found[i], truth[j]))
+    i, j = match_centres(detections, truth)
+    bev_iou, iou_3d = (np.diagonal(iou) for iou in bev_and_3d_iou(detections[i], truth[j]))
     return [
         len(i),
-        *(int((iou >= limit).sum()) for iou in (space, bev) for limit in NUMBERS.iou_limits),
-        round(float(space.sum()), 6),
-        round(float(bev.sum()), 6),
+        *(int((iou >= limit).sum()) for iou in (iou_3d, bev_iou) for limit in NUMBERS.iou_limits),
+        round(float(iou_3d.sum()), 6),
+        round(float(bev_iou.sum()), 6),
     ]
 
 

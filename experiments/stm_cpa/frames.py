@@ -48,19 +48,19 @@ def load_labelled_frame(frame: Frame) -> LabelledFrame:
     """Load a frame with its labels and camera.
 
     Raises:
-        InputError: a file is missing, empty or unreadable, or no Pedestrian is labelled.
+        InputError: A file is missing, empty or unreadable, or there is no Pedestrian label.
     """
-    truth = frame.truth()  # checked first because most frames of KITTI end here
+    truth = frame.truth()  # checked first, because most frames of KITTI have no pedestrian
     if truth is None:
         raise InputError(f"{frame.points or frame.name} has no labels; put the label files next to the scans")
     if PEDESTRIAN not in truth.class_ids:
-        raise InputError("no Pedestrian is labelled; the paper leaves such frames out")
+        raise InputError("no Pedestrian label; the paper does not use such frames")
     cloud, calibration = frame.load(), frame.calibration()
     if calibration is None:
-        raise InputError(f"{frame.name} has no camera calibration, which the paper's crop to the camera's view needs")
+        raise InputError(f"{frame.name} has no camera calibration; the paper crops clouds to the camera's view")
     truth, camera = select_in_image(truth, calibration), calibration.camera()
     if PEDESTRIAN not in truth.class_ids:
-        raise InputError("no Pedestrian is labelled in the image; the paper leaves such frames out")
+        raise InputError("no Pedestrian label in the image; the paper does not use such frames")
     if not camera.in_view(cloud.xyz).any():
         raise InputError(
             f"{frame.points or frame.name} has no points in the camera's view; download the scan and its calibration "
@@ -70,7 +70,7 @@ def load_labelled_frame(frame: Frame) -> LabelledFrame:
 
 
 def find_nearest(boxes: np.ndarray) -> np.ndarray:
-    """Return the box (7,) of boxes (M, 7), M >= 1, that is nearest to the sensor."""
+    """Return the box (7,) that is nearest to the sensor among boxes (M, 7), M >= 1."""
     return boxes[np.argmin(np.hypot(boxes[:, 0], boxes[:, 1]))]
 
 
@@ -78,8 +78,8 @@ def make_nearest_seed(segmented: SegmentedCloud, labelled: LabelledFrame) -> See
     """Return the seed of the paper's protocol: the nearest labelled pedestrian.
 
     Raises:
-        InputError: it has too few points, or is on a vehicle, whose points would be in the
-            template.
+        InputError: The pedestrian has too few points, or is on a vehicle, so that the template would
+            contain points of the vehicle.
     """
     nearest = find_nearest(labelled.pedestrians)
     for box, class_id in zip(labelled.truth.boxes, labelled.truth.class_ids):

@@ -13,11 +13,11 @@ FRAMES = 1779  # frames with a Pedestrian label among KITTI's 7481 training fram
 PEDESTRIANS = 4487
 TABLE_1 = {"0-15": 2093, "15-30": 1771, "30-45": 468, "45-60": 118, "60+": 37}
 
-# Figure 7 as described in Section 4.2: eps with a high recall, and the chosen eps.
+# Figure 7 as described in Section 4.2: range of eps with a high recall, and the eps that the paper uses.
 FIGURE_7 = {"0-15": ((0.15, 0.20), 0.15), "15-30": ((0.25, 0.35), 0.30), "30-45": ((0.40, 0.50), 0.50)}
 MIN_SAMPLES = 10  # "increasing min_samples consistently reduces recall"
 
-# Table 4 by range, with the columns of PAPER_TABLE_6. The F1 of `final` is from Section 4.5.
+# Table 4: range -> stage -> values in the columns of PAPER_TABLE_6. The F1 of `final` is from Section 4.5.
 TABLE_4: dict[str, dict[str, Scores]] = {
     "0-15": {"stage1": (76.2, 53.7, 63.0, None, 0.12), "stage2": (73.0, 69.4, 71.2, 95.8, 0.12)},
     "15-30": {
@@ -43,7 +43,7 @@ TABLE_5 = (
     (49.8, 41.1, 45.1, 88.8, 0.14),
 )
 
-# Figure 8, points stated in the text or in Table 4: steps -> recall, precision, F1.
+# Figure 8, values stated in the text or in Table 4: range -> steps -> recall, precision, F1.
 FIGURE_8: dict[str, dict[int, Scores]] = {
     "15-30": {0: (24.7, 48.4, 32.7), 2: (None, None, 35.6)},
     "30-45": {0: (8.5, 22.1, 12.3)},

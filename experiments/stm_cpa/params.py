@@ -18,15 +18,14 @@ READINGS = {
 
 @dataclass(frozen=True)
 class StmCpaParams:
-    """Values that the paper varies, Sections 4.2 and 4.5.
-
-    The paper does not list the eps and min_samples that it tried; these include all that it
-    mentions.
+    """Parameters that the paper varies in Sections 4.2 and 4.5.
 
     Attributes:
-        search_distance: Largest distance of 3D centres of a hit in the parameter search, metres.
-        cpa_steps: The CPA sweep goes from 0 to this number of steps,
-        cpa_min_range, cpa_max_range: at these horizontal ranges, metres.
+        search_eps, search_min_samples: Values to try. The paper does not list the values that it
+            tried; these include all that it mentions.
+        search_distance: Maximum distance of 3D centres of a hit in the search, metres.
+        cpa_steps: Maximum number of CPA steps in the sweep.
+        cpa_min_range, cpa_max_range: Horizontal ranges of the sweep, metres.
         iou_limits: Overlaps of Table 8.
     """
 

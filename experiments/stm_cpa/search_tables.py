@@ -1,4 +1,4 @@
-"""Tables and figures of the search for DBSCAN's parameters (Figure 7 of the paper)."""
+"""Tables and figures of the parameter search for DBSCAN (Figure 7 of the paper)."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ COUNTS = ("hits", "false", "misses")
 
 
 def make_search_section(records: list[dict]) -> Section:
-    """Return the section of the search, of records of measure_frame()."""
+    """Make the section about the search from the records of measure_frame()."""
     eps, min_samples = NUMBERS.search_eps, NUMBERS.search_min_samples
-    found = stack_counts([r["search"] for r in records], len(eps) * len(min_samples), 2, len(RANGE_NAMES))
-    truth = stack_counts([r["pedestrians"] for r in records], 1, len(RANGE_NAMES))
-    counts = np.stack([found[:, :, 0], found[:, :, 1], truth - found[:, :, 0]], axis=1)
+    positives = stack_counts([r["search"] for r in records], len(eps) * len(min_samples), 2, len(RANGE_NAMES))
+    labels = stack_counts([r["pedestrians"] for r in records], 1, len(RANGE_NAMES))
+    counts = np.stack([positives[:, :, 0], positives[:, :, 1], labels - positives[:, :, 0]], axis=1)
     estimates = bootstrap(counts, lambda sums: compute_rates(*np.moveaxis(sums, -3, 0)))
     sums = counts.sum(axis=0).astype(int)
     settings = [(e, n) for e in eps for n in min_samples]
@@ -29,24 +29,24 @@ def make_search_section(records: list[dict]) -> Section:
         e, n = settings[setting]
         return (f"{e:.2f}", str(n), *make_cells(estimates[:, setting, group]), *map(str, sums[:, setting, group]))
 
-    best, all_rows = [], []
+    best_rows, all_rows = [], []
     for group, name in enumerate(RANGE_NAMES):
-        if truth[:, 0, group].sum() == 0:
+        if labels[:, 0, group].sum() == 0:
             continue
         all_rows += [(name, *make_row(k, group)) for k in range(len(settings))]
-        chosen = settings.index((_find_chosen_eps(name), paper.MIN_SAMPLES))
-        best.append((name, "the paper's", *make_row(chosen, group)))
+        paper_setting = settings.index((_find_paper_eps(name), paper.MIN_SAMPLES))
+        best_rows.append((name, "the paper's", *make_row(paper_setting, group)))
         recall, _, f1 = np.nan_to_num(estimates[0, :, group]).T
         if recall.any():
-            best += [
-                (name, what, *make_row(int(score.argmax()), group))
-                for what, score in (("most recall", recall + 1e-6 * f1), ("most F1", f1))
+            best_rows += [
+                (name, title, *make_row(int(score.argmax()), group))
+                for title, score in (("best recall", recall + 1e-6 * f1), ("best F1", f1))
             ]
     header = ("eps [m]", "min_samples", *RATES, *COUNTS)
     text = (
-        f"Clusters of the seed's height; hits within {NUMBERS.search_distance:g} m. The paper "
-        "describes its Figure 7 in words: high recall at eps 0.15 to 0.20 m below 15 m, 0.25 "
-        "to 0.35 m from 15 to 30 m, 0.40 to 0.50 m beyond; a larger min_samples lowers "
+        f"Only clusters of the seed's height are used; hits are within {NUMBERS.search_distance:g} m. The paper "
+        "describes its Figure 7 in words: recall is high at eps 0.15 to 0.20 m below 15 m, 0.25 "
+        "to 0.35 m from 15 to 30 m, and 0.40 to 0.50 m beyond; a larger min_samples lowers "
         "recall."
     )
     return Section(
@@ -57,8 +57,8 @@ def make_search_section(records: list[dict]) -> Section:
                 "search_best",
                 "The paper's setting and the best of the search",
                 ("range [m]", "setting", *header),
-                tuple(best),
-                "The intervals ignore that the best was chosen among many.",
+                tuple(best_rows),
+                "The intervals do not account for the choice of the best among many settings.",
             ),
             Table("search", "All settings", ("range [m]", *header), tuple(all_rows)),
         ),
@@ -66,7 +66,7 @@ def make_search_section(records: list[dict]) -> Section:
     )
 
 
-def _find_chosen_eps(name: str) -> float:
+def _find_paper_eps(name: str) -> float:
     return paper.FIGURE_7.get(name, paper.FIGURE_7["30-45"])[1]
 
 
@@ -86,10 +86,10 @@ def _draw_figure_7(estimates: np.ndarray) -> Figure:
                         make_line(label.removesuffix(" [%]"), eps, estimates[:, rows, RANGE_NAMES.index(name), k])
                         for k, label in enumerate(RATES)
                     ),
-                    Line("the paper's eps", (chosen, chosen), (0.0, 100.0), dashed=True),
+                    Line("the paper's eps", (paper_eps, paper_eps), (0.0, 100.0), dashed=True),
                 ),
             )
-            for name, (_, chosen) in paper.FIGURE_7.items()
+            for name, (_, paper_eps) in paper.FIGURE_7.items()
         ),
     )
 

@@ -31,9 +31,9 @@ STEPS = ("preprocessing", "DBSCAN", "ground snapping", "height filter", "STM", "
 
 
 def make_sections(records: list[dict[str, Any]]) -> list[Section]:
-    """Return the report of the records of measure_frame(); skipped frames are left out."""
+    """Make the report from the records of measure_frame(), without skipped frames."""
     records = [record for record in records if "skipped" not in record]
-    makers = (
+    functions = (
         _make_truth_section,
         make_search_section,
         _make_stages_section,
@@ -43,34 +43,34 @@ def make_sections(records: list[dict[str, Any]]) -> list[Section]:
         _make_overlap_section,
         _make_runtime_section,
     )
-    return [make(records) for make in makers]
+    return [make_section(records) for make_section in functions]
 
 
 def _make_truth_section(records: list[dict]) -> Section:
     counts = stack_counts([r["pedestrians"] for r in records], len(RANGE_NAMES))
-    shares = bootstrap(counts, lambda sums: 100 * divide(sums, sums.sum(axis=-1, keepdims=True)))
+    percentages = bootstrap(counts, lambda sums: 100 * divide(sums, sums.sum(axis=-1, keepdims=True)))
     published = list(paper.TABLE_1.values())
     rows: list[Row] = [
-        (name, Cell(float(count), paper=paper_count, digits=0), share)
-        for name, count, paper_count, share in zip(
+        (name, Cell(float(count), paper=paper_count, digits=0), percentage)
+        for name, count, paper_count, percentage in zip(
             RANGE_NAMES,
             counts.sum(axis=0),
             published,
-            make_cells(shares, [100 * n / paper.PEDESTRIANS for n in published]),
+            make_cells(percentages, [100 * n / paper.PEDESTRIANS for n in published]),
         )
     ]
     rows.append(("all", Cell(float(counts.sum()), paper=paper.PEDESTRIANS, digits=0), ""))
-    without = [r for r in records if r["no_seed"]]
+    seedless_records = [r for r in records if r["no_seed"]]
     frames = Table(
         "frames",
         "Frames",
         ("", "count"),
         (
             ("frames with a Pedestrian label", Cell(len(records), paper=paper.FRAMES, digits=0)),
-            ("without a seed", Cell(len(without), digits=0)),
+            ("without a seed", Cell(len(seedless_records), digits=0)),
             (
                 "pedestrians in frames without a seed (misses)",
-                Cell(sum(sum(r["pedestrians"]) for r in without), digits=0),
+                Cell(sum(sum(r["pedestrians"]) for r in seedless_records), digits=0),
             ),
         ),
     )
@@ -78,26 +78,26 @@ def _make_truth_section(records: list[dict]) -> Section:
         "no_seed",
         "Frames without a seed",
         ("frame", "pedestrians", "reason"),
-        tuple((r["frame"], str(sum(r["pedestrians"])), r["no_seed"]) for r in without),
+        tuple((r["frame"], str(sum(r["pedestrians"])), r["no_seed"]) for r in seedless_records),
     )
     table = Table("table_1", "Table 1: ground truth by range", ("range [m]", "pedestrians", "share [%]"), tuple(rows))
-    return Section("Ground truth (Table 1)", "", (table, frames, *([no_seed] if without else ())))
+    return Section("Ground truth (Table 1)", "", (table, frames, *([no_seed] if seedless_records else ())))
 
 
 def _make_stages_section(records: list[dict]) -> Section:
-    overall: list[Row] = []
-    by_range: list[Row] = []
+    total_rows: list[Row] = []
+    range_rows: list[Row] = []
     for stage in STAGES:
         counts = _stack_scores(records, [r["stages"][stage] for r in records])
         estimates, sums = bootstrap(counts, _compute_scores), counts.sum(axis=0)
-        overall.append(
+        total_rows.append(
             (
                 STAGE_TITLES[stage],
                 *_make_score_cells(estimates[:, -1], PAPER_TABLE_6[stage]),
                 *_format_counts(sums.sum(axis=-1)),
             )
         )
-        by_range += [
+        range_rows += [
             (
                 name,
                 STAGE_TITLES[stage],
@@ -107,21 +107,21 @@ def _make_stages_section(records: list[dict]) -> Section:
             )
             for k, name in enumerate(RANGE_NAMES)
         ]
-    by_range.sort(key=lambda row: RANGE_NAMES.index(row[0]))  # the sort is stable, so the stages stay in order
+    range_rows.sort(key=lambda row: RANGE_NAMES.index(row[0]))  # the sort is stable, so the stages stay in order
     note = (
-        "Kept: share of the hits of stage 1 that are still hits. A hit: 3D "
-        f"centres within {MAX_CENTRE_DISTANCE:g} m, one to one."
+        "Kept: fraction of the hits of stage 1 that are still hits. A hit has its 3D "
+        f"centre within {MAX_CENTRE_DISTANCE:g} m of the label, one to one."
     )
     return Section(
         "Stages (Tables 3, 4 and 6)",
         "",
         (
-            Table("table_3_6", "Tables 3 and 6: all ranges", ("stage", *SCORES, *COUNTS), tuple(overall), note),
+            Table("table_3_6", "Tables 3 and 6: all ranges", ("stage", *SCORES, *COUNTS), tuple(total_rows), note),
             Table(
                 "table_4",
                 "Table 4: by range",
                 ("range [m]", "stage", "pedestrians", *SCORES, *COUNTS),
-                tuple(by_range),
+                tuple(range_rows),
                 note,
             ),
         ),
@@ -139,28 +139,31 @@ def _make_cpa_section(records: list[dict]) -> Section:
         rows.append(
             (str(k), *_make_score_cells(estimates[-1][:, -1], published), *_format_counts(counts.sum(axis=(0, 2))))
         )
-    drawn = np.stack(estimates, axis=1)  # (3, steps, groups, scores)
+    stacked_estimates = np.stack(estimates, axis=1)  # (3, steps, ranges, scores)
     ranges = f"{NUMBERS.cpa_min_range:g} to {NUMBERS.cpa_max_range:g} m"
     panels = []
     for m, label in enumerate(RATES):
-        lines = [make_line(f"{name} m", steps, drawn[:, :, RANGE_NAMES.index(name), m]) for name in paper.FIGURE_8]
-        for name, points in paper.FIGURE_8.items():
-            by_steps = {k: values[m] for k, values in points.items() if values[m] is not None}
-            lines.append(Line(f"{name} m, paper", tuple(by_steps), tuple(by_steps.values()), dashed=True))
+        lines = [
+            make_line(f"{name} m", steps, stacked_estimates[:, :, RANGE_NAMES.index(name), m])
+            for name in paper.FIGURE_8
+        ]
+        for name, published in paper.FIGURE_8.items():
+            points = {k: values[m] for k, values in published.items() if values[m] is not None}
+            lines.append(Line(f"{name} m, paper", tuple(points), tuple(points.values()), dashed=True))
         panels.append(Panel(label.removesuffix(" [%]"), "CPA steps", "%", tuple(lines)))
-    by_range: list[Row] = [
-        (name, str(k), *_make_score_cells(drawn[:, k, RANGE_NAMES.index(name)], ()))
+    range_rows: list[Row] = [
+        (name, str(k), *_make_score_cells(stacked_estimates[:, k, RANGE_NAMES.index(name)], ()))
         for name in paper.FIGURE_8
         for k in steps
     ]
     return Section(
         "CPA steps (Table 5, Figure 8)",
-        f"Copies are added to clusters at {ranges}. The scores of "
-        "Table 5 are of all ranges. For Figure 8 the paper gives numbers without CPA, and the F1 "
-        "of two steps at 15 to 30 m.",
+        f"CPA adds copies to clusters at {ranges}. The scores in "
+        "Table 5 are over all ranges. For Figure 8 the paper gives only the values without CPA, and the F1 "
+        "for two steps at 15 to 30 m.",
         (
             Table("table_5", f"Table 5: CPA at {ranges}", ("steps", *SCORES, *COUNTS), tuple(rows)),
-            Table("figure_8", "Figure 8 in numbers", ("range [m]", "steps", *SCORES), tuple(by_range)),
+            Table("figure_8", "Figure 8 in numbers", ("range [m]", "steps", *SCORES), tuple(range_rows)),
         ),
         (Figure("figure_8", "Figure 8: CPA steps by range", tuple(panels)),),
     )
@@ -196,9 +199,9 @@ def _make_detectors_section(records: list[dict]) -> Section:
     ]
     return Section(
         "Detectors by centre distance (Table 7)",
-        "All rows see the same points, those in the camera's view. STM-CPA knows a labelled pedestrian of each frame, "
-        "PointPillars does not: it has the shipped weights, trained on simulated scans only, and its default "
-        "threshold. The paper takes its rows of detectors from another study.",
+        "All methods get the same points: those in the camera's view. STM-CPA gets one labelled pedestrian per frame "
+        "as its seed, PointPillars does not. PointPillars has the shipped weights, trained only on simulated scans, "
+        "and its default threshold. The paper takes the values of other detectors from another study.",
         (Table("table_7", "Table 7: pedestrians by centre distance", ("method", *SCORES, *COUNTS), tuple(rows)),),
     )
 
@@ -226,26 +229,26 @@ def _make_overlap_section(records: list[dict]) -> Section:
         )
     return Section(
         "Overlap (Table 8)",
-        "IoU of the hits with the labelled boxes, which have a yaw; boxes of candidates are axis-aligned.",
+        "IoU of the hits with the labelled boxes. Labelled boxes have a yaw; boxes of candidates are axis-aligned.",
         (Table("table_8", "Table 8: IoU of the hits", tuple(header), tuple(rows)),),
     )
 
 
 def _make_runtime_section(records: list[dict]) -> Section:
-    timed = [r for r in records if r["ms"]]
-    means: list[Row] = []
-    medians: list[Row] = []
+    timed_records = [r for r in records if r["ms"]]
+    mean_rows: list[Row] = []
+    median_rows: list[Row] = []
     for name, published in paper.TABLE_9.items():
-        ms = stack_counts([_list_step_times(r["ms"], name) for r in timed], len(STEPS))
+        ms = stack_counts([_list_step_times(r["ms"], name) for r in timed_records], len(STEPS))
         estimates = bootstrap(
             np.column_stack([np.ones(len(ms)), ms]), lambda sums: divide(sums[..., 1:], sums[..., :1])
         )
-        means.append((name, *make_cells(estimates, published, 2)))
-        middle = np.median(ms, axis=0) if len(ms) else np.full(len(STEPS), np.nan)
-        medians.append((name, *(Cell(value, digits=2) for value in nan_to_none(middle))))
-    clusters = stack_counts([r["clusters"] for r in timed], 2).sum(axis=0) / max(len(timed), 1)
+        mean_rows.append((name, *make_cells(estimates, published, 2)))
+        medians = np.median(ms, axis=0) if len(ms) else np.full(len(STEPS), np.nan)
+        median_rows.append((name, *(Cell(value, digits=2) for value in nan_to_none(medians))))
+    clusters = stack_counts([r["clusters"] for r in timed_records], 2).sum(axis=0) / max(len(timed_records), 1)
     note = (
-        "Preprocessing is the crop to the camera; ground snapping includes the RANSAC plane. "
+        "Preprocessing is the crop to the camera's view; ground snapping includes the RANSAC plane. "
         "Reading the files is not included. The paper gives means, on unknown hardware. "
         "Processes that run at the same time slow each other down: use --jobs 1 for clean "
         f"times. STM compares {clusters[0]:.1f} clusters per frame without the height filter, "
@@ -256,8 +259,8 @@ def _make_runtime_section(records: list[dict]) -> Section:
         "Runtime (Table 9)",
         "",
         (
-            Table("table_9", "Table 9: mean time per frame", header, tuple(means), note),
-            Table("table_9_median", "Median time per frame", header, tuple(medians)),
+            Table("table_9", "Table 9: mean time per frame", header, tuple(mean_rows), note),
+            Table("table_9_median", "Median time per frame", header, tuple(median_rows)),
         ),
     )
 
@@ -273,26 +276,29 @@ def _list_step_times(ms: dict[str, float], configuration: str) -> list[float]:
     return [*steps, sum(steps)]
 
 
-def _stack_scores(records: list[dict], of_stage: list[dict]) -> np.ndarray:
-    """Return (F, 6, 5): tp, fp, fn, kept, centre error and hits of stage 1, by range."""
+def _stack_scores(records: list[dict], stage_counts: list[dict]) -> np.ndarray:
+    """Return (F, 6, 5): tp, fp, fn, kept, centre error and hits of stage 1, for each range."""
     fields = ("tp", "fp", "fn", "kept", "error")
     return stack_counts(
-        [[*(counts[k] for k in fields), record["stages"]["stage1"]["tp"]] for record, counts in zip(records, of_stage)],
+        [
+            [*(counts[k] for k in fields), record["stages"]["stage1"]["tp"]]
+            for record, counts in zip(records, stage_counts)
+        ],
         6,
         len(RANGE_NAMES),
     )
 
 
 def _compute_scores(sums: np.ndarray) -> np.ndarray:
-    """Return SCORES of each range and of all (..., 6, 5) of sums of _stack_scores() (..., 6, 5)."""
+    """Compute SCORES of each range and in total (..., 6, 5) from sums of _stack_scores() (..., 6, 5)."""
     sums = np.concatenate([sums, sums.sum(axis=-1, keepdims=True)], axis=-1)
-    tp, fp, fn, kept, error, before = np.moveaxis(sums, -2, 0)
-    others = np.stack([100 * divide(kept, before), divide(error, tp)], axis=-1)
-    return np.concatenate([compute_rates(tp, fp, fn), others], axis=-1)
+    tp, fp, fn, kept, error, stage1_hits = np.moveaxis(sums, -2, 0)
+    kept_and_error = np.stack([100 * divide(kept, stage1_hits), divide(error, tp)], axis=-1)
+    return np.concatenate([compute_rates(tp, fp, fn), kept_and_error], axis=-1)
 
 
 def _make_score_row(title: str, records: list[dict], counts: list[dict], published: tuple) -> Row:
-    """Return the row of a method with these counts in each frame, of all ranges."""
+    """Return the row of a method over all ranges. `counts` has the counts of each frame."""
     stacked = _stack_scores(records, counts)
     scores = bootstrap(stacked, _compute_scores)[:, -1]
     return title, *_make_score_cells(scores, published), *_format_counts(stacked.sum(axis=(0, 2)))

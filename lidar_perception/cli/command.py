@@ -63,7 +63,7 @@ class Command(click.Command):
             if isinstance(param, HelpfulOption) and param.asks_for_help(args):
                 ctx.resilient_parsing = True  # allows required options to be missing
                 super().parse_args(ctx, [*args])
-                click.echo(param.listing(ctx.params))
+                click.echo(param.list_values(ctx.params))
                 ctx.exit()
         try:
             return super().parse_args(ctx, args)
@@ -74,12 +74,12 @@ class Command(click.Command):
                 for flag in (*param.opts, *param.secondary_opts)
                 if flag.startswith("-")
             ]
-            remedy = self.remedy(error.option_name) or suggest_name(error.option_name, flags)
+            remedy = self._suggest_remedy(error.option_name) or suggest_name(error.option_name, flags)
             raise click.UsageError(
                 f"no such option {error.option_name}" + (remedy or f"; {ctx.command_path} --help lists them"), ctx
             ) from None
 
-    def remedy(self, flag: str) -> str:
+    def _suggest_remedy(self, flag: str) -> str:
         """Return an option's suggestion for an unknown flag; "" if there is none."""
         return next(
             (
@@ -101,12 +101,12 @@ class HelpfulOption(click.Option):
             for flag in self.opts
         )
 
-    def listing(self, options: Mapping[str, Any]) -> str:
-        """Return the list of possible values for these options."""
+    def list_values(self, options: Mapping[str, Any]) -> str:
+        """Return the text that lists the possible values, given the other options."""
         raise NotImplementedError
 
     def suggest_option(self, flag: str) -> str:
-        """Return the remedy for an unknown flag that this option replaces; otherwise ""."""
+        """Return a suggestion for an unknown flag that this option replaces; "" for other flags."""
         return ""
 
 

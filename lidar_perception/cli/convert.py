@@ -48,15 +48,15 @@ DATASETS, LABELS = tuple(LAYOUTS), tuple(FORMATS)
 @click.option(
     "--detections",
     metavar="TOPIC",
-    help="Take the boxes on this topic of the bag at DATA (MarkerArray or Detection3DArray), instead of its labels.",
+    help="Convert the boxes on this topic of the bag at DATA (MarkerArray or Detection3DArray) instead of its labels.",
 )
 @click.option(
     "--points", default="", metavar="TOPIC", help="Topic of the clouds of a bag.  [default: /points, or the only one]"
 )
 @path_option(
     "--robot",
-    "robot.param.yaml that `setup` wrote, for a recording with a tilted or turned "
-    "sensor: level its clouds, x ahead, without the robot's own returns, as nodes see them.",
+    "robot.param.yaml that `setup` wrote, for a recording with a tilted or rotated sensor. Clouds are "
+    "converted as in the nodes: levelled, with x ahead, and without the robot's own returns.",
 )
 @click.option(
     "--deskew",
@@ -107,7 +107,7 @@ def convert(
     if source is None:
         raise click.UsageError("DATA is missing: give the path of a recording")
     converts_labels = data is not None or (format in LABELS and format not in (MCAP, *DATASETS))
-    for is_wrong, message in (
+    for is_invalid, message in (
         (images and (converts_labels or format != MCAP), "--images requires --to mcap"),
         (
             (robot is not None or deskew) and (converts_labels or detections is not None),
@@ -120,7 +120,7 @@ def convert(
         ),
         (data is not None and format == "nuscenes", "for labels, choose --to nuscenes-detection or nuscenes-tracking"),
     ):
-        if is_wrong:
+        if is_invalid:
             raise click.UsageError(message)
     recording = open_and_describe(source if data is None else data, level=robot is None, split=split, points=points)
     transform = _make_frame_transform(recording, robot, deskew)
@@ -133,7 +133,7 @@ def convert(
 
 
 def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], Any]:
-    """Return a function that levels and deskews a frame like nodes with this parameter file.
+    """Return a function that levels and deskews a frame as nodes with this parameter file do.
 
     Without a file and without deskewing, the function returns the frame unchanged.
     """
@@ -150,8 +150,8 @@ def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Ca
 
     mount = SensorMount()
     if file is not None:
-        mount, requested = _read_mount(file)
-        deskew = deskew or requested
+        mount, file_enables_deskew = _read_mount(file)
+        deskew = deskew or file_enables_deskew
     if not deskew:
         return partial(level_frame, mount=mount)
     from lidar_perception.data.bag import BagHandle
@@ -159,14 +159,14 @@ def _make_frame_transform(recording: Any, file: Path | None, deskew: bool) -> Ca
 
     if not bag_frames.can_open(recording.path):
         raise InputError(f"{recording.path} is not a bag, so it has no odometry or TF, which --deskew needs")
-    first = recording.frames[len(recording) // 2]
-    poses = BagPoses(BagHandle(recording.path), first.load().frame_id).lookup
-    level_frame(first, mount, poses).load()  # fails early if a topic or a column is missing
+    frame = recording.frames[len(recording) // 2]
+    poses = BagPoses(BagHandle(recording.path), frame.load().frame_id).lookup
+    level_frame(frame, mount, poses).load()  # fails early if a topic or a column is missing
     return partial(level_frame, mount=mount, poses=poses)
 
 
 def _read_mount(file: Path) -> tuple[Any, bool]:
-    """Return the SensorMount of a parameter file, and whether it enables deskewing."""
+    """Return the SensorMount of a parameter file, and True if the file enables deskewing."""
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
     from lidar_perception.data.levelling import SensorMount
@@ -174,23 +174,27 @@ def _read_mount(file: Path) -> tuple[Any, bool]:
     from lidar_perception.params import CloudNodeParams
 
     try:
-        params, node = (
+        params, node_params = (
             with_values(defaults, read_config(file, defaults)) for defaults in (PipelineParams(), CloudNodeParams())
         )
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
-    if params == PipelineParams() and node == CloudNodeParams():
+    if params == PipelineParams() and node_params == CloudNodeParams():
         raise InputError(f"{file} does not describe a mounting; give robot.param.yaml, which `setup` writes")
-    if node.base_frame and params.crop.body:
+    if node_params.base_frame and params.crop.body:
         raise InputError(
-            f"{file} has crop.body in '{node.base_frame}', its base_frame, as nodes "
-            "read it; leave base_frame out and give the box in the sensor's frame, "
-            "as setup writes it"
+            f"{file} gives crop.body in '{node_params.base_frame}' (base_frame); remove base_frame and give the box "
+            "in the sensor's frame, as setup writes it"
         )
     pose = params.ground.sensor_pose
     return SensorMount(
-        pose.height, pose.roll, pose.pitch, math.radians(node.input.ahead), params.crop, params.input.intensity_max
-    ), node.input.deskew != "off"
+        pose.height,
+        pose.roll,
+        pose.pitch,
+        math.radians(node_params.input.ahead),
+        params.crop,
+        params.input.intensity_max,
+    ), node_params.input.deskew != "off"
 
 
 def _convert_to_bag(

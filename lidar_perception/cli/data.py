@@ -23,7 +23,7 @@ DATA_HELP = (
     "files, or the output of `simulate`. BAG:/TOPIC names the clouds of a bag that has "
     "several."
 )
-MAX_DEFAULT_JOBS = 16  # maximum default number of processes, enough to feed a GPU
+MAX_DEFAULT_JOBS = 16  # enough to feed a GPU
 
 
 def path_option(name: str, description: str, metavar: str = "FILE", **option_args: Any) -> Callable:
@@ -32,13 +32,13 @@ def path_option(name: str, description: str, metavar: str = "FILE", **option_arg
 
 
 class OutFile(click.Path):
-    """A file to write at the end of a command, checked at the start."""
+    """Path of a file that a command writes at its end. Checks at the start that it can be written."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         parent = next(folder for folder in path.absolute().parents if folder.exists())
         if path.is_dir() or str(path) == "-" or not (parent.is_dir() and os.access(parent, os.W_OK)):
-            raise InputError(f"{path} cannot be written; give the name of a file")
+            raise InputError(f"cannot write {path}; give the name of a file in a writable folder")
         return path
 
 
@@ -48,7 +48,7 @@ def out_file_option(name: str, description: str, *aliases: str, **option_args: A
 
 
 class OutFolder(click.Path):
-    """A folder to write into, checked at the start and created when something is written."""
+    """Folder to write into. Checks at the start that it is writable; it is created when something is written."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
@@ -98,7 +98,7 @@ def data_argument(
         def wrapper(*args: Any, data: Any, data_option: Any, **kwargs: Any) -> Any:
             if data and data_option:
                 argument_text, option_text = (
-                    " ".join(map(str, each if several else [each])) for each in (data, data_option)
+                    " ".join(map(str, value if several else [value])) for value in (data, data_option)
                 )
                 raise click.UsageError(f"DATA is given twice, {argument_text} and --data {option_text}; give one")
             if required and not (data or data_option):
@@ -183,7 +183,7 @@ class ScoringOptions:
         return recording
 
     def fill(self, report: Any, recording: Any, start: Any, title: str = "evaluating") -> None:
-        """Score the frames of the recording, see scoring.run.fill_report."""
+        """Add the scores of all frames of the recording to a report, see scoring.run.fill_report."""
         from lidar_perception.scoring.run import fill_report
 
         fill_report(report, recording, start, limit=self.limit, jobs=self.jobs, dask=self.dask, title=title)
@@ -240,10 +240,10 @@ def open_and_describe(data: Path, *, level: bool = True, **open_args: Any) -> An
     recording_with_height = apply_measured_height(recording, clouds)
     if recording_with_height is not recording:
         height = next(iter(recording_with_height)).sensor_height
-        errors.print(f"its sensor is {height:.2f} m above the ground, measured on the first clouds", style="dim")
+        errors.print(f"sensor height {height:.2f} m, measured on the first clouds", style="dim")
     if level and clouds:
         if (full_scale := recording.frames[0].intensity_max()) > 1:
-            errors.print(f"its intensity is 0 .. {full_scale:g}, read as 0 .. 1", style="dim")
+            errors.print(f"intensity 0 .. {full_scale:g}, read as 0 .. 1", style="dim")
         for problem in filter(
             None,
             (
@@ -262,8 +262,7 @@ def describe_missing_scans(recording: Any) -> list[str]:
 
 
 def with_recorded_height(recording: Any, params: Any) -> Any:
-    """Return params with the sensor height of the recording, unless they set a height other than
-    the default."""
+    """Return params with the sensor height of the recording, unless they already set a height."""
     from lidar_perception.ground.params import set_sensor_height
     from lidar_perception.types import SENSOR_HEIGHT
 

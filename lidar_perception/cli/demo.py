@@ -20,13 +20,13 @@ from lidar_perception.cli.data import DATA_HELP, data_argument, open_and_describ
 from lidar_perception.cli.evaluate.candidates import with_recorded_setup
 from lidar_perception.cli.options import (
     CANDIDATES,
-    Runs,
+    Algorithm,
     Settings,
-    checked,
+    apply_values,
     device_option,
-    make_candidate_runs,
+    make_candidate_algorithm,
+    make_detector_algorithm,
     make_detector_choice,
-    make_runs,
     range_option,
     settings_options,
 )
@@ -60,9 +60,13 @@ BEHIND_M = 2.0  # a detection farther behind the sensor than this requires an al
 REPLACED = ("drive", "result", "logs")  # subfolders that the next demo replaces
 
 
-def _make_runs(detector: str) -> Runs:
+def _make_algorithm(detector: str) -> Algorithm:
     """Return the parameters of the detector that the nodes run."""
-    return make_candidate_runs(on_messages=True) if detector == CANDIDATES else make_runs(detector, on_messages=True)
+    return (
+        make_candidate_algorithm(in_nodes=True)
+        if detector == CANDIDATES
+        else make_detector_algorithm(detector, in_nodes=True)
+    )
 
 
 @click.command(cls=Command)
@@ -99,7 +103,7 @@ def _make_runs(detector: str) -> Runs:
 )
 @range_option
 @device_option
-@settings_options(lambda given: [_make_runs(given.get("detector") or FUSED)], candidates=True)
+@settings_options(lambda options: [_make_algorithm(options.get("detector") or FUSED)], candidates=True)
 def demo(
     data: Path | None,
     detector: str,
@@ -133,7 +137,7 @@ def demo(
     """
     if data is not None:
         refuse_options(("frames", "drive_seed"), "applies to the simulated drive, which DATA replaces")
-    (values,) = settings.values(_make_runs(detector))
+    (values,) = settings.resolve(_make_algorithm(detector))
     if detector == CANDIDATES and (range != "auto" or device != "auto"):
         raise click.UsageError("--range and --device require a detector with a network")
     choice = make_detector_choice(detector, range, device, values, PAPER if detector == CANDIDATES else None)
@@ -145,7 +149,7 @@ def demo(
     make_folder(out / "logs")
     with compile_in_background(_write_compile_code(choice), out / "logs" / "compile.log", errors.print):
         drive = _make_drive_bag(out / "drive", recording, frames, drive_seed)
-    replayed = _open_replayed(drive, recording)
+    replayed = _open_replayed_bag(drive, recording)
     clouds = len(replayed)
     from lidar_perception.nodes.replay.graph_replay import TRACKS, replay
 
@@ -172,18 +176,18 @@ def demo(
     _print_pace(content, rate, clouds)
     content["tracks"] = _print_tracks(tracks, calibration, content["poses"])
     write_text(out / "scores.json", json.dumps(content, indent=1))
-    picture = _draw_best(
+    has_picture = _draw_best(
         out,
         find_result_cloud_topic(single, detector),
         _select_drawn_objects(detections, detector),
         next(iter(replayed)).sensor_height,
     )
-    console.print(f"results in {out}: result (bag), scores.json, logs" + (", birdseye.png" if picture else ""))
+    console.print(f"results in {out}: result (bag), scores.json, logs" + (", birdseye.png" if has_picture else ""))
     console.print(f"show it: lidar-perception view {out / 'result'}")
     if missing := clouds - content["results"]:
         errors.print(
             Text(f"{missing} clouds produced no result", "red")
-            + ("; without --real-time none is dropped" if real_time else f"; see {out}/logs")
+            + ("; without --real-time, no cloud is dropped" if real_time else f"; see {out}/logs")
         )
         if not real_time:
             raise SystemExit(1)
@@ -195,29 +199,29 @@ def _remove_old_results(out: Path, data: Path | None, detector: str) -> None:
     Raises:
         InputError: `out` holds other files.
     """
-    old = [out / name for name in REPLACED if (out / name).exists()]
-    if old and not (out / RECORD).is_file():
+    old_folders = [out / name for name in REPLACED if (out / name).exists()]
+    if old_folders and not (out / RECORD).is_file():
         raise InputError(
-            f"{old[0]} exists without a {RECORD}, so demo did not create it; remove it, or give another --out"
+            f"{old_folders[0]} exists without a {RECORD}, so demo did not create it; remove it, or give another --out"
         )
-    for folder in old:
+    for folder in old_folders:
         if data is not None and data.resolve().is_relative_to(folder.resolve()):
             raise InputError(f"{data} would be replaced; give another --out")
-    for folder in old:
+    for folder in old_folders:
         shutil.rmtree(folder, ignore_errors=True)
     write_text(out / RECORD, json.dumps({"data": data and str(data), "detector": detector}))
 
 
-def _open_replayed(drive: Path, recording: Recording | None) -> Recording:
+def _open_replayed_bag(path: Path, recording: Recording | None) -> Recording:
     """Open the bag to replay, with the sensor height of the recording that it was converted from."""
-    return open_recording(drive, sensor_height=None if recording is None else recording.frames[0].sensor_height)
+    return open_recording(path, sensor_height=None if recording is None else recording.frames[0].sensor_height)
 
 
 def _load_node_params(choice: DetectorChoice, replayed: Recording) -> Any:
     """Return the parameters of the nodes, and compile their shared code once for all of them."""
     if choice.weights == CANDIDATES:
         warm_up()
-        return with_recorded_setup(replayed, checked(PAPER, choice.settings))
+        return with_recorded_setup(replayed, apply_values(PAPER, choice.settings))
     return choice.open(sensor_height=replayed.frames[0].sensor_height).params
 
 
@@ -309,31 +313,31 @@ def _print_tracks(frames: Sequence[RecordedResult], calibration: Any, poses: str
                 f"(detection {100 * scores['DetA']:.1f}, association {100 * scores['AssA']:.1f})"
             )
     remedy = "; pip install 'lidar_perception[odometry]' to estimate them from the scans"
-    console.print(f"tracks are with {EGO_TITLES[poses]}{remedy * (poses == NO_SOURCE)}")
+    console.print(f"tracking with {EGO_TITLES[poses]}{remedy * (poses == NO_SOURCE)}")
     return {"found": count, "scores": result}
 
 
 def _select_drawn_objects(frames: Sequence[RecordedResult], detector: str) -> dict[int, tuple[np.ndarray, Any]]:
-    """Return {stamp: (boxes of labels, detected objects)} of the classes that are detected."""
+    """Return {stamp: (labelled boxes, detected objects)}, with the classes that the detector supports."""
     names = {CLASSES[PEDESTRIAN]} if detector == CANDIDATES else {*DETECTED}
     return {f.stamp_ns: (f.truth.boxes[[label in names for label in f.truth.labels]], f.published) for f in frames}
 
 
 def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]], height: float) -> bool:
-    """Draw the recorded frame with the most matches, and its tracks; return False without labels."""
+    """Draw the recorded frame with the most matches, and its tracks. Return False if no frame has labels."""
     from lidar_perception.nodes.replay.graph_replay import TRACKS
     from lidar_perception.rendering.colors import color_by_cluster
     from lidar_perception.rendering.files import write_png
     from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
 
-    hits = {
+    counts = {  # (matches, labels) by stamp
         stamp: (len(match_centres(detections.boxes, truth)[0]), len(truth))
         for stamp, (truth, detections) in frames.items()
         if len(truth)
     }
-    if not hits:
+    if not counts:
         return False
-    best_stamp = max(hits, key=lambda s: (hits[s], s))  # the last such frame, because its trails are the longest
+    best_stamp = max(counts, key=lambda s: (counts[s], s))  # the last such frame, because its trails are the longest
     truth, detections = frames[best_stamp]
     trails: dict[int, np.ndarray] = {}
     cloud_msg = None
@@ -365,7 +369,7 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
             frame,
             boxes,
             truth,
-            f"{hits[best_stamp][0]} of {hits[best_stamp][1]} labelled objects detected",
+            f"{counts[best_stamp][0]} of {counts[best_stamp][1]} labelled objects detected",
             f"{best_stamp / 1e9:.1f} s",
             colors,
         ),

@@ -136,9 +136,8 @@ def detect(
 
     --png draws every frame, png/FRAME.png, and --video a video, without a browser.
 
-    Finished frames are saved at once: the same command resumes a run that was stopped, and adds
-    formats to a complete one. Frames that cannot be read are named and counted; the exit code is
-    then 1.
+    Each finished frame is saved at once: the same command resumes an interrupted run, and adds
+    formats to a complete one. Frames that cannot be read are listed; the exit code is then 1.
 
     \b
     Examples:

@@ -35,13 +35,13 @@ def info(data: Path, as_json: bool) -> None:
     if layout is None and data.is_dir():
         raise InputError(f"{data} has no metadata.yaml and is not another kind of recording: {describe_formats()}")
     if layout in (None, bag_frames):
-        content, show = _describe_bag(data), _print_bag
+        content, print_content = _describe_bag(data), _print_bag
     else:
-        content, show = _describe_recording(data), _print_recording
+        content, print_content = _describe_recording(data), _print_recording
     if as_json:
         click.echo(json.dumps(content, indent=1))
     else:
-        show(content)
+        print_content(content)
 
 
 def _describe_bag(path: Path) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def _print_recording(content: dict[str, Any]) -> None:
     greatest = first["greatest_intensity"]
     intensity = "no intensity" if greatest is None else f"intensity up to {greatest:.3g}"
     if first["full_intensity"] > 1:
-        intensity += f" of 1, which is {first['full_intensity']:g} in the files"
+        intensity += f" (0 .. {first['full_intensity']:g} in the files, read as 0 .. 1)"
     console.print(f"first cloud: {first['name']}, {first['points']} points, {intensity}")
     if first["labels"] is not None:
         console.print(f"its labels: {', '.join(first['labels']) or 'none'}")

@@ -11,7 +11,7 @@ import click
 from lidar_perception import __version__
 from lidar_perception.cli.command import Group
 
-COMMANDS = {  # verb -> (module.function, description in the overview)
+COMMANDS = {  # name -> (module.function, description in the overview)
     "demo": ("lidar_perception.cli.demo.demo", "Replay a drive through the ROS 2 nodes and score the result."),
     "convert": ("lidar_perception.cli.convert.convert", "Convert recordings and labels to bags and other formats."),
     "detect": ("lidar_perception.cli.detect.detect", "Run a detector on a recording and write its results."),
@@ -36,7 +36,7 @@ class LazyGroup(Group):
     """A group that imports the module of a command on first use.
 
     Args:
-        commands_by_name: {verb: (module.function, description in the overview)}.
+        commands_by_name: {name: (module.function, description in the overview)}.
     """
 
     def __init__(self, *args: Any, commands_by_name: dict[str, tuple[str, str]], **kwargs: Any):

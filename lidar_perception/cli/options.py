@@ -2,7 +2,7 @@
 
 @click.command(cls=Command)
 @detector_options()
-def verb(detector: DetectorChoice): detector.open(sensor_height=1.73)
+def command(detector: DetectorChoice): detector.open(sensor_height=1.73)
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ON_OFF = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no"
 
 
 @dataclass(frozen=True)
-class Runs:
+class Algorithm:
     """An algorithm whose parameters can be set.
 
     Attributes:
@@ -53,17 +53,17 @@ class Settings:
     """Values of --config and --set, not yet checked against a detector."""
 
     config: Path | None
-    given: tuple[tuple[str, str], ...]
+    assignments: tuple[tuple[str, str], ...]
 
-    def values(self, *runs: Runs) -> list[dict[str, Any]]:
+    def resolve(self, *algorithms: Algorithm) -> list[dict[str, Any]]:
         """Return {dotted name: value} for each algorithm; --set takes precedence over --config.
 
         Raises:
             InputError: no algorithm has a parameter of --set, or a file cannot be used.
         """
-        fields_by_name = {name: f for each in runs for name, f in each.fields.items()}
-        owners = " or ".join(dict.fromkeys(each.name for each in runs))
-        for name, _ in self.given:
+        fields_by_name = {name: f for algorithm in algorithms for name, f in algorithm.fields.items()}
+        owners = " or ".join(dict.fromkeys(algorithm.name for algorithm in algorithms))
+        for name, _ in self.assignments:
             if name not in fields_by_name and name.startswith("input."):
                 raise InputError(f"{name} applies to messages read by nodes; a recording has its own intensity scale")
             if name not in fields_by_name:
@@ -71,31 +71,35 @@ class Settings:
                     f"unknown parameter {name[:80]!r} of {owners}{_suggest_parameter(name, fields_by_name)} "
                     "(--set help lists them all)"
                 )
-        values_by_run: list[dict[str, Any]] = [{} for _ in runs]
+        config_values: list[dict[str, Any]] = [{} for _ in algorithms]
         if self.config is not None:
-            contents = [read_parameters(self.config, each.fields, each.nodes) for each in runs]
-            values_by_run = [values for values, _ in contents]
+            contents = [read_parameters(self.config, algorithm.fields, algorithm.nodes) for algorithm in algorithms]
+            config_values = [values for values, _ in contents]
             _warn(self.config, (line for _, lines in contents for line in lines))
-            if not any(values_by_run):
+            if not any(config_values):
                 errors.print(f"{self.config} has no parameter of {owners}", style="yellow")
         return [
             {
                 **values,
-                **{name: _parse(name, each.fields[name], text) for name, text in self.given if name in each.fields},
+                **{
+                    name: _parse(name, algorithm.fields[name], text)
+                    for name, text in self.assignments
+                    if name in algorithm.fields
+                },
             }
-            for each, values in zip(runs, values_by_run)
+            for algorithm, values in zip(algorithms, config_values)
         ]
 
     def __bool__(self) -> bool:
-        return self.config is not None or bool(self.given)
+        return self.config is not None or bool(self.assignments)
 
 
 def _suggest_parameter(name: str, fields: Fields) -> str:
     """Return the end of an error message that suggests the parameter with the closest name."""
-    members = [each for each in fields if each.startswith(f"{name}.")]
+    members = [key for key in fields if key.startswith(f"{name}.")]
     if members:
         return f", which is a group with {', '.join(members)}"
-    matches = [each for each in fields if each.endswith(f".{name}")]
+    matches = [key for key in fields if key.endswith(f".{name}")]
     return f"; did you mean {matches[0]!r}?" if len(matches) == 1 else suggest_name(name, fields)
 
 
@@ -121,7 +125,7 @@ def _parse_scalar(value_type: type, text: str) -> Any:
 
 
 class Assignment(click.ParamType):
-    """NAME=VALUE, or NAME:=VALUE as in ROS."""
+    """Option value of the form NAME=VALUE, or NAME:=VALUE as in ROS."""
 
     name = "assignment"
 
@@ -137,15 +141,21 @@ class Assignment(click.ParamType):
 
 
 class SetOption(HelpfulOption):
-    """The option --set. `runs` returns the algorithms that the options select."""
+    """The option --set.
 
-    def __init__(self, *args: Any, runs: Callable[[Mapping[str, Any]], list[Runs]], **more: Any):
-        super().__init__(*args, **more)
-        self.runs = runs
+    Args:
+        select: Function from the other options to the algorithms that they select.
+    """
 
-    def listing(self, options: Mapping[str, Any]) -> str:
+    def __init__(self, *args: Any, select: Callable[[Mapping[str, Any]], list[Algorithm]], **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self.select = select
+
+    def list_values(self, options: Mapping[str, Any]) -> str:
         return "\n".join(
-            line for run in self.runs(options) for line in (f"Parameters of {run.name}:", *describe_fields(run.fields))
+            line
+            for algorithm in self.select(options)
+            for line in (f"Parameters of {algorithm.name}:", *describe_fields(algorithm.fields))
         )
 
     def suggest_option(self, flag: str) -> str:
@@ -157,12 +167,14 @@ class SetOption(HelpfulOption):
 
 
 def settings_options(
-    runs: Callable[[Mapping[str, Any]], list[Runs]], example: str = "fused.scores.car=0.7", candidates: bool = False
+    select: Callable[[Mapping[str, Any]], list[Algorithm]],
+    example: str = "fused.scores.car=0.7",
+    candidates: bool = False,
 ) -> Callable:
     """Decorator: --config and --set, which the function gets as settings=Settings(...).
 
     Args:
-        runs: returns the algorithms that the options select, for `--set help`.
+        select: returns the algorithms that the options select, for `--set help`.
         example: assignment to show in the help.
         candidates: True if the candidate pipeline, which has named configurations, can be selected.
     """
@@ -170,14 +182,14 @@ def settings_options(
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
-        def wrapper(*args: Any, config: Path | None, given: tuple, **kwargs: Any) -> Any:
-            return function(*args, settings=Settings(config, given), **kwargs)
+        def wrapper(*args: Any, config: Path | None, assignments: tuple, **kwargs: Any) -> Any:
+            return function(*args, settings=Settings(config, assignments), **kwargs)
 
         wrapper = click.option(
             "--set",
-            "given",
+            "assignments",
             cls=SetOption,
-            runs=runs,
+            select=select,
             multiple=True,
             type=Assignment(),
             metavar="NAME=VALUE",
@@ -194,13 +206,14 @@ def settings_options(
     return decorate
 
 
-def make_candidate_runs(on_messages: bool = False) -> Runs:
+def make_candidate_algorithm(in_nodes: bool = False) -> Algorithm:
     """Return the parameters of the candidate pipeline.
 
     Args:
-        on_messages: True if it runs in nodes, so that parameters of input messages are included.
+        in_nodes: True to include the parameters of input messages.
     """
-    return Runs(CANDIDATES, _read_here(collect_fields(PAPER), on_messages), CANDIDATE_NODES)
+    fields = collect_fields(PAPER)
+    return Algorithm(CANDIDATES, fields if in_nodes else _drop_input_fields(fields), CANDIDATE_NODES)
 
 
 def parameter_options(
@@ -213,19 +226,19 @@ def parameter_options(
 
     The function gets the dataclass as params=...
     """
-    runs = Runs(name, _read_here(collect_fields(defaults), on_messages=False), nodes)
+    algorithm = Algorithm(name, _drop_input_fields(collect_fields(defaults)), nodes)
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
         def wrapper(*args: Any, settings: Settings, **kwargs: Any) -> Any:
-            return function(*args, params=checked(defaults, settings.values(runs)[0]), **kwargs)
+            return function(*args, params=apply_values(defaults, settings.resolve(algorithm)[0]), **kwargs)
 
-        return settings_options(lambda _: [runs], example, name == CANDIDATES)(wrapper)
+        return settings_options(lambda _: [algorithm], example, name == CANDIDATES)(wrapper)
 
     return decorate
 
 
-def checked(params: Any, values: Mapping[str, Any]) -> Any:
+def apply_values(params: Any, values: Mapping[str, Any]) -> Any:
     """Return params with these values.
 
     Raises:
@@ -237,17 +250,17 @@ def checked(params: Any, values: Mapping[str, Any]) -> Any:
         raise InputError(str(error)) from None
 
 
-def weights_of(options: Mapping[str, Any]) -> list[str]:
+def list_weights(options: Mapping[str, Any]) -> list[str]:
     """Return the values of --weights as a list."""
     weights = options.get("weights") or ()
     return [*map(str, weights)] if isinstance(weights, tuple) else [str(weights)]
 
 
-def make_runs(weights: str | Path, on_messages: bool = False) -> Runs:
+def make_detector_algorithm(weights: str | Path, in_nodes: bool = False) -> Algorithm:
     """Return the parameters of the detector that a value of --weights selects.
 
     Args:
-        on_messages: True if it runs in nodes, so that parameters of input messages are included.
+        in_nodes: True to include the parameters of input messages.
 
     Raises:
         InputError: the detector is unknown.
@@ -255,22 +268,23 @@ def make_runs(weights: str | Path, on_messages: bool = False) -> Runs:
     params = default_params(weights)
     name = str(weights)
     node = next((f"{f.name}_detector" for f in fields(params) if f"{f.name}_detector" in NODES), name)
-    return Runs(name, _read_here(collect_fields(params), on_messages), (node,))
+    param_fields = collect_fields(params)
+    return Algorithm(name, param_fields if in_nodes else _drop_input_fields(param_fields), (node,))
 
 
-def _read_here(fields: Fields, on_messages: bool) -> Fields:
-    """Return the fields, without those for input messages if no messages are read."""
-    return {name: f for name, f in fields.items() if on_messages or not name.startswith("input.")}
+def _drop_input_fields(fields: Fields) -> Fields:
+    """Drop the parameters of input messages, which only nodes read."""
+    return {name: f for name, f in fields.items() if not name.startswith("input.")}
 
 
 @dataclass(frozen=True)
-class Tracked:
+class TrackerParams:
     """Parameters of the tracker, named as in its node."""
 
     tracking: TrackingParams = TrackingParams()
 
 
-TRACKER = Runs("the tracker", collect_fields(Tracked()), ("tracker",))
+TRACKER = Algorithm("the tracker", collect_fields(TrackerParams()), ("tracker",))
 
 range_option = click.option(
     "--range",
@@ -295,10 +309,10 @@ def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> 
         tracking: True to accept parameters of the tracker as well; the function gets them as
             tracking=TrackingParams(...).
     """
-    tracker_runs = [TRACKER] if tracking else []
+    tracker = [TRACKER] if tracking else []
 
-    def runs(given: Mapping[str, Any]) -> list[Runs]:
-        return [*map(make_runs, weights_of(given) or [FUSED]), *tracker_runs]
+    def select(options: Mapping[str, Any]) -> list[Algorithm]:
+        return [*map(make_detector_algorithm, list_weights(options) or [FUSED]), *tracker]
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
@@ -316,13 +330,13 @@ def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> 
                 raise click.UsageError("--config and --set require --weights")
             values: list[dict[str, Any]] = [{}, {}]
             if name is not None:
-                values = settings.values(make_runs(name), *tracker_runs) if settings else values
+                values = settings.resolve(make_detector_algorithm(name), *tracker) if settings else values
             if tracking:
-                kwargs["tracking"] = checked(Tracked(), values[1]).tracking
+                kwargs["tracking"] = apply_values(TrackerParams(), values[1]).tracking
             choice = None if name is None else make_detector_choice(name, range, device, values[0])
             return function(*args, detector=choice, **kwargs)
 
-        wrapper = settings_options(runs)(wrapper)
+        wrapper = settings_options(select)(wrapper)
         for option in device_option, range_option, weights_option(default):
             wrapper = option(wrapper)
         return wrapper
@@ -343,11 +357,13 @@ def detectors_options(function: Callable) -> Callable:
     ) -> Any:
         if settings and not weights:
             raise click.UsageError("--config and --set require --weights")
-        values = settings.values(*map(make_runs, weights)) if settings else [{} for _ in weights]
+        values = settings.resolve(*map(make_detector_algorithm, weights)) if settings else [{} for _ in weights]
         choices = tuple(make_detector_choice(name, range, device, params) for name, params in zip(weights, values))
         return function(*args, detectors=choices, **kwargs)
 
-    wrapper = settings_options(lambda given: [*map(make_runs, weights_of(given) or [FUSED])])(wrapper)
+    wrapper = settings_options(lambda options: [*map(make_detector_algorithm, list_weights(options) or [FUSED])])(
+        wrapper
+    )
     for option in device_option, range_option, weights_option(multiple=True):
         wrapper = option(wrapper)
     return wrapper
@@ -356,18 +372,18 @@ def detectors_options(function: Callable) -> Callable:
 def make_detector_choice(
     weights: str | Path, range: str, device: str, values: Mapping[str, Any], params: Any = None
 ) -> DetectorChoice:
-    """Return a detector to open later; its parameters are checked now.
+    """Return the choice of a detector, which is opened later. Its parameters are validated now.
 
     Args:
         params: default parameters of a detector that open_detector does not support.
     """
     if values:
-        checked(default_params(weights) if params is None else params, values)
+        apply_values(default_params(weights) if params is None else params, values)
     return DetectorChoice(str(weights), range, device, dict(values))
 
 
 def weights_option(default: str | None = None, multiple: bool = False) -> Callable:
-    """Return the option --weights; with `multiple` it may be repeated."""
+    """Return the option --weights, which may be repeated if `multiple` is True."""
     note = " May be repeated." if multiple else f" Default: {default}." if default else ""
     return click.option(
         "--weights",
@@ -379,13 +395,13 @@ def weights_option(default: str | None = None, multiple: bool = False) -> Callab
     )
 
 
-def read_config(path: Path, known: Any, nodes: Collection[str] | None = None) -> dict[str, Any]:
+def read_config(path: Path, params: Any, nodes: Collection[str] | None = None) -> dict[str, Any]:
     """Read a parameter file (see read_parameters) and print names that may be misspelt.
 
     Args:
-        known: a dataclass of parameters, or its fields.
+        params: a dataclass of parameters, or its fields.
     """
-    fields = known if isinstance(known, Mapping) else collect_fields(known)
+    fields = params if isinstance(params, Mapping) else collect_fields(params)
     values, lines = read_parameters(path, fields, nodes)
     _warn(path, lines)
     return values

@@ -35,6 +35,7 @@ from lidar_perception.wire.params import ViewParams
 )
 @click.option(
     "--at",
+    "point",
     nargs=3,
     type=float,
     metavar="X Y Z",
@@ -43,7 +44,7 @@ from lidar_perception.wire.params import ViewParams
 @out_file_option("--out", "Template to write.", required=True)
 @parameter_options(PipelineParams(view=ViewParams(enabled=True)))
 def seed(
-    data: Path, number: int | None, at: tuple[float, float, float] | None, out: Path, params: PipelineParams
+    data: Path, number: int | None, point: tuple[float, float, float] | None, out: Path, params: PipelineParams
 ) -> None:
     """Save the silhouette and height of one pedestrian as a template for later runs.
 
@@ -56,14 +57,14 @@ def seed(
     """
     recording = open_and_describe(data)
     params = with_recorded_height(recording, params)
-    frame = _choose_frame(recording, number, params.view, at is None)
+    frame = _choose_frame(recording, number, params.view, point is None)
     camera = frame.camera()
     if camera is None:
         params = replace(params, view=ViewParams(enabled=False))
     segmented = segment_cloud(frame.load(), camera, params)
     source = (
-        make_click_source(np.array(at), params.seed)
-        if at is not None
+        make_click_source(np.array(point), params.seed)
+        if point is not None
         else make_truth_source(load_pedestrians(frame, params.view.enabled))
     )
     (template,) = source(segmented)
@@ -81,7 +82,7 @@ def _choose_frame(recording: Recording, number: int | None, view: ViewParams, ne
             if number is None and (not needs_label or len(load_pedestrians(frame, view.enabled))):
                 return frame
     raise InputError(
-        f"{recording.path} has no frame {number}; it has {len(recording)}"
+        f"{recording.path} has only {len(recording)} frames, so no frame {number}; the first is frame 0"
         if number is not None
         else f"{recording.path} has no Pedestrian label; give --frame and --at"
     )

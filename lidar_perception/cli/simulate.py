@@ -73,7 +73,7 @@ from lidar_perception.types import InputError
     "kind",
     metavar="KIND",
     help="Scenes of this kind only: "
-    + "; ".join(f"{name} {', '.join(one.kinds)}" for name, one in SCENE_TYPES.items())
+    + "; ".join(f"{name} {', '.join(scene_type.kinds)}" for name, scene_type in SCENE_TYPES.items())
     + ". Default: all.",
 )
 @click.option(
@@ -178,19 +178,20 @@ def _write_dataset(
             *(word for name, value in options.items() if value is not None for word in (f"--{name}", str(value))),
         ]
     )
-    was_complete, has_begun = resume and is_finished(out), False
+    was_complete, has_started = resume and is_finished(out), False
     try:
         with make_resumable_folder(out, settings, FOLDERS, resume=resume, force=force) as missing:
-            has_begun = True
+            has_started = True
             with closing(write_frames(out, plan, missing, jobs)) as written:
                 for _ in show_progress(written, "simulating", len(missing)):
                     pass
     except InputError as error:
-        if not has_begun:
+        if not has_started:
             raise
-        raise InputError(f"{error}; finished frames are kept, resume with --resume") from None
+        raise InputError(f"{error}; finished frames are kept, so continue with --resume") from None
     console.print(
-        f"{out} is complete: there is nothing to do"
+        f"{out} is already complete"
         if was_complete
-        else f"{out}: {plan.frames} scans" + (f", {plan.frames - len(missing)} of them from before" if resume else "")
+        else f"{out}: {plan.frames} scans"
+        + (f", {plan.frames - len(missing)} of them from the interrupted run" if resume else "")
     )

@@ -15,7 +15,7 @@ import click
 from lidar_perception import __version__
 from lidar_perception.cli.command import Choice, Group
 from lidar_perception.cli.data import data_argument, make_jobs_option, out_file_option, out_folder_option, path_option
-from lidar_perception.cli.options import checked, device_option, parameter_options
+from lidar_perception.cli.options import apply_values, device_option, parameter_options
 from lidar_perception.param_fields import collect_fields
 from lidar_perception.runs.terminal import console
 from lidar_perception.training.params import FusedTraining, PointNetTraining, PointPillarsTraining
@@ -80,7 +80,7 @@ def training_options(defaults: Any) -> Callable:
             flag_values = {
                 name: value for name in fields_by_name if (value := kwargs.pop(name.replace(".", "_"))) is not None
             }
-            return function(*args, params=checked(params, flag_values), **kwargs)
+            return function(*args, params=apply_values(params, flag_values), **kwargs)
 
         for name, f in reversed(fields_by_name.items()):
             wrapper = _make_flag(name, f)(wrapper)
@@ -215,11 +215,11 @@ def print_fusion_fits(kind: str, fits: Any) -> None:
     table = make_table(
         f"Fitted curves on held-out scans, {kind}", "", "proposals", "correct", ">= 0.4", "correct", "log loss"
     )
-    unfitted = []
+    unfitted_classes = []
     for name, fit in fits.items():
-        rows = [("package", fit.before)]
-        rows += [("fitted", fit.after)] if fit.after else []
-        unfitted += [] if fit.after else [name]
+        rows = [("package", fit.old_score)]
+        rows += [("fitted", fit.new_score)] if fit.new_score else []
+        unfitted_classes += [] if fit.new_score else [name]
         for k, (source, score) in enumerate(rows):
             table.add_row(
                 f"{name}, {source}",
@@ -229,10 +229,10 @@ def print_fusion_fits(kind: str, fits: Any) -> None:
                 f"{score.loss:.3f}",
             )
     console.print(table)
-    if unfitted:
+    if unfitted_classes:
         console.print(
-            f"{', '.join(unfitted)}: too few samples to fit curves, so the packaged curves remain; use more --scans "
-            "or another --scene"
+            f"{', '.join(unfitted_classes)}: too few samples to fit curves, so the packaged curves are kept; use more "
+            "--scans or another --scene"
         )
 
 

@@ -25,7 +25,7 @@ def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:
     """Convert PointPillars weights of OpenPCDet or mmdetection3d (1.x) to a checkpoint.
 
     Supports networks for KITTI with pillars of 0.16 m. The file is loaded as weights only; no code
-    in it is run. Different conventions (anchors, headings, points of a pillar) are converted.
+    in it is run. The conventions for anchors, headings and points of a pillar are converted.
 
     \b
     Examples:
@@ -54,7 +54,7 @@ def onnx(weights: Path, out: Path) -> None:
 
     Any version, size and classes can be exported. The graph of PointPillars takes points sorted
     into pillars and returns the raw outputs at every anchor; that of PointNet takes the points of
-    clusters. The metadata has the configuration. Detectors accept the file as a checkpoint.
+    clusters. The metadata contains the configuration. Detectors accept the file as a checkpoint.
 
     \b
     Examples:

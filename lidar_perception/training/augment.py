@@ -1,6 +1,7 @@
-"""Augmentation of labelled scenes: pure functions with the random generator as an argument.
+"""Augmentation of labelled scenes.
 
-Points in a box stay in it, except for noise and slopes. A scene is in the frame of a level sensor.
+All functions are pure and take the random generator as an argument. Points in a box stay in it,
+except for noise and slopes. A scene is in the frame of a level sensor.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class TrainingScene:
         boxes: (M, 7) float64, x y z l w h yaw.
         class_ids: (M,) int into CLASSES.
         detectable: (M,) bool, False for objects that are too hidden to be detected.
-        around: Objects in all directions are labelled, not only those ahead.
+        all_around: True if objects in all directions are labelled, not only those ahead.
         height: Height of the sensor above the ground in metres.
     """
 
@@ -38,12 +39,12 @@ class TrainingScene:
     boxes: np.ndarray
     class_ids: np.ndarray
     detectable: np.ndarray
-    around: bool = False
+    all_around: bool = False
     height: float = SENSOR_HEIGHT
 
 
 def augment_scene(scene: TrainingScene, params: AugmentParams, rng: np.random.Generator) -> TrainingScene:
-    """Apply all random changes except those of turn_and_crop and database.paste_objects."""
+    """Apply all random changes except those of rotate_and_crop and database.paste_objects."""
     scene = move_objects(scene, params.object_turn, params.object_shift, rng)
     if rng.random() < params.flip:
         scene = flip_scene(scene)
@@ -59,22 +60,23 @@ def augment_scene(scene: TrainingScene, params: AugmentParams, rng: np.random.Ge
     return raise_scene(scene, rng.uniform(-params.height, params.height), rng.uniform(-params.tilt, params.tilt, 2))
 
 
-def turn_and_crop(
+def rotate_and_crop(
     scene: TrainingScene, params: AugmentParams, low: np.ndarray, high: np.ndarray, rng: np.random.Generator
 ) -> TrainingScene:
     """Rotate the scene at random, and crop it to the region between low and high (3,) in m.
 
-    The crop has a margin for the other changes. It comes first, since most points are outside.
+    The crop leaves a margin for the other changes. This step runs first, because it removes most
+    points.
     """
-    turn = np.pi if scene.around and params.turn else params.turn
-    scene = turn_scene(scene, rng.uniform(-turn, turn))
+    turn = np.pi if scene.all_around and params.turn else params.turn
+    scene = rotate_scene(scene, rng.uniform(-turn, turn))
     margin = 1 + params.height + params.scale / (1 - params.scale) * np.abs([low, high])
     margin[:, 2] += 2 * params.tilt * np.abs([low[:2], high[:2]]).max()
     return crop_scene(scene, low - margin[0], high + margin[1])
 
 
 def crop_scene(scene: TrainingScene, low: np.ndarray, high: np.ndarray) -> TrainingScene:
-    """Keep the points between low and high (3,) in m, and the boxes whose centre is within these limits of x and y."""
+    """Keep the points between low and high (3,) in m, and the boxes whose centre is between them in x and y."""
     keep = np.ones(len(scene.points), bool)
     for axis in range(3):
         keep &= (scene.points[:, axis] >= low[axis]) & (scene.points[:, axis] < high[axis])
@@ -95,7 +97,7 @@ def flip_scene(scene: TrainingScene) -> TrainingScene:
     return replace(scene, points=points, boxes=boxes)
 
 
-def turn_scene(scene: TrainingScene, angle: float) -> TrainingScene:
+def rotate_scene(scene: TrainingScene, angle: float) -> TrainingScene:
     """Rotate the scene counter-clockwise about the sensor by an angle in rad."""
     cos, sin = np.cos(angle), np.sin(angle)
     matrix = np.array([[cos, sin], [-sin, cos]])
@@ -114,9 +116,9 @@ def scale_scene(scene: TrainingScene, factor: float) -> TrainingScene:
     return replace(scene, points=points, boxes=boxes)
 
 
-def drop_points(scene: TrainingScene, share: float, rng: np.random.Generator) -> TrainingScene:
-    """Drop a random share of the points."""
-    return replace(scene, points=scene.points[rng.random(len(scene.points)) >= share])
+def drop_points(scene: TrainingScene, fraction: float, rng: np.random.Generator) -> TrainingScene:
+    """Drop a random fraction of the points."""
+    return replace(scene, points=scene.points[rng.random(len(scene.points)) >= fraction])
 
 
 def change_intensity(scene: TrainingScene, factor: float, offset: float) -> TrainingScene:
@@ -128,9 +130,9 @@ def change_intensity(scene: TrainingScene, factor: float, offset: float) -> Trai
 
 
 def distort_intensity(points: np.ndarray, params: IntensityParams, rng: np.random.Generator) -> np.ndarray:
-    """Change the intensities of points (N, 4) to those of another sensor, or set all to 0.
+    """Change the intensities of points (N, 4) as if another sensor had measured them, or set all to 0.
 
-    An intensity of 0 stays 0. Gain and gamma are not changed, since normalize_intensity removes
+    An intensity of 0 stays 0. Gain and gamma are not changed, because normalize_intensity removes
     them.
     """
     points = points.copy()
@@ -151,7 +153,7 @@ def distort_intensity(points: np.ndarray, params: IntensityParams, rng: np.rando
 
 
 def add_reflector(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Make a random range of heights of an object with points (N, 4), N >= 1, retroreflective."""
+    """Make the points (N, 4), N >= 1, of an object retroreflective between two random heights."""
     points = points.copy()
     height = points[:, 2]
     low, high = np.sort(rng.uniform(height.min(), height.max(), 2))
@@ -173,12 +175,12 @@ def vary_background(
     Returns:
         (N, 4) changed points, and the factors (3,) of the sizes, equal along x and y.
     """
-    wide, high = np.exp(rng.uniform(-params.things_stretch, params.things_stretch, 2))
-    factors = np.array([wide, wide, high])
+    width_factor, height_factor = np.exp(rng.uniform(-params.things_stretch, params.things_stretch, 2))
+    factors = np.array([width_factor, width_factor, height_factor])
     points = points.copy()
     points[:, :3] = (points[:, :3] - foot) * factors + foot
-    factor = np.exp(rng.uniform(-params.things_intensity, params.things_intensity))
-    points[:, 3] = np.clip(points[:, 3] * factor, 0, 1)
+    gain = np.exp(rng.uniform(-params.things_intensity, params.things_intensity))
+    points[:, 3] = np.clip(points[:, 3] * gain, 0, 1)
     if rng.random() < params.things_shine:
         points = add_reflector(points, rng)
     return points, factors
@@ -206,9 +208,9 @@ def blur_ranges(points: np.ndarray, beam: float, point: float, rng: np.random.Ge
     first = beams.min(initial=0)
     offsets = rng.normal(0, beam, int(beams.max(initial=0) - first) + 1)
     shift = offsets[beams - first] + rng.normal(0, point, len(points))
-    moved = points.copy()
-    moved[:, :3] *= (1 + shift / ranges)[:, None]
-    return moved
+    points = points.copy()
+    points[:, :3] *= (1 + shift / ranges)[:, None]
+    return points
 
 
 def raise_scene(scene: TrainingScene, height: float, slopes: ArrayLike = (0.0, 0.0)) -> TrainingScene:
@@ -232,7 +234,7 @@ def move_objects(scene: TrainingScene, turn: float, shift: float, rng: np.random
 
     Args:
         scene: Scene, which is not changed.
-        turn: Largest rotation about the object's centre, rad.
+        turn: Maximum rotation about the object's centre, rad.
         shift: Standard deviation of the shift along x and along y, m.
         rng: Random generator.
     """
@@ -248,17 +250,17 @@ def move_objects(scene: TrainingScene, turn: float, shift: float, rng: np.random
         goal[6] = wrap_angle(goal[6] + angles[i])
         if bev_iou(enlarge_boxes(np.stack([boxes[i], goal])), others).any():
             continue
-        own = find_points_in_box(points, boxes[i], BOX_MARGIN_M)
-        points[own, :3] = move_with_box(points[own, :3], boxes[i], goal)
+        indices = find_points_in_box(points, boxes[i], BOX_MARGIN_M)
+        points[indices, :3] = move_with_box(points[indices, :3], boxes[i], goal)
         boxes[i] = goal
     return replace(scene, points=points, boxes=boxes)
 
 
 def move_with_box(xyz: np.ndarray, box: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """Move points (N, 3) with a box (7,) to the pose of another box, goal (7,), as float32."""
+    """Move the points (N, 3) of a box (7,) to the pose of another box, goal (7,). Return float32."""
     relative = to_box_frame(xyz.astype(np.float64), box)
-    about = np.array([0.0, 0, 0, 0, 0, 0, -goal[6]])
-    return (to_box_frame(relative, about) + goal[:3]).astype(np.float32)
+    rotation = np.array([0.0, 0, 0, 0, 0, 0, -goal[6]])  # a box, whose frame is rotated by -yaw
+    return (to_box_frame(relative, rotation) + goal[:3]).astype(np.float32)
 
 
 def enlarge_boxes(boxes: np.ndarray, margin: float = BOX_MARGIN_M) -> np.ndarray:

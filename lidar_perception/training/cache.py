@@ -23,11 +23,11 @@ Content = TypeVar("Content")
 
 
 class CacheError(InputError):
-    """Error: the cache cannot be written. A scene that cannot be read is a plain InputError."""
+    """Raised if the cache cannot be written. A scene that cannot be read raises a plain InputError."""
 
 
-def cache_path(cache: Path | None, *key: Any) -> Path | None:
-    """Return the path of the cache file for a key; None without a cache. Equal keys have equal reprs."""
+def make_cache_path(cache: Path | None, *key: Any) -> Path | None:
+    """Return the path of the cache file for a key, or None without a cache. The file name depends on the key's repr."""
     if cache is None:
         return None
     return cache / f"{hashlib.sha1(repr((*key, __version__)).encode()).hexdigest()[:20]}.npz"
@@ -53,9 +53,9 @@ def load_or_compute(
 
     Args:
         path: Path of the .npz file, or None for no cache.
-        compute: Computes the content.
-        from_arrays: Converts the arrays of the file to the content.
-        to_arrays: Converts the content to arrays.
+        compute: Function that computes the content.
+        from_arrays: Function that converts the arrays of the file to the content.
+        to_arrays: Function that converts the content to arrays.
         max_gb: The file is written only while the folder is smaller than this.
 
     Raises:
@@ -94,7 +94,7 @@ def folder_size(folder: Path) -> int:
 
 def find_missing(source: Any, numbers: Sequence[int]) -> list[int]:
     """Return the scene numbers without a cache file; none if the source has no cache."""
-    return [i for i in numbers if (path := source.path(i)) is not None and not path.is_file()]
+    return [i for i in numbers if (path := source.cache_file(i)) is not None and not path.is_file()]
 
 
 def fill_cache(sources: Sequence[Any], numbers: Sequence[Sequence[int]], jobs: int, title: str) -> None:
@@ -103,7 +103,7 @@ def fill_cache(sources: Sequence[Any], numbers: Sequence[Sequence[int]], jobs: i
     Scenes that cannot be read are skipped; training reports them later.
 
     Args:
-        sources: Sources with path(i) and store(i).
+        sources: Sources with cache_file(i) and store(i).
         numbers: Scene numbers of each source.
         jobs: Number of processes.
         title: Title of the progress bar.

@@ -1,6 +1,6 @@
 """Objects cut from scenes to be pasted into others: labelled objects, and background that resembles people.
 
-Such background are posts, poles, trunks and bins.
+Examples of such background are posts, poles, tree trunks and bins.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.training.augment import TrainingScene, enlarge_boxes
-from lidar_perception.training.cache import cache_path, load_or_compute
+from lidar_perception.training.cache import load_or_compute, make_cache_path
 from lidar_perception.training.database import BACKGROUND_ID, Database
 from lidar_perception.training.pasting import find_points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, PointCloud
@@ -30,12 +30,12 @@ MAX_WIDTH_M = 1.2  # maximum length of the object's sides
 MIN_TOP_M, MAX_TOP_M = 0.6, 4.5  # height of the object's top above the ground
 MAX_GAP_M = 0.8  # maximum height of the object's lowest point above the ground
 MIN_DISTANCE_M = 0.3  # minimum distance from every labelled box
-MAX_BACKGROUND_OBJECTS = 20  # maximum number of such objects from a scene
+MAX_BACKGROUND_OBJECTS = 20  # maximum number of background objects from a scene
 
 
 @dataclass(frozen=True)
 class CutObjects:
-    """Source whose scene(i) is the Database of the objects cut from scene i, see cut_objects.
+    """Source whose load_scene(i) is the Database of the objects cut from scene i, see cut_objects.
 
     Attributes:
         scenes: Source of scenes.
@@ -52,19 +52,19 @@ class CutObjects:
     def __len__(self) -> int:
         return len(self.scenes)
 
-    def path(self, i: int) -> Path | None:
+    def cache_file(self, i: int) -> Path | None:
         """Return the cache file of scene i."""
-        return cache_path(self.cache, self.scenes.key(i), self.classes, self.min_points)
+        return make_cache_path(self.cache, self.scenes.cache_key(i), self.classes, self.min_points)
 
     def store(self, i: int) -> None:
         """Write the objects of scene i to the cache."""
-        self.scene(i)
+        self.load_scene(i)
 
-    def scene(self, i: int) -> Database:
+    def load_scene(self, i: int) -> Database:
         """Return the objects of scene i. Raise InputError if the scene cannot be read."""
         return load_or_compute(
-            self.path(i),
-            lambda: cut_objects(self.scenes.scene(i), self.classes, self.min_points, i),
+            self.cache_file(i),
+            lambda: cut_objects(self.scenes.load_scene(i), self.classes, self.min_points, i),
             lambda arrays: Database(**arrays),
             vars,
         )
@@ -82,17 +82,17 @@ def cut_objects(scene: TrainingScene, classes: tuple[str, ...], min_points: int,
         min_points: Objects with fewer points are ignored.
         seed: Seed of the choice of background objects.
     """
-    chosen = [CLASSES.index(name) for name in classes]
+    class_indices = [CLASSES.index(name) for name in classes]
     overlap = bev_iou(scene.boxes, scene.boxes) > 0
-    isolated = overlap.sum(axis=1) <= 1
+    is_isolated = overlap.sum(axis=1) <= 1
     boxes, class_ids, points = [np.zeros((0, 7))], [], [np.zeros((0, 4), np.float32)]
-    for i in np.flatnonzero(scene.detectable & isolated & np.isin(scene.class_ids, chosen)):
+    for i in np.flatnonzero(scene.detectable & is_isolated & np.isin(scene.class_ids, class_indices)):
         object_points = scene.points[find_points_in_box(scene.points, scene.boxes[i], 0.0)]
         if len(object_points) >= min_points:
             boxes.append(scene.boxes[i : i + 1])
             class_ids.append(scene.class_ids[i])
             points.append(object_points)
-    if PEDESTRIAN in chosen:
+    if PEDESTRIAN in class_indices:
         background_boxes, background_points = find_background_objects(scene, min_points, np.random.default_rng(seed))
         boxes.append(background_boxes)
         class_ids.extend([BACKGROUND_ID] * len(background_boxes))
@@ -107,7 +107,7 @@ def cut_objects(scene: TrainingScene, classes: tuple[str, ...], min_points: int,
 
 
 def join_databases(parts: Sequence[Database]) -> Database:
-    """Concatenate databases; the result is empty without any."""
+    """Concatenate databases. The result is empty if there are none."""
     parts = [
         Database(np.zeros((0, 7)), np.zeros(0, np.int32), np.zeros((0, 4), np.float32), np.zeros(1, np.int64)),
         *parts,
@@ -129,7 +129,7 @@ def find_background_objects(
 
     Args:
         scene: Scene.
-        min_points: Smallest number of points of a cluster.
+        min_points: Minimum number of points of a cluster.
         rng: Random generator that selects MAX_BACKGROUND_OBJECTS if there are more.
 
     Returns:
@@ -145,14 +145,14 @@ def find_background_objects(
     floor = find_ground_heights(xyz[ground], boxes[:, :2])
     boxes[:, 5] = high[:, 2] - floor
     boxes[:, 2] = floor + boxes[:, 5] / 2
-    candidates = (
+    is_candidate = (
         (sizes >= min_points)
         & (boxes[:, 3:5].max(axis=1, initial=0) <= MAX_WIDTH_M)
         & (boxes[:, 5] >= MIN_TOP_M)
         & (boxes[:, 5] <= MAX_TOP_M)
         & (low[:, 2] - floor <= MAX_GAP_M)
     )
-    indices = np.flatnonzero(candidates)
+    indices = np.flatnonzero(is_candidate)
     overlap = bev_iou(enlarge_boxes(boxes[indices]), enlarge_boxes(scene.boxes, MIN_DISTANCE_M))
     indices = rng.permutation(indices[~overlap.any(axis=1)])[:MAX_BACKGROUND_OBJECTS]
     return boxes[indices], [scene.points[ids == k + 1] for k in indices]

@@ -21,7 +21,7 @@ PREFETCH = 4  # batches that each worker prepares in advance
 
 
 class Item(NamedTuple):
-    """A sample, and the reasons why scenes before it were skipped."""
+    """A sample, and the reasons why the scenes before it were skipped."""
 
     sample: Any
     skipped: tuple[str, ...] = ()
@@ -35,8 +35,8 @@ class Stream:
     stream[n] raises InputError if no scene can be used.
 
     Attributes:
-        sources: Sources with scene(i) and a length.
-        prepare: prepare(scene, rng) makes a sample.
+        sources: Sources with load_scene(i) and a length.
+        prepare: Function prepare(scene, rng) that makes a sample.
         seed: Seed of the order and of the samples.
     """
 
@@ -49,17 +49,17 @@ class Stream:
         return sum(map(len, self.sources))
 
     def __getitem__(self, n: int) -> Item:
-        epoch, first = divmod(n, len(self))
+        epoch, start = divmod(n, len(self))
         order = np.random.default_rng([self.seed, epoch]).permutation(len(self))
         skipped: list[str] = []
         for offset in range(len(self)):
             rng = np.random.default_rng([self.seed, n, offset])
             try:
-                source, i = find_source(self.sources, int(order[(first + offset) % len(self)]))
-                return Item(self.prepare(source.scene(i), rng), tuple(skipped))
+                source, i = find_source(self.sources, int(order[(start + offset) % len(self)]))
+                return Item(self.prepare(source.load_scene(i), rng), tuple(skipped))
             except InputError as error:
                 skipped.append(str(error))
-        raise InputError(f"none of the {len(self)} scenes can be used ({skipped[0]})")
+        raise InputError(f"no usable scene among {len(self)} ({skipped[0]})")
 
 
 def find_source(sources: Sequence[Any], n: int) -> tuple[Any, int]:
@@ -77,7 +77,7 @@ class SceneReader:
 
     Attributes:
         sources: Sources with a length.
-        read: read(source, i) reads one scene, or raises InputError.
+        read: Function read(source, i) that reads one scene, or raises InputError.
     """
 
     sources: tuple[Any, ...]
@@ -101,52 +101,52 @@ class Batches:
         stream: The samples.
         size: Samples per batch.
         jobs: Worker processes, 0 for none.
-        rank, world: Rank of this process, and number of processes that train together.
-        skipped: Number of skipped scenes by reason; each reason is printed once.
+        rank, world_size: Rank and number of processes in distributed training.
+        skipped: Number of skipped scenes by reason. Each reason is printed once.
     """
 
     stream: Stream
     size: int
     jobs: int = 0
     rank: int = 0
-    world: int = 1
+    world_size: int = 1
     skipped: dict[str, int] = field(default_factory=dict)
 
     @property
-    def epoch(self) -> int:
+    def steps_per_epoch(self) -> int:
         """Steps per epoch, at least 1."""
-        return max(1, round(len(self.stream) / (self.size * self.world)))
+        return max(1, round(len(self.stream) / (self.size * self.world_size)))
 
-    def numbers(self, step: int) -> Iterator[list[int]]:
-        """Yield the stream indices of each batch from `step` on."""
+    def _iterate_indices(self, step: int) -> Iterator[list[int]]:
+        """Yield the stream indices of the batches of this step and all later ones."""
         for i in count(step):
-            first = (i * self.world + self.rank) * self.size
+            first = (i * self.world_size + self.rank) * self.size
             yield list(range(first, first + self.size))
 
     def __call__(self, step: int) -> Iterator[list[Any]]:
-        for items in load_items(self.stream, self.numbers(step), self.jobs):
-            for reason in (r for item in items for r in item.skipped):
+        for items in load_items(self.stream, self._iterate_indices(step), self.jobs):
+            for reason in (reason for item in items for reason in item.skipped):
                 if reason not in self.skipped:
                     errors.print(f"skipped: {reason}")
                 self.skipped[reason] = self.skipped.get(reason, 0) + 1
             yield [item.sample for item in items]
 
 
-def load_items(items: Any, numbers: Iterator[list[int]], jobs: int) -> Iterator[list[Any]]:
+def load_items(items: Any, groups: Iterator[list[int]], jobs: int) -> Iterator[list[Any]]:
     """Load groups of items in worker processes: yield [items[n] for n in group] in order.
 
     Args:
         items: Sequence that can be pickled.
-        numbers: Groups of indices.
+        groups: Groups of indices.
         jobs: Worker processes; 0 loads in this process.
 
     Raises:
         InputError: A worker process ended, for example for lack of memory.
     """
     if jobs == 0:
-        yield from map(_make_loader(items), numbers)
+        yield from map(_make_loader(items), groups)
     else:
-        yield from run_in_order(partial(_make_loader, items), numbers, jobs, PREFETCH, "prepared scenes")
+        yield from run_in_order(partial(_make_loader, items), groups, jobs, PREFETCH, "prepared scenes")
 
 
 def _make_loader(items: Any) -> Callable[[list[int]], list[Any]]:

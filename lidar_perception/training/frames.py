@@ -26,13 +26,13 @@ class LabelledFrames:
     Attributes:
         path: Path of the recording.
         frames: The frames.
-        drives: The frames are consecutive in time.
+        is_sequential: True if the frames are consecutive in time.
         height: Height of the sensor above the ground in metres; None uses that of the recording.
     """
 
     path: Path
     frames: tuple[Frame, ...]
-    drives: bool = True
+    is_sequential: bool = True
     height: float | None = None
 
     def to_scenes(self, view: bool = True) -> RecordedScenes:
@@ -58,8 +58,8 @@ class LabelledFrames:
             )
         return replace(self, frames=remaining)
 
-    def split(self, share: float, seed: int) -> tuple[LabelledFrames, LabelledFrames]:
-        """Split off a share of the labelled frames for validation.
+    def split(self, fraction: float, seed: int) -> tuple[LabelledFrames, LabelledFrames]:
+        """Split off a fraction of the labelled frames for validation.
 
         Frames of drives are drawn by draw_drives, others by draw_items.
 
@@ -69,22 +69,21 @@ class LabelledFrames:
         Raises:
             InputError: There are fewer than two frames.
         """
-        if self.drives:
-            labelled = [frame for frame in self.frames if may_have_labels(frame)] or self.frames
-            runs = [[labelled[i] for i in run] for drives in split_drives(labelled).values() for run in drives]
-            names = {frame.name for frame in draw_drives(runs, share, seed)}
+        if self.is_sequential:
+            frames = [frame for frame in self.frames if may_have_labels(frame)] or self.frames
+            drives = [[frames[i] for i in indices] for drive in split_drives(frames).values() for indices in drive]
+            names = {frame.name for frame in draw_drives(drives, fraction, seed)}
         else:
-            names = {frame.name for frame in draw_items(self.frames, share, seed)}
+            names = {frame.name for frame in draw_items(self.frames, fraction, seed)}
         if not 0 < len(names) < len(self.frames):
             raise InputError(TOO_FEW_FRAMES)
-        parts = [
-            tuple(frame for frame in self.frames if (frame.name in names) == held_out) for held_out in (False, True)
-        ]
-        return replace(self, frames=parts[0]), replace(self, frames=parts[1])
+        training = tuple(frame for frame in self.frames if frame.name not in names)
+        validation = tuple(frame for frame in self.frames if frame.name in names)
+        return replace(self, frames=training), replace(self, frames=validation)
 
 
 def open_labelled_frames(
-    path: Path, split: Path | None = None, height: float = 0.0, mixed: bool = False
+    path: Path, split: Path | None = None, height: float = 0.0, with_simulated: bool = False
 ) -> LabelledFrames:
     """Open the frames of a recording.
 
@@ -92,8 +91,9 @@ def open_labelled_frames(
         path: Path of the recording.
         split: File that names the frames to use; None for all.
         height: Height of the sensor in metres. 0 uses that of the recording, or measures it on the
-            first clouds. If mixed, the height of the recording has priority.
-        mixed: Simulated scans are used too, and height is the height of their sensor.
+            first clouds.
+        with_simulated: True if the run also uses simulated scans. Then `height` is that of the
+            simulated sensor, and a height given by the recording has priority.
 
     Raises:
         InputError: A file is missing, or the recording has no labelled boxes.
@@ -101,19 +101,19 @@ def open_labelled_frames(
     recording = open_recording(path, split=split)
     recording.require(BOXES, "train")
     return LabelledFrames(
-        path, tuple(recording.frames[:]), recording.is_sequential, _find_height(recording, height, mixed)
+        path, tuple(recording.frames[:]), recording.is_sequential, _find_height(recording, height, with_simulated)
     )
 
 
-def _find_height(recording: Recording, height: float, mixed: bool) -> float | None:
-    if height and not (mixed and recording.has_sensor_height):
+def _find_height(recording: Recording, height: float, with_simulated: bool) -> float | None:
+    if height and not (with_simulated and recording.has_sensor_height):
         return height
     measured = apply_measured_height(recording, load_first_clouds(recording))
     return None if measured is recording else next(iter(measured)).sensor_height
 
 
 def may_have_labels(frame: Frame) -> bool:
-    """Return True if a frame has labels, or labels that cannot be read (reported later)."""
+    """Return True if a frame has labels, even if they cannot be read; such errors are reported later."""
     try:
         return frame.truth() is not None
     except InputError:
@@ -121,44 +121,44 @@ def may_have_labels(frame: Frame) -> bool:
 
 
 def _frame_keys(frame: Frame) -> set[tuple[Path, str]]:
-    """Return keys of a frame that are the same for any path of its recording: (file, name in a bag)."""
+    """Return keys (file, name in a bag) that identify a frame whatever path its recording was opened by."""
     if frame.points is not None:
         return {(frame.points.resolve(), "")}
     return {(file.resolve(), frame.name) for file in frame.files}
 
 
-def draw_items(items: Sequence[T], share: float, seed: int) -> list[T]:
-    """Draw a random share of the items, at least one and not all, in their order.
+def draw_items(items: Sequence[T], fraction: float, seed: int) -> list[T]:
+    """Draw a random fraction of the items, at least one but not all, in their original order.
 
     Raises:
         InputError: There are fewer than two items.
     """
-    chosen = np.random.default_rng(seed).choice(len(items), _count_held_out(len(items), share), replace=False)
-    return [items[i] for i in np.sort(chosen)]
+    indices = np.random.default_rng(seed).choice(len(items), _count_held_out(len(items), fraction), replace=False)
+    return [items[i] for i in np.sort(indices)]
 
 
-def draw_drives(drives: Sequence[Sequence[T]], share: float, seed: int) -> list[T]:
-    """Draw a share of all items, at least one and not all, as complete drives and the end of one more.
+def draw_drives(drives: Sequence[Sequence[T]], fraction: float, seed: int) -> list[T]:
+    """Draw a fraction of all items, at least one but not all: some complete drives and the end of one more.
 
-    Consecutive frames are too similar to be separated at random.
+    Frames are not drawn one by one, because consecutive frames are too similar.
 
     Raises:
         InputError: There are fewer than two items.
     """
-    missing = _count_held_out(sum(map(len, drives)), share)
+    missing = _count_held_out(sum(map(len, drives)), fraction)
     order = np.random.default_rng(seed).permutation(len(drives))
-    complete: list[T] = []
-    longer: list[Sequence[T]] = []
+    items: list[T] = []
+    longer_drives: list[Sequence[T]] = []
     for drive in (drives[i] for i in order):
         if len(drive) <= missing:
-            complete.extend(drive)
+            items.extend(drive)
             missing -= len(drive)
         else:
-            longer.append(drive)
-    return [*complete, *(longer[0][-missing:] if missing else ())]
+            longer_drives.append(drive)
+    return [*items, *(longer_drives[0][-missing:] if missing else ())]
 
 
-def _count_held_out(count: int, share: float) -> int:
+def _count_held_out(count: int, fraction: float) -> int:
     if count < 2:
         raise InputError(TOO_FEW_FRAMES)
-    return min(max(round(share * count), 1), count - 1)
+    return min(max(round(fraction * count), 1), count - 1)

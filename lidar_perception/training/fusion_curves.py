@@ -1,6 +1,6 @@
 """Fit of the confidence curves of the fused detector to simulated scans.
 
-The curves combine the evidence of PointPillars, silhouettes and the PointNet to one probability,
+The curves combine the evidence of PointPillars, silhouettes and PointNet into one probability,
 see detectors/fused/evidence.py.
 """
 
@@ -37,7 +37,8 @@ from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError
 MAX_CENTRE_DISTANCE_M = 0.5  # maximum centre distance of a match with a pedestrian or cyclist
 MIN_SAMPLES = 20  # minimum number of correct and of wrong proposals of a class to fit its curves
 MIN_PROBABILITY = 1e-6  # probabilities are clipped at this value in the log loss
-DEFAULT_SENSOR, DEFAULT_SCENE = "hdl64e", "street"  # defaults for weights whose header has none
+DEFAULT_SENSOR, DEFAULT_SCENE = "hdl64e", "street"  # for weights whose header names none
+WITH_INTENSITY, WITHOUT_INTENSITY = CLOUD_KINDS = "with intensity", "without intensity"  # they have separate curves
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Samples:
 
     Attributes:
         class_ids: (K,) int into CLASSES.
-        correct: (K,) bool, the proposal is correct.
+        correct: (K,) bool, True for correct proposals.
         scans: (K,) int, number of the scan.
         evidence: (K,) log-odds by name of the source.
     """
@@ -56,13 +57,13 @@ class Samples:
     scans: np.ndarray
     evidence: Evidence
 
-    def take(self, chosen: np.ndarray) -> Samples:
+    def take(self, indices: np.ndarray) -> Samples:
         """Select proposals by a mask or by indices."""
         return Samples(
-            self.class_ids[chosen],
-            self.correct[chosen],
-            self.scans[chosen],
-            {name: odds[chosen] for name, odds in self.evidence.items()},
+            self.class_ids[indices],
+            self.correct[indices],
+            self.scans[indices],
+            {name: odds[indices] for name, odds in self.evidence.items()},
         )
 
     @staticmethod
@@ -90,18 +91,15 @@ class ClassFit(NamedTuple):
 
     Attributes:
         proposals, correct: Number of proposals, and of correct ones.
-        before: Score of the previous curves.
-        after: Score of the new curves by cross-validation; None with too few proposals.
+        old_score: Score of the previous curves.
+        new_score: Score of the new curves by cross-validation; None with too few proposals.
     """
 
     proposals: int
     correct: int
-    before: CurveScore
-    after: CurveScore | None
+    old_score: CurveScore
+    new_score: CurveScore | None
 
-
-# Kinds of clouds, which have separate curves.
-WITH, WITHOUT = KINDS = "with intensity", "without intensity"
 
 
 def fit_fusion(
@@ -113,22 +111,22 @@ def fit_fusion(
 
     Args:
         weights: Checkpoint of PointPillars; None for the packaged one.
-        classifier: Checkpoint of the PointNet; None for the packaged one.
+        classifier: Checkpoint of PointNet; None for the packaged one.
         out: Fusion file to write, see detectors/fused/fusion.py.
         params: Simulated scans.
         jobs: Number of processes.
 
     Returns:
-        The fit of each class, by kind of cloud, see KINDS.
+        The fit of each class, by kind of cloud, see CLOUD_KINDS.
 
     Raises:
-        InputError: An input cannot be used; raised before any scan is simulated.
+        InputError: An input cannot be used. Raised before any scan is simulated.
     """
     fused = FusedParams(
         weights=str(weights or ""), classifier=str(classifier or ""), range=params.range, threads=1, warm_up=False
     )
     detector = load_fused_detector("", "cpu", FusedDetectorParams(fused=fused))
-    header, other = detector.proposer.header, detector.classifier.header
+    header, classifier_header = detector.proposer.header, detector.classifier.header
     params = fill_from_header(params, header)
     sensor = find_sensor(params.sensor, params.mount_height or _find_trained_height(header))
     scenes = Scenes(None, params.people, params.scene)
@@ -138,41 +136,47 @@ def fit_fusion(
         f"{params.scans} {params.scene} scans of {params.sensor} at {sensor.height:g} m, "
         f"{'all around' if around else 'ahead'}"
     )
-    for network in header, other:
-        if warning := network.find_height_mismatch(sensor.height):
-            errors.print(f"{NETWORKS[network.network][0]}: {warning}")
-    source = SimulatedScenes(FIRST_FIT_SEED, params.scans, sensor, scenes, around=around)
+    for network_header in header, classifier_header:
+        if warning := network_header.find_height_mismatch(sensor.height):
+            errors.print(f"{NETWORKS[network_header.network][0]}: {warning}")
+    source = SimulatedScenes(FIRST_FIT_SEED, params.scans, sensor, scenes, all_around=around)
     samples, shipped = simulate_samples(FusedDetectorParams(fused=fused), source, jobs), find_fusion()
-    before = {WITH: shipped.models, WITHOUT: shipped.models_without_intensity or shipped.models}
+    old_models = {
+        WITH_INTENSITY: shipped.models,
+        WITHOUT_INTENSITY: shipped.models_without_intensity or shipped.models,
+    }
     models, fits = {}, {}
-    for kind in KINDS:
-        models[kind], fits[kind] = fit_classes(samples[kind], before[kind])
-    counts = {kind: {name: [fit.proposals, fit.correct] for name, fit in own.items()} for kind, own in fits.items()}
+    for kind in CLOUD_KINDS:
+        models[kind], fits[kind] = fit_classes(samples[kind], old_models[kind])
+    counts = {
+        kind: {name: [fit.proposals, fit.correct] for name, fit in class_fits.items()}
+        for kind, class_fits in fits.items()
+    }
     write_fusion(
         out,
         (weights, classifier),
-        models[WITH],
+        models[WITH_INTENSITY],
         {
             "sensor": params.sensor,
             "height": sensor.height,
             "scene": params.scene,
             "scans": params.scans,
             "range": "around" if around else "ahead",
-            "proposals, hits": counts[WITH],
-            "proposals, hits without intensity": counts[WITHOUT],
+            "proposals, hits": counts[WITH_INTENSITY],
+            "proposals, hits without intensity": counts[WITHOUT_INTENSITY],
         },
-        models[WITHOUT],
+        models[WITHOUT_INTENSITY],
     )
     return fits
 
 
 def fill_from_header(params: FusedTraining, header: Header) -> FusedTraining:
-    """Replace an empty sensor or scene by those on which the weights were trained.
+    """Fill in an empty sensor or scene with those that the weights were trained on.
 
     Raises:
         InputError: The file of that sensor is missing.
     """
-    sensor, trained = _read_sensor(header), header.training.get("params")
+    sensor, training_params = _read_sensor(header), header.training.get("params")
     name = sensor.get("name") or DEFAULT_SENSOR
     if not params.sensor and Path(name).suffix in (".yaml", ".yml") and not Path(name).is_file():
         raise InputError(
@@ -181,7 +185,9 @@ def fill_from_header(params: FusedTraining, header: Header) -> FusedTraining:
     return replace(
         params,
         sensor=params.sensor or name,
-        scene=params.scene or (trained.get("scene") if isinstance(trained, dict) else "") or DEFAULT_SCENE,
+        scene=params.scene
+        or (training_params.get("scene") if isinstance(training_params, dict) else "")
+        or DEFAULT_SCENE,
     )
 
 
@@ -199,12 +205,12 @@ def _read_sensor(header: Header) -> dict[str, Any]:
 def collect_samples(frame: Frame, proposals: Proposals, scan: int) -> Samples:
     """Match the proposals of a simulated frame with its labels.
 
-    Some proposals are ignored: those outside the image, if there is a camera; duplicates on an
-    object that a better proposal has already matched; and those on objects of a similar class (a
-    van for a car), as in KITTI's protocol.
+    Ignored as in KITTI's protocol: proposals outside the image, if there is a camera; duplicates on
+    an object that a better proposal has already matched; and proposals on objects of a similar
+    class, such as a van for Car.
     """
     truth, camera, detections = frame.truth(), frame.camera(), proposals.detections
-    assert truth is not None  # simulated frames always have it
+    assert truth is not None  # simulated frames always have labels
     centres = detections.boxes[:, :3] - np.array([0, 0, frame.sensor_height - SENSOR_HEIGHT], np.float32)
     in_view = np.ones(len(detections), bool) if camera is None else camera.in_view(centres)
     selected, correct = [], []
@@ -240,15 +246,16 @@ def _match_boxes(boxes: np.ndarray, objects: np.ndarray, name: str) -> np.ndarra
 
 
 def simulate_samples(params: FusedDetectorParams, scenes: SimulatedScenes, jobs: int) -> dict[str, Samples]:
-    """Simulate all scans and collect the proposals in them; the result does not depend on jobs.
+    """Simulate all scans and collect the proposals in them. The result does not depend on `jobs`.
 
     Returns:
-        The proposals in the scans with their intensity, and in the same scans without, by kind.
+        The proposals by kind of cloud, see CLOUD_KINDS. The same scans are used with and without
+        their intensity.
     """
     make_sampler = partial(_make_sampler, params, scenes)
     results = run_in_processes(make_sampler, range(len(scenes)), jobs, "detected in simulated scans")
     parts = dict(show_progress(results, "simulating and detecting", len(scenes)))
-    return {kind: Samples.concatenate([parts[i][kind] for i in sorted(parts)]) for kind in KINDS}
+    return {kind: Samples.concatenate([parts[i][kind] for i in sorted(parts)]) for kind in CLOUD_KINDS}
 
 
 def _make_sampler(
@@ -257,34 +264,34 @@ def _make_sampler(
     detector: FusedDetector = load_fused_detector("", "cpu", params)
 
     def sample_scan(i: int) -> tuple[int, dict[str, Samples]]:
-        frame = scenes.frame(i)
-        at_height, cloud = detector.with_sensor_height(frame.sensor_height), frame.load()
-        clouds = {WITH: cloud, WITHOUT: replace(cloud, intensity=None)}
-        return i, {kind: collect_samples(frame, at_height.propose(c), i) for kind, c in clouds.items()}
+        frame = scenes.load_frame(i)
+        frame_detector, cloud = detector.with_sensor_height(frame.sensor_height), frame.load()
+        clouds = {WITH_INTENSITY: cloud, WITHOUT_INTENSITY: replace(cloud, intensity=None)}
+        return i, {kind: collect_samples(frame, frame_detector.propose(c), i) for kind, c in clouds.items()}
 
     return sample_scan
 
 
-def fit_classes(samples: Samples, before: Models) -> tuple[Models, dict[str, ClassFit]]:
-    """Fit the curves of each class, and score old and new curves.
+def fit_classes(samples: Samples, old_models: Models) -> tuple[Models, dict[str, ClassFit]]:
+    """Fit the curves of each class, and score the old and the new curves.
 
-    Classes with too few samples keep their curves in `before`, if any.
+    Classes with too few samples keep their old curves, if there are any.
 
     Returns:
         The curves, and the fit by class.
     """
-    models, fits = dict(before), {}
+    models, fits = dict(old_models), {}
     for name in DETECTED:
         class_samples = samples.take(samples.class_ids == CLASSES.index(name))
-        after = None
+        new_score = None
         if has_enough_samples(class_samples):
             models[name] = fit_class(name, class_samples)
-            after = _cross_validate(name, class_samples)
+            new_score = _cross_validate(name, class_samples)
         fits[name] = ClassFit(
             len(class_samples.correct),
             int(class_samples.correct.sum()),
-            _score(class_samples, compute_probabilities(before, class_samples.class_ids, class_samples.evidence)),
-            after,
+            _score(class_samples, compute_probabilities(old_models, class_samples.class_ids, class_samples.evidence)),
+            new_score,
         )
     return models, fits
 
@@ -292,7 +299,7 @@ def fit_classes(samples: Samples, before: Models) -> tuple[Models, dict[str, Cla
 def has_enough_samples(samples: Samples) -> bool:
     """Return True if both halves of the scans have enough correct and wrong proposals."""
     halves = [samples.correct[samples.scans % 2 == half] for half in range(2)]
-    return all(min(right.sum(), (~right).sum()) >= MIN_SAMPLES / 2 for right in halves)
+    return all(min(correct.sum(), (~correct).sum()) >= MIN_SAMPLES / 2 for correct in halves)
 
 
 def fit_class(name: str, samples: Samples) -> dict:
@@ -307,8 +314,8 @@ def _cross_validate(name: str, samples: Samples) -> CurveScore:
     for half in range(2):
         in_half = samples.scans % 2 == half
         model = {name: fit_class(name, samples.take(~in_half))}
-        left_out = samples.take(in_half)
-        scores[in_half] = compute_probabilities(model, left_out.class_ids, left_out.evidence)
+        test_samples = samples.take(in_half)
+        scores[in_half] = compute_probabilities(model, test_samples.class_ids, test_samples.evidence)
     return _score(samples, scores)
 
 
@@ -316,9 +323,9 @@ def _score(samples: Samples, scores: np.ndarray) -> CurveScore:
     if not len(scores):
         return CurveScore(0.0, 0, 0)
     likelihood = np.where(samples.correct, scores, 1 - scores)
-    passed = scores >= ScoreParams().get(CLASSES[samples.class_ids[0]])
+    is_detection = scores >= ScoreParams().get(CLASSES[samples.class_ids[0]])
     return CurveScore(
         float(-np.log(np.maximum(likelihood, MIN_PROBABILITY)).mean()),
-        int((passed & samples.correct).sum()),
-        int((passed & ~samples.correct).sum()),
+        int((is_detection & samples.correct).sum()),
+        int((is_detection & ~samples.correct).sum()),
     )

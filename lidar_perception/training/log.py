@@ -13,18 +13,18 @@ from lidar_perception.types import InputError
 
 
 class Table:
-    """CSV file with a column "step" and further columns, which the first added row determines."""
+    """CSV file with a column "step" and other columns, which the first added row determines."""
 
     def __init__(self, path: Path, step: int):
-        """Open a table, and drop the rows after `step` that a killed run wrote after its last save."""
+        """Open a table. Drop the rows after `step`, which a killed run wrote after its last save."""
         self.path, self.columns = path, None
         self.stream: TextIO | None = None
         rows = _read_rows(path)
         if rows:
             self.columns = rows[0]
-            valid = [row for row in rows[1:] if len(row) == len(rows[0]) and int(row[0]) <= step]
+            kept_rows = [row for row in rows[1:] if len(row) == len(rows[0]) and int(row[0]) <= step]
             text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows([rows[0], *valid])
+            csv.writer(text, lineterminator="\n").writerows([rows[0], *kept_rows])
             write_text(path, text.getvalue())
 
     def add(self, step: int, values: dict[str, float]) -> None:
@@ -43,7 +43,6 @@ class Table:
             raise InputError(f"cannot write {self.path}: {error.strerror}") from None
 
     def close(self) -> None:
-        """Close the file."""
         if self.stream is not None:
             with suppress(OSError):  # add() has already reported a full disk
                 self.stream.close()
@@ -84,7 +83,6 @@ class Log:
                 self.board.add_scalar(f"{table}/{name}", value, step)
 
     def close(self) -> None:
-        """Close all files."""
         for table in self.tables.values():
             table.close()
         if self.board is not None:

@@ -41,10 +41,10 @@ def train(
     out: Path,
     device: torch.device = torch.device("cpu"),
     resume: bool = False,
-    until: float = math.inf,
-    validation: float = 0.0,
+    deadline: float = math.inf,
+    validation_s: float = 0.0,
 ) -> Progress:
-    """Train until all steps are done, the time is over, or SIGINT or SIGTERM arrives, and save the state.
+    """Train until all steps are done, the deadline is near, or SIGINT or SIGTERM arrives, and save the state.
 
     If fewer steps than planned fit into the time, the learning rate falls faster, to the same final
     value. On the CPU, the same task and seed give the same weights, even after an interruption.
@@ -55,15 +55,15 @@ def train(
         out: Folder of the run, for its state, log.csv, validation.csv, and the files of task.save.
         device: Device of the network.
         resume: Continue the run in out, if there is one.
-        until: Value of time.monotonic() by which the last validation must end.
-        validation: Expected duration of the first validation, in seconds.
+        deadline: Value of time.monotonic() by which the last validation must end.
+        validation_s: Expected duration of the first validation.
 
     Returns:
         Progress at the end.
 
     Raises:
-        InputError: out contains a run and resume is False, or a run with other settings; out is not
-            writable; or the loss is not finite for too many steps.
+        InputError: `out` contains a run and resume is False, or a run with other settings; `out` is
+            not writable; or the loss is not finite for too many steps.
     """
     directory = RunDirectory(out)
     directory.require_no_state(resume)
@@ -72,45 +72,46 @@ def train(
     torch.manual_seed(params.seed + get_rank())
     run = Run(task, params, device)
     if path.exists():
-        run.load(_read_state(path, run.settings()))
+        run.load(_read_state(path, run.collect_settings()))
     wait_for_all()  # rank 0 replaces the file that the others have read above
     log = Log(out, run.progress.step) if get_rank() == 0 else None
     start = time.monotonic() - run.progress.seconds
-    pace, has_warned = Pace(until, run.validate_steps, validation), False
+    budget, has_warned = TimeBudget(deadline, run.validate_steps, validation_s), False
     try:
         with _catch_signals() as stop, make_progress() as bar:
-            line = bar.add_task("training", total=run.steps, completed=int(run.position), visible=get_rank() == 0)
+            bar_task = bar.add_task("training", total=run.steps, completed=int(run.position), visible=get_rank() == 0)
             batches = iter(task.batches(run.progress.step))
             while True:
                 if is_true_anywhere(stop.is_set(), device):
                     run.progress.stopped = True
                     _save_state(path, run)
                     break
-                run.progress.late = is_true_anywhere(pace.is_over(), device) and not run.done
-                due = run.is_validation_due() and (run.done or not is_true_anywhere(pace.is_over(2), device))
-                if due or (run.progress.late and run.progress.step > run.progress.validated):
+                run.progress.late = is_true_anywhere(budget.is_over(), device) and not run.is_done
+                is_due = run.is_validation_due() and (run.is_done or not is_true_anywhere(budget.is_over(2), device))
+                if is_due or (run.progress.late and run.progress.step > run.progress.validated):
                     _save_state(path, run)  # the run may be killed during the validation
-                    with pace.time_validation(), pause_progress(bar):
+                    with budget.time_validation(), pause_progress(bar):
                         _validate(run, log)
                     _save_state(path, run)
-                if run.done or run.progress.late:
+                if run.is_done or run.progress.late:
                     break
                 row = run.step(_next_batch(batches, path, run))
                 step = run.progress.step
-                pace.count_step()
-                if until < math.inf:
-                    steps_left = max(0.0, find_minimum(pace.steps_left(step), device))
-                    run.shorten_schedule(steps_left)
-                    if step + steps_left < 0.9 * run.steps and not has_warned and get_rank() == 0:
+                budget.count_step()
+                if deadline < math.inf:
+                    remaining_steps = max(0.0, find_minimum(budget.estimate_remaining_steps(step), device))
+                    run.shorten_schedule(remaining_steps)
+                    if step + remaining_steps < 0.9 * run.steps and not has_warned and get_rank() == 0:
                         has_warned = True
                         errors.print(
-                            f"slower than planned, {pace.step_duration:.2g} s per step: about {step + steps_left:.0f} "
-                            f"of {run.steps} steps fit into the budget, so the learning rate falls faster"
+                            f"slower than planned, {budget.step_duration:.2g} s per step: about "
+                            f"{step + remaining_steps:.0f} of {run.steps} steps fit into the budget, so the learning "
+                            "rate falls faster"
                         )
                 run.progress.seconds = time.monotonic() - start
-                bar.update(line, completed=run.position)
+                bar.update(bar_task, completed=run.position)
                 if row is not None:
-                    bar.update(line, description=f"loss {row['loss']:.3f} lr {row['lr']:.1e}")
+                    bar.update(bar_task, description=f"loss {row['loss']:.3f} lr {row['lr']:.1e}")
                     if log is not None and step % params.log_steps == 0:
                         log.add("loss", step, {**row, "skipped": run.progress.skipped, "seconds": run.progress.seconds})
                 if step % params.save_steps == 0 and not run.is_validation_due():
@@ -121,17 +122,17 @@ def train(
     return run.progress
 
 
-class Pace:
-    """Estimate of the number of steps that fit into the remaining time.
+class TimeBudget:
+    """Time budget of a run. Estimates how many steps fit into the remaining time.
 
     Args:
-        until: Value of time.monotonic() at the end of the budget.
+        deadline: Value of time.monotonic() at the end of the budget.
         validate_steps: Steps between validations; there is one more at the end.
-        validation: Expected duration of a validation, in seconds.
+        validation_s: Expected duration of a validation.
     """
 
-    def __init__(self, until: float, validate_steps: int, validation: float = 0.0):
-        self.until, self.validate_steps, self.validation = until, validate_steps, validation
+    def __init__(self, deadline: float, validate_steps: int, validation_s: float = 0.0):
+        self.deadline, self.validate_steps, self.validation_s = deadline, validate_steps, validation_s
         self.start = self.last_step = time.monotonic()
         self.steps = self.seconds = 0.0  # exponentially weighted sums
 
@@ -141,8 +142,8 @@ class Pace:
         return self.seconds / self.steps
 
     def is_over(self, validations: int = 1) -> bool:
-        """Return True if the remaining time is only sufficient for this many validations."""
-        return time.monotonic() + validations * self.validation >= self.until
+        """Return True if the remaining time is only enough for this many validations."""
+        return time.monotonic() + validations * self.validation_s >= self.deadline
 
     def count_step(self) -> None:
         """Record the end of a step."""
@@ -151,27 +152,29 @@ class Pace:
         weight = math.exp(-duration / DECAY_S)
         self.steps, self.seconds = weight * self.steps + 1, weight * self.seconds + duration
 
-    def steps_left(self, step: int) -> float:
-        """Return the number of steps that fit after this one: below 1 for none, inf while unknown."""
+    def estimate_remaining_steps(self, step: int) -> float:
+        """Return the number of steps that fit after this one: below 1 if none fits, inf while it is unknown."""
         now = time.monotonic()
-        if now - self.start < WARM_UP_S or self.until == math.inf:
+        if now - self.start < WARM_UP_S or self.deadline == math.inf:
             return math.inf
-        since = step % self.validate_steps  # steps since the last validation
-        left = self.until - now - self.validation + since * self.step_duration
-        cycles, rest = divmod(left, self.validate_steps * self.step_duration + self.validation)
-        return cycles * self.validate_steps + min(rest / self.step_duration, self.validate_steps) - since - SPARE_STEPS
+        steps_since_validation = step % self.validate_steps
+        # Time from the last validation on, without the final validation.
+        seconds = self.deadline - now - self.validation_s + steps_since_validation * self.step_duration
+        cycles, rest = divmod(seconds, self.validate_steps * self.step_duration + self.validation_s)
+        steps = cycles * self.validate_steps + min(rest / self.step_duration, self.validate_steps)
+        return steps - steps_since_validation - SPARE_STEPS
 
     @contextmanager
     def time_validation(self) -> Iterator[None]:
         """Measure the duration of the validation in this context, and exclude it from the step duration."""
         start = time.monotonic()
         yield
-        self.validation = time.monotonic() - start
-        self.last_step += self.validation
+        self.validation_s = time.monotonic() - start
+        self.last_step += self.validation_s
 
 
 def _validate(run: Run, log: Log | None) -> None:
-    """Validate the averaged weights on rank 0, which has the log, and save the best and last weights."""
+    """Validate the averaged weights on rank 0 (the process with a log), and save the best and last weights."""
     progress = run.progress
     progress.validated = progress.step
     if log is not None:
@@ -186,7 +189,7 @@ def _validate(run: Run, log: Log | None) -> None:
         record = {**vars(progress), "metrics": metrics, "calibration": calibration}
         if is_best:
             run.task.save("best", run.average.module, record)
-        if run.done or progress.late:
+        if run.is_done or progress.late:
             run.task.save("last", run.average.module, record)
     wait_for_all()
 
@@ -199,7 +202,7 @@ def _save_state(path: Path, run: Run) -> None:
 
 def _write_state(path: Path, run: Run) -> None:
     content = io.BytesIO()
-    torch.save(run.state(), content)
+    torch.save(run.make_state(), content)
     write_bytes(path, content.getbuffer())
 
 
@@ -224,9 +227,9 @@ def _read_state(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
     except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"cannot read {path}: {reason}; remove it to start again") from None
-    if different := find_differences(saved_settings, settings):
+    if differences := find_differences(saved_settings, settings):
         raise InputError(
-            f"{path} belongs to a run with {'; '.join(different[:3])}; resume it with the same settings, "
+            f"{path} belongs to a run with {'; '.join(differences[:3])}; resume it with the same settings, "
             "or give another --out"
         )
     return state

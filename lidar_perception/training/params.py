@@ -8,13 +8,13 @@ from typing import Any
 from lidar_perception.detectors.params import make_range_param
 from lidar_perception.param_fields import Params, flatten, param
 
-CHANGEABLE = ("log_steps", "save_steps", "max_skipped", "data.cache", "data.cache_gb")  # when a run is resumed
-PAPER_SHARE = 751 / 7518  # fraction of the frames that paper B holds out
+CHANGEABLE = ("log_steps", "save_steps", "max_skipped", "data.cache", "data.cache_gb")  # may change on resuming
+PAPER_VAL_FRACTION = 751 / 7518  # fraction of the frames that paper B holds out
 
 
 @dataclass(frozen=True)
 class LoopParams(Params):
-    """Length of the training, optimizer, and intervals of validations, checkpoints and logs."""
+    """Length of the training, optimizer, and intervals between validations, checkpoints and logs."""
 
     steps: int = param(0, "Training steps. 0: determined by the epochs or the budget.", low=0, high=10**9)
     epochs: float = param(0.0, "Passes over the data, if steps is 0. 0: determined by the budget.", low=0.0, high=1e5)
@@ -27,14 +27,14 @@ class LoopParams(Params):
     clip: float = param(10.0, "Maximum norm of the gradient; larger ones are clipped. 0: no limit.", low=0.0, high=1e6)
     ema: float = param(
         0.999,
-        "Decay of the moving average of the weights, which is validated and saved. 0: no average.",
+        "Decay of the moving average of the weights. The average is validated and saved. 0: no average.",
         low=0.0,
         high=0.999999,
     )
     amp: str = param(
         "auto",
         "Number format of the forward pass. auto: bf16 if the device has "
-        "instructions for it, which takes half the time on the CPU; otherwise fp16 "
+        "instructions for it (twice as fast on the CPU); otherwise fp16 "
         "on CUDA and float32 on the CPU.",
         choices=("auto", "bf16", "fp16", "off"),
     )
@@ -49,22 +49,24 @@ class LoopParams(Params):
     )
     seed: int = param(0, "Seed of the weights, the order of the scenes and their augmentation.", low=0, high=2**31 - 1)
 
-    def fixed_settings(self) -> dict[str, Any]:
+    def get_fixed_settings(self) -> dict[str, Any]:
         """Return the parameters by dotted name that must not change when a run is resumed."""
         return {name: value for name, value in flatten(self).items() if name not in CHANGEABLE}
 
-    def total_steps(self, epoch: int) -> int:
-        """Return the number of steps, 0 if the budget determines it. epoch: steps per epoch."""
-        return self.steps or (max(1, round(self.epochs * epoch)) if self.epochs else 0)
+    def compute_total_steps(self, steps_per_epoch: int) -> int:
+        """Return the number of steps, or 0 if the budget determines it."""
+        return self.steps or (max(1, round(self.epochs * steps_per_epoch)) if self.epochs else 0)
 
-    def validation_steps(self, epoch: int) -> int:
-        """Return the steps between validations, 0 if the budget determines them. epoch: steps per epoch."""
-        return self.validate_steps or (max(1, round(self.validate_epochs * epoch)) if self.validate_epochs else 0)
+    def compute_validation_steps(self, steps_per_epoch: int) -> int:
+        """Return the steps between validations, or 0 if the budget determines them."""
+        return self.validate_steps or (
+            max(1, round(self.validate_epochs * steps_per_epoch)) if self.validate_epochs else 0
+        )
 
 
 @dataclass(frozen=True)
 class NoiseParams(Params):
-    """Noise of the ranges."""
+    """Noise added to the ranges of the points."""
 
     beam_noise: float = param(
         0.08,
@@ -80,7 +82,7 @@ class NoiseParams(Params):
 
 @dataclass(frozen=True)
 class IntensityParams(Params):
-    """Augmentation of the intensity of whole scans, before it is normalized."""
+    """Augmentation of the intensities of a scan, before they are normalized."""
 
     no_intensity: float = param(0.5, "Probability that a scene has no intensity.", low=0.0, high=1.0)
     fade: float = param(
@@ -113,7 +115,7 @@ class BackgroundParams(NoiseParams):
 
 @dataclass(frozen=True)
 class AugmentParams(BackgroundParams, IntensityParams):
-    """Augmentation of scenes. 0 switches a change off."""
+    """Augmentation of scenes. A value of 0 switches a change off."""
 
     crowded: float = param(
         0.7, "Probability that objects from other scenes are pasted into a scene.", low=0.0, high=1.0
@@ -134,8 +136,8 @@ class AugmentParams(BackgroundParams, IntensityParams):
     flip: float = param(0.5, "Probability that left and right are swapped.", low=0.0, high=1.0)
     turn: float = param(
         0.785,
-        "Maximum rotation of the scene about the sensor; if the scene is "
-        "labelled all around and this is not 0, any angle.",
+        "Maximum rotation of the scene about the sensor. A scene that is "
+        "labelled all around is rotated by any angle, unless this is 0.",
         unit="rad",
         low=0.0,
         high=3.1416,
@@ -169,16 +171,16 @@ class DataParams(Params):
     )
     cache_gb: float = param(
         20.0,
-        "Scans are added to the cache until it has this size; the rest are simulated again in every epoch.",
+        "Maximum size of the cache. Scans that do not fit into it are simulated again in every epoch.",
         unit="GB",
         low=0.0,
         high=1e6,
     )
     val_share: float = param(
-        PAPER_SHARE,
+        PAPER_VAL_FRACTION,
         "Fraction of the frames held out for validation if "
         "neither --val nor --val-split is given. The seed selects them; "
-        "drives are held out whole, or the end of one.",
+        "of recorded drives, complete drives are held out, or the end of one.",
         low=0.0,
         high=0.9,
     )
@@ -227,8 +229,8 @@ class PointPillarsTraining(SceneTraining):
     ahead: float = param(
         0.0,
         "Train only up to this far ahead and behind, which is faster; the "
-        "weights still cover the whole range. 0: determined by the budget; a "
-        "large number: the whole range.",
+        "weights still cover the full range. 0: determined by the budget; a "
+        "large number: the full range.",
         unit="m",
         low=0.0,
         high=1000.0,
@@ -247,13 +249,14 @@ class PointPillarsTraining(SceneTraining):
 
 @dataclass(frozen=True)
 class ClusterAugmentParams(BackgroundParams, IntensityParams):
-    """Number of clusters to train on, and their augmentation. 0 switches a change off."""
+    """Number of clusters to train on, and their augmentation. A value of 0 switches a change off."""
 
     objects: int = param(24, "Maximum number of clusters of each class per scene.", low=1, high=1000)
     background: int = param(40, "Maximum number of background clusters per scene.", low=0, high=10_000)
     sparse: float = param(
         0.0,
-        "Fraction of the scenes reduced to 8 to 70 % of their points before cutting, like scans of a sparser sensor.",
+        "Fraction of the scenes that are reduced to 8 to 70 % of their points before clusters are cut, like scans of "
+        "a sparser sensor.",
         low=0.0,
         high=1.0,
     )
@@ -328,22 +331,26 @@ class FusedTraining(Params):
 
     scene: str = param(
         "",
-        "Environment of the simulated scans: street, campus or indoor, or "
-        "several in turn, such as street,campus. Empty: as in the training of the "
-        "weights.",
+        "Environment of the simulated scans: street, campus or indoor, or several in turn, such as "
+        "street,campus. Empty: the one that the weights were trained on.",
     )
     sensor: str = param(
         "",
         "Sensor of the simulated scans: a sensor.yaml, or the name of a "
         "preset. Empty: the sensor that the weights were trained for.",
     )
-    scans: int = param(240, "Simulated scans for the fit of the curves, each of another scene.", low=2, high=100_000)
+    scans: int = param(
+        240, "Number of simulated scans to fit the curves to, each of a different scene.", low=2, high=100_000
+    )
     people: float = param(
-        2.5, "Pedestrians and cyclists in them, as a multiple of the usual number.", low=0.0, high=100.0
+        2.5,
+        "Number of pedestrians and cyclists in the simulated scans, as a multiple of the usual number.",
+        low=0.0,
+        high=100.0,
     )
     mount_height: float = param(
         0.0,
-        "Height of the sensor above the ground. 0: as in the training of the weights.",
+        "Height of the sensor above the ground. 0: the height that the weights were trained for.",
         unit="m",
         low=0.0,
         high=10.0,

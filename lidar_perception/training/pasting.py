@@ -11,9 +11,9 @@ MIN_FLOOR_POINTS = 5
 
 @njit(cache=True, nogil=True)
 def find_points_in_box(points: np.ndarray, box: np.ndarray, margin: float) -> np.ndarray:
-    """Return the ascending indices (K,) int64 of the points in a box that is enlarged by margin (m).
+    """Return the ascending indices (K,) int64 of the points in a box that is enlarged by `margin` metres.
 
-    Does the same as geometry.points_in_box, four times as fast.
+    Gives the same points as geometry.points_in_box, but is four times as fast.
 
     Args:
         points: (N, 3 or more).
@@ -50,14 +50,14 @@ def paste_object(
         object_points: (K, 4) points of the object.
         box: (7,) float64 box of the object. Scene points in it are dropped.
         margin: Margin of the box in metres.
-        max_hidden: Largest allowed number of scene points in front of the object.
+        max_hidden: Maximum allowed number of scene points in front of the object.
 
     Returns:
         The remaining scene points followed by object_points; (0, 4) if the object would be hidden.
     """
     bearing = np.arctan2(box[1], box[0])
     cos, sin = np.cos(bearing), np.sin(bearing)
-    # Bounds of depth, horizontal slope and vertical slope of the object.
+    # Limits of the object's depth, horizontal slope and vertical slope.
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for i in range(len(object_points)):
         depth = max(cos * object_points[i, 0] + sin * object_points[i, 1], MIN_RANGE_M)
@@ -71,8 +71,8 @@ def paste_object(
     for i in range(len(points)):
         depth = cos * points[i, 0] + sin * points[i, 1]
         if depth > 0 and not low[0] <= depth <= high[0]:
-            aside = cos * points[i, 1] - sin * points[i, 0]
-            if low[1] * depth <= aside <= high[1] * depth and low[2] * depth <= points[i, 2] <= high[2] * depth:
+            lateral = cos * points[i, 1] - sin * points[i, 0]
+            if low[1] * depth <= lateral <= high[1] * depth and low[2] * depth <= points[i, 2] <= high[2] * depth:
                 if depth > high[0]:
                     continue
                 in_front += 1
@@ -93,11 +93,11 @@ def estimate_floor(points: np.ndarray, box: np.ndarray, half_size: float, quanti
     Args:
         points: (N, 3 or more).
         box: (7,) box.
-        half_size: Points whose distance from the box's centre along x and y is at most this are used, m.
-        quantile: Quantile of their heights, 0 .. 1, that is the ground.
+        half_size: Half the side of the square around the box's centre whose points are used, m.
+        quantile: Quantile (0 .. 1) of their heights that is taken as the ground.
 
     Returns:
-        The height; NaN with fewer than MIN_FLOOR_POINTS points.
+        The height, or NaN with fewer than MIN_FLOOR_POINTS points.
     """
     heights, count = np.empty(len(points), points.dtype), 0
     for i in range(len(points)):

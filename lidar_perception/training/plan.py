@@ -6,27 +6,27 @@ from dataclasses import dataclass, replace
 
 from lidar_perception.types import InputError
 
-RESERVE_SHARE = 0.1  # fraction of the budget reserved for everything that is not measured
+RESERVE_FRACTION = 0.1  # part of the budget reserved for everything that is not measured
 STARTUP_S = 20.0  # time until all processes run
-MAX_PREPARATION_SHARE = 0.25  # maximum fraction of the time for the preparation of scenes
-VALIDATION_SHARE = 0.12  # fraction of the time for validations
+MAX_PREPARATION_FRACTION = 0.25  # maximum part of the time for the preparation of scenes
+VALIDATION_FRACTION = 0.12  # part of the time for validations
 SCANS_RANGE, VAL_SCANS_RANGE = (24, 3000), (16, 200)
 MAX_VALIDATIONS = 6
 EPOCHS_RANGE = 4, 80
-FULL_RANGE_STEPS = 12_000  # runs with at least this many steps cover the whole detection range
+FULL_RANGE_STEPS = 12_000  # runs with at least this many steps cover the full detection range
 MIN_STEPS = 20
 
 
 @dataclass(frozen=True)
 class Speed:
-    """Measured durations in seconds.
+    """Measured durations in seconds, and the size of a scan.
 
     Attributes:
-        scan: Simulation of a scan on one core; 0 if nothing is simulated.
-        cut: Cutting of objects or clusters from a scan on one core.
-        step: Training step on the reduced range.
-        whole: Training step on the whole range.
-        frame: Validation of a frame.
+        scan: Duration of simulating a scan on one core; 0 if nothing is simulated.
+        cut: Duration of cutting the objects or clusters from a scan on one core.
+        step: Duration of a training step on the reduced range.
+        whole: Duration of a training step on the full range.
+        frame: Duration of validating a frame.
         scan_mb: Size of a cached scan, MB.
     """
 
@@ -43,11 +43,11 @@ class Plan:
     """Plan of a training run.
 
     Attributes:
-        scans, val_scans: Numbers of simulated training and validation scans.
+        scans, val_scans: Number of simulated training and validation scans.
         cuts: Number of scenes from which objects or clusters are cut.
         steps: Number of training steps.
         validate_steps: Steps between validations.
-        part: Train on the reduced range only.
+        part: True to train on the reduced range only.
     """
 
     scans: int = 0
@@ -59,14 +59,15 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Data:
-    """Available scenes.
+class AvailableScenes:
+    """Numbers of scenes that a plan can use.
 
     Attributes:
-        simulated, val_simulated: Training or validation scans are simulated.
-        recorded, val_recorded: Numbers of recorded training and validation scenes.
+        simulated: True if (some) training scans are simulated.
+        val_simulated: True if (some) validation scans are simulated.
+        recorded, val_recorded: Number of recorded training and validation scenes.
         batch: Scenes per step.
-        most_cuts: Largest number of scenes from which objects or clusters are cut.
+        most_cuts: Maximum number of scenes from which objects or clusters are cut.
     """
 
     simulated: bool
@@ -77,29 +78,31 @@ class Data:
     most_cuts: int
 
 
-def fit_plan(hours: float, cores: int, speed: Speed, data: Data, fixed: Plan = Plan(), epochs: float = 0.0) -> Plan:
+def fit_plan(
+    hours: float, cores: int, speed: Speed, data: AvailableScenes, user_plan: Plan = Plan(), epochs: float = 0.0
+) -> Plan:
     """Fit a plan to a time budget.
 
     It has as many scans as can be used in EPOCHS_RANGE[0] epochs and prepared in
-    MAX_PREPARATION_SHARE of the time. The rest of the time, without validations, is for the steps.
+    MAX_PREPARATION_FRACTION of the time. The steps get the rest of the time, apart from validations.
 
     Args:
-        hours: Budget.
+        hours: Time budget.
         cores: CPU cores that prepare scenes.
         speed: Measured durations.
         data: Available scenes.
-        fixed: Numbers other than 0 are kept, even if they exceed the budget; part=False excludes
-            the reduced range.
-        epochs: Number of epochs, 0 to fit it.
+        user_plan: Numbers other than 0 are kept, even if they exceed the budget; part=False
+            excludes the reduced range.
+        epochs: Number of epochs; 0 to choose it by the budget.
 
     Raises:
         InputError: The budget is too short for MIN_STEPS.
     """
-    plan = _fit_unchecked(hours, cores, speed, data, fixed, epochs)
-    if fixed.steps or epochs or plan.steps >= MIN_STEPS:
+    plan = _fit_unchecked(hours, cores, speed, data, user_plan, epochs)
+    if user_plan.steps or epochs or plan.steps >= MIN_STEPS:
         return plan
     min_hours = hours
-    while _fit_unchecked(min_hours, cores, speed, data, fixed, epochs).steps < MIN_STEPS:
+    while _fit_unchecked(min_hours, cores, speed, data, user_plan, epochs).steps < MIN_STEPS:
         min_hours = 1.2 * min_hours
     raise InputError(
         f"a budget of {hours:g} h is too short for {MIN_STEPS} steps on this machine: "
@@ -107,47 +110,49 @@ def fit_plan(hours: float, cores: int, speed: Speed, data: Data, fixed: Plan = P
     )
 
 
-def _fit_unchecked(hours: float, cores: int, speed: Speed, data: Data, fixed: Plan, epochs: float) -> Plan:
+def _fit_unchecked(
+    hours: float, cores: int, speed: Speed, data: AvailableScenes, user_plan: Plan, epochs: float
+) -> Plan:
     """Fit a plan whose number of steps may be too small."""
-    time = 3600 * hours * (1 - RESERVE_SHARE) - STARTUP_S
-    scans, val_scans, steps = fixed.scans, fixed.val_scans, fixed.steps
+    time = 3600 * hours * (1 - RESERVE_FRACTION) - STARTUP_S
+    scans, val_scans, steps = user_plan.scans, user_plan.val_scans, user_plan.steps
     if data.simulated and not scans:
         preparation = (speed.scan + speed.cut) / cores
-        preparable = MAX_PREPARATION_SHARE * time / preparation
-        trainable = (1 - VALIDATION_SHARE) * time / (preparation + EPOCHS_RANGE[0] * speed.step / data.batch)
-        scans = _clip(min(preparable, trainable), SCANS_RANGE)
+        max_prepared = MAX_PREPARATION_FRACTION * time / preparation
+        max_trained = (1 - VALIDATION_FRACTION) * time / (preparation + EPOCHS_RANGE[0] * speed.step / data.batch)
+        scans = _clip(min(max_prepared, max_trained), SCANS_RANGE)
         scans = min(scans, steps * data.batch) if steps else scans
     scenes = (scans if data.simulated else 0) + data.recorded
     if data.val_simulated and not val_scans:
-        val_scans = _clip(min(scenes / 8, VALIDATION_SHARE * time / MAX_VALIDATIONS / speed.frame), VAL_SCANS_RANGE)
+        val_scans = _clip(min(scenes / 8, VALIDATION_FRACTION * time / MAX_VALIDATIONS / speed.frame), VAL_SCANS_RANGE)
     epoch = max(1, round(scenes / data.batch))
     steps = steps or (max(1, round(epochs * epoch)) if epochs else 0)
-    plan = Plan(scans, val_scans, fixed.cuts or min(scenes, data.most_cuts), steps, fixed.validate_steps)
+    plan = Plan(scans, val_scans, user_plan.cuts or min(scenes, data.most_cuts), steps, user_plan.validate_steps)
     validation = speed.frame * (val_scans + data.val_recorded)
-    validations = max(1, min(MAX_VALIDATIONS, int(VALIDATION_SHARE * time / validation)))
-    time_left = time - preparation_duration(plan, cores, speed) - validations * validation
-    part = fixed.part and time_left / speed.whole < FULL_RANGE_STEPS
+    validations = max(1, min(MAX_VALIDATIONS, int(VALIDATION_FRACTION * time / validation)))
+    time_left = time - estimate_preparation_duration(plan, cores, speed) - validations * validation
+    part = user_plan.part and time_left / speed.whole < FULL_RANGE_STEPS
     steps = steps or max(0, min(int(time_left / (speed.step if part else speed.whole)), EPOCHS_RANGE[1] * epoch))
-    validate_steps = fixed.validate_steps or max(1, -(-steps // validations))
+    validate_steps = user_plan.validate_steps or max(1, -(-steps // validations))
     return replace(plan, part=part, steps=steps, validate_steps=validate_steps)
 
 
-def preparation_duration(plan: Plan, cores: int, speed: Speed) -> float:
-    """Return the duration of simulating and cutting all scenes, in seconds."""
+def estimate_preparation_duration(plan: Plan, cores: int, speed: Speed) -> float:
+    """Estimate the duration of simulating and cutting all scenes, in seconds."""
     return (speed.scan * (plan.scans + plan.val_scans) + speed.cut * plan.cuts) / cores
 
 
-def training_durations(plan: Plan, speed: Speed, data: Data) -> tuple[float, float]:
-    """Return the durations of all steps and of all validations, in seconds."""
+def estimate_training_durations(plan: Plan, speed: Speed, data: AvailableScenes) -> tuple[float, float]:
+    """Estimate the total durations of the steps and of the validations, in seconds."""
     validations = -(-plan.steps // plan.validate_steps)
     return (
         plan.steps * (speed.step if plan.part else speed.whole),
-        validations * validation_duration(plan, speed, data),
+        validations * estimate_validation_duration(plan, speed, data),
     )
 
 
-def validation_duration(plan: Plan, speed: Speed, data: Data) -> float:
-    """Return the duration of one validation, in seconds."""
+def estimate_validation_duration(plan: Plan, speed: Speed, data: AvailableScenes) -> float:
+    """Estimate the duration of one validation, in seconds."""
     return (plan.val_scans + data.val_recorded) * speed.frame
 
 

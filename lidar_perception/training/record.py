@@ -1,4 +1,4 @@
-"""Checkpoints of a training run, their initial weights, and the metrics of a validation."""
+"""Checkpoints, initial weights and validation metrics of a training run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def make_save_function(
             "seconds": round(record["seconds"]),
             "steps_skipped": record["skipped"],
             "scenes_skipped": len(batches.skipped),
-            "batch": params.batch * batches.world,
+            "batch": params.batch * batches.world_size,
             "params": flatten(params),
             "version": __version__,
         }
@@ -53,12 +53,12 @@ def load_initial_weights(network: Net, init: Path | None, config_type: type[Conf
     if init is not None:
         loaded, count = copy_matching_weights(network, init, config_type)
         if loaded < count:
-            errors.print(f"{loaded} of {count} tensors are from {init}, the others are initialised at random")
+            errors.print(f"loaded {loaded} of {count} tensors from {init}; the others are initialised at random")
     return network
 
 
 def report_skipped(skipped: Sequence[str], remaining: int, reported: set[str]) -> None:
-    """Print the reasons why validation frames were skipped, each once.
+    """Print each reason why validation frames were skipped once.
 
     Args:
         skipped: Reasons.
@@ -73,7 +73,7 @@ def report_skipped(skipped: Sequence[str], remaining: int, reported: set[str]) -
             errors.print(f"validation: {reason}")
     reported.update(skipped)
     if remaining == 0:
-        raise InputError(f"no frame to validate on can be used ({next(iter(skipped), 'there is none')})")
+        raise InputError(f"no usable validation frame ({next(iter(skipped), 'there are no frames')})")
 
 
 def round_metrics(metrics: dict[str, float]) -> dict[str, float | None]:
@@ -106,5 +106,5 @@ def select_metrics(content: dict[str, Any], score: str, classes: Sequence[str]) 
             value = content["ap"].get(name, {}).get(row, {}).get("moderate")
             metrics[f"{name}_{row}"] = float("nan") if value is None else value["r40"]
     row = "bev_relaxed" if score == "bev" else "3d"
-    valid = [v for name in classes if not np.isnan(v := metrics[f"{name}_{row}"])]
-    return {"score": float(np.mean(valid)) if valid else float("nan"), **metrics}
+    values = [value for name in classes if not np.isnan(value := metrics[f"{name}_{row}"])]
+    return {"score": float(np.mean(values)) if values else float("nan"), **metrics}

@@ -29,14 +29,14 @@ class Task(Generic[Net]):
         module: The network, on its device.
         loss: loss(module, batch) -> (scalar to minimise, parts to log). It must call module as a
             function, since module may be wrapped for several processes.
-        batches: batches(step) -> iterator over the batches from this step (from 0) on, always the
-            same.
+        batches: batches(step) -> iterator over the batches of this step (from 0) and all later ones.
+            Repeated calls give the same batches.
         validate: validate(module) -> (metrics, calibration). The metric "score" selects the best
             weights; the calibration converts scores to probabilities, see
             detectors/calibration.py.
         save: save(name, module, record) writes the weights "best" or "last"; the record is JSON data.
-        epoch: Steps per epoch.
-        about: Further settings that must not change when the run is resumed.
+        steps_per_epoch: Number of steps per epoch.
+        about: Description of the data, which must not change when the run is resumed.
     """
 
     module: Net
@@ -44,7 +44,7 @@ class Task(Generic[Net]):
     batches: Callable[[int], Iterable[Any]]
     validate: Callable[[Net], Validation]
     save: Callable[[str, nn.Module, dict[str, Any]], None]
-    epoch: int
+    steps_per_epoch: int
     about: dict[str, Any] = field(default_factory=dict)
 
 
@@ -60,8 +60,8 @@ class Progress:
         validated: Step of the last validation.
         seconds: Duration of the run.
         left_out: Number of planned steps removed from the schedule for lack of time.
-        stopped: A signal stopped the run.
-        late: The time budget is spent.
+        stopped: True if a signal stopped the run.
+        late: True if the time budget is spent.
     """
 
     step: int = 0
@@ -81,24 +81,24 @@ class Run:
 
     def __init__(self, task: Task, params: LoopParams, device: torch.device):
         self.task, self.params, self.device = task, params, device
-        self.steps = params.total_steps(task.epoch)
-        self.validate_steps = params.validation_steps(task.epoch)
+        self.steps = params.compute_total_steps(task.steps_per_epoch)
+        self.validate_steps = params.compute_validation_steps(task.steps_per_epoch)
         self.module = task.module
         self.average = WeightAverage(self.module, params.ema)
-        # At first, norm statistics are means over all steps, so that their initial values do not matter.
+        # In the first steps, norm statistics are means over all steps so far: their initial values are arbitrary.
         self.norms = [
             (m, m.momentum)
             for m in self.module.modules()
             if isinstance(m, nn.modules.batchnorm._BatchNorm) and m.momentum is not None
         ]
-        self.wrapped: nn.Module = self.module
+        self.parallel_module: nn.Module = self.module
         if get_world_size() > 1:
-            self.wrapped = nn.parallel.DistributedDataParallel(
+            self.parallel_module = nn.parallel.DistributedDataParallel(
                 self.module, device_ids=[device] if device.type == "cuda" else None
             )
         self.optimizer = torch.optim.AdamW(self.module.parameters(), lr=params.lr, weight_decay=params.weight_decay)
-        self.format = choose_dtype(params.amp, device)
-        self.scaler = torch.amp.GradScaler(device.type, enabled=self.format is torch.float16)
+        self.dtype = choose_dtype(params.amp, device)
+        self.scaler = torch.amp.GradScaler(device.type, enabled=self.dtype is torch.float16)
         self.progress = Progress()
 
     @property
@@ -107,26 +107,33 @@ class Run:
         return self.progress.step + self.progress.left_out
 
     @property
-    def done(self) -> bool:
+    def is_done(self) -> bool:
         """True at the end of the schedule."""
         return self.position >= self.steps
 
-    def shorten_schedule(self, fit: float) -> None:
-        """Remove steps evenly, so that the schedule ends after `fit` more steps."""
-        left, fit = self.steps - self.position, max(fit, 1.0)
-        if left > fit:  # with fit = 1, exactly one step is left
-            self.progress.left_out = self.steps - self.progress.step - (left - left / fit + 1)
+    def shorten_schedule(self, remaining_steps: float) -> None:
+        """Remove steps evenly, so that the schedule ends after `remaining_steps` more steps, at least one."""
+        planned_steps, remaining_steps = self.steps - self.position, max(remaining_steps, 1.0)
+        if planned_steps > remaining_steps:  # the next step then advances the schedule by their ratio
+            self.progress.left_out = (
+                self.steps - self.progress.step - (planned_steps - planned_steps / remaining_steps + 1)
+            )
 
     def is_validation_due(self) -> bool:
         """Return True if the current weights must be validated."""
         step = self.progress.step
-        return step > self.progress.validated and (step % self.validate_steps == 0 or self.done)
+        return step > self.progress.validated and (step % self.validate_steps == 0 or self.is_done)
 
-    def settings(self) -> dict[str, Any]:
+    def collect_settings(self) -> dict[str, Any]:
         """Return the settings that must not change when the run is resumed."""
-        return {**self.params.fixed_settings(), **self.task.about, "steps": self.steps, "processes": get_world_size()}
+        return {
+            **self.params.get_fixed_settings(),
+            **self.task.about,
+            "steps": self.steps,
+            "processes": get_world_size(),
+        }
 
-    def state(self) -> dict[str, Any]:
+    def make_state(self) -> dict[str, Any]:
         """Return the state from which the run can be resumed, for torch.save."""
         cuda = torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else None
         return {
@@ -138,11 +145,11 @@ class Run:
             "progress": vars(self.progress).copy(),
             "random": torch.get_rng_state(),
             "cuda": cuda,
-            "asked": self.settings(),
+            "asked": self.collect_settings(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Restore a state returned by state()."""
+        """Restore a state returned by make_state."""
         self.module.load_state_dict(state["module"])
         self.average.module.load_state_dict(state["average"])
         self.average.updates = state["updates"]
@@ -157,26 +164,26 @@ class Run:
         """Train on one batch.
 
         Returns:
-            Values to log, or None if the step was skipped and only the counters changed.
+            Values to log, or None if the step was skipped, which changes only the counters.
 
         Raises:
             InputError: Loss or gradient was not finite in too many consecutive steps.
         """
-        rate, beta = compute_one_cycle(self.position, self.steps, self.params.lr, self.params.warm_share)
+        learning_rate, beta = compute_one_cycle(self.position, self.steps, self.params.lr, self.params.warm_share)
         for group in self.optimizer.param_groups:
-            group["lr"], group["betas"] = rate, (beta, group["betas"][1])
+            group["lr"], group["betas"] = learning_rate, (beta, group["betas"][1])
         for norm, momentum in self.norms:
             norm.momentum = max(momentum, 1 / (self.progress.step + 1))
-        # To undo the change of the norm statistics if the step is skipped.
-        buffers = [(buffer, buffer.clone()) for buffer in self.module.buffers()]
-        self.wrapped.train()
-        with torch.autocast(self.device.type, self.format) if self.format else nullcontext():
-            total, parts = self.task.loss(self.wrapped, batch)
+        # A skipped step must not change the norm statistics, so their old values are saved.
+        saved_buffers = [(buffer, buffer.clone()) for buffer in self.module.buffers()]
+        self.parallel_module.train()
+        with torch.autocast(self.device.type, self.dtype) if self.dtype else nullcontext():
+            total, parts = self.task.loss(self.parallel_module, batch)
         gradient_norm = self._descend(total)
         self.progress.step += 1
         if not math.isfinite(gradient_norm):
-            for buffer, before in buffers:
-                buffer.copy_(before)
+            for buffer, old_value in saved_buffers:
+                buffer.copy_(old_value)
             self.progress.skipped += 1
             self.progress.in_a_row += 1
             if self.progress.in_a_row >= self.params.max_skipped:
@@ -191,11 +198,11 @@ class Run:
             "loss": total.item(),
             **{name: float(part) for name, part in parts.items()},
             "gradient": gradient_norm,
-            "lr": rate,
+            "lr": learning_rate,
         }
 
     def _descend(self, total: Tensor) -> float:
-        """Make an optimizer step. Return the norm of the gradient, not finite if the step was skipped."""
+        """Make an optimizer step. Return the norm of the gradient, which is not finite if the step was skipped."""
         if is_true_anywhere(not torch.isfinite(total).item(), self.device):
             return math.nan
         self.optimizer.zero_grad(set_to_none=True)

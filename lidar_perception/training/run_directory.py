@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 from lidar_perception.runs.files import check_writable_folder, read_text, remove_temporaries, write_text
 from lidar_perception.runs.resuming import find_differences, lock_folder
 from lidar_perception.training.distributed import get_rank
-from lidar_perception.training.plan import Data, Plan, Speed
+from lidar_perception.training.plan import AvailableScenes, Plan, Speed
 from lidar_perception.types import InputError
 
 RUN = "run.json"  # settings, measured speed and plan of the first start
-STATE = "last.pt"  # state from which a run is resumed
+STATE = "last.pt"  # state from which the run is resumed
 WEIGHTS = "best.safetensors", "last.safetensors"
 SCANS = "scans"  # the cache, unless another one is given
 RUN_FILES = (RUN, STATE, *WEIGHTS, "objects.npz", "log.csv", "validation.csv")
@@ -26,12 +26,12 @@ MAX_RUN_BYTES = 10**6
 
 
 class PlannedRun(NamedTuple):
-    """Content of run.json. settings must not change when the run is resumed."""
+    """Content of run.json. The settings must not change when the run is resumed."""
 
     settings: dict[str, Any]
     plan: Plan
     speed: Speed
-    data: Data
+    data: AvailableScenes
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,10 @@ class RunDirectory:
 
     @property
     def state_file(self) -> Path:
-        """Path of the state from which a run resumes."""
         return self.path / STATE
 
     @property
     def plan_file(self) -> Path:
-        """Path of the plan."""
         return self.path / RUN
 
     def require_no_run(self, resume: bool) -> None:
@@ -110,14 +108,14 @@ class RunDirectory:
         try:
             content = json.loads(text)
             run = PlannedRun(
-                content["asked"], Plan(**content["plan"]), Speed(**content["speed"]), Data(**content["data"])
+                content["asked"], Plan(**content["plan"]), Speed(**content["speed"]), AvailableScenes(**content["data"])
             )
-            different = find_differences(run.settings, json.loads(json.dumps(settings)))
+            differences = find_differences(run.settings, json.loads(json.dumps(settings)))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError(f"cannot read {self.plan_file}: {error!r}; give another --out") from None
-        if different:
+        if differences:
             raise InputError(
-                f"{self.path} contains a run with {'; '.join(different[:3])}; resume it with the same settings, "
+                f"{self.path} contains a run with {'; '.join(differences[:3])}; resume it with the same settings, "
                 "or give another --out"
             )
         return run

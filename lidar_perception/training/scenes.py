@@ -1,7 +1,7 @@
 """Sources of labelled scenes: recordings, and simulated scenes with a cache on disk.
 
-A source has a length, scene(i) for training and frame(i) for validation. It can be pickled: each
-process opens the files that it reads.
+A source has a length, load_scene(i) for training and load_frame(i) for validation. It can be
+pickled: each process opens the files that it reads.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ from lidar_perception.simulation.drive import choose_drive_frame, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.cache import cache_path, file_fingerprint, folder_size, load_or_compute
+from lidar_perception.training.cache import file_fingerprint, folder_size, load_or_compute, make_cache_path
 from lidar_perception.types import GroundTruth, InputError, PointCloud
+
+EXTRAS = ("track_id", "truncated", "occluded", "num_points", "visible")  # keys of GroundTruth.extras to cache
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,8 @@ class RecordedScenes:
     Attributes:
         path: Path of the recording.
         names: Names of the frames.
-        view: Use only the points in the image if there is a camera, since labels end there.
+        view: True to use only the points in the camera image, if there is one, because KITTI labels
+            only objects in it.
         height: Height of the sensor above the ground in metres; None uses that of the recording.
     """
 
@@ -52,8 +55,8 @@ class RecordedScenes:
     @cached_property
     def _frames(self) -> dict[str, Frame]:
         frames = open_recording(self.path, sensor_height=self.height).frames[:]
-        by_name = {frame.name: frame for frame in frames}
-        return {name: by_name[name] for name in self.names}
+        frames_by_name = {frame.name: frame for frame in frames}
+        return {name: frames_by_name[name] for name in self.names}
 
     def __getstate__(self) -> dict:
         return {k: v for k, v in self.__dict__.items() if k != "_frames"}
@@ -63,16 +66,16 @@ class RecordedScenes:
         """Height of the sensor above the ground in the first frame, in metres."""
         return self._frames[self.names[0]].sensor_height
 
-    def key(self, i: int) -> str:
+    def cache_key(self, i: int) -> str:
         """Return the cache key of scene i, which changes when one of its files changes."""
         frame = self._frames[self.names[i]]
         return repr(
             (*map(file_fingerprint, frame.files), split_topic(self.path)[1], frame.name, self.view, frame.sensor_height)
         )
 
-    def scene(self, i: int) -> TrainingScene:
-        """Return scene i for training. Raise InputError with the name of the file if it cannot be read."""
-        frame, truth = self._labelled_frame(i)
+    def load_scene(self, i: int) -> TrainingScene:
+        """Load scene i for training. Raise InputError with the name of the file if it cannot be read."""
+        frame, truth = self._find_labelled_frame(i)
         scan, camera = frame.load(), frame.camera()
         points = scan.points()
         if self.view and camera is not None:
@@ -81,11 +84,11 @@ class RecordedScenes:
             points, truth.boxes, truth.class_ids, np.ones(len(truth), bool), camera is None, frame.sensor_height
         )
 
-    def frame(self, i: int) -> Frame:
+    def load_frame(self, i: int) -> Frame:
         """Return frame i for validation, with all points. Raise InputError if it has no labels."""
-        return self._labelled_frame(i)[0]
+        return self._find_labelled_frame(i)[0]
 
-    def _labelled_frame(self, i: int) -> tuple[Frame, GroundTruth]:
+    def _find_labelled_frame(self, i: int) -> tuple[Frame, GroundTruth]:
         frame = self._frames[self.names[i]]
         truth = frame.truth()
         if truth is None:
@@ -95,88 +98,87 @@ class RecordedScenes:
 
 @dataclass(frozen=True)
 class SimulatedScenes:
-    """Simulated scans of the scenes with the seeds first, first + 1, ...
+    """Simulated scans of scenes with consecutive seeds.
 
     Attributes:
-        first: Seed of the first scene.
+        first_seed: Seed of the first scene.
         count: Number of scans.
         sensor: The sensor.
         scenes: Types of the scenes.
         cache: Folder of cached scans, or None.
-        cache_gb: Largest size of the cache, GB.
-        per_scene: Number of scans of each scene, spread over its drive. Several save time, since
-            making a scene takes as long as simulating a scan.
-        around: The camera of the validation frames, which limits the labels, points ahead, left,
-            behind and right in turn, instead of always ahead.
+        cache_gb: Maximum size of the cache, GB.
+        scans_per_scene: Number of scans of each scene, spread over its drive. Several scans save
+            time, because making a scene takes as long as simulating a scan.
+        all_around: True to let the camera of the validation frames, which limits the labels, point
+            ahead, left, behind and right in turn. If False, it always points ahead.
     """
 
-    first: int
+    first_seed: int
     count: int
     sensor: Sensor = HDL64E
     scenes: Scenes = ALL_STREETS
     cache: Path | None = None
     cache_gb: float = 20.0
-    per_scene: int = 1
-    around: bool = False
+    scans_per_scene: int = 1
+    all_around: bool = False
 
     def __len__(self) -> int:
         return self.count
 
     def locate(self, i: int) -> tuple[int, int]:
         """Return the seed of the scene of scan i, and the number of the scan in its drive."""
-        scene, part = divmod(i, self.per_scene)
-        return self.first + scene, choose_drive_frame(part, self.per_scene, self.sensor)
+        scene, scan = divmod(i, self.scans_per_scene)
+        return self.first_seed + scene, choose_drive_frame(scan, self.scans_per_scene, self.sensor)
 
-    def key(self, i: int) -> str:
+    def cache_key(self, i: int) -> str:
         """Return the cache key of scan i."""
         return repr((self.sensor, tuple(self.scenes), self.locate(i)))
 
-    def path(self, i: int) -> Path | None:
+    def cache_file(self, i: int) -> Path | None:
         """Return the cache file of scan i."""
-        return cache_path(self.cache, self.key(i))
+        return make_cache_path(self.cache, self.cache_key(i))
 
-    def scene(self, i: int) -> TrainingScene:
-        """Return scan i for training, with labels in all directions."""
-        frame, truth = self.scan(i)
+    def load_scene(self, i: int) -> TrainingScene:
+        """Load scan i for training, with labels in all directions."""
+        frame, truth = self.load_scan(i)
         return TrainingScene(
             frame.points(), truth.boxes, truth.class_ids, find_labelled(truth), True, self.sensor.height
         )
 
-    def frame(self, i: int) -> Frame:
-        """Return scan i for validation, with KITTI's labels in the camera image, or all labels without a camera."""
-        scan, truth = self.scan(i)
-        scene, part = self.locate(i)
+    def load_frame(self, i: int) -> Frame:
+        """Load scan i for validation. With a camera, only objects in its image are labelled, as in KITTI."""
+        scan, truth = self.load_scan(i)
+        seed, number = self.locate(i)
         if not self.scenes.camera:
-            return Frame.of(f"scene {scene} frame {part}", scan, select_labels(truth), sensor_height=self.sensor.height)
-        camera = turn_camera(np.pi / 2 * (i % 4)) if self.around else FORWARD_CAMERA
+            return Frame.of(
+                f"scene {seed} frame {number}", scan, select_labels(truth), sensor_height=self.sensor.height
+            )
+        camera = turn_camera(np.pi / 2 * (i % 4)) if self.all_around else FORWARD_CAMERA
         return Frame.of(
-            f"street {scene} frame {part}",
+            f"street {seed} frame {number}",
             scan,
             make_kitti_labels(truth, camera),
             camera,
             sensor_height=self.sensor.height,
         )
 
-    def scan(self, i: int) -> tuple[PointCloud, GroundTruth]:
-        """Return scan i with all its objects, from the cache if possible."""
-        return load_or_compute(self.path(i), lambda: self._simulate(i), _from_arrays, _to_arrays, self.cache_gb)
+    def load_scan(self, i: int) -> tuple[PointCloud, GroundTruth]:
+        """Load scan i with all its objects from the cache, or simulate it."""
+        return load_or_compute(self.cache_file(i), lambda: self._simulate(i), _from_arrays, _to_arrays, self.cache_gb)
 
     def store(self, i: int) -> None:
-        """Write scan i to the cache, if there is room."""
+        """Write scan i to the cache, unless the cache is full."""
         if self.cache is not None and folder_size(self.cache) < self.cache_gb * 1e9:
-            self.scan(i)
+            self.load_scan(i)
 
     def _simulate(self, i: int) -> tuple[PointCloud, GroundTruth]:
         scan = simulate_scan(*self.locate(i), self.sensor, self.scenes)
         return scan.frame, scan.truth
 
 
-EXTRAS = ("track_id", "truncated", "occluded", "num_points", "visible")
-
-
 def _to_arrays(scan: tuple[PointCloud, GroundTruth]) -> dict[str, np.ndarray]:
     frame, truth = scan
-    assert frame.intensity is not None  # simulated scans always have it
+    assert frame.intensity is not None  # simulated scans always have intensity
     extras = {name: np.array([e[name] for e in truth.extras]) for name in EXTRAS}
     return dict(xyz=frame.xyz, intensity=frame.intensity, boxes=truth.boxes, class_ids=truth.class_ids, **extras)
 

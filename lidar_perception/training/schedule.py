@@ -17,13 +17,13 @@ def compute_one_cycle(step: float, steps: int, lr: float, warm_share: float) -> 
 
     The rate rises to lr in the first warm_share of the steps and then falls, both along cosines.
     """
-    first, last = lr / START_DIVISOR, lr / START_DIVISOR / END_DIVISOR
-    top = warm_share * steps - 1
-    if step <= top:
-        share = _cosine_ramp(step / top) if top > 0 else 1.0
-        return (first + (lr - first) * share, MAX_MOMENTUM + (MIN_MOMENTUM - MAX_MOMENTUM) * share)
-    share = _cosine_ramp((step - top) / (steps - 1 - top)) if steps - 1 > top else 1.0
-    return lr + (last - lr) * share, MIN_MOMENTUM + (MAX_MOMENTUM - MIN_MOMENTUM) * share
+    first_rate, last_rate = lr / START_DIVISOR, lr / START_DIVISOR / END_DIVISOR
+    peak_step = warm_share * steps - 1
+    if step <= peak_step:
+        ramp = _cosine_ramp(step / peak_step) if peak_step > 0 else 1.0
+        return (first_rate + (lr - first_rate) * ramp, MAX_MOMENTUM + (MIN_MOMENTUM - MAX_MOMENTUM) * ramp)
+    ramp = _cosine_ramp((step - peak_step) / (steps - 1 - peak_step)) if steps - 1 > peak_step else 1.0
+    return lr + (last_rate - lr) * ramp, MIN_MOMENTUM + (MAX_MOMENTUM - MIN_MOMENTUM) * ramp
 
 
 def _cosine_ramp(x: float) -> float:
@@ -33,8 +33,8 @@ def _cosine_ramp(x: float) -> float:
 class WeightAverage:
     """Exponential moving average of a module's weights and norm statistics, as a module.
 
-    The decay of update t (from 1) is min(decay, t / (t + 9)), so that the initial weights are soon
-    forgotten.
+    The decay of update t (from 1) is min(decay, t / (t + 9)), so that the initial weights soon have
+    no effect.
     """
 
     def __init__(self, module: nn.Module, decay: float):

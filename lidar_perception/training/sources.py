@@ -26,7 +26,7 @@ def open_sources(
     params: DataParams,
     seed: int,
     sensor: Sensor = HDL64E,
-    around: bool = False,
+    all_around: bool = False,
     scene: str = "street",
     height: float = 0.0,
 ) -> tuple[tuple, tuple]:
@@ -34,10 +34,10 @@ def open_sources(
 
     Args:
         data, val, split, val_split: See TrainingRequest.
-        params: Numbers of scans, cache and held-out share.
+        params: Numbers of scans, cache, and fraction of frames to hold out.
         seed: Seed of the choice of held-out frames.
         sensor: Sensor of the simulated scans.
-        around: Validate simulated scenes in all directions, not only ahead.
+        all_around: True to validate simulated scenes in all directions, not only ahead.
         scene: Types of simulated scenes, see Scenes.
         height: Height of the sensor, see open_labelled_frames.
 
@@ -50,31 +50,31 @@ def open_sources(
     folders = [Path(name) for name in data if name != SIM]
     val_folders = [Path(name) for name in val if name != SIM] or ([] if val else folders)
     if split is not None and len(folders) != 1:
-        raise InputError("--split needs exactly one recording to train on")
+        raise InputError("--split requires exactly one recording to train on")
     if val_split is not None and len(val_folders) != 1:
-        raise InputError("--val-split needs exactly one recording in --val")
-    mixed = SIM in (*data, *val)
-    training = [open_labelled_frames(folder, split, height, mixed) for folder in folders]
+        raise InputError("--val-split requires exactly one recording in --val")
+    with_simulated = SIM in (*data, *val)
+    train_frames = [open_labelled_frames(folder, split, height, with_simulated) for folder in folders]
     if val or val_split is not None:
-        held_out = [open_labelled_frames(folder, val_split, height, mixed) for folder in val_folders]
+        val_frames = [open_labelled_frames(folder, val_split, height, with_simulated) for folder in val_folders]
     else:
-        pairs = [frames.split(params.val_share, seed) for frames in training]
-        training, held_out = [first for first, _ in pairs], [second for _, second in pairs]
+        splits = [frames.split(params.val_share, seed) for frames in train_frames]
+        train_frames, val_frames = [split[0] for split in splits], [split[1] for split in splits]
     if split is not None and val_split is None:  # --split has priority
-        held_out = [frames.exclude(training, "validate on") for frames in held_out]
+        val_frames = [frames.exclude(train_frames, "validate on") for frames in val_frames]
     else:
-        training = [frames.exclude(held_out, "train on") for frames in training]
-    sources: list[RecordedScenes | SimulatedScenes] = [frames.to_scenes(params.view) for frames in training]
-    val_sources: list[RecordedScenes | SimulatedScenes] = [frames.to_scenes(params.view) for frames in held_out]
+        train_frames = [frames.exclude(val_frames, "train on") for frames in train_frames]
+    sources: list[RecordedScenes | SimulatedScenes] = [frames.to_scenes(params.view) for frames in train_frames]
+    val_sources: list[RecordedScenes | SimulatedScenes] = [frames.to_scenes(params.view) for frames in val_frames]
     simulate = partial(
         SimulatedScenes, sensor=sensor, cache_gb=params.cache_gb, cache=Path(params.cache) if params.cache else None
     )
     scenes, val_scenes = Scenes(None, params.people, scene), Scenes(None, params.val_people, scene)
-    if mixed:
+    if with_simulated:
         scenes.scene_types()  # raises InputError for an unknown scene
     if SIM in data:
-        per_scene = min(params.street_scans, longest_drive(sensor))
-        sources.append(simulate(FIRST_TRAINING_SEED, params.scans, scenes=scenes, per_scene=per_scene))
+        scans_per_scene = min(params.street_scans, longest_drive(sensor))
+        sources.append(simulate(FIRST_TRAINING_SEED, params.scans, scenes=scenes, scans_per_scene=scans_per_scene))
     if SIM in (val or data):
-        val_sources.append(simulate(FIRST_VALIDATION_SEED, params.val_scans, scenes=val_scenes, around=around))
+        val_sources.append(simulate(FIRST_VALIDATION_SEED, params.val_scans, scenes=val_scenes, all_around=all_around))
     return tuple(sources), tuple(val_sources)

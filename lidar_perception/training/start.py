@@ -1,4 +1,4 @@
-"""Start or resume of a training run: plan, preparation of the scenes, and training."""
+"""Start of a new or resumed training run: make the plan, prepare the scenes, and train."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from lidar_perception.training.cache import fill_cache
 from lidar_perception.training.data import Batches
 from lidar_perception.training.distributed import get_rank, get_world_size, join_process_group, wait_for_all
 from lidar_perception.training.loop import train
-from lidar_perception.training.plan import Speed, validation_duration
+from lidar_perception.training.plan import Speed, estimate_validation_duration
 from lidar_perception.training.planning import (
     DEFAULT_BUDGET_H,
     Planner,
@@ -77,7 +77,7 @@ def start_training(
         InputError: An input cannot be used. Inputs are checked before long computations where possible.
     """
     start = time.monotonic()
-    init = trainer.packaged_weights(params) if request.init == PACKAGE else request.init
+    init = trainer.find_packaged_weights(params) if request.init == PACKAGE else request.init
     directory = RunDirectory(request.out)
     _check_request(request, directory, init)
     if not params.data.cache:
@@ -87,8 +87,7 @@ def start_training(
         hours = DEFAULT_BUDGET_H
     sensor = find_sensor(params.sensor, params.mount_height)
     settings = _collect_settings(request, params, sensor, init)
-    chosen = torch.device(find_device(request.device))
-    with join_process_group(chosen) as device, directory.lock():
+    with join_process_group(torch.device(find_device(request.device))) as device, directory.lock():
         wait_for_all()  # rank 0 writes files that the others have checked above
         planner = Planner(trainer, request, params, sensor, device, speed)
         if get_rank() == 0:
@@ -98,27 +97,33 @@ def start_training(
         wait_for_all()
         run = directory.read_plan(settings)
         params = planner.apply_plan(run.plan)
-        sources, held_out = open_scenes(request, params, sensor)
-        cuts = trainer.make_cuts(params, sources, held_out, Path(params.data.cache))
+        sources, val_sources = open_scenes(request, params, sensor)
+        cuts = trainer.make_cuts(params, sources, val_sources, Path(params.data.cache))
         if get_rank() == 0:
             with _explain_interrupt():
-                _prepare_scenes(trainer, request, sources, held_out, cuts)
+                _prepare_scenes(trainer, request, sources, val_sources, cuts)
                 trainer.collect_cuts(params, cuts, request.out)
         wait_for_all()
-        stream, validation = trainer.make_streams(params, sources, held_out, cuts, request.out)
+        stream, validation = trainer.make_streams(params, sources, val_sources, cuts, request.out)
         batches = Batches(stream, params.batch, request.jobs, get_rank(), get_world_size())
         about = {
             "data": list(request.data),
             "scenes": len(stream),
             "validation": list(request.val) or "held out",
-            "validation_scenes": sum(map(len, held_out)),
+            "validation_scenes": sum(map(len, val_sources)),
             "init": str(request.init or ""),
             "sensor": _describe_sensor(params, sensor, sources),
         }
         task = trainer.make_task(params, batches, validation, request.out, device, about, commit, init)
-        until = math.inf if hours is None else start + 3600 * hours
+        deadline = math.inf if hours is None else start + 3600 * hours
         progress = train(
-            task, params, request.out, device, request.resume, until, validation_duration(run.plan, run.speed, run.data)
+            task,
+            params,
+            request.out,
+            device,
+            request.resume,
+            deadline,
+            estimate_validation_duration(run.plan, run.speed, run.data),
         )
         return TrainingResult(progress, params.steps, batches) if get_rank() == 0 else None
 
@@ -137,7 +142,7 @@ def _explain_interrupt() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        errors.print("stopped; prepared scenes are kept, continue with --resume")
+        errors.print("stopped; prepared scenes are kept, so continue with --resume")
         raise
 
 
@@ -150,9 +155,9 @@ def _make_plan(planner: Planner, directory: RunDirectory, settings: dict[str, An
 
 
 def _prepare_scenes(
-    trainer: Trainer, request: TrainingRequest, sources: Sequence[Any], held_out: Sequence[Any], cuts: Cuts
+    trainer: Trainer, request: TrainingRequest, sources: Sequence[Any], val_sources: Sequence[Any], cuts: Cuts
 ) -> None:
-    simulated = [s for s in (*sources, *held_out) if isinstance(s, SimulatedScenes)]
+    simulated = [s for s in (*sources, *val_sources) if isinstance(s, SimulatedScenes)]
     fill_cache(simulated, [range(len(s)) for s in simulated], request.jobs, "simulating")
     fill_cache(*cuts, request.jobs, trainer.cutting_title)
 
@@ -160,20 +165,20 @@ def _prepare_scenes(
 def _collect_settings(request: TrainingRequest, params: Any, sensor: Sensor, init: Path | None) -> dict[str, Any]:
     """Return the settings that must not change when the run is resumed.
 
-    Splits and weights are represented by their content, since their files may change.
+    Splits and weights are represented by their content, because their files may change.
     """
-    sources, held_out = open_scenes(request, limit_to_few_scans(params), sensor)
-    weights = sha256(init.read_bytes()).hexdigest()[:12] if init else ""
+    sources, val_sources = open_scenes(request, limit_to_few_scans(params), sensor)
+    weights_hash = sha256(init.read_bytes()).hexdigest()[:12] if init else ""
     return {
-        **params.fixed_settings(),
+        **params.get_fixed_settings(),
         "data": list(request.data),
         "val": list(request.val),
         "split": str(request.split or ""),
         "val_split": str(request.val_split or ""),
         "frame_names": _hash_frame_names(sources),
-        "val_frame_names": _hash_frame_names(held_out),
+        "val_frame_names": _hash_frame_names(val_sources),
         "init": str(request.init or ""),
-        "init_weights": weights,
+        "init_weights": weights_hash,
         "sensor": asdict(sensor),
     }
 

@@ -1,4 +1,4 @@
-"""Measurement of the durations of a training run."""
+"""Measurement of how long the parts of a training run take."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def select_usable_scenes(scenes: Iterable[Item], prepare: Callable[[Any], Any]) 
     """Return the first scenes, at most MAX_TIMED_SCENES, for which prepare(scene) raises no InputError.
 
     Raises:
-        InputError: No scene can be used; the message contains the first reason.
+        InputError: There is no such scene. The message contains the first reason.
     """
-    chosen: list[Any] = []
+    usable_scenes: list[Any] = []
     reasons: list[str] = []
     for scene, skipped in scenes:
         reasons += skipped
@@ -45,19 +45,19 @@ def select_usable_scenes(scenes: Iterable[Item], prepare: Callable[[Any], Any]) 
         except InputError as error:
             reasons.append(str(error))
             continue
-        chosen.append(scene)
-        if len(chosen) == MAX_TIMED_SCENES:
+        usable_scenes.append(scene)
+        if len(usable_scenes) == MAX_TIMED_SCENES:
             break
-    if not chosen:
-        raise InputError(f"no scene to train on can be used ({next(iter(reasons), 'there is none')})")
-    return chosen
+    if not usable_scenes:
+        raise InputError(f"no usable training scene ({next(iter(reasons), 'there are no scenes')})")
+    return usable_scenes
 
 
 def find_readable_frame(scenes: SceneReader, is_typical: Callable[[Any], bool] = lambda _: True) -> Any:
-    """Return the first readable validation frame for which is_typical is True, else the first readable one.
+    """Return the first validation frame that is typical, or the first readable one if none is.
 
     Raises:
-        InputError: No frame can be read; the message contains the first reason.
+        InputError: No frame can be read. The message contains the first reason.
     """
     fallback: Any = None
     reasons: list[str] = []
@@ -68,19 +68,19 @@ def find_readable_frame(scenes: SceneReader, is_typical: Callable[[Any], bool] =
             return sample
         fallback = sample if fallback is None else fallback
     if fallback is None:
-        raise InputError(f"no frame to validate on can be used ({next(iter(reasons), 'there is none')})")
+        raise InputError(f"no usable validation frame ({next(iter(reasons), 'there are no frames')})")
     return fallback
 
 
 def measure_step(
     module: nn.Module, loss: Callable, prepare: Callable[[], Sequence[Any]], params: LoopParams, device: torch.device
 ) -> float:
-    """Return the duration of one training step in seconds, including the preparation of its samples on all cores.
+    """Measure the duration of one training step in seconds, including the preparation of its samples on all cores.
 
     Args:
         module: Network to train; its gradients and statistics change.
         loss: loss(module, batch), as in run.Task.
-        prepare: Returns a few samples.
+        prepare: Function that returns a few samples.
         params: Batch size and number format.
         device: Device of the network.
     """

@@ -20,7 +20,7 @@ class Cuts(NamedTuple):
 
 
 class StepSpeed(NamedTuple):
-    """The measured durations of plan.Speed that depend on the network, in seconds."""
+    """The durations of plan.Speed that depend on the network, in seconds."""
 
     cut: float
     step: float
@@ -29,7 +29,10 @@ class StepSpeed(NamedTuple):
 
 
 class Trainer(Protocol):
-    """Training of one network. The params of all methods are the parameters of its training."""
+    """The parts of a training run that depend on the network.
+
+    The argument `params` of all methods has the parameters of the training.
+    """
 
     @property
     def name(self) -> str:
@@ -39,28 +42,28 @@ class Trainer(Protocol):
     def cutting_title(self) -> str:
         """Title of the progress bar while objects or clusters are cut."""
 
-    def max_cuts(self, params: Any) -> int:
-        """Return the largest number of scenes from which objects or clusters are cut."""
+    def find_max_cut_scenes(self, params: Any) -> int:
+        """Return the maximum number of scenes from which objects or clusters are cut."""
 
-    def reduced_range(self, params: Any) -> dict[str, Any]:
-        """Return values of parameters that limit training to a part of the range, which is faster; {} if impossible."""
+    def find_reduced_range(self, params: Any) -> dict[str, Any]:
+        """Return parameters that limit training to a part of the range, which is faster; {} if that is impossible."""
 
     def measure_speed(
-        self, params: Any, scenes: Iterable[Item], held_out: Sequence[Any], device: torch.device
+        self, params: Any, scenes: Iterable[Item], val_sources: Sequence[Any], device: torch.device
     ) -> StepSpeed:
-        """Measure durations on the first usable scenes. Raise InputError if none can be used."""
+        """Measure durations on the first usable scenes. Raise InputError if there are none."""
 
-    def packaged_weights(self, params: Any) -> Path:
+    def find_packaged_weights(self, params: Any) -> Path:
         """Return the path of the packaged weights. Raise InputError if there are none."""
 
-    def make_cuts(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any], cache: Path) -> Cuts:
-        """Make the sources of cut objects or clusters; nothing is cut yet."""
+    def make_cuts(self, params: Any, sources: Sequence[Any], val_sources: Sequence[Any], cache: Path) -> Cuts:
+        """Return the sources of cut objects or clusters. They cut nothing until a scene is loaded."""
 
     def collect_cuts(self, params: Any, cuts: Cuts, out: Path) -> None:
         """Write the cut objects or clusters to the folder out for training."""
 
     def make_streams(
-        self, params: Any, sources: Sequence[Any], held_out: Sequence[Any], cuts: Cuts, out: Path
+        self, params: Any, sources: Sequence[Any], val_sources: Sequence[Any], cuts: Cuts, out: Path
     ) -> tuple[Stream, SceneReader]:
         """Return the stream of training samples and the validation scenes."""
 
@@ -68,7 +71,7 @@ class Trainer(Protocol):
         self,
         params: Any,
         batches: Batches,
-        held_out: SceneReader,
+        val_scenes: SceneReader,
         out: Path,
         device: torch.device,
         about: dict[str, Any],
@@ -80,10 +83,10 @@ class Trainer(Protocol):
         Args:
             params: Parameters of the training, with the numbers of the plan.
             batches: Batches of training samples.
-            held_out: Validation scenes.
+            val_scenes: Validation scenes.
             out: Folder for best.safetensors and last.safetensors.
             device: Device of the network.
-            about: Description of the data for the header, which must be the same in a resumed run.
+            about: Description of the data for the header. It must be the same in a resumed run.
             commit: Version of the code for the header.
             init: Checkpoint with initial weights, see checkpoint.copy_matching_weights; None for random ones.
         """

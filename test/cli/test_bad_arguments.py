@@ -81,11 +81,11 @@ BAD_INPUTS = {
     ),
     "json under a file": (
         ["evaluate", "candidates", "--data", "{bag}", "--json", "{kitti}/training/calib/000000.txt/o"],
-        "cannot be written",
+        "cannot write",
     ),
     "json is a folder": (
         ["evaluate", "candidates", "--data", "{tmp}/none", "--json", "{tmp}"],
-        "{tmp} cannot be written",
+        "cannot write {tmp}",
     ),
     "detector": (
         ["evaluate", "detection", "--data", "{kitti}", "--weights", "fussed"],
@@ -93,7 +93,7 @@ BAD_INPUTS = {
     ),
     "no standard output": (
         ["evaluate", "candidates", "--data", "{tmp}/none", "--json", "-"],
-        "- cannot be written; give the name of a file",
+        "cannot write -; give the name of a file",
     ),
 }
 

@@ -18,7 +18,7 @@ from samples import LABELS, WALKER, lowered_crowd, object_folder, walker_label, 
 
 from lidar_perception.cli import info
 from lidar_perception.cli.data import open_and_describe
-from lidar_perception.cli.demo import _load_node_params, _open_replayed
+from lidar_perception.cli.demo import _load_node_params, _open_replayed_bag
 from lidar_perception.cli.main import COMMANDS, cli
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.to_bag import write_bag
@@ -301,6 +301,6 @@ def test_missing_rclpy_is_reported_before_any_work(command, tmp_path):
 def test_demo_passes_the_measured_sensor_height_to_its_nodes(tmp_path):
     write_bag(tmp_path / "bag", [lowered_crowd(i, 1.0) for i in range(3)])
     recording = open_and_describe(tmp_path / "bag")
-    played = _open_replayed(recording.path, recording)
+    played = _open_replayed_bag(recording.path, recording)
     pose = _load_node_params(DetectorChoice("candidates"), played).ground.sensor_pose
     assert pose.height == pytest.approx(0.7, abs=0.02)

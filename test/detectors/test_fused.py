@@ -316,7 +316,11 @@ def test_classifier_box_interpolates_between_networks(detector):
 def test_hilly_ground_changes_only_the_height_of_boxes():
     """The networks get the points relative to flat ground."""
     detector = load_fused_detector("", "cpu", EAGER).with_range("around")
-    scan = SimulatedScenes(7, 1, find_sensor("hdl64e", 0.0), Scenes(None, 3.0, "street"), around=True).frame(0).load()
+    scan = (
+        SimulatedScenes(7, 1, find_sensor("hdl64e", 0.0), Scenes(None, 3.0, "street"), all_around=True)
+        .load_frame(0)
+        .load()
+    )
 
     def hills(xy: np.ndarray) -> np.ndarray:
         return 0.04 * xy[:, 0] + 0.5 * np.sin(xy[:, 1] / 12)

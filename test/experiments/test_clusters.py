@@ -10,7 +10,7 @@ from samples import crowd_folder
 
 from experiments.clusters.experiment import SEGMENTATION
 from experiments.clusters.range_image import cluster_range_image
-from experiments.clusters.segmentation import COUNTS, count_points, pair_clusters
+from experiments.clusters.segmentation import COUNT_COLUMNS, count_points, pair_clusters
 from experiments.clusters.segmentation_tables import compute_object_scores, compute_scores
 from experiments.framework.statistics import compute_paired_p
 from lidar_perception.data.open import open_recording
@@ -28,7 +28,7 @@ def objects(owner, region=None):
 def scores(ids, owner, ground=None, region=None):
     ground = np.zeros(len(owner), bool) if ground is None else np.asarray(ground, bool)
     counts = count_points(np.asarray(ids, np.int32), ground, objects(owner, region))
-    return dict(zip(COUNTS, counts)), compute_scores(np.array(counts, float)).tolist()
+    return dict(zip(COUNT_COLUMNS, counts)), compute_scores(np.array(counts, float)).tolist()
 
 
 def test_perfect_clusters_score_100_with_any_numbers():
@@ -43,7 +43,7 @@ def test_point_counts_equal_hand_computed_values():
     ids = np.repeat([4, 5, 4, 0, 6, 0], [12, 8, 5, 10, 15, 40])
     ground = np.repeat([0, 0, 0, 1, 0, 1], [12, 8, 5, 10, 15, 40])
     counts, found = scores(ids, owner, ground)
-    assert [counts[k] for k in COUNTS[:5]] == [50, 12 + 15, 12, 17, 30]
+    assert [counts[k] for k in COUNT_COLUMNS[:5]] == [50, 12 + 15, 12, 17, 30]
     assert found == pytest.approx([100 * 27 / 50, 100 * 12 / 17, 40, 2400 / 47, 100 * 12 / 35])
     assert counts["objects"] == 2 and counts["hits"] == 0
 
@@ -103,8 +103,9 @@ def test_report_is_complete_with_and_without_records(frames):
     records = [SEGMENTATION.measure(frames, i) for i in range(2)]
     for record in records:
         for counts in (*record["methods"].values(), *record["sweeps"].values()):
-            named = dict(zip(COUNTS, counts, strict=True))
-            assert named["both"] <= min(named["found"], named["true"]) <= named["points"]
+            named = dict(zip(COUNT_COLUMNS, counts, strict=True))
+            limit = min(named["found object points"], named["object points"])
+            assert named["right object points"] <= limit <= named["points"]
     for some in ([], [{"frame": "x", "skipped": "why"}], records):
         sections = SEGMENTATION.make_sections(some)
         tables = [table for section in sections for table in section.tables]

@@ -175,7 +175,7 @@ def test_tiny_budget_runs_end_to_end(tmp_path, coarse, monkeypatch):
 
 def test_thinned_and_noisy_clouds_are_reproducible(frames):
     cloud = frames[0].load()
-    half, again = (change_cloud(cloud, Change(share=0.5), "a") for _ in range(2))
+    half, again = (change_cloud(cloud, Change(fraction=0.5), "a") for _ in range(2))
     assert len(half) == pytest.approx(len(cloud) / 2, rel=0.2)
     np.testing.assert_array_equal(half.xyz, again.xyz)
     noisy = change_cloud(cloud, Change(noise=0.05), "a")

@@ -362,7 +362,7 @@ def test_page_is_self_contained_and_describes_the_run(whole, crowds):
     page = (whole / "report.html").read_text()
     assert not re.findall(r'(?:src|href|srcset)="(?!data:|#)', page) and "<script" not in page
     assert str(crowds) in page and "11 measured, 1 skipped" in page and "lidar_perception" in page
-    assert "no Pedestrian is labelled" in page
+    assert "no Pedestrian label" in page
     report = json.loads((whole / "report.json").read_text())
     assert (report["measured"], report["skipped"]) == (11, 1)
     assert [r["frame"] for r in report["skipped_frames"]] == ["000011"]

@@ -31,7 +31,7 @@ from experiments.realism.scan_statistics import (
     compute_object_rows,
     compute_scan_rows,
     compute_square_degrees,
-    is_whole,
+    is_full_scan,
 )
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.data.frame import Frame
@@ -206,9 +206,9 @@ def test_cropped_scan_counts_for_its_objects_only():
     whole = make_scan(0)
     seen = np.flatnonzero(whole.camera().in_view(whole.load().xyz))
     cropped = with_scan(whole, whole.load().take(seen))
-    assert is_whole(whole.load()) and not is_whole(cropped.load())
+    assert is_full_scan(whole.load()) and not is_full_scan(cropped.load())
     measured = measure_scans([cropped], PAPER)
-    assert (measured.scans, measured.whole_scans) == (1, 0)
+    assert (measured.scans, measured.full_scans) == (1, 0)
     assert all(not measured.rows[name] for name in ("points", "clusters", "ground intensity"))
     expected = compute_rows(whole)
     assert all(np.array_equal(rows, expected[name], equal_nan=True) for name, rows in compute_rows(cropped).items())
@@ -322,7 +322,7 @@ def tracking_folder(root):
 def test_object_and_tracking_folders_are_read(tmp_path, make):
     measured = measure_scans(select_frames(open_recording(make(tmp_path))), PAPER)
     assert measured.objects == {"Car": 0, "Pedestrian": 1, "Cyclist": 0}
-    assert (measured.scans, measured.whole_scans, measured.skipped) == (1, 1, [])
+    assert (measured.scans, measured.full_scans, measured.skipped) == (1, 1, [])
 
 
 def test_folders_without_labels_are_rejected(tmp_path):
@@ -341,7 +341,7 @@ def test_broken_scans_are_skipped_and_counted(tmp_path):
     assert compare_scans(measured, measured)["real"]["skipped"] == measured.skipped
     for scan in scans:
         write(scan, b"cut")
-    with pytest.raises(InputError, match=r"none of the 3 scans can be read: .*000000.bin"):
+    with pytest.raises(InputError, match=r"cannot read any of the 3 scans: .*000000.bin"):
         measure_scans(select_frames(open_recording(tmp_path)), PAPER)
 
 
@@ -359,7 +359,7 @@ def test_command_writes_json_and_picture(tmp_path, monkeypatch):
 
     def few_drawn(path, content):
         """Draw only one panel of each kind, because drawing all takes long."""
-        kinds = {(CURVES[name].histogram, CURVES[name].log): name for name in CURVES}
+        kinds = {(CURVES[name].histogram, CURVES[name].log_scale): name for name in CURVES}
         draw_realism(path, {**content, "curves": {name: content["curves"][name] for name in kinds.values()}})
 
     monkeypatch.setattr(command, "draw_realism", few_drawn)
@@ -391,8 +391,8 @@ def test_command_simulates_the_given_sensor(tmp_path):
 
 
 def test_real_scans_agree_with_themselves(data):
-    scans = [r for r in open_recording(data / "kitti_object") if is_whole(r.load())][:2]
+    scans = [r for r in open_recording(data / "kitti_object") if is_full_scan(r.load())][:2]
     first, second = (measure_scans(scans, PAPER) for _ in range(2))
     content = compare_scans(first, second)
     assert all(b["ratio"] in (1.0, None) for c in content["curves"].values() for b in c["bins"])
-    assert first.whole_scans == 2
+    assert first.full_scans == 2

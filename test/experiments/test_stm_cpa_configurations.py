@@ -13,7 +13,7 @@ from experiments.stm_cpa.configurations import (
     CONFIGURATIONS,
     WITHOUT_SEED,
     ScoredBoxes,
-    drop_given,
+    drop_seed_pedestrian,
     find_best_f1,
     score_boxes,
 )
@@ -69,7 +69,7 @@ def test_seed_pedestrian_is_neither_hit_nor_miss():
     found = ScoredBoxes(boxes_at([(5.1, 0), (20, 0)]), np.array([0.9, 0.8]), 0.5)
     counts = score_boxes(found, truth)
     assert [sum(counts[k]) for k in ("tp", "fp", "fn")] == [1, 1, 1]
-    without = score_boxes(*drop_given(found, truth, truth[0]))
+    without = score_boxes(*drop_seed_pedestrian(found, truth, truth[0]))
     assert [sum(without[k]) for k in ("tp", "fp", "fn")] == [0, 1, 1]
     assert without["ranked"] == [[0.8, 0]]
 

@@ -130,8 +130,8 @@ def test_mixture_alternates_between_kinds_of_scenes():
     assert make_cached_scene("indoor", None, 3).kind == make_scene(3, None, 2.0, mixed.scene).kind
     assert make_scene(4, None, 1.0, mixed.scene).kind == make_scene(4).kind
     source = SimulatedScenes(3, 2, TINY, mixed)
-    assert not mixed.camera and source.frame(0).camera() is None
-    assert source.scene(0).height == 0.6 and source.key(0) != SimulatedScenes(3, 2, TINY).key(0)
+    assert not mixed.camera and source.load_frame(0).camera() is None
+    assert source.load_scene(0).height == 0.6 and source.cache_key(0) != SimulatedScenes(3, 2, TINY).cache_key(0)
 
 
 @pytest.mark.parametrize("kind", SCENE_TYPES["indoor"].kinds)

@@ -64,10 +64,10 @@ def test_failed_data_set_is_marked_and_resumed(made, tmp_path, monkeypatch, layo
     assert json.loads((out / "INCOMPLETE").read_text())["frames"] == 5
     assert not (out / "dataset.json").exists()
     result = run(out, layout, 5, 1, "--streets-of", 2, "--resume")
-    assert result.exit_code == 0 and "3 of them from before" in result.output
+    assert result.exit_code == 0 and "3 of them from the interrupted run" in result.output
     assert content(out) == content(made / layout)
     again = run(out, layout, 5, 1, "--streets-of", 2, "--resume")
-    assert again.exit_code == 0 and "nothing to do" in again.output
+    assert again.exit_code == 0 and "is already complete" in again.output
     assert content(out) == content(made / layout)
 
 
@@ -227,7 +227,7 @@ def test_other_sensor_of_same_name_is_not_resumed(tmp_path):
     sensor.write_text("elevations: [2, -8]\nazimuth_step: 5\nrate: 10\n")
     options = ["--out", str(out), "--format", "kitti", "--sensor", str(sensor), "--frames", "1", "--jobs", "1"]
     invoke(options)
-    assert "nothing to do" in invoke([*options, "--resume"]).output
+    assert "is already complete" in invoke([*options, "--resume"]).output
     sensor.write_text("elevations: [2, -9]\nazimuth_step: 5\nrate: 10\n")
     with pytest.raises(InputError, match="was begun with sensor_digest"):
         invoke([*options, "--resume"])

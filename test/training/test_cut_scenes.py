@@ -35,7 +35,7 @@ from lidar_perception.training.augment import TrainingScene, raise_scene
 from lidar_perception.training.data import SceneReader
 from lidar_perception.training.params import ClusterAugmentParams
 from lidar_perception.training.pointnet import cut_scenes
-from lidar_perception.training.pointnet.cut_scenes import SPARSE_SHARES, CutScene, CutScenes, cut_clusters
+from lidar_perception.training.pointnet.cut_scenes import SPARSE_FRACTIONS, CutScene, CutScenes, cut_clusters
 from lidar_perception.training.pointnet.task import (
     MIN_POINTS_LEFT,
     ClusterPreparation,
@@ -209,10 +209,10 @@ class RepeatedScene:
     def __len__(self):
         return self.count
 
-    def key(self, i):
+    def cache_key(self, i):
         return "one"
 
-    def scene(self, i):
+    def load_scene(self, i):
         return self.one
 
 
@@ -224,15 +224,15 @@ def test_scene_is_cut_by_clustering_and_around_objects(rng, tmp_path):
     assert np.array_equal(cut.boxes[cut.is_box_crop], BOXES[:2])
     assert not cut.boxes[cut.labels == UNKNOWN].any() and cut.boxes[cut.labels == 1].any()
     source = CutScenes(RepeatedScene(scene), CONFIG, 5, tmp_path)
-    first, again = source.scene(0), source.scene(0)  # the second one is read from the cache
+    first, again = source.load_scene(0), source.load_scene(0)  # the second one is read from the cache
     assert len(list(tmp_path.iterdir())) == 1
     for name in ("labels", "boxes", "is_box_crop"):
         assert np.array_equal(getattr(first, name), getattr(again, name))
     assert np.array_equal(first.clusters.points, again.clusters.points)
     next(tmp_path.iterdir()).write_bytes(b"broken")
-    assert np.array_equal(source.scene(0).labels, first.labels)
+    assert np.array_equal(source.load_scene(0).labels, first.labels)
     other = CutScenes(RepeatedScene(scene), make_pointnet_config("base"), 5, tmp_path)
-    other.scene(0)
+    other.load_scene(0)
     assert len(list(tmp_path.iterdir())) == 2  # another configuration has its own cache file
 
 
@@ -262,20 +262,20 @@ def test_fraction_of_sparse_scenes_is_reproducible(rng, tmp_path):
     none, half, all_ = (
         CutScenes(RepeatedScene(scene, count), CONFIG, 5, tmp_path, sparse=sparse) for sparse in (0.0, 0.5, 1.0)
     )
-    assert {none.draw_share(i) for i in range(count)} == {1.0}
-    assert all(SPARSE_SHARES[0] <= all_.draw_share(i) <= SPARSE_SHARES[1] for i in range(count))
-    shares = [half.draw_share(i) for i in range(count)]
+    assert {none.draw_fraction(i) for i in range(count)} == {1.0}
+    assert all(SPARSE_FRACTIONS[0] <= all_.draw_fraction(i) <= SPARSE_FRACTIONS[1] for i in range(count))
+    shares = [half.draw_fraction(i) for i in range(count)]
     assert 10 < sum(share < 1 for share in shares) < 30
-    assert all(share in (1.0, all_.draw_share(i)) for i, share in enumerate(shares))
-    whole, known = none.scene(0), set(map(bytes, scene.points[:, :3]))
+    assert all(share in (1.0, all_.draw_fraction(i)) for i, share in enumerate(shares))
+    whole, known = none.load_scene(0), set(map(bytes, scene.points[:, :3]))
     sizes = []
     for i in range(count):
-        thinned, again = all_.scene(i), all_.scene(i)  # the second one is read from the cache
+        thinned, again = all_.load_scene(i), all_.load_scene(i)  # the second one is read from the cache
         assert np.array_equal(thinned.clusters.points, again.clusters.points)
         assert known >= set(map(bytes, thinned.clusters.points[:, :3]))
         sizes.append(thinned.clusters.sizes[(thinned.labels == 0) & thinned.is_box_crop][0])
     car = whole.clusters.sizes[(whole.labels == 0) & whole.is_box_crop][0]
-    expected = np.array([all_.draw_share(i) for i in range(count)]) * car
+    expected = np.array([all_.draw_fraction(i) for i in range(count)]) * car
     assert (np.abs(sizes - expected) < 5 * np.sqrt(expected)).all()
 
 
@@ -370,12 +370,12 @@ def test_validation_calibrates_and_reports_broken_scenes(rng):
         def __len__(self):
             return 2
 
-        def scene(self, i):
+        def load_scene(self, i):
             if i == 1:
                 raise InputError("broken.bin")
             return scene
 
-        def frame(self, i):
+        def load_frame(self, i):
             return Frame.of("a", PointCloud(np.zeros((0, 3), np.float32)), truth, CALIBRATION)
 
     items = [SceneReader((Source(),), load_validation_clusters)[n] for n in range(2)]

@@ -43,10 +43,10 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.training import fusion_curves
 from lidar_perception.training.fusion_curves import (
-    KINDS,
+    CLOUD_KINDS,
     MIN_SAMPLES,
-    WITH,
-    WITHOUT,
+    WITH_INTENSITY,
+    WITHOUT_INTENSITY,
     Samples,
     collect_samples,
     fit_class,
@@ -79,25 +79,25 @@ def test_fitted_scores_are_probabilities_in_any_order_of_scans(seed):
     for low in np.arange(0.1, 0.9, 0.2):
         chosen = (scores >= low) & (scores < low + 0.2)
         assert abs(other.correct[chosen].mean() - scores[chosen].mean()) < 0.08
-    assert fits["Pedestrian"].after.loss < fits["Pedestrian"].before.loss
+    assert fits["Pedestrian"].new_score.loss < fits["Pedestrian"].old_score.loss
     assert fits["Pedestrian"].proposals == 4000
     assert fits["Pedestrian"].correct == own.correct.sum()
     again, _ = fit_classes(own.take(rng.permutation(4000)), load_shipped_models())
     for curve, before in zip(again["Pedestrian"]["curves"].values(), models["Pedestrian"]["curves"].values()):
         np.testing.assert_allclose(curve["values"], before["values"], atol=0.02)
     # A class with too few samples keeps its curves.
-    assert models["Car"] == load_shipped_models()["Car"] and fits["Car"].after is None
+    assert models["Car"] == load_shipped_models()["Car"] and fits["Car"].new_score is None
 
 
 def test_clouds_without_intensity_get_their_own_curves(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
-    samples = {kind: draw_samples(rng, 2000, PEDESTRIAN, odds) for kind, odds in zip(KINDS, (-1.5, 1.0))}
+    samples = {kind: draw_samples(rng, 2000, PEDESTRIAN, odds) for kind, odds in zip(CLOUD_KINDS, (-1.5, 1.0))}
     monkeypatch.setattr(fusion_curves, "simulate_samples", lambda *_: samples)
     fits = fusion_curves.fit_fusion(None, None, tmp_path / "fused.json", FusedTraining())
     fusion, shipped = read_fusion(tmp_path / "fused.json"), find_fusion()
     for kind, models, before in (
-        (WITH, fusion.models, shipped.models),
-        (WITHOUT, fusion.models_without_intensity, shipped.models_without_intensity),
+        (WITH_INTENSITY, fusion.models, shipped.models),
+        (WITHOUT_INTENSITY, fusion.models_without_intensity, shipped.models_without_intensity),
     ):
         assert models["Pedestrian"]["bias"] == fit_class("Pedestrian", samples[kind])["bias"]
         assert models["Car"] == before["Car"]
@@ -112,7 +112,7 @@ def test_curves_are_not_fitted_to_too_few_samples():
         own.scans[:] = np.arange(500) % 2
         models, fits = fit_classes(own, load_shipped_models())
         assert (models["Car"] == load_shipped_models()["Car"]) == (right < MIN_SAMPLES)
-        assert (fits["Car"].after is None) == (right < MIN_SAMPLES)
+        assert (fits["Car"].new_score is None) == (right < MIN_SAMPLES)
         models, _ = fit_classes(own, {"Cyclist": models["Cyclist"]})  # a new class
         assert ("Car" in models) == (right >= MIN_SAMPLES)
 

@@ -10,21 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.training import loop
-from lidar_perception.training.loop import Pace
+from lidar_perception.training.loop import TimeBudget
 from lidar_perception.training.plan import (
     MIN_STEPS,
     SCANS_RANGE,
-    Data,
+    AvailableScenes,
     Plan,
     Speed,
+    estimate_preparation_duration,
+    estimate_training_durations,
     fit_plan,
-    preparation_duration,
-    training_durations,
 )
 from lidar_perception.types import InputError
 
 SPEED = Speed(scan=0.4, cut=0.1, step=1.2, whole=3.0, frame=0.2)
-SIM = Data(True, True, 0, 0, 4, 500)
+SIM = AvailableScenes(True, True, 0, 0, 4, 500)
 speeds = st.builds(
     lambda scan, cut, step, share, frame: Speed(scan, cut, step, step / share, frame),
     st.floats(0.05, 5),
@@ -35,10 +35,16 @@ speeds = st.builds(
 )
 data = st.one_of(
     st.builds(
-        Data, st.just(True), st.just(True), st.integers(0, 5000), st.just(0), st.integers(1, 32), st.integers(0, 10**9)
+        AvailableScenes,
+        st.just(True),
+        st.just(True),
+        st.integers(0, 5000),
+        st.just(0),
+        st.integers(1, 32),
+        st.integers(0, 10**9),
     ),
     st.builds(
-        Data,
+        AvailableScenes,
         st.just(False),
         st.just(False),
         st.integers(4, 5000),
@@ -60,7 +66,7 @@ def test_plan_fits_budget_or_error_suggests_a_larger_one(speed, data, hours, cor
             plan = fit_plan(1.1 * enough, cores, speed, data)
             assert plan.steps >= MIN_STEPS
         return
-    seconds = preparation_duration(plan, cores, speed) + sum(training_durations(plan, speed, data))
+    seconds = estimate_preparation_duration(plan, cores, speed) + sum(estimate_training_durations(plan, speed, data))
     assert seconds <= 3600 * hours
     assert plan.steps >= MIN_STEPS and 1 <= plan.validate_steps <= plan.steps
     assert plan.scans == 0 or SCANS_RANGE[0] <= plan.scans <= SCANS_RANGE[1]
@@ -90,26 +96,26 @@ def test_plan_keeps_numbers_given_by_the_user():
 def test_pace_counts_steps_that_fit_between_validations(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(loop.time, "monotonic", lambda: now[0])
-    pace = Pace(until=1000.0, validate_steps=10)
+    budget = TimeBudget(deadline=1000.0, validate_steps=10)
     for _ in range(29):
         now[0] += 2.0
-        pace.count_step()
-        assert pace.steps_left(1) == math.inf and not pace.is_over()  # in its first minute
-    with pace.time_validation():
+        budget.count_step()
+        assert budget.estimate_remaining_steps(1) == math.inf and not budget.is_over()  # in its first minute
+    with budget.time_validation():
         now[0] += 10.0
     now[0] += 2.0
-    pace.count_step()
+    budget.count_step()
     # In 930 s: 2 steps, 30 times 10 s and 10 steps, 4 steps and 10 s for the last validation.
-    assert pace.steps_left(8) == pytest.approx(2 + 30 * 10 + 4 - loop.SPARE_STEPS, abs=1)
+    assert budget.estimate_remaining_steps(8) == pytest.approx(2 + 30 * 10 + 4 - loop.SPARE_STEPS, abs=1)
     for _ in range(400):
         now[0] += 4.0
-        pace.count_step()
-    assert pace.step_duration == pytest.approx(4.0, abs=0.2)  # old steps have little weight
-    assert pace.is_over() and pace.steps_left(3) < 1
-    endless = Pace(math.inf, 1)
+        budget.count_step()
+    assert budget.step_duration == pytest.approx(4.0, abs=0.2)  # old steps have little weight
+    assert budget.is_over() and budget.estimate_remaining_steps(3) < 1
+    endless = TimeBudget(math.inf, 1)
     now[0] += 1e6
     endless.count_step()
-    assert not endless.is_over() and endless.steps_left(1) == math.inf
+    assert not endless.is_over() and endless.estimate_remaining_steps(1) == math.inf
 
 
 @pytest.mark.parametrize("hours", [1e-4, 0.01])

@@ -48,12 +48,12 @@ def test_frame_without_labels_is_rejected(tmp_path):
     root = object_folder(tmp_path, count=2)
     (root / "training/label_2/000001.txt").unlink()
     with pytest.raises(InputError, match=r"000001\.bin has no labels"):
-        RecordedScenes(root, ("000001",)).scene(0)
+        RecordedScenes(root, ("000001",)).load_scene(0)
 
 
 def test_kitti_scenes_are_cropped_to_the_image(tmp_path):
     root = object_folder(tmp_path, walker_label() + "\n", 1)
-    ahead, whole = (RecordedScenes(root, ("000000",), view).scene(0) for view in (True, False))
+    ahead, whole = (RecordedScenes(root, ("000000",), view).load_scene(0) for view in (True, False))
     assert 0 < len(ahead.points) < len(whole.points)
     assert (ahead.points[:, 0] > 0).all() and (whole.points[:, 0] < 0).any()
     np.testing.assert_allclose(ahead.boxes[0], WALKER, atol=0.02)
@@ -64,11 +64,11 @@ def test_bag_of_folder_has_same_scenes(tmp_path):
     folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
     write_bag(tmp_path / "bag", open_recording(folder))
     from_bag = open_labelled_frames(tmp_path / "bag").to_scenes()
-    from_bag.scene(0)  # opens files, which cannot be pickled
+    from_bag.load_scene(0)  # opens files, which cannot be pickled
     for source in (from_bag, pickle.loads(pickle.dumps(from_bag))):
         for i in range(2):
-            scene, expected = source.scene(i), open_labelled_frames(folder).to_scenes().scene(i)
-            assert np.array_equal(scene.points, expected.points) and not scene.around
+            scene, expected = source.load_scene(i), open_labelled_frames(folder).to_scenes().load_scene(i)
+            assert np.array_equal(scene.points, expected.points) and not scene.all_around
             np.testing.assert_allclose(scene.boxes, expected.boxes, atol=1e-9)
             assert np.array_equal(scene.class_ids, expected.class_ids)
 
@@ -76,8 +76,8 @@ def test_bag_of_folder_has_same_scenes(tmp_path):
 def test_scenes_without_camera_are_labelled_all_around(tmp_path):
     frames = [Frame.of("0", PointCloud(two_objects()[:, :3].copy()), GroundTruth.of([WALKER], [PEDESTRIAN]))]
     write_bag(tmp_path / "bag", frames)
-    scene = open_labelled_frames(tmp_path / "bag").to_scenes().scene(0)
-    assert scene.around and np.array_equal(scene.points[:, :3], two_objects()[:, :3])
+    scene = open_labelled_frames(tmp_path / "bag").to_scenes().load_scene(0)
+    assert scene.all_around and np.array_equal(scene.points[:, :3], two_objects()[:, :3])
     assert not scene.points[:, 3].any()  # no intensity
     write_bag(tmp_path / "bare", [Frame.of("0", frames[0].load())])
     with pytest.raises(InputError, match="has no labelled boxes, which train needs"):
@@ -132,17 +132,17 @@ def test_labelled_end_of_drive_is_held_out(tmp_path):
 
 def test_cache_key_changes_with_files_and_height(tmp_path, monkeypatch):
     root = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
-    keys = [open_labelled_frames(root).to_scenes().key(i) for i in range(2)]
+    keys = [open_labelled_frames(root).to_scenes().cache_key(i) for i in range(2)]
     monkeypatch.chdir(tmp_path)
-    assert open_labelled_frames(Path("kitti/training")).to_scenes().key(0) == keys[0] != keys[1]
+    assert open_labelled_frames(Path("kitti/training")).to_scenes().cache_key(0) == keys[0] != keys[1]
     write(root / "training/label_2/000000.txt", "")
     now = open_labelled_frames(root).to_scenes()
-    assert now.key(0) != keys[0] and now.key(1) == keys[1]
-    assert open_labelled_frames(root, height=0.6).to_scenes().key(1) != keys[1]
+    assert now.cache_key(0) != keys[0] and now.cache_key(1) == keys[1]
+    assert open_labelled_frames(root, height=0.6).to_scenes().cache_key(1) != keys[1]
     write_bag(tmp_path / "bag", open_recording(root))
-    key = open_labelled_frames(tmp_path / "bag").to_scenes().key(0)
+    key = open_labelled_frames(tmp_path / "bag").to_scenes().cache_key(0)
     os.utime(next((tmp_path / "bag").glob("*.mcap")), ns=(0, 0))
-    assert open_labelled_frames(tmp_path / "bag").to_scenes().key(0) != key
+    assert open_labelled_frames(tmp_path / "bag").to_scenes().cache_key(0) != key
 
 
 def low_bag(path: Path, height: float, count: int = 2) -> Path:
@@ -164,14 +164,14 @@ def test_samples_do_not_depend_on_sensor_height(tmp_path):
     for height in SENSOR_HEIGHT, 0.6:
         source = open_labelled_frames(low_bag(tmp_path / f"{height}", height)).to_scenes()
         again = pickle.loads(pickle.dumps(source))
-        assert again.sensor_height == again.scene(0).height == again.frame(1).sensor_height
+        assert again.sensor_height == again.load_scene(0).height == again.load_frame(1).sensor_height
         assert again.sensor_height == pytest.approx(height, abs=0.011)
-        samples.append(ScenePreparation(config, STILL)(source.scene(0), np.random.default_rng(0)))
+        samples.append(ScenePreparation(config, STILL)(source.load_scene(0), np.random.default_rng(0)))
     assert len(samples[0].points) == len(samples[1].points)
     assert np.allclose(samples[0].boxes, samples[1].boxes, atol=0.011)
     path = tmp_path / "0.6"
-    assert open_labelled_frames(path, height=1.1, mixed=True).to_scenes().scene(0).height == 1.1
+    assert open_labelled_frames(path, height=1.1, with_simulated=True).to_scenes().load_scene(0).height == 1.1
     folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 1)
-    assert open_labelled_frames(folder, height=1.1).to_scenes().scene(0).height == 1.1
-    mixed = open_labelled_frames(folder, height=1.1, mixed=True).to_scenes()
-    assert mixed.scene(0).height == SENSOR_HEIGHT
+    assert open_labelled_frames(folder, height=1.1).to_scenes().load_scene(0).height == 1.1
+    mixed = open_labelled_frames(folder, height=1.1, with_simulated=True).to_scenes()
+    assert mixed.load_scene(0).height == SENSOR_HEIGHT

@@ -253,7 +253,7 @@ def test_unusable_first_scenes_are_skipped(kind, tmp_path, one_thread):
     write(held, "000002\n000003\n")
     refused = small_run(kind, tmp_path / "other", root, "--val-split", str(held)).exception
     assert isinstance(refused, InputError) and "\n" not in str(refused)
-    assert "no frame to validate on can be used" in str(refused) and "000002.bin" in str(refused)
+    assert "no usable validation frame" in str(refused) and "000002.bin" in str(refused)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -168,9 +168,9 @@ def test_run_is_not_overwritten_or_resumed_with_other_settings(unbroken, tmp_pat
 
 
 def test_settings_without_effect_may_differ_when_resuming():
-    settings = PointPillarsTraining().fixed_settings()
-    assert PointPillarsTraining(save_steps=7).fixed_settings() == settings
-    assert PointPillarsTraining(version="v0").fixed_settings() != settings
+    settings = PointPillarsTraining().get_fixed_settings()
+    assert PointPillarsTraining(save_steps=7).get_fixed_settings() == settings
+    assert PointPillarsTraining(version="v0").get_fixed_settings() != settings
 
 
 # non-finite steps
@@ -241,7 +241,7 @@ def test_two_processes_with_half_batch_equal_one(tmp_path):
             RANK=str(number), LOCAL_RANK=str(number), WORLD_SIZE="2", MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port)
         )
         with join_process_group(CPU):
-            train(Toy(plain=True, size=4).task(), PARAMS, tmp_path / "two", until=1e12)
+            train(Toy(plain=True, size=4).task(), PARAMS, tmp_path / "two", deadline=1e12)
 
     processes = [fork(train_rank, number) for number in range(2)]
     for process in processes:
@@ -265,7 +265,7 @@ def test_run_out_of_time_validates_saves_and_resumes(unbroken, tmp_path, monkeyp
     now = [0.0]
     monkeypatch.setattr(loop.time, "monotonic", lambda: now[0])
     toy = Toy(lambda step: now.__setitem__(0, float(step)))
-    progress = train(toy.task(), PARAMS, tmp_path, until=5.0)
+    progress = train(toy.task(), PARAMS, tmp_path, deadline=5.0)
     assert (progress.step, progress.late, progress.stopped) == (6, True, False)
     assert [int(row["step"]) for row in rows(tmp_path, "validation.csv")] == [4, 6]
     assert set(toy.saved) == {"best", "last"}

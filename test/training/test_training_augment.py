@@ -23,9 +23,9 @@ from lidar_perception.training.augment import (
     flip_scene,
     move_objects,
     raise_scene,
+    rotate_and_crop,
+    rotate_scene,
     scale_scene,
-    turn_and_crop,
-    turn_scene,
 )
 from lidar_perception.training.cut_objects import cut_objects, join_databases
 from lidar_perception.training.database import BACKGROUND_ID, Database, paste_objects, vary_background_box
@@ -86,7 +86,7 @@ def test_points_stay_in_their_boxes(seed):
     before = find_points_of_boxes(scene)
     for changed in (
         flip_scene(scene),
-        turn_scene(scene, rng.uniform(-4, 4)),
+        rotate_scene(scene, rng.uniform(-4, 4)),
         scale_scene(scene, rng.uniform(0.8, 1.2)),
         raise_scene(scene, rng.uniform(-1, 1)),
         change_intensity(scene, rng.uniform(0.5, 1.5), rng.uniform(-0.3, 0.3)),
@@ -114,7 +114,7 @@ def test_inverse_augmentations_restore_the_scene(seed, angle):
     scene = make_random_scene(seed)
     for back in (
         flip_scene(flip_scene(scene)),
-        turn_scene(turn_scene(scene, angle), -angle),
+        rotate_scene(rotate_scene(scene, angle), -angle),
         scale_scene(scale_scene(scene, 1.25), 0.8),
         raise_scene(raise_scene(scene, 0.5, (0.02, -0.01)), -0.5, (-0.02, 0.01)),
     ):
@@ -127,7 +127,7 @@ def test_positive_rotation_is_counterclockwise():
     scene = TrainingScene(
         np.array([[5, 0, 1, 0.5]], np.float32), np.array([[5.0, 0, 1, 4, 2, 1, 0.1]]), np.array([CAR]), np.ones(1, bool)
     )
-    changed = turn_scene(scene, np.pi / 2)
+    changed = rotate_scene(scene, np.pi / 2)
     np.testing.assert_allclose(changed.points, [[0, 5, 1, 0.5]], atol=1e-6)
     np.testing.assert_allclose(changed.boxes, [[0, 5, 1, 4, 2, 1, 0.1 + np.pi / 2]], atol=1e-9)
 
@@ -339,7 +339,7 @@ def test_early_crop_keeps_points_that_may_move_into_range(seed, larger, higher):
         )
         return crop_scene(scene, low, high)
 
-    part = turn_and_crop(scene, params, low, high, np.random.default_rng(seed))
+    part = rotate_and_crop(scene, params, low, high, np.random.default_rng(seed))
     assert len(part.points) < len(scene.points) and len(part.boxes) == len(part.class_ids)
     expected, cropped = changed(scene), changed(part)
     assert np.array_equal(cropped.points, expected.points)
@@ -353,7 +353,7 @@ def test_scenes_labelled_all_around_rotate_by_any_angle():
             np.array([[5, 0, -1, 0.5]], np.float32), np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool), around
         )
         points = [
-            turn_and_crop(
+            rotate_and_crop(
                 scene, AugmentParams(), np.full(3, -9.0), np.full(3, 9.0), np.random.default_rng(seed)
             ).points[0]
             for seed in range(60)

@@ -16,7 +16,7 @@ from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.pointpillars.detector import load_detector
 from lidar_perception.simulation.drive import simulate_scan
 from lidar_perception.simulation.sensor import find_sensor
-from lidar_perception.training.params import PAPER_SHARE, DataParams, PointPillarsTraining
+from lidar_perception.training.params import PAPER_VAL_FRACTION, DataParams, PointPillarsTraining
 from lidar_perception.training.sources import open_sources
 from lidar_perception.types import InputError
 
@@ -140,7 +140,7 @@ def test_held_out_frames_are_not_trained_on(tmp_path):
     assert count_frames(("sim",), (folder,), None, None, params, 0) == ([7], [5])
     (streets,) = open_sources(("sim",), (), None, None, params, 0)[0]
     (others,) = open_sources(("sim",), (), None, None, params, 0)[1]
-    assert streets.first + streets.count <= others.first
+    assert streets.first_seed + streets.count <= others.first_seed
     ours, theirs = write(tmp_path / "a", "000000\n000001\n"), write(tmp_path / "b", "000001\n")
     (train_on,), (held,) = open_sources((folder,), (folder,), ours, theirs, params, 0)
     assert (train_on.names, held.names) == (("000000",), ("000001",))
@@ -213,7 +213,7 @@ def test_bad_input_is_rejected_at_once(tmp_path, tiny_size, arguments, reason):
 
 
 def test_fraction_of_the_paper_is_held_out_by_default():
-    assert round(PAPER_SHARE * 7518) == 751
+    assert round(PAPER_VAL_FRACTION * 7518) == 751
     text = train("--help").output
     for group in PointPillarsTraining, DataParams:
         for f in dataclasses.fields(group):

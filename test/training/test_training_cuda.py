@@ -49,10 +49,10 @@ def test_training_step_agrees_with_cpu(version):
 
 def test_training_in_16_bits_lowers_loss():
     run, batch = run_on("cuda", "v4", "auto")
-    assert run.format is torch.bfloat16
+    assert run.dtype is torch.bfloat16
     losses = [run.step(batch)["loss"] for _ in range(run.steps)]
     assert losses[-1] < 0.3 * losses[0] and run.progress.skipped == 0
-    state = run.state()
+    state = run.make_state()
     again, _ = run_on("cuda", "v4", "auto")
     again.load(state)
     assert all(torch.equal(a, b) for a, b in zip(run.module.state_dict().values(), again.module.state_dict().values()))

@@ -55,9 +55,9 @@ SENSOR = find_sensor("generic:8,-20,4,2,10")
 def test_cached_scans_equal_simulated_ones(tmp_path, monkeypatch):
     plain = SimulatedScenes(7, 2, SENSOR)
     cached = SimulatedScenes(7, 2, SENSOR, cache=tmp_path / "cache")
-    frame, truth = plain.scan(1)
+    frame, truth = plain.load_scan(1)
     for _ in range(2):
-        again = cached.scan(1)
+        again = cached.load_scan(1)
         assert np.array_equal(frame.xyz, again[0].xyz)
         assert np.array_equal(frame.intensity, again[0].intensity)
         assert np.array_equal(truth.boxes, again[1].boxes) and truth.extras == again[1].extras
@@ -65,20 +65,20 @@ def test_cached_scans_equal_simulated_ones(tmp_path, monkeypatch):
     monkeypatch.undo()
     (file,) = (tmp_path / "cache").iterdir()
     file.write_bytes(file.read_bytes()[:100])  # a damaged file is computed again
-    assert np.array_equal(cached.scan(1)[0].xyz, frame.xyz)
+    assert np.array_equal(cached.load_scan(1)[0].xyz, frame.xyz)
     full = SimulatedScenes(7, 2, SENSOR, cache=tmp_path / "cache", cache_gb=1e-9)
-    full.scan(0)
+    full.load_scan(0)
     assert len(list((tmp_path / "cache").iterdir())) == 1
 
 
 def test_hidden_simulated_objects_are_not_detectable():
     source = SimulatedScenes(7, 1, SENSOR)
-    _, truth = source.scan(0)
-    scene = source.scene(0)
+    _, truth = source.load_scan(0)
+    scene = source.load_scene(0)
     seen = [e["visible"] >= 0.15 and e["num_points"] >= 5 for e in truth.extras]
-    assert scene.around and scene.detectable.tolist() == seen and 0 < sum(seen) < len(seen)
+    assert scene.all_around and scene.detectable.tolist() == seen and 0 < sum(seen) < len(seen)
     assert drive.simulate_scan(7, 0, SENSOR).frame.xyz.shape == scene.points[:, :3].shape
-    assert scene.height == source.frame(0).sensor_height == 1.73
+    assert scene.height == source.load_frame(0).sensor_height == 1.73
 
 
 # the stream
@@ -93,7 +93,7 @@ class Numbers:
     def __len__(self):
         return self.count
 
-    def scene(self, i):
+    def load_scene(self, i):
         point = np.full((1, 4), self.first + i, np.float32)
         return TrainingScene(point, np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool))
 
@@ -110,13 +110,13 @@ def test_stream_depends_only_on_seed():
     whole = take_batches(Batches(stream, 3), 0, 12)
     assert take_batches(Batches(stream, 3), 5, 7) == whole[5:]  # like after an interruption
     assert take_batches(Batches(stream, 3, jobs=2), 0, 6) == whole[:6]
-    pair = [take_batches(Batches(stream, 3, rank=rank, world=2), 0, 6) for rank in (0, 1)]
+    pair = [take_batches(Batches(stream, 3, rank=rank, world_size=2), 0, 6) for rank in (0, 1)]
     assert [batch for both in zip(*pair) for batch in both] == whole
     assert take_batches(Batches(Stream(stream.sources, prepare_all, 6), 3), 0, 12) != whole
     flat = [point / 4 for batch in whole for point, _ in batch]
     assert sorted(flat[:11]) == sorted(flat[11:22]) == [*range(7), *range(100, 104)]
     assert flat[:11] != flat[11:22]
-    assert Batches(stream, 3).epoch == 4
+    assert Batches(stream, 3).steps_per_epoch == 4
 
 
 # PointPillars' samples
@@ -219,7 +219,7 @@ def test_validation_scores_of_perfect_and_empty_detections(tmp_path):
 def test_validation_without_camera_keeps_labels_in_range(view):
     config = make_config("v0", "compact", **(RANGES["around"] if view == "around" else {}))
     source = SimulatedScenes(7, 1, SENSOR, Scenes(None, 3.0, "campus"))
-    known = source.frame(0).truth()
+    known = source.load_frame(0).truth()
     truth = load_validation_frame(config, source, 0).truth()
     seen = is_within(known.boxes, config.low, config.high)
     assert np.array_equal(truth.boxes, known.boxes[seen]) and len(truth.extras) == len(truth)
@@ -295,7 +295,7 @@ def test_samples_do_not_depend_on_sensor_height():
 
 @pytest.mark.parametrize("quarter", range(4))
 def test_labels_in_rotated_camera_equal_those_of_rotated_scene(quarter):
-    _, truth = SimulatedScenes(7, 1, SENSOR).scan(0)
+    _, truth = SimulatedScenes(7, 1, SENSOR).load_scan(0)
     yaw = quarter * np.pi / 2
     cos, sin = np.cos(-yaw), np.sin(-yaw)
     boxes = truth.boxes.copy()
@@ -305,7 +305,7 @@ def test_labels_in_rotated_camera_equal_those_of_rotated_scene(quarter):
     seen = make_kitti_labels(truth, turn_camera(yaw))
     assert [e["track_id"] for e in seen.extras] == [e["track_id"] for e in turned.extras]
     assert len(seen.notes) == len(turned.notes)
-    frame = SimulatedScenes(4, 8, SENSOR, around=True).frame(quarter + 4)
+    frame = SimulatedScenes(4, 8, SENSOR, all_around=True).load_frame(quarter + 4)
     assert np.allclose(frame.calibration().lidar_to_camera, turn_camera(yaw).lidar_to_camera)
 
 

@@ -120,7 +120,7 @@ def planned(tmp_path_factory):
 def test_slow_run_ends_in_time_with_final_learning_rate(seconds, fits, planned, tmp_path, monkeypatch, capsys):
     first = int(fits * 300)
     until = sum(seconds(step) for step in range(first)) + 30.0 * (first // 60 + 1)
-    toy, progress = run_timed(seconds, 30.0, tmp_path, monkeypatch, until=until)
+    toy, progress = run_timed(seconds, 30.0, tmp_path, monkeypatch, deadline=until)
     assert not progress.late and loop.time.monotonic() <= until
     assert 0.85 * first <= progress.step <= first
     assert 300 <= progress.step + progress.left_out < 301
@@ -133,7 +133,7 @@ def test_slow_run_ends_in_time_with_final_learning_rate(seconds, fits, planned, 
 
 
 def test_sufficient_budget_keeps_the_plan(planned, tmp_path, monkeypatch):
-    _, progress = run_timed(lambda _: 1.0, 30.0, tmp_path, monkeypatch, until=600.0)
+    _, progress = run_timed(lambda _: 1.0, 30.0, tmp_path, monkeypatch, deadline=600.0)
     assert progress.left_out == 0 and equals(tmp_path, planned)
 
 
@@ -143,7 +143,7 @@ def test_shortened_run_resumes_where_it_stopped(tmp_path, monkeypatch):
             signal.raise_signal(signal.SIGTERM)
         return 10.0
 
-    _, before = run_timed(stop, 0.0, tmp_path, monkeypatch, until=1500.0)
+    _, before = run_timed(stop, 0.0, tmp_path, monkeypatch, deadline=1500.0)
     assert before.stopped and before.left_out > 10
     progress = train(Toy().task(), PLANNED, tmp_path, resume=True)
     rates = [float(row["lr"]) for row in rows(tmp_path)]

@@ -1,1 +1,1 @@
-"""evaluate: the algorithms against labels, without ROS."""
+"""evaluate: score algorithms against labels, without ROS."""

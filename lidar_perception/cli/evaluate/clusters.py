@@ -9,7 +9,7 @@ import click
 
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import ScoringOptions, no_labels_error, path_option, scoring_options
-from lidar_perception.cli.options import Runs, Settings, checked, settings_options
+from lidar_perception.cli.options import Algorithm, Settings, apply_values, settings_options
 from lidar_perception.detectors.open import POINTNET, default_params, resolve_weights
 from lidar_perception.detectors.weights_file import POINTNET_WEIGHTS
 from lidar_perception.param_fields import collect_fields
@@ -18,17 +18,17 @@ from lidar_perception.types import InputError
 
 
 def _find_checkpoint(weights: Path | None) -> Path:
-    """Return the checkpoint of --weights; InputError if it is not a PointNet checkpoint."""
+    """Return the checkpoint of --weights. Raise InputError if it is not a PointNet checkpoint."""
     network, path = (POINTNET, None) if weights is None else resolve_weights(weights)
     if network != POINTNET:
-        raise InputError(f"{weights} is a checkpoint of {network}; give one of {POINTNET}")
+        raise InputError(f"{weights} is a {network} checkpoint; give a {POINTNET} checkpoint")
     return path or POINTNET_WEIGHTS
 
 
-def _make_runs(weights: Path | None) -> Runs:
+def _make_algorithm(weights: Path | None) -> Algorithm:
     """Return the ground and clustering parameters that the network was trained with."""
     fields = collect_fields(default_params(_find_checkpoint(weights)))
-    return Runs(
+    return Algorithm(
         "ground and clustering",
         {name: f for name, f in fields.items() if name.startswith(("ground.", "clustering."))},
         ("pointnet_detector",),
@@ -38,7 +38,7 @@ def _make_runs(weights: Path | None) -> Runs:
 @click.command(cls=Command)
 @scoring_options()
 @path_option("--weights", "Checkpoint of PointNet. Default: the shipped one.")
-@settings_options(lambda given: [_make_runs(given.get("weights"))], "clustering.density=0")
+@settings_options(lambda options: [_make_algorithm(options.get("weights"))], "clustering.density=0")
 def clusters(options: ScoringOptions, weights: Path | None, settings: Settings) -> None:
     """Score the classes that PointNet assigns to clusters and points.
 
@@ -59,8 +59,8 @@ def clusters(options: ScoringOptions, weights: Path | None, settings: Settings) 
     from lidar_perception.scoring.points.clusters import ClusterScores, measure_network
 
     file = _find_checkpoint(weights)
-    (values,) = settings.values(_make_runs(weights)) if settings else [{}]
-    checked(default_params(file), values)
+    (values,) = settings.resolve(_make_algorithm(weights)) if settings else [{}]
+    apply_values(default_params(file), values)
     scores = ClusterScores(read_header(file, PointNetConfig).config.classes)
     recording = options.open_recording(BOXES)
     options.fill(scores, recording, partial(measure_network, file, values))

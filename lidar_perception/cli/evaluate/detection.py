@@ -1,4 +1,4 @@
-"""evaluate detection: boxes with scores against labels, without ROS."""
+"""evaluate detection: score detected boxes against labels, without ROS."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class DetectionRequest:
                     "--write-results requires --weights; --results DIR already contains result files"
                 )
             if self.keep != 1:
-                raise click.UsageError("--keep requires --weights; with --results DIR no detector reads scans")
+                raise click.UsageError("--keep requires --weights; --results DIR does not run a detector")
         elif self.write_results is not None and self.write_results.is_dir() and any(self.write_results.iterdir()):
             raise InputError(f"{self.write_results} already contains files; give another folder")
 
@@ -85,7 +85,7 @@ class DetectionRequest:
             )
         return recording
 
-    def make_start(self, recording: Any) -> Any:
+    def make_measurement(self, recording: Any) -> Any:
         """Return the function that scores a frame, see scoring.run.StartMeasurement."""
         from lidar_perception.scoring.detections import measure_detector, measure_result_files
 
@@ -148,7 +148,7 @@ def _print_scores(content: dict[str, Any]) -> None:
     "--keep",
     type=click.FloatRange(0, 1),
     default=1.0,
-    metavar="SHARE",
+    metavar="FRACTION",
     help="Keep only this fraction (0 to 1) of the points of each scan, drawn with a fixed seed. Default: 1.",
 )
 @click.option(
@@ -197,7 +197,7 @@ def detection(options: ScoringOptions, **choices: Any) -> None:
     request.check()
     recording = request.open_recording()
     report = DetectionReport(sequential=recording.is_sequential)
-    options.fill(report, recording, request.make_start(recording))
+    options.fill(report, recording, request.make_measurement(recording))
     if request.write_results is not None:
         console.print(f"result files: {request.write_results}")
     if not report.frames and (request.write_results is None or report.skipped):

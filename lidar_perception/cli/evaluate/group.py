@@ -1,4 +1,4 @@
-"""evaluate: scores without ROS."""
+"""evaluate: the group of the commands that score algorithms without ROS."""
 
 from __future__ import annotations
 

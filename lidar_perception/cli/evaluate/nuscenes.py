@@ -48,7 +48,7 @@ class NuscenesRequest:
             raise InputError(f"{self.options.data} ({recording.layout}) is not nuScenes; use evaluate detection")
         return recording
 
-    def make_start(self, recording: Any) -> Any:
+    def make_measurement(self, recording: Any) -> Any:
         """Return the function that scores a frame, see scoring.run.StartMeasurement."""
         from lidar_perception.scoring.nuscenes.report import measure_key_frames, measure_result_file
 
@@ -90,7 +90,7 @@ def nuscenes(options: ScoringOptions, **choices: Any) -> None:
     request.check()
     recording = request.open_recording()
     report = NuscenesReport()
-    options.fill(report, recording, request.make_start(recording))
+    options.fill(report, recording, request.make_measurement(recording))
     if request.write_results is not None:
         write_results(request.write_results, report.boxes)
         console.print(f"result file: {request.write_results}")

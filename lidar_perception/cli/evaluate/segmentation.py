@@ -1,4 +1,4 @@
-"""evaluate segmentation: scores of ground and clusters, without ROS."""
+"""evaluate segmentation: score ground segmentation and clustering, without ROS."""
 
 from __future__ import annotations
 

@@ -24,8 +24,8 @@ from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
     default="auto",
     show_default=True,
     help="The sensor's motion: from the recording's poses; from the scans, by KISS-ICP "
-    "(the extra [odometry]); or none: tracks are relative to the sensor. auto: the first "
-    "of these that is available, poses where one of the first frames has one.",
+    "(the extra [odometry]); or none: tracks are relative to the sensor. auto: the first of these that is "
+    "available; poses count as available if one of the first frames has a pose.",
 )
 def tracking(options: ScoringOptions, detector: DetectorChoice, tracking: TrackingParams, ego: str) -> None:
     """Score tracks of Car, Pedestrian and Cyclist: HOTA, CLEAR MOT and AB3DMOT.

@@ -1,1 +1,1 @@
-"""Training of the PointNet on clusters."""
+"""Training of PointNet on clusters."""

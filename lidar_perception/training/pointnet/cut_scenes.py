@@ -25,12 +25,12 @@ from lidar_perception.intensity import normalize_intensity
 from lidar_perception.scoring.detections import draw_subset
 from lidar_perception.scoring.points.clusters import UNKNOWN, label_clusters
 from lidar_perception.training.augment import TrainingScene, raise_scene
-from lidar_perception.training.cache import cache_path, file_fingerprint, load_or_compute
+from lidar_perception.training.cache import file_fingerprint, load_or_compute, make_cache_path
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, PointCloud
 
-SPARSE_SHARES = 0.08, 0.7  # smallest and largest share of the points of a sparse scene
-MIN_POINTS_LEFT = 3  # minimum points of a cluster in a sparse or augmented scene
-OBJECT_MARGIN_M = 0.3  # margin of the boxes by which objects are cut
+SPARSE_FRACTIONS = 0.08, 0.7  # minimum and maximum fraction of the points that a subsampled scene keeps
+MIN_POINTS_LEFT = 3  # minimum points of a cluster in a subsampled or augmented scene
+OBJECT_MARGIN_M = 0.3  # margin added to a box when its object is cut out
 MAX_DECOYS = 24  # random decoys per scene without a proposer
 MAX_RANDOM_DECOYS = 8  # random decoys per scene with a proposer
 MAX_PROPOSALS = 14  # decoys of each class per scene from a proposer
@@ -44,8 +44,8 @@ class CutScene:
         clusters: The clusters.
         labels: (K,) int64, see scoring.points.clusters.label_clusters.
         boxes: (K, 7) float64 boxes of the objects, 0 for background.
-        is_box_crop: (K,) bool, True for clusters that were cut by the box of an object or decoy,
-            instead of by clustering.
+        is_box_crop: (K,) bool, True for clusters that were cut out with the box of an object or
+            decoy instead of by clustering.
     """
 
     clusters: Clusters
@@ -56,7 +56,7 @@ class CutScene:
 
 @dataclass(frozen=True)
 class CutScenes:
-    """Source whose scene(i) is the CutScene of scene i, see cut_clusters.
+    """Source whose load_scene(i) is the CutScene of scene i, see cut_clusters.
 
     Attributes:
         scenes: Source of scenes.
@@ -64,8 +64,8 @@ class CutScenes:
         min_points: Clusters with fewer points are ignored.
         cache: Folder of cached clusters, or None.
         proposer: PointPillars checkpoint whose wrong proposals become decoys, or None.
-        sparse: Share of the scenes that are subsampled before the cut, to imitate a sparser sensor.
-            The choice depends only on the number of the scene.
+        sparse: Fraction of the scenes that are subsampled before the cut, to imitate a sparser
+            sensor. The choice depends only on the number of the scene.
     """
 
     scenes: Any
@@ -78,24 +78,24 @@ class CutScenes:
     def __len__(self) -> int:
         return len(self.scenes)
 
-    def frame(self, i: int) -> Frame:
+    def load_frame(self, i: int) -> Frame:
         """Return the frame of scene i for validation."""
-        return self.scenes.frame(i)
+        return self.scenes.load_frame(i)
 
-    def draw_share(self, i: int) -> float:
-        """Return the share of the points to which scene i is subsampled."""
+    def draw_fraction(self, i: int) -> float:
+        """Return the fraction of the points to which scene i is subsampled."""
         rng = np.random.default_rng(i)
         if rng.random() >= self.sparse:
             return 1.0
-        return float(np.exp(rng.uniform(*np.log(SPARSE_SHARES))))
+        return float(np.exp(rng.uniform(*np.log(SPARSE_FRACTIONS))))
 
-    def path(self, i: int) -> Path | None:
+    def cache_file(self, i: int) -> Path | None:
         """Return the cache file of scene i."""
         proposer = [] if self.proposer is None else [file_fingerprint(self.proposer)]
-        sparse = [share] if (share := self.draw_share(i)) < 1 else []
-        return cache_path(
+        sparse = [fraction] if (fraction := self.draw_fraction(i)) < 1 else []
+        return make_cache_path(
             self.cache,
-            self.scenes.key(i),
+            self.scenes.cache_key(i),
             self.config.ground,
             self.config.clustering,
             self.config.classes,
@@ -106,16 +106,16 @@ class CutScenes:
 
     def store(self, i: int) -> None:
         """Write the clusters of scene i to the cache."""
-        self.scene(i)
+        self.load_scene(i)
 
-    def scene(self, i: int) -> CutScene:
+    def load_scene(self, i: int) -> CutScene:
         """Return the clusters of scene i. Raise InputError if the scene cannot be read."""
-        return load_or_compute(self.path(i), lambda: self._cut(i), _from_arrays, _to_arrays)
+        return load_or_compute(self.cache_file(i), lambda: self._cut(i), _from_arrays, _to_arrays)
 
     def _cut(self, i: int) -> CutScene:
-        scene, min_points, share = self.scenes.scene(i), self.min_points, self.draw_share(i)
-        if share < 1:
-            indices = draw_subset(len(scene.points), share, str(i))
+        scene, min_points, fraction = self.scenes.load_scene(i), self.min_points, self.draw_fraction(i)
+        if fraction < 1:
+            indices = draw_subset(len(scene.points), fraction, str(i))
             scene = replace(scene, points=scene.points[indices])
             min_points = min(min_points, MIN_POINTS_LEFT)
         return cut_clusters(scene, self.config, min_points, self.proposer)
@@ -127,8 +127,9 @@ def cut_clusters(
     """Cut a scene into labelled clusters in the frame of a sensor at SENSOR_HEIGHT.
 
     The clusters are followed by box crops: the points around each detectable object, and decoys,
-    which are background cut in the same way. They are needed since the network also classifies
-    the points in the boxes of a detector. Clusters of objects that are not detectable are UNKNOWN.
+    which are background cut in the same way. They are needed because the network also classifies
+    the points in the boxes of a detector. Clusters of objects that are not detectable are labelled
+    UNKNOWN.
 
     Args:
         scene: Scene.
@@ -164,17 +165,17 @@ def cut_clusters(
     crops = crop_boxes(crop_regions, obstacles, OBJECT_MARGIN_M)
     indices = np.flatnonzero(crops.sizes >= min_points)
     crops = crops.take(indices).with_ground(frame.xyz.compress(ground, axis=0))
-    both = Clusters(
+    all_clusters = Clusters(
         np.concatenate([clusters.points, crops.points]),
         np.concatenate([clusters.first, clusters.first[-1] + crops.first[1:]]),
         np.concatenate([clusters.ids, np.full(len(crops), -1)]),
         np.concatenate([clusters.ground, crops.ground]),
     )
     return CutScene(
-        both,
+        all_clusters,
         np.concatenate([labels, crop_labels[indices]]),
         np.concatenate([boxes, crop_regions[indices]]),
-        np.arange(len(both)) >= len(clusters),
+        np.arange(len(all_clusters)) >= len(clusters),
     )
 
 
@@ -184,23 +185,22 @@ def make_decoys(background: Clusters, config: PointNetConfig) -> np.ndarray:
     Each box is near the mean of a cluster and stands on the ground. The result is deterministic.
     """
     rng = np.random.default_rng(len(background.points))
-    chosen = rng.permutation(len(background))[:MAX_DECOYS]
-    own = background.take(chosen)
-    centres = compute_centroids(own.points, own.first)
-    sizes = np.array(config.sizes)[rng.integers(len(config.sizes), size=len(own))]
+    clusters = background.take(rng.permutation(len(background))[:MAX_DECOYS])
+    centres = compute_centroids(clusters.points, clusters.first)
+    sizes = np.array(config.sizes)[rng.integers(len(config.sizes), size=len(clusters))]
     sizes = sizes * rng.uniform(0.9, 1.15, sizes.shape)
     return np.column_stack(
         [
             centres + rng.normal(0, 0.2, centres.shape),
-            own.floor + sizes[:, 2] / 2,
+            clusters.floor + sizes[:, 2] / 2,
             sizes,
-            rng.uniform(-np.pi, np.pi, len(own)),
+            rng.uniform(-np.pi, np.pi, len(clusters)),
         ]
     )
 
 
 def propose_boxes(frame: PointCloud, proposer: Path) -> np.ndarray:
-    """Return the best MAX_PROPOSALS boxes of each class that PointPillars proposes, (P, 7).
+    """Return the MAX_PROPOSALS best proposals (P, 7) of PointPillars for each class.
 
     Args:
         frame: Cloud of a sensor at SENSOR_HEIGHT.

@@ -1,4 +1,4 @@
-"""Training task of the PointNet: samples, loss and validation."""
+"""Training task of PointNet: samples, loss and validation."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class ClusterPreparation:
     Attributes:
         config: Configuration of the network.
         augment: Numbers of clusters, and limits of the augmentation.
-        with_decoys: Up to half of the background consists of decoys.
+        with_decoys: True to draw up to half of the background clusters from the decoys.
     """
 
     config: PointNetConfig
@@ -69,17 +69,17 @@ class ClusterPreparation:
 
     def __call__(self, scene: CutScene, rng: np.random.Generator) -> ClusterSample:
         """Make the sample of a scene. Raise InputError if the scene has no usable cluster."""
-        chosen = self._draw_clusters(scene, rng)
-        if len(chosen) == 0:
+        indices = self._draw_clusters(scene, rng)
+        if len(indices) == 0:
             raise InputError("a scene has no cluster to train on")
-        labels, boxes = scene.labels[chosen], scene.boxes[chosen].copy()
-        clusters = scene.clusters.take(chosen)
+        labels, boxes = scene.labels[indices], scene.boxes[indices].copy()
+        clusters = scene.clusters.take(indices)
         background = np.flatnonzero(labels == len(self.config.classes))
         feet = np.column_stack([compute_centroids(clusters.points, clusters.first), clusters.floor])
         for k in background:
-            own = slice(clusters.first[k], clusters.first[k + 1])
-            clusters.points[own], _ = vary_background(clusters.points[own], feet[k], self.augment, rng)
-        clusters, boxes = augment_clusters(clusters, boxes, scene.is_box_crop[chosen], self.augment, rng)
+            rows = slice(clusters.first[k], clusters.first[k + 1])
+            clusters.points[rows], _ = vary_background(clusters.points[rows], feet[k], self.augment, rng)
+        clusters, boxes = augment_clusters(clusters, boxes, scene.is_box_crop[indices], self.augment, rng)
         inputs = make_network_input(clusters, self.config.points, int(rng.integers(1 << 30)), self.config.farthest)
         has_box = (labels >= 0) & (labels < len(self.config.classes))
         classes = np.where(has_box, labels, 0)
@@ -88,15 +88,15 @@ class ClusterPreparation:
 
     def _draw_clusters(self, scene: CutScene, rng: np.random.Generator) -> np.ndarray:
         """Draw clusters of each class and of the background, up to the numbers in self.augment."""
-        chosen = []
+        indices_by_class = []
         for label in range(len(self.config.classes) + 1):
             limit = self.augment.background if label == len(self.config.classes) else self.augment.objects
-            own = rng.permutation(np.flatnonzero(scene.labels == label))
+            indices = rng.permutation(np.flatnonzero(scene.labels == label))
             if self.with_decoys and label == len(self.config.classes):
-                decoys = own[scene.is_box_crop[own]][: limit // 2]
-                own = np.concatenate([decoys, own[~scene.is_box_crop[own]]])
-            chosen.append(own[:limit])
-        return np.sort(np.concatenate(chosen))
+                decoys = indices[scene.is_box_crop[indices]][: limit // 2]
+                indices = np.concatenate([decoys, indices[~scene.is_box_crop[indices]]])
+            indices_by_class.append(indices[:limit])
+        return np.sort(np.concatenate(indices_by_class))
 
 
 def augment_clusters(
@@ -109,7 +109,7 @@ def augment_clusters(
     """Augment clusters.
 
     All clusters are flipped and scaled in the same way. Each one loses points, gets noise, and may
-    be moved away, with fewer points accordingly. Box crops are cut again by a shifted box.
+    be moved farther away, which removes more points. Box crops are cut again with a shifted box.
 
     Args:
         clusters: K clusters, which are not changed.
@@ -122,34 +122,34 @@ def augment_clusters(
         The changed clusters and boxes.
     """
     count = len(clusters)
-    number = np.repeat(np.arange(count), clusters.sizes)
+    cluster_of_point = np.repeat(np.arange(count), clusters.sizes)
     points, boxes = clusters.points.copy(), boxes.copy()
     keep = np.ones(len(points), bool)
     for k in np.flatnonzero(is_box_crop):
-        part = slice(clusters.first[k], clusters.first[k + 1])
-        shifted = boxes[k] + rng.normal(0, params.box_shift, 7) * [1, 1, 0.5, 0, 0, 0, 0.3]
-        shifted[3:6] *= rng.uniform(0.9, 1.15, 3)
-        keep[part] = points_in_box(points[part, :3], shifted)
-    farther = np.where(rng.random(count) < 0.3, rng.uniform(1, 1 + params.farther, count), 1.0)
-    share = np.where(rng.random(count) < 0.5, rng.uniform(1 - params.dropout, 1, count), 1.0)
-    keep &= rng.random(len(points)) < (share / farther**2)[number]
-    left = np.bincount(number[keep], minlength=count)
-    keep |= (left < MIN_POINTS_LEFT)[number]
-    farther = np.where(left < MIN_POINTS_LEFT, 1.0, farther)
-    centres = _group_means(points[:, :2].astype(np.float64), number, count)
-    shifts = centres * (farther - 1)[:, None]
-    points[:, :2] += shifts[number].astype(np.float32)
+        rows = slice(clusters.first[k], clusters.first[k + 1])
+        shifted_box = boxes[k] + rng.normal(0, params.box_shift, 7) * [1, 1, 0.5, 0, 0, 0, 0.3]
+        shifted_box[3:6] *= rng.uniform(0.9, 1.15, 3)
+        keep[rows] = points_in_box(points[rows, :3], shifted_box)
+    range_factors = np.where(rng.random(count) < 0.3, rng.uniform(1, 1 + params.farther, count), 1.0)
+    fractions = np.where(rng.random(count) < 0.5, rng.uniform(1 - params.dropout, 1, count), 1.0)
+    keep &= rng.random(len(points)) < (fractions / range_factors**2)[cluster_of_point]
+    sizes = np.bincount(cluster_of_point[keep], minlength=count)
+    keep |= (sizes < MIN_POINTS_LEFT)[cluster_of_point]
+    range_factors = np.where(sizes < MIN_POINTS_LEFT, 1.0, range_factors)
+    centres = _compute_group_means(points[:, :2].astype(np.float64), cluster_of_point, count)
+    shifts = centres * (range_factors - 1)[:, None]
+    points[:, :2] += shifts[cluster_of_point].astype(np.float32)
     boxes[:, :2] += shifts
     scale = 1 + rng.uniform(-params.scale, params.scale)
     height = rng.uniform(-params.height, params.height)
     floor = clusters.floor
-    points[:, 2] -= floor[number].astype(np.float32)
+    points[:, 2] -= floor[cluster_of_point].astype(np.float32)
     boxes[:, 2] -= floor
     points[:, :3] *= np.float32(scale)
     boxes[:, :6] *= scale
-    points[:, 2] += floor[number].astype(np.float32)
+    points[:, 2] += floor[cluster_of_point].astype(np.float32)
     boxes[:, 2] += floor
-    # Imitate errors of the estimated ground height.
+    # The estimated ground height has errors too.
     floor = floor + height + rng.uniform(-0.5, 0.5, count) * params.height
     if rng.random() < params.flip:
         points[:, 1] *= -1
@@ -158,15 +158,15 @@ def augment_clusters(
     gain = rng.uniform(1 - params.intensity, 1 + params.intensity)
     points[:, 3] = np.clip(points[:, 3] * gain, 0, 1)
     points = distort_intensity(points, params, rng)
-    sizes = np.bincount(number[keep], minlength=count)
+    sizes = np.bincount(cluster_of_point[keep], minlength=count)
     first = np.concatenate([[0], np.cumsum(sizes)])
     return Clusters(points[keep], first, clusters.ids, floor), boxes
 
 
-def _group_means(values: np.ndarray, number: np.ndarray, count: int) -> np.ndarray:
-    """Return the mean (count, D) of the values (P, D) of each group number (P,), 0 for empty groups."""
-    sums = np.stack([np.bincount(number, column, minlength=count) for column in values.T], axis=1)
-    return sums / np.maximum(np.bincount(number, minlength=count), 1)[:, None]
+def _compute_group_means(values: np.ndarray, groups: np.ndarray, count: int) -> np.ndarray:
+    """Return the mean (count, D) of the values (P, D) in each group, 0 for empty groups. groups: (P,) group indices."""
+    sums = np.stack([np.bincount(groups, column, minlength=count) for column in values.T], axis=1)
+    return sums / np.maximum(np.bincount(groups, minlength=count), 1)[:, None]
 
 
 def make_loss(config: PointNetConfig, device: torch.device) -> Callable:
@@ -216,9 +216,9 @@ class ValidationClusters:
 
 def load_validation_clusters(source: CutScenes, i: int) -> ValidationClusters:
     """Load scene i of a source. Raise InputError if it cannot be read."""
-    scene = source.scene(i)
+    scene = source.load_scene(i)
     indices = np.flatnonzero(~scene.is_box_crop)
-    frame = source.frame(i)
+    frame = source.load_frame(i)
     return ValidationClusters(
         frame.name,
         scene.clusters.take(indices),
@@ -233,10 +233,10 @@ def validate_network(network: PointNet, scenes: Sequence[ValidationClusters]) ->
     """Calibrate the network on one or more scenes, and evaluate it.
 
     Returns:
-        Metrics and calibration, see Task.validate. The score is the mean BEV AP at the relaxed
-        overlaps (moderate, R40). accuracy is the percentage of clusters with at least
-        MIN_SCORED_POINTS points whose class is correct, object_accuracy that of the objects among
-        them; NaN without clusters.
+        Metrics and calibration, see Task.validate. `score` is the mean BEV AP at the relaxed
+        overlaps (moderate, R40). `accuracy` is the percentage of clusters with at least
+        MIN_SCORED_POINTS points whose class is correct; `object_accuracy` is the same for objects
+        only. Both are NaN if there are no such clusters.
     """
     config = network.config
     labels = np.concatenate([s.labels for s in scenes])

@@ -1,4 +1,4 @@
-"""Trainer of the PointNet."""
+"""Trainer of PointNet."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from lidar_perception.training.timing import find_readable_frame, measure_durati
 from lidar_perception.training.trainer import Cuts, StepSpeed
 from lidar_perception.types import InputError
 
-TIMED_FRAMES = 8  # validated together, so that the duration of the calibration matters little
+TIMED_FRAMES = 8  # frames to time validation with; several, so that the calibration matters little
 
 
 def find_proposer(params: PointNetTraining) -> Path | None:
@@ -53,7 +53,7 @@ def find_proposer(params: PointNetTraining) -> Path | None:
 
 @dataclass(frozen=True)
 class PointNetTrainer:
-    """Trainer of the PointNet in one configuration; see Trainer for the methods."""
+    """Trainer of PointNet in one configuration; see Trainer for the methods."""
 
     config: PointNetConfig
     cutting_title: str = "cutting clusters"
@@ -62,20 +62,20 @@ class PointNetTrainer:
     def name(self) -> str:
         return f"PointNet {self.config.title}".strip()
 
-    def packaged_weights(self, params: PointNetTraining) -> Path:
+    def find_packaged_weights(self, params: PointNetTraining) -> Path:
         """Return the weights of the improved network, which partly fit the other configurations."""
         return find_pointnet_weights(PointNetParams())
 
-    def max_cuts(self, params: PointNetTraining) -> int:
-        """Return a number larger than any data set, since clusters are cut from all scenes."""
+    def find_max_cut_scenes(self, params: PointNetTraining) -> int:
+        """Return a number larger than any data set, because clusters are cut from all scenes."""
         return 10**9
 
-    def reduced_range(self, params: PointNetTraining) -> dict[str, Any]:
-        """Return {}, since clusters at all ranges are used."""
+    def find_reduced_range(self, params: PointNetTraining) -> dict[str, Any]:
+        """Return {}, because clusters at all ranges are used."""
         return {}
 
     def measure_speed(
-        self, params: PointNetTraining, scenes: Iterable[Item], held_out: Sequence[Any], device: torch.device
+        self, params: PointNetTraining, scenes: Iterable[Item], val_sources: Sequence[Any], device: torch.device
     ) -> StepSpeed:
         """Measure durations on the clusters of the first usable scenes."""
         prepare = ClusterPreparation(self.config, params.augment)
@@ -87,19 +87,19 @@ class PointNetTrainer:
         def prepare_scene(scene: TrainingScene) -> Any:
             return prepare(cut_scene(scene), make_rng())
 
-        chosen = select_usable_scenes(scenes, prepare_scene)  # also compiles kernels
-        cutting, parts = measure_duration(lambda: [cut_scene(scene) for scene in chosen])
+        usable_scenes = select_usable_scenes(scenes, prepare_scene)  # also compiles kernels
+        cutting, cut_scenes = measure_duration(lambda: [cut_scene(scene) for scene in usable_scenes])
         network = make_pointnet(self.config).to(device)
         step = measure_step(
             network,
             make_loss(self.config, device),
-            lambda: [prepare(part, make_rng()) for part in parts],
+            lambda: [prepare(scene, make_rng()) for scene in cut_scenes],
             params,
             device,
         )
         frame = find_readable_frame(
             SceneReader(
-                tuple(CutScenes(source, self.config, params.data.min_points) for source in held_out),
+                tuple(CutScenes(source, self.config, params.data.min_points) for source in val_sources),
                 load_validation_clusters,
             ),
             lambda frame: len(frame.clusters) > 0,
@@ -108,10 +108,12 @@ class PointNetTrainer:
         with torch.no_grad():
             validate_network(network, [frame])
             validation, _ = measure_duration(lambda: validate_network(network, [frame] * TIMED_FRAMES))
-        return StepSpeed(cutting / len(chosen), step, step, validation / TIMED_FRAMES)
+        return StepSpeed(cutting / len(usable_scenes), step, step, validation / TIMED_FRAMES)
 
-    def make_cuts(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any], cache: Path) -> Cuts:
-        """Return sources of clusters, cut from all scenes."""
+    def make_cuts(
+        self, params: PointNetTraining, sources: Sequence[Any], val_sources: Sequence[Any], cache: Path
+    ) -> Cuts:
+        """Return the sources of clusters, which are cut from all scenes."""
         cut = partial(
             CutScenes,
             config=self.config,
@@ -119,14 +121,14 @@ class PointNetTrainer:
             cache=cache / "clusters",
             proposer=find_proposer(params),
         )
-        cuts = [*(cut(source, sparse=params.augment.sparse) for source in sources), *map(cut, held_out)]
+        cuts = [*(cut(source, sparse=params.augment.sparse) for source in sources), *map(cut, val_sources)]
         return Cuts(cuts, [range(len(source)) for source in cuts])
 
     def collect_cuts(self, params: PointNetTraining, cuts: Cuts, out: Path) -> None:
-        """Do nothing, since training reads the cache."""
+        """Do nothing, because training reads the clusters from the cache."""
 
     def make_streams(
-        self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any], cuts: Cuts, out: Path
+        self, params: PointNetTraining, sources: Sequence[Any], val_sources: Sequence[Any], cuts: Cuts, out: Path
     ) -> tuple[Stream, SceneReader]:
         training, validation = cuts.sources[: len(sources)], cuts.sources[len(sources) :]
         prepare = ClusterPreparation(self.config, params.augment, bool(params.proposer))
@@ -136,7 +138,7 @@ class PointNetTrainer:
         self,
         params: PointNetTraining,
         batches: Batches,
-        held_out: SceneReader,
+        val_scenes: SceneReader,
         out: Path,
         device: torch.device,
         about: dict[str, Any],
@@ -149,7 +151,9 @@ class PointNetTrainer:
 
         def validate(module: PointNet) -> Validation:
             if not scenes:
-                items = [item for (item,) in load_items(held_out, ([n] for n in range(len(held_out))), batches.jobs)]
+                items = [
+                    item for (item,) in load_items(val_scenes, ([n] for n in range(len(val_scenes))), batches.jobs)
+                ]
                 scenes.extend(item.sample for item in items if item.sample is not None)
                 report_skipped([reason for item in items for reason in item.skipped], len(scenes), set())
             return validate_network(module, scenes)
@@ -160,6 +164,6 @@ class PointNetTrainer:
             batches,
             validate,
             make_save_function(out, self.config, params, batches, about, commit),
-            batches.epoch,
+            batches.steps_per_epoch,
             about,
         )

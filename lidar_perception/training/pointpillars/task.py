@@ -40,7 +40,7 @@ from lidar_perception.runs.terminal import show_progress
 from lidar_perception.scoring.detections import FrameDetections, run_detector
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.training.augment import TrainingScene, augment_scene, raise_scene, turn_and_crop
+from lidar_perception.training.augment import TrainingScene, augment_scene, raise_scene, rotate_and_crop
 from lidar_perception.training.data import SceneReader, load_items
 from lidar_perception.training.database import Database, paste_objects
 from lidar_perception.training.params import AugmentParams
@@ -64,7 +64,7 @@ class Sample:
         points, cluster_map: See expert.NetworkInput.
         boxes: (M, 7) float32.
         labels: (M,) int64 into the config's classes; DONT_CARE_LABEL for a region without labels.
-        is_target: (M,) bool, True for objects that must be detected; the others are ignored.
+        is_target: (M,) bool, True for objects that must be detected; other objects are ignored.
         targets: Targets of the anchors.
     """
 
@@ -78,7 +78,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class ScenePreparation:
-    """Preparation of a Sample: a scene is augmented and cropped, and expert columns are added.
+    """Preparation of a Sample: augment and crop a scene, and add the expert columns.
 
     Attributes:
         config: Configuration of the network.
@@ -105,9 +105,9 @@ class ScenePreparation:
 
     def __call__(self, scene: TrainingScene, rng: np.random.Generator) -> Sample:
         """Make the sample of a scene. Raise InputError if no point is in the detection range."""
-        lift = np.array([0, 0, scene.height - SENSOR_HEIGHT])  # shift to a sensor at SENSOR_HEIGHT
-        low, high = np.array(self.config.low) - lift, np.array(self.config.high) - lift
-        scene = turn_and_crop(scene, self.augment, low, high, rng)
+        shift = np.array([0, 0, scene.height - SENSOR_HEIGHT])  # to the frame of a sensor at SENSOR_HEIGHT
+        low, high = np.array(self.config.low) - shift, np.array(self.config.high) - shift
+        scene = rotate_and_crop(scene, self.augment, low, high, rng)
         if self._objects is not None and rng.random() < self.augment.crowded:
             scene = paste_objects(scene, self._objects, self.augment, low, high, rng)
         scene = augment_scene(scene, self.augment, rng)
@@ -117,14 +117,14 @@ class ScenePreparation:
         inputs = make_network_input(view, self.config)
         if len(inputs.points) < 2:
             raise InputError("a scene has no point in the detection range")
-        boxes, labels, is_target = self._select_objects(raise_scene(scene, lift[2]), view.xyz)
+        boxes, labels, is_target = self._select_objects(raise_scene(scene, shift[2]), view.xyz)
         targets = _assign_targets(boxes, labels, is_target, self._anchors, self.config)
         return Sample(inputs.points, inputs.cluster_map, boxes, labels, is_target, to_sparse(targets))
 
     def _select_objects(self, scene: TrainingScene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
         low, high = np.array(self.config.low), np.array(self.config.high)
         names = [CLASSES[i] for i in scene.class_ids]
-        labels = np.array([self._label(CLASS_BY_SIMILAR.get(name, name)) for name in names], np.int64)
+        labels = np.array([self._find_label(CLASS_BY_SIMILAR.get(name, name)) for name in names], np.int64)
         indices = np.flatnonzero(is_within(scene.boxes, low, high) & (labels != -1))
         is_target = [
             bool(scene.detectable[i])
@@ -135,14 +135,14 @@ class ScenePreparation:
         ]
         return scene.boxes[indices].astype(np.float32), labels[indices], np.array(is_target, bool)
 
-    def _label(self, name: str) -> int:
+    def _find_label(self, name: str) -> int:
         if name == CLASSES[DONT_CARE]:
             return DONT_CARE_LABEL
         return self.config.classes.index(name) if name in self.config.classes else -1
 
 
 def reduce_range(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig:
-    """Return the config with a shorter detection range, rounded up to whole cells of the feature map.
+    """Return the config with a shorter detection range, rounded up to full cells of the feature map.
 
     Args:
         config: Configuration of the network.
@@ -165,14 +165,14 @@ def _assign_targets(
 ) -> Targets:
     """Assign the anchors to the objects of one sample.
 
-    Anchors on objects that are no targets, and anchors that touch a DontCare region, are ignored.
+    Anchors on other objects, and anchors that touch a DontCare region, are ignored.
     """
-    all_boxes, classes, mask = map(torch.from_numpy, (boxes, labels, is_target))
-    targets = assign(anchors, config, all_boxes[mask], classes[mask])
+    all_boxes, classes, target_mask = map(torch.from_numpy, (boxes, labels, is_target))
+    targets = assign(anchors, config, all_boxes[target_mask], classes[target_mask])
     anchor_labels = targets.labels[0]
     for index, spec in enumerate(config.anchors):
         for others, min_iou in (
-            (all_boxes[~mask & (classes == index)], spec.unmatched),
+            (all_boxes[~target_mask & (classes == index)], spec.unmatched),
             (all_boxes[classes == DONT_CARE_LABEL], MIN_TOUCH_IOU),
         ):
             candidates = find_near_anchors(anchors, config, others, index)
@@ -210,7 +210,7 @@ def load_validation_frame(config: NetworkConfig, source: Any, i: int) -> Frame:
     Raises:
         InputError: The frame cannot be read.
     """
-    frame = source.frame(i)
+    frame = source.load_frame(i)
     truth, calibration = frame.truth(), frame.calibration()
     if calibration is None and truth is not None:
         inside = np.flatnonzero(is_within(truth.boxes, config.low, config.high))

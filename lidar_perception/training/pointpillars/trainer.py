@@ -56,98 +56,100 @@ class PointPillarsTrainer:
     def name(self) -> str:
         return f"PointPillars {self.config.title}"
 
-    def packaged_weights(self, params: PointPillarsTraining) -> Path:
+    def find_packaged_weights(self, params: PointPillarsTraining) -> Path:
         """Return the weights of the same version and size."""
         return find_pointpillars_weights(PointPillarsParams(version=params.version, size=params.size))
 
-    def max_cuts(self, params: PointPillarsTraining) -> int:
+    def find_max_cut_scenes(self, params: PointPillarsTraining) -> int:
         """Return the number of scenes from which objects are cut; 0 if no objects are pasted."""
         augment = params.augment
         pasted = augment.crowded and (augment.cars or augment.pedestrians or augment.cyclists or augment.things)
         return augment.database_scans if pasted else 0
 
-    def reduced_range(self, params: PointPillarsTraining) -> dict[str, Any]:
+    def find_reduced_range(self, params: PointPillarsTraining) -> dict[str, Any]:
         """Return the range that contains most objects; {} if the user gave a range."""
         ahead, aside = REDUCED_RANGES[params.range]
         return {} if params.ahead or params.aside else {"ahead": ahead, "aside": aside}
 
     def measure_speed(
-        self, params: PointPillarsTraining, scenes: Iterable[Item], held_out: Sequence[Any], device: torch.device
+        self, params: PointPillarsTraining, scenes: Iterable[Item], val_sources: Sequence[Any], device: torch.device
     ) -> StepSpeed:
         """Measure durations on the first usable scenes, with objects that are cut from them."""
 
         def cut_all() -> list[Database]:
-            return [cut_objects(scene, self.config.classes, params.data.min_points) for scene in chosen]
+            return [cut_objects(scene, self.config.classes, params.data.min_points) for scene in usable_scenes]
 
         reduced = reduce_range(
-            self.config, **(self.reduced_range(params) or {"ahead": params.ahead, "aside": params.aside})
+            self.config, **(self.find_reduced_range(params) or {"ahead": params.ahead, "aside": params.aside})
         )
         prepare = ScenePreparation(reduced, params.augment, params.data.min_points)
-        chosen = select_usable_scenes(scenes, lambda scene: prepare(scene, np.random.default_rng(0)))
-        cut_objects(chosen[0], self.config.classes, params.data.min_points)  # triggers compilation
-        cutting, parts = measure_duration(cut_all)
+        usable_scenes = select_usable_scenes(scenes, lambda scene: prepare(scene, np.random.default_rng(0)))
+        cut_objects(usable_scenes[0], self.config.classes, params.data.min_points)  # triggers compilation
+        cutting, databases = measure_duration(cut_all)
         network = make_network(self.config).to(device)
         channels_last(network)
         with tempfile.TemporaryDirectory() as folder:
-            join_databases(parts).save(Path(folder) / OBJECTS)
-            prepare_pasted = replace(prepare, database=Path(folder) / OBJECTS if self.max_cuts(params) else None)
+            join_databases(databases).save(Path(folder) / OBJECTS)
+            prepare_pasted = replace(
+                prepare, database=Path(folder) / OBJECTS if self.find_max_cut_scenes(params) else None
+            )
             step = measure_step(
                 network,
                 make_loss(reduced, device),
-                lambda: [prepare_pasted(scene, np.random.default_rng(0)) for scene in chosen],
+                lambda: [prepare_pasted(scene, np.random.default_rng(0)) for scene in usable_scenes],
                 params,
                 device,
             )
         detector = self._make_detector(network, device)
         frame = find_readable_frame(
-            self._make_reader(held_out), lambda frame: detect_in_frame(frame, detector).problem is None
+            self._make_reader(val_sources), lambda frame: detect_in_frame(frame, detector).problem is None
         )
-        whole = step * np.prod(self.config.grid) / np.prod(reduced.grid)
+        full_range_step = step * np.prod(self.config.grid) / np.prod(reduced.grid)
         validation, _ = measure_duration(lambda: detect_in_frame(frame, detector))
-        return StepSpeed(cutting / len(chosen), step, float(whole), validation)
+        return StepSpeed(cutting / len(usable_scenes), step, float(full_range_step), validation)
 
     def make_cuts(
-        self, params: PointPillarsTraining, sources: Sequence[Any], held_out: Sequence[Any], cache: Path
+        self, params: PointPillarsTraining, sources: Sequence[Any], val_sources: Sequence[Any], cache: Path
     ) -> Cuts:
-        """Return sources of objects, cut from random scenes."""
+        """Return the sources of objects, which are cut from randomly drawn scenes."""
         ends = np.cumsum([0, *map(len, sources)])
-        chosen = np.random.default_rng(params.seed).permutation(ends[-1])[: self.max_cuts(params)]
+        indices = np.random.default_rng(params.seed).permutation(ends[-1])[: self.find_max_cut_scenes(params)]
         min_points, folder = params.data.min_points, cache / "objects"
         cuts = [CutObjects(source, self.config.classes, min_points, folder) for source in sources]
         numbers = [
-            np.sort(chosen[(chosen >= first) & (chosen < end)] - first).tolist() for first, end in pairwise(ends)
+            np.sort(indices[(indices >= first) & (indices < end)] - first).tolist() for first, end in pairwise(ends)
         ]
         return Cuts(cuts, numbers)
 
     def collect_cuts(self, params: PointPillarsTraining, cuts: Cuts, out: Path) -> None:
         """Write all cut objects to out / OBJECTS."""
-        if not self.max_cuts(params) or (out / OBJECTS).is_file():
+        if not self.find_max_cut_scenes(params) or (out / OBJECTS).is_file():
             return
-        parts = []
+        databases = []
         for source, numbers in zip(*cuts):
             for i in numbers:
                 try:
-                    parts.append(source.scene(i))
+                    databases.append(source.load_scene(i))
                 except InputError:  # training reports it later
                     continue
-        join_databases(parts).save(out / OBJECTS)
+        join_databases(databases).save(out / OBJECTS)
 
     def make_streams(
-        self, params: PointPillarsTraining, sources: Sequence[Any], held_out: Sequence[Any], cuts: Cuts, out: Path
+        self, params: PointPillarsTraining, sources: Sequence[Any], val_sources: Sequence[Any], cuts: Cuts, out: Path
     ) -> tuple[Stream, SceneReader]:
         prepare = ScenePreparation(
             reduce_range(self.config, params.ahead, params.aside),
             params.augment,
             params.data.min_points,
-            out / OBJECTS if self.max_cuts(params) else None,
+            out / OBJECTS if self.find_max_cut_scenes(params) else None,
         )
-        return Stream(tuple(sources), prepare, params.seed), self._make_reader(held_out)
+        return Stream(tuple(sources), prepare, params.seed), self._make_reader(val_sources)
 
     def make_task(
         self,
         params: PointPillarsTraining,
         batches: Batches,
-        held_out: SceneReader,
+        val_scenes: SceneReader,
         out: Path,
         device: torch.device,
         about: dict[str, Any],
@@ -161,7 +163,7 @@ class PointPillarsTrainer:
 
         def validate(module: PointPillars) -> Validation:
             detector = self._make_detector(module, device)
-            report = validate_detector(detector, held_out, batches.jobs)
+            report = validate_detector(detector, val_scenes, batches.jobs)
             report_skipped(report.skipped, len(report.frames), reported)
             return summarize_report(report, params.score, self.config.classes)
 
@@ -172,7 +174,7 @@ class PointPillarsTrainer:
             batches,
             validate,
             make_save_function(out, self.config, params, batches, about, commit),
-            batches.epoch,
+            batches.steps_per_epoch,
             about,
         )
 
@@ -180,5 +182,5 @@ class PointPillarsTrainer:
         proposer = PointPillarsProposer(TorchNetwork(network, str(device)), Header(self.config), str(device))
         return PointPillarsDetector(proposer, VALIDATION_PARAMS)
 
-    def _make_reader(self, held_out: Sequence[Any]) -> SceneReader:
-        return SceneReader(tuple(held_out), partial(load_validation_frame, self.config))
+    def _make_reader(self, val_sources: Sequence[Any]) -> SceneReader:
+        return SceneReader(tuple(val_sources), partial(load_validation_frame, self.config))
