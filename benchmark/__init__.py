@@ -1,4 +1,4 @@
-"""Benchmarks of our algorithms against others: python -m benchmark, or ./lidar benchmark."""
+"""Benchmarks of our algorithms against other implementations: python -m benchmark, or ./lidar benchmark."""
 
 from lidar_perception.runs.threads import use_passive_waiting
 

@@ -1,7 +1,7 @@
-"""lidar benchmark: all algorithms against their peers, in one run on one machine.
+"""lidar benchmark: time all algorithms and other implementations of them, in one run on one machine.
 
-The candidate pipeline against a plain implementation of paper A, each algorithm against its peers,
-every version of EG-PointPillars, and the graph of nodes over DDS.
+Compares the candidate pipeline with a plain implementation of paper A and each algorithm with its
+peers, and times every version of EG-PointPillars and the graph of nodes over DDS.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from lidar_perception.scoring.centres.report import select_pedestrians
 from lidar_perception.types import InputError, PointCloud
 from lidar_perception.wire.params import ViewParams
 
-MIN_FULL_SCAN_POINTS = 60_000  # minimum points of a full scan; one cropped to the camera's view has about 20,000
-MIN_PEDESTRIAN_FRAMES = 3  # minimum number of pedestrian frames; with fewer, other frames are used too
+MIN_FULL_SCAN_POINTS = 60_000  # a scan that is cropped to the camera's view has only about 20,000
+MIN_PEDESTRIAN_FRAMES = 3  # if there are fewer, other frames are used too
 
 
 @click.command(context_settings=dict(help_option_names=["-h", "--help"]))
@@ -49,19 +49,18 @@ MIN_PEDESTRIAN_FRAMES = 3  # minimum number of pedestrian frames; with fewer, ot
     required=True,
     metavar="PATH",
     multiple=True,
-    help="A recording with Pedestrian labels and a camera, such as KITTI. "
-    "A second one, with labelled points (SemanticKITTI), scores the ground methods too, "
-    "and one with track ids (KITTI tracking) the trackers.",
+    help="A recording with Pedestrian labels and a camera, such as KITTI. Repeat with labelled points "
+    "(SemanticKITTI) to score the ground methods too, and with track ids (KITTI tracking) to score the trackers.",
 )
 @click.option(
-    "--json", "json_file", type=click.Path(path_type=Path), metavar="FILE", help="Write the figures to this file."
+    "--json", "json_file", type=click.Path(path_type=Path), metavar="FILE", help="Write the results to this file."
 )
 @click.option(
     "--repeat",
     type=click.IntRange(1),
     default=5,
     show_default=True,
-    help="Runs per frame; the median counts. Fewer for slow peers.",
+    help="Runs per frame, of which the median is used. Slow peers run less often.",
 )
 @click.option(
     "--frames",
@@ -69,7 +68,7 @@ MIN_PEDESTRIAN_FRAMES = 3  # minimum number of pedestrian frames; with fewer, ot
     type=click.IntRange(1),
     default=8,
     show_default=True,
-    help="Frames for the single algorithms, evenly spread over the recording.",
+    help="Number of frames for each algorithm, evenly spread over the recording.",
 )
 @click.option(
     "--graph/--no-graph",
@@ -80,7 +79,7 @@ MIN_PEDESTRIAN_FRAMES = 3  # minimum number of pedestrian frames; with fewer, ot
 def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int, graph: bool) -> None:
     """Time our candidate pipeline and a plain scikit-learn + OpenCV implementation of the paper,
     each algorithm and its peers, and the steps of every version of EG-PointPillars and of the
-    PointNet detector. Peers that are not installed are left out.
+    PointNet detector. Peers that are not installed are skipped.
 
     \b
     Example:
@@ -94,7 +93,7 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     frames = [f for f in recording if len(select_pedestrians(f.truth()))]
     if not frames:
         raise InputError(f"{recording.path} has no frame with a Pedestrian label")
-    labelled = [
+    labelled_frames = [
         f
         for candidate in recordings
         if POINT_LABELS in candidate.contents
@@ -112,11 +111,12 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
         "candidates": compare_candidates(frames, repeat),
     }
     print_comparison(content["candidates"])
-    in_view = [
-        crop_to_view(f, camera, ViewParams(enabled=True))[1].xyz for f, camera in _with_camera(recording, frames, count)
+    clouds_in_view = [
+        crop_to_view(scan, camera, ViewParams(enabled=True))[1].xyz
+        for scan, camera in _load_scans_with_camera(recording, frames, count)
     ]
-    scans = _full_scans(recording, count)
-    content |= _measure(in_view, scans, repeat)
+    scans = _load_full_scans(recording, count)
+    content |= _measure_algorithms(clouds_in_view, scans, repeat)
     if scans:
         content["detection"] = measure_detection(scans, repeat)
         print_detection(content["detection"])
@@ -124,8 +124,8 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
         print_measured(content["engines"])
         content["pointnet"] = measure_pointnet(scans, repeat)
         print_pointnet(content["pointnet"])
-    if labelled:
-        content["ground_scores"] = ground.measure_labelled(labelled, repeat)
+    if labelled_frames:
+        content["ground_scores"] = ground.measure_labelled(labelled_frames, repeat)
         print_ground(content["ground_scores"])
     for candidate in recordings:
         if drives := measure_recording(candidate):
@@ -140,46 +140,46 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
         write_text(json_file, json.dumps(content, indent=1))
 
 
-def _with_camera(recording: Recording, pedestrian: list[Frame], count: int) -> list[tuple]:
-    """Return (scan, camera) of frames with a pedestrian, or of any frames if these are few."""
-    selected = pedestrian if len(pedestrian) >= MIN_PEDESTRIAN_FRAMES else recording.frames
-    return [(f.load(), f.camera()) for f in choose_evenly(selected, count)]
+def _load_scans_with_camera(recording: Recording, pedestrian_frames: list[Frame], count: int) -> list[tuple]:
+    """Return (scan, camera) of frames with a pedestrian, or of any frames if there are few of them."""
+    frames = pedestrian_frames if len(pedestrian_frames) >= MIN_PEDESTRIAN_FRAMES else recording.frames
+    return [(f.load(), f.camera()) for f in choose_evenly(frames, count)]
 
 
-def _full_scans(recording: Recording, count: int) -> list[PointCloud]:
+def _load_full_scans(recording: Recording, count: int) -> list[PointCloud]:
     full_scans = [f for f in recording if len(f.load()) > MIN_FULL_SCAN_POINTS]
     return [f.load() for f in choose_evenly(full_scans, count)]
 
 
-def _measure(in_view: list[np.ndarray], scans: list[PointCloud], repeat: int) -> dict:
+def _measure_algorithms(clouds_in_view: list[np.ndarray], scans: list[PointCloud], repeat: int) -> dict:
     """Measure and print each algorithm and its peers."""
     full_scans = [f.xyz for f in scans]
     obstacles_in_view, obstacles, cloth_obstacles = (
         [xyz.compress(~segment(xyz), axis=0) for xyz in clouds]
         for clouds, segment in (
-            (in_view, segment_by_threshold),
+            (clouds_in_view, segment_by_threshold),
             (full_scans, segment_by_threshold),
             (full_scans, segment_by_cloth),
         )
     )
     content = {}
 
-    def show(name: str, result: dict) -> None:
+    def add_result(name: str, result: dict) -> None:
         content[name] = result
         print_measured(result)
 
-    show("dbscan_in_view", clustering.measure_dbscan("DBSCAN, in view", obstacles_in_view, repeat, 12))
-    show("threshold_in_view", ground.measure_threshold("Threshold, in view", in_view, repeat))
+    add_result("dbscan_in_view", clustering.measure_dbscan("DBSCAN, in view", obstacles_in_view, repeat, 12))
+    add_result("threshold_in_view", ground.measure_threshold("Threshold, in view", clouds_in_view, repeat))
     if not scans:
         errors.print(f"no scan has more than {MIN_FULL_SCAN_POINTS} points: skipping the full-scan benchmark")
         return content
-    show("dbscan_whole_scan", clustering.measure_dbscan("DBSCAN, full scan", obstacles, repeat, 20))
+    add_result("dbscan_whole_scan", clustering.measure_dbscan("DBSCAN, full scan", obstacles, repeat, 20))
     for threshold in ("global", "local"):
-        show(f"euclidean_{threshold}", clustering.measure_euclidean(cloth_obstacles, threshold, repeat))
-    show("paper_c", clustering.measure_paper_c(full_scans, repeat))
-    show("threshold", ground.measure_threshold("Threshold, full scan", full_scans, repeat))
-    show("patchwork", ground.measure_patchwork(scans, repeat))
-    show("cloth", ground.measure_cloth(full_scans, repeat))
+        add_result(f"euclidean_{threshold}", clustering.measure_euclidean(cloth_obstacles, threshold, repeat))
+    add_result("paper_c", clustering.measure_paper_c(full_scans, repeat))
+    add_result("threshold", ground.measure_threshold("Threshold, full scan", full_scans, repeat))
+    add_result("patchwork", ground.measure_patchwork(scans, repeat))
+    add_result("cloth", ground.measure_cloth(full_scans, repeat))
     return content
 
 

@@ -1,4 +1,4 @@
-"""The candidate pipeline against a plain implementation of paper A."""
+"""Comparison of the candidate pipeline with a plain implementation of paper A."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.scoring.centres.report import select_pedestrians
 
-MAX_DIFFERENCE_M = 0.02  # max distance in metres between equal boxes; two RANSAC planes differ a little
+MAX_DIFFERENCE_M = 0.02  # boxes that differ by less count as equal; the two RANSAC planes differ slightly
 
 
 def compare_candidates(frames: list[Frame], repeat: int) -> dict:
-    """Return the median times of both, and how well their results agree."""
+    """Compare the STM-CPA pipeline with its plain implementation: median times and agreement of the results."""
     our_ms: dict[str, list[float]] = {}
     plain_ms: dict[str, list[float]] = {}
     best_ms: dict[str, list[float]] = {}
@@ -36,25 +36,25 @@ def compare_candidates(frames: list[Frame], repeat: int) -> dict:
         arguments = scan.xyz, camera.projection, camera.width, camera.height, truth
         plain_results = [plain_stm_cpa.find_candidates(*arguments) for _ in range(min(repeat, 3))]
         our_results = [find_candidates(scan, make_truth_source(truth), camera, PAPER) for _ in range(repeat)]
-        _median_of_steps(plain_ms, [r["ms"] for r in plain_results])
-        _median_of_steps(our_ms, [refined.ms for _, refined in our_results])
-        _median_of_steps(
+        _append_medians(plain_ms, [r["ms"] for r in plain_results])
+        _append_medians(our_ms, [refined.ms for _, refined in our_results])
+        _append_medians(
             best_ms, [find_candidates(scan, make_truth_source(truth), camera, BEST)[1].ms for _ in range(repeat)]
         )
         result = plain_results[0]
-        # Given the same ground, the clusters and candidates must be identical.
+        # With the same ground, the clusters and candidates must be identical.
         ids = cluster_obstacles(result["points"], result["ground"], PAPER.clustering)
         agreement["labels_identical"] += np.array_equal(ids, result["labels"])
         boxes = fit_grounded_boxes(result["points"], result["ground"], ids)
         segmented = SegmentedCloud(np.arange(len(ids)), result["points"], result["ground"], ids, boxes)
         refined = refine_segmented(segmented, make_truth_source(truth), PAPER)
         agreement["candidates_same_given_ground"] += all(
-            len(getattr(refined, s)) == len(result[s]) == _count_shared(getattr(refined, s).boxes, result[s])
+            len(getattr(refined, s)) == len(result[s]) == _count_equal_boxes(getattr(refined, s).boxes, result[s])
             for s in STAGES
         )
-        # Each implementation with its own RANSAC.
+        # Here each implementation uses its own RANSAC.
         agreement["candidates"] += max(len(our_results[0][1].final), len(result["final"]))
-        agreement["candidates_same"] += _count_shared(our_results[0][1].final.boxes, result["final"])
+        agreement["candidates_same"] += _count_equal_boxes(our_results[0][1].final.boxes, result["final"])
     medians = {
         name: {k: float(np.median(v)) for k, v in steps.items()}
         for name, steps in (("ours_ms", our_ms), ("plain_ms", plain_ms), ("best_ms", best_ms))
@@ -63,14 +63,15 @@ def compare_candidates(frames: list[Frame], repeat: int) -> dict:
     return {**medians, "times_faster": ratios, "agreement": agreement}
 
 
-def _median_of_steps(times: dict[str, list[float]], runs: list[dict[str, float]]) -> None:
+def _append_medians(times: dict[str, list[float]], runs: list[dict[str, float]]) -> None:
+    """Append the median time of each step, and of their sum, over several runs on one frame."""
     for run in runs:
         run["total"] = sum(run.values())
     for step in runs[0]:
         times.setdefault(step, []).append(float(np.median([run[step] for run in runs])))
 
 
-def _count_shared(a: np.ndarray, b: np.ndarray) -> int:
+def _count_equal_boxes(a: np.ndarray, b: np.ndarray) -> int:
     """Count the boxes of `a` that differ from a box of `b` by at most MAX_DIFFERENCE_M in every value."""
     if len(a) == 0 or len(b) == 0:
         return 0
@@ -78,7 +79,7 @@ def _count_shared(a: np.ndarray, b: np.ndarray) -> int:
 
 
 def print_comparison(content: dict) -> None:
-    table = Table(title="Median ms per frame: plain implementation of the paper, and ours")
+    table = Table(title="Median ms per frame of a plain implementation of the paper, and of ours")
     for name in ("step", "plain", "ours", "times faster", "ours, best"):
         table.add_column(name, justify="left" if name == "step" else "right")
     for step, best in content["best_ms"].items():
@@ -94,9 +95,8 @@ def print_comparison(content: dict) -> None:
     console.print(table)
     agreement = content["agreement"]
     console.print(
-        f"cluster labels identical in {agreement['labels_identical']} of {agreement['frames']} "
-        "frames, border points included; candidates of all stages the same in "
-        f"{agreement['candidates_same_given_ground']} (same ground for both); with each "
-        f"its own RANSAC {agreement['candidates_same']} of {agreement['candidates']} final "
-        "candidates are the same"
+        f"with the same ground, cluster labels are identical in {agreement['labels_identical']} of "
+        f"{agreement['frames']} frames (including border points), and candidates of all stages in "
+        f"{agreement['candidates_same_given_ground']}; if each implementation uses its own RANSAC, "
+        f"{agreement['candidates_same']} of {agreement['candidates']} final candidates are equal"
     )

@@ -1,4 +1,4 @@
-"""Clustering against its peers.
+"""Comparison of our clustering with its peers.
 
 Clouds are points (N, 3) float32 without ground, unless a function says otherwise.
 """
@@ -24,10 +24,11 @@ PLAIN = "SciPy and NumPy"
 
 
 def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: float) -> dict:
-    """Measure our DBSCAN and those of peers.py, with paper A's bands.
+    """Measure our DBSCAN and those of peers.py, with paper A's range bands.
 
-    The target refers to the faster of scikit-learn's two. Labels must equal scikit-learn's, border
-    points included; for the other peers noise and the partition of the core points must be equal.
+    The target is for the faster of the two scikit-learn variants. Labels, including those of border
+    points, must be equal to scikit-learn's. For other peers, the noise and the partition of the core
+    points must be equal.
     """
     installed = [p for p in peers.DBSCANS if not p.find_problem()]
     rows = {p.name: make_row(p.name, note=p.find_problem()) for p in peers.DBSCANS}
@@ -37,9 +38,11 @@ def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: fl
         ([p for p in installed if p == peers.WHEEL], partial(run_in_child, measure_dbscans)),
     ):
         if group:
-            times, same, differ = run([peers.DBSCANS.index(p) for p in group], clouds, repeat, title)
+            times, same_counts, differ_counts = run([peers.DBSCANS.index(p) for p in group], clouds, repeat, title)
             ms |= times
-            rows |= {p.name: compute_speedup(p.name, times, None, same[p.name], differ[p.name]) for p in group}
+            rows |= {
+                p.name: compute_speedup(p.name, times, None, same_counts[p.name], differ_counts[p.name]) for p in group
+            }
     faster_peer = min((p.name for p in peers.SKLEARN), key=lambda name: ms[name])
     rows[faster_peer] = add_target(rows[faster_peer], target)
     return make_measurement(title, len(clouds), np.median([len(c) for c in clouds]), list(rows.values()))
@@ -48,11 +51,17 @@ def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: fl
 def measure_dbscans(
     indices: list[int], clouds: list[np.ndarray], repeat: int, title: str
 ) -> tuple[dict, Counter, Counter]:
-    """Measure our DBSCAN and the chosen peers.
+    """Measure our DBSCAN and some peers.
 
-    chosen are indices into peers.DBSCANS, which can be sent to a child process. Returns median
-    times, the number of clouds with equal results, and the number of points that only one of the
-    two calls noise.
+    Args:
+        indices: Indices into peers.DBSCANS. Unlike peers, they can be sent to a child process.
+        clouds: Clouds to cluster.
+        repeat: Runs per cloud.
+        title: Title of the progress bar.
+
+    Returns:
+        Median times, the number of clouds with equal results, and the number of points that are
+        noise only for the peer or only for us.
     """
     group = [peers.DBSCANS[i] for i in indices]
 
@@ -63,26 +72,26 @@ def measure_dbscans(
         }
 
     clock = Clock(repeat, make_calls(thin_cloud(clouds[0])))
-    same: Counter[str] = Counter()
-    differ: Counter[str] = Counter()
+    same_counts: Counter[str] = Counter()
+    differ_counts: Counter[str] = Counter()
     for xyz in show_progress(clouds, title, len(clouds)):
         results = clock.time(make_calls(xyz))
         our_labels, is_core = results["ours"], find_core_points(xyz)
         for p in group:
             peer_labels = results[p.name]
-            same[p.name] += (
+            same_counts[p.name] += (
                 np.array_equal(peer_labels, our_labels)
                 if p in peers.SKLEARN
                 else have_same_clusters(peer_labels, our_labels, is_core)
             )
-            differ[p.name] += int(((peer_labels == 0) != (our_labels == 0)).sum())
-    return clock.compute_medians(), same, differ
+            differ_counts[p.name] += int(((peer_labels == 0) != (our_labels == 0)).sum())
+    return clock.compute_medians(), same_counts, differ_counts
 
 
 def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> dict:
     """Measure our Euclidean clustering and plain_euclidean.
 
-    The peer takes seconds with the local threshold, so it runs on half of the frames.
+    With the local threshold plain_euclidean takes seconds, so only half of the clouds are used.
     """
     params = EuclideanParams(threshold=threshold)
     if threshold == "local":
@@ -95,11 +104,11 @@ def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> 
         }
 
     title = f"Adaptive Euclidean, {threshold} threshold, full scan"
-    clock, same = Clock(repeat, make_calls(thin_cloud(clouds[0]))), 0
+    clock, same_count = Clock(repeat, make_calls(thin_cloud(clouds[0]))), 0
     for xyz in show_progress(clouds, title, len(clouds)):
         results = clock.time(make_calls(xyz))
-        same += have_same_clusters(results[PLAIN], results["ours"], results["ours"] > 0)
-    rows = [compute_speedup(PLAIN, clock.compute_medians(), 3, same)]
+        same_count += have_same_clusters(results[PLAIN], results["ours"], results["ours"] > 0)
+    rows = [compute_speedup(PLAIN, clock.compute_medians(), 3, same_count)]
     return make_measurement(title, len(clouds), np.median([len(c) for c in clouds]), rows)
 
 
@@ -107,8 +116,8 @@ def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
     """Measure paper C's segmentation of full scans: cloth, then Euclidean clustering."""
 
     def segment(xyz, threshold):
-        rest = xyz.compress(~segment_by_cloth(xyz), axis=0)
-        return cluster_euclidean(rest, EuclideanParams(threshold=threshold))
+        obstacles = xyz.compress(~segment_by_cloth(xyz), axis=0)
+        return cluster_euclidean(obstacles, EuclideanParams(threshold=threshold))
 
     def make_calls(xyz):
         return {"cloth": partial(segment_by_cloth, xyz), **{t: partial(segment, xyz, t) for t in ("global", "local")}}
@@ -123,7 +132,7 @@ def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
 
 
 def find_core_points(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
-    """Return the mask (N,) of points with min_samples points of their band within its eps."""
+    """Return the mask (N,) of points that have at least min_samples points of their range band within eps."""
 
     def label_core_points(band, eps, min_samples):
         tree = cKDTree(band.astype(np.float64))
@@ -134,7 +143,7 @@ def find_core_points(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> 
 
 
 def have_same_clusters(a: np.ndarray, b: np.ndarray, is_core: np.ndarray) -> bool:
-    """Return True if labels a and b (N,) have equal noise (0) and partition core points equally."""
+    """Return True if labels a and b (N,) have the same noise points (0) and partition the core points equally."""
     if not np.array_equal(a == 0, b == 0):
         return False
     pairs = np.unique(np.stack([a[is_core], b[is_core]]), axis=1)

@@ -1,7 +1,4 @@
-"""Time of each step of every version and size of EG-PointPillars on this machine's device.
-
-The sparse engine is also compared with torch on the CPU.
-"""
+"""Timing of each step of every version and size of EG-PointPillars, and of the sparse engine against torch."""
 
 from __future__ import annotations
 
@@ -34,16 +31,16 @@ from lidar_perception.runs.threads import get_thread_count, set_thread_count
 from lidar_perception.types import PointCloud
 
 PAPER_TO_V0 = {"v0": 1.0, "v1": 1.06, "v2": 1.86, "v3": 2.48, "v4": 3.54}  # time relative to V0 in paper B, RTX 4090
-MAX_V4_TO_V0 = 1.6  # target: V4 takes less than this factor times V0
-CANDIDATES = 200  # anchors above the threshold, typical of a street
-MAX_SLOW_SCANS = 3  # scans for the full network on a CPU, which takes half a second per frame
+MAX_V4_TO_V0 = 1.6  # target: maximum ratio of the times of V4 and V0
+ANCHORS_ABOVE_THRESHOLD = 200  # typical of a street
+MAX_SLOW_SCANS = 3  # number of scans for the full network on a CPU, which takes half a second per scan
 
 
 def measure_detection(scans: list[PointCloud], repeat: int, sizes: Sequence[str] = tuple(SIZES)) -> dict:
-    """Measure the median time of each step over full scans, versions in turn, all in torch.
+    """Measure the median time of each step over full scans, for all versions alternately, with torch.
 
-    Weights are random: time depends on them only through the number of anchors above the
-    thresholds, which let CANDIDATES anchors pass.
+    The weights are random. They affect the time only through the number of anchors above the
+    threshold, so the threshold is set to have ANCHORS_ABOVE_THRESHOLD of them.
     """
     device = find_device()
     device_name = torch.cuda.get_device_name(device) if device != CPU else read_cpu_name()
@@ -68,22 +65,22 @@ def _compute_medians(
             for version, detector in detectors.items():
                 timings = detector(scan).timings
                 ms[version][i, j] = [timings[step] for step in STEPS]
-    figures_by_version: dict[str, dict] = {}
+    results_by_version: dict[str, dict] = {}
     for version, runs in ms.items():
         steps = np.median(np.median(runs, axis=1), axis=0)
         total = float(np.median(np.median(runs.sum(axis=2), axis=1)))
-        figures_by_version[version] = {
+        results_by_version[version] = {
             "ms": dict(zip(STEPS, steps.tolist())),
             "total_ms": total,
             "share": dict(zip(STEPS, (steps / steps.sum()).tolist())),
-            "to_v0": total / figures_by_version["v0"]["total_ms"] if figures_by_version else 1.0,
+            "to_v0": total / results_by_version["v0"]["total_ms"] if results_by_version else 1.0,
             "paper_to_v0": PAPER_TO_V0[version],
         }
-    return figures_by_version
+    return results_by_version
 
 
 class RecordingNetwork:
-    """A network that keeps its last logits (A, K)."""
+    """A network that stores its last logits (A, K)."""
 
     has_fixed_range = True
 
@@ -102,7 +99,7 @@ class RecordingNetwork:
 
 
 def _make_detector(version: str, size: str, device: str, scan: PointCloud) -> PointPillarsDetector:
-    """Return a warmed-up detector whose thresholds CANDIDATES anchors of this scan pass."""
+    """Return a warmed-up detector whose threshold is exceeded by ANCHORS_ABOVE_THRESHOLD anchors in this scan."""
     config = make_config(version, size)
     torch.manual_seed(0)
     recording = RecordingNetwork(TorchNetwork(make_network(config).eval(), device))
@@ -111,7 +108,7 @@ def _make_detector(version: str, size: str, device: str, scan: PointCloud) -> Po
     detector(scan)
     assert recording.logits is not None
     scores = np.sort(expit(recording.logits.max(axis=1)))
-    threshold = float(scores[-min(CANDIDATES, len(scores))])
+    threshold = float(scores[-min(ANCHORS_ABOVE_THRESHOLD, len(scores))])
     detector = detector.with_min_score(threshold)
     detector.proposer.network = recording.network
     detector(scan)
@@ -119,38 +116,39 @@ def _make_detector(version: str, size: str, device: str, scan: PointCloud) -> Po
 
 
 def print_detection(content: dict) -> None:
-    """Print a table for each size, with the share of each step."""
-    for size, figures in content["sizes"].items():
+    """Print a table for each size, with the time of each step and its fraction of the total."""
+    for size, results in content["sizes"].items():
         table = Table(
-            title=f"EG-PointPillars {size}, ms a frame ({figures['frames']} scans, "
-            f"{figures['points']:.0f} points) on {content['device']}, "
+            title=f"EG-PointPillars {size}, ms per frame ({results['frames']} scans, "
+            f"{results['points']:.0f} points) on {content['device']}, "
             f"{content['threads']} CPU threads, random weights"
         )
         for name in ("version", *STEPS, "total", "to v0", "paper's"):
             table.add_column(name, justify="left" if name == "version" else "right")
-        for version, version_figures in figures["versions"].items():
+        for version, version_results in results["versions"].items():
             table.add_row(
                 version,
                 *(
-                    f"{version_figures['ms'][step]:.1f} ({100 * version_figures['share'][step]:.0f} %)"
+                    f"{version_results['ms'][step]:.1f} ({100 * version_results['share'][step]:.0f} %)"
                     for step in STEPS
                 ),
-                f"{version_figures['total_ms']:.1f}",
-                f"{version_figures['to_v0']:.2f}",
-                f"{version_figures['paper_to_v0']:.2f}",
+                f"{version_results['total_ms']:.1f}",
+                f"{version_results['to_v0']:.2f}",
+                f"{version_results['paper_to_v0']:.2f}",
             )
         console.print(table)
-        ratio = figures["versions"]["v4"]["to_v0"]
+        ratio = results["versions"]["v4"]["to_v0"]
         console.print(
-            f"v4 takes {ratio:.2f} of the time of v0, target < {MAX_V4_TO_V0}: "
+            f"v4 takes {ratio:.2f} times as long as v0, target < {MAX_V4_TO_V0}: "
             + ("met" if ratio < MAX_V4_TO_V0 else "not met")
         )
 
 
 def measure_engines(scans: list[PointCloud], repeat: int, detectors: Sequence[str] = (POINTPILLARS, FUSED)) -> dict:
-    """Compare the engines torch and sparse of PointPillars with the shipped weights.
+    """Compare PointPillars' engines torch and sparse with the shipped weights.
 
-    Median CPU time of one thread, in turn. `same` counts scans with equal detections.
+    Measures the median CPU time with one thread. `same` is the number of scans with equal
+    detections.
     """
     threads = get_thread_count()
     set_thread_count(1)
@@ -163,22 +161,22 @@ def measure_engines(scans: list[PointCloud], repeat: int, detectors: Sequence[st
                 )
                 for name, engine in (("torch", "torch"), ("ours", "sparse"))
             }
-            name, same = f"{weights} {range_name}, engine torch", 0
+            name, same_count = f"{weights} {range_name}, engine torch", 0
             clock = Clock(repeat, {}, process_time)
             for scan in show_progress(scans, name, len(scans)):
-                results = clock.time({each: partial(detector, scan) for each, detector in engines.items()})
-                same += _have_same_detections(results["torch"], results["ours"])
+                results = clock.time({engine: partial(detector, scan) for engine, detector in engines.items()})
+                same_count += _have_same_detections(results["torch"], results["ours"])
             ms = clock.compute_medians()
-            rows.append(compute_speedup(name, {name: ms["torch"], "ours": ms["ours"]}, same=same))
+            rows.append(compute_speedup(name, {name: ms["torch"], "ours": ms["ours"]}, same=same_count))
     set_thread_count(threads)
     title = f"Sparse engine, CPU ms of one thread at a load of {os.getloadavg()[0]:.1f}"
     return make_measurement(title, len(scans), np.median([len(scan) for scan in scans]), rows)
 
 
-def _have_same_detections(a: DetectionResult, b: DetectionResult) -> bool:
-    a_, b_ = a.detections, b.detections
+def _have_same_detections(first: DetectionResult, second: DetectionResult) -> bool:
+    a, b = first.detections, second.detections
     return bool(
-        np.array_equal(a_.class_ids, b_.class_ids)
-        and np.allclose(a_.boxes, b_.boxes, rtol=0, atol=1e-4)
-        and np.allclose(a_.scores, b_.scores, rtol=0, atol=1e-5)
+        np.array_equal(a.class_ids, b.class_ids)
+        and np.allclose(a.boxes, b.boxes, rtol=0, atol=1e-4)
+        and np.allclose(a.scores, b.scores, rtol=0, atol=1e-5)
     )

@@ -1,9 +1,9 @@
-"""Our tracker and AB3DMOT on simulated drives that were not used to tune parameters, with intervals.
+"""Comparison of our tracker with AB3DMOT on simulated drives that were not used for tuning, with intervals.
 
     python -m benchmark.drives --drives 20 --seconds 20 --cache folder --json tracks.json
 
-Detections are computed once and kept in --cache: simulation and networks take a second per frame,
-the trackers milliseconds.
+Detections are computed once and stored in --cache, because simulation and networks take a second per
+frame, but the trackers only milliseconds.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Counts = dict[str, tuple[HotaCounts, ClearCounts]]
 
 
 def detect(street: int, frames: int, people: float) -> Drive:
-    """Detect in the first scans of a street with each detector, weak detections included."""
+    """Run each detector on the first scans of a street. The result includes detections with low scores."""
     params = with_values(BEST, {"seed.source": "automatic"})
     detectors: dict[str, Detector] = {
         "candidates": CandidateDetector(make_automatic_source(load_seeds(), params), FORWARD_CAMERA.camera(), params),
@@ -63,33 +63,33 @@ def detect(street: int, frames: int, people: float) -> Drive:
     drive = []
     for i in range(frames):
         scan = simulate_scan(street, i, HDL64E, Scenes(None, people))
-        detections = {name: _detect_street(detector, scan.frame) for name, detector in detectors.items()}
+        detections = {name: _detect_in_scan(detector, scan.frame) for name, detector in detectors.items()}
         drive.append(
             (TrackedFrame(Detections.none(), make_kitti_labels(scan.truth), scan.frame.stamp_ns, scan.pose), detections)
         )
     return drive
 
 
-def _detect_street(detector: Detector, frame) -> Detections:
+def _detect_in_scan(detector: Detector, cloud) -> Detections:
     try:
-        return detector(frame).detections
-    except InputError:  # the frame has no seed
+        return detector(cloud).detections
+    except InputError:  # STM-CPA found no seed
         return Detections.none()
 
 
 def load_detections(folder: Path, street: int, frames: int, people: float) -> Drive:
-    """Load the result of detect() from a folder; compute and save it there if it is missing."""
+    """Load the result of detect() from a folder. If it is missing, compute it and save it there."""
     file = folder / f"{street}_{frames}_{people:g}.pkl"
     if not file.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        part = file.with_suffix(".part")
-        part.write_bytes(pickle.dumps(detect(street, frames, people)))
-        part.rename(file)
+        temporary_file = file.with_suffix(".part")
+        temporary_file.write_bytes(pickle.dumps(detect(street, frames, people)))
+        temporary_file.rename(file)
     return pickle.loads(file.read_bytes())
 
 
 def count_tracks(drive: list[TrackedFrame], step: Step, classes: tuple[str, ...]) -> Counts:
-    """Count the tracks of a drive by class."""
+    """Compute the HOTA and CLEAR counts of a tracker on a drive by class."""
     frames = []
     for frame in drive:
         ids, detections = step(frame)
@@ -102,18 +102,23 @@ def count_tracks(drive: list[TrackedFrame], step: Step, classes: tuple[str, ...]
 def measure_drives(drives: list[Drive], detector: str, params: TrackingParams) -> dict:
     """Return the scores of both trackers with intervals, by class."""
     classes, min_score = DETECTORS[detector]
-    selected = [[replace(seen, found=found[detector]) for seen, found in drive] for drive in drives]
-    peers = [count_tracks(drive, make_peer_step(PlainAb3dmot(), min_score), classes) for drive in selected]
-    ours = [count_tracks(drive, make_tracker_step(params), classes) for drive in selected]
-    return {name: _compare_scores([p[name] for p in peers], [o[name] for o in ours]) for name in classes}
+    tracked_drives = [
+        [replace(frame, detections=detections[detector]) for frame, detections in drive] for drive in drives
+    ]
+    peer_counts = [count_tracks(drive, make_peer_step(PlainAb3dmot(), min_score), classes) for drive in tracked_drives]
+    our_counts = [count_tracks(drive, make_tracker_step(params), classes) for drive in tracked_drives]
+    return {
+        name: _compare_scores([counts[name] for counts in peer_counts], [counts[name] for counts in our_counts])
+        for name in classes
+    }
 
 
-def _compare_scores(peers: list[tuple], ours: list[tuple]) -> dict:
-    labels = [clear.tp + clear.fn for _, clear in ours]
+def _compare_scores(peer_counts: list[tuple], our_counts: list[tuple]) -> dict:
+    label_counts = [clear.tp + clear.fn for _, clear in our_counts]
     scores = {}
-    for name, drive_counts in ("peer", peers), ("ours", ours):
+    for name, drive_counts in ("peer", peer_counts), ("ours", our_counts):
         clear = sum((c for _, c in drive_counts), ClearCounts())
-        hota = resample(drive_counts, lambda drawn: sum((h for h, _ in drawn), HotaCounts()).compute_scores()["HOTA"])
+        hota = resample(drive_counts, lambda sample: sum((h for h, _ in sample), HotaCounts()).compute_scores()["HOTA"])
         scores[name] = {
             **sum((h for h, _ in drive_counts), HotaCounts()).compute_scores(),
             **clear.compute_scores(),
@@ -126,20 +131,20 @@ def _compare_scores(peers: list[tuple], ours: list[tuple]) -> dict:
         scores[name]["values"] = hota
     difference = np.subtract(scores["ours"].pop("values"), scores["peer"].pop("values"))
     return {
-        "labels": sum(labels),
+        "labels": sum(label_counts),
         **scores,
         "gain": scores["ours"]["HOTA"] - scores["peer"]["HOTA"],
         "gain_interval": _compute_interval(difference),
     }
 
 
-def resample(drives: list, value: Callable[[list], float]) -> np.ndarray:
-    """Return values (RESAMPLE_COUNT,) over drives drawn with replacement.
+def resample(drives: list, compute: Callable[[list], float]) -> np.ndarray:
+    """Compute a value (RESAMPLE_COUNT,) for each of many samples of the drives, drawn with replacement.
 
-    The draws are the same for the same number of drives, so differences are paired.
+    Equal numbers of drives are sampled in the same way, so that differences are paired.
     """
-    draws = np.random.default_rng(0).integers(0, len(drives), (RESAMPLE_COUNT, len(drives)))
-    return np.array([value([drives[i] for i in draw]) for draw in draws])
+    samples = np.random.default_rng(0).integers(0, len(drives), (RESAMPLE_COUNT, len(drives)))
+    return np.array([compute([drives[i] for i in sample]) for sample in samples])
 
 
 def _compute_interval(values: np.ndarray) -> list[float]:
@@ -147,23 +152,24 @@ def _compute_interval(values: np.ndarray) -> list[float]:
 
 
 def print_drives(content: dict) -> None:
-    """Print a row per detector and class: the peer, then ours, in percent."""
+    """Print a row per detector and class, with the peer's value followed by ours, in percent."""
     table = Table(title=f"{content['drives']} drives of {content['seconds']:g} s")
     for name in "detector", "class", "boxes", "HOTA", "gain", "switches", "precision", "recall":
         table.add_column(name)
     for detector, classes in content["detectors"].items():
         for name, scores in classes.items():
-            pair = [
+            hota, precision, recall = (
                 f"{100 * scores['peer'][k]:.1f}, {100 * scores['ours'][k]:.1f}" for k in ("HOTA", "precision", "recall")
-            ]
+            )
             table.add_row(
                 detector,
                 name,
                 str(scores["labels"]),
-                pair[0],
+                hota,
                 f"{100 * scores['gain']:+.1f} [{_format_interval(scores['gain_interval'])}]",
                 f"{scores['peer']['switches']}, {scores['ours']['switches']}",
-                *pair[1:],
+                precision,
+                recall,
             )
     console.print(table)
 

@@ -1,4 +1,4 @@
-"""The graph of nodes over DDS: latency, CPU time and memory."""
+"""Latency, CPU time and memory of the graph of nodes over DDS."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ RUNS: dict[str, tuple[dict[str, Any], int]] = {  # name -> (arguments of replay(
 def measure_graph(recording: Recording) -> dict[str, dict]:
     """Replay a recording at 10 Hz through the graphs of RUNS, one after the other.
 
-    No cloud is lost: a graph that cannot keep up gets its clouds later, see `speed`.
+    No cloud is lost: the replay waits for a graph that cannot keep up, see `speed`.
 
     Returns:
-        {graph: clouds, results, speed (1 = real time), latency_ms, cpu_ms (CPU time of all
-        processes per cloud), memory_mb, and the load average before the run}
+        For each graph clouds, results, speed (1 = real time), latency_ms, stage_ms, cpu_ms (CPU time
+        of all processes per cloud), memory_mb, and load (load average before the run).
     """
     from lidar_perception.nodes.replay.graph_replay import replay
 
@@ -65,11 +65,11 @@ def measure_graph(recording: Recording) -> dict[str, dict]:
 @contextmanager
 def run_busy_processes(count: int) -> Iterator[None]:
     """Run `count` processes that each keep one core busy."""
-    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    processes = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
     try:
         yield
     finally:
-        for process in others:
+        for process in processes:
             process.kill()
             process.wait()
 

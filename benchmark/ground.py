@@ -1,4 +1,4 @@
-"""Ground segmentation against its peers."""
+"""Comparison of our ground segmentation with its peers."""
 
 from __future__ import annotations
 
@@ -21,18 +21,17 @@ from lidar_perception.scoring.points.segmentation import PROTOCOLS, GroundReport
 from lidar_perception.types import SENSOR_HEIGHT, PointCloud
 
 PARAMS = GroundParams()
-# Upper limit of the points that both implementations fit a plane to.
-MAX_Z = PARAMS.threshold.max_height - SENSOR_HEIGHT
+MAX_Z = PARAMS.threshold.max_height - SENSOR_HEIGHT  # both implementations fit a plane to the points below this
 
 
 def measure_threshold(title: str, clouds: list[np.ndarray], repeat: int) -> dict:
-    """Measure our plane fit and scikit-learn's RANSAC on points (N, 3) below paper A's z < -1.3."""
+    """Measure our plane fit and scikit-learn's RANSAC on the low points of clouds (N, 3), as in paper A."""
     peer, points = peers.RANSAC, np.median([len(c) for c in clouds])
     if peer.find_problem():
         return make_measurement(title, len(clouds), points, [make_row(peer.name, note=peer.find_problem())])
 
     def make_calls(xyz):
-        # Selecting the low points is part of the measured time, as in ours.
+        # The time includes the selection of the low points, like ours.
         return {peer.name: lambda: peer.run(xyz, xyz[:, 2] < MAX_Z), "ours": partial(segment_by_threshold, xyz)}
 
     clock = Clock(repeat, make_calls(thin_cloud(clouds[0])))
@@ -42,7 +41,7 @@ def measure_threshold(title: str, clouds: list[np.ndarray], repeat: int) -> dict
 
 
 def measure_patchwork(frames: list[PointCloud], repeat: int) -> dict:
-    """Measure ours and the bare library on an existing array, with a new object per cloud."""
+    """Measure our Patchwork++ and the library, which gets a ready array and uses a new object per cloud."""
     title, name = "Patchwork++, full scan", peers.PATCHWORK.name
     points = np.median([len(f) for f in frames])
     if peers.PATCHWORK.find_problem():
@@ -54,15 +53,15 @@ def measure_patchwork(frames: list[PointCloud], repeat: int) -> dict:
             "ours": partial(segment_by_patchwork, frame.xyz, frame.intensity, SENSOR_HEIGHT),
         }
 
-    same = differ = 0
+    same_count = differ_count = 0
     with peers.silence_stdout():
         clock = Clock(repeat, make_calls(frames[0], frames[0].points()))
         for frame in show_progress(frames, title, len(frames)):
             masks = clock.time(make_calls(frame, frame.points()))
-            different = int((_to_mask(masks[name], len(frame)) != masks["ours"]).sum())
-            same, differ = same + (different == 0), differ + different
+            difference = int((_to_mask(masks[name], len(frame)) != masks["ours"]).sum())
+            same_count, differ_count = same_count + (difference == 0), differ_count + difference
     return make_measurement(
-        title, len(frames), points, [compute_speedup(name, clock.compute_medians(), 1.3, same, differ)]
+        title, len(frames), points, [compute_speedup(name, clock.compute_medians(), 1.3, same_count, differ_count)]
     )
 
 
@@ -73,9 +72,10 @@ def _to_mask(indices, count: int) -> np.ndarray:
 
 
 def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
-    """Measure our cloth and the wheel's, of equal resolution, on points within max_range.
+    """Measure our cloth and the peer's with the same resolution, on the points within max_range.
 
-    The wheel's time excludes its float64 array and the mask from its indices.
+    The peer's time does not include the conversions of its input to float64 and of its result to a
+    mask.
     """
     title, name = "Cloth, full scan", peers.CLOTH.name
     scans = [_crop_to_max_range(xyz) for xyz in scans]
@@ -83,8 +83,8 @@ def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
     if peers.CLOTH.find_problem():
         return make_measurement(title, len(scans), points, [make_row(name, note=peers.CLOTH.find_problem())])
 
-    def make_calls(xyz, precise):
-        return {name: partial(peers.CLOTH.run, precise), "ours": partial(segment_by_cloth, xyz)}
+    def make_calls(xyz, xyz_float64):
+        return {name: partial(peers.CLOTH.run, xyz_float64), "ours": partial(segment_by_cloth, xyz)}
 
     with peers.silence_stdout():
         clock = Clock(min(repeat, SLOW_REPEAT), make_calls(*_add_float64(thin_cloud(scans[0]))))
@@ -102,29 +102,29 @@ def _crop_to_max_range(xyz: np.ndarray, params: ClothParams = PARAMS.cloth) -> n
 
 
 def measure_labelled(frames: list[Frame], repeat: int) -> dict:
-    """Measure precision, recall and F1 of our three methods and the wheel's cloth by protocol."""
-    missing = {"patchwork": peers.PATCHWORK.find_problem(), peers.CLOTH.name: peers.CLOTH.find_problem()}
+    """Measure precision, recall and F1 of our three methods and of the peer's cloth by protocol."""
+    problems = {"patchwork": peers.PATCHWORK.find_problem(), peers.CLOTH.name: peers.CLOTH.find_problem()}
     methods: dict[str, Callable] = {
         **{name: partial(_segment_with_ours, name) for name in METHODS},
-        peers.CLOTH.name: _segment_with_wheel,
+        peers.CLOTH.name: _segment_with_peer_cloth,
     }
-    reports = {name: GroundReport() for name in methods if not missing.get(name)}
+    reports = {name: GroundReport() for name in methods if not problems.get(name)}
 
-    def make_calls(frame):
-        return {name: partial(methods[name], frame) for name in reports}
+    def make_calls(cloud):
+        return {name: partial(methods[name], cloud) for name in reports}
 
     with peers.silence_stdout():
         clock = None
-        for item in show_progress(frames, "ground of labelled scans", len(frames)):
-            frame, semantic = item.load(), item.point_truth().classes
-            clock = clock or Clock(min(repeat, SLOW_REPEAT), make_calls(frame))
-            for name, mask in clock.time(make_calls(frame)).items():
-                counts = count_by_protocol(mask, semantic, frame.xyz[:, 2])
+        for frame in show_progress(frames, "ground of labelled scans", len(frames)):
+            cloud, point_classes = frame.load(), frame.point_truth().classes
+            clock = clock or Clock(min(repeat, SLOW_REPEAT), make_calls(cloud))
+            for name, mask in clock.time(make_calls(cloud)).items():
+                counts = count_by_protocol(mask, point_classes, cloud.xyz[:, 2])
                 reports[name].update(counts, clock.ms[name][-1])
     return {
         "scans": len(frames),
         "protocols": list(PROTOCOLS),
-        "methods": {name: reports[name].compute() if name in reports else {"note": missing[name]} for name in methods},
+        "methods": {name: reports[name].compute() if name in reports else {"note": problems[name]} for name in methods},
     }
 
 
@@ -132,7 +132,7 @@ def _segment_with_ours(name: str, frame: PointCloud) -> np.ndarray:
     return METHODS[name](frame.xyz, frame.intensity, PARAMS)
 
 
-def _segment_with_wheel(frame: PointCloud) -> np.ndarray:
-    inside = np.flatnonzero((np.abs(frame.xyz[:, :2]) <= PARAMS.cloth.max_range).all(axis=1))
-    ground = peers.CLOTH.run(frame.xyz[inside].astype(np.float64))
-    return _to_mask(inside[np.asarray(ground, np.int64)], len(frame))
+def _segment_with_peer_cloth(cloud: PointCloud) -> np.ndarray:
+    indices = np.flatnonzero((np.abs(cloud.xyz[:, :2]) <= PARAMS.cloth.max_range).all(axis=1))
+    ground = peers.CLOTH.run(cloud.xyz[indices].astype(np.float64))
+    return _to_mask(indices[np.asarray(ground, np.int64)], len(cloud))

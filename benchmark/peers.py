@@ -1,4 +1,4 @@
-"""Peers from other packages, some of which may not be installed."""
+"""Peers: implementations in other packages, some of which may not be installed."""
 
 from __future__ import annotations
 
@@ -21,8 +21,11 @@ from lidar_perception.ground.params import ClothParams, PatchworkParams
 class Peer:
     """An algorithm of another package.
 
-    package: name on PyPI.
-    run: the algorithm, with the signature stated above its section of this module.
+    Attributes:
+        name: Name in tables.
+        package: Name on PyPI.
+        module: Name of the module to import.
+        run: The algorithm, with the signature in the comment above its section of this module.
     """
 
     name: str
@@ -74,13 +77,13 @@ SKLEARN = (
     Peer("sklearn, n_jobs=-1", "scikit-learn", "sklearn", _make_sklearn_dbscan(-1)),
 )
 OPEN3D = Peer("Open3D", "open3d", "open3d", _run_open3d_dbscan)
-# Its threads keep polling after the call and use a quarter of a core until the process ends.
+# Runs in a process of its own: its threads poll after the call and use a quarter of a core until the process ends.
 WHEEL = Peer("dbscan", "dbscan", "dbscan", _run_dbscan_wheel)
 DBSCANS = (*SKLEARN, WHEEL, OPEN3D)
 
 
 def cluster_by_bands(run: Callable, xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
-    """Cluster each band with a DBSCAN. Return labels (N,) as distance_aware_dbscan does, 0 = noise."""
+    """Cluster each range band with a DBSCAN. Return labels (N,) as distance_aware_dbscan does; 0 is noise."""
     band = np.searchsorted(np.asarray(params.range_limits), horizontal_range(xyz), side="right")
     labels, max_label = np.zeros(len(xyz), np.int32), 0
     for i, eps in enumerate(params.eps):
@@ -109,25 +112,25 @@ def _run_ransac(xyz: np.ndarray, low: np.ndarray) -> np.ndarray:
 RANSAC = Peer("scikit-learn's RANSAC", "scikit-learn", "sklearn", _run_ransac)
 
 
-# Ground segmentation. Both libraries print on file descriptor 1.
+# Ground segmentation. Both libraries print to file descriptor 1.
 
 
 @contextmanager
 def silence_stdout() -> Iterator[None]:
-    """Discard output to file descriptor 1, to which C++ libraries write without sys.stdout."""
+    """Discard output to file descriptor 1, to which C++ libraries write directly."""
     sys.stdout.flush()
-    saved, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    stdout_copy, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(null, 1)
         yield
     finally:
-        os.dup2(saved, 1)
-        os.close(saved)
+        os.dup2(stdout_copy, 1)
+        os.close(stdout_copy)
         os.close(null)
 
 
 def _run_patchwork(points: np.ndarray, sensor_height: float, params: PatchworkParams = PatchworkParams()) -> np.ndarray:
-    """Return the indices of the ground among points (N, 4) float32, with a new object."""
+    """Return the indices of the ground among points (N, 4) float32. Makes a new object for each call."""
     import pypatchworkpp
 
     settings = pypatchworkpp.Parameters()
@@ -142,9 +145,9 @@ def _run_patchwork(points: np.ndarray, sensor_height: float, params: PatchworkPa
 
 
 def _run_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()):
-    """Return the indices of the ground among points (N, 3) float64, in the wheel's own type.
+    """Return the indices of the ground among points (N, 3) float64, as a vector of the library.
 
-    Points must not be far away: the wheel aborts the process if the grid does not fit into memory.
+    Points must not be far away: the library aborts the process if its grid does not fit into memory.
     Rigidness 3 and 500 iterations are its defaults.
     """
     import CSF

@@ -1,8 +1,8 @@
-"""A plain implementation of AB3DMOT (Weng et al., IROS 2020), the peer of our tracker.
+"""Plain implementation of AB3DMOT (Weng et al., IROS 2020), to compare our tracker with.
 
-One constant-velocity Kalman filter per box, Hungarian assignment by centre distance, birth after 3
-hits, death after 2 misses, classes separate. Numbers are the authors' for KITTI (covariances, gates
-of 6 m, 1 m for pedestrians). It shares only the types with our code.
+It has one constant-velocity Kalman filter per box and Hungarian assignment by centre distance. Tracks
+start after 3 hits and end after 2 misses. Classes are tracked separately. Covariances and gates are
+the authors' values for KITTI. It shares only the types with our code.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ MIN_HITS, MAX_AGE = 3, 2
 GATES = {"Car": 6.0, "Pedestrian": 1.0, "Cyclist": 6.0}
 OTHER_GATE = 6.0
 
-# State: x y z yaw l w h, and the change of x y z per frame.
+# The state is x y z yaw l w h, and the change of x y z per frame.
 TRANSITION = np.eye(10)
 TRANSITION[:3, 7:] = np.eye(3)
 MEASUREMENT = np.eye(7, 10)
@@ -40,12 +40,12 @@ class _Track:
         self.covariance = TRANSITION @ self.covariance @ TRANSITION.T + PROCESS_NOISE
         self.age += 1
 
-    def update(self, measured: np.ndarray, score: float) -> None:
-        yaw_change = (measured[3] - self.state[3] + np.pi) % (2 * np.pi) - np.pi
+    def update(self, measurement: np.ndarray, score: float) -> None:
+        yaw_change = (measurement[3] - self.state[3] + np.pi) % (2 * np.pi) - np.pi
         if abs(yaw_change) > np.pi / 2:  # the detector confused front and back
             self.state[3] += np.pi
             yaw_change -= np.sign(yaw_change) * np.pi
-        difference = measured - self.state[:7]
+        difference = measurement - self.state[:7]
         difference[3] = yaw_change
         gain = (
             self.covariance @ MEASUREMENT.T @ np.linalg.inv(MEASUREMENT @ self.covariance @ MEASUREMENT.T + np.eye(7))
@@ -56,7 +56,7 @@ class _Track:
 
 
 class PlainAb3dmot:
-    """Tracker from detections and the sensor pose (4, 4) to ids (K,) and Detections."""
+    """Tracker. A call with detections and the sensor pose (4, 4) returns ids (K,) and Detections."""
 
     def __init__(self) -> None:
         self.tracks: dict[int, list[_Track]] = {}

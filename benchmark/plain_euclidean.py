@@ -1,6 +1,6 @@
-"""A plain implementation of paper C's adaptive Euclidean clustering with SciPy and NumPy.
+"""Plain implementation of paper C's adaptive Euclidean clustering with SciPy and NumPy.
 
-It is the peer of lidar_perception.clustering.euclidean, whose docstring has the definition and the
+It is compared with lidar_perception.clustering.euclidean, whose docstring has the definition and the
 equations. It shares only the parameters with our code.
 """
 
@@ -19,7 +19,7 @@ MAX_NEIGHBOURS = 4_000_000  # maximum number of neighbours held in memory: about
 
 
 def cluster_euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams()) -> np.ndarray:
-    """Cluster points (N, 3) float32, metres, as (N,) int32: 0 none, 1..K."""
+    """Cluster points (N, 3) float32, metres. Return (N,) int32 ids: 0 for no cluster, 1 to K for clusters."""
     if len(xyz) == 0:
         return np.zeros(0, np.int32)
     tree = cKDTree(np.asarray(xyz, np.float32).astype(np.float64))
@@ -39,17 +39,17 @@ def _compute_thresholds(tree: cKDTree, params: EuclideanParams) -> np.ndarray:
     else:
         total, count = np.zeros(tree.n), np.zeros(tree.n, np.int64)
         for i, j, squared in _find_neighbours(tree, np.ones(tree.n, bool), params.radius):
-            other = (i != j) & (squared <= params.radius * params.radius)
-            total += np.bincount(i[other], np.sqrt(squared[other]), tree.n)
-            count += np.bincount(i[other], minlength=tree.n)
+            is_neighbour = (i != j) & (squared <= params.radius * params.radius)
+            total += np.bincount(i[is_neighbour], np.sqrt(squared[is_neighbour]), tree.n)
+            count += np.bincount(i[is_neighbour], minlength=tree.n)
         mean = total / np.maximum(count, 1)
     return (params.alpha * mean).astype(np.float32).astype(np.float64)
 
 
 def _find_neighbours(tree: cKDTree, selected: np.ndarray, radius: float) -> Iterator[tuple]:
-    """Return rows of the wanted points, rows of points within radius of them, squared distances.
+    """Yield pairs of neighbours: indices of selected points, indices of points near them, squared distances.
 
-    A few more points at the border are included. The search runs in parts to bound memory.
+    Some pairs are slightly farther apart than the radius. The search runs in parts to limit memory.
     """
     rows = tree.indices[selected[tree.indices]]  # in tree order, so that each part is spatially compact
     if len(rows) == 0:
@@ -65,7 +65,7 @@ def _find_neighbours(tree: cKDTree, selected: np.ndarray, radius: float) -> Iter
 
 
 def _connect_leaders(tree: cKDTree, thresholds: np.ndarray, is_leader: np.ndarray) -> np.ndarray:
-    """Return the component (N,) of each leader (Eq. 8); followers are separate."""
+    """Return the component (N,) of each leader (Eq. 8). Each follower is a component of its own."""
     component = np.arange(tree.n)
     for i, j, squared in _find_neighbours(tree, is_leader, thresholds[is_leader].max(initial=0.0)):
         is_linked = is_leader[j] & (squared <= thresholds[i] ** 2)
@@ -91,17 +91,17 @@ def _assign_followers(
 
 
 def _number_clusters(component: np.ndarray, min_size: int = 1) -> np.ndarray:
-    """Number the components of at least min_size points 1..K by their first point, (N,) int32."""
-    is_kept = component >= 0
-    is_kept[is_kept] = np.bincount(component[is_kept])[component[is_kept]] >= min_size
-    _, first, inverse = np.unique(component[is_kept], return_index=True, return_inverse=True)
+    """Number the components with at least min_size points from 1 in the order of their first point, (N,) int32."""
+    in_cluster = component >= 0
+    in_cluster[in_cluster] = np.bincount(component[in_cluster])[component[in_cluster]] >= min_size
+    _, first, inverse = np.unique(component[in_cluster], return_index=True, return_inverse=True)
     labels = np.zeros(len(component), np.int32)
-    labels[is_kept] = np.argsort(np.argsort(first))[inverse] + 1
+    labels[in_cluster] = np.argsort(np.argsort(first))[inverse] + 1
     return labels
 
 
 def _merge_clusters(points: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
-    """Merge by Eq. 9; the diameter of a cluster is the diagonal of its axis-aligned box."""
+    """Merge clusters by Eq. 9. The diameter of a cluster is the diagonal of its axis-aligned box."""
     count = labels.max(initial=0)
     if count < 2:
         return labels
@@ -114,9 +114,9 @@ def _merge_clusters(points: np.ndarray, labels: np.ndarray, gamma: float) -> np.
     first, second = [], []
     for k in range(count - 1):
         distance = np.sqrt(((centre[k + 1 :] - centre[k]) ** 2).sum(axis=1))
-        close = np.flatnonzero(distance < gamma * (diameter[k + 1 :] + diameter[k]) / 2)
-        first.append(np.full(len(close), k))
-        second.append(close + k + 1)
+        neighbours = np.flatnonzero(distance < gamma * (diameter[k + 1 :] + diameter[k]) / 2)
+        first.append(np.full(len(neighbours), k))
+        second.append(neighbours + k + 1)
     pairs = np.concatenate(first), np.concatenate(second)
     graph = coo_matrix((np.ones(len(pairs[0]), bool), pairs), (count, count))
     component = connected_components(graph, directed=False)[1]

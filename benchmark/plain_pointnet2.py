@@ -1,7 +1,8 @@
-"""A plain implementation of PointNet++ with single-scale grouping (Qi et al., NeurIPS 2017).
+"""Plain implementation of PointNet++ with single-scale grouping (Qi et al., NeurIPS 2017).
 
-As in small repositories: farthest point sampling in a loop, ball query by sorting all distances,
-groups through 1 x 1 convolutions. It has the widths of our network and is only timed.
+It is written like many small repositories: farthest point sampling in a loop, ball query by sorting
+all distances, and 1 x 1 convolutions on the groups. It has the layer widths of our network, and is
+used only for timing.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from lidar_perception.detectors.pointnet.config import PointNetConfig
 
 
 def sample_farthest(xyz: Tensor, count: int) -> Tensor:
-    """Return indices (B, count) of points (B, N, 3), each farthest from the previous ones."""
+    """Return indices (B, count) of points (B, N, 3), each of which is farthest from the previous ones."""
     batch, size = xyz.shape[:2]
     indices = torch.zeros(batch, count, dtype=torch.long)
     distances, last = torch.full((batch, size), 1e10), torch.zeros(batch, dtype=torch.long)
@@ -37,7 +38,7 @@ def query_ball(radius: float, count: int, xyz: Tensor, centres: Tensor) -> Tenso
 
 
 class SetAbstraction(nn.Module):
-    """Groups of points in balls, each through layers and a maximum."""
+    """Layer that groups points in balls and applies shared layers and max pooling to each group."""
 
     def __init__(self, count: int, radius: float, neighbours: int, *channels: int):
         super().__init__()
@@ -63,10 +64,14 @@ class PlainPointNet2(nn.Module):
 
     def __init__(self, config: PointNetConfig):
         super().__init__()
-        group, local, wide = config.group_channels, config.local_channels, config.global_channels
-        self.first = SetAbstraction(config.centroids, config.radii[-1], config.neighbours[-1], 5, *group, local)
-        self.second = SetAbstraction(config.coarse, config.coarse_radius, config.coarse_neighbours, 3 + local, wide)
-        sizes, layers = (wide, *config.head_channels), []
+        local_width, global_width = config.local_channels, config.global_channels
+        self.first = SetAbstraction(
+            config.centroids, config.radii[-1], config.neighbours[-1], 5, *config.group_channels, local_width
+        )
+        self.second = SetAbstraction(
+            config.coarse, config.coarse_radius, config.coarse_neighbours, 3 + local_width, global_width
+        )
+        sizes, layers = (global_width, *config.head_channels), []
         for a, b in pairwise(sizes):
             layers += [nn.Linear(a, b), nn.BatchNorm1d(b), nn.ReLU()]
         self.head = nn.Sequential(*layers, nn.Linear(sizes[-1], len(config.classes) + 1 + 6 + 2 * config.yaw_bins))

@@ -1,7 +1,7 @@
-"""A plain implementation of paper A with scikit-learn, OpenCV and NumPy, the peer of our pipeline.
+"""Plain implementation of paper A with scikit-learn, OpenCV and NumPy, to compare our pipeline with.
 
-Where the paper leaves a choice open it makes our choice. It shares only the camera matrix with our
-code.
+Where the paper is ambiguous, it makes the same choice as our pipeline. It shares only the camera
+matrix with our code.
 """
 
 from __future__ import annotations
@@ -28,10 +28,16 @@ def find_candidates(
     pedestrians: np.ndarray,
     ground: np.ndarray | None = None,
 ) -> dict:
-    """Find candidates in xyz (N, 3).
+    """Find candidates in a cloud.
 
-    Returns points in view, ground, labels, boxes by stage (K, 7) and ms by step. A given ground
-    replaces RANSAC's, to compare the other steps separately.
+    Args:
+        xyz: (N, 3) points.
+        projection, width, height: Projection matrix and image size of the camera.
+        pedestrians: (M, 7) labelled pedestrians.
+        ground: Mask of the ground among the points in view; None to find it by RANSAC.
+
+    Returns:
+        Points in view, ground, labels, boxes (K, 7) of each stage, and ms of each step.
     """
     times = [perf_counter()]
     homogeneous = np.column_stack([xyz, np.ones(len(xyz))]) @ projection.T
@@ -53,8 +59,8 @@ def find_candidates(
 
     labels = np.full(len(points), -1)
     distance = np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2)
-    for near, far, eps in BANDS:
-        band = ~ground & (distance >= near) & (distance < far)
+    for low_range, high_range, eps in BANDS:
+        band = ~ground & (distance >= low_range) & (distance < high_range)
         if band.sum() == 0:
             continue
         band_labels = DBSCAN(eps=eps, min_samples=MIN_SAMPLES).fit(points[band]).labels_
@@ -67,13 +73,13 @@ def find_candidates(
 
     seed_box = pedestrians[np.argmin(np.hypot(pedestrians[:, 0], pedestrians[:, 1]))]
     seed = points[~ground][_is_inside(points[~ground], seed_box)]
-    matching = [k for k in range(len(boxes)) if abs(boxes[k, 5] - seed_box[5]) <= HEIGHT_TOLERANCE]
+    stage1 = [k for k in range(len(boxes)) if abs(boxes[k, 5] - seed_box[5]) <= HEIGHT_TOLERANCE]
     times.append(perf_counter())
     template = _draw_silhouette(seed, 0)
-    stm_scores = {k: _compute_cosine(_draw_silhouette(clusters[k], 0), template) for k in matching}
+    stm_scores = {k: _compute_cosine(_draw_silhouette(clusters[k], 0), template) for k in stage1}
     times.append(perf_counter())
     cpa_scores = dict(stm_scores)
-    for k in matching:
+    for k in stage1:
         if CPA_RANGE[0] <= np.hypot(boxes[k, 0], boxes[k, 1]) < CPA_RANGE[1]:
             cpa_scores[k] = _compute_cosine(_draw_silhouette(clusters[k], CPA_STEPS), template)
     times.append(perf_counter())
@@ -83,9 +89,9 @@ def find_candidates(
         "points": points,
         "ground": ground,
         "labels": labels + 1,
-        "stage1": boxes[matching],
-        "stage2": boxes[[k for k in matching if stm_scores[k] >= TAU]],
-        "final": boxes[[k for k in matching if cpa_scores[k] >= TAU]],
+        "stage1": boxes[stage1],
+        "stage2": boxes[[k for k in stage1 if stm_scores[k] >= TAU]],
+        "final": boxes[[k for k in stage1 if cpa_scores[k] >= TAU]],
         "ms": {s: 1e3 * (b - a) for s, a, b in zip(steps, times, times[1:])},
     }
 
@@ -99,9 +105,9 @@ def _fit_box(cluster: np.ndarray, plane: LinearRegression) -> list[float]:
 
 def _is_inside(points: np.ndarray, box: np.ndarray) -> np.ndarray:
     offset = points - box[:3]
-    along = offset[:, 0] * np.cos(box[6]) + offset[:, 1] * np.sin(box[6])
-    across = offset[:, 1] * np.cos(box[6]) - offset[:, 0] * np.sin(box[6])
-    return (np.abs(along) <= box[3] / 2) & (np.abs(across) <= box[4] / 2) & (np.abs(offset[:, 2]) <= box[5] / 2)
+    x = offset[:, 0] * np.cos(box[6]) + offset[:, 1] * np.sin(box[6])
+    y = offset[:, 1] * np.cos(box[6]) - offset[:, 0] * np.sin(box[6])
+    return (np.abs(x) <= box[3] / 2) & (np.abs(y) <= box[4] / 2) & (np.abs(offset[:, 2]) <= box[5] / 2)
 
 
 def _draw_silhouette(cluster: np.ndarray, steps: int) -> np.ndarray:
@@ -109,7 +115,7 @@ def _draw_silhouette(cluster: np.ndarray, steps: int) -> np.ndarray:
     centroid = cluster.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov(cluster[:, :2].T))
     lateral = axes[:, 1]
-    if lateral @ [-centroid[1], centroid[0]] < 0:  # "left" is as seen from the sensor
+    if lateral @ [-centroid[1], centroid[0]] < 0:  # the axis points to the left, seen from the sensor
         lateral = -lateral
     y, z = (cluster - centroid)[:, :2] @ lateral, cluster[:, 2] - centroid[2]
     scales = [1.0] + [max(CPA_MIN, 1 - k * CPA_DECREMENT) for k in range(1, steps + 1)]

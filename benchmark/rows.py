@@ -1,8 +1,8 @@
-"""Results of measurements: plain dicts with rows for the table and the JSON file.
+"""Results of measurements, as dicts with rows for the printed table and the JSON file.
 
-A row has the peer's name, peer_ms and ours_ms, value with its unit, the target if any and whether
-it is met, the number of frames with equal results, and the number of points that differ in the
-others.
+A row has the peer's `name`, `peer_ms` and `ours_ms`; a `value` with its `unit`; a `target`, if there is
+one, and `met`; `same`, the number of frames with equal results; and `differ`, the number of points
+that differ in the other frames.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from rich.text import Text
 from lidar_perception.runs.terminal import console
 
 
-def make_measurement(title: str, frames: int, points: float, rows: list[dict], **more) -> dict:
-    return {"title": title, "frames": frames, "points": round(points), "rows": rows, **more}
+def make_measurement(title: str, frames: int, points: float, rows: list[dict], **values) -> dict:
+    return {"title": title, "frames": frames, "points": round(points), "rows": rows, **values}
 
 
 def make_row(
@@ -47,7 +47,7 @@ def make_row(
 
 
 def add_target(content: dict, target: float | None) -> dict:
-    """Return the row with its target: a minimum for unit "x" (times faster), else a maximum."""
+    """Return the row with a target, which is a minimum for the unit "x" (times faster), otherwise a maximum."""
     value, met = content["value"], None
     if target is not None and value is not None:
         met = value >= target if content["unit"] == "x" else value < target
@@ -57,7 +57,7 @@ def add_target(content: dict, target: float | None) -> dict:
 def compute_speedup(
     name: str, ms: dict[str, float], target: float | None = None, same: int | None = None, differ: int | None = None
 ) -> dict:
-    """Return how many times faster ours is than the named peer."""
+    """Return the row of a peer. Its value is how many times faster our implementation is."""
     return make_row(
         name, peer_ms=ms[name], ours_ms=ms["ours"], value=ms[name] / ms["ours"], target=target, same=same, differ=differ
     )

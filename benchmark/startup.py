@@ -1,5 +1,7 @@
-"""CPU time and memory of a process until its detector is ready: with compiled code in the cache, with
-torch, and with an empty cache."""
+"""CPU time and memory of a process until its detector is ready.
+
+Measured with compiled code in the cache, with torch, and with an empty cache.
+"""
 
 from __future__ import annotations
 
@@ -33,11 +35,13 @@ print(usage.ru_utime + usage.ru_stime, int(status.split('VmHWM:')[1].split()[0])
 WITH_TORCH = "fused, engine torch"
 
 
-def measure_startup(repeat: int, cold: tuple[str, ...] = ("fused", "clustering")) -> dict:
-    """Measure start-ups.
+def measure_startup(repeat: int, cold_starts: tuple[str, ...] = ("fused", "clustering")) -> dict:
+    """Measure the start of processes.
 
     Args:
-        cold: names in CODE_BY_NAME that are also measured with an empty cache, which takes minutes.
+        repeat: Number of runs.
+        cold_starts: Names in CODE_BY_NAME that are also measured with an empty cache, which takes
+            minutes.
     """
     runs = {name: np.median([_run_process(code) for _ in range(repeat)], axis=0) for name, code in CODE_BY_NAME.items()}
     rows = [
@@ -49,10 +53,10 @@ def measure_startup(repeat: int, cold: tuple[str, ...] = ("fused", "clustering")
         )
     ]
     rows += [make_row(f"{name}, peak memory", value=memory, unit="MB") for name, (_, memory) in runs.items()]
-    for name in cold:
+    for name in cold_starts:
         with tempfile.TemporaryDirectory() as folder:
             seconds, _ = _run_process(CODE_BY_NAME[name], NUMBA_CACHE_DIR=folder)
-        rows.append(make_row(f"{name}, compiled from nothing", ours_ms=1e3 * seconds))
+        rows.append(make_row(f"{name}, empty cache", ours_ms=1e3 * seconds))
     title = f"Start of a process, CPU ms at a load of {os.getloadavg()[0]:.1f}"
     return make_measurement(title, repeat, 0, rows)
 

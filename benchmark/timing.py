@@ -1,4 +1,4 @@
-"""Times of several functions called in turn, so that other load affects all equally."""
+"""Timing of several functions that are called alternately, so that other load affects all equally."""
 
 from __future__ import annotations
 
@@ -19,8 +19,12 @@ def time_interleaved(
 ) -> tuple[dict[str, float], dict[str, Any]]:
     """Return the median ms of each call over `repeat` rounds, and its last result.
 
-    A round makes each call once, in the order of the dict. clock returns seconds; time.process_time
-    measures CPU time.
+    Each round makes each call once, in the order of the dict.
+
+    Args:
+        calls: Functions by name.
+        repeat: Number of rounds.
+        clock: Function that returns seconds. time.process_time measures CPU time.
     """
     ms: dict[str, list[float]] = {name: [] for name in calls}
     results: dict[str, Any] = {}
@@ -33,15 +37,21 @@ def time_interleaved(
 
 
 class Clock:
-    """Timer of several functions over frames. The calls in `warm` run once before, without being timed."""
+    """Timer of several functions over frames.
 
-    def __init__(self, repeat: int, warm: Calls, clock: Callable[[], float] = perf_counter) -> None:
+    Args:
+        repeat: Number of calls per frame.
+        warm_up_calls: Calls that are made once at the start, without being timed.
+        clock: See time_interleaved().
+    """
+
+    def __init__(self, repeat: int, warm_up_calls: Calls, clock: Callable[[], float] = perf_counter) -> None:
         self.repeat, self.clock = repeat, clock
         self.ms: dict[str, list[float]] = {}
-        time_interleaved(warm, 1)
+        time_interleaved(warm_up_calls, 1)
 
     def time(self, calls: Calls) -> dict[str, Any]:
-        """Time one frame, and return the result of each call."""
+        """Time the calls for one frame, and return their results."""
         ms, results = time_interleaved(calls, self.repeat, self.clock)
         for name, value in ms.items():
             self.ms.setdefault(name, []).append(value)
@@ -53,18 +63,18 @@ class Clock:
 
 
 def run_in_child(function: Callable, *arguments):
-    """Run function(*arguments) in a fresh process, for libraries that disturb later times."""
+    """Run function(*arguments) in a new process, for libraries that would affect later measurements."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as child:
         return child.submit(function, *arguments).result()
 
 
 def choose_evenly(items: Sequence, count: int) -> list:
-    """Return count evenly spread items, or all if there are fewer."""
+    """Return `count` evenly spaced items, or all items if there are fewer."""
     if len(items) <= count:
         return list(items)
     return [items[i] for i in np.linspace(0, len(items) - 1, count).round().astype(int)]
 
 
 def thin_cloud(xyz: np.ndarray) -> np.ndarray:
-    """Return every 20th point, to warm up with."""
+    """Return every 20th point. Small clouds are enough to warm up a function."""
     return np.ascontiguousarray(xyz[::20])

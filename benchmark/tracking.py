@@ -1,4 +1,4 @@
-"""Our tracker against a plain AB3DMOT, on the same detections and poses."""
+"""Comparison of our tracker with a plain AB3DMOT, on the same detections and poses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, GroundTruth
 
-PEER_MIN_SCORE = ScoreParams().car  # minimum score of the peer's input, because the peer ignores scores
+PEER_MIN_SCORE = ScoreParams().car  # minimum score of the detections for the peer, which ignores scores
 SHOWN_METRICS = (
     "HOTA",
     "DetA",
@@ -42,9 +42,9 @@ Step = Callable[["TrackedFrame"], tuple[np.ndarray, Detections]]
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """One frame: detections, weak ones included, and labels with track ids."""
+    """A frame with detections, including those with low scores, and labels with track ids."""
 
-    found: Detections
+    detections: Detections
     truth: GroundTruth
     stamp_ns: int = 0
     pose: np.ndarray | None = None
@@ -52,7 +52,7 @@ class TrackedFrame:
 
 
 def measure_recording(recording: Recording) -> dict:
-    """Track PointPillars' detections in a recording with both trackers; {} without track ids."""
+    """Track PointPillars' detections in a recording with both trackers. Return {} if there are no track ids."""
     if not recording.frames or not recording.frames[0].sequence:
         return {}
     detector = open_detector("pointpillars", min_score=MIN_SCORE, sensor_height=recording.frames[0].sensor_height)
@@ -74,11 +74,12 @@ def measure_recording(recording: Recording) -> dict:
 def measure_tracking(drives: Mapping[str, Sequence[TrackedFrame]], params: TrackingParams = TrackingParams()) -> dict:
     """Measure both trackers, "ours" and "plain AB3DMOT".
 
-    Returns the scores of TrackingReport by centres, and ms, the median time per frame.
+    Returns:
+        For each tracker the scores of TrackingReport, and `ms`, the median time per frame.
     """
     return {
-        name: _measure(drives, make)
-        for name, make in (
+        name: _measure(drives, make_step)
+        for name, make_step in (
             ("plain AB3DMOT", lambda: make_peer_step(PlainAb3dmot())),
             ("ours", lambda: make_tracker_step(params)),
         )
@@ -86,16 +87,16 @@ def measure_tracking(drives: Mapping[str, Sequence[TrackedFrame]], params: Track
 
 
 def make_peer_step(plain: PlainAb3dmot, min_score: float = PEER_MIN_SCORE) -> Step:
-    """Track one drive with the peer, which gets detections of at least min_score."""
-    return lambda frame: plain(frame.found[frame.found.scores >= min_score], frame.pose)
+    """Return a function that tracks one drive with the peer, which gets detections of at least min_score."""
+    return lambda frame: plain(frame.detections[frame.detections.scores >= min_score], frame.pose)
 
 
 def make_tracker_step(params: TrackingParams) -> Step:
-    """Track one drive with our tracker."""
+    """Return a function that tracks one drive with our tracker."""
     our_tracker = Tracker(params)
 
     def step(frame: TrackedFrame) -> tuple[np.ndarray, Detections]:
-        tracks = our_tracker(frame.found, frame.stamp_ns, frame.pose)
+        tracks = our_tracker(frame.detections, frame.stamp_ns, frame.pose)
         return tracks.ids, tracks.detections
 
     return step
@@ -115,7 +116,7 @@ def _measure(drives: Mapping[str, Sequence[TrackedFrame]], make_step: Callable[[
 
 def print_tracking(content: dict) -> None:
     """Print a row per class and tracker."""
-    table = Table(title="Tracks by centres, similarity 1 - d / 2 m")
+    table = Table(title="Tracks matched by centre distance d, similarity 1 - d / 2 m")
     for name in ("class", "tracker", *SHOWN_METRICS):
         table.add_column(name, justify="left" if name in ("class", "tracker") else "right")
     for class_name in next(iter(content.values()))["classes"]:

@@ -1,4 +1,4 @@
-"""Ground and clusters of an array of points: python examples/ground_and_clusters.py [cloud.npy]."""
+"""Segment the ground and clusters of an array of points: python examples/ground_and_clusters.py [cloud.npy]."""
 
 import sys
 

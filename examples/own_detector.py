@@ -1,6 +1,6 @@
-"""A detector of your own, without a network: every cluster of the size of a person.
+"""Your own detector, without a network: detects every cluster that has the size of a person.
 
-python examples/own_detector.py                                                # scores it
+python examples/own_detector.py                                                # evaluates it
 cd examples && lidar-perception detect drive.bag --weights own_detector:PersonSizedClusters
 """
 
@@ -10,7 +10,7 @@ import lidar_perception as lp
 
 
 class PersonSizedClusters:
-    """Call an instance with a cloud to get Detections."""
+    """Detector. Call an instance with a cloud to get Detections."""
 
     classes = ("Pedestrian",)
 

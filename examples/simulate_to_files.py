@@ -1,6 +1,6 @@
 """Simulate labelled clouds of your sensor as .npy files: python examples/simulate_to_files.py OUT.
 
-OUT/NAME.npy holds (N, 4) x y z intensity, OUT/labels/NAME.json the boxes of the objects.
+OUT/NAME.npy has the points (N, 4) x y z intensity, OUT/labels/NAME.json the boxes of the objects.
 """
 
 import json

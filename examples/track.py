@@ -8,7 +8,7 @@ import lidar_perception as lp
 
 recording = lp.open_recording(sys.argv[1]) if sys.argv[1:] else lp.simulate(8)
 height = recording.frames[0].sensor_height
-detector = lp.load_detector(min_score=0.05, sensor_height=height)  # the tracker has thresholds
+detector = lp.load_detector(min_score=0.05, sensor_height=height)  # the tracker has its own thresholds
 tracker = lp.Tracker()
 for frame in recording:
     detections = detector(frame.load()).detections

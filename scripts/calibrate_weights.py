@@ -1,7 +1,7 @@
-"""Calibrate the scores of weights to probabilities, on scans that were not used for training.
+"""Calibrate the scores of checkpoints to probabilities, on scans that were not used for training.
 
-Only the calibration in the header of a file changes, not the order of the scores. A file stays
-unchanged if the scans have too few objects of one of its classes.
+Only the calibration in the header of a file changes, not the order of the scores. A file is not
+changed if the scans have too few objects of one of its classes.
 
     lidar-perception simulate --format kitti --frames 360 --people 2.5 --seed 700000 --out scans
     python scripts/calibrate_weights.py scans v4.safetensors pointnet.safetensors
@@ -26,21 +26,21 @@ from lidar_perception.scoring.kitti.reliability import fit_calibrations
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.scoring.run import fill_report
 
-MIN_COUNTED_SCORE = 0.02
+MIN_SCORE = 0.02  # minimum score of detections to calibrate with
 
 
-def load_uncalibrated(weights: Path) -> NetworkDetector:
-    """Return the detector of a checkpoint with its network's own scores."""
+def open_uncalibrated_detector(weights: Path) -> NetworkDetector:
+    """Open the detector of a checkpoint with the raw scores of its network."""
     detector = open_detector(weights, "cpu")
     assert isinstance(detector, NetworkDetector)
-    return detector.with_raw_scores().with_min_score(MIN_COUNTED_SCORE)
+    return detector.with_raw_scores().with_min_score(MIN_SCORE)
 
 
 @click.command()
 @click.argument("scans", type=click.Path(exists=True, path_type=Path))
 @click.argument("weights", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--jobs", default=1)
-@click.option("--limit", type=int, help="Largest number of scans.")
+@click.option("--limit", type=int, help="Maximum number of scans.")
 def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -> None:
     """Calibrate checkpoints, in place."""
     for path in weights:
@@ -48,7 +48,7 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
         fill_report(
             report,
             open_recording(scans),
-            partial(measure_detector, partial(load_uncalibrated, path), 1.0, None),
+            partial(measure_detector, partial(open_uncalibrated_detector, path), 1.0, None),
             jobs=jobs,
             limit=limit,
         )
@@ -56,7 +56,7 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
         header = read_header(path)
         if missing := sorted({*header.calibration} - {*calibrations}):
             raise click.ClickException(
-                f"{path} stays unchanged: {scans} has too few correct or wrong detections of {', '.join(missing)}"
+                f"{path} is not changed: {scans} has too few correct or wrong detections of {', '.join(missing)}"
             )
         save_header(path, replace(header, calibration=calibrations))
         console.print(f"{path.name}: {calibrations}")

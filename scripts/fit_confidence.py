@@ -1,11 +1,11 @@
-"""Fit candidates/confidence.json to simulated scans: two additive models of log-odds.
+"""Fit candidates/confidence.json to simulated scans: two additive log-odds models.
 
 One model uses the shape of a cluster, the other also its similarity to a seed.
 
     lidar-perception simulate --format kitti --frames 400 --people 2 --seed 6000 --out scans
     python scripts/fit_confidence.py scans
 
-Pedestrians are weighted so that they are as far away as in KITTI's training set (paper A, Table 1).
+Pedestrians are weighted so that their ranges are distributed as in KITTI's training set (paper A, Table 1).
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from lidar_perception.scoring.centres.matching import find_range_bins, match_cen
 from lidar_perception.training.curves import fit_curves
 from lidar_perception.types import PEDESTRIAN, InputError
 
-KITTI_RANGES = np.array([2093, 1771, 468, 118, 37])  # paper A, Table 1
-RISING = {"similarity": 1, "height_difference_m": -1}  # more similarity never lowers the confidence
+KITTI_PEDESTRIANS = np.array([2093, 1771, 468, 118, 37])  # number of pedestrians by range, from paper A, Table 1
+DIRECTIONS = {"similarity": 1, "height_difference_m": -1}  # more similarity must not lower the confidence
 OUT = Path(module.__file__).with_name("confidence.json")
 
 
@@ -46,9 +46,10 @@ def select_pedestrians(frame: Frame) -> np.ndarray:
 
 
 def collect_samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | None:
-    """Return the features of K clusters compared with a seed of another frame; None for K = 0.
+    """Return the features of the K clusters of a frame, compared with the seed of another frame.
 
-    Also returns `hit` (K,) bool, and range bins of the clusters and of the pedestrians.
+    The result also has `hit` (K,) bool, and the range bins of the clusters and of the pedestrians.
+    None if there are no clusters.
     """
     truth = select_pedestrians(frame)
     segmented = segment_cloud(frame.load(), frame.camera(), params)
@@ -60,17 +61,17 @@ def collect_samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | 
     images = draw_silhouettes(points, start, np.ones((len(boxes), 1)), boxes[:, 2] - boxes[:, 5] / 2, params)
     features["similarity"] = compute_similarity(images, seed.silhouette(params), params.stm)
     features["height_difference_m"] = np.abs(features["height_m"] - seed.height)
-    matched, _ = match_centres(boxes, truth)
+    hit_indices, _ = match_centres(boxes, truth)
     return {
         "features": features,
-        "hit": np.isin(np.arange(len(boxes)), matched),
+        "hit": np.isin(np.arange(len(boxes)), hit_indices),
         "bins": find_range_bins(boxes),
         "truth": find_range_bins(truth),
     }
 
 
 def find_seed(job: tuple[str, int]) -> Seed | None:
-    """Return the nearest pedestrian of a frame as seed, as in the paper's protocol, or None."""
+    """Return the nearest pedestrian of a frame as a seed, as in the paper's protocol; None if there is none."""
     frame = open_recording(job[0]).frames[job[1]]
     try:
         segmented = segment_cloud(frame.load(), frame.camera(), BEST)
@@ -91,24 +92,26 @@ def main(roots: list[str]) -> None:
     jobs = [(root, i) for root in roots for i in range(len(open_recording(root).frames))]
     with Pool() as pool:
         seeds = pool.map(find_seed, jobs, chunksize=8)
-        others = [next(s for s in seeds[i + 1 :] + seeds[: i + 1] if s is not None) for i in range(len(seeds))]
-        results = pool.map(run_job, list(zip(jobs, others)), chunksize=8)
+        # Each frame is compared with the seed of the next frame that has one.
+        next_seeds = [next(s for s in seeds[i + 1 :] + seeds[: i + 1] if s is not None) for i in range(len(seeds))]
+        results = pool.map(run_job, list(zip(jobs, next_seeds)), chunksize=8)
         frames = [result for result in results if result is not None]
     features = {name: np.concatenate([f["features"][name] for f in frames]) for name in (*SHAPE_KNOTS, *SEED_KNOTS)}
-    hit, bins = (np.concatenate([f[name] for f in frames]) for name in ("hit", "bins"))
-    truth = np.bincount(np.concatenate([f["truth"] for f in frames]), minlength=5)
-    share = KITTI_RANGES / KITTI_RANGES.sum() / np.maximum(truth / truth.sum(), 1e-9)
-    weight = np.where(hit, share[bins], 1.0)
+    is_hit, bins = (np.concatenate([f[name] for f in frames]) for name in ("hit", "bins"))
+    pedestrians = np.bincount(np.concatenate([f["truth"] for f in frames]), minlength=5)
+    kitti_fractions = KITTI_PEDESTRIANS / KITTI_PEDESTRIANS.sum()
+    range_weights = kitti_fractions / np.maximum(pedestrians / pedestrians.sum(), 1e-9)
+    weights = np.where(is_hit, range_weights[bins], 1.0)
     models = {
         "trained_on": {
             "frames": len(frames),
-            "clusters": len(hit),
-            "pedestrians": int(hit.sum()),
-            "of": int(truth.sum()),
-            "weights_by_range": share.round(2).tolist(),
+            "clusters": len(is_hit),
+            "pedestrians": int(is_hit.sum()),
+            "of": int(pedestrians.sum()),
+            "weights_by_range": range_weights.round(2).tolist(),
         },
-        "shape": fit_curves(features, hit, weight, SHAPE_KNOTS),
-        "seed": fit_curves(features, hit, weight, {**SHAPE_KNOTS, **SEED_KNOTS}, RISING),
+        "shape": fit_curves(features, is_hit, weights, SHAPE_KNOTS),
+        "seed": fit_curves(features, is_hit, weights, {**SHAPE_KNOTS, **SEED_KNOTS}, DIRECTIONS),
     }
     write_text(OUT, json.dumps(models, indent=1))
     print(OUT, models["trained_on"])

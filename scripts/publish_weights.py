@@ -1,12 +1,12 @@
-"""Add trained weights to the package, as float16 and with a model card.
+"""Add trained weights to the package, stored as float16 and with a model card.
 
     lidar-perception simulate --format kitti --frames 500 --seed 9000 --out simulated
     python scripts/publish_weights.py v4/best.safetensors simulated /data/kitti/object
     python scripts/publish_weights.py v4/best.safetensors --mean-with before.safetensors simulated
     python scripts/publish_weights.py --card pointnet.safetensors /data/kitti/object
 
-The card states training data, classes, range, sensor, figures with intervals on each folder, known
-failures and licence. The folders must not have been used for training.
+The card lists training data, classes, range, sensor, scores with intervals on each folder, known
+failures and the licence. The folders must not have been used for training.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Run the tests of this checkout: ./lidar test [ARGUMENTS of pytest].
 
-Without arguments: ruff (rules and format), mypy, the documentation site and all tests. The tests of the core run on
-all cores, and two more processes run the tests that mostly wait for other processes. Numba compiles
-once before the tests, while ruff and mypy run. Coverage must reach the limit in setup.cfg. It is
-not measured in nodes with their own processes, nor in long tests of lines that others cover, as
-this doubles their time.
+Without arguments, runs ruff (rules and format), mypy, the build of the documentation site and all
+tests. The tests of the core run on all cores, and two more processes run the tests that mostly wait
+for other processes. Numba compiles once before the tests, while ruff and mypy run. Coverage must
+reach the limit in setup.cfg. It is not measured in nodes that run in their own processes, nor in
+long tests of lines that other tests cover, because it doubles their time.
 
     ./lidar test
     ./lidar test -k clustering -x
@@ -24,10 +24,10 @@ from lidar_perception.runs.terminal import errors
 from lidar_perception.runs.threads import default_to_one_thread, use_passive_waiting
 
 ROOT = Path(__file__).resolve().parents[1]
-MAX_WORKERS = 4  # each loads torch and compiles
-NODE_WORKERS = 2  # for tests that mostly wait
-# Folders and files of these tests, the slowest first.
-WITH_PROCESSES = (
+MAX_WORKERS = 4  # each worker needs memory for torch and compiled code
+NODE_WORKERS = 2  # workers for tests that mostly wait for other processes
+# Folders and files of tests that mostly wait for other processes, the slowest first.
+NODE_TESTS = (
     "test/testing",
     "test/fuzz",
     "test/studio/test_label_server.py",
@@ -36,8 +36,8 @@ WITH_PROCESSES = (
     "test/launch",
     "test/ros",
 )
-# Programs that fill Numba's cache, from which the test processes load.
-COMPILE = (
+# Programs that fill Numba's cache for the test processes.
+COMPILE_PROGRAMS = (
     """
 from lidar_perception.candidates.warm_up import warm_up
 warm_up()
@@ -57,19 +57,19 @@ for frame in simulate_frames(1, 1):
 
 
 def main(arguments: list[str]) -> int:
-    """Run everything, or pytest alone with the arguments; return the exit code."""
+    """Run everything, or only pytest if there are arguments. Return the exit code."""
     use_passive_waiting()
     if arguments:
         return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=ROOT).returncode
     with tempfile.TemporaryDirectory() as folder:
-        failed = run_everything(Path(folder))
-    if failed:
-        errors.print(Text("failed:", "red") + f" {', '.join(failed)}")
-    return int(bool(failed))
+        failures = run_everything(Path(folder))
+    if failures:
+        errors.print(Text("failed:", "red") + f" {', '.join(failures)}")
+    return int(bool(failures))
 
 
 class BackgroundCommand:
-    """A Python command in the background; its output is printed when it has ended."""
+    """A Python command that runs in the background. wait() prints its output."""
 
     def __init__(self, *words: str, environment: dict[str, str] | None = None):
         self.output = tempfile.TemporaryFile("w+")
@@ -77,8 +77,8 @@ class BackgroundCommand:
             [sys.executable, *words], cwd=ROOT, env=environment, stdout=self.output, stderr=subprocess.STDOUT
         )
 
-    def failed(self) -> bool:
-        """Wait for the end; return True if the command failed."""
+    def wait(self) -> bool:
+        """Wait for the end of the command and print its output. Return True if it failed."""
         code = self.process.wait()
         self.output.seek(0)
         print(self.output.read(), end="", flush=True)
@@ -88,41 +88,42 @@ class BackgroundCommand:
 def run_everything(folder: Path) -> list[str]:
     """Run all checks and tests, and return the names of those that failed.
 
-    folder: for the files of the coverage measurement.
+    Args:
+        folder: Folder for coverage files and the built site.
     """
-    default_to_one_thread()  # as many processes as cores
+    default_to_one_thread()  # because there are as many processes as cores
     environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)  # so that each module is compiled once
     if sys.version_info >= (3, 12):
         environment["COVERAGE_CORE"] = "sysmon"  # each line costs time only once
     pytest = ("-m", "pytest", "--cov", "--cov-report=", "--cov-fail-under=0")
-    nodes = [name for name in WITH_PROCESSES if (ROOT / name).exists()]
+    node_tests = [name for name in NODE_TESTS if (ROOT / name).exists()]
     workers = min(os.cpu_count() or 1, MAX_WORKERS)
-    running = {
+    commands = {
         "ruff": BackgroundCommand("-m", "ruff", "check"),
         "formatter": BackgroundCommand("-m", "ruff", "format", "--check"),
         "mypy": BackgroundCommand("-m", "mypy"),
     }
-    *parts, last = COMPILE  # if they fail, so do the tests
-    for compiling in [BackgroundCommand("-c", part) for part in parts]:
-        compiling.failed()
-    BackgroundCommand("-c", last).failed()
-    running["docs"] = BackgroundCommand(
+    *first_programs, last_program = COMPILE_PROGRAMS  # failures are ignored, because the tests then fail too
+    for command in [BackgroundCommand("-c", program) for program in first_programs]:
+        command.wait()
+    BackgroundCommand("-c", last_program).wait()
+    commands["docs"] = BackgroundCommand(
         "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder / "site")
     )
-    running["tests of nodes"] = BackgroundCommand(
+    commands["tests of nodes"] = BackgroundCommand(
         *pytest,
-        *_distributed(NODE_WORKERS),
-        *nodes,
+        *_make_worker_options(NODE_WORKERS),
+        *node_tests,
         environment={**environment, "COVERAGE_FILE": str(folder / "nodes")},
     )
-    core = subprocess.run(
-        [sys.executable, *pytest, *_distributed(workers), *(f"--ignore={name}" for name in nodes)],
+    core_tests = subprocess.run(
+        [sys.executable, *pytest, *_make_worker_options(workers), *(f"--ignore={name}" for name in node_tests)],
         cwd=ROOT,
         env=environment,
     )
-    failed = ["tests"] * bool(core.returncode)
-    failed += [name for name, command in running.items() if command.failed()]
+    failures = ["tests"] * bool(core_tests.returncode)
+    failures += [name for name, command in commands.items() if command.wait()]
     coverage, environment["COVERAGE_FILE"] = [sys.executable, "-m", "coverage"], str(folder / "all")
     subprocess.run(
         [*coverage, "combine", "--quiet", "--keep", str(folder / "coverage"), str(folder / "nodes")],
@@ -130,14 +131,14 @@ def run_everything(folder: Path) -> list[str]:
         env=environment,
     )
     coverage_report = subprocess.run([*coverage, "report"], cwd=ROOT, env=environment)
-    return [*failed, *["coverage"] * bool(coverage_report.returncode)]
+    return [*failures, *["coverage"] * bool(coverage_report.returncode)]
 
 
-def _distributed(workers: int) -> tuple[str, ...]:
+def _make_worker_options(workers: int) -> tuple[str, ...]:
     """Return the options of pytest for this many processes.
 
-    Whole files are distributed in their order. pytest-xdist would sort them by their number of
-    tests, and the slowest would come last.
+    Each worker gets complete files, in the given order. By default pytest-xdist sorts files by their
+    number of tests, so that the slowest ones would come last.
     """
     return "-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"
 

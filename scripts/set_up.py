@@ -2,9 +2,9 @@
 
     python scripts/set_up.py EXTRA...
 
-./lidar calls it. It installs with uv, which is much faster than pip and gets pip's settings as
-options. uv is found on PATH or installed by pip. If uv fails or lacks one of the settings, pip
-installs everything.
+./lidar calls this script. It installs with uv, which is much faster than pip, and passes pip's
+settings to it as options. uv is found on PATH or installed with pip. If uv fails or does not support
+one of the settings, everything is installed with pip.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 CONSTRAINTS = ROOT / "constraints.txt"
 PIP = [sys.executable, "-m", "pip"]
-# Options of uv for settings of pip with one or more values, separated by whitespace.
+# Setting of pip -> option of uv. The settings have one or more values, separated by whitespace.
 OPTIONS = {
     "find-links": "--find-links",
     "index-url": "--default-index",
@@ -31,13 +31,13 @@ OPTIONS = {
     "only-binary": "--only-binary",
     "no-binary": "--no-binary",
 }
-VARIABLES = {
+VARIABLES = {  # setting of pip -> environment variable of uv
     "cert": "SSL_CERT_FILE",
     "timeout": "UV_HTTP_TIMEOUT",
     "default-timeout": "UV_HTTP_TIMEOUT",
     "proxy": "ALL_PROXY",
 }
-IRRELEVANT = {
+IGNORED_SETTINGS = {
     "disable-pip-version-check",
     "no-color",
     "no-input",
@@ -58,7 +58,7 @@ IRRELEVANT = {
 
 
 def main(extras: list[str]) -> int:
-    """Install with uv, or else with pip; return the exit code."""
+    """Install with uv, or with pip if that fails. Return the exit code."""
     target = f"{ROOT}[{','.join(extras)}]"
     if uv_options := find_uv_options(read_pip_settings()):
         options, variables = uv_options
@@ -79,7 +79,7 @@ def main(extras: list[str]) -> int:
             variables,
         ):
             return 0
-        print("set_up.py: pip installs instead of uv", flush=True)
+        print("set_up.py: installing with pip instead of uv", flush=True)
     return (
         0
         if _run(
@@ -90,20 +90,20 @@ def main(extras: list[str]) -> int:
 
 
 def read_pip_settings() -> dict[str, str]:
-    """Return the settings of `pip install` by name, from its files and environment variables."""
+    """Return the settings of `pip install` by name, from its configuration files and environment variables."""
     output = subprocess.run([*PIP, "config", "list"], capture_output=True, text=True).stdout
-    by_section: dict[str, dict[str, str]] = {"global": {}, "install": {}, ":env:": {}}
+    sections: dict[str, dict[str, str]] = {"global": {}, "install": {}, ":env:": {}}
     for line in output.splitlines():
         key, _, value = line.partition("=")
         section, _, name = key.rpartition(".")
-        if section in by_section:
-            by_section[section][name] = str(ast.literal_eval(value))
-    return {name: value for settings in by_section.values() for name, value in settings.items()}
+        if section in sections:
+            sections[section][name] = str(ast.literal_eval(value))
+    return {name: value for settings in sections.values() for name, value in settings.items()}
 
 
 def find_uv_options(settings: dict[str, str]) -> tuple[list[str], dict[str, str]] | None:
-    """Return options and environment variables of uv for settings of pip; None if uv lacks one."""
-    options = ["--index-strategy", "unsafe-best-match"]  # as pip, which compares all indexes
+    """Convert settings of pip to options and environment variables of uv. None if uv does not support one of them."""
+    options = ["--index-strategy", "unsafe-best-match"]  # pip compares all indexes too
     variables = {}
     for name, value in settings.items():
         if name in OPTIONS:
@@ -112,26 +112,26 @@ def find_uv_options(settings: dict[str, str]) -> tuple[list[str], dict[str, str]
             variables[VARIABLES[name]] = value
         elif name == "no-index":
             options += ["--no-index"] * (value.lower() in ("1", "true", "yes", "on"))
-        elif name not in IRRELEVANT:
-            print(f"set_up.py: uv has no setting like pip's {name}", flush=True)
+        elif name not in IGNORED_SETTINGS:
+            print(f"set_up.py: uv does not support pip's setting {name}", flush=True)
             return None
     return options, variables
 
 
 def find_uv() -> str | None:
-    """Return the path of uv, installed by pip if there is none; None if that fails."""
-    installed = Path(sys.executable).with_name("uv")
-    path = shutil.which("uv") or (str(installed) if installed.exists() else None)
+    """Return the path of uv. It is installed with pip if it is missing; None if that fails."""
+    local_path = Path(sys.executable).with_name("uv")
+    path = shutil.which("uv") or (str(local_path) if local_path.exists() else None)
     if path is None and _run([*PIP, "install", "--quiet", "--disable-pip-version-check", "uv"]):
-        path = str(installed)
+        path = str(local_path)
     return path
 
 
 def find_torch() -> list[str]:
-    """Return the requirement for the file of torch that pip would install, such as a CPU build.
+    """Return the requirement for the torch file that pip would install, such as a CPU build.
 
-    uv may choose another build of the same version if there are several indexes. [] if torch is
-    installed; if pip finds no file, it installs torch.
+    uv might choose another build of the same version if there are several indexes. Returns [] if
+    torch is already installed. If pip reports no file, torch is installed with pip.
     """
     try:
         version("torch")
@@ -158,7 +158,11 @@ def find_torch() -> list[str]:
     try:
         url = json.loads(report.stdout)["install"][0]["download_info"]["url"]
     except (ValueError, LookupError):
-        print(report.stderr, f"set_up.py: pip installs torch, exit code {report.returncode}", flush=True)
+        print(
+            report.stderr,
+            f"set_up.py: pip's report failed ({report.returncode}); installing torch with pip",
+            flush=True,
+        )
         _run([*PIP, "install", "--disable-pip-version-check", "--constraint", str(CONSTRAINTS), "torch"])
         return []
     return [f"torch @ {url}"]

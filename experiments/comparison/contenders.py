@@ -101,15 +101,15 @@ def open_contenders(
         )
 
     files, missing_reasons = _find_package_files()
-    opened: list[OpenedDetector] = []
+    opened_detectors: list[OpenedDetector] = []
     for path in [*files, *weights]:
         detector = open_one(path)
         if str(path) in LOAD or not isinstance(detector, NetworkDetector | CustomDetector):
             raise InputError(f"{path} is already in the comparison; give other weights")
-        name = _make_name(detector, [FUSED, *(other.name for other in opened)])
-        opened.append(OpenedDetector(name, detector, path))
-    contenders = [detector.to_contender() for detector in opened]
-    opened_names = [detector.name for detector in opened]
+        name = _make_name(detector, [FUSED, *(other.name for other in opened_detectors)])
+        opened_detectors.append(OpenedDetector(name, detector, path))
+    contenders = [detector.to_contender() for detector in opened_detectors]
+    opened_names = [detector.name for detector in opened_detectors]
     missing = [Missing(name, reason) for name, reason in missing_reasons.items() if name not in opened_names]
     try:
         contenders.append(make_contender(FUSED, open_one(FUSED), "those of PointPillars and PointNet"))

@@ -49,14 +49,14 @@ def start_comparison(
     on the first frame without being measured, because its first run also loads compiled code. With
     open_function bound, this is a StartMeasurement of scoring.run.
     """
-    contenders, measured = open_function(), count()
+    contenders, frame_numbers = open_function(), count()
 
     def measure(frame: Frame) -> dict[str, FrameDetections[Detections]] | None:
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None:
             return None
         frame = Frame.of(frame.name, frame.load(), truth, calibration)  # read once for all detectors
-        number = next(measured)
+        number = next(frame_numbers)
         if number == 0:
             for contender in contenders:
                 _detect(contender, frame)

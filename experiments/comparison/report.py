@@ -48,8 +48,8 @@ def print_comparison(content: dict, console: Console) -> None:
     for reason in dict.fromkeys(row["reason"] for row in content["missing"]):
         names = [row["name"] for row in content["missing"] if row["reason"] == reason]
         console.print(Text("missing", "yellow") + f": {', '.join(names)}: {reason}", soft_wrap=False)
-    failed = [f"{name}: {line}" for name, row in content["rows"].items() for line in row["failed"]]
-    print_skipped([*content["skipped"], *failed], console)
+    failures = [f"{name}: {line}" for name, row in content["rows"].items() for line in row["failed"]]
+    print_skipped([*content["skipped"], *failures], console)
 
 
 def _print_precision(content: dict, console: Console) -> None:

@@ -30,12 +30,12 @@ MAX_NAMES = 10  # maximum number of frame names listed for one reason
 
 
 def write_report(
-    out: Path, experiment: Experiment, records: list[dict[str, Any]], sections: list[Section], about: dict[str, str]
+    out: Path, experiment: Experiment, records: list[dict[str, Any]], sections: list[Section], run_info: dict[str, str]
 ) -> Path:
     """Write report.html, .md and .json, tables/*.csv and figures/*.png into out.
 
     Args:
-        about: Facts about the run, such as the data and the machine, by name.
+        run_info: Facts about the run, such as the data and the machine, by name.
 
     Returns:
         The path of the HTML page.
@@ -45,13 +45,13 @@ def write_report(
     """
     counts = {"measured": sum("skipped" not in r for r in records)}
     counts["skipped"] = len(records) - counts["measured"]
-    about = {"frames": f"{counts['measured']} measured, {counts['skipped']} skipped", **about}
+    run_info = {"frames": f"{counts['measured']} measured, {counts['skipped']} skipped", **run_info}
     groups = group_skipped_frames(records)
     content = {
         "experiment": experiment.name,
         "title": experiment.title,
         "question": experiment.question,
-        "about": about,
+        "about": run_info,
         **counts,
         "skipped_frames": [r for r in records if "skipped" in r],
         "sections": sections,
@@ -61,8 +61,8 @@ def write_report(
         write_text(out / "tables" / f"{table.name}.csv", to_csv(table))
     for figure in (figure for section in sections for figure in section.figures):
         write_bytes(out / "figures" / f"{figure.name}.png", encode_png(figure))
-    write_text(out / "report.md", to_markdown(experiment, sections, about, groups))
-    write_text(out / "report.html", to_html(experiment, sections, about, groups))
+    write_text(out / "report.md", to_markdown(experiment, sections, run_info, groups))
+    write_text(out / "report.html", to_html(experiment, sections, run_info, groups))
     return out / "report.html"
 
 
@@ -97,7 +97,7 @@ def is_number(cell: str | Cell) -> bool:
 
 
 def to_html(
-    experiment: Experiment, sections: list[Section], about: dict[str, str], skipped: list[dict[str, Any]]
+    experiment: Experiment, sections: list[Section], run_info: dict[str, str], skipped: list[dict[str, Any]]
 ) -> str:
     """Return the report as one self-contained HTML page."""
     import jinja2
@@ -110,7 +110,7 @@ def to_html(
     return template.render(
         title=experiment.title,
         question=experiment.question,
-        about=about,
+        about=run_info,
         skipped=skipped,
         sections=sections,
         legend=LEGEND,
@@ -122,10 +122,10 @@ def to_html(
 
 
 def to_markdown(
-    experiment: Experiment, sections: list[Section], about: dict[str, str], skipped: list[dict[str, Any]]
+    experiment: Experiment, sections: list[Section], run_info: dict[str, str], skipped: list[dict[str, Any]]
 ) -> str:
     """Return the report in Markdown, with links to the figures."""
-    lines = [f"# {experiment.title}", "", experiment.question, "", *_format_rows(("", ""), list(about.items())), ""]
+    lines = [f"# {experiment.title}", "", experiment.question, "", *_format_rows(("", ""), list(run_info.items())), ""]
     if skipped:
         lines += [
             "## Skipped frames",

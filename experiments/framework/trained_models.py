@@ -1,7 +1,7 @@
 """Training of all detectors of an experiment on the same scenes and within one time budget.
 
     plan = plan_training(request)           # measured once, then read from a file
-    trained = train_models(request, plan)   # a finished model is not trained again
+    trained_models = train_models(request, plan)   # a finished model is not trained again
 
 Every model has a folder out/models/NAME-HASH, where HASH is the hash of its configuration. An
 interrupted run is resumed there.
@@ -275,7 +275,7 @@ def train_models(request: ModelRequest, plan: SharedPlan) -> dict[str, TrainedMo
         InputError: A network cannot be trained.
     """
     limit_s = math.inf if request.budget is None else 3600 * request.budget
-    trained: dict[str, TrainedModel] = {}
+    trained_models: dict[str, TrainedModel] = {}
     for seed in range(plan.seeds):
         for first_model, model in zip(request.models(request.params, 0), request.models(request.params, seed)):
             if first_model.name not in plan.durations:
@@ -284,15 +284,15 @@ def train_models(request: ModelRequest, plan: SharedPlan) -> dict[str, TrainedMo
             planned_model = plan.apply(model)
             folder = request.folder / _name_folder(planned_model, request.scenes)
             if not (folder / "last.safetensors").exists():
-                spent_s = sum(trained_model.seconds for trained_model in trained.values())
+                spent_s = sum(trained_model.seconds for trained_model in trained_models.values())
                 is_optional = seed > 0 or not model.required
                 if is_optional and spent_s + plan.durations[first_model.name] > limit_s:
                     errors.print(f"{model.name} is skipped because the budget is used up")
                     continue
                 errors.print(f"training {model.name}", style="bold")
                 _train(planned_model, request, folder, plan.speeds[first_model.name])
-            trained[model.name] = read_trained_model(planned_model, folder)
-    return trained
+            trained_models[model.name] = read_trained_model(planned_model, folder)
+    return trained_models
 
 
 def _train(model: Model, request: ModelRequest, folder: Path, speed: Speed) -> None:

@@ -54,7 +54,7 @@ def main(data: Path, weights: str, min_score: float | None, kitti: Path | None) 
 
 
 def _format_cell(name: str, counts: Counts | None) -> str:
-    text = "" if counts is None else f"{counts.found} / {counts.false} / {counts.missed}"
+    text = "" if counts is None else f"{counts.tp} / {counts.fp} / {counts.fn}"
     return f"  {name} {text:16}"
 
 

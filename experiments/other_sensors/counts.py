@@ -43,18 +43,18 @@ class LabelledCloud:
 class Counts:
     """Numbers of true positives, false positives and misses."""
 
-    found: int = 0
-    false: int = 0
-    missed: int = 0
+    tp: int = 0
+    fp: int = 0
+    fn: int = 0
 
     def __add__(self, other: Counts) -> Counts:
-        return Counts(self.found + other.found, self.false + other.false, self.missed + other.missed)
+        return Counts(self.tp + other.tp, self.fp + other.fp, self.fn + other.fn)
 
     @property
     def f1(self) -> float:
         """F1 in percent; NaN if there are neither objects nor detections."""
-        total = 2 * self.found + self.false + self.missed
-        return 200 * self.found / total if total else float("nan")
+        total = 2 * self.tp + self.fp + self.fn
+        return 200 * self.tp / total if total else float("nan")
 
 
 def read_clouds(folder: Path) -> Iterator[LabelledCloud]:
@@ -73,21 +73,21 @@ def read_clouds(folder: Path) -> Iterator[LabelledCloud]:
         yield LabelledCloud(path.parent.name, path.stem, cloud, boxes, names.astype(str), num)
 
 
-def count_detections(labelled: LabelledCloud, detections: Detections) -> dict[str, Counts]:
+def count_detections(labelled_cloud: LabelledCloud, detections: Detections) -> dict[str, Counts]:
     """Count true positives, false positives and misses of each labelled class.
 
     An object is matched by the detection with the highest score within MAX_DISTANCE_M. Ignored are
     objects with few points or far away, detections near them, and detections beyond MAX_RANGE_M.
     """
     counts = {}
-    is_counted = _is_counted(labelled.boxes, labelled.points)
+    is_counted = _is_counted(labelled_cloud.boxes, labelled_cloud.points)
     for name, limit in MAX_DISTANCE_M.items():
-        if name in UNLABELLED.get(labelled.dataset, ()):
+        if name in UNLABELLED.get(labelled_cloud.dataset, ()):
             continue
         class_detections = detections[detections.class_ids == CLASSES.index(name)]
         class_detections = class_detections[np.argsort(-class_detections.scores, kind="stable")]
-        labels = np.flatnonzero(labelled.names == name)
-        distances = centre_distances(class_detections.boxes, labelled.boxes[labels])
+        labels = np.flatnonzero(labelled_cloud.names == name)
+        distances = centre_distances(class_detections.boxes, labelled_cloud.boxes[labels])
         is_matched = np.zeros(len(labels), bool)
         false_positives = 0
         for row, box in zip(distances, class_detections.boxes):
@@ -106,10 +106,10 @@ def count_all(
 ) -> dict[tuple[str, str], Counts]:
     """Return the counts by (data set, class), with the recorded intensity or without intensity."""
     sums: dict[tuple[str, str], Counts] = {}
-    for labelled in clouds:
-        cloud = labelled.cloud if with_intensity else replace(labelled.cloud, intensity=None)
-        for name, counts in count_detections(labelled, detector(cloud).detections).items():
-            key = labelled.dataset, name
+    for labelled_cloud in clouds:
+        cloud = labelled_cloud.cloud if with_intensity else replace(labelled_cloud.cloud, intensity=None)
+        for name, counts in count_detections(labelled_cloud, detector(cloud).detections).items():
+            key = labelled_cloud.dataset, name
             sums[key] = sums.get(key, Counts()) + counts
     return sums
 

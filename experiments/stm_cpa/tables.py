@@ -147,8 +147,8 @@ def _make_cpa_section(records: list[dict]) -> Section:
             make_line(f"{name} m", steps, stacked_estimates[:, :, RANGE_NAMES.index(name), m])
             for name in paper.FIGURE_8
         ]
-        for name, published in paper.FIGURE_8.items():
-            points = {k: values[m] for k, values in published.items() if values[m] is not None}
+        for name, values_by_steps in paper.FIGURE_8.items():
+            points = {k: values[m] for k, values in values_by_steps.items() if values[m] is not None}
             lines.append(Line(f"{name} m, paper", tuple(points), tuple(points.values()), dashed=True))
         panels.append(Panel(label.removesuffix(" [%]"), "CPA steps", "%", tuple(lines)))
     range_rows: list[Row] = [

@@ -68,8 +68,8 @@ def rotate_and_crop(
     The crop leaves a margin for the other changes. This step runs first, because it removes most
     points.
     """
-    turn = np.pi if scene.all_around and params.turn else params.turn
-    scene = rotate_scene(scene, rng.uniform(-turn, turn))
+    max_angle = np.pi if scene.all_around and params.turn else params.turn
+    scene = rotate_scene(scene, rng.uniform(-max_angle, max_angle))
     margin = 1 + params.height + params.scale / (1 - params.scale) * np.abs([low, high])
     margin[:, 2] += 2 * params.tilt * np.abs([low[:2], high[:2]]).max()
     return crop_scene(scene, low - margin[0], high + margin[1])
@@ -77,16 +77,16 @@ def rotate_and_crop(
 
 def crop_scene(scene: TrainingScene, low: np.ndarray, high: np.ndarray) -> TrainingScene:
     """Keep the points between low and high (3,) in m, and the boxes whose centre is between them in x and y."""
-    keep = np.ones(len(scene.points), bool)
+    point_mask = np.ones(len(scene.points), bool)
     for axis in range(3):
-        keep &= (scene.points[:, axis] >= low[axis]) & (scene.points[:, axis] < high[axis])
-    inside = is_within(scene.boxes, low, high)
+        point_mask &= (scene.points[:, axis] >= low[axis]) & (scene.points[:, axis] < high[axis])
+    box_mask = is_within(scene.boxes, low, high)
     return replace(
         scene,
-        points=scene.points[keep],
-        boxes=scene.boxes[inside],
-        class_ids=scene.class_ids[inside],
-        detectable=scene.detectable[inside],
+        points=scene.points[point_mask],
+        boxes=scene.boxes[box_mask],
+        class_ids=scene.class_ids[box_mask],
+        detectable=scene.detectable[box_mask],
     )
 
 
@@ -229,26 +229,26 @@ def raise_scene(scene: TrainingScene, height: float, slopes: ArrayLike = (0.0, 0
     return replace(scene, points=points, boxes=boxes)
 
 
-def move_objects(scene: TrainingScene, turn: float, shift: float, rng: np.random.Generator) -> TrainingScene:
+def move_objects(scene: TrainingScene, max_angle: float, shift: float, rng: np.random.Generator) -> TrainingScene:
     """Rotate and shift each object with its points at random, unless it touches another box before or after.
 
     Args:
         scene: Scene, which is not changed.
-        turn: Maximum rotation about the object's centre, rad.
+        max_angle: Maximum rotation about the object's centre, rad.
         shift: Standard deviation of the shift along x and along y, m.
         rng: Random generator.
     """
     points, boxes = scene.points.copy(), scene.boxes.copy()
-    if not (turn or shift):
+    if not (max_angle or shift):
         return scene
-    angles = rng.uniform(-turn, turn, len(boxes))
+    angles = rng.uniform(-max_angle, max_angle, len(boxes))
     shifts = rng.normal(0, shift, (len(boxes), 2)) if shift else np.zeros((len(boxes), 2))
     for i in range(len(boxes)):
-        others = np.delete(enlarge_boxes(boxes), i, axis=0)
+        other_boxes = np.delete(enlarge_boxes(boxes), i, axis=0)
         goal = boxes[i].copy()
         goal[:2] += shifts[i]
         goal[6] = wrap_angle(goal[6] + angles[i])
-        if bev_iou(enlarge_boxes(np.stack([boxes[i], goal])), others).any():
+        if bev_iou(enlarge_boxes(np.stack([boxes[i], goal])), other_boxes).any():
             continue
         indices = find_points_in_box(points, boxes[i], BOX_MARGIN_M)
         points[indices, :3] = move_with_box(points[indices, :3], boxes[i], goal)

@@ -49,14 +49,14 @@ class LabelledFrames:
         Raises:
             InputError: No frame remains.
         """
-        excluded = {key for other in others for frame in other.frames for key in _frame_keys(frame)}
-        remaining = tuple(frame for frame in self.frames if excluded.isdisjoint(_frame_keys(frame)))
-        if not remaining:
+        excluded_keys = {key for frames in others for frame in frames.frames for key in _list_keys(frame)}
+        remaining_frames = tuple(frame for frame in self.frames if excluded_keys.isdisjoint(_list_keys(frame)))
+        if not remaining_frames:
             raise InputError(
                 f"{self.path}: no frame is left to {purpose}, since training and validation must not share "
                 "frames; give other frames, or omit --val to hold out a part of the data"
             )
-        return replace(self, frames=remaining)
+        return replace(self, frames=remaining_frames)
 
     def split(self, fraction: float, seed: int) -> tuple[LabelledFrames, LabelledFrames]:
         """Split off a fraction of the labelled frames for validation.
@@ -108,8 +108,8 @@ def open_labelled_frames(
 def _find_height(recording: Recording, height: float, with_simulated: bool) -> float | None:
     if height and not (with_simulated and recording.has_sensor_height):
         return height
-    measured = apply_measured_height(recording, load_first_clouds(recording))
-    return None if measured is recording else next(iter(measured)).sensor_height
+    recording_with_height = apply_measured_height(recording, load_first_clouds(recording))
+    return None if recording_with_height is recording else next(iter(recording_with_height)).sensor_height
 
 
 def may_have_labels(frame: Frame) -> bool:
@@ -120,7 +120,7 @@ def may_have_labels(frame: Frame) -> bool:
         return True
 
 
-def _frame_keys(frame: Frame) -> set[tuple[Path, str]]:
+def _list_keys(frame: Frame) -> set[tuple[Path, str]]:
     """Return keys (file, name in a bag) that identify a frame whatever path its recording was opened by."""
     if frame.points is not None:
         return {(frame.points.resolve(), "")}

@@ -101,7 +101,6 @@ class ClassFit(NamedTuple):
     new_score: CurveScore | None
 
 
-
 def fit_fusion(
     weights: Path | None, classifier: Path | None, out: Path, params: FusedTraining, jobs: int = 1
 ) -> dict[str, dict[str, ClassFit]]:
@@ -131,20 +130,17 @@ def fit_fusion(
     sensor = find_sensor(params.sensor, params.mount_height or _find_trained_height(header))
     scenes = Scenes(None, params.people, params.scene)
     scenes.scene_types()  # raises InputError for an unknown scene
-    around = detector.range == "around"
+    all_around = detector.range == "around"
     errors.print(
         f"{params.scans} {params.scene} scans of {params.sensor} at {sensor.height:g} m, "
-        f"{'all around' if around else 'ahead'}"
+        f"{'all around' if all_around else 'ahead'}"
     )
     for network_header in header, classifier_header:
         if warning := network_header.find_height_mismatch(sensor.height):
             errors.print(f"{NETWORKS[network_header.network][0]}: {warning}")
-    source = SimulatedScenes(FIRST_FIT_SEED, params.scans, sensor, scenes, all_around=around)
+    source = SimulatedScenes(FIRST_FIT_SEED, params.scans, sensor, scenes, all_around=all_around)
     samples, shipped = simulate_samples(FusedDetectorParams(fused=fused), source, jobs), find_fusion()
-    old_models = {
-        WITH_INTENSITY: shipped.models,
-        WITHOUT_INTENSITY: shipped.models_without_intensity or shipped.models,
-    }
+    old_models = {WITH_INTENSITY: shipped.models, WITHOUT_INTENSITY: shipped.models_without_intensity or shipped.models}
     models, fits = {}, {}
     for kind in CLOUD_KINDS:
         models[kind], fits[kind] = fit_classes(samples[kind], old_models[kind])
@@ -161,7 +157,7 @@ def fit_fusion(
             "height": sensor.height,
             "scene": params.scene,
             "scans": params.scans,
-            "range": "around" if around else "ahead",
+            "range": "around" if all_around else "ahead",
             "proposals, hits": counts[WITH_INTENSITY],
             "proposals, hits without intensity": counts[WITHOUT_INTENSITY],
         },
@@ -213,7 +209,7 @@ def collect_samples(frame: Frame, proposals: Proposals, scan: int) -> Samples:
     assert truth is not None  # simulated frames always have labels
     centres = detections.boxes[:, :3] - np.array([0, 0, frame.sensor_height - SENSOR_HEIGHT], np.float32)
     in_view = np.ones(len(detections), bool) if camera is None else camera.in_view(centres)
-    selected, correct = [], []
+    indices, correct = [], []
     for class_id in np.unique(detections.class_ids):
         order = np.flatnonzero((detections.class_ids == class_id) & in_view)
         order = order[np.argsort(-detections.scores[order], kind="stable")]
@@ -226,14 +222,14 @@ def collect_samples(frame: Frame, proposals: Proposals, scan: int) -> Samples:
             if not len(unmatched) and (hit.any() or similar_hit.any()):
                 continue
             is_matched[unmatched[:1]] = True
-            selected.append(i)
+            indices.append(i)
             correct.append(len(unmatched) > 0)
-    indices = np.array(selected, np.int64)
+    rows = np.array(indices, np.int64)
     return Samples(
-        detections.class_ids[indices],
+        detections.class_ids[rows],
         np.array(correct, bool),
-        np.full(len(indices), scan),
-        {name: odds[indices] for name, odds in proposals.evidence.items()},
+        np.full(len(rows), scan),
+        {name: odds[rows] for name, odds in proposals.evidence.items()},
     )
 
 

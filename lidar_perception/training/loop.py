@@ -160,8 +160,8 @@ class TimeBudget:
         steps_since_validation = step % self.validate_steps
         # Time from the last validation on, without the final validation.
         seconds = self.deadline - now - self.validation_s + steps_since_validation * self.step_duration
-        cycles, rest = divmod(seconds, self.validate_steps * self.step_duration + self.validation_s)
-        steps = cycles * self.validate_steps + min(rest / self.step_duration, self.validate_steps)
+        cycles, remainder = divmod(seconds, self.validate_steps * self.step_duration + self.validation_s)
+        steps = cycles * self.validate_steps + min(remainder / self.step_duration, self.validate_steps)
         return steps - steps_since_validation - SPARE_STEPS
 
     @contextmanager

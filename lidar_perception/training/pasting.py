@@ -21,21 +21,21 @@ def find_points_in_box(points: np.ndarray, box: np.ndarray, margin: float) -> np
     """
     indices, count = np.empty(len(points), np.int64), 0
     cos, sin = np.cos(box[6]), np.sin(box[6])
-    half = box[3:6] / 2 + margin
+    half_size = box[3:6] / 2 + margin
     for i in range(len(points)):
-        if _is_in_box(points[i], box, half, cos, sin):
+        if _is_in_box(points[i], box, half_size, cos, sin):
             indices[count] = i
             count += 1
     return indices[:count].copy()
 
 
 @njit(inline="always")
-def _is_in_box(point, box, half, cos, sin):
+def _is_in_box(point, box, half_size, cos, sin):
     dx, dy = point[0] - box[0], point[1] - box[1]
     return (
-        abs(cos * dx + sin * dy) <= half[0]
-        and abs(cos * dy - sin * dx) <= half[1]
-        and abs(point[2] - box[2]) <= half[2]
+        abs(cos * dx + sin * dy) <= half_size[0]
+        and abs(cos * dy - sin * dx) <= half_size[1]
+        and abs(point[2] - box[2]) <= half_size[2]
     )
 
 
@@ -65,7 +65,7 @@ def paste_object(
             (depth, (cos * object_points[i, 1] - sin * object_points[i, 0]) / depth, object_points[i, 2] / depth)
         ):
             low[k], high[k] = min(low[k], value), max(high[k], value)
-    half, yaw_cos, yaw_sin = box[3:6] / 2 + margin, np.cos(box[6]), np.sin(box[6])
+    half_size, yaw_cos, yaw_sin = box[3:6] / 2 + margin, np.cos(box[6]), np.sin(box[6])
     out = np.empty((len(points) + len(object_points), 4), np.float32)
     count, in_front = 0, 0
     for i in range(len(points)):
@@ -76,7 +76,7 @@ def paste_object(
                 if depth > high[0]:
                     continue
                 in_front += 1
-        if not _is_in_box(points[i], box, half, yaw_cos, yaw_sin):
+        if not _is_in_box(points[i], box, half_size, yaw_cos, yaw_sin):
             for k in range(4):
                 out[count, k] = points[i, k]
             count += 1

@@ -24,13 +24,13 @@ from lidar_perception.types import InputError
 
 
 def make_save_function(
-    out: Path, config: Any, params: LoopParams, batches: Batches, about: dict[str, Any], commit: str
+    out: Path, config: Any, params: LoopParams, batches: Batches, data_info: dict[str, Any], commit: str
 ) -> Callable[[str, nn.Module, dict[str, Any]], None]:
     """Return a function save(name, module, record) that writes out/name.safetensors, see Task.save."""
 
     def save(name: str, module: nn.Module, record: dict[str, Any]) -> None:
         training = {
-            **about,
+            **data_info,
             "seed": params.seed,
             "steps": record["step"],
             "seconds": round(record["seconds"]),

@@ -36,7 +36,7 @@ class Task(Generic[Net]):
             detectors/calibration.py.
         save: save(name, module, record) writes the weights "best" or "last"; the record is JSON data.
         steps_per_epoch: Number of steps per epoch.
-        about: Description of the data, which must not change when the run is resumed.
+        data_info: Description of the data, which must not change when the run is resumed.
     """
 
     module: Net
@@ -45,7 +45,7 @@ class Task(Generic[Net]):
     validate: Callable[[Net], Validation]
     save: Callable[[str, nn.Module, dict[str, Any]], None]
     steps_per_epoch: int
-    about: dict[str, Any] = field(default_factory=dict)
+    data_info: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -128,7 +128,7 @@ class Run:
         """Return the settings that must not change when the run is resumed."""
         return {
             **self.params.get_fixed_settings(),
-            **self.task.about,
+            **self.task.data_info,
             "steps": self.steps,
             "processes": get_world_size(),
         }

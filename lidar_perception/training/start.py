@@ -106,7 +106,7 @@ def start_training(
         wait_for_all()
         stream, validation = trainer.make_streams(params, sources, val_sources, cuts, request.out)
         batches = Batches(stream, params.batch, request.jobs, get_rank(), get_world_size())
-        about = {
+        data_info = {
             "data": list(request.data),
             "scenes": len(stream),
             "validation": list(request.val) or "held out",
@@ -114,7 +114,7 @@ def start_training(
             "init": str(request.init or ""),
             "sensor": _describe_sensor(params, sensor, sources),
         }
-        task = trainer.make_task(params, batches, validation, request.out, device, about, commit, init)
+        task = trainer.make_task(params, batches, validation, request.out, device, data_info, commit, init)
         deadline = math.inf if hours is None else start + 3600 * hours
         progress = train(
             task,

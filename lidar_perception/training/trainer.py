@@ -74,7 +74,7 @@ class Trainer(Protocol):
         val_scenes: SceneReader,
         out: Path,
         device: torch.device,
-        about: dict[str, Any],
+        data_info: dict[str, Any],
         commit: str,
         init: Path | None,
     ) -> Task:
@@ -86,7 +86,7 @@ class Trainer(Protocol):
             val_scenes: Validation scenes.
             out: Folder for best.safetensors and last.safetensors.
             device: Device of the network.
-            about: Description of the data for the header. It must be the same in a resumed run.
+            data_info: Description of the data for the header. It must be the same in a resumed run.
             commit: Version of the code for the header.
             init: Checkpoint with initial weights, see checkpoint.copy_matching_weights; None for random ones.
         """

@@ -83,10 +83,7 @@ BAD_INPUTS = {
         ["evaluate", "candidates", "--data", "{bag}", "--json", "{kitti}/training/calib/000000.txt/o"],
         "cannot write",
     ),
-    "json is a folder": (
-        ["evaluate", "candidates", "--data", "{tmp}/none", "--json", "{tmp}"],
-        "cannot write {tmp}",
-    ),
+    "json is a folder": (["evaluate", "candidates", "--data", "{tmp}/none", "--json", "{tmp}"], "cannot write {tmp}"),
     "detector": (
         ["evaluate", "detection", "--data", "{kitti}", "--weights", "fussed"],
         "'fussed'; did you mean 'fused'? Valid names: pointpillars, pointnet, fused",

@@ -81,7 +81,7 @@ def test_concurrent_first_calls_create_one_environment(tmp_path):
             stderr=subprocess.PIPE,
             env={**os.environ, "LIDAR_VENV": str(venv), "LIDAR_PYTHON": "/bin/false"},
         )
-        assert "another call is making" in other.stderr.readline()
+        assert "waiting for another process" in other.stderr.readline()
         write(venv / "lidar-setup", stamp())
     assert other.communicate() == ("ran info\n", "") and other.returncode == 0
 
@@ -103,7 +103,7 @@ def test_sourced_ros_does_not_affect_the_new_environment(tmp_path):
             "LIDAR_PYTHON": str(python),
         },
     )
-    assert done.returncode == 1 and "installing failed" in done.stderr  # this Python cannot create environments
+    assert done.returncode == 1 and "installation failed" in done.stderr  # this Python cannot create environments
     assert seen.read_text().split() == ["unset", "unset"]
 
 

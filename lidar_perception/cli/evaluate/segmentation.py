@@ -74,13 +74,13 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
     clustering_methods = tuple(name for name in CLUSTERING_METHODS if name in methods)
     # Open everything first, so that a typo in the last path does not cost an hour.
     recordings = [options.open_recording(None, path) for path in options.data]
-    labelled = [recording for recording in recordings if POINT_LABELS in recording.contents]
+    with_point_labels = [recording for recording in recordings if POINT_LABELS in recording.contents]
     for recording in recordings:
-        if recording not in labelled:
+        if recording not in with_point_labels:
             recording.require(BOXES, "evaluate segmentation")
-    if png is not None and not (labelled and ground_methods):
+    if png is not None and not (with_point_labels and ground_methods):
         raise click.UsageError("--png requires labelled points (SemanticKITTI) and a ground method")
-    if not (labelled or clustering_methods):
+    if not (with_point_labels or clustering_methods):
         raise click.UsageError(
             "ground methods require labelled points: give SemanticKITTI, or choose a clustering method"
         )
@@ -107,8 +107,8 @@ def segmentation(options: ScoringOptions, methods: tuple, png: Path | None, para
     if png is not None:
         from lidar_perception.scoring.points.report import segment_by_methods
 
-        recording_params = with_recorded_height(labelled[0], params)
-        for frame in islice(labelled[0], options.limit):
+        recording_params = with_recorded_height(with_point_labels[0], params)
+        for frame in islice(with_point_labels[0], options.limit):
             scan, labels, ground_masks = segment_by_methods(frame, recording_params, ground_methods)
             if labels is not None:
                 draw_ground(png, frame.name, scan, labels.classes, ground_masks)

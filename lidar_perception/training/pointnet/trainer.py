@@ -141,7 +141,7 @@ class PointNetTrainer:
         val_scenes: SceneReader,
         out: Path,
         device: torch.device,
-        about: dict[str, Any],
+        data_info: dict[str, Any],
         commit: str,
         init: Path | None,
     ) -> Task:
@@ -163,7 +163,7 @@ class PointNetTrainer:
             make_loss(self.config, device),
             batches,
             validate,
-            make_save_function(out, self.config, params, batches, about, commit),
+            make_save_function(out, self.config, params, batches, data_info, commit),
             batches.steps_per_epoch,
-            about,
+            data_info,
         )

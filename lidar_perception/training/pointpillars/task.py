@@ -171,15 +171,15 @@ def _assign_targets(
     targets = assign(anchors, config, all_boxes[target_mask], classes[target_mask])
     anchor_labels = targets.labels[0]
     for index, spec in enumerate(config.anchors):
-        for others, min_iou in (
+        for ignored_boxes, min_iou in (
             (all_boxes[~target_mask & (classes == index)], spec.unmatched),
             (all_boxes[classes == DONT_CARE_LABEL], MIN_TOUCH_IOU),
         ):
-            candidates = find_near_anchors(anchors, config, others, index)
+            candidates = find_near_anchors(anchors, config, ignored_boxes, index)
             if len(candidates):
-                ignored = nearest_axis_iou(anchors[candidates], others).max(dim=1).values >= min_iou
-                ignored &= anchor_labels[candidates] == BACKGROUND
-                anchor_labels[candidates[ignored]] = IGNORED
+                is_ignored = nearest_axis_iou(anchors[candidates], ignored_boxes).max(dim=1).values >= min_iou
+                is_ignored &= anchor_labels[candidates] == BACKGROUND
+                anchor_labels[candidates[is_ignored]] = IGNORED
     return targets
 
 
@@ -213,9 +213,9 @@ def load_validation_frame(config: NetworkConfig, source: Any, i: int) -> Frame:
     frame = source.load_frame(i)
     truth, calibration = frame.truth(), frame.calibration()
     if calibration is None and truth is not None:
-        inside = np.flatnonzero(is_within(truth.boxes, config.low, config.high))
-        extras = [truth.extras[i] for i in inside]
-        truth = GroundTruth.of(truth.boxes[inside], truth.class_ids[inside], extras, truth.notes)
+        indices = np.flatnonzero(is_within(truth.boxes, config.low, config.high))
+        extras = [truth.extras[k] for k in indices]
+        truth = GroundTruth.of(truth.boxes[indices], truth.class_ids[indices], extras, truth.notes)
     return Frame.of(frame.name, frame.load(), truth, calibration, sensor_height=frame.sensor_height)
 
 

@@ -152,7 +152,7 @@ class PointPillarsTrainer:
         val_scenes: SceneReader,
         out: Path,
         device: torch.device,
-        about: dict[str, Any],
+        data_info: dict[str, Any],
         commit: str,
         init: Path | None,
     ) -> Task:
@@ -173,9 +173,9 @@ class PointPillarsTrainer:
             make_loss(reduced, device),
             batches,
             validate,
-            make_save_function(out, self.config, params, batches, about, commit),
+            make_save_function(out, self.config, params, batches, data_info, commit),
             batches.steps_per_epoch,
-            about,
+            data_info,
         )
 
     def _make_detector(self, network: PointPillars, device: torch.device) -> PointPillarsDetector:
