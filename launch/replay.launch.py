@@ -120,7 +120,9 @@ def replay(context, argument_names):
         remappings=list(remap.items()),
         ros_arguments=log_level,
     )
-    end = TimerAction(period=LAST_FRAME_DELAY_S, actions=[EmitEvent(event=Shutdown(reason="the bag is played"))])
+    end = TimerAction(
+        period=LAST_FRAME_DELAY_S, actions=[EmitEvent(event=Shutdown(reason="reached the end of the bag"))]
+    )
     graph = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(HERE / "detectors.launch.py")),
         launch_arguments={

@@ -187,9 +187,9 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
     for name, values in new.items():
         kind = np.dtype(values.dtype).newbyteorder(byte_order)
         code = CODES[f"{kind.kind}{kind.itemsize}"]
-        existing = names.get(name)
-        if existing is not None and existing.datatype == code and existing.count <= 1:
-            layout[name] = (existing.offset, kind)
+        existing_field = names.get(name)
+        if existing_field is not None and existing_field.datatype == code and existing_field.count <= 1:
+            layout[name] = (existing_field.offset, kind)
             continue
         fields = [f for f in fields if f.name != name]
         offset = -(-offset // kind.itemsize) * kind.itemsize  # aligned as in C structs

@@ -59,11 +59,11 @@ def sample_cells(cells: Cells, max_work: int) -> Sample:
 
 def _mix_bits(bits: np.ndarray) -> np.ndarray:
     """Hash each column of (3, N) uint64 to one uint64 (splitmix64)."""
-    mixed = bits[0] << np.uint64(32) | bits[1]
+    hashes = bits[0] << np.uint64(32) | bits[1]
     for increment in (bits[2], np.uint64(0)):
-        mixed = (mixed ^ mixed >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
-        mixed = (mixed ^ mixed >> np.uint64(27)) * np.uint64(0x94D049BB133111EB) + increment
-    return mixed ^ mixed >> np.uint64(31)
+        hashes = (hashes ^ hashes >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
+        hashes = (hashes ^ hashes >> np.uint64(27)) * np.uint64(0x94D049BB133111EB) + increment
+    return hashes ^ hashes >> np.uint64(31)
 
 
 @njit(cache=True, nogil=True)

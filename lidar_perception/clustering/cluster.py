@@ -30,22 +30,24 @@ def cluster(
         InputError: the array has another shape or type.
     """
     xyz = as_point_cloud(cloud).xyz
-    usable = are_usable_returns(xyz)
-    if usable.all():
+    is_usable = are_usable_returns(xyz)
+    if is_usable.all():
         return _cluster_usable(xyz, params, density)
     labels = np.zeros(len(xyz), np.int32)
-    labels[usable] = _cluster_usable(xyz[usable], params, density)
+    labels[is_usable] = _cluster_usable(xyz[is_usable], params, density)
     return labels
 
 
 def _cluster_usable(xyz: np.ndarray, params: ClusteringParams, density: float) -> np.ndarray:
-    adapted = adapt_to_density(params, density)
-    if adapted.method == "dbscan":
-        return distance_aware_dbscan(xyz, adapted.dbscan)
+    adapted_params = adapt_to_density(params, density)
+    if adapted_params.method == "dbscan":
+        return distance_aware_dbscan(xyz, adapted_params.dbscan)
     radii = (
-        None if adapted is params else compute_radii(xyz, density, params.euclidean.radius, adapted.euclidean.radius)
+        None
+        if adapted_params is params
+        else compute_radii(xyz, density, params.euclidean.radius, adapted_params.euclidean.radius)
     )
-    return cluster_euclidean(xyz, adapted.euclidean, radii=radii)
+    return cluster_euclidean(xyz, adapted_params.euclidean, radii=radii)
 
 
 def cluster_obstacles(

@@ -35,9 +35,9 @@ def find_consistent_points(xyz: np.ndarray, radii: np.ndarray, limit: float, max
     variation = np.divide(np.maximum(eigenvalues[:, 0], 0), sums, out=np.zeros_like(sums), where=sums > 0)
     cells_with_variation = cells._replace(xyz=np.vstack([cells.xyz, variation]))
     means = _average_fourth_row(cells_with_variation, sample_cells(cells_with_variation, max_work), radii2)
-    consistent = np.empty(len(xyz), bool)
-    consistent[cells.order] = np.float32(np.abs(variation - means)) <= np.float32(limit)
-    return consistent
+    is_consistent = np.empty(len(xyz), bool)
+    is_consistent[cells.order] = np.float32(np.abs(variation - means)) <= np.float32(limit)
+    return is_consistent
 
 
 @njit(cache=True, nogil=True)

@@ -76,8 +76,8 @@ def _join_bands(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray, ep
     """
     parent = np.arange(int(labels.max(initial=0)) + 1, dtype=np.int32)
     ranges = horizontal_range(xyz)
-    clustered = [indices[labels[indices] > 0] for indices in bands]
-    for inner, outer, reach in zip(clustered, clustered[1:], map(min, eps, eps[1:])):
+    clustered_indices = [indices[labels[indices] > 0] for indices in bands]
+    for inner, outer, reach in zip(clustered_indices, clustered_indices[1:], map(min, eps, eps[1:])):
         if len(inner) and len(outer):
             inner_range, outer_range = ranges[inner], ranges[outer]
             inner = inner[inner_range >= outer_range.min() - reach]

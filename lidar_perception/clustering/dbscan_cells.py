@@ -76,25 +76,25 @@ def _find_core_points(x, y, z, start, first, second, eps2, min_samples):
     """
     cells = len(start) - 1
     neighbour_counts = np.empty(len(x), np.int32)
-    sparse = np.empty(cells, np.bool_)
+    is_sparse = np.empty(cells, np.bool_)
     for c in range(cells):
         size = start[c + 1] - start[c]
-        sparse[c] = size < min_samples
+        is_sparse[c] = size < min_samples
         neighbour_counts[start[c] : start[c + 1]] = size
     for p in range(len(first)):
         a, b = first[p], second[p]
-        if sparse[a] and sparse[b]:
+        if is_sparse[a] and is_sparse[b]:
             for i in range(start[a], start[a + 1]):
                 for j in range(start[b], start[b + 1]):
                     is_neighbour = is_near(x, y, z, i, j, eps2)
                     neighbour_counts[i] += is_neighbour
                     neighbour_counts[j] += is_neighbour
-            sparse[a] = _has_sparse_point(neighbour_counts, start[a], start[a + 1], min_samples)
-            sparse[b] = _has_sparse_point(neighbour_counts, start[b], start[b + 1], min_samples)
-        elif sparse[a]:
-            sparse[a] = _count_neighbours(x, y, z, start, a, b, eps2, min_samples, neighbour_counts)
-        elif sparse[b]:
-            sparse[b] = _count_neighbours(x, y, z, start, b, a, eps2, min_samples, neighbour_counts)
+            is_sparse[a] = _has_sparse_point(neighbour_counts, start[a], start[a + 1], min_samples)
+            is_sparse[b] = _has_sparse_point(neighbour_counts, start[b], start[b + 1], min_samples)
+        elif is_sparse[a]:
+            is_sparse[a] = _count_neighbours(x, y, z, start, a, b, eps2, min_samples, neighbour_counts)
+        elif is_sparse[b]:
+            is_sparse[b] = _count_neighbours(x, y, z, start, b, a, eps2, min_samples, neighbour_counts)
     return neighbour_counts >= min_samples
 
 
@@ -112,7 +112,7 @@ def _count_neighbours(x, y, z, start, a, b, eps2, min_samples, neighbour_counts)
 
     Counting stops at min_samples. Returns True if a point of cell a still has fewer.
     """
-    sparse = False
+    is_sparse = False
     for i in range(start[a], start[a + 1]):
         count = neighbour_counts[i]
         if count < min_samples:
@@ -122,8 +122,8 @@ def _count_neighbours(x, y, z, start, a, b, eps2, min_samples, neighbour_counts)
                     if count == min_samples:
                         break
             neighbour_counts[i] = count
-            sparse |= count < min_samples
-    return sparse
+            is_sparse |= count < min_samples
+    return is_sparse
 
 
 @njit(cache=True, nogil=True)
@@ -185,8 +185,8 @@ def _join_cells(x, y, z, start, first, second, core, eps2, max_work):
         if extents[a, 0] <= extents[a, 3] and extents[b, 0] <= extents[b, 3]:
             root_a, root_b = find_root(parent, a), find_root(parent, b)
             if root_a != root_b:
-                touching, distances = _cells_touch(x, y, z, core, extents, start, a, b, eps2)
-                if touching:
+                are_touching, distances = _cells_touch(x, y, z, core, extents, start, a, b, eps2)
+                if are_touching:
                     parent[max(root_a, root_b)] = min(root_a, root_b)
                 work += distances
                 if work > max_work:

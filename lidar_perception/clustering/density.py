@@ -33,13 +33,13 @@ def measure_density(xyz: np.ndarray) -> float:
         HDL-64E has 13 to 16.
     """
     step = max(len(xyz) // MAX_SAMPLED, 1)
-    sampled = np.ascontiguousarray(xyz[::step])
-    usable = are_usable_returns(sampled)
-    if not usable.all():
-        sampled = sampled.take(np.flatnonzero(usable), axis=0)
-    if len(sampled) == 0:
+    sample = np.ascontiguousarray(xyz[::step])
+    is_usable = are_usable_returns(sample)
+    if not is_usable.all():
+        sample = sample.take(np.flatnonzero(is_usable), axis=0)
+    if len(sample) == 0:
         return 0.0
-    x, y, z = np.ascontiguousarray(sampled.T)
+    x, y, z = np.ascontiguousarray(sample.T)
     distance = np.hypot(x, y)
     # CELL_DEG is a power of two, so floor() equals the slower operator //.
     row = np.floor((np.degrees(np.arctan2(z, distance)) + 90.0) / CELL_DEG)

@@ -9,7 +9,7 @@ from lidar_perception.param_fields import MAX_INT, Params, param
 
 @dataclass(frozen=True)
 class DbscanParams(Params):
-    """Distance-aware DBSCAN (paper A, Section 3.3, Table 2)."""
+    """Parameters of distance-aware DBSCAN (paper A, Section 3.3, Table 2)."""
 
     range_limits: tuple[float, ...] = param(
         (15.0, 30.0), "Horizontal ranges at which eps changes, ascending.", unit="m", low=0.0, high=1e6
@@ -44,7 +44,7 @@ class DbscanParams(Params):
 
 @dataclass(frozen=True)
 class EuclideanParams(Params):
-    """Adaptive Euclidean clustering (paper C, Eq. 6 to 9 and 11)."""
+    """Parameters of adaptive Euclidean clustering (paper C, Eq. 6 to 9 and 11)."""
 
     threshold: str = param(
         "local",
@@ -86,7 +86,7 @@ FULL_DENSITY = 10.0  # points per square degree from which our parameter values 
 
 @dataclass(frozen=True)
 class ClusteringParams(Params):
-    """Clustering of the points that are not ground."""
+    """Parameters of the clustering of non-ground points."""
 
     method: str = param(
         "dbscan",
@@ -111,7 +111,7 @@ BOX_SHAPES = ("axis_aligned", "min_area", "l_shape")
 
 @dataclass(frozen=True)
 class BoxParams(Params):
-    """Boxes of clusters."""
+    """Parameters of the boxes of clusters."""
 
     shape: str = param(
         "axis_aligned",

@@ -16,7 +16,7 @@ MIN_SIDE_DISTANCE_M = np.float32(0.01)  # d0: lower limit of a point's distance 
 
 @njit(cache=True, nogil=True)
 def _to_sortable(value):
-    """Map the bits of a float32 to an integer that sorts as the number does (-0 as 0), or back."""
+    """Map the bits of a float32 to an integer with the same sort order (-0 equals 0), or back."""
     return value if value >= 0 else -(1 << 31) - value
 
 

@@ -121,5 +121,5 @@ def classify_by_diagonal(boxes: np.ndarray) -> np.ndarray:
 def _fold_direction(yaw: np.ndarray) -> np.ndarray:
     """Wrap the directions of lines to [-pi/2, pi/2) float32."""
     limit = np.float32(np.pi / 2)
-    folded = ((yaw + np.pi / 2) % np.pi - np.pi / 2).astype(np.float32)
-    return np.where(folded >= limit, -limit, folded)  # values just below pi/2 round up to it
+    folded_yaw = ((yaw + np.pi / 2) % np.pi - np.pi / 2).astype(np.float32)
+    return np.where(folded_yaw >= limit, -limit, folded_yaw)  # values just below pi/2 round up to it

@@ -52,7 +52,7 @@ def find_climbing_cells(lowest, height, threshold, slope):
     round_number = 0
     while len(candidates):
         round_number += 1
-        accepted = []
+        accepted_cells = []
         for r, c in candidates:
             nearest2, base_height = REACH_CELLS * REACH_CELLS + 1, 0.0
             for distance2, row_offset, column_offset in NEIGHBOURS:
@@ -66,11 +66,11 @@ def find_climbing_cells(lowest, height, threshold, slope):
             if nearest2 <= REACH_CELLS * REACH_CELLS and (
                 lowest[r, c] - base_height <= STEP_M + slope * np.sqrt(nearest2)
             ):
-                accepted.append((r, c))
+                accepted_cells.append((r, c))
         candidates.clear()
-        for r, c in accepted:
+        for r, c in accepted_cells:
             is_ground[r, c] = is_climbing[r, c] = True
-        for r, c in accepted:
+        for r, c in accepted_cells:
             for i in range(max(r - REACH_CELLS, 0), min(r + REACH_CELLS + 1, rows)):
                 for j in range(max(c - REACH_CELLS, 0), min(c + REACH_CELLS + 1, columns)):
                     if lowest[i, j] != UNOBSERVED and not is_ground[i, j] and queued_round[i, j] < round_number:

@@ -39,14 +39,14 @@ def settle_sheet(obstacle: np.ndarray, lift: float, tolerance: float, levels: in
         obstacles.append(obstacles[-1].reshape(rows // 2, 2, columns // 2, 2).min(axis=(1, 3)))
     sheet = np.zeros(0, np.float32)
     for level in range(levels - 1, -1, -1):
-        padded = np.pad(obstacles[level], 1, constant_values=np.inf)
-        lifts = np.where(np.isfinite(padded), np.float32(lift * 4**level), np.float32(0))
+        padded_obstacle = np.pad(obstacles[level], 1, constant_values=np.inf)
+        lifts = np.where(np.isfinite(padded_obstacle), np.float32(lift * 4**level), np.float32(0))
         if level == levels - 1:
-            sheet = np.minimum(np.float32(obstacles[-1].min()), padded)
+            sheet = np.minimum(np.float32(obstacles[-1].min()), padded_obstacle)
         else:
-            sheet = _refine(sheet, padded)
+            sheet = _refine(sheet, padded_obstacle)
         for _ in range(MAX_CYCLES if level == 0 else 2):
-            if _run_cycle(sheet, padded, lifts, levels - 1 - level) <= tolerance:
+            if _run_cycle(sheet, padded_obstacle, lifts, levels - 1 - level) <= tolerance:
                 break
     return sheet[1:-1, 1:-1].copy()
 
@@ -67,9 +67,9 @@ def _run_cycle(sheet: np.ndarray, obstacle: np.ndarray, lift: np.ndarray, coarse
 
 
 def _refine(sheet: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
-    refined = np.zeros_like(obstacle)
-    _add_correction(sheet, refined, obstacle)
-    return refined
+    refined_sheet = np.zeros_like(obstacle)
+    _add_correction(sheet, refined_sheet, obstacle)
+    return refined_sheet
 
 
 @njit(cache=True, nogil=True)

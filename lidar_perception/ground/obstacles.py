@@ -20,8 +20,9 @@ def find_obstacles(
     """Select the points that are not ground and within a height band above the ground around them.
 
     Args:
-        xyz: (N, 3) finite points; pose levels a copy of them.
+        xyz: (N, 3) finite points.
         ground: (N,) bool.
+        pose: mounting of the sensor, used to level a copy of the points.
 
     Returns:
         (N,) bool, True = obstacle. Without ground points, heights are unknown, so all points are

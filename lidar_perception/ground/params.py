@@ -11,7 +11,7 @@ from lidar_perception.types import SENSOR_HEIGHT
 
 @dataclass(frozen=True)
 class SensorPoseParams(Params):
-    """Mounting of the sensor.
+    """Parameters of the sensor's mounting.
 
     Algorithms use a levelled copy of the cloud; published points keep their coordinates.
     """
@@ -42,7 +42,7 @@ class SensorPoseParams(Params):
 
 @dataclass(frozen=True)
 class ThresholdParams(Params):
-    """Height threshold and RANSAC plane (paper A, Sections 3.2 and 3.4, Table 2)."""
+    """Parameters of the height threshold and RANSAC plane (paper A, Sections 3.2 and 3.4, Table 2)."""
 
     max_height: float = param(
         0.43,
@@ -73,7 +73,7 @@ class ThresholdParams(Params):
 
 @dataclass(frozen=True)
 class PatchworkParams(Params):
-    """Patchwork++: a plane in each sector of concentric zones (Lee et al., IROS 2022)."""
+    """Parameters of Patchwork++, which fits a plane in each sector of concentric zones (Lee et al., IROS 2022)."""
 
     min_range: float = param(2.7, "Points nearer than this are not ground.", unit="m", low=0.0, high=50.0)
     max_range: float = param(80.0, "Points farther than this are not ground.", unit="m", low=5.0, high=1000.0)
@@ -99,7 +99,7 @@ class PatchworkParams(Params):
 
 @dataclass(frozen=True)
 class ClothParams(Params):
-    """Cloth simulation (paper C, Eq. 2 and 3; Zhang et al., Remote Sensing 2016)."""
+    """Parameters of the cloth simulation (paper C, Eq. 2 and 3; Zhang et al., Remote Sensing 2016)."""
 
     resolution: float = param(0.5, "Distance between the cloth's particles.", unit="m", low=0.1, high=10.0)
     max_range: float = param(
@@ -137,7 +137,7 @@ GROUND_METHODS = ("threshold", "patchwork", "cloth")
 
 @dataclass(frozen=True)
 class GroundParams(Params):
-    """Ground segmentation."""
+    """Parameters of ground segmentation."""
 
     method: str = param(
         "threshold",
@@ -154,7 +154,7 @@ class GroundParams(Params):
 
 @dataclass(frozen=True)
 class ObstacleParams(Params):
-    """Selection of obstacles among the points that are not ground, by height above the ground."""
+    """Parameters of the selection of obstacles by height above the ground."""
 
     min_height: float = param(
         0.0,

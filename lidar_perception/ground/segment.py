@@ -1,4 +1,4 @@
-"""Ground segmentation of a cloud by the method that the parameters name."""
+"""Ground segmentation of a cloud with a selectable method."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def segment_ground(cloud: PointCloud | ArrayLike, params: GroundParams = GroundP
         InputError: the array has another shape or type.
     """
     frame = as_point_cloud(cloud)
-    usable = are_usable_returns(frame.xyz)
-    if usable.all():
+    is_usable = are_usable_returns(frame.xyz)
+    if is_usable.all():
         return _segment(frame.xyz, frame.intensity, params)
     ground = np.zeros(len(frame), bool)
-    intensity = None if frame.intensity is None else frame.intensity[usable]
-    ground[usable] = _segment(frame.xyz[usable], intensity, params)
+    intensity = None if frame.intensity is None else frame.intensity[is_usable]
+    ground[is_usable] = _segment(frame.xyz[is_usable], intensity, params)
     return ground
 
 

@@ -53,10 +53,10 @@ def fit_ground_surface(ground: np.ndarray, default: float) -> GroundSurface:
     mean = np.divide(height_sum, count, out=np.zeros(shape), where=has_height)
     sigma = SMOOTHING_M / CELL_M
     weight = ndimage.gaussian_filter(has_height.astype(np.float64), sigma, mode="constant")
-    smoothed = ndimage.gaussian_filter(mean, sigma, mode="constant") / np.maximum(weight, MIN_WEIGHT)
+    smoothed_heights = ndimage.gaussian_filter(mean, sigma, mode="constant") / np.maximum(weight, MIN_WEIGHT)
     nearest_cell = ndimage.distance_transform_edt(weight < MIN_WEIGHT, return_distances=False, return_indices=True)
     x, y = (low + 0.5) * CELL_M
-    return GroundSurface(smoothed[tuple(nearest_cell)], (float(x), float(y)))
+    return GroundSurface(smoothed_heights[tuple(nearest_cell)], (float(x), float(y)))
 
 
 @njit(cache=True, nogil=True)

@@ -42,8 +42,8 @@ class Clustering(ManagedNode):
             frame, indices = to_point_cloud(msg)
             in_view = read_column(msg, "in_view", indices)
             if in_view is not None and (in_view == OUT_OF_RANGE).any():
-                kept = np.flatnonzero(in_view != OUT_OF_RANGE)
-                frame, indices = frame.take(kept), indices.take(kept)
+                in_range = np.flatnonzero(in_view != OUT_OF_RANGE)
+                frame, indices = frame.take(in_range), indices.take(in_range)
             frame = self.transforms.find_placement(msg.header).level_frame(frame)
             column = read_column(msg, "ground", indices)
             ground = np.zeros(len(frame), bool) if column is None else column > 0

@@ -121,9 +121,9 @@ class EgoInput:
                     "both use the same clock (use_sim_time)?"
                 )
         if setting == "tf" and self.source != "tf":
-            fixed = self.node.node_params.input.fixed_frame
+            fixed_frame = self.node.node_params.input.fixed_frame
             return (
-                f"TF does not connect '{frame_id}' with '{fixed}' (input.fixed_frame): tracks "
+                f"TF does not connect '{frame_id}' with '{fixed_frame}' (input.fixed_frame): tracks "
                 "are relative to the sensor"
             )
         if setting in ("odometry", "kiss_icp") and self.source != setting:

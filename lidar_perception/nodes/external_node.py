@@ -143,7 +143,15 @@ class ExternalNode:
 
 
 class GraphMonitor(ExternalNode):
-    """Counts the results of a running graph."""
+    """Node that counts the results of a running graph.
+
+    Args:
+        domain: ROS domain of the graph.
+        detections: topic of the detections to count.
+
+    Attributes:
+        frames: number of results so far.
+    """
 
     poll_s = 0.1
 

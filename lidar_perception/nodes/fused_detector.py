@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 class FusedNode(DetectorNode):
-    """Uses the columns `ground` and `cluster_id` if the cloud has them.
+    """Node of the fused detector, or of a custom detector if fused.weights is its module:Class.
 
-    The parameter fused.weights may be the module:Class of a custom detector.
+    It uses the columns `ground` and `cluster_id` if the cloud has them.
     """
 
     def __init__(self, **options: Any):

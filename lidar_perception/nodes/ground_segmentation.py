@@ -49,28 +49,34 @@ class GroundSegmentation(ManagedNode):
 
     def on_points(self, msg: Any) -> None:
         with self.diagnostics.measure_frame(to_ns(msg.header.stamp)):
-            frame, usable, params = self.sensor.read_frame(msg)
+            frame, cloud_indices, params = self.sensor.read_frame(msg)
             camera = self.camera.get(msg.header, params.view)
             indices, visible_frame = crop_to_view(frame, camera, params.view)
-            visible = usable.take(indices)
+            visible_indices = cloud_indices.take(indices)
             if self.node_params.range == "all":
-                segmented, indices, ground = (visible_frame, visible, segment_ground(visible_frame, params.ground))
-            else:  # segmented like in the detector, with the same fallback
+                segmented_frame, indices, ground = (
+                    visible_frame,
+                    visible_indices,
+                    segment_ground(visible_frame, params.ground),
+                )
+            else:  # segmented as in the detector, with the same fallback
                 view = NormalizedView.of(visible_frame, params.ground.sensor_pose, **RANGES[self.node_params.range])
-                segmented, indices, ground = (
+                segmented_frame, indices, ground = (
                     view.frame,
-                    visible.take(view.indices),
+                    visible_indices.take(view.indices),
                     segment_view_ground(view.frame, params.ground),
                 )
-            in_view = scatter_values(OUT_OF_RANGE, visible, msg, "u1")
+            in_view = scatter_values(OUT_OF_RANGE, visible_indices, msg, "u1")
             in_view[indices] = IN_VIEW
             self.points.publish(
                 add_columns(msg, make_bag_message, ground=scatter_values(ground, indices, msg, "u1"), in_view=in_view)
             )
-        self._publish_parts(msg, visible_frame, visible, params, ground if self.node_params.range == "all" else None)
-        plane = fit_plane(segmented.xyz.compress(ground, axis=0))
+        self._publish_parts(
+            msg, visible_frame, visible_indices, params, ground if self.node_params.range == "all" else None
+        )
+        plane = fit_plane(segmented_frame.xyz.compress(ground, axis=0))
         if plane is not None:
-            inlier_fraction = compute_inlier_fraction(segmented.xyz, plane)
+            inlier_fraction = compute_inlier_fraction(segmented_frame.xyz, plane)
             self.diagnostics.counts.update(
                 plane=" ".join(f"{v:.4f}" for v in plane),
                 plane_inlier_share=f"{inlier_fraction:.3f}",

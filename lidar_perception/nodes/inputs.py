@@ -255,7 +255,7 @@ class SeedInput:
 
 
 def _raise_missing(reason: str) -> SeedSource:
-    def source(segmented: SegmentedCloud) -> tuple[Seed, ...]:
+    def raise_error(segmented: SegmentedCloud) -> tuple[Seed, ...]:
         raise InputError(reason)
 
-    return source
+    return raise_error

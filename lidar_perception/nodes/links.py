@@ -37,8 +37,8 @@ class Output:
         self.publisher, self.links = publisher, links
         self.receivers: tuple[Receive, ...] = ()
         self.count = 0  # number of messages passed to linked nodes
-        latched = publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-        self.always_publishes = links is None or latched
+        is_latched = publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        self.always_publishes = links is None or is_latched
         if links is not None:
             links.add(self)
 

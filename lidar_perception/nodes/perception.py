@@ -46,13 +46,13 @@ class Perception(ManagedNode):
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.diagnostics.measure_frame(to_ns(msg.header.stamp)):
-            frame, usable, params = self.sensor.read_frame(msg)
+            frame, cloud_indices, params = self.sensor.read_frame(msg)
             segmented = segment_cloud(frame, self.camera.get(msg.header, params.view), params)
             problem = diagnose_empty(len(frame), segmented.ground, segmented.cluster_ids) or self.sensor.find_problem(
                 frame, params
             )
             self.results.publish(msg.header, frame.xyz, lambda: refine_segmented(segmented, source, params), problem)
-        indices = usable.take(segmented.indices)
+        indices = cloud_indices.take(segmented.indices)
         if self.points.get_subscription_count():
             self.points.publish(
                 add_columns(

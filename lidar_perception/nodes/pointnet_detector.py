@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 
 
 class PointNetNode(DetectorNode):
-    """Uses the column `cluster_id`; without it the node finds ground and clusters itself."""
+    """Node of the PointNet detector.
+
+    It uses the column `cluster_id`; without it, the node computes ground and clusters itself.
+    """
 
     def __init__(self, **options: Any):
         loader = NetworkLoader("pointnet", STEPS, find_pointnet_weights, _load, lambda config: config.name)

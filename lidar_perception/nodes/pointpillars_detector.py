@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class PointPillarsNode(DetectorNode):
-    """Uses the columns `ground` and `cluster_id` if the cloud has them."""
+    """Node of EG-PointPillars. It uses the columns `ground` and `cluster_id` if the cloud has them."""
 
     def __init__(self, **options: Any):
         loader = NetworkLoader(

@@ -27,7 +27,7 @@ RETRY_DURATION_S = 0.3  # duration of the renewed wait
 # Numbers of missed periods after which the state becomes ERROR and STALE.
 SILENT_PERIODS, STALE_PERIODS = 3.0, 6.0
 # Kind of publisher -> (hint if no clouds arrive, hint if too few arrive).
-QUESTIONS = {
+HINTS = {
     "sensor": ("is the sensor{} connected and running?", "is the sensor{} overloaded?"),
     "detector": (
         "is the detector{} running and receiving clouds?",
@@ -75,7 +75,7 @@ class Reception:
         self.links: Links | None = getattr(node, "links", None)
         self.what = what
         self.topic = node.resolve_topic_name(name)
-        self.fixed = f"qos_overrides.{self.topic}.subscription.reliability" in parameter_overrides(node)
+        self.has_fixed_reliability = f"qos_overrides.{self.topic}.subscription.reliability" in parameter_overrides(node)
         self.reliability = BEST_EFFORT if params().reliability == "best_effort" else RELIABLE
         self.waiting: deque[Any] = deque()
         self.linked: deque[tuple[Any, dict]] = deque()  # messages received through a link, see _receive
@@ -145,7 +145,9 @@ class Reception:
             profile,
             raw=True,
             event_callbacks=events,
-            qos_overriding_options=QoSOverridingOptions([*kinds, QoSPolicyKind.RELIABILITY] if self.fixed else kinds),
+            qos_overriding_options=QoSOverridingOptions(
+                [*kinds, QoSPolicyKind.RELIABILITY] if self.has_fixed_reliability else kinds
+            ),
         )
         self.arrivals.depth = self.subscription.qos_profile.depth
 
@@ -172,7 +174,7 @@ class Reception:
             reliability = RELIABLE if offers == {RELIABLE} else BEST_EFFORT
         else:
             reliability = {"reliable": RELIABLE, "best_effort": BEST_EFFORT}.get(setting, self.reliability)
-        if self.fixed or reliability == self.reliability:
+        if self.has_fixed_reliability or reliability == self.reliability:
             return
         self.reliability = reliability
         self.node.destroy_subscription(self.subscription)
@@ -296,7 +298,7 @@ class Reception:
                     "rate",
                     WARN,
                     f"{rate:.1f} Hz on {self.topic}, but {expected:.1f} Hz "
-                    f"are expected (input.rate): {self._list_questions()[1]}",
+                    f"are expected (input.rate): {self._list_hints()[1]}",
                 )
             )
         sent, lost, dropped = self.arrivals.count_recent()
@@ -331,11 +333,11 @@ class Reception:
         return (
             kind,
             level,
-            f"no {self.what} on {self.topic} for more than {round(limit, 1):g} s: {self._list_questions()[0]}",
+            f"no {self.what} on {self.topic} for more than {round(limit, 1):g} s: {self._list_hints()[0]}",
         )
 
-    def _list_questions(self) -> list[str]:
-        """Return the questions of QUESTIONS for the current publishers."""
+    def _list_hints(self) -> list[str]:
+        """Return the hints of HINTS for the current publishers."""
         names = sorted({_name(p) for p in self.last_publishers})
         if names and all(name.endswith("_player") for name in names):
             kind = "player"  # matches bag_player and rosbag2_player
@@ -343,17 +345,17 @@ class Reception:
             kind = "detector"
         else:  # nodes of this package publish NODE/output/points
             kind = "node" if self.topic.endswith("/output/points") else "sensor"
-        return [question.format(f" {', '.join(names)}" if names else "") for question in QUESTIONS[kind]]
+        return [hint.format(f" {', '.join(names)}" if names else "") for hint in HINTS[kind]]
 
     def _find_incompatible_publisher(self, publishers: list[Any]) -> Problem | None:
         """Return a problem for best-effort publishers if the parameters demand a reliable subscription."""
         names = [_name(p) for p in publishers if p.qos_profile.reliability == BEST_EFFORT]
-        adapts = not self.fixed and self.params().reliability != "reliable"
+        adapts = not self.has_fixed_reliability and self.params().reliability != "reliable"
         if not names or adapts or self.output is not None or (self.subscription.qos_profile.reliability != RELIABLE):
             return None
         remedy = (
             f"set qos_overrides.{self.topic}.subscription.reliability to best_effort"
-            if self.fixed
+            if self.has_fixed_reliability
             else "set input.reliability to auto"
         )
         return (

@@ -14,7 +14,8 @@ LOCK_NAME = re.compile(r"(fastrtps_[0-9a-f]{16})_el")
 MIN_AGE_S = 60.0  # minimum age of a segment that may be removed
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 PROFILES = {256 * 2**20: "fastdds.xml", 40 * 2**20: "fastdds_small.xml"}  # required free bytes -> profile
-DRIVER_PROFILE, SOCKET_BUFFER = "fastdds_driver.xml", 2 * 2**20  # profile, and the net.core.rmem_max it needs, in bytes
+DRIVER_PROFILE = "fastdds_driver.xml"
+SOCKET_BUFFER = 2 * 2**20  # minimum net.core.rmem_max for DRIVER_PROFILE, in bytes
 
 
 def use_large_shared_memory(from_driver: bool = False) -> None:
@@ -34,11 +35,11 @@ def use_large_shared_memory(from_driver: bool = False) -> None:
         memory = os.statvfs(SHARED_MEMORY)
     except OSError:
         return
-    free = memory.f_bavail * memory.f_frsize
-    profile = next((name for required, name in PROFILES.items() if free >= required), None)
+    free_bytes = memory.f_bavail * memory.f_frsize
+    profile = next((name for required, name in PROFILES.items() if free_bytes >= required), None)
     if profile != "fastdds.xml":
         print(
-            f"/dev/shm has only {free / 2**20:.0f} MB free, so clouds above "
+            f"/dev/shm has only {free_bytes / 2**20:.0f} MB free, so clouds above "
             f"{3 if profile else 0} MB may be lost between processes; start the container with "
             "--shm-size=1g",
             file=sys.stderr,

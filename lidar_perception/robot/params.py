@@ -10,7 +10,7 @@ from lidar_perception.param_fields import Params, param
 
 @dataclass(frozen=True)
 class CropParams(Params):
-    """Crop of the clouds before all other processing; by default nothing is removed."""
+    """Parameters of the crop, which precedes all other processing; by default nothing is removed."""
 
     body: tuple[float, ...] = param(
         float,

@@ -64,12 +64,17 @@ def convert_livox_ros1_to_cdr(data: bytes) -> bytes:
     (size,) = struct.unpack_from("<I", data, 12)  # follows seq and stamp in the header
     start = 16 + size
     (count,) = struct.unpack_from("<I", data, start + FIXED_BYTES)
-    packed = np.frombuffer(data, PACKED, count, start + FIXED_BYTES + 4)
-    padded = np.zeros((count, POINT_BYTES), np.uint8)
-    padded[:, : PACKED.itemsize] = packed.view(np.uint8).reshape(count, PACKED.itemsize)
+    packed_points = np.frombuffer(data, PACKED, count, start + FIXED_BYTES + 4)
+    padded_points = np.zeros((count, POINT_BYTES), np.uint8)
+    padded_points[:, : PACKED.itemsize] = packed_points.view(np.uint8).reshape(count, PACKED.itemsize)
     head = data[4:12] + struct.pack("<I", size + 1) + data[16:start] + b"\0"
     return b"".join(
-        (b"\0\1\0\0", head.ljust(_align(len(head)), b"\0"), data[start : start + FIXED_BYTES + 4], padded.tobytes())
+        (
+            b"\0\1\0\0",
+            head.ljust(_align(len(head)), b"\0"),
+            data[start : start + FIXED_BYTES + 4],
+            padded_points.tobytes(),
+        )
     )
 
 

@@ -9,7 +9,7 @@ from lidar_perception.param_fields import Params, param
 
 @dataclass(frozen=True)
 class InputParams(Params):
-    """Interpretation of the fields of a cloud."""
+    """Parameters that describe the fields of a cloud."""
 
     intensity_max: float = param(
         0.0,
@@ -24,7 +24,7 @@ class InputParams(Params):
 
 @dataclass(frozen=True)
 class ViewParams(Params):
-    """Crop of the cloud to the camera's field of view (paper A, Section 3.2)."""
+    """Parameters of the crop to the camera's field of view (paper A, Section 3.2)."""
 
     enabled: bool = param(
         False,

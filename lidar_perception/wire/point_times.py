@@ -15,7 +15,7 @@ from msg_utils.stamps import SECOND_NS, to_ns
 # Names used by Ouster, Velodyne, Hesai and RoboSense, Autoware and Livox; the first match counts.
 NAMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
 UNITS_NS = (10**9, 10**6, 10**3, 1)
-LIVOX_COLUMN, LIVOX_UNIT_NS = ("offset_time", True), 1  # integers, whose unit Livox documents
+LIVOX_COLUMN, LIVOX_UNIT_NS = ("offset_time", True), 1  # (name, is integer) and documented unit of Livox times
 SWEEP_S = 2e-3, 1.0  # limits of the duration of a sweep, from which the unit is inferred
 SINCE_1970_NS = 1e18  # larger values are Unix times
 MAX_OFFSET_S = 1.0  # maximum offset of a point's time from the stamp of its cloud

@@ -7,7 +7,7 @@ CAMERA_INFO = "/camera/camera_info"
 EXTRINSICS = "/camera/extrinsics"  # geometry_msgs/TransformStamped, pose of the camera in the LiDAR frame
 IMAGE = "/camera/image/compressed"
 TF, TF_STATIC = "/tf", "/tf_static"
-ODOMETRY = "/odom"  # nav_msgs/Odometry, the usual name
+ODOMETRY = "/odom"  # usual topic of nav_msgs/Odometry
 CLICK = "/clicked_point"  # topic that RViz and Foxglove publish
 DETECTIONS, TRACKS = "/output/detections", "/output/tracks"  # suffixes of the topics of a node
 

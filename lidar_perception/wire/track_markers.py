@@ -106,7 +106,7 @@ def make_track_markers(
 
 
 def read_trails(msg: Any) -> dict[int, np.ndarray]:
-    """Read the trails (N, 3) float64 from a MarkerArray, by track id."""
+    """Return {track id: trail (N, 3) float64} from a MarkerArray."""
     return {
         int(m.id): np.array([[p.x, p.y, p.z] for p in m.points], np.float64)
         for m in msg.markers

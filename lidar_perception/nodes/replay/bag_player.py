@@ -163,7 +163,7 @@ class BagPlayer(LidarNode):
                 self.serve(timeout_sec=left)
         self.pace.wait_for_answers(self._serve_answers, self.stop.done)
         self._count_pace()
-        self.diagnostics.report(OK, "stopped" if self.stop.done() else "the bag is played")
+        self.diagnostics.report(OK, "stopped" if self.stop.done() else "reached the end of the bag")
         self._wait_until_delivered()
 
     def _wait_for_subscribers(self) -> None:

@@ -132,7 +132,7 @@ class Evaluator(LidarNode):
     def _score(self, frame: dict[str, MarkedObjects]) -> None:
         truth, calibration = to_truth(frame[TRUTH]), self._read_calibration()
         stages = {s: to_scored_labels(to_detections(frame[s])) for s in self.params.stages}
-        visible_truth, visible = (
+        visible_truth, visible_objects = (
             (truth, stages)
             if calibration is None
             else (
@@ -141,7 +141,7 @@ class Evaluator(LidarNode):
             )
         )
         for name, result in self.results.items():
-            self._score_class(name, result, visible_truth, visible)
+            self._score_class(name, result, visible_truth, visible_objects)
         for stage, objects in stages.items():
             if len(self.precision[stage].frames) < MAX_AP_FRAMES:
                 self.precision[stage].update(FrameDetections(str(frame[TRUTH].stamp_ns), truth, objects, calibration))

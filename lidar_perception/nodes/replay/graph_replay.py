@@ -110,32 +110,32 @@ def replay(
     )
     if scored := detector == "candidates":
         nodes["evaluator"] = configure_evaluator(scores.resolve(), single)
-    recorded = [find_result_cloud_topic(single, detector), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
-    nodes["bag_recorder"] = {}, {"bag": str((out / "result").resolve()), "topics": recorded}
+    recorded_topics = [find_result_cloud_topic(single, detector), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
+    nodes["bag_recorder"] = {}, {"bag": str((out / "result").resolve()), "topics": recorded_topics}
     one_process = runs_in_one_process(processes)
-    with Processes(out / "logs", domain) as running, GraphMonitor(domain, stages[FINAL_STAGE]) as monitor:
-        with running.share_process(GRAPH) if one_process else nullcontext():
+    with Processes(out / "logs", domain) as node_processes, GraphMonitor(domain, stages[FINAL_STAGE]) as monitor:
+        with node_processes.share_process(GRAPH) if one_process else nullcontext():
             for node in (*graph, "bag_recorder"):
-                running.start(node, *nodes[node])
+                node_processes.start(node, *nodes[node])
         if scored:
-            running.start("evaluator", *nodes["evaluator"])
+            node_processes.start("evaluator", *nodes["evaluator"])
         outputs = find_connected_outputs({node: remap for node, (remap, _) in nodes.items()})
         with errors.status("starting the nodes"):
-            ready = monitor.spin_until(lambda: monitor.is_connected(outputs), START_TIMEOUT_S, running.check)
+            ready = monitor.spin_until(lambda: monitor.is_connected(outputs), START_TIMEOUT_S, node_processes.check)
         if not ready:
             raise InputError(
-                f"the nodes did not find each other in {START_TIMEOUT_S:.0f} s: "
-                f"{list(monitor.diagnostics) or 'none'} reported; see {out}/logs"
+                f"the nodes have not connected within {START_TIMEOUT_S:.0f} s (started: "
+                f"{', '.join(monitor.diagnostics) or 'none'}); see {out}/logs"
             )
         # Besides the graph, the tracker and the recorder may subscribe to the clouds; the recorder
         # also subscribes to the labels.
-        cloud_subscribers = 1 + (poses == "kiss_icp") + (POINTS in recorded)
+        cloud_subscribers = 1 + (poses == "kiss_icp") + (POINTS in recorded_topics)
         rules = list_awaited_topics([detector], single, cloud_subscribers, 1 + scored)
         # The detections have four subscribers: monitor, recorder, tracker, evaluator.
         rules += [f"{relative_name(stages[FINAL_STAGE])}:={3 + scored}"]
         rules += [relative_name(ODOMETRY)] if poses == "recording" else []
         first, last = CpuTimes(), CpuTimes()  # CPU times at the first and the last result
-        running.start(
+        node_processes.start(
             "bag_player",
             {},
             {
@@ -149,21 +149,21 @@ def replay(
         memory: dict[str, float] = {}
         with make_progress() as bar:
             task = bar.add_task("replaying", total=clouds)
-            before = -1
+            previous_frames = -1
 
             def finished() -> bool:
                 bar.update(task, completed=monitor.frames)
                 if monitor.frames > last.frames:
-                    last.read(monitor.frames, running)
+                    last.read(monitor.frames, node_processes)
                     if not first.frames:
-                        first.read(monitor.frames, running)
+                        first.read(monitor.frames, node_processes)
                 if 2 * monitor.frames > clouds and not memory:
-                    memory.update(running.measure_memory_mb())
+                    memory.update(node_processes.measure_memory_mb())
                 return monitor.frames >= clouds
 
-            while not finished() and (monitor.frames != before or not running.has_ended("bag_player")):
-                before = monitor.frames
-                monitor.spin_until(finished, SILENCE_TIMEOUT_S, lambda: running.check("bag_player"))
+            while not finished() and (monitor.frames != previous_frames or not node_processes.has_ended("bag_player")):
+                previous_frames = monitor.frames
+                monitor.spin_until(finished, SILENCE_TIMEOUT_S, lambda: node_processes.check("bag_player"))
 
         # Both timings lag behind the results by their own processing time.
         def caught_up(node: str) -> bool:
@@ -172,7 +172,7 @@ def replay(
         for node in {"evaluator", TRACKER} & nodes.keys():
             monitor.spin_until(partial(caught_up, node), SILENCE_TIMEOUT_S)
         stage_ms = {node: float(ms) for node in graph if (ms := monitor.get_value(node, "processing_ms_median"))}
-        codes = running.stop(timeout=30)
+        codes = node_processes.stop(timeout=30)
     if failed := {node: code for node, code in codes.items() if code}:
         errors.print(Text(f"exit codes {failed}", "red") + f"; see {out}/logs")
     if monitor.frames == 0:
@@ -200,10 +200,10 @@ class CpuTimes:
     def __init__(self) -> None:
         self.frames, self.seconds = 0, dict[str, float]()
 
-    def read(self, frames: int, running: Processes) -> None:
+    def read(self, frames: int, processes: Processes) -> None:
         """Read the times when `frames` results have arrived; processes that have ended keep theirs."""
         self.frames = frames
-        self.seconds.update(running.measure_cpu_seconds(), watch=process_time())
+        self.seconds.update(processes.measure_cpu_seconds(), watch=process_time())
 
     def ms_per_frame(self, earlier: CpuTimes) -> dict[str, float]:
         """Return {process: CPU time per result since an earlier reading, in ms}."""
