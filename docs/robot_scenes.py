@@ -32,7 +32,7 @@ def main() -> None:
     )
     for (scene, kind, seed), view, above in zip(SHOWN, axes[::2], axes[1::2]):
         made = make_scene(seed, kind, 1.0, scene)
-        moment = made.at(MOMENT / FINE.rate, HEIGHT)
+        moment = made.compute_state(MOMENT / FINE.rate, HEIGHT)
         draw_view(
             view, cast_rays(moment.solids, made.ground, moment.position, FINE, moment.motion, heading=moment.heading)
         )

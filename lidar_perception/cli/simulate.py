@@ -19,7 +19,7 @@ from lidar_perception.runs.resumable_folder import is_finished, make_resumable_f
 from lidar_perception.runs.resuming import hash_names
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.simulation.dataset import FOLDERS, LAYOUTS, DatasetPlan, write_frames
-from lidar_perception.simulation.drive import longest_drive
+from lidar_perception.simulation.drive import count_drive_scans
 from lidar_perception.simulation.recording import simulate_frames
 from lidar_perception.simulation.scene import MAX_PEOPLE, SCENE_TYPES, Scenes
 from lidar_perception.simulation.sensor import GENERIC_FORMAT, SENSOR_NAMES, find_sensor
@@ -125,7 +125,7 @@ def simulate(
         raise click.UsageError("--resume and --force cannot be combined; --force starts over")
     sensor = find_sensor(sensor_name, mount_height)
     plan = DatasetPlan(
-        layout, sensor, seed, frames, streets_of or (1 if layout == "kitti" else longest_drive(sensor)), scenes
+        layout, sensor, seed, frames, streets_of or (1 if layout == "kitti" else count_drive_scans(sensor)), scenes
     )
     if layout == "mcap":
         if resume:

@@ -1,1 +1,1 @@
-"""A seeded street and a spinning LiDAR: labelled scans without a data set."""
+"""Simulated streets, campuses and interiors, and spinning LiDARs: labelled scans without a data set."""

@@ -1,4 +1,4 @@
-"""Actors of a scene: objects that stand, or move along straight lines, and never collide."""
+"""Actors of a scene: objects that stand still or move along straight lines, without collisions."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from lidar_perception.simulation.shapes.scene_object import SceneObject, make_ri
 from lidar_perception.simulation.solids import compute_hull
 from lidar_perception.simulation.trajectory import Trajectory
 
-HEAD_ROOM_M = 2.2  # parts above this height do not block anyone
-# Maximum distance of objects in a scan, and that of objects of at least LARGE_M.
+HEAD_ROOM_M = 2.2  # height above which parts do not block other actors
+# Maximum distance of objects in a scan, and of those that are larger than LARGE_M.
 SIGHT_M, FAR_SIGHT_M, LARGE_M = 80.0, 120.0, 5.0
-STEP_S = 0.1  # time between the robot positions that others keep clear of
+STEP_S = 0.1  # time step of the robot's trajectory in collision checks
 
 
 def make_prop(parts: np.ndarray) -> SceneObject:
@@ -28,7 +28,7 @@ def make_prop(parts: np.ndarray) -> SceneObject:
 
 @dataclass(frozen=True)
 class Actor:
-    """An object with its motion: straight ahead from time start to stop, standing before and after.
+    """An object that moves straight ahead between the times start and stop, and stands still otherwise.
 
     Attributes:
         obj: The object.
@@ -48,17 +48,17 @@ class Actor:
 
     @cached_property
     def footprint(self) -> np.ndarray:
-        """Footprint (8,) float64, see X, Y, HEADING, ... below. It contains the labelled box in all poses."""
+        """Footprint (8,) float64, see X, Y, HEADING, ... below. It contains the labelled box in every pose."""
         x0, y0, _, x1, y1, _ = compute_hull(self.obj.parts(0.0), HEAD_ROOM_M)
         length, width, _ = self.obj.size
         x0, x1 = min(x0, -length / 2), max(x1, length / 2)
         y0, y1 = min(y0, -width / 2), max(y1, width / 2)
         x, y = (x0 + x1) / 2, (y0 + y1) / 2
-        ahead, aside = cos(self.heading), sin(self.heading)
+        cos_heading, sin_heading = cos(self.heading), sin(self.heading)
         return np.array(
             [
-                self.x + ahead * x - aside * y,
-                self.y + aside * x + ahead * y,
+                self.x + cos_heading * x - sin_heading * y,
+                self.y + sin_heading * x + cos_heading * y,
                 self.heading,
                 (x1 - x0) / 2,
                 (y1 - y0) / 2,
@@ -69,14 +69,14 @@ class Actor:
         )
 
 
-# Columns of a footprint: the rectangle around the parts of an actor below HEAD_ROOM_M, with its
-# centre at time 0, half length and half width in m, and the motion of the actor.
+# Columns of a footprint, the rectangle around the parts of an actor below HEAD_ROOM_M: its centre at
+# time 0, its half length and half width in m, and the motion of the actor.
 X, Y, HEADING, LENGTH, WIDTH, SPEED, START, STOP = range(8)
 
 
 @njit(cache=True, nogil=True)
 def _touches_any(footprint, others, radii, seconds, gap):
-    """Return True if a footprint touches any of others (M, 8), whose motion radii are radii (M,)."""
+    """Return True if a footprint touches any of the others (M, 8), which have the motion radii (M,)."""
     radius = _motion_radius(footprint, seconds) + gap
     for m in range(len(others)):
         x, y, limit = others[m, X] - footprint[X], others[m, Y] - footprint[Y], radius + radii[m]
@@ -87,7 +87,7 @@ def _touches_any(footprint, others, radii, seconds, gap):
 
 @njit(cache=True, nogil=True)
 def _motion_radius(footprint, seconds):
-    """Return the radius of a circle around the first centre of a footprint that it never leaves, in m."""
+    """Return the radius of a circle around the initial centre that a footprint never leaves, in m."""
     return math.hypot(footprint[LENGTH], footprint[WIDTH]) + footprint[SPEED] * seconds
 
 
@@ -95,7 +95,7 @@ def _motion_radius(footprint, seconds):
 def footprints_touch(one, other, seconds, gap):
     """Return True if two footprints (8,) come within gap metres at any time in 0 .. seconds.
 
-    Separating axis theorem for moving rectangles; exact for gap 0.
+    This uses the separating axis theorem for moving rectangles, and is exact for gap 0.
     """
     times = np.empty(6)
     times[:] = (one[START], one[STOP], other[START], other[STOP], 0.0, seconds)
@@ -116,9 +116,9 @@ def footprints_touch(one, other, seconds, gap):
             distance = x * cos + y * sin
             change = (next_x - x) * cos + (next_y - y) * sin
             if abs(change) >= 1e-9:
-                first, second = (-width - distance) / change, (width - distance) / change
-                enter = max(enter, min(first, second))
-                leave = min(leave, max(first, second))
+                first_contact, second_contact = (-width - distance) / change, (width - distance) / change
+                enter = max(enter, min(first_contact, second_contact))
+                leave = min(leave, max(first_contact, second_contact))
             elif abs(distance) > width:
                 enter = 2.0
         if enter <= leave:
@@ -128,7 +128,7 @@ def footprints_touch(one, other, seconds, gap):
 
 @njit(cache=True, nogil=True)
 def _compute_offset(one, other, t):
-    """Return the vector from the centre of one to that of the other at time t."""
+    """Return the vector from the centre of `one` to the centre of `other` at time t."""
     moved = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
     other_moved = other[SPEED] * min(max(t - other[START], 0.0), other[STOP] - other[START])
     return (
@@ -139,18 +139,18 @@ def _compute_offset(one, other, t):
 
 @njit(cache=True, nogil=True)
 def _touches_trajectory(footprint, trajectory, radius):
-    """Return True if a footprint (8,) comes within radius of a sampled trajectory (T, 3), [t x y].
+    """Return True if a footprint (8,) comes within `radius` of a sampled trajectory (T, 3), [t x y].
 
     Half of the motion between two samples is added to the radius.
     """
     cos, sin = math.cos(footprint[HEADING]), math.sin(footprint[HEADING])
     for k in range(len(trajectory)):
-        (t, x, y), last = trajectory[k], trajectory[max(k - 1, 0)]
-        step = footprint[SPEED] * (t - last[0]) + math.hypot(x - last[1], y - last[2])
+        (t, x, y), previous = trajectory[k], trajectory[max(k - 1, 0)]
+        step = footprint[SPEED] * (t - previous[0]) + math.hypot(x - previous[1], y - previous[2])
         moved = footprint[SPEED] * min(max(t - footprint[START], 0.0), footprint[STOP] - footprint[START])
         x, y = x - footprint[X] - cos * moved, y - footprint[Y] - sin * moved
-        ahead, aside = abs(cos * x + sin * y) - footprint[LENGTH], abs(cos * y - sin * x) - footprint[WIDTH]
-        if math.hypot(max(ahead, 0.0), max(aside, 0.0)) < radius + step / 2:
+        dx, dy = abs(cos * x + sin * y) - footprint[LENGTH], abs(cos * y - sin * x) - footprint[WIDTH]
+        if math.hypot(max(dx, 0.0), max(dy, 0.0)) < radius + step / 2:
             return True
     return False
 
@@ -170,7 +170,7 @@ class ActorSet:
         Args:
             seconds: Duration of the drive.
             keep_clear: (M, 8) footprints to keep clear of.
-            trajectory: Trajectory of a round robot; None without one.
+            trajectory: Trajectory of a round robot to keep clear of; None without a robot.
             radius: Radius of the robot, m.
         """
         self.seconds = seconds
@@ -182,32 +182,32 @@ class ActorSet:
             self._append(footprint)
 
     def admit(self, *group: Actor, gap: float = 0.1) -> bool:
-        """Add a group of actors, unless they come within gap of other actors or the robot, or touch each other.
+        """Add a group of actors if it never comes within `gap` of others, and its members never touch.
 
         Returns:
             True if the group was added.
         """
-        before = self._count
+        old_count = self._count
         for actor in group:
-            footprint, own = actor.footprint, slice(before, self._count)
+            footprint, group_slice = actor.footprint, slice(old_count, self._count)
             if (
                 _touches_trajectory(footprint, self._path, self._radius + gap)
-                or _touches_any(footprint, self._footprints[:before], self._radii, self.seconds, gap)
-                or _touches_any(footprint, self._footprints[own], self._radii[own], self.seconds, 0.0)
+                or _touches_any(footprint, self._footprints[:old_count], self._radii, self.seconds, gap)
+                or _touches_any(footprint, self._footprints[group_slice], self._radii[group_slice], self.seconds, 0.0)
             ):
-                self._count = before
+                self._count = old_count
                 return False
             self._append(footprint)
         self.actors += group
         return True
 
     def admit_each(self, actors: Iterable[Actor], gap: float = 0.1) -> None:
-        """Add each of the actors that never comes within gap of others or the robot."""
+        """Add each actor that never comes within `gap` of the others or the robot."""
         for actor in actors:
             self.admit(actor, gap=gap)
 
     def add(self, *group: Actor) -> None:
-        """Add a group without a check, such as people on a bench."""
+        """Add a group that may touch others, such as people on a bench."""
         self.actors += group
         for actor in group:
             self._append(actor.footprint)

@@ -1,4 +1,4 @@
-"""Camera of the simulated car, which limits the labels to its image but takes no pictures."""
+"""Camera of the simulated car. It takes no pictures, but only objects in its image are labelled."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from lidar_perception.data.kitti.labels import DONT_CARE
 from lidar_perception.data.kitti.write import keep_visible_objects
 from lidar_perception.types import GroundTruth
 
-# Smallest visible share and number of points of a labelled object, since annotators skip objects
-# that are hardly visible. Few labels in KITTI have fewer than 5 points.
+# Minimum visible fraction and number of points of a labelled object: annotators skip objects that are
+# hardly visible, and few labels in KITTI have fewer than 5 points.
 MIN_VISIBLE, MIN_POINTS = 0.15, 5
 
 
-def turn_camera(yaw: float) -> Calibration:
+def rotate_camera(yaw: float) -> Calibration:
     """Rotate FORWARD_CAMERA about the sensor's z axis by yaw (rad, counter-clockwise)."""
     cos, sin = np.cos(yaw), np.sin(yaw)
-    back = np.array([[cos, sin, 0, 0], [-sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    return replace(FORWARD_CAMERA, lidar_to_camera=FORWARD_CAMERA.lidar_to_camera @ back)
+    rotation = np.array([[cos, sin, 0, 0], [-sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    return replace(FORWARD_CAMERA, lidar_to_camera=FORWARD_CAMERA.lidar_to_camera @ rotation)
 
 
 def find_labelled(truth: GroundTruth) -> np.ndarray:
@@ -34,15 +34,15 @@ def select_labels_in_view(truth: GroundTruth) -> GroundTruth:
 
 
 def select_labels(truth: GroundTruth) -> GroundTruth:
-    """Return the labelled objects in all directions, for scenes without a camera."""
+    """Return the labelled objects in all directions."""
     return _select(truth, find_labelled(truth))
 
 
 def make_kitti_labels(truth: GroundTruth, camera: Calibration = FORWARD_CAMERA) -> GroundTruth:
     """Make the content of a KITTI label file.
 
-    Labelled objects that are at least partly in the image are objects; other objects in the image
-    become DontCare regions, as notes.
+    It has the objects that are at least partly in the image. Those that are not visible enough for a
+    label become DontCare regions, as notes.
     """
     in_image = keep_visible_objects(truth, camera)
     labelled = find_labelled(in_image)

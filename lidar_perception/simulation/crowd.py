@@ -7,15 +7,15 @@ from collections.abc import Iterator
 import numpy as np
 
 from lidar_perception.simulation.actors import Actor, ActorSet
-from lidar_perception.simulation.places import Court, Side, scatter
+from lidar_perception.simulation.places import Court, Side, draw_positions_along
 from lidar_perception.simulation.shapes import furniture
 from lidar_perception.simulation.shapes.people import CARRIED, make_pedestrian, make_sitting_person, make_wheelchair
 from lidar_perception.simulation.shapes.scene_object import SceneObject
 
-# Probabilities of groups of 1, 2, ... people.
+# Probabilities of groups with 1, 2, ... people.
 STANDING_PROBABILITIES, WALKING_PROBABILITIES = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)
-CROWD_FACTORS = 0.3, 1.0, 1.0, 2.5  # factors for the number of people in a court
-WHEELCHAIR_SHARE = 0.06  # wheelchairs per group that walks or stands
+CROWD_FACTORS = 0.3, 1.0, 1.0, 2.5  # random factors for the number of people in a court
+WHEELCHAIR_RATIO = 0.06  # wheelchairs per walking or standing group
 
 
 def make_person(rng, speed: float = 0.0) -> SceneObject:
@@ -26,15 +26,21 @@ def make_person(rng, speed: float = 0.0) -> SceneObject:
 
 def place_standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
     """Yield standing people, and groups of people who face each other."""
-    for along in scatter(rng, side.length, rate):
-        out, count = rng.uniform(0.4, max(side.walk - 0.4, 1.0)), rng.choice([1, 2, 3, 4], p=STANDING_PROBABILITIES)
-        first, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 0.7) * (count > 1)
-        angles = first + 2 * np.pi / count * np.arange(count)
+    for position in draw_positions_along(rng, side.length, rate):
+        offset, count = (
+            rng.uniform(0.4, max(side.sidewalk_width - 0.4, 1.0)),
+            rng.choice([1, 2, 3, 4], p=STANDING_PROBABILITIES),
+        )
+        start_angle, radius = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 0.7) * (count > 1)
+        angles = start_angle + 2 * np.pi / count * np.arange(count)
         yield [
             side.place(
-                make_person(rng), along + radius * np.cos(a), out + radius * np.sin(a), a + np.pi + rng.normal(0, 0.15)
+                make_person(rng),
+                position + radius * np.cos(angle),
+                offset + radius * np.sin(angle),
+                angle + np.pi + rng.normal(0, 0.15),
             )
-            for a in angles
+            for angle in angles
         ]
 
 
@@ -45,19 +51,19 @@ def place_walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Act
         rng: Random generator.
         side: The sidewalk.
         rate: Groups per 100 m.
-        roam: People also walk on the road, and in any direction.
+        roam: True if people also walk on the road, and in any direction.
     """
-    for along in scatter(rng, side.length, rate):
+    for position in draw_positions_along(rng, side.length, rate):
         speed = _draw_speed(rng)
-        turn = np.pi * rng.integers(2) + rng.normal(0, 0.02)
-        low = 0.9
+        heading = np.pi * rng.integers(2) + rng.normal(0, 0.02)
+        min_offset = 0.9
         if roam:
-            low, turn = -3.0, turn + rng.normal(0, 0.6) * (rng.random() < 0.5)
-        out = rng.uniform(low, max(side.walk - 0.5, low + 0.5))
+            min_offset, heading = -3.0, heading + rng.normal(0, 0.6) * (rng.random() < 0.5)
+        offset = rng.uniform(min_offset, max(side.sidewalk_width - 0.5, min_offset + 0.5))
         moves = _draw_moves(rng, speed, 0.2)
         count = rng.choice([1, 2, 3], p=WALKING_PROBABILITIES)
         yield [
-            side.place(make_person(rng, speed), along + rng.uniform(-0.2, 0.2), out + 0.85 * i, turn, **moves)
+            side.place(make_person(rng, speed), position + rng.uniform(-0.2, 0.2), offset + 0.85 * i, heading, **moves)
             for i in range(count)
         ]
 
@@ -71,17 +77,23 @@ def place_strolling(rng, court: Court, rate: float) -> Iterator[list[Actor]]:
         rate: Groups per 100 square metres.
     """
     for x, y in court.draw_positions(rng, rate):
-        speed, turn = _draw_speed(rng), rng.uniform(-np.pi, np.pi)
+        speed, heading = _draw_speed(rng), rng.uniform(-np.pi, np.pi)
         moves = _draw_moves(rng, speed, 0.5)
         count = rng.choice([1, 2, 3], p=WALKING_PROBABILITIES)
         yield [
-            Actor(make_person(rng, speed), x - 0.85 * i * np.sin(turn), y + 0.85 * i * np.cos(turn), turn, **moves)
+            Actor(
+                make_person(rng, speed),
+                x - 0.85 * i * np.sin(heading),
+                y + 0.85 * i * np.cos(heading),
+                heading,
+                **moves,
+            )
             for i in range(count)
         ]
 
 
 def _draw_moves(rng, speed: float, chance: float) -> dict[str, float]:
-    """Draw the speed, start and stop of an Actor, which starts or stops on the way with this chance."""
+    """Draw the speed, start and stop of an Actor that starts or stops on the way with probability `chance`."""
     moves = {"speed": speed}
     pick = rng.random()
     if pick < chance:
@@ -95,7 +107,7 @@ def _draw_speed(rng) -> float:
 
 
 def fill_court(
-    rng, actors: ActorSet, court: Court, people: float, along: float, across: float, standers: float
+    rng, actors: ActorSet, court: Court, people: float, walkers: float, strollers: float, standers: float
 ) -> None:
     """Add pedestrians and people in wheelchairs to a court.
 
@@ -103,41 +115,44 @@ def fill_court(
         rng: Random generator.
         actors: Actors of the scene, to which people are added.
         court: The court.
-        people: Factor for all numbers, which are also multiplied by a random one of CROWD_FACTORS.
-        along: Groups who walk along x, per 100 m.
-        across: Groups who walk in any direction, per 100 square metres.
+        people: Factor for all numbers, which are also multiplied by one of CROWD_FACTORS.
+        walkers: Groups who walk along x, per 100 m.
+        strollers: Groups who walk in any direction, per 100 square metres.
         standers: Groups who stand, per 100 m.
     """
     people *= rng.choice(CROWD_FACTORS)
     for groups in (
         place_standing(rng, court.floor, standers * people),
-        place_walking(rng, court.floor, along * people, roam=False),
-        place_wheelchairs(rng, court.floor, WHEELCHAIR_SHARE * (along + standers) * people),
-        place_strolling(rng, court.inner(0.4), across * people),
+        place_walking(rng, court.floor, walkers * people, roam=False),
+        place_wheelchairs(rng, court.floor, WHEELCHAIR_RATIO * (walkers + standers) * people),
+        place_strolling(rng, court.shrink(0.4), strollers * people),
     ):
         for group in groups:
             actors.admit(*group)
 
 
 def place_wheelchairs(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
-    """Yield people in wheelchairs along a side, rate per 100 m."""
-    for along in scatter(rng, side.length, rate):
+    """Yield people in wheelchairs along a side, with a mean number of `rate` per 100 m."""
+    for position in draw_positions_along(rng, side.length, rate):
         yield [
             side.place(
                 make_wheelchair(rng),
-                along,
-                rng.uniform(0.5, max(side.walk - 0.5, 0.6)),
+                position,
+                rng.uniform(0.5, max(side.sidewalk_width - 0.5, 0.6)),
                 np.pi * rng.integers(2) + rng.normal(0, 0.1),
                 speed=rng.choice((0.0, rng.uniform(0.5, 1.3))),
             )
         ]
 
 
-def place_bench(rng, side: Side, along: float, out: float, people: float, share: float = 0.25) -> list[Actor]:
-    """Return a bench with its back to the outside of a side, and people on a random share of its seats."""
+def place_bench(rng, side: Side, position: float, offset: float, people: float, occupancy: float = 0.25) -> list[Actor]:
+    """Return a bench that faces the inside of a side, and the people on its two seats.
+
+    occupancy * people is the probability that a seat is taken, at most 0.8.
+    """
     sitters = [
-        side.place(make_sitting_person(rng, chair=False), along + aside, out, -np.pi / 2)
-        for aside in (-0.45, 0.45)
-        if rng.random() < min(share * people, 0.8)
+        side.place(make_sitting_person(rng, has_chair=False), position + shift, offset, -np.pi / 2)
+        for shift in (-0.45, 0.45)
+        if rng.random() < min(occupancy * people, 0.8)
     ]
-    return [side.place(furniture.make_bench(rng), along, out, -np.pi / 2), *sitters]
+    return [side.place(furniture.make_bench(rng), position, offset, -np.pi / 2), *sitters]

@@ -1,6 +1,6 @@
 """Simulated data sets in the layouts of KITTI and SemanticKITTI, written by several processes.
 
-A frame depends only on its number, so the files do not depend on processes and interruptions.
+A frame depends only on its number, so the number of processes and interruptions do not change the files.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from lidar_perception.data.kitti import write as write_kitti
 from lidar_perception.runs.processes import run_in_processes
 from lidar_perception.runs.resumable_folder import finish_frame
 from lidar_perception.simulation.camera import FORWARD_CAMERA, make_kitti_labels
-from lidar_perception.simulation.drive import SimulatedScan, longest_drive, simulate_scan
+from lidar_perception.simulation.drive import SimulatedScan, count_drive_scans, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.types import InputError
 
 LAYOUTS = ("kitti", "kitti-tracking", "semantickitti")
-FOLDERS = ("training", "sequences")  # top folders of these layouts
+FOLDERS = ("training", "sequences")  # top-level folders of these layouts
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,11 @@ class DatasetPlan:
 
     def __post_init__(self) -> None:
         self.scenes.scene_types()
-        limit = longest_drive(self.sensor)
+        limit = count_drive_scans(self.sensor)
         if not 1 <= self.frames_per_drive <= limit:
-            raise InputError(f"streets-of = {self.frames_per_drive} must be 1 .. {limit}, the scans of one drive")
+            raise InputError(
+                f"streets-of = {self.frames_per_drive} must be 1 .. {limit}, the number of scans in a drive"
+            )
 
 
 def write_frame(folder: Path, plan: DatasetPlan, number: int) -> int:
@@ -62,27 +64,27 @@ def write_frame(folder: Path, plan: DatasetPlan, number: int) -> int:
     Raises:
         InputError: A file cannot be written.
     """
-    sequence, moment = divmod(number, plan.frames_per_drive)
-    scan = simulate_scan(plan.seed + sequence, moment, plan.sensor, plan.scenes)
+    sequence, scan_index = divmod(number, plan.frames_per_drive)
+    scan = simulate_scan(plan.seed + sequence, scan_index, plan.sensor, plan.scenes)
     order = np.argsort(scan.ring, kind="stable")  # beam by beam, as in KITTI's files
     cloud = scan.frame.points()[order]
     if plan.layout == "semantickitti":
-        shares = _write_semantickitti(folder, plan, sequence, moment, scan, cloud, order)
+        shared_files = _write_semantickitti(folder, plan, sequence, scan_index, scan, cloud, order)
     else:
         truth = make_kitti_labels(scan.truth)
         if plan.layout == "kitti":
             write_kitti.write_object(folder, number, cloud, truth, FORWARD_CAMERA)
-            shares = {}
+            shared_files = {}
         else:
             name = f"{sequence:04}"
-            write_kitti.write_velodyne(folder / f"training/velodyne/{name}/{moment:06}.bin", cloud)
-            shares = {
-                f"training/label_02/{name}.txt": write_kitti.format_tracking_labels(moment, truth, FORWARD_CAMERA)
+            write_kitti.write_velodyne(folder / f"training/velodyne/{name}/{scan_index:06}.bin", cloud)
+            shared_files = {
+                f"training/label_02/{name}.txt": write_kitti.format_tracking_labels(scan_index, truth, FORWARD_CAMERA)
             }
-            if moment == 0:
+            if scan_index == 0:
                 calibration = write_kitti.format_calibration(FORWARD_CAMERA)
-                shares[f"training/calib/{name}.txt"] = calibration
-    finish_frame(folder, number, shares)
+                shared_files[f"training/calib/{name}.txt"] = calibration
+    finish_frame(folder, number, shared_files)
     return number
 
 
@@ -90,21 +92,21 @@ def _write_semantickitti(
     folder: Path,
     plan: DatasetPlan,
     sequence: int,
-    moment: int,
+    scan_index: int,
     scan: SimulatedScan,
     cloud: np.ndarray,
     order: np.ndarray,
 ) -> dict[str, str]:
     digits = max(2, len(str((plan.frames - 1) // plan.frames_per_drive)))
     name = f"sequences/{sequence:0{digits}}"
-    semantickitti.write_scan(folder / name, moment, cloud, scan.semantic[order], scan.instance[order])
-    shares = {
+    semantickitti.write_scan(folder / name, scan_index, cloud, scan.semantic[order], scan.instance[order])
+    shared_files = {
         f"{name}/poses.txt": semantickitti.format_pose(scan.pose, FORWARD_CAMERA),
-        f"{name}/times.txt": f"{moment / plan.sensor.rate:.6e}\n",
+        f"{name}/times.txt": f"{scan_index / plan.sensor.rate:.6e}\n",
     }
-    if moment == 0:
-        shares[f"{name}/calib.txt"] = semantickitti.format_calibration(FORWARD_CAMERA)
-    return shares
+    if scan_index == 0:
+        shared_files[f"{name}/calib.txt"] = semantickitti.format_calibration(FORWARD_CAMERA)
+    return shared_files
 
 
 def write_frames(folder: Path, plan: DatasetPlan, numbers: list[int], jobs: int) -> Generator[int]:

@@ -9,38 +9,38 @@ import numpy as np
 
 from lidar_perception.simulation import crowd
 from lidar_perception.simulation.actors import Actor, ActorSet, make_prop
-from lidar_perception.simulation.places import Court, Side, place_against, space_evenly
+from lidar_perception.simulation.places import Court, Side, draw_even_positions, place_along
 from lidar_perception.simulation.roadside import FRONTS
 from lidar_perception.simulation.shapes import furniture, interiors
 from lidar_perception.simulation.shapes.people import make_sitting_person
 from lidar_perception.simulation.terrain import PAVEMENT, Ground
 from lidar_perception.simulation.trajectory import DRIVE_SECONDS, ROBOT_RADIUS_M, Trajectory, draw_trajectory
 
-WINDOW_VIEW_M = 4.0  # distance from windows to the plants outside
+WINDOW_VIEW_M = 4.0  # distance from windows to the trees outside
 SEAT_WIDTH_M = 0.65  # width of a table per person
 
 
 @dataclass(frozen=True)
 class IndoorKind:
-    """Parameters of a kind of interior, which is laid out around the trajectory of the robot.
+    """Parameters of a kind of interior. Its layout surrounds the trajectory of the robot.
 
     Pairs (low, high) are the ranges of uniform distributions. Lengths are in m.
     """
 
-    share: float  # fraction of scenes of this kind
-    wide: tuple[float, float]  # distance from the trajectory to the side walls
-    ends: tuple[float, float]  # distance to the walls behind and ahead
+    fraction: float  # fraction of scenes of this kind
+    side_distance: tuple[float, float]  # distance from the trajectory to the side walls
+    ends: tuple[float, float]  # distance from the trajectory to the end walls
     height: tuple[float, float]
-    walls: dict[str, float]  # weights of the kinds of wall segments, see WALLS
-    fill: tuple[str, ...]  # kinds of furniture, see FILLS
-    turn: float  # maximum heading of the robot to either side, rad
-    outer: float = 0.0  # probability that a side consists of windows only
-    at_walls: float = 12.0  # objects along the walls, per 100 m
-    things: float = 0.3  # objects per 100 square metres
-    along: float = 0.0  # groups walking along x, per 100 m
-    across: float = 0.0  # groups walking in any direction, per 100 square metres
+    walls: dict[str, float]  # probability of each kind of wall segment, see WALLS
+    furniture: tuple[str, ...]  # kinds of furniture, see FURNITURE
+    max_heading: float  # maximum deviation of the robot's heading from x, rad
+    window_chance: float = 0.0  # probability that a wall consists of windows
+    wall_objects: float = 12.0  # objects along the walls, per 100 m
+    floor_objects: float = 0.3  # objects per 100 square metres
+    walkers: float = 0.0  # groups walking along x, per 100 m
+    strollers: float = 0.0  # groups walking in any direction, per 100 square metres
     standers: float = 5.0  # standing groups, per 100 m
-    stands: float = 0.15  # probability that the robot stands still
+    stop_chance: float = 0.15  # probability that the robot stands still
     speed: tuple[float, float] = (0.5, 1.5)
 
 
@@ -53,10 +53,10 @@ INDOOR_KINDS = {
         {"wall": 0.42, "door": 0.38, "glazing": 0.1, "passage": 0.1},
         (),
         0.25,
-        along=45.0,
+        walkers=45.0,
         standers=8.0,
-        things=0.6,
-        at_walls=22.0,
+        floor_objects=0.6,
+        wall_objects=22.0,
     ),
     "hall": IndoorKind(
         0.3,
@@ -66,8 +66,8 @@ INDOOR_KINDS = {
         {"wall": 0.4, "door": 0.2, "glazing": 0.2, "passage": 0.2},
         ("columns", "benches", "tables"),
         0.7,
-        outer=0.4,
-        across=2.2,
+        window_chance=0.4,
+        strollers=2.2,
         standers=16.0,
     ),
     "canteen": IndoorKind(
@@ -78,10 +78,10 @@ INDOOR_KINDS = {
         {"wall": 0.6, "door": 0.15, "glazing": 0.15, "passage": 0.1},
         ("columns", "many tables"),
         0.3,
-        outer=0.35,
-        across=2.0,
+        window_chance=0.35,
+        strollers=2.0,
         standers=14.0,
-        along=12.0,
+        walkers=12.0,
     ),
     "store": IndoorKind(
         0.15,
@@ -91,10 +91,10 @@ INDOOR_KINDS = {
         {"wall": 0.8, "door": 0.15, "glazing": 0.05},
         ("shelves",),
         0.1,
-        across=2.0,
-        along=18.0,
+        strollers=2.0,
+        walkers=18.0,
         standers=16.0,
-        things=0.5,
+        floor_objects=0.5,
     ),
 }
 WALLS = {  # kind -> (function, minimum length, maximum length)
@@ -110,102 +110,104 @@ OBJECTS = (*interiors.PERSON_SIZED, furniture.make_planter, furniture.make_litte
 def make_interior(
     rng: np.random.Generator, kind: IndoorKind, people: float
 ) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
-    """Make ground, actors and trajectory of an interior; people: factor for the number of people."""
-    trajectory = draw_trajectory(rng, kind.speed, kind.stands, kind.turn)
+    """Make the ground, actors and trajectory of an interior, with a factor for the number of people."""
+    trajectory = draw_trajectory(rng, kind.speed, kind.stop_chance, kind.max_heading)
     actors = ActorSet(DRIVE_SECONDS, trajectory=trajectory, radius=ROBOT_RADIUS_M)
-    court = Court.around(
-        trajectory.sample(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2), rng.uniform(*kind.wide, 2)
+    court = Court.enclose(
+        trajectory.sample(DRIVE_SECONDS, 1.0)[:, 1:], rng.uniform(*kind.ends, 2), rng.uniform(*kind.side_distance, 2)
     )
     height = rng.uniform(*kind.height)
-    for side in court.sides():
+    for side in court.make_sides():
         actors.add(*_build_walls(rng, side, kind, height))
-    for name in kind.fill:
-        for first, *others in FILLS[name](rng, court, height, people):
+    for name in kind.furniture:
+        for first, *others in FURNITURE[name](rng, court, height, people):
             if actors.admit(first, gap=0.8 if others else 0.3):
                 actors.add(*others)
-    for side in court.sides():
-        actors.admit_each(place_against(rng, side, OBJECTS, kind.at_walls), gap=0.05)
-    for x, y in court.inner(0.8).draw_positions(rng, kind.things):
+    for side in court.make_sides():
+        actors.admit_each(place_along(rng, side, OBJECTS, kind.wall_objects), gap=0.05)
+    for x, y in court.shrink(0.8).draw_positions(rng, kind.floor_objects):
         parts = OBJECTS[rng.integers(len(OBJECTS))](rng)
         actors.admit(Actor(make_prop(parts), x, y, rng.uniform(-np.pi, np.pi)), gap=0.3)
-    crowd.fill_court(rng, actors, court, people, kind.along, kind.across, kind.standers)
-    # Placed last because it does not block people.
-    area = court.inner(-interiors.WALL_THICKNESS_M)
+    crowd.fill_court(rng, actors, court, people, kind.walkers, kind.strollers, kind.standers)
+    # Placed last because it blocks nobody.
+    area = court.shrink(-interiors.WALL_THICKNESS_M)
     ceiling = interiors.make_ceiling(rng, area.x1 - area.x0, area.y1 - area.y0, height)
     actors.add(Actor(make_prop(ceiling), *court.centre))
-    return PAVEMENT._replace(sidewalk=rng.uniform(0.2, 0.6)), tuple(actors.actors), trajectory
+    return PAVEMENT._replace(sidewalk_reflectance=rng.uniform(0.2, 0.6)), tuple(actors.actors), trajectory
 
 
 def _build_walls(rng, side: Side, kind: IndoorKind, height: float) -> Iterator[Actor]:
-    """Yield the segments of a wall, or windows with plants outside."""
-    names, shares = list(kind.walls), list(kind.walls.values())
-    outer = rng.random() < kind.outer
-    along = 0.0
-    while along < side.length:
-        make, low, high = WALLS["window" if outer else str(rng.choice(names, p=shares))]
-        remaining = side.length - along
+    """Yield the segments of a wall, or windows with trees outside."""
+    names, weights = list(kind.walls), list(kind.walls.values())
+    has_windows = rng.random() < kind.window_chance
+    position = 0.0
+    while position < side.length:
+        make, low, high = WALLS["window" if has_windows else str(rng.choice(names, p=weights))]
+        remaining = side.length - position
         if remaining < low + 0.5:
             make, low, high = interiors.make_wall, remaining, remaining
         length = min(rng.uniform(low, high), remaining)
-        yield side.place(make(rng, length, height), along + length / 2, 0.0)
-        along += length
-    if outer:
-        yield from FRONTS["verge"](rng, side._replace(walk=WINDOW_VIEW_M))
+        yield side.place(make(rng, length, height), position + length / 2, 0.0)
+        position += length
+    if has_windows:
+        yield from FRONTS["verge"](rng, side._replace(sidewalk_width=WINDOW_VIEW_M))
 
 
 def _place_columns(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
-    """Yield rows of equal columns."""
+    """Yield rows of columns."""
     column = make_prop(interiors.make_column(rng, height))
-    (dx, dy), (x, y) = rng.uniform(5.0, 10.0, 2), rng.uniform(1.0, 5.0, 2)
-    for at_x in np.arange(court.x0 + x, court.x1 - 1, dx):
-        for at_y in np.arange(court.y0 + y, court.y1 - 1, dy):
+    (spacing_x, spacing_y), (x, y) = rng.uniform(5.0, 10.0, 2), rng.uniform(1.0, 5.0, 2)
+    for at_x in np.arange(court.x0 + x, court.x1 - 1, spacing_x):
+        for at_y in np.arange(court.y0 + y, court.y1 - 1, spacing_y):
             yield [Actor(column, at_x, at_y)]
 
 
 def _place_benches(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
-    """Yield benches along the walls, with people, and counters."""
-    for side in court.sides():
-        for along in space_evenly(rng, side.length, rng.uniform(4.0, 12.0)):
+    """Yield benches with people along the walls, and counters."""
+    for side in court.make_sides():
+        for position in draw_even_positions(rng, side.length, rng.uniform(4.0, 12.0)):
             if rng.random() < 0.6:
-                yield crowd.place_bench(rng, side, along, -rng.uniform(0.4, 1.0), people)
+                yield crowd.place_bench(rng, side, position, -rng.uniform(0.4, 1.0), people)
         if rng.random() < 0.4:
             yield [
                 side.place(interiors.make_counter(rng), rng.uniform(0, side.length), -rng.uniform(1.2, 2.5), -np.pi / 2)
             ]
 
 
-def _scatter_tables(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
+def _place_tables(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
     """Yield tables at random positions, each with its chairs and people."""
-    for x, y in court.inner(1.5).draw_positions(rng, 1.5):
-        yield _set_table(rng, x, y, rng.uniform(-np.pi, np.pi), people)
+    for x, y in court.shrink(1.5).draw_positions(rng, 1.5):
+        yield _make_table_group(rng, x, y, rng.uniform(-np.pi, np.pi), people)
 
 
-def _line_up_tables(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
+def _place_table_rows(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
     """Yield rows of tables, each with its chairs and people."""
-    dx, dy = rng.uniform(2.2, 3.5, 2)
-    turn = np.pi / 2 * rng.integers(2)
-    for x in np.arange(court.x0 + 1.3, court.x1 - 1.2, dx):
-        for y in np.arange(court.y0 + 1.3, court.y1 - 1.2, dy):
+    spacing_x, spacing_y = rng.uniform(2.2, 3.5, 2)
+    heading = np.pi / 2 * rng.integers(2)
+    for x in np.arange(court.x0 + 1.3, court.x1 - 1.2, spacing_x):
+        for y in np.arange(court.y0 + 1.3, court.y1 - 1.2, spacing_y):
             if rng.random() < 0.85:
-                yield _set_table(
-                    rng, x + rng.normal(0, 0.1), y + rng.normal(0, 0.1), turn + rng.normal(0, 0.05), people
+                yield _make_table_group(
+                    rng, x + rng.normal(0, 0.1), y + rng.normal(0, 0.1), heading + rng.normal(0, 0.05), people
                 )
 
 
-def _set_table(rng, x: float, y: float, turn: float, people: float) -> list[Actor]:
+def _make_table_group(rng, x: float, y: float, heading: float, people: float) -> list[Actor]:
     """Return a table, and the chairs and people at its long sides."""
     length, width = rng.uniform((0.7, 0.65), (2.0, 0.9))
-    table = Actor(make_prop(interiors.make_table(rng, length, width)), x, y, turn)
-    line, around = Side(x, y, turn, 0.0, 0.0, ""), []
+    table = Actor(make_prop(interiors.make_table(rng, length, width)), x, y, heading)
+    line, seats = Side(x, y, heading, 0.0, 0.0, ""), []
     count = int(length / SEAT_WIDTH_M)
-    for along in (np.arange(count) + 0.5) * SEAT_WIDTH_M - count * SEAT_WIDTH_M / 2:
+    for position in (np.arange(count) + 0.5) * SEAT_WIDTH_M - count * SEAT_WIDTH_M / 2:
         for side in (-1, 1):
-            out, pick = side * (width / 2 + rng.uniform(0.2, 0.4)), rng.random()
+            offset, pick = side * (width / 2 + rng.uniform(0.2, 0.4)), rng.random()
             if pick < min(0.35 * people, 0.8):
-                around.append(line.place(make_sitting_person(rng), along, out, -side * np.pi / 2))
+                seats.append(line.place(make_sitting_person(rng), position, offset, -side * np.pi / 2))
             elif pick < 0.85:
-                around.append(line.place(interiors.make_chair(rng), along, out, -side * np.pi / 2 + rng.normal(0, 0.3)))
-    return [table, *around]
+                seats.append(
+                    line.place(interiors.make_chair(rng), position, offset, -side * np.pi / 2 + rng.normal(0, 0.3))
+                )
+    return [table, *seats]
 
 
 def _place_shelves(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
@@ -220,10 +222,10 @@ def _place_shelves(rng, court: Court, height: float, people: float) -> Iterator[
         y += 0.7 + aisle
 
 
-FILLS = {
+FURNITURE = {
     "columns": _place_columns,
     "benches": _place_benches,
-    "tables": _scatter_tables,
-    "many tables": _line_up_tables,
+    "tables": _place_tables,
+    "many tables": _place_table_rows,
     "shelves": _place_shelves,
 }

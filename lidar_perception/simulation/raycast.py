@@ -1,12 +1,12 @@
-"""First hits of all rays of one revolution of the sensor, compiled.
+"""Compiled ray casting: the first hits of all rays of one revolution.
 
-Solids are rasterised into a depth buffer of firings and beams, each into its window (windows.py).
-Unlabelled solids come last, from near to far, since most of their rays are then hidden. The ground,
-which takes longest, is intersected only where it may be nearer. Rays at the edges of solids are cast
-a second time, into the footprint of the beam, see edges.py.
+Each solid is rasterised into its window (windows.py) of a depth buffer of firings and beams.
+Unlabelled solids come last, nearest first, because most of their rays are hidden by then. The ground
+is the most expensive, so it is intersected only where it may be nearer than the solids. Rays at the
+edges of solids are cast a second time, into the footprint of the beam, see edges.py.
 
-Solids are in the sensor's frame at the stamp. The ground is in the world frame, relative to which the
-sensor's frame is rotated only about z.
+Solids are in the sensor's frame at the stamp. The ground is in the world frame. The sensor's frame is
+rotated relative to the world only about z.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from lidar_perception.simulation.intersection import (
 )
 from lidar_perception.simulation.sensor import NO_MOTION, Motion, Sensor, make_rays
 from lidar_perception.simulation.solids import Solids
-from lidar_perception.simulation.terrain import Ground, cast_ground, min_ground_range, to_compiled
+from lidar_perception.simulation.terrain import Ground, bound_ground_range, cast_ground, compile_ground
 from lidar_perception.simulation.windows import find_windows
 
 
@@ -43,7 +43,8 @@ class Hits(NamedTuple):
         owner: int32 track id of the object, 0 for none.
         semantic: uint16 class; 0 without a hit, 1 (outlier) between two surfaces, see edges.py.
         solid: int32 index of the solid, -1 for none.
-        reached: (objects + 1,) int64, number of rays that would hit each object if it were alone.
+        unoccluded_counts: (objects + 1,) int64, number of rays that would hit each object if it were
+            alone.
     """
 
     range: np.ndarray
@@ -52,20 +53,20 @@ class Hits(NamedTuple):
     owner: np.ndarray
     semantic: np.ndarray
     solid: np.ndarray
-    reached: np.ndarray
+    unoccluded_counts: np.ndarray
 
 
-class Turn(NamedTuple):
+class CompiledRays(NamedTuple):
     """Rays of one revolution, for compiled code.
 
     Attributes:
         direction: (columns, rings, 3) unit vectors in the sensor's frame at the stamp.
-        since: (columns,) time after the stamp, s.
+        times: (columns,) time of each firing relative to the stamp, s.
         lift: (rings,) start of each beam on the z axis, m.
     """
 
     direction: np.ndarray
-    since: np.ndarray
+    times: np.ndarray
     lift: np.ndarray
 
 
@@ -86,23 +87,23 @@ def cast_rays(
         position: (3,) position of the sensor in the world at the stamp, m.
         sensor: The sensor.
         motion: Motion of the sensor in its own frame.
-        seed: Seed of foliage, glass and edges; its lowest 64 bits are used.
+        seed: Seed of the random hits on foliage, glass and edges; its lowest 64 bits are used.
         heading: Heading of the sensor in the world, rad.
     """
     salt = np.uint64(mix_bits(np.uint64(seed % (1 << 64))))
     rays = make_rays(sensor, motion)
-    turn = Turn(rays.direction, rays.since, sensor.origins()[:, 2].copy())
+    compiled_rays = CompiledRays(rays.direction, rays.times, sensor.compute_origins()[:, 2].copy())
     windows = find_windows(solids, sensor, motion, sensor.divergence / 2)
     scene = (
         compile_solids(solids, motion, salt),
         windows,
         np.lexsort((windows.min_range, solids.owner, solids.owner == 0)),
-        to_compiled(ground),
+        compile_ground(ground),
         np.array(position, np.float64),
         np.array(motion.velocity, np.float64),
         (math.cos(heading), math.sin(heading)),
         float(sensor.max_range),
-        foliage.LEAF_SHARE,
+        foliage.LEAF_FRACTION,
     )
     shape = (sensor.columns, sensor.rings)
     hits = Hits(
@@ -114,74 +115,100 @@ def cast_rays(
         np.empty(shape, np.int32),
         np.zeros(int(solids.owner.max(initial=0)) + 1, np.int64),
     )
-    _cast_first(hits, turn, np.ones(shape, bool), *scene, True)
+    _cast_first(hits, compiled_rays, np.ones(shape, bool), *scene, True)
     if sensor.divergence:
-        edge, other = find_edges(hits.solid), Hits(*(np.empty_like(grid) for grid in hits))
-        _turn_into_footprints(turn.direction, edge, float(sensor.divergence), salt)
-        _cast_first(other, turn, edge, *scene, False)
-        _merge_edges(hits, other, edge, float(sensor.pulse), salt)
+        is_edge, other_hits = find_edges(hits.solid), Hits(*(np.empty_like(grid) for grid in hits))
+        _jitter_in_footprints(compiled_rays.direction, is_edge, float(sensor.divergence), salt)
+        _cast_first(other_hits, compiled_rays, is_edge, *scene, False)
+        _merge_edges(hits, other_hits, is_edge, float(sensor.pulse), salt)
     return hits
 
 
 @njit(cache=True, nogil=True)
 def _cast_first(
-    hits, turn, mask, shapes, windows, order, ground, position, velocity, facing, max_range, leaf_share, counting
+    hits,
+    rays,
+    mask,
+    shapes,
+    windows,
+    order,
+    ground,
+    position,
+    velocity,
+    rotation,
+    max_range,
+    leaf_fraction,
+    is_counting,
 ):
-    """Fill the hits of the rays in the mask (columns, rings), and hits.reached if counting.
+    """Fill in the hits of the rays in the mask (columns, rings).
 
-    order: indices of the solids, first by owner, then those without an owner from near to far.
+    Args:
+        hits: Hits to fill.
+        rays: CompiledRays.
+        mask: (columns, rings) bool, rays to cast.
+        shapes: CompiledSolids.
+        windows: Windows of the solids.
+        order: Order in which to draw the solids: by owner, then those without an owner, nearest first.
+        ground: Compiled ground.
+        position: Position (3,) of the sensor in the world at the stamp.
+        velocity: Velocity (3,) of the sensor in its own frame.
+        rotation: Cosine and sine of the sensor's heading in the world.
+        max_range: Maximum range, m.
+        leaf_fraction: See foliage.py.
+        is_counting: Also fill in hits.unoccluded_counts.
     """
     hits.range[:] = np.inf
     hits.solid[:] = -1
-    _draw_solids(hits, turn, mask, shapes, windows, order, max_range, leaf_share, counting)
+    _draw_solids(hits, rays, mask, shapes, windows, order, max_range, leaf_fraction, is_counting)
     columns, rings = mask.shape
     for column in range(columns):
-        since = turn.since[column]
-        along, aside, up = _to_world(velocity, facing)
-        x, y, z = position[0] + along * since, position[1] + aside * since, position[2] + up * since
+        time = rays.times[column]
+        vx, vy, vz = _to_world(velocity, rotation)
+        x, y, z = position[0] + vx * time, position[1] + vy * time, position[2] + vz * time
         for ring in range(rings):
             if mask[column, ring]:
-                direction = _get_direction(turn, column, ring)
-                start, down = (x, y, z + turn.lift[ring]), _to_world(direction, facing)
-                far, s = hits.range[column, ring], hits.solid[column, ring]
-                if not far < min_ground_range(ground, start, down):
-                    hit = cast_ground(ground, start, down, max_range)
-                    if s < 0 or np.float32(hit.range) < np.float32(far):
+                direction = _get_direction(rays, column, ring)
+                start, world_direction = (x, y, z + rays.lift[ring]), _to_world(direction, rotation)
+                closest_range, s = hits.range[column, ring], hits.solid[column, ring]
+                if not closest_range < bound_ground_range(ground, start, world_direction):
+                    hit = cast_ground(ground, start, world_direction, max_range)
+                    if s < 0 or np.float32(hit.range) < np.float32(closest_range):
                         _write_hit(
                             hits, column, ring, RayHit(hit.range, hit.brightness, hit.cosine, 0, hit.semantic, -1)
                         )
                         continue
                 if s >= 0:
-                    brightness, cosine = shade_hit(
-                        shapes, s, direction, since, turn.lift[ring], ring * columns + column
-                    )
+                    brightness, cosine = shade_hit(shapes, s, direction, time, rays.lift[ring], ring * columns + column)
                     _write_hit(
-                        hits, column, ring, RayHit(far, brightness, cosine, shapes.owner[s], shapes.semantic[s], s)
+                        hits,
+                        column,
+                        ring,
+                        RayHit(closest_range, brightness, cosine, shapes.owner[s], shapes.semantic[s], s),
                     )
                 else:
                     _write_hit(hits, column, ring, RayHit(np.inf, 0.0, 0.0, 0, 0, -1))
 
 
 @njit(cache=True, nogil=True)
-def _to_world(vector, facing):
-    """Rotate a vector (x, y, z) from the sensor's frame to the world; facing: cos and sin of the heading."""
-    cos, sin = facing
+def _to_world(vector, rotation):
+    """Rotate a vector (x, y, z) about z from the sensor's frame to the world; see _cast_first for `rotation`."""
+    cos, sin = rotation
     return cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]
 
 
 @njit(cache=True, nogil=True)
-def _get_direction(turn, column, ring):
-    x, y, z = turn.direction[column, ring]
+def _get_direction(rays, column, ring):
+    x, y, z = rays.direction[column, ring]
     return x, y, z
 
 
 @njit(cache=True, nogil=True)
-def _draw_solids(hits, turn, mask, shapes, windows, order, max_range, leaf_share, counting):
+def _draw_solids(hits, rays, mask, shapes, windows, order, max_range, leaf_fraction, is_counting):
     columns, rings = mask.shape
-    latest = np.zeros((columns, rings), np.int32)  # last owner hit by each ray
+    last_owner = np.zeros((columns, rings), np.int32)  # owner of the last solid that each ray hit
     for s in order:
-        owner, near = shapes.owner[s], windows.min_range[s]
-        counts = counting and owner > 0
+        owner, min_range = shapes.owner[s], windows.min_range[s]
+        is_counted = is_counting and owner > 0
         highest, lowest = 0, rings
         while lowest > 0 and not windows.beams[s, lowest - 1]:
             lowest -= 1
@@ -192,30 +219,32 @@ def _draw_solids(hits, turn, mask, shapes, windows, order, max_range, leaf_share
             for ring in range(highest, lowest):
                 if not windows.beams[s, ring] or not mask[column, ring]:
                     continue
-                far = hits.range[column, ring]
-                if near > far and not counts:
+                closest_range = hits.range[column, ring]
+                if min_range > closest_range and not is_counted:
                     continue
                 start, direction = to_unit_frame(
-                    shapes, s, _get_direction(turn, column, ring), turn.since[column], turn.lift[ring]
+                    shapes, s, _get_direction(rays, column, ring), rays.times[column], rays.lift[ring]
                 )
                 enter, leave = intersect_shape(shapes.kind[s], start, direction)
-                if not (enter <= leave and leave > 0) or (np.float32(enter) > np.float32(far) and not counts):
+                if not (enter <= leave and leave > 0) or (
+                    np.float32(enter) > np.float32(closest_range) and not is_counted
+                ):
                     continue
-                t = find_stop_range(shapes, s, start, direction, enter, leave, ring * columns + column, leaf_share)
+                t = find_stop_range(shapes, s, start, direction, enter, leave, ring * columns + column, leaf_fraction)
                 if not t < leave or t > max_range:
                     continue
-                if counts and latest[column, ring] != owner:
-                    latest[column, ring] = owner
-                    hits.reached[owner] += 1
-                # If hits are equal in float32, the solid with the lower index wins, in any order.
-                t32, far32, before = np.float32(t), np.float32(far), hits.solid[column, ring]
-                if t32 < far32 or (t32 == far32 and (before < 0 or s < before)):
+                if is_counted and last_owner[column, ring] != owner:
+                    last_owner[column, ring] = owner
+                    hits.unoccluded_counts[owner] += 1
+                # Of equal ranges in float32, the solid with the lower index wins, whatever the drawing order.
+                t32, closest32, closest_solid = np.float32(t), np.float32(closest_range), hits.solid[column, ring]
+                if t32 < closest32 or (t32 == closest32 and (closest_solid < 0 or s < closest_solid)):
                     hits.range[column, ring], hits.solid[column, ring] = t, s
 
 
 @njit(cache=True, nogil=True)
-def _turn_into_footprints(direction, mask, divergence, salt):
-    """Rotate the rays in the mask to random points in the footprints of their beams."""
+def _jitter_in_footprints(direction, mask, divergence, salt):
+    """Rotate the rays in the mask to random points in the footprints of their beams, in place."""
     columns, rings = mask.shape
     for column in range(columns):
         for ring in range(rings):
@@ -227,8 +256,8 @@ def _turn_into_footprints(direction, mask, divergence, salt):
 
 
 @njit(cache=True, nogil=True)
-def _merge_edges(hits, other, mask, pulse, salt):
-    """Merge the hits of both rays of the beams in the mask, in place into hits."""
+def _merge_edges(hits, other_hits, mask, pulse, salt):
+    """Merge other_hits into hits, in place, for the beams in the mask."""
     columns, rings = mask.shape
     for column in range(columns):
         for ring in range(rings):
@@ -239,7 +268,7 @@ def _merge_edges(hits, other, mask, pulse, salt):
                     ring,
                     merge_hits(
                         _read_hit(hits, column, ring),
-                        _read_hit(other, column, ring),
+                        _read_hit(other_hits, column, ring),
                         pulse,
                         salt + np.uint64(ring * columns + column),
                     ),

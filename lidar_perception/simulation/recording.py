@@ -1,4 +1,4 @@
-"""Simulated drives as labelled frames: of a car with a camera like KITTI's, or of robots without a camera."""
+"""Simulated drives as labelled frames: a car with KITTI's camera, or robots without a camera."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from pathlib import Path
 
 from lidar_perception.data.frame import BOXES, CAMERA, POSES, ComputedFrames, Frame, Recording
 from lidar_perception.simulation.camera import FORWARD_CAMERA, select_labels, select_labels_in_view
-from lidar_perception.simulation.drive import longest_drive, simulate_scan
+from lidar_perception.simulation.drive import count_drive_scans, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 
-DRIVE_GAP_NS = 10 * 10**9  # gap between the drives through two scenes, as in KITTI's recordings
+DRIVE_GAP_NS = 10 * 10**9  # time between the drives through two scenes
 
 
 class SimulatedFrames(ComputedFrames):
     """Frames of simulated drives, computed when they are read.
 
-    If all scenes have a camera, only objects whose centre is in the image are labelled, as in
+    If all scenes have a camera, only objects with their centre in the image are labelled, as in
     KITTI. Otherwise objects in all directions are labelled.
     """
 
@@ -30,7 +30,7 @@ class SimulatedFrames(ComputedFrames):
         frames_per_drive: int | None = None,
         scenes: Scenes = ALL_STREETS,
     ) -> None:
-        """Define the frames; none is computed yet.
+        """Create the sequence without computing any frame.
 
         Args:
             seed: Seed of the first scene; the next scene has seed + 1.
@@ -40,7 +40,7 @@ class SimulatedFrames(ComputedFrames):
             scenes: Types of the scenes.
         """
         self._seed, self._frames, self._sensor, self._scenes = seed, frames, sensor, scenes
-        self._per_drive = frames_per_drive or longest_drive(sensor)
+        self._per_drive = frames_per_drive or count_drive_scans(sensor)
         self._has_camera = scenes.camera
 
     def __len__(self) -> int:
@@ -48,18 +48,18 @@ class SimulatedFrames(ComputedFrames):
 
     def compute_frame(self, number: int) -> Frame:
         camera, labels = (FORWARD_CAMERA, select_labels_in_view) if self._has_camera else (None, select_labels)
-        scene, moment = divmod(number, self._per_drive)
+        scene, index = divmod(number, self._per_drive)
         drive_ns = DRIVE_GAP_NS + round(self._per_drive * 10**9 / self._sensor.rate)
-        scan = simulate_scan(self._seed + scene, moment, self._sensor, self._scenes)
+        scan = simulate_scan(self._seed + scene, index, self._sensor, self._scenes)
         frame = replace(scan.frame, stamp_ns=scan.frame.stamp_ns + scene * drive_ns)
         return Frame.of(
-            f"{scene:04}/{moment:06}",
+            f"{scene:04}/{index:06}",
             frame,
             labels(scan.truth),
             camera,
             pose=scan.pose.copy,
             sequence=f"{scene:04}",
-            index=moment,
+            index=index,
             sensor_height=self._sensor.height,
         )
 
@@ -72,7 +72,7 @@ def simulate_frames(
 
 
 def simulate_recording(seed: int, frames: int, sensor: Sensor = HDL64E, scenes: Scenes = ALL_STREETS) -> Recording:
-    """Return simulated drives as a recording without files."""
+    """Return a recording of simulated drives, which has no files."""
     content = {BOXES, POSES} | ({CAMERA} if scenes.camera else set())
     return Recording(
         Path("simulation"),

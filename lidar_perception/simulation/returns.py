@@ -10,18 +10,21 @@ from lidar_perception.simulation.raycast import Hits
 from lidar_perception.simulation.sensor import NO_MOTION, Motion, Sensor, make_rays
 from lidar_perception.simulation.solids import RETROREFLECTOR
 
-# The power of a return is proportional to a power of the cosine of the incidence, and its logarithm
-# scatters. With these values, returns of the road are lost at the same ranges as ahead of KITTI's
-# car: 0.7 of the rays return at 38 m, 0.5 at 43 m, 0.35 at 50 m, and none at 60 m (median of 27
-# scans). Neighbouring returns are lost together: in SemanticKITTI, only 0.03 of the returns of the
-# road beyond 35 m are lost alone.
+# The power of a return is proportional to cos(incidence) ** GRAZING_EXPONENT, and its logarithm has a
+# random error. With these values, returns from the road are lost at the same ranges as in front of
+# KITTI's car: 0.7 of the rays return at 38 m, 0.5 at 43 m, 0.35 at 50 m, and none at 60 m (median of 27
+# scans). Neighbouring returns are lost together: in SemanticKITTI, only 0.03 of the returns from the
+# road beyond 35 m are lost singly.
 GRAZING_EXPONENT = 1 / 3
-POWER_SCATTER, SCATTER_COLUMNS = 0.5, 16  # standard deviation, and number of columns that share a value
-INTENSITY_NOISE = 0.035  # as on roads, sidewalks (0.03) and facades (0.04) of SemanticKITTI
+POWER_SCATTER, SCATTER_COLUMNS = (
+    0.5,
+    16,
+)  # standard deviation of the log power, and number of adjacent columns with the same error
+INTENSITY_NOISE = 0.035  # SemanticKITTI has 0.03 on roads and sidewalks, and 0.04 on facades
 
 
 class Returns(NamedTuple):
-    """N points of one turn, beam by beam, counter-clockwise from straight ahead, as in KITTI's files.
+    """N points of one revolution, in the order of KITTI's files: by beam, then counter-clockwise from x.
 
     Attributes:
         xyz: (N, 3) float32, m in the sensor's frame.
@@ -29,7 +32,7 @@ class Returns(NamedTuple):
         owner: (N,) int32, see Hits.
         semantic: (N,) uint16, see Hits.
         ring: (N,) uint16, 0 is the highest beam.
-        time: (N,) float32, seconds after the stamp.
+        time: (N,) float32, seconds relative to the stamp.
     """
 
     xyz: np.ndarray
@@ -43,24 +46,24 @@ class Returns(NamedTuple):
 def make_returns(
     hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator, compensated: bool = True
 ) -> Returns:
-    """Make the returns of the hits.
+    """Convert hits to returns, with noise and losses.
 
-    The power of a return is proportional to brightness / range squared. It is lost if the power is
-    below that of a surface of brightness 0.1 that faces the sensor at sensor.reach.
+    The power of a return is proportional to brightness / range ** 2. The return is lost if its power
+    is below that of a surface of brightness 0.1 that faces the sensor at the range sensor.reach.
 
     Args:
         hits: First hits of all rays.
         sensor: The sensor.
         motion: Motion of the sensor.
         rng: Random generator.
-        compensated: Apply motion correction, so that points are in the frame at the stamp, as in
-            KITTI; otherwise each point is in the frame at its own time.
+        compensated: Apply motion correction, as in KITTI: points are in the sensor's frame at the
+            stamp. Otherwise each point is in the sensor's frame at its own time.
     """
     shape = hits.range.shape
     rays = make_rays(sensor, motion if compensated else NO_MOTION)
-    noisy = hits.range + rng.normal(0.0, sensor.range_noise, shape)
+    noisy_range = hits.range + rng.normal(0.0, sensor.range_noise, shape)
     if sensor.offsets:
-        noisy += np.asarray(sensor.offsets)
+        noisy_range += np.asarray(sensor.offsets)
     with np.errstate(divide="ignore", invalid="ignore"):  # inf / inf for rays without a hit
         power = (
             np.log(hits.brightness / 0.1)
@@ -68,15 +71,15 @@ def make_returns(
             - 2 * np.log(hits.range / sensor.reach)
         )
     scatter = rng.normal(0.0, POWER_SCATTER, (-(-shape[0] // SCATTER_COLUMNS), shape[1]))
-    keep = power > np.repeat(scatter, SCATTER_COLUMNS, axis=0)[: shape[0]]
-    keep &= (rng.random(shape) >= sensor.dropout) & sensor.open_rays()
-    # A margin, so that ranges are within the limits after rounding to float32.
-    keep &= (noisy > sensor.min_range + 1e-4) & (noisy < sensor.max_range - 1e-4)
-    ring, column = divmod(np.flatnonzero(keep.T), shape[0])
+    is_kept = power > np.repeat(scatter, SCATTER_COLUMNS, axis=0)[: shape[0]]
+    is_kept &= (rng.random(shape) >= sensor.dropout) & sensor.find_unblocked_rays()
+    # The margin keeps the ranges within the limits after rounding to float32.
+    is_kept &= (noisy_range > sensor.min_range + 1e-4) & (noisy_range < sensor.max_range - 1e-4)
+    ring, column = divmod(np.flatnonzero(is_kept.T), shape[0])
     ray = column * shape[1] + ring
     ranges, brightness = hits.range.ravel()[ray], hits.brightness.ravel()[ray]
     xyz = rays.direction.reshape(-1, 3)[ray]
-    xyz *= noisy.ravel()[ray, None]
+    xyz *= noisy_range.ravel()[ray, None]
     xyz += rays.origin.reshape(-1, 3)[ray]
     intensity = brightness + rng.normal(0.0, INTENSITY_NOISE, len(ring))
     if sensor.fade[1]:
@@ -92,5 +95,5 @@ def make_returns(
         hits.owner.ravel()[ray],
         hits.semantic.ravel()[ray],
         ring.astype(np.uint16),
-        (sensor.times() - motion.stamp / sensor.rate)[column].astype(np.float32),
+        (sensor.compute_firing_times() - motion.stamp / sensor.rate)[column].astype(np.float32),
     )

@@ -1,6 +1,6 @@
-"""Scenes, and their content in the LiDAR frame at any time of a drive.
+"""Scenes, and their state in the sensor's frame at any time of a drive.
 
-A scene consists of a ground, actors, and the trajectory of the sensor. It is a street for a car, or
+A scene consists of the ground, actors, and the trajectory of the sensor. It is a street for a car, or
 a campus or interior for a robot.
 """
 
@@ -20,12 +20,12 @@ from lidar_perception.simulation.roadside import furnish
 from lidar_perception.simulation.sensor import Motion
 from lidar_perception.simulation.solids import PART, Solids, compute_hull, place_parts
 from lidar_perception.simulation.street import STREET_KINDS, StreetKind, draw_street
-from lidar_perception.simulation.terrain import Ground, surface_height
+from lidar_perception.simulation.terrain import Ground, compute_ground_height
 from lidar_perception.simulation.traffic import populate
 from lidar_perception.simulation.trajectory import DRIVE_SECONDS, Trajectory
 from lidar_perception.types import CLASSES, InputError, suggest_name
 
-MAX_PEOPLE = 100  # maximum factor for the number of people; creating a street then takes 3 s
+MAX_PEOPLE = 100  # maximum factor for the number of people, with which a street takes 3 s to make
 EGO_HALF_SIZE_M = (3.0, 1.1)  # half length and half width of the area kept clear for the ego vehicle
 
 
@@ -43,9 +43,13 @@ class Scenes(NamedTuple):
     scene: str = "street"
 
     def scene_types(self) -> list[SceneType]:
-        """Return the scene types in order. Raise InputError for an invalid attribute."""
+        """Return the selected scene types.
+
+        Raises:
+            InputError: An attribute is invalid.
+        """
         if not 0 <= self.people <= MAX_PEOPLE:
-            raise InputError(f"people = {self.people} must be 0 .. {MAX_PEOPLE}, such as 1")
+            raise InputError(f"people = {self.people} must be between 0 and {MAX_PEOPLE}; the default is 1")
         names = self.scene.split(",")
         if unknown := [name for name in names if name not in SCENE_TYPES]:
             raise InputError(
@@ -57,14 +61,14 @@ class Scenes(NamedTuple):
             if self.kind is not None and self.kind not in SCENE_TYPES[name].kinds:
                 raise InputError(
                     f"kind = {self.kind!r} must be one of "
-                    f"{', '.join(SCENE_TYPES[name].kinds)} where scene is {name}"
+                    f"{', '.join(SCENE_TYPES[name].kinds)} for scene {name}"
                     f"{suggest_name(self.kind, SCENE_TYPES[name].kinds)}"
                 )
         return [SCENE_TYPES[name] for name in names]
 
     @property
     def camera(self) -> bool:
-        """True if all scene types have a forward camera, which limits the labels to its image."""
+        """True if all scene types have a forward camera, so that only objects in its image are labelled."""
         return all(scene_type.camera for scene_type in self.scene_types())
 
 
@@ -72,9 +76,11 @@ ALL_STREETS = Scenes()
 CROWDED_ZONES = Scenes("zone", 3.0)  # for demos and tests of pedestrian detectors
 
 
-# An actor. forward: unit vector; class: into CLASSES, -1 without a label; track: 0 without a label; sight:
-# maximum distance at which it is visible; feet: height of the lowest ground below an unlabelled actor that
-# never moves, NaN for others (it may be too long to stand on the slope).
+# Properties of an actor.
+# forward: unit vector of its heading. class: index into CLASSES, -1 without a label. track: 0 without a label.
+# sight: maximum distance at which it is visible.
+# feet: height of the lowest ground below an unlabelled actor that never moves, which may be too long to stand
+# on the slope; NaN for other actors.
 ACTOR_ROW = np.dtype(
     [
         *(("xy", float, 2), ("forward", float, 2), ("size", float, 3)),
@@ -84,8 +90,8 @@ ACTOR_ROW = np.dtype(
 )
 
 
-class SceneMoment(NamedTuple):
-    """A scene at one time, in the sensor's frame.
+class SceneState(NamedTuple):
+    """State of a scene at one time, in the sensor's frame.
 
     Attributes:
         solids: Solids of all objects in sight.
@@ -93,7 +99,7 @@ class SceneMoment(NamedTuple):
         heading: Heading of the sensor in the world, rad.
         boxes: (K, 7), see GroundTruth.
         class_ids: (K,) int32.
-        track_ids: (K,) int32, from 1; also the owners of the solids.
+        track_ids: (K,) int32, from 1; the owners of the solids have the same ids.
         speeds: (K,) m/s over the ground.
         motion: Motion of the sensor.
     """
@@ -126,44 +132,45 @@ class Scene:
     kind: str = ""
     seconds: float = DRIVE_SECONDS
 
-    def sensor_pose(self, t: float, sensor_height: float) -> np.ndarray:
+    def compute_sensor_pose(self, t: float, sensor_height: float) -> np.ndarray:
         """Return the pose (4, 4) float64 of the sensor in the world after t seconds."""
-        along, pose = self.trajectory.at(t), np.eye(4)
-        cos, sin = math.cos(along.heading), math.sin(along.heading)
+        point, pose = self.trajectory.evaluate(t), np.eye(4)
+        cos, sin = math.cos(point.heading), math.sin(point.heading)
         pose[:2, :2] = (cos, -sin), (sin, cos)
-        pose[:3, 3] = (along.x, along.y, surface_height(self.ground, along.x, along.y) + sensor_height)
+        pose[:3, 3] = (point.x, point.y, compute_ground_height(self.ground, point.x, point.y) + sensor_height)
         return pose
 
-    def at(self, t: float, sensor_height: float) -> SceneMoment:
+    def compute_state(self, t: float, sensor_height: float) -> SceneState:
         """Return the scene after t seconds, for a sensor at this height above the ground in m."""
-        along, pose = self.trajectory.at(t), self.sensor_pose(t, sensor_height)
-        sensor, rotation = pose[:3, 3].copy(), pose[:3, :3]
-        ego = sensor[:2]
-        a = self._table
+        point, pose = self.trajectory.evaluate(t), self.compute_sensor_pose(t, sensor_height)
+        sensor_position, rotation = pose[:3, 3].copy(), pose[:3, :3]
+        a = self._actor_table
         travelled = a["speed"] * np.clip(t - a["start"], 0.0, a["stop"] - a["start"])
-        flat = a["xy"] + a["forward"] * travelled[:, None]
-        near = np.flatnonzero(np.hypot(*(flat - ego).T) <= a["sight"])
-        a, travelled, flat = a[near], travelled[near], flat[near]
-        feet = np.where(np.isnan(a["feet"]), surface_height(self.ground, *flat.T), a["feet"])
-        base = (np.column_stack([flat, feet]) - sensor) @ rotation
-        heading = a["heading"] - along.heading
+        xy = a["xy"] + a["forward"] * travelled[:, None]
+        in_sight = np.flatnonzero(np.hypot(*(xy - sensor_position[:2]).T) <= a["sight"])
+        a, travelled, xy = a[in_sight], travelled[in_sight], xy[in_sight]
+        feet = np.where(np.isnan(a["feet"]), compute_ground_height(self.ground, *xy.T), a["feet"])
+        position = (np.column_stack([xy, feet]) - sensor_position) @ rotation
+        heading = a["heading"] - point.heading
         speed = np.where((a["start"] <= t) & (t < a["stop"]), a["speed"], 0.0)
-        velocity = self._add_climb(a["forward"] * speed[:, None]) @ rotation
+        velocity = self._add_vertical_velocity(a["forward"] * speed[:, None]) @ rotation
 
-        parts = [self.actors[i].obj.parts(s) for i, s in zip(near.tolist(), travelled.tolist())]
+        parts = [self.actors[i].obj.parts(s) for i, s in zip(in_sight.tolist(), travelled.tolist())]
         owner = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
-        solids = place_parts(_join_parts(parts), base[owner], heading[owner], a["track"][owner], velocity[owner])
+        solids = place_parts(_join_parts(parts), position[owner], heading[owner], a["track"][owner], velocity[owner])
 
         labelled = np.flatnonzero(a["track"])
-        boxes = np.column_stack([base, a["size"], heading])[labelled]
+        boxes = np.column_stack([position, a["size"], heading])[labelled]
         boxes[:, 2] += boxes[:, 5] / 2
-        sensor_velocity = (self._add_climb(np.array([along.velocity])) @ rotation)[0]
-        motion = Motion(tuple(sensor_velocity.tolist()), along.yaw_rate)
+        sensor_velocity = (self._add_vertical_velocity(np.array([point.velocity])) @ rotation)[0]
+        motion = Motion(tuple(sensor_velocity.tolist()), point.yaw_rate)
         a = a[labelled]
-        return SceneMoment(solids, sensor, along.heading, boxes, a["class"], a["track"], speed[labelled], motion)
+        return SceneState(
+            solids, sensor_position, point.heading, boxes, a["class"], a["track"], speed[labelled], motion
+        )
 
     @cached_property
-    def _table(self) -> np.ndarray:
+    def _actor_table(self) -> np.ndarray:
         """Properties of the actors as (A,) ACTOR_ROW."""
         table = np.empty(len(self.actors), ACTOR_ROW)
         for row, a in zip(table, self.actors):
@@ -182,43 +189,43 @@ class Scene:
         fixed = np.flatnonzero((table["speed"] == 0) & ~is_labelled)
         footprints = np.array([self.actors[i].footprint for i in fixed]).reshape(-1, 8)
         corners = _compute_corners(footprints)
-        table["feet"][fixed] = surface_height(self.ground, *corners).min(axis=1)
+        table["feet"][fixed] = compute_ground_height(self.ground, *corners).min(axis=1)
         return table
 
-    def _add_climb(self, flat: np.ndarray) -> np.ndarray:
-        """Add the vertical velocity on the sloping ground to horizontal velocities (N, 2): (N, 3)."""
+    def _add_vertical_velocity(self, velocity: np.ndarray) -> np.ndarray:
+        """Convert horizontal velocities (N, 2) to velocities (N, 3) along the sloping ground."""
         slope = np.array([self.ground.slope_x, self.ground.slope_y])
-        return np.column_stack([flat, flat @ slope])
+        return np.column_stack([velocity, velocity @ slope])
 
 
 def _join_parts(arrays: list[np.ndarray]) -> np.ndarray:
     """Concatenate arrays (P,) PART; much faster than np.concatenate."""
-    joined = np.empty(sum(map(len, arrays)), PART)
+    result = np.empty(sum(map(len, arrays)), PART)
     end = 0
     for parts in arrays:
         begin, end = end, end + len(parts)
-        joined[begin:end] = parts
-    return joined
+        result[begin:end] = parts
+    return result
 
 
 def _compute_corners(footprints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return x and y (A, 4) of the corners of footprints (A, 8) at time 0."""
     x, y, heading, length, width = footprints[:, :5, None].transpose(1, 0, 2)
-    ahead, aside = length * np.array([1, 1, -1, -1]), width * np.array([1, -1, 1, -1])
+    forward, left = length * np.array([1, 1, -1, -1]), width * np.array([1, -1, 1, -1])
     return (
-        x + np.cos(heading) * ahead - np.sin(heading) * aside,
-        y + np.sin(heading) * ahead + np.cos(heading) * aside,
+        x + np.cos(heading) * forward - np.sin(heading) * left,
+        y + np.sin(heading) * forward + np.cos(heading) * left,
     )
 
 
 def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0, scene: str = "street") -> Scene:
-    """Make the scene of a seed. Objects that would touch others at any time are dropped.
+    """Make the scene of a seed. Objects that would touch others during the drive are left out.
 
     Args:
         seed: Seed, 0 or more.
-        kind: Kind of the scene type; None draws one.
-        people: Factor for the usual number of pedestrians, sitting people and cyclists. On streets,
-            1 is similar to KITTI.
+        kind: Kind of the scene type, such as "city"; None draws one.
+        people: Factor for the usual number of pedestrians, sitting people and cyclists. Streets with
+            a factor of 1 are similar to KITTI.
         scene: See Scenes.
 
     Raises:
@@ -227,17 +234,18 @@ def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0, scen
     if seed < 0:
         raise InputError(f"seed = {seed} must not be negative")
     types = Scenes(kind, people, scene).scene_types()
-    chosen = types[seed % len(types)]
+    scene_type = types[seed % len(types)]
     rng = np.random.default_rng(seed)
-    drawn = str(rng.choice(list(chosen.kinds), p=[k.share for k in chosen.kinds.values()]))
-    kind = kind or drawn
-    return Scene(*chosen.make(rng, chosen.kinds[kind], people), kind)
+    # Drawn in any case, so that the scene of a seed does not depend on whether its kind is given.
+    random_kind = str(rng.choice(list(scene_type.kinds), p=[k.fraction for k in scene_type.kinds.values()]))
+    kind = kind or random_kind
+    return Scene(*scene_type.make(rng, scene_type.kinds[kind], people), kind)
 
 
 def _make_street(
     rng: np.random.Generator, kind: StreetKind, people: float
 ) -> tuple[Ground, tuple[Actor, ...], Trajectory]:
-    """Make a street along x with a car that drives at y = 0."""
+    """Make a street along x, on which the ego vehicle drives at y = 0."""
     street = draw_street(rng, kind, DRIVE_SECONDS)
     ego = [0.0, 0.0, 0.0, *EGO_HALF_SIZE_M, street.speed, 0.0, np.inf]
     actors = ActorSet(DRIVE_SECONDS, np.array([ego]))
@@ -250,9 +258,9 @@ class SceneType(NamedTuple):
     """A type of scene.
 
     Attributes:
-        kinds: Parameters of each kind by name, with the probability `share`.
-        make: make(rng, kind, people) returns ground, actors and trajectory.
-        camera: The scenes have a forward camera, see Scenes.
+        kinds: Parameters of each kind by name, including its probability `fraction`.
+        make: Function (rng, kind, people) that returns ground, actors and trajectory.
+        camera: True if the scenes have a forward camera, see Scenes.
     """
 
     kinds: dict[str, Any]

@@ -1,4 +1,4 @@
-"""Vehicles, cyclists and people of a street."""
+"""Vehicles, cyclists and people on a street."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from lidar_perception.simulation.actors import SIGHT_M, Actor, ActorSet
 from lidar_perception.simulation.crowd import place_bench, place_standing, place_walking
-from lidar_perception.simulation.places import Side, scatter
+from lidar_perception.simulation.places import Side, draw_positions_along
 from lidar_perception.simulation.shapes.cyclists import make_bicycle, make_cyclist, make_motorcycle, make_motorcyclist
 from lidar_perception.simulation.shapes.heavy_vehicles import make_bus, make_tram, make_truck
 from lidar_perception.simulation.shapes.people import make_sitting_person
@@ -16,18 +16,22 @@ from lidar_perception.simulation.shapes.primitives import block, disc
 from lidar_perception.simulation.shapes.scene_object import SceneObject, make_rigid
 from lidar_perception.simulation.shapes.vehicles import make_car, make_van
 from lidar_perception.simulation.solids import make_parts
-from lidar_perception.simulation.street import CORNER_WALK_M, PARALLEL_STRIP_M, Lane, Street, parking_width
+from lidar_perception.simulation.street import CORNER_SIDEWALK_M, PARALLEL_STRIP_M, Lane, Street, compute_parking_width
 
 DRAWBAR_M = 0.8  # gap between a car and its trailer
-FREE_CORNER_M = 5.0  # distance to a crossing without parked vehicles
+FREE_CORNER_M = 5.0  # distance from a crossing to the first parked vehicle
 OTHER_VEHICLE = 20  # SemanticKITTI class
-MOTORCYCLIST_SHARE = 0.3  # fraction of motorcyclists among the riders at the edges of the road
+MOTORCYCLIST_FRACTION = 0.3  # motorcyclists among the riders at the edges of the road
 
 
 def populate(rng: np.random.Generator, street: Street, actors: ActorSet, people: float) -> None:
-    """Add all labelled actors of a street, and parked bicycles and motorcycles.
+    """Add the labelled actors of a street, and parked bicycles and motorcycles.
 
-    people: factor for the number of people.
+    Args:
+        rng: Random generator.
+        street: The street.
+        actors: Actors of the scene, to which the new ones are added.
+        people: Factor for the number of people.
     """
     kind, blocks = street.kind, street.blocks
     for lane in street.lanes:
@@ -35,10 +39,10 @@ def populate(rng: np.random.Generator, street: Street, actors: ActorSet, people:
             actors.admit(*group, gap=0.3)
     for crossing in street.ground.crossings:
         actors.admit_each(_fill_side_street(rng, crossing, street.ground), gap=0.3)
-    for side, share in [(b, 1.0) for b in blocks] + [(arm, 0.7) for arm in street.arms]:
-        actors.admit_each(_park_vehicles(rng, side, share * rng.uniform(*kind.occupied)))
+    for side, factor in [(curb, 1.0) for curb in blocks] + [(curb, 0.7) for curb in street.side_curbs]:
+        actors.admit_each(_park_vehicles(rng, side, factor * rng.uniform(*kind.occupancy)))
     for side in blocks:
-        for seat, *sitters in _place_seats(rng, side, kind.seats, people):
+        for seat, *sitters in _place_seats(rng, side, kind.benches, people):
             if actors.admit(seat, gap=0.4):
                 actors.add(*sitters)
     actors.admit_each(_place_riders(rng, street, actors.seconds, people), gap=0.3)
@@ -46,12 +50,12 @@ def populate(rng: np.random.Generator, street: Street, actors: ActorSet, people:
         for group in place_standing(rng, side, kind.standers * people):
             actors.admit(*group)
     for side in (*blocks, *_find_crosswalks(street)):
-        for group in place_walking(rng, side, kind.walkers * people, roam=kind.curb < 0.05):
+        for group in place_walking(rng, side, kind.walkers * people, roam=kind.curb_height < 0.05):
             actors.admit(*group)
 
 
 def _draw_vehicles(rng, use: str) -> list[SceneObject]:
-    """Draw a vehicle of a lane, and its trailer if it has one. The frequencies are similar to KITTI's labels."""
+    """Draw a vehicle for a kind of lane, some with a trailer. The frequencies are similar to KITTI's labels."""
     if use == "rail":
         return [make_tram(rng)]
     pick = rng.random()
@@ -72,143 +76,154 @@ def make_trailer(rng) -> SceneObject:
 
 
 def _queue_vehicles(rng, lane: Lane, street: Street, seconds: float) -> Iterator[list[Actor]]:
-    """Yield the vehicles of a lane that come into sight, with a distance to the ego vehicle."""
+    """Yield the vehicles in a lane that come into sight during the drive, clear of the ego vehicle."""
     if lane.use == "cycle":
         return
     is_ego_lane, direction = lane is street.lanes[0], lane.direction
-    # Distance that the ego vehicle gains on the lane.
+    # Distance by which the ego vehicle overtakes the traffic in the lane.
     gain = (street.speed - direction * lane.speed) * seconds
-    x, last = sorted((-direction * SIGHT_M, direction * SIGHT_M))
-    x, last = x + min(gain, 0.0), last + max(gain, 0.0)
+    x, end = sorted((-direction * SIGHT_M, direction * SIGHT_M))
+    x, end = x + min(gain, 0.0), end + max(gain, 0.0)
     stop_lines = [25.0] if is_ego_lane else [edge[direction < 0] for edge in street.ground.crossings]
-    waiting = rng.uniform(0, 40)
+    queue_length = rng.uniform(0, 40)
     while True:
         group = _draw_vehicles(rng, lane.use)
-        length = sum(t.size[0] for t in group) + DRAWBAR_M * (len(group) - 1)
-        min_gap = 1.2 + lane.speed
+        length = sum(obj.size[0] for obj in group) + DRAWBAR_M * (len(group) - 1)
+        min_gap = 1.2 + lane.speed  # 1 s of driving
         x += min_gap + rng.exponential(street.kind.headway * lane.speed + 1.0) * (2.0 if lane.use == "rail" else 1.0)
-        if x + length > last:
+        if x + length > end:
             return
-        back, front = (x, x + length) if direction > 0 else (x + length, x)
+        rear, front = (x, x + length) if direction > 0 else (x + length, x)
         x += length
-        if lane.speed == 0.0 and not any(0 < (line - front) * direction < waiting for line in stop_lines):
+        if lane.speed == 0.0 and not any(0 < (line - front) * direction < queue_length for line in stop_lines):
             continue
-        if is_ego_lane and min(back, front) - 2.5 < min_gap and max(back, front) + 2.5 > -min_gap:
+        if is_ego_lane and min(rear, front) - 2.5 < min_gap and max(rear, front) + 2.5 > -min_gap:
             continue
         speed = lane.speed * rng.uniform(0.98, 1.02)
-        aside, heading = rng.normal(0, 0.12), np.pi * (direction < 0)
+        offset, heading = rng.normal(0, 0.12), np.pi * (direction < 0)
         actors = []
         for obj in group:
-            middle = front - direction * obj.size[0] / 2
-            actors.append(Actor(obj, middle, lane.y + aside, heading, speed))
-            front = middle - direction * (obj.size[0] / 2 + DRAWBAR_M)
+            centre = front - direction * obj.size[0] / 2
+            actors.append(Actor(obj, centre, lane.y + offset, heading, speed))
+            front = centre - direction * (obj.size[0] / 2 + DRAWBAR_M)
         yield actors
 
 
 def _fill_side_street(rng, crossing: tuple[float, float], ground) -> Iterator[Actor]:
-    """Yield the vehicles of a side street that wait at the street, drive away from it or cross it."""
+    """Yield vehicles in a side street that wait at the main street, drive away from it or cross it."""
     low, high = crossing
-    strip = parking_width(crossing)
-    quarter = (high - low - 2 * strip) / 4 + strip
-    for curb, up in ((ground.curb_left, 1), (ground.curb_right, -1)):
-        coming, going = (low, high) if up > 0 else (high, low)
-        coming, going = coming + up * quarter, going - up * quarter
-        y = curb + up * rng.uniform(0.5, 1.0 + ground.walk)
+    parking_width = compute_parking_width(crossing)
+    lane_offset = (high - low - 2 * parking_width) / 4 + parking_width
+    for curb, direction in ((ground.curb_left, 1), (ground.curb_right, -1)):
+        approach_x, exit_x = (low, high) if direction > 0 else (high, low)
+        approach_x, exit_x = approach_x + direction * lane_offset, exit_x - direction * lane_offset
+        y = curb + direction * rng.uniform(0.5, 1.0 + ground.sidewalk_width)
         while rng.random() < 0.5:
             obj = _draw_vehicles(rng, "road")[0]
-            yield Actor(obj, coming, y + up * obj.size[0] / 2, -up * np.pi / 2)
-            y += up * (obj.size[0] + rng.uniform(1, 3))
-        for chance, far in ((0.25, rng.uniform(5, 50)), (0.3, -rng.uniform(15, 100))):
+            yield Actor(obj, approach_x, y + direction * obj.size[0] / 2, -direction * np.pi / 2)
+            y += direction * (obj.size[0] + rng.uniform(1, 3))
+        for chance, distance in ((0.25, rng.uniform(5, 50)), (0.3, -rng.uniform(15, 100))):
             if rng.random() < chance:
-                yield Actor(_draw_vehicles(rng, "road")[0], going, curb + up * far, up * np.pi / 2, rng.uniform(3, 9))
+                yield Actor(
+                    _draw_vehicles(rng, "road")[0],
+                    exit_x,
+                    curb + direction * distance,
+                    direction * np.pi / 2,
+                    rng.uniform(3, 9),
+                )
 
 
-def _park_vehicles(rng, side: Side, occupied: float) -> Iterator[Actor]:
+def _park_vehicles(rng, side: Side, occupancy: float) -> Iterator[Actor]:
     """Yield parked vehicles: along the curb, in driveways, and in car parks behind the sidewalk.
 
-    occupied: share of the parking spaces that are occupied.
+    Args:
+        rng: Random generator.
+        side: The curb.
+        occupancy: Fraction of the parking spaces that are occupied.
     """
 
-    def vehicle():
+    def make_parked_vehicle():
         pick = rng.random()
         if pick < 0.965:
             return (make_car if pick < 0.88 else make_van)(rng, driver=False)
         return (make_truck if pick < 0.99 else make_trailer)(rng)
 
-    def across(out, angle):
+    def park_in_row(offset, angle):
         spacing = 2.6 / abs(np.sin(angle))
-        for along in np.arange(FREE_CORNER_M, side.length - FREE_CORNER_M, spacing):
-            if rng.random() < occupied:
-                turn = angle + np.pi * (rng.random() < 0.3) + rng.normal(0, 0.03)
-                yield side.place(make_car(rng, driver=False), along, out + rng.normal(0, 0.15), turn)
+        for position in np.arange(FREE_CORNER_M, side.length - FREE_CORNER_M, spacing):
+            if rng.random() < occupancy:
+                heading = angle + np.pi * (rng.random() < 0.3) + rng.normal(0, 0.03)
+                yield side.place(make_car(rng, driver=False), position, offset + rng.normal(0, 0.15), heading)
 
-    if side.parking > PARALLEL_STRIP_M:
-        yield from across(-side.parking / 2 - 0.1, rng.choice([1.57, 2.2]))
-    along = FREE_CORNER_M
-    while side.parking == PARALLEL_STRIP_M and along < side.length - FREE_CORNER_M - 4:
-        obj = vehicle()
-        if rng.random() < occupied:
-            turn = np.pi * (rng.random() < 0.95) + rng.normal(0, 0.025)
-            yield side.place(obj, along + obj.size[0] / 2, -0.25 - obj.size[1] / 2 + rng.normal(0, 0.06), turn)
-        along += obj.size[0] + rng.uniform(0.7, 1.8)
+    if side.parking_width > PARALLEL_STRIP_M:
+        yield from park_in_row(-side.parking_width / 2 - 0.1, rng.choice([1.57, 2.2]))
+    position = FREE_CORNER_M
+    while side.parking_width == PARALLEL_STRIP_M and position < side.length - FREE_CORNER_M - 4:
+        obj = make_parked_vehicle()
+        if rng.random() < occupancy:
+            heading = np.pi * (rng.random() < 0.95) + rng.normal(0, 0.025)
+            yield side.place(obj, position + obj.size[0] / 2, -0.25 - obj.size[1] / 2 + rng.normal(0, 0.06), heading)
+        position += obj.size[0] + rng.uniform(0.7, 1.8)
     if side.front == "garden":
-        for along in scatter(rng, side.length, 6.0):
+        for position in draw_positions_along(rng, side.length, 6.0):
             yield side.place(
                 make_car(rng, driver=False),
-                along,
-                side.walk + rng.uniform(3, 6),
+                position,
+                side.sidewalk_width + rng.uniform(3, 6),
                 rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.04),
             )
     if side.front == "verge" and rng.random() < 0.35:
-        yield from across(side.walk + rng.uniform(5, 9), 1.57)
+        yield from park_in_row(side.sidewalk_width + rng.uniform(5, 9), 1.57)
 
 
 def _place_seats(rng, side: Side, rate: float, people: float) -> Iterator[list[Actor]]:
-    """Yield benches at the wall, each with the people on it, and people on cafe chairs."""
-    for along in scatter(rng, side.length, 8 * rate):
-        yield place_bench(rng, side, along, max(side.walk - 0.7, 1.5), people, 0.2)
-    for along in scatter(rng, side.length, rate * people):
-        out = side.walk - rng.uniform(0.8, 2.5)
-        for aside in rng.uniform((-0.9, 0.5), (-0.5, 0.9)):
-            yield [side.place(make_sitting_person(rng), along + aside, out, np.pi * (aside > 0) + rng.normal(0, 0.2))]
+    """Yield benches with people at the wall, and pairs of people on cafe chairs."""
+    for position in draw_positions_along(rng, side.length, 8 * rate):
+        yield place_bench(rng, side, position, max(side.sidewalk_width - 0.7, 1.5), people, 0.2)
+    for position in draw_positions_along(rng, side.length, rate * people):
+        offset = side.sidewalk_width - rng.uniform(0.8, 2.5)
+        for shift in rng.uniform((-0.9, 0.5), (-0.5, 0.9)):
+            yield [
+                side.place(make_sitting_person(rng), position + shift, offset, np.pi * (shift > 0) + rng.normal(0, 0.2))
+            ]
 
 
 def _place_riders(rng, street: Street, seconds: float, people: float) -> Iterator[Actor]:
-    """Yield riders at the edges of the road, on sidewalks and crossings, and parked bicycles."""
+    """Yield riders at the edges of the road, on sidewalks and on crossings, and parked bicycles."""
     ground, kind = street.ground, street.kind
     lanes = [lane for lane in street.lanes if lane.use == "cycle"]
-    places = [(lane.y, lane.direction) for lane in lanes] or [
-        (ground.curb_right + ground.parking + 0.6, 1),
-        (ground.curb_left - ground.parking - 0.6, -1),
+    edge_lanes = [(lane.y, lane.direction) for lane in lanes] or [
+        (ground.curb_right + ground.parking_width + 0.6, 1),
+        (ground.curb_left - ground.parking_width - 0.6, -1),
     ]
-    for y, direction in places:
+    for y, direction in edge_lanes:
         speed = rng.uniform(3.5, 5.5)
-        first = street.start - (street.speed * seconds if direction > 0 else 0.0)
-        for x in first + scatter(rng, street.end - first, kind.riders * people * (2.0 if lanes else 1.0)):
-            make = make_motorcyclist if rng.random() < MOTORCYCLIST_SHARE else make_cyclist
+        start = street.start - (street.speed * seconds if direction > 0 else 0.0)
+        for x in start + draw_positions_along(rng, street.end - start, kind.riders * people * (2.0 if lanes else 1.0)):
+            make = make_motorcyclist if rng.random() < MOTORCYCLIST_FRACTION else make_cyclist
             yield Actor(make(rng), x, y + rng.normal(0, 0.1), np.pi * (direction < 0), speed * rng.uniform(0.95, 1.05))
     for side in (*street.blocks, *_find_crosswalks(street)):
-        for along in scatter(rng, side.length, kind.riders * people * 0.5):
+        for position in draw_positions_along(rng, side.length, kind.riders * people * 0.5):
             yield side.place(
                 make_cyclist(rng),
-                along,
-                max(side.walk, 1.0) * rng.uniform(0.5, 0.7),
+                position,
+                max(side.sidewalk_width, 1.0) * rng.uniform(0.5, 0.7),
                 np.pi * rng.integers(2),
                 speed=rng.uniform(2.0, 4.5),
             )
     for side in street.blocks:
-        for along in scatter(rng, side.length, kind.clutter / 6 if side.walk else 0.0):
-            out, turn = rng.choice([0.9, max(side.walk - 1.0, 0.9)]), rng.normal(np.pi / 2, 0.2)
-            maker = make_bicycle if rng.random() < 0.75 else make_motorcycle
+        for position in draw_positions_along(rng, side.length, kind.clutter / 6 if side.sidewalk_width else 0.0):
+            offset, heading = rng.choice([0.9, max(side.sidewalk_width - 1.0, 0.9)]), rng.normal(np.pi / 2, 0.2)
+            make_parked = make_bicycle if rng.random() < 0.75 else make_motorcycle
             for i in range(rng.integers(1, 6)):
-                yield side.place(maker(rng), along + 0.75 * i, out, turn)
+                yield side.place(make_parked(rng), position + 0.75 * i, offset, heading)
 
 
 def _find_crosswalks(street: Street) -> list[Side]:
-    """Return the sidewalks of the side streets, continued across the street."""
-    far = 40.0
+    """Return the sidewalks of the side streets, extended across the main street."""
+    reach = 40.0
     return [
-        Side(x, land * far, -land * np.pi / 2, 2 * far, CORNER_WALK_M, "")
+        Side(x, front_direction * reach, -front_direction * np.pi / 2, 2 * reach, CORNER_SIDEWALK_M, "")
         for crossing in street.ground.crossings
-        for x, land in zip(crossing, (-1, 1))
+        for x, front_direction in zip(crossing, (-1, 1))
     ]

@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-DRIVE_SECONDS = 20.0  # duration of a drive without collisions
+DRIVE_SECONDS = 20.0  # duration of a drive
 ROBOT_RADIUS_M = 0.35
 
 
 class TrajectoryPoint(NamedTuple):
-    """Trajectory at one time.
+    """Position, heading and velocity on a trajectory at one time.
 
     Attributes:
         x, y: Position in the world, m.
@@ -29,50 +29,50 @@ class TrajectoryPoint(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """Trajectory with x = speed * t and y = sum of amplitude * sin(rate * t + phase).
+    """Smooth trajectory: x = speed * t, y = sum of amplitude * sin(rate * t + phase).
 
     Attributes:
         speed: m/s.
-        sways: (amplitude in m, rate in rad/s, phase in rad) of each sinusoid along y; empty for a
-            straight trajectory.
+        sinusoids: (amplitude in m, rate in rad/s, phase in rad) of each sinusoid along y; empty for
+            a straight trajectory.
     """
 
     speed: float = 0.0
-    sways: tuple[tuple[float, float, float], ...] = ()
+    sinusoids: tuple[tuple[float, float, float], ...] = ()
 
-    def at(self, t: float) -> TrajectoryPoint:
+    def evaluate(self, t: float) -> TrajectoryPoint:
         """Return position, heading and their derivatives after t seconds."""
         y = velocity_y = acceleration_y = 0.0
-        for amplitude, rate, phase in self.sways:
+        for amplitude, rate, phase in self.sinusoids:
             sin, cos = math.sin(rate * t + phase), math.cos(rate * t + phase)
             y, velocity_y = y + amplitude * sin, velocity_y + amplitude * rate * cos
             acceleration_y -= amplitude * rate * rate * sin
-        square = self.speed**2 + velocity_y**2
-        yaw_rate = self.speed * acceleration_y / square if square else 0.0
+        speed_sq = self.speed**2 + velocity_y**2
+        yaw_rate = self.speed * acceleration_y / speed_sq if speed_sq else 0.0
         heading = math.atan2(velocity_y, self.speed)
         return TrajectoryPoint(self.speed * t, y, heading, (self.speed, velocity_y), yaw_rate)
 
     def sample(self, seconds: float, step: float) -> np.ndarray:
         """Sample the trajectory from 0 to `seconds` every `step` seconds: (T, 3) float64 rows [t x y]."""
         times = np.linspace(0.0, seconds, round(seconds / step) + 1)
-        return np.array([(t, *self.at(t)[:2]) for t in times])
+        return np.array([(t, *self.evaluate(t)[:2]) for t in times])
 
 
 def draw_trajectory(
     rng: np.random.Generator, speed_range: tuple[float, float], stop_chance: float, max_heading: float
 ) -> Trajectory:
-    """Draw a trajectory that stands still, or sways with periods of 8 to 25 s.
+    """Draw a trajectory of a robot that stands still, or weaves with periods of 8 to 25 s.
 
     Args:
         rng: Random generator.
-        speed_range: Lowest and highest speed, m/s.
-        stop_chance: Probability that it stands still.
-        max_heading: Largest heading to both sides, rad.
+        speed_range: Minimum and maximum speed, m/s.
+        stop_chance: Probability that the robot stands still.
+        max_heading: Maximum deviation of the heading from x, rad.
     """
     if rng.random() < stop_chance:
         return Trajectory()
     speed, rate = rng.uniform(*speed_range), 2 * np.pi / rng.uniform((8.0, 15.0), (15.0, 25.0))
-    # The heading of one sway is at most atan(amplitude * rate / speed); two sways share max_heading.
+    # The maximum heading of one sinusoid is atan(amplitude * rate / speed); each of the two gets half of it.
     amplitude = 0.5 * speed * np.tan(max_heading * rng.uniform(0.3, 1.0, 2)) / rate
     phase = rng.uniform(-np.pi, np.pi, 2)
     return Trajectory(float(speed), tuple(zip(amplitude.tolist(), rate.tolist(), phase.tolist())))

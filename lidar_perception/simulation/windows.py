@@ -1,4 +1,4 @@
-"""Windows of solids in the grid of firings and beams, like bounding rectangles in an image."""
+"""Windows of solids: their bounding rectangles in the grid of firings and beams."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from lidar_perception.simulation.solids import BOX, ELLIPSOID, Solids
 
 
 class Windows(NamedTuple):
-    """Windows of P solids. Only rays in the window of a solid can hit it.
+    """Bounding windows of P solids. Only rays in the window of a solid can hit it.
 
     Attributes:
         first: (P,) int64 first column, 0 .. columns - 1.
-        count: (P,) int64 number of columns; after the last column of the grid follows column 0.
+        count: (P,) int64 number of columns; windows wrap around from the last column to column 0.
         beams: (P, rings) bool, beams that can hit the solid.
         min_range: (P,) lower bound of the range of a hit, m.
     """
@@ -34,9 +34,9 @@ class Grid(NamedTuple):
     Attributes:
         columns, rate, max_range: See Sensor.
         stamp, yaw_rate: See Motion.
-        begin, end: Begin and end of the turn, seconds after the stamp.
+        begin, end: Start and end of the revolution, seconds relative to the stamp.
         margin: Margin in azimuth, rad.
-        moves: The sensor or a solid moves.
+        is_moving: True if the sensor or a solid moves.
         lift: (rings,) start of each beam on the z axis, m.
         rise, fall: (rings,) slopes of the highest and the lowest ray of each beam.
     """
@@ -49,7 +49,7 @@ class Grid(NamedTuple):
     end: float
     margin: float
     max_range: float
-    moves: bool
+    is_moving: bool
     lift: np.ndarray
     rise: np.ndarray
     fall: np.ndarray
@@ -64,8 +64,8 @@ def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION, mar
         motion: Motion of the sensor.
         margin: Largest angle between a ray and its beam, rad.
     """
-    relative = solids.velocity - np.asarray(motion.velocity, np.float64)
-    since = sensor.times() - motion.stamp / sensor.rate
+    relative_velocity = solids.velocity - np.asarray(motion.velocity, np.float64)
+    times = sensor.compute_firing_times() - motion.stamp / sensor.rate
     elevations, limit = np.asarray(sensor.elevations), np.pi / 2 - 1e-6
     rise, fall = (np.tan(np.clip(elevations + m, -limit, limit)) for m in (margin + 1e-9, -margin - 1e-9))
     grid = Grid(
@@ -73,12 +73,12 @@ def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION, mar
         float(sensor.rate),
         float(motion.stamp),
         float(motion.yaw_rate),
-        float(since.min()),
-        float(since.max()),
+        float(times.min()),
+        float(times.max()),
         float(margin / np.cos(np.abs(elevations).max())),
         float(sensor.max_range),
-        bool(relative.any() or motion.yaw_rate),
-        sensor.origins()[:, 2].copy(),
+        bool(relative_velocity.any() or motion.yaw_rate),
+        sensor.compute_origins()[:, 2].copy(),
         rise,
         fall,
     )
@@ -86,77 +86,90 @@ def find_windows(solids: Solids, sensor: Sensor, motion: Motion = NO_MOTION, mar
     windows = Windows(
         np.empty(count, np.int64), np.empty(count, np.int64), np.empty((count, sensor.rings), bool), np.empty(count)
     )
-    arrays = (np.array(values, float, order="C") for values in (solids.centre, solids.half, solids.axes, relative))
+    arrays = (
+        np.array(values, float, order="C")
+        for values in (solids.centre, solids.half_size, solids.axes, relative_velocity)
+    )
     _fill_windows(windows, grid, np.array(solids.kind), *arrays)
     return windows
 
 
 @njit(cache=True, nogil=True)
-def _fill_windows(windows, grid, kind, centre, half, axes, relative):
+def _fill_windows(windows, grid, kind, centre, half_size, axes, relative_velocity):
     corners, box_axes, box_half = np.empty((16, 3)), np.empty((3, 3)), np.empty(3)
     for p in range(len(kind)):
-        # Iterate: the window for the whole turn limits the time at which the sensor faces the solid.
-        begin, end = (grid.begin, grid.end) if grid.moves else (0.0, 0.0)
-        for _ in range(3 if grid.moves else 1):
-            ahead = _find_direction(centre[p], relative[p], (begin + end) / 2)
+        # Iterate: the window of the full revolution limits the time at which the sensor faces the solid.
+        begin, end = (grid.begin, grid.end) if grid.is_moving else (0.0, 0.0)
+        for _ in range(3 if grid.is_moving else 1):
+            direction = _find_direction(centre[p], relative_velocity[p], (begin + end) / 2)
             _fill_corners(
-                corners, box_axes, box_half, kind[p], centre[p], half[p], axes[p], relative[p], ahead, begin, end
+                corners,
+                box_axes,
+                box_half,
+                kind[p],
+                centre[p],
+                half_size[p],
+                axes[p],
+                relative_velocity[p],
+                direction,
+                begin,
+                end,
             )
             first, count = _find_columns(corners, grid, begin, end)
-            latest = grid.columns // 2 - first
-            earliest = latest - count + 1
+            last_firing = grid.columns // 2 - first
+            first_firing = last_firing - count + 1
             begin, end = grid.begin, grid.end
-            if latest // grid.columns == earliest // grid.columns:
-                turn = grid.columns * grid.rate
-                begin = earliest % grid.columns / turn - grid.stamp / grid.rate
-                end = latest % grid.columns / turn - grid.stamp / grid.rate
+            if last_firing // grid.columns == first_firing // grid.columns:
+                firing_rate = grid.columns * grid.rate
+                begin = first_firing % grid.columns / firing_rate - grid.stamp / grid.rate
+                end = last_firing % grid.columns / firing_rate - grid.stamp / grid.rate
         windows.first[p], windows.count[p] = first % grid.columns, count
-        windows.min_range[p] = _fill_beams(corners, box_axes, ahead, grid, windows.beams[p]) - 1e-6
+        windows.min_range[p] = _fill_beams(corners, box_axes, direction, grid, windows.beams[p]) - 1e-6
 
 
 @njit(cache=True, nogil=True)
-def _find_direction(centre, relative, since):
-    """Return the horizontal direction (x, y) to a solid at a time."""
-    x, y = centre[0] + relative[0] * since, centre[1] + relative[1] * since
+def _find_direction(centre, relative_velocity, time):
+    """Return the horizontal direction (x, y) from the sensor to a solid at a time."""
+    x, y = centre[0] + relative_velocity[0] * time, centre[1] + relative_velocity[1] * time
     distance = max(math.hypot(x, y), 1e-9)
     return x / distance, y / distance
 
 
 @njit(cache=True, nogil=True)
-def _fill_corners(corners, box_axes, box_half, kind, centre, half, axes, relative, ahead, begin, end):
-    """Fill the corners (16, 3) of a box around a solid at begin and end (s), its axes and its half sizes.
+def _fill_corners(corners, box_axes, box_half, kind, centre, half_size, axes, relative_velocity, direction, begin, end):
+    """Fill in a box around a solid: its axes, half sizes, and corners (16, 3) at the times begin and end.
 
-    Round solids get a box that faces the sensor, which is tighter.
+    The box of a round solid faces the sensor, which makes it tighter.
     """
     if kind == BOX:
         box_axes[:] = axes
-        box_half[:] = half
+        box_half[:] = half_size
     else:
         box_axes[:] = 0.0
-        box_axes[0, 0], box_axes[1, 0] = ahead
-        box_axes[0, 1], box_axes[1, 1] = -ahead[1], ahead[0]
+        box_axes[0, 0], box_axes[1, 0] = direction
+        box_axes[0, 1], box_axes[1, 1] = -direction[1], direction[0]
         box_axes[2, 2] = 1.0
         for i in range(3):
             a, b, c = 0.0, 0.0, 0.0
             for j in range(3):
-                a += box_axes[j, i] * axes[j, 0] * half[0]
-                b += box_axes[j, i] * axes[j, 1] * half[1]
-                c += box_axes[j, i] * axes[j, 2] * half[2]
+                a += box_axes[j, i] * axes[j, 0] * half_size[0]
+                b += box_axes[j, i] * axes[j, 1] * half_size[1]
+                c += box_axes[j, i] * axes[j, 2] * half_size[2]
             if kind == ELLIPSOID:
                 box_half[i] = math.sqrt(a * a + b * b + (c * c))
             else:
                 box_half[i] = math.sqrt(a * a + b * b) + abs(c)
     for n in range(16):
-        since = begin if n < 8 else end
+        time = begin if n < 8 else end
         for i in range(3):
-            corners[n, i] = centre[i] + relative[i] * since
+            corners[n, i] = centre[i] + relative_velocity[i] * time
             for j in range(3):
                 corners[n, i] += box_axes[i, j] * (box_half[j] if n >> j & 1 else -box_half[j])
 
 
 @njit(cache=True, nogil=True)
 def _find_columns(corners, grid, begin, end):
-    """Return the first column and the number of columns of a window, with the rotation of the sensor."""
+    """Return the first column and the number of columns of a window, including the rotation of the sensor."""
     x, y = 0.0, 0.0
     for n in range(16):
         x, y = x + corners[n, 0], y + corners[n, 1]
@@ -177,22 +190,22 @@ def _find_columns(corners, grid, begin, end):
 
 
 @njit(cache=True, nogil=True)
-def _fill_beams(corners, box_axes, ahead, grid, beams):
-    """Fill the beams (rings,) bool that can hit the box, and return its distance from the z axis."""
-    near, far, bottom, top = 0.0, 0.0, np.inf, -np.inf
-    for side in range(3):  # two sides of the box, and the direction towards it
-        x, y = ahead if side == 2 else (box_axes[0, side], box_axes[1, side])
+def _fill_beams(corners, box_axes, direction, grid, beams):
+    """Fill in the beams (rings,) bool that can hit the box, and return its distance from the z axis."""
+    min_distance, max_distance, bottom, top = 0.0, 0.0, np.inf, -np.inf
+    for side in range(3):  # the normals of two sides of the box, and the direction towards it
+        x, y = direction if side == 2 else (box_axes[0, side], box_axes[1, side])
         length = max(math.hypot(x, y), 1e-9)
         low, high = np.inf, -np.inf
         for n in range(16):
-            along = (x * corners[n, 0] + y * corners[n, 1]) / length
-            low, high = min(low, along), max(high, along)
-        near = max(near, low, -high)
+            projection = (x * corners[n, 0] + y * corners[n, 1]) / length
+            low, high = min(low, projection), max(high, projection)
+        min_distance = max(min_distance, low, -high)
     for n in range(16):
-        far = max(far, math.hypot(corners[n, 0], corners[n, 1]))
+        max_distance = max(max_distance, math.hypot(corners[n, 0], corners[n, 1]))
         bottom, top = min(bottom, corners[n, 2]), max(top, corners[n, 2])
     for r in range(len(beams)):
-        highest = grid.lift[r] + max(near * grid.rise[r], far * grid.rise[r])
-        lowest = grid.lift[r] + min(near * grid.fall[r], far * grid.fall[r])
-        beams[r] = highest >= bottom and lowest <= top and near <= grid.max_range
-    return near
+        highest = grid.lift[r] + max(min_distance * grid.rise[r], max_distance * grid.rise[r])
+        lowest = grid.lift[r] + min(min_distance * grid.fall[r], max_distance * grid.fall[r])
+        beams[r] = highest >= bottom and lowest <= top and min_distance <= grid.max_range
+    return min_distance

@@ -19,10 +19,10 @@ from lidar_perception.simulation.camera import (
     FORWARD_CAMERA,
     find_labelled,
     make_kitti_labels,
+    rotate_camera,
     select_labels,
-    turn_camera,
 )
-from lidar_perception.simulation.drive import choose_drive_frame, simulate_scan
+from lidar_perception.simulation.drive import choose_scan_index, simulate_scan
 from lidar_perception.simulation.scene import ALL_STREETS, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
@@ -128,7 +128,7 @@ class SimulatedScenes:
     def locate(self, i: int) -> tuple[int, int]:
         """Return the seed of the scene of scan i, and the number of the scan in its drive."""
         scene, scan = divmod(i, self.scans_per_scene)
-        return self.first_seed + scene, choose_drive_frame(scan, self.scans_per_scene, self.sensor)
+        return self.first_seed + scene, choose_scan_index(scan, self.scans_per_scene, self.sensor)
 
     def cache_key(self, i: int) -> str:
         """Return the cache key of scan i."""
@@ -153,7 +153,7 @@ class SimulatedScenes:
             return Frame.of(
                 f"scene {seed} frame {number}", scan, select_labels(truth), sensor_height=self.sensor.height
             )
-        camera = turn_camera(np.pi / 2 * (i % 4)) if self.all_around else FORWARD_CAMERA
+        camera = rotate_camera(np.pi / 2 * (i % 4)) if self.all_around else FORWARD_CAMERA
         return Frame.of(
             f"street {seed} frame {number}",
             scan,

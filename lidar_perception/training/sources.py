@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from lidar_perception.simulation.drive import longest_drive
+from lidar_perception.simulation.drive import count_drive_scans
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.frames import open_labelled_frames
@@ -73,7 +73,7 @@ def open_sources(
     if with_simulated:
         scenes.scene_types()  # raises InputError for an unknown scene
     if SIM in data:
-        scans_per_scene = min(params.street_scans, longest_drive(sensor))
+        scans_per_scene = min(params.street_scans, count_drive_scans(sensor))
         sources.append(simulate(FIRST_TRAINING_SEED, params.scans, scenes=scenes, scans_per_scene=scans_per_scene))
     if SIM in (val or data):
         val_sources.append(simulate(FIRST_VALIDATION_SEED, params.val_scans, scenes=val_scenes, all_around=all_around))

@@ -54,7 +54,7 @@ def test_tilted_sensor_is_measured_correctly(name):
         )
     if driver["intensity"]:
         assert m.intensity.full_scale == driver["intensity"][2] and m.intensity.is_certain
-        assert m.intensity.zero_share == pytest.approx(
+        assert m.intensity.zero_fraction == pytest.approx(
             float(np.mean(np.concatenate([s.intensity for s in m.source.scans]) == 0))
         )
     if driver["time"]:
@@ -157,7 +157,7 @@ def test_cloud_without_columns_warns():
     assert MOUNTS["pandarxt-32"][0] is BARE
     m = measure("pandarxt-32")
     text = "\n".join(find_warnings(m))
-    assert "there is no intensity" in text and "the rate is unknown" in text
+    assert "the clouds have no intensity" in text and "the rate is unknown" in text
     assert "silent: 1  # no intensity in the clouds" in format_sensor(m)
     assert "input.intensity_max" not in choose_params(m)
 

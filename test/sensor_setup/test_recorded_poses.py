@@ -125,9 +125,9 @@ def test_contradictions_of_tf_and_clouds_are_reported():
     assert not any("URDF" in line for line in find_warnings(right))
     recorded = right.mounting.recorded._replace(problem="3 of 4 clouds have no pose")
     unposed = replace(right, mounting=right.mounting._replace(recorded=recorded))
-    assert any("from clouds alone: 3 of 4 clouds" in line for line in find_warnings(unposed))
+    assert any("only from clouds: 3 of 4 clouds" in line for line in find_warnings(unposed))
     for tf_mount, height, words in (
-        (make_mount(0, roll + 3, pitch), None, "with roll"),
+        (make_mount(0, roll + 3, pitch), None, "has roll"),
         (make_mount(0, roll, pitch - 3), None, "and pitch"),
         (make_mount(45, roll, pitch), None, "correct the yaw"),
         (true, mount.height + 0.4, "above the ground"),

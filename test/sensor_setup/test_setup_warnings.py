@@ -97,7 +97,7 @@ def test_robot_body_is_found_and_cropped():
 
     m = measure(change_scans(with_body))
     c = m.view.coverage
-    assert c.can_crop and c.body.any() and c.foreign_share < 0.1
+    assert c.can_crop and c.body.any() and c.foreign_fraction < 0.1
     assert (c.box[:2] < [-0.6, -0.1]).all() and (c.box[3:5] > [-0.7, 0.1]).all()
     assert -0.9 < c.box[0] and c.box[3] < 0 and np.abs(c.box[[2, 5]]).max() < 0.4
     behind = [(a, b) for ring, a, b in c.blocked if ring == 0]
@@ -228,7 +228,7 @@ def test_sector_without_returns_limits_the_field_of_view():
     m = measure(change_scans(lambda p: p[np.abs(np.arctan2(p["y"], p["x"])) < np.radians(60)]))
     start, end = m.view.coverage.view
     assert abs(start - 300) <= 1 and abs(end - 60) <= 1
-    assert make_sensor(m).open_rays().mean() == pytest.approx(1 / 3, abs=0.02)
+    assert make_sensor(m).find_unblocked_rays().mean() == pytest.approx(1 / 3, abs=0.02)
 
 
 def test_frame_with_y_ahead_or_z_down_is_reported():
@@ -346,12 +346,12 @@ def test_unusable_clouds_are_rejected():
     with pytest.raises(InputError, match="2D scanner"):
         measure(change_scans(lambda p: p[p["ring"] == 8]))
     mixed = change_scans(None)
-    with pytest.raises(InputError, match="several layouts"):
+    with pytest.raises(InputError, match="different columns"):
         measure([mixed[0]._replace(columns=("x", "y", "z")), *mixed[1:]])
     m = measure(mixed)
     mount = m.mounting.mount._replace(height=60.0)
     high = replace(m, mounting=m.mounting._replace(mount=mount))
-    with pytest.raises(InputError, match=r"height = 60\.0 is outside 0\.0 \.\. 50\.0 m; give"):
+    with pytest.raises(InputError, match=r"height = 60\.0 is outside 0\.0 \.\. 50\.0 m; use"):
         format_params(high)
 
 

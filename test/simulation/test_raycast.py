@@ -23,13 +23,13 @@ DRIVE = Motion((12.0, -1.0, 0.2), 0.8, stamp=0.3)
 
 def cast_by_brute_force(objects, sensor, motion=NO_MOTION):
     """Return range, solid (columns, rings) and reached, from tests of every solid with every ray."""
-    turn = make_rays(sensor, motion)
-    nearest = np.full(turn.direction.shape[:2], np.inf)
-    solid, reached = np.full(nearest.shape, -1), {}
+    rays = make_rays(sensor, motion)
+    nearest = np.full(rays.direction.shape[:2], np.inf)
+    solid, ray_counts = np.full(nearest.shape, -1), {}
     for i in range(len(objects)):
-        centre = objects.centre[i] + objects.velocity[i] * turn.since[:, None, None]
-        o = (turn.origin - centre) @ objects.axes[i] / objects.half[i]
-        d = turn.direction @ objects.axes[i] / objects.half[i]
+        centre = objects.centre[i] + objects.velocity[i] * rays.times[:, None, None]
+        o = (rays.origin - centre) @ objects.axes[i] / objects.half_size[i]
+        d = rays.direction @ objects.axes[i] / objects.half_size[i]
         o = np.broadcast_to(o, d.shape)
         with np.errstate(all="ignore"):
             slab = np.sort(np.stack([(-1 - o) / d, (1 - o) / d]), axis=0)
@@ -45,11 +45,11 @@ def cast_by_brute_force(objects, sensor, motion=NO_MOTION):
                 enter = np.maximum(quadric[0], slab[0][..., 2])
                 leave = np.minimum(quadric[1], slab[1][..., 2])
         t = np.where((enter <= leave) & (enter > 0) & (enter <= sensor.max_range), enter, np.inf)
-        own = int(objects.owner[i])
-        reached[own] = reached.get(own, False) | (t < np.inf)
+        owner = int(objects.owner[i])
+        ray_counts[owner] = ray_counts.get(owner, False) | (t < np.inf)
         solid = np.where(t < nearest, i, solid)
         nearest = np.minimum(nearest, t)
-    return nearest, solid, {k: v.sum() for k, v in reached.items() if k}
+    return nearest, solid, {k: v.sum() for k, v in ray_counts.items() if k}
 
 
 def are_equal(one, other):
@@ -58,16 +58,16 @@ def are_equal(one, other):
 
 @pytest.mark.parametrize("motion", [NO_MOTION, DRIVE])
 @pytest.mark.parametrize("seed", range(4))
-def test_hits_equal_slow_reference(seed, motion):
+def test_hits_equal_brute_force_reference(seed, motion):
     objects = make_crowd(seed)
     for sensor in (SENSOR, replace(SENSOR, lifts=(), elevations=tuple(np.linspace(1.4, -1.4, 9)))):
         hits = cast_rays(objects, Ground(), NO_GROUND, sensor, motion)
-        nearest, solid, reached = cast_by_brute_force(objects, sensor, motion)
+        nearest, solid, ray_counts = cast_by_brute_force(objects, sensor, motion)
         assert (nearest < np.inf).sum() > 50
         assert np.allclose(hits.range, nearest, rtol=1e-9)
         assert np.array_equal(hits.solid, solid)
         assert np.array_equal(hits.owner, np.where(solid < 0, 0, objects.owner[solid]))
-        assert {k: n for k, n in enumerate(hits.reached) if n} == {k: n for k, n in reached.items() if n}
+        assert {k: n for k, n in enumerate(hits.unoccluded_counts) if n} == {k: n for k, n in ray_counts.items() if n}
 
 
 def make_foliage(seed):
@@ -81,7 +81,7 @@ def make_foliage(seed):
 
 def test_hits_depend_on_seed_only():
     for seed, motion in ((0, NO_MOTION), (1, DRIVE)):
-        scene = make_foliage(seed), FULL._replace(rough=0.05), OVER_ROAD, WIDE, motion
+        scene = make_foliage(seed), FULL._replace(tuft_height=0.05), OVER_ROAD, WIDE, motion
         one = cast_rays(*scene, seed)
         assert are_equal(one, cast_rays(*scene, seed))
         for other in (9, -1, (1 << 90) + 5):
@@ -98,23 +98,23 @@ def test_nearest_of_single_casts_equals_joint_cast(motion):
     objects = replace(
         objects,
         centre=objects.centre * (5 + 0.3 * far) / far - [0, 0, 1],
-        half=0.6 * objects.half,
+        half_size=0.6 * objects.half_size,
         density=np.where(rng.random(count) < 0.3, 1.0, np.inf),
         owner=np.where(rng.random(count) < 0.7, 0, objects.owner).astype(np.int32),
     )
-    ground = FULL._replace(rough=0.8, litter=0.6, camber=0.03, curb_left=3.0, curb_right=-2.0)
+    ground = FULL._replace(tuft_height=0.8, litter_height=0.6, camber=0.03, curb_left=3.0, curb_right=-2.0)
     hits = cast_rays(objects, ground, OVER_ROAD, SENSOR, motion)
     nearest = cast_rays(objects.take(np.arange(0)), ground, OVER_ROAD, SENSOR, motion)._asdict()
     for i in range(count):
         # The other solids are out of reach, so that solid i keeps its index.
         alone = replace(objects, centre=np.where(np.arange(count)[:, None] == i, objects.centre, 1e4))
-        met = cast_rays(alone, Ground(), NO_GROUND, SENSOR, motion)
-        nearer = met.range < nearest["range"]
-        assert (met.solid[nearer] == i).all()
-        for name in nearest.keys() - {"reached"}:
-            nearest[name] = np.where(nearer, getattr(met, name), nearest[name])
+        is_hit = cast_rays(alone, Ground(), NO_GROUND, SENSOR, motion)
+        nearer = is_hit.range < nearest["range"]
+        assert (is_hit.solid[nearer] == i).all()
+        for name in nearest.keys() - {"unoccluded_counts"}:
+            nearest[name] = np.where(nearer, getattr(is_hit, name), nearest[name])
     assert len(np.unique(hits.solid)) > 80 and 0.1 < (hits.solid < 0).mean() < 0.9
-    for name in nearest.keys() - {"reached"}:
+    for name in nearest.keys() - {"unoccluded_counts"}:
         assert np.array_equal(getattr(hits, name), nearest[name]), name
 
 
@@ -134,19 +134,19 @@ def test_wall_is_flat_only_after_motion_compensation():
 
 @pytest.fixture
 def even_leaves(monkeypatch):
-    """Fill all cells with leaves."""
-    monkeypatch.setattr(foliage, "LEAF_SHARE", 1.0)
+    """Fill every cell of foliage with leaves."""
+    monkeypatch.setattr(foliage, "LEAF_FRACTION", 1.0)
 
 
 def test_leaf_clumps_are_constant_during_drive():
-    """Two casts with different random numbers hit leaves in the same cells, a fraction LEAF_SHARE of all."""
+    """Two casts with different random numbers hit leaves in the same cells, a fraction LEAF_FRACTION of all."""
     fine = make_generic_sensor(64, -8.0, 8.0, 0.1, 10.0, divergence=0.0)
     plant = make_solids(BOX, (12, 0, 0), (3, 3, 3), density=2.0)
     filled = []
     for seed in (1, 2):
         hits = cast_rays(plant, Ground(), NO_GROUND, fine, seed=seed)
-        met = np.isfinite(hits.range)
-        xyz = fine.directions()[met] * hits.range[met][:, None] - [12, 0, 0]
+        is_hit = np.isfinite(hits.range)
+        xyz = fine.compute_directions()[is_hit] * hits.range[is_hit][:, None] - [12, 0, 0]
         filled.append({tuple(c) for c in np.floor(xyz / foliage.CELL_M).astype(int)})
         assert len(xyz) > 2000
     both = filled[0] & filled[1]
@@ -167,11 +167,11 @@ def test_foliage_stops_rays_after_mean_free_path(kind, even_leaves):
     path = thick.range[shell] - thin.range[shell]
     assert shell.sum() > 1000 and (path > 0).all()
     # In deep foliage, path lengths are exponentially distributed up to 2 m.
-    middle = shell & (np.abs(fine.directions()[..., 1]) < 0.1)
+    middle = shell & (np.abs(fine.compute_directions()[..., 1]) < 0.1)
     path = (thick.range - np.where(shell, thin.range, 0))[middle]
     for depth in (0.5, 1.0, 2.0):
         assert abs((path > depth).mean() - np.exp(-0.7 * depth)) < 4 * 0.5 / np.sqrt(len(path))
-    assert thick.reached[1] == np.isfinite(thick.range).sum() < thin.reached[1]
+    assert thick.unoccluded_counts[1] == np.isfinite(thick.range).sum() < thin.unoccluded_counts[1]
 
 
 def test_rays_from_inside_are_stopped_only_by_foliage(even_leaves):
@@ -188,10 +188,10 @@ def test_glass_transmits_the_given_fraction_of_rays():
     panes = replace(panes, transmission=np.array([0.7, 0.0]))
     fine = make_generic_sensor(32, -5.0, 5.0, 0.1, 10.0, divergence=0.0)
     hits = cast_rays(panes, Ground(), NO_GROUND, fine)
-    front = np.abs(fine.directions()[..., 1]) < 0.2
-    front &= fine.directions()[..., 0] > 0
-    share = (hits.owner[front] == 2).mean()
-    assert abs(share - 0.7) < 4 * 0.46 / np.sqrt(front.sum())
+    front = np.abs(fine.compute_directions()[..., 1]) < 0.2
+    front &= fine.compute_directions()[..., 0] > 0
+    fraction = (hits.owner[front] == 2).mean()
+    assert abs(fraction - 0.7) < 4 * 0.46 / np.sqrt(front.sum())
     assert set(np.unique(hits.owner[front])) == {1, 2}
 
 
@@ -200,7 +200,7 @@ def test_nearest_solid_is_hit_and_occluded_rays_are_counted():
     hits = cast_rays(both, Ground(), OVER_ROAD, SENSOR)
     hit_counts = np.bincount(hits.owner.ravel(), minlength=3)
     assert (hits.range[0][hits.owner[0] == 1] < 5.0).all()
-    assert hit_counts[1] == hits.reached[1] and hit_counts[2] < 0.4 * hits.reached[2]
+    assert hit_counts[1] == hits.unoccluded_counts[1] and hit_counts[2] < 0.4 * hits.unoccluded_counts[2]
 
 
 def test_beam_on_an_edge_returns_one_side_or_a_range_between():
@@ -209,33 +209,33 @@ def test_beam_on_an_edge_returns_one_side_or_a_range_between():
     fine = make_generic_sensor(64, -10.0, 10.0, 0.2, 10.0, divergence=3e-3)
     exact = cast_rays(objects, Ground(), NO_GROUND, replace(fine, divergence=0.0))
     beams = cast_rays(objects, Ground(), NO_GROUND, fine)
-    mixed = beams.owner == 0
-    mixed &= np.isfinite(beams.range)
+    is_mixed = beams.owner == 0
+    is_mixed &= np.isfinite(beams.range)
     low, high = exact.range[exact.owner > 0].min(), exact.range[exact.owner > 0].max()
-    assert mixed.sum() > 10 and ((beams.range > low) & (beams.range < high))[mixed].all()
+    assert is_mixed.sum() > 10 and ((beams.range > low) & (beams.range < high))[is_mixed].all()
     unchanged = beams.range == exact.range
     assert 0.9 < unchanged[exact.owner > 0].mean() < 1
-    x = (fine.directions() * np.where(np.isfinite(beams.range), beams.range, 0)[..., None])[..., 0]
+    x = (fine.compute_directions() * np.where(np.isfinite(beams.range), beams.range, 0)[..., None])[..., 0]
     assert (np.abs(x[beams.owner == 1] - 4.8) < 0.01).all()  # points with an owner are on its surface
     apart = cast_rays(replace(objects, centre=objects.centre + [[0, 0, 0], [3, 0, 0]]), Ground(), NO_GROUND, fine)
     assert (apart.owner[np.isfinite(apart.range)] > 0).all()  # too far apart for mixed returns
-    assert np.array_equal(beams.reached, exact.reached)
+    assert np.array_equal(beams.unoccluded_counts, exact.unoccluded_counts)
 
 
-def test_beam_on_one_surface_equals_ray():
+def test_beam_on_single_surface_equals_ray():
     objects = make_solids(BOX, (8, 0, 0), (1, 200, 200))
     one, other = (cast_rays(objects, Ground(), NO_GROUND, s) for s in (SENSOR, WIDE))
-    inner = np.isfinite(np.roll(one.range, 1, 0)) & np.isfinite(np.roll(one.range, -1, 0))
-    assert np.array_equal(one.range[inner], other.range[inner])
+    is_inner = np.isfinite(np.roll(one.range, 1, 0)) & np.isfinite(np.roll(one.range, -1, 0))
+    assert np.array_equal(one.range[is_inner], other.range[is_inner])
 
 
 def test_hashed_numbers_are_uniform_and_reproducible():
-    def numbers(seed, count=40_000):
+    def draw_numbers(seed, count=40_000):
         return np.array([hash_uniform(seed, np.uint64((7 << 32) + i)) for i in range(count)])
 
-    u = numbers(3)
+    u = draw_numbers(3)
     assert 0 < u.min() and u.max() < 1 and len(np.unique(u)) == len(u)
     assert np.abs(np.histogram(u, 20, (0, 1))[0] - 2000).max() < 5 * np.sqrt(2000)
     assert abs(np.corrcoef(u[1:], u[:-1])[0, 1]) < 0.02
-    assert abs(np.corrcoef(u, numbers(4))[0, 1]) < 0.02
-    assert np.array_equal(numbers(3, 9), u[:9])
+    assert abs(np.corrcoef(u, draw_numbers(4))[0, 1]) < 0.02
+    assert np.array_equal(draw_numbers(3, 9), u[:9])

@@ -22,7 +22,7 @@ from lidar_perception.simulation.recording import simulate_frames
 from lidar_perception.simulation.returns import make_returns
 from lidar_perception.simulation.scene import SCENE_TYPES, Scenes, make_scene
 from lidar_perception.simulation.sensor import find_sensor, make_generic_sensor
-from lidar_perception.simulation.terrain import surface_height
+from lidar_perception.simulation.terrain import compute_ground_height
 from lidar_perception.simulation.trajectory import ROBOT_RADIUS_M, Trajectory, draw_trajectory
 from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.types import CLASSES, InputError
@@ -62,13 +62,13 @@ def test_trajectory_derivatives_are_exact():
     for seed in range(20):
         way = draw_trajectory(np.random.default_rng(seed), (0.5, 1.5), 0.2, 0.7)
         for t in (0.0, 3.3, 19.0):
-            before, now, after = (way.at(t + d) for d in (-h, 0.0, h))
+            before, now, after = (way.evaluate(t + d) for d in (-h, 0.0, h))
             assert np.allclose(np.subtract(after[:2], before[:2]) / (2 * h), now.velocity, atol=1e-6)
             assert (after.heading - before.heading) / (2 * h) == pytest.approx(now.yaw_rate, abs=1e-6)
             assert abs(now.heading) < 0.71 and np.hypot(*now.velocity) < 1.5 / np.cos(0.7)
             assert np.allclose(np.tan(now.heading) * now.velocity[0], now.velocity[1])
     assert way.sample(20.0, 0.1).shape == (201, 3)
-    assert Trajectory().at(7.0) == (0.0, 0.0, 0.0, (0.0, 0.0), 0.0)
+    assert Trajectory().evaluate(7.0) == (0.0, 0.0, 0.0, (0.0, 0.0), 0.0)
 
 
 @pytest.mark.parametrize("scene, kind", ROBOTS)
@@ -77,7 +77,7 @@ def test_actors_never_touch_robot_or_each_other(scene, kind):
     props = [a for a in simulated.actors if not a.obj.label]
     fixed = make_flat_boxes(np.array([a.footprint for a in props]), 0.0)
     for t in np.linspace(0.0, simulated.seconds, 9):
-        moment, pose = simulated.at(t, 0.6), simulated.sensor_pose(t, 0.6)
+        moment, pose = simulated.compute_state(t, 0.6), simulated.compute_sensor_pose(t, 0.6)
         robot = np.array([[0.0, 0, 0, 1.4 * ROBOT_RADIUS_M, 1.4 * ROBOT_RADIUS_M, 1, 0]])
         boxes = np.concatenate([robot, moment.boxes * [1, 1, 0, 1, 1, 1, 1]])
         assert not {0} & set(find_overlaps(boxes, 1)[:, 0].tolist())
@@ -93,20 +93,20 @@ def test_points_and_boxes_agree_with_world(scene, kind):
     """For any heading and yaw rate, the ground agrees with the world and points of labelled objects are in their
     boxes."""
     simulated = make_cached_scene(scene, kind)
-    simulated = replace(simulated, ground=simulated.ground._replace(rough=0.0, litter=0.0))
+    simulated = replace(simulated, ground=simulated.ground._replace(tuft_height=0.0, litter_height=0.0))
     for t in (0.0, 7.3):
-        moment, pose = simulated.at(t, 0.6), simulated.sensor_pose(t, 0.6)
+        moment, pose = simulated.compute_state(t, 0.6), simulated.compute_sensor_pose(t, 0.6)
         hits = cast_rays(moment.solids, simulated.ground, moment.position, EXACT, moment.motion, 1, moment.heading)
         got = make_returns(hits, EXACT, moment.motion, np.random.default_rng(0))
         world = transform_points(got.xyz.astype(float), pose)
         ground = np.isin(got.semantic, GROUND) & (got.owner == 0)
-        off = world[ground, 2] - surface_height(simulated.ground, *world[ground, :2].T)
+        error = world[ground, 2] - compute_ground_height(simulated.ground, *world[ground, :2].T)
         # At the edge of a kerb, the height is that of either side.
-        assert ground.sum() > 100 and (np.abs(off) < 2e-3).mean() > 0.97
-        assert np.abs(off).max() <= simulated.ground.curb_height + 2e-3
+        assert ground.sum() > 100 and (np.abs(error) < 2e-3).mean() > 0.97
+        assert np.abs(error).max() <= simulated.ground.curb_height + 2e-3
         boxes = moment.boxes.copy()
         boxes[:, :3] = transform_points(boxes[:, :3], pose)
-        feet = surface_height(simulated.ground, *boxes[:, :2].T)
+        feet = compute_ground_height(simulated.ground, *boxes[:, :2].T)
         assert np.allclose(boxes[:, 2] - boxes[:, 5] / 2, feet)
         for box, track, speed in zip(moment.boxes, moment.track_ids, moment.speeds):
             own = got.xyz[(got.owner == track) & (got.semantic != 99)]
@@ -118,9 +118,9 @@ def test_robot_scenes_have_labels_all_around_and_no_camera(tmp_path):
     frames = list(simulate_frames(3, 2, TINY, 1, Scenes(None, 3.0, "campus")))
     for number, frame in enumerate(frames):
         truth = frame.truth()
-        whole = simulate_scan(3 + number, 0, TINY, Scenes(None, 3.0, "campus"))
+        scan = simulate_scan(3 + number, 0, TINY, Scenes(None, 3.0, "campus"))
         assert frame.camera() is None and frame.sensor_height == 0.6
-        assert len(truth) == find_labelled(whole.truth).sum()
+        assert len(truth) == find_labelled(scan.truth).sum()
     assert any((frame.truth().boxes[:, 0] < 0).any() for frame in frames)
     assert next(simulate_frames(3, 1, TINY, 1)).camera() is not None
 
@@ -176,8 +176,8 @@ def test_command_writes_every_layout_for_robots(layout, tmp_path):
     first, second = open_recording(out)
     assert len(first.load()) > 500
     if layout != "kitti-tracking":  # this layout has no poses
-        apart = np.linalg.inv(first.pose()) @ second.pose()
-        assert 0.0 <= np.linalg.norm(apart[:3, 3]) < 0.3
+        motion = np.linalg.inv(first.pose()) @ second.pose()
+        assert 0.0 <= np.linalg.norm(motion[:3, 3]) < 0.3
     if layout == "semantickitti":
         classes = set(np.unique(first.point_truth().classes))
         assert classes & set(GROUND) and classes <= {
@@ -209,8 +209,8 @@ def test_command_writes_every_layout_for_robots(layout, tmp_path):
         (Scenes(scene="moon"), "unknown scene 'moon': must be one of street, campus, indoor"),
         (Scenes("zone", 1.0, "campus"), "kind = 'zone' must be one of forecourt, square, path"),
         (Scenes("city", 1.0, "street,campus"), "kind = 'city' must be one of forecourt, square, path"),
-        (Scenes(people=np.nan), "people = nan must be 0 .. 100"),
-        (Scenes(people=1e25), "people = 1e.25 must be 0 .. 100"),
+        (Scenes(people=np.nan), "people = nan must be between 0 and 100"),
+        (Scenes(people=1e25), "people = 1e.25 must be between 0 and 100"),
     ],
 )
 def test_unknown_scene_raises_input_error(scenes, message):

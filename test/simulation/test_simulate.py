@@ -73,9 +73,9 @@ def test_failed_data_set_is_marked_and_resumed(made, tmp_path, monkeypatch, layo
 
 @pytest.fixture
 def start():
-    """Return start(out, frames, ...), which runs the command until some frames are done.
+    """Return a function (out, frames, ...) that starts the command and waits for the first frames.
 
-    The group ends with the test.
+    All processes are killed at the end of the test.
     """
     groups = []
 
@@ -121,7 +121,7 @@ def test_killed_command_leaves_no_process_and_resumes(start, tmp_path):
     assert len(list(out.glob("training/label_02/*.txt"))) == 2
 
 
-def test_data_set_is_locked_and_ctrl_c_ends_processes(start, tmp_path):
+def test_data_set_is_locked_and_ctrl_c_ends_all_processes(start, tmp_path):
     process = start(tmp_path / "set", 100_000)
     for more in (["--resume"], ["--force"], []):
         with pytest.raises(InputError, match="another process"):

@@ -24,10 +24,10 @@ pytestmark = [
 def test_single_scan_equals_scan_of_drive():
     several = list(simulate_drive(3, 3, TINY))
     for i, scan in enumerate(several):
-        alone = simulate_scan(3, i, TINY)
-        assert scan.frame.xyz.tobytes() == alone.frame.xyz.tobytes()
-        assert np.array_equal(scan.semantic, alone.semantic)
-        assert scan.truth.extras == alone.truth.extras
+        single = simulate_scan(3, i, TINY)
+        assert scan.frame.xyz.tobytes() == single.frame.xyz.tobytes()
+        assert np.array_equal(scan.semantic, single.semantic)
+        assert scan.truth.extras == single.truth.extras
     assert np.array_equal(several[0].pose, np.eye(4)) and several[2].pose[0, 3] > 0
 
 
@@ -37,19 +37,19 @@ def test_columns_of_scan_agree_with_points():
     assert {scan.semantic.dtype, scan.instance.dtype, scan.ring.dtype} == {np.dtype(np.uint16)}
     assert all(len(c) == n for c in (scan.semantic, scan.instance, scan.ring, scan.time))
     elevation = np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
-    off = np.abs(elevation - np.array(TINY.elevations)[scan.ring])
-    assert np.median(off) < 0.01  # beams start a little above each other, and the sensor moves
+    error = np.abs(elevation - np.array(TINY.elevations)[scan.ring])
+    assert np.median(error) < 0.01  # beams have different origins, and the sensor moves
     assert scan.time.dtype == np.float32 and np.ptp(scan.time) < 1 / TINY.rate
     ahead = (np.abs(xyz[:, 1]) < 0.1) & (xyz[:, 0] > 0)
-    assert np.abs(scan.time[ahead]).max() < 0.01  # the stamp is when the sensor looks ahead
+    assert np.abs(scan.time[ahead]).max() < 0.01  # at the stamp, the sensor points forward
     assert scan.instance[np.isin(scan.semantic, (40, 48, 50, 70, 72, 80))].max() == 0
     things = scan.instance > 0
     assert np.isin(scan.semantic[things], [*THINGS, *MOVING, 99]).all()  # 99: carried objects
     assert np.isin(scan.semantic, list(MOVING)).any() and (scan.semantic == 10).any()
     for box, extra in zip(scan.truth.boxes, scan.truth.extras):
-        own = scan.instance == extra["track_id"]
-        assert own.sum() == extra["num_points"]
-        assert points_in_box(xyz[own], box, margin=1.0).all()  # moving parts, mirrors, umbrellas
+        on_object = scan.instance == extra["track_id"]
+        assert on_object.sum() == extra["num_points"]
+        assert points_in_box(xyz[on_object], box, margin=1.0).all()  # moving parts, mirrors, umbrellas
 
 
 def test_object_layout_reads_back(made):
@@ -91,7 +91,7 @@ def test_tracking_layout_reads_back(made):
 
 
 def assert_same_objects(actual, expected, accuracy, truncation=None):
-    """Assert that labels agree to the digits of the text."""
+    """Assert that labels agree within the accuracy of the text format."""
     assert actual.labels == expected.labels
     assert [name for name, _ in actual.notes] == [name for name, _ in expected.notes]
     for (_, a), (_, b) in zip(actual.notes, expected.notes):
@@ -100,7 +100,7 @@ def assert_same_objects(actual, expected, accuracy, truncation=None):
     turned = wrap_angle(actual.boxes[:, 6] - expected.boxes[:, 6])
     assert np.abs(turned).max(initial=0) <= accuracy
     for a, b in zip(actual.extras, expected.extras):
-        scale = 2 if truncation else 1  # a level in the tracking layout
+        scale = 2 if truncation else 1  # the tracking layout has levels 0, 1 and 2
         assert abs(a["truncated"] / scale - b["truncated"]) <= (truncation or accuracy)
         assert a["occluded"] == b["occluded"]
         assert np.allclose(a["bbox"], b["bbox"], atol=accuracy)
@@ -117,7 +117,7 @@ def test_semantickitti_layout_reads_back(made):
         assert np.array_equal(frame.load().xyz, scan.frame.xyz[order])
         assert np.array_equal(truth.classes, scan.semantic[order])
         assert np.array_equal(truth.instances, scan.instance[order])
-        assert np.allclose(frame.pose(), scan.pose, atol=1e-9)  # inverts pose_line
+        assert np.allclose(frame.pose(), scan.pose, atol=1e-9)  # inverse of format_pose
     for sequence in range(2):
         folder = root / f"sequences/{sequence:02}"
         calibration = dict(line.split(": ") for line in (folder / "calib.txt").read_text().splitlines())
@@ -151,7 +151,7 @@ def test_sensor_height_is_kept_in_every_layout(tmp_path, layout, inner):
         assert open_recording(low).frames[0].sensor_height == SENSOR_HEIGHT
 
 
-def test_bag_continues_with_next_street(tmp_path):
+def test_bag_contains_consecutive_streets(tmp_path):
     result = run(tmp_path / "bag", "mcap", 4, 1, "--streets-of", 2)
     assert result.exit_code == 0, result.output
     recording = list(open_recording(tmp_path / "bag"))
@@ -179,15 +179,15 @@ def test_2d_boxes_contain_projected_corners():
     assert (rectangles[in_image] >= 0).all() and (rectangles[in_image] <= [1241, 374, 1241, 374]).all()
     projection = FORWARD_CAMERA.camera().projection
     corners = box_corners(boxes) @ projection[:, :3].T + projection[:, 3]
-    whole = (corners[..., 2] > write_kitti.MIN_DEPTH_M).all(axis=1)
+    in_front = (corners[..., 2] > write_kitti.MIN_DEPTH_M).all(axis=1)
     pixels = corners[..., :2] / corners[..., 2:]
-    inside = whole & ((pixels >= 0) & (pixels <= [1241, 374])).all(axis=(1, 2)) & in_image
+    inside = in_front & ((pixels >= 0) & (pixels <= [1241, 374])).all(axis=(1, 2)) & in_image
     assert inside.sum() > 10 and np.abs(outside[inside]).max() < 1e-9
     assert np.allclose(
         rectangles[inside], np.concatenate([pixels[inside].min(axis=1), pixels[inside].max(axis=1)], axis=1)
     )
     # A box that reaches behind the camera: all of its points in the image are in its 2D box.
-    for box, limits in zip(boxes[~whole & in_image], rectangles[~whole & in_image]):
+    for box, limits in zip(boxes[~in_front & in_image], rectangles[~in_front & in_image]):
         inner = rng.uniform(-0.5, 0.5, (4000, 3)) * box[3:6]
         cos, sin = np.cos(box[6]), np.sin(box[6])
         points = inner @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) + box[:3]
@@ -198,21 +198,21 @@ def test_2d_boxes_contain_projected_corners():
 
 
 def test_2d_boxes_agree_with_real_labels(data):
-    worst, shares = [], []
+    worst, errors = [], []
     for frame in open_recording(data / "kitti_object"):
         truth = frame.truth()
         boxes, outside = write_kitti.project_boxes(truth.boxes, frame.calibration())
-        for box, share, extra in zip(boxes, outside, truth.extras):
+        for box, truncated, extra in zip(boxes, outside, truth.extras):
             worst.append(np.abs(box - extra["bbox"]).max())
-            shares.append(abs(share - extra["truncated"]))
-    assert np.median(worst) < 0.5 and np.max(shares) < 0.07
+            errors.append(abs(truncated - extra["truncated"]))
+    assert np.median(worst) < 0.5 and np.max(errors) < 0.07
 
 
 def test_labels_without_objects_read_back(tmp_path):
-    nothing = simulate_scan(3, 0, TINY).truth
-    nothing = type(nothing).of([], [])
-    write_kitti.write_object(tmp_path, 0, np.zeros((0, 4)), nothing, FORWARD_CAMERA)
+    empty = simulate_scan(3, 0, TINY).truth
+    empty = type(empty).of([], [])
+    write_kitti.write_object(tmp_path, 0, np.zeros((0, 4)), empty, FORWARD_CAMERA)
     assert len(read_object_labels(tmp_path / "training/label_2/000000.txt", np.eye(4))) == 0
-    text = write_kitti.format_tracking_labels(0, nothing, FORWARD_CAMERA)
+    text = write_kitti.format_tracking_labels(0, empty, FORWARD_CAMERA)
     (tmp_path / "0000.txt").write_text(text)
     assert read_tracking_labels(tmp_path / "0000.txt", np.eye(4)) == {}

@@ -12,7 +12,7 @@ from lidar_perception.simulation.raycast import cast_rays
 from lidar_perception.simulation.returns import make_returns
 from lidar_perception.simulation.scene import ALL_STREETS, CROWDED_ZONES
 from lidar_perception.simulation.sensor import HDL64E, NO_MOTION
-from lidar_perception.simulation.terrain import surface_height
+from lidar_perception.simulation.terrain import compute_ground_height
 from lidar_perception.types import CLASSES, PEDESTRIAN
 
 COARSE = replace(HDL64E, azimuth_step=float(np.radians(0.5)))
@@ -25,12 +25,12 @@ def street(seed):
 
 
 def scan(seed, t, sensor=COARSE):
-    """Return hits, and measured xyz and owner, of one moment of a street."""
+    """Return scene, its state after t seconds, hits, and xyz and owner of the returns."""
     scene = street(seed)
-    moment = scene.at(t, sensor.height)
-    hits = cast_rays(moment.solids, scene.ground, moment.position, sensor)
+    state = scene.compute_state(t, sensor.height)
+    hits = cast_rays(state.solids, scene.ground, state.position, sensor)
     xyz, _, owner, *_ = make_returns(hits, sensor, NO_MOTION, np.random.default_rng(0))
-    return scene, moment, hits, xyz, owner
+    return scene, state, hits, xyz, owner
 
 
 def test_same_seed_gives_same_bytes():
@@ -71,19 +71,19 @@ def test_frames_have_documented_properties():
 @pytest.mark.parametrize("t", [0.0, 3.9])
 @pytest.mark.parametrize("seed", [0, 2])
 def test_points_of_object_are_in_its_box(seed, t):
-    _, moment, hits, xyz, owner = scan(seed, t)
+    _, state, hits, xyz, owner = scan(seed, t)
     semantic = make_returns(hits, COARSE, NO_MOTION, np.random.default_rng(0)).semantic
-    for box, track, speed, kind in zip(moment.boxes, moment.track_ids, moment.speeds, moment.class_ids):
-        own = (owner == track) & (semantic != 99)  # 99: carried objects
+    for box, track, speed, kind in zip(state.boxes, state.track_ids, state.speeds, state.class_ids):
+        on_object = (owner == track) & (semantic != 99)  # 99: carried objects
         # Hits at the edge of a beam are reported at its centre. Boxes are those at the stamp, up to half a
         # sweep from some points. Mirrors and umbrellas stick out.
         beam = (np.linalg.norm(box[:3]) + 10) * COARSE.divergence / 2 + 6 * COARSE.range_noise
         margin = beam + speed / COARSE.rate / 2 + (0.6 if kind == PEDESTRIAN else 0.2)
-        assert points_in_box(xyz[own], box, margin=margin).all()
-        outside = ~points_in_box(xyz[own], box, margin=beam + 0.05)
-        assert speed > 2 or outside.sum() <= 0.4 * own.sum()
-    assert set(np.unique(owner)) <= {0, *moment.track_ids}
-    truth = label_scan(moment, hits, owner)
+        assert points_in_box(xyz[on_object], box, margin=margin).all()
+        is_outside = ~points_in_box(xyz[on_object], box, margin=beam + 0.05)
+        assert speed > 2 or is_outside.sum() <= 0.4 * on_object.sum()
+    assert set(np.unique(owner)) <= {0, *state.track_ids}
+    truth = label_scan(state, hits, owner)
     assert [e["num_points"] for e in truth.extras] == [(owner == e["track_id"]).sum() for e in truth.extras]
 
 
@@ -91,23 +91,23 @@ def test_points_of_object_are_in_its_box(seed, t):
 def test_boxes_stand_on_ground_without_overlap(seed):
     scene = street(seed)
     for t in (0.0, 2.0, 10.0, 19.9):
-        moment = scene.at(t, 1.73)
-        world = moment.boxes[:, :3] + moment.position
-        ground = np.array([surface_height(scene.ground, x, y) for x, y, _ in world])
-        assert np.abs(world[:, 2] - moment.boxes[:, 5] / 2 - ground).max() < 0.05
+        state = scene.compute_state(t, 1.73)
+        world = state.boxes[:, :3] + state.position
+        ground = np.array([compute_ground_height(scene.ground, x, y) for x, y, _ in world])
+        assert np.abs(world[:, 2] - state.boxes[:, 5] / 2 - ground).max() < 0.05
         # No footprint contains a corner or the centre of another one.
-        flat = moment.boxes * [1, 1, 0, 1, 1, 1, 1]
-        marks = np.concatenate([box_corners(flat)[:, :4] * [1, 1, 0], flat[:, None, :3]], axis=1)
+        flat = state.boxes * [1, 1, 0, 1, 1, 1, 1]
+        corners_and_centres = np.concatenate([box_corners(flat)[:, :4] * [1, 1, 0], flat[:, None, :3]], axis=1)
         for i, box in enumerate(flat):
-            assert not points_in_box(np.delete(marks, i, axis=0).reshape(-1, 3), box).any()
+            assert not points_in_box(np.delete(corners_and_centres, i, axis=0).reshape(-1, 3), box).any()
 
 
 def test_pedestrians_are_always_in_view():
     for scan in simulate_drive(33, 11, replace(COARSE, rate=2.5), CROWDED_ZONES):
         boxes = scan.truth.select_class(PEDESTRIAN)
         distance, bearing = np.hypot(boxes[:, 0], boxes[:, 1]), np.arctan2(boxes[:, 1], boxes[:, 0])
-        seen = (np.abs(bearing) < np.radians(40)) & (distance > 6) & (distance < 35)
-        assert seen.sum() >= 2
+        in_view = (np.abs(bearing) < np.radians(40)) & (distance > 6) & (distance < 35)
+        assert in_view.sum() >= 2
 
 
 def test_scans_resemble_those_of_real_sensor():
@@ -129,10 +129,10 @@ def test_scans_resemble_those_of_real_sensor():
 
 
 @pytest.mark.parametrize(
-    "arguments, named",
+    "arguments, message",
     [({"frames": 0}, "frames = 0"), ({"frames": 10_000}, "frames = 10000"), ({"seed": -1}, "seed = -1")],
 )
-def test_invalid_arguments_raise_at_the_call(arguments, named):
-    with pytest.raises(ValueError, match=named) as error:
+def test_invalid_arguments_raise_at_the_call(arguments, message):
+    with pytest.raises(ValueError, match=message) as error:
         simulate_drive(**arguments)
     assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""Objects of a scene: sizes, parts and poses."""
+"""Sizes, parts and poses of scene objects."""
 
 from functools import cache, partial
 
@@ -19,7 +19,7 @@ from lidar_perception.simulation.shapes import (
 )
 from lidar_perception.simulation.shapes.primitives import block, disc, rod
 from lidar_perception.simulation.shapes.scene_object import SIZES, draw_size
-from lidar_perception.simulation.shapes.vehicles import SIDE
+from lidar_perception.simulation.shapes.vehicles import SIDE_GAP_M
 from lidar_perception.simulation.solids import compute_extents, make_parts, place_parts
 from lidar_perception.simulation.terrain import Ground
 from lidar_perception.types import CLASSES
@@ -33,7 +33,7 @@ LABELLED = {
     "stander": (partial(people.make_pedestrian, speed=0.0), 16),
     "backpack": (partial(people.make_pedestrian, speed=1.2, carried="backpack"), 16),
     "sitting": (people.make_sitting_person, 18),
-    "on bench": (partial(people.make_sitting_person, chair=False), 16),
+    "on bench": (partial(people.make_sitting_person, has_chair=False), 16),
     "cyclist": (cyclists.make_cyclist, 20),
     "motorcyclist": (cyclists.make_motorcyclist, 24),
     "car": (vehicles.make_car, 34),
@@ -84,15 +84,15 @@ def find_stride(obj):
 
 @pytest.mark.parametrize("name", [*LABELLED, *SCENERY])
 def test_solids_of_every_shape_are_valid(name):
-    make, most = {**LABELLED, **SCENERY}[name]
+    make, max_count = {**LABELLED, **SCENERY}[name]
     for seed in SEEDS:
         parts = draw_parts(make, seed)
-        assert 0 < len(parts) <= most
+        assert 0 < len(parts) <= max_count
         assert np.isin(parts["kind"], (0, 1, 2)).all()
         assert set(parts["semantic"].tolist()) <= SEMANTICS
-        for field in ("centre", "half", "pitch", "yaw"):
+        for field in ("centre", "half_size", "pitch", "yaw"):
             assert np.isfinite(parts[field]).all(), field
-        assert (parts["half"] > 0).all() and (parts["density"] > 0).all()
+        assert (parts["half_size"] > 0).all() and (parts["density"] > 0).all()
         assert (parts["reflectance"] >= 0).all() and (parts["reflectance"] <= 1).all()
         assert (parts["transmission"] >= 0).all() and (parts["transmission"] < 1).all()
 
@@ -104,15 +104,15 @@ def test_box_covers_body_of_labelled_object(name):
         obj = make(np.random.default_rng(seed))
         assert obj.label in CLASSES
         low, high = compute_extents(obj.parts(0.0))
-        body = np.abs((low + high)[:, 1] / 2) < obj.size[1] / 2  # all but the mirrors
-        low, high = low[body].min(axis=0), high[body].max(axis=0)
+        is_body = np.abs((low + high)[:, 1] / 2) < obj.size[1] / 2  # without the mirrors
+        low, high = low[is_body].min(axis=0), high[is_body].max(axis=0)
         length, width, height = obj.size
-        width -= 2 * SIDE if name in ("car", "parked", "van") else 0.0
+        width -= 2 * SIDE_GAP_M if name in ("car", "parked", "van") else 0.0
         if obj.label != "Pedestrian":
             assert np.allclose(low, (-length / 2, -width / 2, 0.0), atol=1e-6)
             assert np.allclose(high, (length / 2, width / 2, height), atol=1e-6)
         assert np.isclose(high[1] - low[1], width)
-        assert (~body).sum() <= 2
+        assert (~is_body).sum() <= 2
 
 
 @pytest.mark.parametrize("name", ["walker", "child", "stander", "backpack"])
@@ -134,18 +134,18 @@ def test_box_contains_pedestrian_during_the_entire_stride(name):
 def test_foot_on_ground_does_not_slide():
     for seed in SEEDS:
         obj = people.make_pedestrian(np.random.default_rng(seed), 1.3)
-        ways = np.linspace(0, find_stride(obj), 401)
-        feet = np.array([obj.parts(x)[-2:] for x in ways])
+        distances = np.linspace(0, find_stride(obj), 401)
+        feet = np.array([obj.parts(x)[-2:] for x in distances])
         tip = (
             feet["centre"][..., 0]
-            + feet["half"][..., 0] * np.cos(feet["pitch"])
-            + (ways[:, None] - feet["half"][..., 2] * np.sin(feet["pitch"]))
+            + feet["half_size"][..., 0] * np.cos(feet["pitch"])
+            + (distances[:, None] - feet["half_size"][..., 2] * np.sin(feet["pitch"]))
         )
         sole = np.array([compute_extents(f)[0][:, 2] for f in feet])
-        stands = (sole[1:] < 1e-9) & (sole[:-1] < 1e-9)
-        assert (stands.any(axis=1)).all()
-        assert np.abs(np.diff(tip, axis=0)[stands]).max() < 1e-6
-        assert 0.5 < stands.mean() < 0.7
+        is_standing = (sole[1:] < 1e-9) & (sole[:-1] < 1e-9)
+        assert (is_standing.any(axis=1)).all()
+        assert np.abs(np.diff(tip, axis=0)[is_standing]).max() < 1e-6
+        assert 0.5 < is_standing.mean() < 0.7
 
 
 def test_walk_repeats_after_stride_and_mirrors_after_step():
@@ -158,14 +158,14 @@ def test_walk_repeats_after_stride_and_mirrors_after_step():
     assert np.allclose(np.sort(high[:, 1]), np.sort(-low_step[:, 1]))
 
 
-def test_limbs_are_connected_and_keep_length():
-    """Limbs keep their length between joints; knees bend forward."""
+def test_leg_segments_keep_their_length():
+    """Thighs and shanks have the same length in every pose."""
     obj = people.make_pedestrian(np.random.default_rng(4), 1.4)
     height = obj.size[2]
     for x in np.linspace(0, find_stride(obj), 50):
         thigh, shank = (obj.parts(x)[[-6, -5]], obj.parts(x)[[-4, -3]])
         for row in (*thigh, *shank):
-            assert 0.24 * height < 2 * row["half"][2] < 0.25 * height
+            assert 0.24 * height < 2 * row["half_size"][2] < 0.25 * height
 
 
 def test_faster_walkers_take_longer_steps():
@@ -200,8 +200,8 @@ def test_vehicles_are_symmetric(style):
     low, high = compute_extents(parts)
     mirrored = np.stack([low[:, 0], -high[:, 1], low[:, 2], high[:, 0], -low[:, 1], high[:, 2]], 1)
     hulls = np.hstack([low, high])
-    far = np.abs(mirrored[:, None] - hulls).max(axis=2).min(axis=1)
-    assert far.max() < 1e-9
+    deviation = np.abs(mirrored[:, None] - hulls).max(axis=2).min(axis=1)
+    assert deviation.max() < 1e-9
 
 
 def test_beam_can_pass_through_windows_of_car():
@@ -209,15 +209,15 @@ def test_beam_can_pass_through_windows_of_car():
     parts = vehicles.make_body((4.0, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.85, driver=False)
     low, high = compute_extents(parts)
     x, z = -0.45, 1.25  # between the pillars in the middle and at the back, above the seats
-    met = (low[:, 0] < x) & (x < high[:, 0]) & (low[:, 2] < z) & (z < high[:, 2])
-    assert (parts["transmission"][met] > 0.5).all() and met.sum() == 2
+    is_hit = (low[:, 0] < x) & (x < high[:, 0]) & (low[:, 2] < z) & (z < high[:, 2])
+    assert (parts["transmission"][is_hit] > 0.5).all() and is_hit.sum() == 2
 
 
 def scan_object(obj, distance, yaw, seed):
     """Return the points that an HDL-64E measures on an object at a distance ahead, with z above its bottom."""
     parts = obj.parts(0.4 * seed)
-    base = np.tile([distance, 0.0, -1.73], (len(parts), 1))
-    solids = place_parts(parts, base, np.full(len(parts), yaw), np.ones(len(parts)), np.zeros((len(parts), 3)))
+    position = np.tile([distance, 0.0, -1.73], (len(parts), 1))
+    solids = place_parts(parts, position, np.full(len(parts), yaw), np.ones(len(parts)), np.zeros((len(parts), 3)))
     hits = cast_rays(solids, Ground(), np.array([0.0, 0.0, 1e4]), HDL64E, NO_MOTION, seed)
     xyz = make_returns(hits, HDL64E, NO_MOTION, np.random.default_rng(seed)).xyz
     return xyz + np.array([0.0, 0.0, 1.73])
@@ -225,30 +225,30 @@ def scan_object(obj, distance, yaw, seed):
 
 def test_fraction_of_low_points_of_cyclist_agrees_with_kitti():
     """46 % of the points of 10 KITTI cyclists are below 0.42 of their height."""
-    shares = []
+    fractions = []
     for seed in SEEDS:
         obj = cyclists.make_cyclist(np.random.default_rng(seed))
         heights = scan_object(obj, 20.0, 0.5 * seed, seed)[:, 2]
-        shares.append((heights[heights > 0.15] < 0.42 * obj.size[2]).mean())
-    assert 0.40 < np.mean(shares) < 0.52
+        fractions.append((heights[heights > 0.15] < 0.42 * obj.size[2]).mean())
+    assert 0.40 < np.mean(fractions) < 0.52
 
 
 @pytest.mark.parametrize("distance, low, high", [(20.0, 0.22, 0.32), (33.0, 0.20, 0.32), (48.0, 0.08, 0.25)])
 def test_fraction_of_points_above_car_windows_falls_with_range(distance, low, high):
     """In KITTI, 38, 31 and 16 % of the points are above 0.65 of the height for 22, 17 and 15 cars seen from
     behind at 12 to 25, 25 to 40 and 40 to 70 m. Their lower parts are often occluded."""
-    shares = []
+    fractions = []
     for seed in range(16):
         obj = vehicles.make_car(np.random.default_rng(seed))
         heights = scan_object(obj, distance, 0.0, seed)[:, 2] / obj.size[2]
         if (heights > 0.15).sum() >= 8:
-            shares.append((heights[heights > 0.15] > 0.65).mean())
-    assert low < np.mean(shares) < high
+            fractions.append((heights[heights > 0.15] > 0.65).mean())
+    assert low < np.mean(fractions) < high
 
 
 @cache
 def scan_cars_from_front():
-    """Return 24 cars and their points from 20 m away."""
+    """Return 24 cars with their points at a distance of 20 m."""
     cars = [vehicles.make_car(np.random.default_rng(seed)) for seed in range(24)]
     return [(car, scan_object(car, 20.0, np.pi + 0.05 * (seed % 5 - 2), seed)) for seed, car in enumerate(cars)]
 
@@ -262,13 +262,15 @@ def test_only_the_bumper_touches_the_front_of_the_box(zone, low, high):
     depths = []
     for obj, points in scan_cars_from_front():
         x, y, z = points.T
-        met = (np.abs(y) < 0.45 * obj.size[1]) & (z > zone[0] * obj.size[2]) & (z < zone[1] * obj.size[2]) & (x < 21.0)
-        depths.append(np.percentile(x[met] - 20.0 + obj.size[0] / 2, 25))
+        is_hit = (
+            (np.abs(y) < 0.45 * obj.size[1]) & (z > zone[0] * obj.size[2]) & (z < zone[1] * obj.size[2]) & (x < 21.0)
+        )
+        depths.append(np.percentile(x[is_hit] - 20.0 + obj.size[0] / 2, 25))
     assert low < np.median(depths) < high
 
 
 @pytest.mark.parametrize("length", [3.2, 3.8, 4.5])
-def test_seats_do_not_reveal_length_of_car(length):
+def test_short_and_long_cars_have_the_same_seats(length):
     parts = vehicles.make_body((length, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.8, driver=False)
     seats = parts[np.isclose(parts["transmission"], 0.75)]
     assert len(seats) == 2 and np.ptp(seats["centre"][:, 0]) > 0.4
@@ -278,10 +280,10 @@ def test_seats_do_not_reveal_length_of_car(length):
 def test_sizes_have_the_deviation_of_the_table(label):
     rng = np.random.default_rng(0)
     sizes = np.array([draw_size(rng, label) for _ in range(4000)])
-    mean, spread, together = SIZES[label]
+    mean, spread, correlation = SIZES[label]
     assert np.allclose(sizes.mean(axis=0), mean, atol=0.06 * np.array(spread))
     assert np.allclose(sizes.std(axis=0), spread, rtol=0.2)
-    assert abs(np.corrcoef(sizes[:, 0], sizes[:, 2])[0, 1] - together) < 0.08
+    assert abs(np.corrcoef(sizes[:, 0], sizes[:, 2])[0, 1] - correlation) < 0.08
     assert (sizes > 0.2).all()
 
 
@@ -305,14 +307,14 @@ def test_size_table_agrees_with_labels(data):
 
 
 @pytest.mark.parametrize("name", SCENERY)
-def test_scenery_is_on_or_in_ground(name):
+def test_scenery_reaches_the_ground(name):
     make, _ = SCENERY[name]
     for seed in SEEDS:
         low, high = find_extents(draw_parts(make, seed))
         assert low[2] <= 1e-9 < high[2]
 
 
-def test_rods_and_discs_have_given_ends():
+def test_rods_discs_and_blocks_have_exact_extents():
     rows = [rod((0, 0, 0), (3, 4, 12), 1e-6, 0.3), disc((1, 2, 3), 0.5, 0.1, 0.3), block((1, -1, 2), (0, 1, 0), 0.3)]
     parts = make_parts(rows, 10)
     low, high = compute_extents(parts)

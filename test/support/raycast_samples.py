@@ -1,4 +1,4 @@
-"""Solids and ground to cast rays at."""
+"""Solids and ground for tests of the ray caster."""
 
 from dataclasses import replace
 
@@ -15,7 +15,9 @@ OVER_ROAD = np.array([0.0, 0.0, SENSOR.height])
 FULL = Ground(0.01, -0.02, 0.05, 20.0, 0.02, 6.0, -4.0, 0.13, 2.0, ((8.0, 15.0), (-30.0, -22.0)), 1.5)
 
 
-def make_solids(kind, centre, half, owner=1, axes=None, density=np.inf, transmission=0.0, velocity=(0.0, 0.0, 0.0)):
+def make_solids(
+    kind, centre, half_size, owner=1, axes=None, density=np.inf, transmission=0.0, velocity=(0.0, 0.0, 0.0)
+):
     """Return solids of P kinds, centres and half sizes; other attributes are given per solid or for all."""
     kind, centre = np.atleast_1d(np.array(kind, np.int8)), np.atleast_2d(np.array(centre, float))
     n = len(kind)
@@ -23,7 +25,7 @@ def make_solids(kind, centre, half, owner=1, axes=None, density=np.inf, transmis
     return Solids(
         kind,
         centre,
-        np.broadcast_to(np.array(half, float), (n, 3)),
+        np.broadcast_to(np.array(half_size, float), (n, 3)),
         np.broadcast_to(axes, (n, 3, 3)),
         np.full(n, 0.5),
         np.full(n, 10, np.uint16),
@@ -35,12 +37,12 @@ def make_solids(kind, centre, half, owner=1, axes=None, density=np.inf, transmis
 
 
 def make_crowd(seed, count=60, moving=True):
-    """Return random solids of all kinds around the sensor, some far away."""
+    """Return random solids of all kinds around the sensor, some of them far away."""
     rng = np.random.default_rng(seed)
     axes = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
-    bearing, far = rng.uniform(-np.pi, np.pi, count), rng.uniform(4, 70, count)
-    centre = np.stack([far * np.cos(bearing), far * np.sin(bearing), rng.uniform(-3, 2, count)], 1)
-    made = make_solids(
+    bearing, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(4, 70, count)
+    centre = np.stack([distance * np.cos(bearing), distance * np.sin(bearing), rng.uniform(-3, 2, count)], 1)
+    solids = make_solids(
         rng.integers(0, 3, count),
         centre,
         rng.uniform(0.05, 2.0, (count, 3)),
@@ -48,4 +50,4 @@ def make_crowd(seed, count=60, moving=True):
         axes,
         velocity=rng.normal(0, 8, (count, 3)) * moving,
     )
-    return replace(made, reflectance=rng.uniform(0.1, 0.9, count))
+    return replace(solids, reflectance=rng.uniform(0.1, 0.9, count))

@@ -1,4 +1,4 @@
-"""Simulated clouds of tilted sensors with the columns of real drivers, whose mount is known."""
+"""Simulated clouds of tilted sensors with a known mounting and the columns of real drivers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lidar_perception.simulation.raycast import Hits, cast_rays
 from lidar_perception.simulation.returns import make_returns
 from lidar_perception.simulation.scene import ALL_STREETS
 from lidar_perception.simulation.sensor import Motion, Sensor, find_sensor, make_rays
-from lidar_perception.simulation.terrain import Ground, cast_ground, surface_height, to_compiled
+from lidar_perception.simulation.terrain import Ground, cast_ground, compile_ground, compute_ground_height
 from lidar_perception.wire.codec import make_bag_message
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import make_header
@@ -23,7 +23,7 @@ OUSTER = dict(intensity=("intensity", "<f4", 255), ring=("ring", "<u1", 1), time
 HESAI = dict(intensity=("intensity", "u1", 255), ring=("channel", "<u2", 1), time=("time_stamp", "<u4", 1e9))
 KITTI = dict(intensity=("intensity", "<f4", 1), ring=None, time=None)
 BARE = dict(intensity=None, ring=None, time=None)
-EVEN = dict(camber=0.0, wave=0.0, rough=0.0, litter=0.0)  # street without unevenness
+EVEN = dict(camber=0.0, wave_height=0.0, tuft_height=0.0, litter_height=0.0)  # ground without unevenness
 MOUNTS = {  # sensor: driver, roll and pitch in degrees, height in metres
     "hdl-64e": (KITTI, 1.5, -2.0, 1.73),
     "hdl-32e": (VELODYNE, -3.0, 4.0, 1.9),
@@ -44,29 +44,32 @@ def tilt_matrix(roll: float, pitch: float) -> np.ndarray:
     )
 
 
-def find_road_pose(ground: Ground, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_road_pose(ground: Ground, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return axes (3, 3) with z along the road's normal at (x, y), and the point on the road."""
     x, y = np.meshgrid(np.linspace(-6, 6, 25), np.linspace(-3, 3, 13))
-    z = surface_height(ground._replace(curb_height=0.0), at[0] + x, at[1] + y)
+    z = compute_ground_height(ground._replace(curb_height=0.0), xy[0] + x, xy[1] + y)
     a, b, c = np.linalg.lstsq(np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)]), z.ravel(), rcond=None)[0]
     up = np.array([-a, -b, 1.0]) / np.sqrt(a * a + b * b + 1)
-    ahead = np.array([up[2], 0.0, -up[0]]) / np.hypot(up[0], up[2])
-    return np.column_stack([ahead, np.cross(up, ahead), up]), np.array([*at, c])
+    forward = np.array([up[2], 0.0, -up[0]]) / np.hypot(up[0], up[2])
+    return np.column_stack([forward, np.cross(up, forward), up]), np.array([*xy, c])
 
 
 @njit(cache=True)
-def _cast_ground(ground, start, direction, since, velocity, lift, max_range):
-    """Return range, brightness, cosine and class (columns, rings, 4) of the ground alone."""
-    out = np.empty((*direction.shape[:2], 4))
+def _cast_ground(ground, start, direction, times, velocity, lift, max_range):
+    """Return range, brightness, cosine and class (columns, rings, 4) of hits on the ground."""
+    result = np.empty((*direction.shape[:2], 4))
     for i in range(direction.shape[0]):
         for k in range(direction.shape[1]):
-            at = start + velocity * since[i] + lift[k]
+            origin = start + velocity * times[i] + lift[k]
             hit = cast_ground(
-                ground, (at[0], at[1], at[2]), (direction[i, k, 0], direction[i, k, 1], direction[i, k, 2]), max_range
+                ground,
+                (origin[0], origin[1], origin[2]),
+                (direction[i, k, 0], direction[i, k, 1], direction[i, k, 2]),
+                max_range,
             )
-            out[i, k, 0], out[i, k, 1] = hit.range, hit.brightness
-            out[i, k, 2], out[i, k, 3] = hit.cosine, hit.semantic
-    return out
+            result[i, k, 0], result[i, k, 1] = hit.range, hit.brightness
+            result[i, k, 2], result[i, k, 3] = hit.cosine, hit.semantic
+    return result
 
 
 def simulate_tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int, even: bool = True):
@@ -76,38 +79,39 @@ def simulate_tilted(sensor: Sensor, roll: float, pitch: float, street: int, numb
     scene = drive._make_cached_scene(street, ALL_STREETS)
     ground = scene.ground._replace(**EVEN) if even else scene.ground
     scene = replace(scene, ground=ground)
-    sensor = sensor.at_turn(number)
-    moment = scene.at(number / sensor.rate, sensor.height)
-    axes, foot = find_road_pose(ground, moment.position[:2])
-    position = foot + sensor.height * axes[:, 2]
+    sensor = sensor.at_revolution(number)
+    state = scene.compute_state(number / sensor.rate, sensor.height)
+    axes, road_point = find_road_pose(ground, state.position[:2])
+    position = road_point + sensor.height * axes[:, 2]
     world = axes @ tilt_matrix(roll, pitch)
     solids = replace(
-        moment.solids,
-        centre=(moment.solids.centre + moment.position - position) @ world,
-        axes=world.T @ moment.solids.axes,
-        velocity=moment.solids.velocity @ world,
+        state.solids,
+        centre=(state.solids.centre + state.position - position) @ world,
+        axes=world.T @ state.solids.axes,
+        velocity=state.solids.velocity @ world,
     )
-    motion = Motion(tuple(np.array(moment.motion.velocity) @ world))
+    motion = Motion(tuple(np.array(state.motion.velocity) @ world))
     hits = cast_rays(solids, Ground(), np.array([0.0, 0.0, 1e6]), sensor, motion, street)
-    made = make_rays(sensor, motion)
+    rays = make_rays(sensor, motion)
     lift = np.outer(sensor.lifts or np.zeros(sensor.rings), world[:, 2])
-    on_ground = _cast_ground(
-        to_compiled(ground),
+    ground_hits = _cast_ground(
+        compile_ground(ground),
         position,
-        made.direction @ world.T,
-        made.since,
-        np.array(moment.motion.velocity),
+        rays.direction @ world.T,
+        rays.times,
+        np.array(state.motion.velocity),
         lift,
         sensor.max_range,
     )
-    nearer = on_ground[..., 0] < hits.range
+    is_ground = ground_hits[..., 0] < hits.range
     merged = [
-        np.where(nearer, on_ground[..., i], part) for i, part in enumerate((hits.range, hits.brightness, hits.cosine))
+        np.where(is_ground, ground_hits[..., i], values)
+        for i, values in enumerate((hits.range, hits.brightness, hits.cosine))
     ]
-    owner = np.where(nearer, 0, hits.owner)
-    semantic = np.where(nearer, on_ground[..., 3], hits.semantic).astype(np.uint16)
+    owner = np.where(is_ground, 0, hits.owner)
+    semantic = np.where(is_ground, ground_hits[..., 3], hits.semantic).astype(np.uint16)
     return make_returns(
-        Hits(*merged, owner, semantic, hits.solid, hits.reached),
+        Hits(*merged, owner, semantic, hits.solid, hits.unoccluded_counts),
         sensor,
         motion,
         np.random.default_rng([street, number]),
@@ -119,21 +123,21 @@ def make_cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str =
     """Return a PointCloud2 with a driver's columns, ordered by beam for KITTI and by firing otherwise."""
     order = np.arange(len(returns.xyz)) if driver is KITTI else np.argsort(returns.time, kind="stable")
     columns = {axis: returns.xyz[order, i] for i, axis in enumerate("xyz")}
-    kinds = [(axis, "<f4") for axis in "xyz"]
+    fields = [(axis, "<f4") for axis in "xyz"]
     for key, values in (
         ("intensity", returns.intensity),
         ("ring", returns.ring),
         ("time", returns.time - returns.time.min()),
     ):
         if driver[key] is not None:
-            name, kind, scale = driver[key]
+            name, dtype, scale = driver[key]
             values = values[order].astype(np.float64) * abs(scale)
             if key == "ring" and scale < 0:
                 values = rings - 1 - values
-            whole = kind[-2] != "f" or (key == "intensity" and scale > 1)
-            columns[name] = np.round(values) if whole else values
-            kinds.append((name, kind))
-    points = np.empty(len(order), kinds)
+            is_integer = dtype[-2] != "f" or (key == "intensity" and scale > 1)
+            columns[name] = np.round(values) if is_integer else values
+            fields.append((name, dtype))
+    points = np.empty(len(order), fields)
     for name, values in columns.items():
         points[name] = values
     return from_array(points, make_header(stamp_ns, frame_id, make_bag_message), make_bag_message)

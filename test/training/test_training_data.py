@@ -23,7 +23,7 @@ from lidar_perception.detectors.pointpillars.config import RANGES, make_config
 from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED, to_dense
 from lidar_perception.geometry import is_within, wrap_angle
 from lidar_perception.simulation import drive
-from lidar_perception.simulation.camera import make_kitti_labels, turn_camera
+from lidar_perception.simulation.camera import make_kitti_labels, rotate_camera
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import find_sensor
 from lidar_perception.training import scenes as scenes_module
@@ -302,11 +302,11 @@ def test_labels_in_rotated_camera_equal_those_of_rotated_scene(quarter):
     boxes[:, :2] = boxes[:, :2] @ np.array([[cos, sin], [-sin, cos]])
     boxes[:, 6] = wrap_angle(boxes[:, 6] - yaw)
     turned = make_kitti_labels(GroundTruth.of(boxes, truth.class_ids, truth.extras))
-    seen = make_kitti_labels(truth, turn_camera(yaw))
+    seen = make_kitti_labels(truth, rotate_camera(yaw))
     assert [e["track_id"] for e in seen.extras] == [e["track_id"] for e in turned.extras]
     assert len(seen.notes) == len(turned.notes)
     frame = SimulatedScenes(4, 8, SENSOR, all_around=True).load_frame(quarter + 4)
-    assert np.allclose(frame.calibration().lidar_to_camera, turn_camera(yaw).lidar_to_camera)
+    assert np.allclose(frame.calibration().lidar_to_camera, rotate_camera(yaw).lidar_to_camera)
 
 
 def test_reduced_range_around_keeps_all_directions():

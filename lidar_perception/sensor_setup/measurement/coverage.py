@@ -1,4 +1,4 @@
-"""Coverage of the sensor: its view, blind sectors, and the robot's own body."""
+"""Coverage of a sensor: its field of view, blind sectors, and returns from the robot's body."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from lidar_perception.sensor_setup.measurement.mount import Mount
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
 SECTORS = 360  # sectors of a revolution
-NEAR_BODY_M = 1.0  # constant returns this close come from the robot, even if it stands still
-MAX_BODY_M = 4.0  # constant returns this close come from the robot if it drives
-MAX_ROBOT_SIZE_M = (5.5, 2.6)  # maximum length and width, those of a van
-MAX_BODY_SHARE = 0.3  # maximum fraction of all points; more points are walls along the robot's path
-MAX_FOREIGN_SHARE = 0.2  # maximum fraction of points in the body box that do not belong to the robot
+NEAR_BODY_M = 1.0  # range below which constant returns come from the robot, even if it stands still
+MAX_BODY_M = 4.0  # range below which constant returns come from the robot while it drives
+MAX_ROBOT_SIZE_M = (5.5, 2.6)  # maximum length and width of a robot: a van
+MAX_BODY_FRACTION = 0.3  # maximum fraction of points on the body; with more, walls are among them
+MAX_FOREIGN_FRACTION = 0.2  # maximum fraction of points in the body box that do not belong to the robot
 MIN_BODY_SCANS = 0.7  # minimum fraction of scans with a return from the body
 MAX_BODY_VARIATION_M = 0.06  # maximum variation of the body's range
 MIN_BODY_HEIGHT_M = 0.15  # minimum height of the body above the ground
 MIN_CELLS = 20  # minimum number of (sector, beam) cells of a body; fewer may be chance
 MARGIN_M = 0.05  # margin around the body box
-# The robot stands still if less than MAX_CHANGED_SHARE of the returns beyond MIN_FAR_M change their
-# range by MIN_CHANGE_M between these quantiles of the scans (extremes are people passing by).
-MIN_FAR_M, MIN_CHANGE_M, QUANTILES, MAX_CHANGED_SHARE = 4.0, 0.3, (0.1, 0.9), 0.3
-MAX_GROUND_RANGE_M = 30.0  # maximum range at which the ground reliably returns
+# The robot stands still if, beyond MIN_FAR_M, the range of less than MAX_CHANGED_FRACTION of the cells
+# changes by MIN_CHANGE_M between these quantiles of the scans. Quantiles exclude people who pass by.
+MIN_FAR_M, MIN_CHANGE_M, QUANTILES, MAX_CHANGED_FRACTION = 4.0, 0.3, (0.1, 0.9), 0.3
+MAX_GROUND_RANGE_M = 30.0  # maximum range of reliable returns from the ground
 MIN_BLIND = 3  # minimum width of a blind sector in degrees; narrower gaps may be chance
-MIN_SEEN_SHARE = 0.35  # minimum fraction of sectors with a return for a beam that can show blind sectors
+MIN_SEEN_FRACTION = 0.35  # minimum fraction of sectors with returns for a beam that can show blind sectors
 ROW_STEP = 2.0  # elevation step between rows if there are no beams, in degrees
 
 
@@ -38,24 +38,24 @@ class Coverage(NamedTuple):
 
     Attributes:
         rows: (R,) elevations in degrees of the beams, or of rows without beams, descending.
-        return_share: (R, 360) share of the scans with a return.
-        body: (R, 360) bool, returns of the robot itself.
-        box: (6,) box around the body's points, lower then upper corner, m; empty without any.
-        foreign_share: Share of the points in the box that are not the body's.
-        body_share: Share of all points that are the body's.
-        has_walls: The constant returns are too many for a robot's body, for example because of walls
-            along its path. Then only returns within NEAR_BODY_M count as body.
-        stationary: The robot stands still; None if unknown.
-        blocked: (first row, from, to) of blind sectors, degrees counter-clockwise.
+        return_fraction: (R, 360) fraction of the scans with a return.
+        body: (R, 360) bool, cells with returns from the robot itself.
+        box: (6,) box around the points on the body, lower then upper corner, m; empty without points.
+        foreign_fraction: Fraction of the points in the box that are not on the body.
+        body_fraction: Fraction of all points that are on the body.
+        has_walls: True if there are too many constant returns for the body of a robot, for example
+            because of walls along its path. Then only returns within NEAR_BODY_M count as body.
+        stationary: True if the robot stands still; None if unknown.
+        blocked: (first row, from, to) of each blind sector, degrees counter-clockwise.
         view: (from, to) of the azimuths with returns, degrees.
     """
 
     rows: np.ndarray
-    return_share: np.ndarray
+    return_fraction: np.ndarray
     body: np.ndarray
     box: np.ndarray
-    foreign_share: float
-    body_share: float
+    foreign_fraction: float
+    body_fraction: float
     has_walls: bool
     stationary: bool | None
     blocked: list[tuple[int, float, float]]
@@ -63,11 +63,11 @@ class Coverage(NamedTuple):
 
     @property
     def can_crop(self) -> bool:
-        """True if cropping the box removes little but the body: no walls, few other points or a small box."""
+        """True if the box can be cropped without losing much else: no walls, and few other points or a small box."""
         return (
             len(self.box) > 0
             and not self.has_walls
-            and (self.foreign_share <= MAX_FOREIGN_SHARE or float(np.abs(self.box).max()) < NEAR_BODY_M)
+            and (self.foreign_fraction <= MAX_FOREIGN_FRACTION or float(np.abs(self.box).max()) < NEAR_BODY_M)
         )
 
 
@@ -76,7 +76,7 @@ class NearestReturns(NamedTuple):
 
     Attributes:
         rows: (R,) elevations, see Coverage.
-        labels: Row of each point of each scan, (N,) int64, -1 for none.
+        labels: Row of each point, -1 for none; one array (N,) int64 per scan.
         ranges: (S, R, 360) float32 range of the nearest return in m, inf without one.
     """
 
@@ -86,84 +86,98 @@ class NearestReturns(NamedTuple):
 
 
 def find_nearest_returns(scans: Sequence[Scan], beams: Beams | None) -> NearestReturns:
-    """Find the nearest return of each scan in each cell."""
+    """Find the nearest return in each cell of each scan."""
     rows, labels = _assign_rows(scans, beams)
     ranges = np.full((len(scans), len(rows), SECTORS), np.inf, np.float32)
     for image, scan, label in zip(ranges, scans, labels):
-        valid = label >= 0
-        np.minimum.at(image, (label[valid], _to_sectors(scan)[valid]), scan.range[valid].astype(np.float32))
+        has_row = label >= 0
+        np.minimum.at(image, (label[has_row], _to_sectors(scan)[has_row]), scan.range[has_row].astype(np.float32))
     return NearestReturns(rows, labels, ranges)
 
 
 def measure_coverage(
     scans: Sequence[Scan], nearest: NearestReturns, mount: Mount | None, stationary: bool | None
 ) -> Coverage:
-    """Measure field of view, blind sectors and the robot's body on all scans together.
+    """Measure the field of view, blind sectors and the robot's body from all scans together.
 
     Args:
+        scans: The scans.
+        nearest: Nearest returns of the scans.
         mount: Mount of the sensor; None if unknown.
-        stationary: The robot stands still; None if unknown.
+        stationary: True if the robot stands still; None if unknown.
     """
     rows, labels, ranges = nearest
-    return_share = np.isfinite(ranges).mean(axis=0)
-    body, middle = _find_body(ranges, rows, mount, stationary)
-    own, box = _select_body(scans, labels, body, middle)
+    return_fraction = np.isfinite(ranges).mean(axis=0)
+    body, median = _find_body(ranges, rows, mount, stationary)
+    masks, box = _select_body(scans, labels, body, median)
     total = sum(len(scan.xyz) for scan in scans)
-    wide, long = np.sort(box[3:5] - box[:2]) if len(box) else (0.0, 0.0)
+    width, length = np.sort(box[3:5] - box[:2]) if len(box) else (0.0, 0.0)
     has_walls = bool(
-        long > MAX_ROBOT_SIZE_M[0] or wide > MAX_ROBOT_SIZE_M[1] or sum(m.sum() for m in own) > MAX_BODY_SHARE * total
+        length > MAX_ROBOT_SIZE_M[0]
+        or width > MAX_ROBOT_SIZE_M[1]
+        or sum(m.sum() for m in masks) > MAX_BODY_FRACTION * total
     )
     if has_walls:
-        body = _drop_small(body & (middle < NEAR_BODY_M))
-        own, box = _select_body(scans, labels, body, middle)
-    # A cell without returns is blind only if it points to the ground; others may point to the sky.
-    sees_ground = (
-        np.zeros(return_share.shape, bool)
+        body = _drop_small(body & (median < NEAR_BODY_M))
+        masks, box = _select_body(scans, labels, body, median)
+    # Only cells that point to the ground can be blind. Others without returns may point to the sky.
+    is_towards_ground = (
+        np.zeros(return_fraction.shape, bool)
         if mount is None
-        else (_cell_directions(rows) @ mount.normal * MAX_GROUND_RANGE_M < -mount.height)
+        else (_compute_cell_directions(rows) @ mount.normal * MAX_GROUND_RANGE_M < -mount.height)
     )
-    sees_ground |= not sees_ground.any()  # no cell reaches the ground, for example on a tall vehicle
-    open_ = (return_share > 0).any(axis=0) | ~sees_ground.any(axis=0)
-    inside = [~select_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
-    foreign = float(sum((i & ~m).sum() for i, m in zip(inside, own)) / max(1, sum(i.sum() for i in inside)))
+    is_towards_ground |= (
+        not is_towards_ground.any()
+    )  # if no cell reaches the ground, as on a tall vehicle, all cells count
+    in_view = (return_fraction > 0).any(axis=0) | ~is_towards_ground.any(axis=0)
+    in_box = [~select_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
+    foreign_fraction = float(sum((i & ~m).sum() for i, m in zip(in_box, masks)) / max(1, sum(i.sum() for i in in_box)))
     coverage = Coverage(
         rows,
-        return_share,
+        return_fraction,
         body,
         box,
-        foreign,
-        sum(m.sum() for m in own) / max(1, total),
+        foreign_fraction,
+        sum(m.sum() for m in masks) / max(1, total),
         has_walls,
         stationary,
         [],
-        _find_view(open_),
+        _find_view(in_view),
     )
-    # If the robot stands still, the constant returns may be a person next to it.
-    hiding = body & (coverage.can_crop and stationary is False)
+    # If the robot stands still, constant returns may come from a person next to it.
+    hidden_by_body = body & (coverage.can_crop and stationary is False)
     return coverage._replace(
-        blocked=_find_blocked(((return_share == 0) & sees_ground) | hiding, open_, return_share, hiding)
+        blocked=_find_blocked(
+            ((return_fraction == 0) & is_towards_ground) | hidden_by_body, in_view, return_fraction, hidden_by_body
+        )
     )
 
 
 def _select_body(
-    scans: Sequence[Scan], labels: Sequence[np.ndarray], body: np.ndarray, middle: np.ndarray
+    scans: Sequence[Scan], labels: Sequence[np.ndarray], body: np.ndarray, median: np.ndarray
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Select the points of the body: in its cells (R, 360), at their median range (R, 360).
+    """Select the points on the body.
+
+    Args:
+        scans: The scans.
+        labels: Row of each point of each scan.
+        body: (R, 360) bool, cells of the body.
+        median: (R, 360) median range of each cell, m.
 
     Returns:
-        (N,) bool for each scan, and the box (6,) around these points, empty without points.
+        A mask (N,) for each scan, and the box (6,) around the selected points, empty without points.
     """
-    own = [
+    masks = [
         _look_up(scan, label, body, False)
-        & (np.abs(scan.range - _look_up(scan, label, middle, 0.0)) < 3 * MAX_BODY_VARIATION_M)
+        & (np.abs(scan.range - _look_up(scan, label, median, 0.0)) < 3 * MAX_BODY_VARIATION_M)
         for scan, label in zip(scans, labels)
     ]
-    points = np.concatenate([scan.xyz[m] for scan, m in zip(scans, own)])
+    points = np.concatenate([scan.xyz[mask] for scan, mask in zip(scans, masks)])
     if not len(points):
-        return own, np.zeros(0)
-    # Percentiles, so that a few returns next to the body do not widen the box.
+        return masks, np.zeros(0)
+    # Percentiles exclude a few returns next to the body.
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
-    return own, np.concatenate([low - MARGIN_M, high + MARGIN_M])
+    return masks, np.concatenate([low - MARGIN_M, high + MARGIN_M])
 
 
 def _assign_rows(scans: Sequence[Scan], beams: Beams | None) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -178,48 +192,49 @@ def _to_sectors(scan: Scan) -> np.ndarray:
 
 
 def _look_up(scan: Scan, labels: np.ndarray, cells: np.ndarray, default: float) -> np.ndarray:
-    """Return the value of each point's cell in cells (R, 360), as (N,); default for points without a row."""
+    """Return the value (N,) of each point's cell in cells (R, 360); `default` for points without a row."""
     return np.where(labels >= 0, cells[labels, _to_sectors(scan)], default).astype(cells.dtype)
 
 
 def is_stationary(ranges: np.ndarray) -> bool | None:
-    """Return True if most far returns are constant, which shows that the robot stands still.
+    """Return True if the robot stands still: most far returns have a constant range.
 
     Args:
         ranges: (S, R, 360) ranges of S scans in m, inf without a return.
 
     Returns:
-        True or False; None for a single scan, or with too few far returns.
+        None for a single scan, or if there are too few far returns.
     """
     if len(ranges) < 2:
         return None
     count = np.isfinite(ranges).sum(axis=0)
-    frequent = count >= max(2, 0.6 * len(ranges))
-    ordered, last = np.sort(ranges[:, frequent], axis=0), count[frequent] - 1
-    first, last = (
-        np.take_along_axis(ordered, np.round(share * last).astype(int)[None], axis=0)[0] for share in QUANTILES
+    is_frequent = count >= max(2, 0.6 * len(ranges))
+    sorted_ranges, high = np.sort(ranges[:, is_frequent], axis=0), count[is_frequent] - 1
+    low, high = (
+        np.take_along_axis(sorted_ranges, np.round(quantile * high).astype(int)[None], axis=0)[0]
+        for quantile in QUANTILES
     )
-    far = first + last > 2 * MIN_FAR_M
-    if far.sum() < 100:
+    is_far = low + high > 2 * MIN_FAR_M
+    if is_far.sum() < 100:
         return None
-    return bool(((last - first)[far] > MIN_CHANGE_M).mean() < MAX_CHANGED_SHARE)
+    return bool(((high - low)[is_far] > MIN_CHANGE_M).mean() < MAX_CHANGED_FRACTION)
 
 
 def _find_body(
     ranges: np.ndarray, rows: np.ndarray, mount: Mount | None, stationary: bool | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cells with a constant near return, (R, 360) bool, and the median ranges (R, 360)."""
+    """Return the cells of the body, which have constant near returns, and the median ranges, (R, 360) each."""
     has_return = np.isfinite(ranges)
-    filled = np.where(has_return, ranges, np.nan)
-    filled[:, ~has_return.any(axis=0)] = 1e9
-    median = np.nanmedian(filled, axis=0)
-    variation = np.nanmedian(np.abs(filled - median), axis=0)
-    constant = (has_return.mean(axis=0) >= MIN_BODY_SCANS) & (variation <= MAX_BODY_VARIATION_M) & (len(ranges) >= 3)
-    if stationary is False and len(ranges) >= 5 and mount is not None:  # else the floor would count
-        body = constant & (median < MAX_BODY_M)
-        body &= median * (_cell_directions(rows) @ mount.normal) + mount.height > MIN_BODY_HEIGHT_M
+    padded_ranges = np.where(has_return, ranges, np.nan)
+    padded_ranges[:, ~has_return.any(axis=0)] = 1e9
+    median = np.nanmedian(padded_ranges, axis=0)
+    variation = np.nanmedian(np.abs(padded_ranges - median), axis=0)
+    is_constant = (has_return.mean(axis=0) >= MIN_BODY_SCANS) & (variation <= MAX_BODY_VARIATION_M) & (len(ranges) >= 3)
+    if stationary is False and len(ranges) >= 5 and mount is not None:  # the mount excludes the floor
+        body = is_constant & (median < MAX_BODY_M)
+        body &= median * (_compute_cell_directions(rows) @ mount.normal) + mount.height > MIN_BODY_HEIGHT_M
     else:
-        body = constant & (median < NEAR_BODY_M)
+        body = is_constant & (median < NEAR_BODY_M)
     return _drop_small(body), median
 
 
@@ -227,59 +242,66 @@ def _drop_small(body: np.ndarray) -> np.ndarray:
     return body if body.sum() >= MIN_CELLS else np.zeros_like(body)
 
 
-def _cell_directions(rows: np.ndarray) -> np.ndarray:
-    """Return (R, 360, 3) unit vectors to the cells in the sensor's frame."""
-    up, aside = np.radians(rows)[:, None], np.radians(np.arange(SECTORS) + 0.5)
-    return np.stack(np.broadcast_arrays(np.cos(up) * np.cos(aside), np.cos(up) * np.sin(aside), np.sin(up)), axis=-1)
+def _compute_cell_directions(rows: np.ndarray) -> np.ndarray:
+    """Return unit vectors (R, 360, 3) to the cells in the sensor's frame."""
+    elevation, azimuth = np.radians(rows)[:, None], np.radians(np.arange(SECTORS) + 0.5)
+    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    return np.stack(np.broadcast_arrays(x, y, np.sin(elevation)), axis=-1)
 
 
 def _find_blocked(
-    blind: np.ndarray, open_: np.ndarray, return_share: np.ndarray, body: np.ndarray
+    blind: np.ndarray, in_view: np.ndarray, return_fraction: np.ndarray, body: np.ndarray
 ) -> list[tuple[int, float, float]]:
-    """Find sectors in which a beam and all lower beams are blind; outside open_ (360,), all beams are.
+    """Find sectors in which a beam and all lower beams are blind.
 
     Beams with few returns, such as those into the sky, cannot show blind sectors and are ignored.
+
+    Args:
+        blind: (R, 360) bool, cells without a view.
+        in_view: (360,) bool; in all other sectors, all beams are blind.
+        return_fraction: See Coverage.
+        body: (R, 360) bool, cells that the body hides.
 
     Returns:
         (first row, from, to) of each sector, in degrees.
     """
-    informative = (
-        (return_share[:, open_] > 0).mean(axis=1) >= MIN_SEEN_SHARE
-        if open_.any()
-        else np.zeros(len(return_share), bool)
+    is_informative = (
+        (return_fraction[:, in_view] > 0).mean(axis=1) >= MIN_SEEN_FRACTION
+        if in_view.any()
+        else np.zeros(len(return_fraction), bool)
     )
-    if not informative.any():
+    if not is_informative.any():
         return []
     # The lowest informative beam with a return in each sector.
-    hidden = np.where(informative[:, None], blind, True)
+    hidden = np.where(is_informative[:, None], blind, True)
     lowest = len(blind) - np.cumprod(hidden[::-1], axis=0).sum(axis=0)
-    candidates = np.append(np.flatnonzero(informative), len(blind))
-    first = candidates[np.searchsorted(candidates, lowest)]
-    for row in range(len(blind) - 2, -1, -1):  # the body blocks informative and other beams alike
-        first = np.where((first == row + 1) & body[row], row, first)
-    first = np.where(open_, first, 0)
-    out = []
-    step = max(1, len(blind) // 16)  # coarse rows, so that adjacent sectors merge
-    level = np.where(first < len(blind), -(-first // step) * step, len(blind))
-    level = np.minimum(level, np.where(first < len(blind), len(blind) - 1, len(blind)))
-    turn = int(np.argmax(np.diff(level, prepend=level[-1]) != 0))
-    rolled = np.roll(level, -turn)
+    candidates = np.append(np.flatnonzero(is_informative), len(blind))
+    first_row = candidates[np.searchsorted(candidates, lowest)]
+    for row in range(len(blind) - 2, -1, -1):  # add rows that the body hides
+        first_row = np.where((first_row == row + 1) & body[row], row, first_row)
+    first_row = np.where(in_view, first_row, 0)
+    sectors = []
+    step = max(1, len(blind) // 16)  # rounding of rows, so that adjacent sectors merge
+    level = np.where(first_row < len(blind), -(-first_row // step) * step, len(blind))
+    level = np.minimum(level, np.where(first_row < len(blind), len(blind) - 1, len(blind)))
+    shift = int(np.argmax(np.diff(level, prepend=level[-1]) != 0))
+    rolled = np.roll(level, -shift)
     starts = np.flatnonzero(np.diff(rolled, prepend=-1) != 0)
     for start, end in zip(starts, [*starts[1:], SECTORS]):
         if rolled[start] < len(blind) and end - start >= MIN_BLIND:
-            out.append((int(rolled[start]), float((start + turn) % 360), float((end + turn - 1) % 360 + 1)))
-    return sorted(out)
+            sectors.append((int(rolled[start]), float((start + shift) % 360), float((end + shift - 1) % 360 + 1)))
+    return sorted(sectors)
 
 
-def _find_view(open_: np.ndarray) -> tuple[float, float]:
-    """Return the field of view (from, to) in degrees, which leaves out the widest gap; (0, 360) without a gap."""
-    if not open_.any() or open_.all():
+def _find_view(in_view: np.ndarray) -> tuple[float, float]:
+    """Return the field of view (from, to) in degrees: all but the widest gap; (0, 360) without a gap."""
+    if not in_view.any() or in_view.all():
         return 0.0, 360.0
-    turn = int(np.argmax(open_))
-    rolled = np.roll(open_, -turn)
+    shift = int(np.argmax(in_view))
+    rolled = np.roll(in_view, -shift)
     edges = np.flatnonzero(np.diff(rolled.astype(int), append=1))
-    falls, rises = edges[0::2], edges[1::2]
-    widest = int(np.argmax(rises - falls))
-    if rises[widest] - falls[widest] < MIN_BLIND:
+    ends, starts = edges[0::2], edges[1::2]
+    widest = int(np.argmax(starts - ends))
+    if starts[widest] - ends[widest] < MIN_BLIND:
         return 0.0, 360.0
-    return float((rises[widest] + 1 + turn) % 360), float((falls[widest] + 1 + turn) % 360)
+    return float((starts[widest] + 1 + shift) % 360), float((ends[widest] + 1 + shift) % 360)

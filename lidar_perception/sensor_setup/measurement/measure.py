@@ -1,4 +1,4 @@
-"""Measurement of a sensor and its mounting from its clouds."""
+"""Measurement of a sensor and its mounting from clouds."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ from lidar_perception.sensor_setup.measurement.timing import Timing, measure_tim
 from lidar_perception.simulation.sensor import SENSOR_NAMES, find_sensor
 from lidar_perception.types import InputError
 
-MAX_MODEL_ERROR = 0.15  # degrees, median difference between beams of the sensor and of its model
-# Limit if beams are missing, as a share of the model's beam spacing; a random sensor has 1 / 4.
+MAX_MODEL_ERROR = 0.15  # maximum median difference between measured beams and those of a model, in degrees
+# The same limit if beams are missing, as a fraction of the model's beam spacing; random beams differ by 1 / 4.
 MAX_PARTIAL_ERROR = 1 / 6
-MIN_SCANS = 5  # fewer cannot separate the robot from its surroundings
-MIN_OUTDOOR_RANGE_M = 30.0  # if nothing is farther, the room limits the range and not the sensor
-MAX_RAW_SPREAD = 0.01  # degrees between points of a beam in a raw cloud
-MIN_MOTION_M = 0.1  # a robot that moves less stands still
-MIN_POSE_MOTION_M = 2.0  # the same by recorded poses, which drift
-PEOPLE_ELEVATIONS = (-15.0, 5.0)  # degrees, of the beams that hit people
+MIN_SCANS = 5  # minimum number of scans to separate the robot from its surroundings
+MIN_OUTDOOR_RANGE_M = 30.0  # maximum range below which a room limits the range, not the sensor
+MAX_RAW_SPREAD = 0.01  # maximum deviation of the points of a beam in a raw cloud, in degrees
+MIN_MOTION_M = 0.1  # minimum motion between scans of a robot that drives
+MIN_POSE_MOTION_M = 2.0  # minimum extent of the recorded poses of a robot that drives; poses drift
+PEOPLE_ELEVATIONS = (-15.0, 5.0)  # range of elevations of the beams that hit people, in degrees
 
 
 class CloudSource(NamedTuple):
-    """Clouds that were measured, with the name of their recording and the total number of clouds in it."""
+    """Scans for the measurement, with the name of their recording and its total number of clouds."""
 
     name: str
     scans: tuple[Scan, ...]
@@ -67,9 +67,9 @@ class ScanPattern(NamedTuple):
     """Scan pattern of the sensor.
 
     Attributes:
-        beams: The beams; None if there are none.
+        beams: The beams; None if none were found.
         azimuth_step: Angle between two firings in degrees, NaN without beams.
-        second_returns: Share of the points that are second returns.
+        second_returns: Fraction of the points that are second returns.
         range_noise: Standard deviation of the range in metres, NaN if unknown.
         model: Sensor of config/sensors with the same beams, "" for none.
     """
@@ -87,7 +87,7 @@ class ScanPattern(NamedTuple):
 
     @property
     def prefers_model(self) -> bool:
-        """True if the model's beams are more reliable: points were moved, or beams have no returns."""
+        """True if the beams of the model are more reliable, because points were moved or beams have no returns."""
         if not self.model or self.beams is None:
             return False
         count, model_count = len(self.beams.elevations), find_sensor(self.model).rings
@@ -107,7 +107,7 @@ class Mounting(NamedTuple):
 
     Attributes:
         mount: Pose above the ground; None if unknown.
-        on_ground: The origin of the clouds is on the ground, so the mount is unknown.
+        on_ground: True if the origin of the clouds is on the ground, so that the mount is unknown.
         heading: Driving direction of the robot; None if no ground was found.
         recorded: Poses in the recording.
         height_hint: Height given by the user in metres; None if not given.
@@ -122,7 +122,7 @@ class Mounting(NamedTuple):
 
 @dataclass(frozen=True)
 class SensorMeasurement:
-    """Result of measure_sensor. intensity is None if the clouds have no usable intensity."""
+    """Measured properties of a sensor. `intensity` is None if the clouds have no usable intensity."""
 
     source: CloudSource
     pattern: ScanPattern
@@ -133,15 +133,15 @@ class SensorMeasurement:
 
     @property
     def elevation_step(self) -> float:
-        """Median spacing in degrees of the beams that hit people; NaN without beams."""
+        """Median spacing of the beams that hit people, in degrees; NaN without beams."""
         if self.pattern.beams is None:
             return np.nan
         elevations = self.pattern.beams.elevations
         if self.mounting.mount is not None and self.mounting.mount.upside_down:
             elevations = -elevations[::-1]
         low, high = PEOPLE_ELEVATIONS
-        middle = elevations[(elevations >= low) & (elevations <= high)]
-        steps = -np.diff(middle if len(middle) > 2 else elevations)
+        people_elevations = elevations[(elevations >= low) & (elevations <= high)]
+        steps = -np.diff(people_elevations if len(people_elevations) > 2 else elevations)
         return float(np.median(steps)) if len(steps) else np.nan
 
 
@@ -159,25 +159,25 @@ def measure_sensor(
     Args:
         scans: Scans of the recording.
         numbers: Numbers of the scans in the recording.
-        source: Name of the recording.
+        source: Name of the recording, for messages.
         total: Number of clouds in the recording.
-        stamps_ns: Stamps of all clouds of the recording in ns; None if they have none.
+        stamps_ns: Stamps of all clouds in the recording in ns; None if they have none.
         recorded: Poses in the recording.
         height_hint: Height of the sensor in metres, if known.
 
     Raises:
-        InputError: The clouds have several layouts, or come from a 2D scanner.
+        InputError: The clouds have different columns, or come from a 2D scanner.
     """
     if len({scan.columns for scan in scans}) > 1:
         raise InputError(
-            f"{source} has clouds of several layouts ({', '.join(scans[0].columns)} "
-            "and others), probably of several sensors; use the clouds of one sensor"
+            f"{source} has clouds with different columns ({', '.join(scans[0].columns)} "
+            "and others), probably from several sensors; use the clouds of one sensor"
         )
     require_3d(np.concatenate([scan.elevation for scan in scans]), source)
     pattern = _measure_pattern(scans)
     mount = measure_mount(scans)
     nearest = find_nearest_returns(scans, pattern.beams)
-    # Uniform surroundings, such as a field, look constant although the robot moves.
+    # In uniform surroundings, such as a field, returns are constant although the robot moves.
     stationary = False if recorded.distance >= MIN_POSE_MOTION_M else is_stationary(nearest.ranges)
     heading = _find_heading(scans, numbers, mount, stationary, recorded)
     # People and doors change the surroundings although the robot stands still.
@@ -185,7 +185,7 @@ def measure_sensor(
         True if len(scans) > 1 and _measure_distance(scans, mount, heading, recorded) < MIN_MOTION_M else stationary
     )
     view = _measure_view(scans, measure_coverage(scans, nearest, mount, stationary))
-    # The level beams of a sensor also are in a plane through its origin.
+    # Level beams are also in a plane through the origin.
     may_be_on_ground = mount is None and (pattern.beams is None or pattern.is_moved)
     return SensorMeasurement(
         CloudSource(source, tuple(scans), total),
@@ -208,13 +208,13 @@ def _measure_pattern(scans: Sequence[Scan]) -> ScanPattern:
 
 def _measure_view(scans: Sequence[Scan], coverage: Coverage) -> View:
     ranges = np.concatenate([s.range for s in scans])
-    outside = ranges[
+    outside_ranges = ranges[
         select_points(
             np.concatenate([s.xyz for s in scans]),
             CropParams(body=tuple(coverage.box.tolist()) if coverage.can_crop else ()),
         )
     ]
-    low, high = np.percentile(outside if len(outside) else ranges, [0.02, 99.995])
+    low, high = np.percentile(outside_ranges if len(outside_ranges) else ranges, [0.02, 99.995])
     return View(coverage, float(low), float(high))
 
 
@@ -223,12 +223,12 @@ def _find_heading(
 ) -> Heading | None:
     if mount is None:
         return None
-    shifts = find_shifts(draw_images(_level_scans(scans, mount), moves=stationary is False), numbers)
+    shifts = find_shifts(draw_images(_level_scans(scans, mount), is_moving=stationary is False), numbers)
     if recorded.base or not recorded.poses:
         return estimate_heading(shifts, compute_shifts(recorded.poses, shifts))
-    # Odometry of the sensor itself shows its motion, but not the x axis of the base.
-    level = invert_pose(mount.pose)
-    poses = {number: sensor @ level for number, sensor in recorded.poses.items()}
+    # Odometry of the sensor gives its motion, but not the x axis of the base.
+    sensor_from_level = invert_pose(mount.pose)
+    poses = {number: sensor_pose @ sensor_from_level for number, sensor_pose in recorded.poses.items()}
     return estimate_heading(compute_shifts(poses, shifts), {})
 
 
@@ -241,22 +241,26 @@ def _measure_distance(
 ) -> float:
     """Return the distance travelled in metres, NaN if unknown.
 
-    Without recorded poses it is the largest shift between neighbouring clouds, or between the first
-    and the last cloud if the robot is slow.
+    Without recorded poses, this is the largest shift between neighbouring clouds, or between the
+    first and the last cloud if that is larger.
     """
     distance = recorded.distance
-    # If only some clouds have poses, the robot may have stopped at these.
+    # If only some clouds have poses, the robot may have stood still during these.
     if len(recorded.poses) == len(scans) or distance >= MIN_MOTION_M:
         return distance
     if mount is None or heading is None:
         return np.nan
-    ends = _level_scans([scans[0], scans[-1]], mount)
-    shift = find_shift(*map(compute_spectrum, draw_images(ends, moves=False)))
+    end_scans = _level_scans([scans[0], scans[-1]], mount)
+    shift = find_shift(*map(compute_spectrum, draw_images(end_scans, is_moving=False)))
     return np.nan if shift is None else float(np.maximum(heading.distance, np.hypot(*shift)))
 
 
 def find_matching_model(beams: Beams | None) -> str:
-    """Return the name of the sensor in config/sensors with these beams, or most of them; "" for none."""
+    """Find the sensor in config/sensors with these beams, or most of them.
+
+    Returns:
+        Its name, "" if no sensor matches.
+    """
     best, error = "", MAX_MODEL_ERROR
     if beams is None:
         return best

@@ -1,4 +1,4 @@
-"""Motion of the robot between scans by correlation of bird's-eye images, and its heading."""
+"""Motion of the robot between scans, from the correlation of bird's-eye images, and its heading."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from scipy.fft import irfft2, rfft2
 from lidar_perception.geometry import wrap_angle
 
 CELL_M, HALF_SIZE_M = 0.2, 40.0  # cell size and half width of the bird's-eye images
-LOW_M, HIGH_M = 0.3, 3.0  # heights above the ground of the points in the images
-MIN_SHIFT_M = 0.3  # minimum shift that gives a direction
-MIN_PEAK_RATIO = 1.2  # minimum ratio of a clear peak to the rest of the correlation
-PEAK_HALF_SIZE = 5  # cells around a peak that are excluded from the rest
-# With at least MIN_STATIC_SCANS scans, cells occupied in this share of them are ignored: they move
-# with the robot, for example where a beam hits a straight wall.
-STATIC_SHARE, MIN_STATIC_SCANS = 0.7, 5
-GAPS = (1, 2, 4, 8, 16)  # differences between the numbers of clouds that are compared
+MIN_HEIGHT_M, MAX_HEIGHT_M = 0.3, 3.0  # heights above the ground of the points in the images
+MIN_SHIFT_M = 0.3  # minimum shift with a reliable direction
+MIN_PEAK_RATIO = 1.2  # minimum ratio of a peak to the rest of the correlation
+PEAK_HALF_SIZE = 5  # half size of a peak, in cells
+# With at least MIN_STATIC_SCANS scans, cells that are occupied in this fraction of them are ignored: they
+# move with the robot, for example where a beam hits a straight wall.
+STATIC_FRACTION, MIN_STATIC_SCANS = 0.7, 5
+GAPS = (1, 2, 4, 8, 16)  # differences between the numbers of the compared clouds
 MIN_AGREEMENT = 0.8  # minimum length of the mean direction vector, 0 to 1
-MAX_STRAIGHT_TURN = 5.0  # maximum rotation between scans in degrees; in turns, an off-centre sensor moves sideways
-MIN_ERROR = 7.0  # minimum error in degrees, since walls can bias all shifts of one place
+MAX_STRAIGHT_TURN = 5.0  # maximum rotation in degrees; when the robot turns, an off-centre sensor moves sideways
+MIN_ERROR = 7.0  # minimum error of the heading in degrees, because walls can bias all shifts in one place
 MAX_OFF_AXIS = 10.0  # tolerance between x axis and heading in degrees, added to twice the error
 
 
@@ -43,7 +43,7 @@ class Heading(NamedTuple):
         error: Standard error of the angle in degrees.
         distance: Longest shift in metres, NaN if most shifts are ambiguous.
         problem: Reason why the heading is unknown, "" if it is known.
-        from_base: The heading is the base's x axis, even if the robot drove backwards.
+        from_base: True if the heading is the x axis of the base, even if the robot drove backwards.
     """
 
     degrees: float
@@ -54,7 +54,7 @@ class Heading(NamedTuple):
 
     @property
     def is_off_axis(self) -> bool:
-        """True if the cloud's x axis does not point ahead."""
+        """True if the x axis of the cloud does not point forward."""
         return not self.problem and abs(self.degrees) - 2 * self.error > MAX_OFF_AXIS
 
     @property
@@ -64,7 +64,7 @@ class Heading(NamedTuple):
 
 
 def wrap_degrees(degrees: float | np.ndarray) -> Any:
-    """Wrap degrees to -180 .. 180."""
+    """Wrap angles in degrees to -180 .. 180."""
     return np.degrees(wrap_angle(np.radians(degrees)))
 
 
@@ -85,74 +85,79 @@ def find_shift(before: np.ndarray, after: np.ndarray) -> Shift | None:
         The shift; None if the correlation has no clear peak.
     """
     size = len(before)
-    match = irfft2(before * np.conj(after))
-    best = np.unravel_index(match.argmax(), match.shape)
-    peak, rest = match[best], match.copy()
-    rows, columns = ((np.arange(-PEAK_HALF_SIZE, PEAK_HALF_SIZE + 1) + b) % size for b in best)
+    correlation = irfft2(before * np.conj(after))
+    peak_cell = np.unravel_index(correlation.argmax(), correlation.shape)
+    peak_value, rest = correlation[peak_cell], correlation.copy()
+    rows, columns = ((np.arange(-PEAK_HALF_SIZE, PEAK_HALF_SIZE + 1) + b) % size for b in peak_cell)
     rest[np.ix_(rows, columns)] = 0.0
-    if peak <= 0 or peak < MIN_PEAK_RATIO * rest.max():
+    if peak_value <= 0 or peak_value < MIN_PEAK_RATIO * rest.max():
         return None
-    x, y = ((int(b) + size // 2) % size - size // 2 + _refine_peak(match, best, axis) for axis, b in enumerate(best))
+    x, y = (
+        (int(b) + size // 2) % size - size // 2 + _refine_peak(correlation, peak_cell, axis)
+        for axis, b in enumerate(peak_cell)
+    )
     return Shift(x * CELL_M, y * CELL_M)
 
 
-def _refine_peak(match: np.ndarray, best: tuple[np.intp, ...], axis: int) -> float:
-    """Return the subcell offset of a peak by a parabola through its neighbours, in -0.5 .. 0.5 cells."""
-    around = [list(best) for _ in range(3)]
-    for cell, step in zip(around, (-1, 0, 1)):
-        cell[axis] = (cell[axis] + step) % len(match)
-    low, top, high = (float(match[tuple(cell)]) for cell in around)
-    return 0.5 * (high - low) / bend if (bend := 2 * top - low - high) > 0 else 0.0
+def _refine_peak(correlation: np.ndarray, peak_cell: tuple[np.intp, ...], axis: int) -> float:
+    """Return the offset of a peak in cells (-0.5 .. 0.5), from a parabola through its neighbours."""
+    neighbours = [list(peak_cell) for _ in range(3)]
+    for cell, step in zip(neighbours, (-1, 0, 1)):
+        cell[axis] = (cell[axis] + step) % len(correlation)
+    low, top, high = (float(correlation[tuple(cell)]) for cell in neighbours)
+    return 0.5 * (high - low) / curvature if (curvature := 2 * top - low - high) > 0 else 0.0
 
 
-def draw_images(scans: Sequence[np.ndarray], moves: bool) -> np.ndarray:
+def draw_images(scans: Sequence[np.ndarray], is_moving: bool) -> np.ndarray:
     """Draw bird's-eye images of the points above the ground.
 
     Args:
         scans: S arrays of points (N, 3) in a level frame, z = 0 on the ground.
-        moves: The robot moves, so cells that are occupied in most scans are cleared.
+        is_moving: True if the robot moves; clears cells that are occupied in most scans.
 
     Returns:
         (S, cells, cells) float32, 1 in occupied cells.
     """
     images = np.zeros((len(scans), *[int(2 * HALF_SIZE_M / CELL_M)] * 2), np.float32)
     for image, xyz in zip(images, scans):
-        drawn = (xyz[:, 2] > LOW_M) & (xyz[:, 2] < HIGH_M) & (np.abs(xyz[:, :2]) < HALF_SIZE_M).all(axis=1)
-        cells = ((xyz[drawn, :2] + HALF_SIZE_M) / CELL_M).astype(int)
+        is_drawn = (
+            (xyz[:, 2] > MIN_HEIGHT_M) & (xyz[:, 2] < MAX_HEIGHT_M) & (np.abs(xyz[:, :2]) < HALF_SIZE_M).all(axis=1)
+        )
+        cells = ((xyz[is_drawn, :2] + HALF_SIZE_M) / CELL_M).astype(int)
         image[cells[:, 0], cells[:, 1]] = 1.0
-    if moves and len(scans) >= MIN_STATIC_SCANS:
-        images *= images.mean(axis=0) < STATIC_SHARE
+    if is_moving and len(scans) >= MIN_STATIC_SCANS:
+        images *= images.mean(axis=0) < STATIC_FRACTION
     return images
 
 
 def find_shifts(images: np.ndarray, numbers: Sequence[int]) -> Shifts:
-    """Find the shift of each scan to a later one, over the shortest gap with at least MIN_SHIFT_M.
+    """Find the shift between each scan and a later one, the first with a shift of at least MIN_SHIFT_M.
 
     Args:
         images: (S, cells, cells) images from draw_images.
-        numbers: Numbers of their clouds in the recording.
+        numbers: Numbers of the clouds in the recording.
 
     Returns:
-        Shift of each pair of clouds; over the longest gap if the robot moves less than MIN_SHIFT_M.
+        Shift of each pair of clouds. If all shifts of a cloud are smaller, that over the longest gap.
     """
     shifts: dict[tuple[int, int], Shift | None] = {}
     spectra = dict(zip(numbers, map(compute_spectrum, images), strict=True))
-    for number, before in spectra.items():
-        others = [number + gap for gap in GAPS if number + gap in spectra]
-        for other in others:
-            shift = find_shift(before, spectra[other])
+    for number, spectrum in spectra.items():
+        later_numbers = [number + gap for gap in GAPS if number + gap in spectra]
+        for later in later_numbers:
+            shift = find_shift(spectrum, spectra[later])
             if shift is None or np.hypot(*shift) >= MIN_SHIFT_M:
                 break
-        if others:
-            shifts[number, other] = shift
+        if later_numbers:
+            shifts[number, later] = shift
     return shifts
 
 
 def compute_shifts(poses: Mapping[int, np.ndarray], pairs: Shifts) -> Shifts:
-    """Compute the shifts of the base between pairs of scans, in its own frame, from its poses.
+    """Compute the shifts of the base between pairs of scans, in its own frame.
 
     Args:
-        poses: (4, 4) poses of the base by number of the scan.
+        poses: Poses (4, 4) of the base by scan number.
         pairs: Pairs of scans. Pairs without poses are left out.
 
     Returns:
@@ -168,36 +173,38 @@ def compute_shifts(poses: Mapping[int, np.ndarray], pairs: Shifts) -> Shifts:
 
 
 def estimate_heading(shifts: Shifts, base: Shifts) -> Heading:
-    """Estimate the heading as the mean direction of all shifts of at least MIN_SHIFT_M.
+    """Estimate the heading: the mean direction of all shifts of at least MIN_SHIFT_M.
 
     Args:
         shifts: Shifts of the sensor.
-        base: Shifts of the base between the same scans, see compute_shifts. If not empty, the
-            heading is the direction of the base's x axis.
+        base: Shifts of the base between the same scans, see compute_shifts. If it is not empty,
+            the heading is the direction of the x axis of the base.
     """
-    valid = {pair: complex(*shift) for pair, shift in shifts.items() if shift is not None}
-    far = {pair: shift for pair, shift in valid.items() if np.hypot(shift.real, shift.imag) >= MIN_SHIFT_M}
-    distance = float(np.abs(list(valid.values())).max(initial=0.0))
-    if not far and 2 * len(valid) <= len(shifts):
+    known_shifts = {pair: complex(*shift) for pair, shift in shifts.items() if shift is not None}
+    long_shifts = {
+        pair: shift for pair, shift in known_shifts.items() if np.hypot(shift.real, shift.imag) >= MIN_SHIFT_M
+    }
+    distance = float(np.abs(list(known_shifts.values())).max(initial=0.0))
+    if not long_shifts and 2 * len(known_shifts) <= len(shifts):
         problem = "the surroundings have too few distinct features to measure the robot's motion"
         return Heading(np.nan, np.nan, np.nan, problem)
-    if not far:
+    if not long_shifts:
         problem = f"the robot moved only {distance:.1f} m between the clouds that were compared"
         return Heading(np.nan, np.nan, distance, problem)
-    by_base = {
-        pair: far[pair] / complex(*step)
+    relative_to_base = {
+        pair: long_shifts[pair] / complex(*step)
         for pair, step in base.items()
-        if pair in far and step is not None and np.hypot(*step) >= MIN_SHIFT_M / 2
+        if pair in long_shifts and step is not None and np.hypot(*step) >= MIN_SHIFT_M / 2
     }
-    turns = np.array(list((by_base or far).values()))
-    mean = complex((turns / np.abs(turns)).mean())
+    directions = np.array(list((relative_to_base or long_shifts).values()))
+    mean = complex((directions / np.abs(directions)).mean())
     agreement = min(abs(mean), 1.0)
     if agreement < MIN_AGREEMENT:
         problem = (
             "the motion of the clouds does not agree with the odometry"
-            if by_base
-            else f"the robot turned or drove back and forth: {len(turns)} shifts have different directions"
+            if relative_to_base
+            else f"the robot turned or drove back and forth: {len(directions)} shifts have different directions"
         )
-        return Heading(np.nan, np.nan, distance, problem, bool(by_base))
-    error = max(float(np.degrees(np.sqrt(-2 * np.log(agreement)) / np.sqrt(len(turns)))), MIN_ERROR)
-    return Heading(float(np.degrees(np.angle(mean))), error, distance, "", bool(by_base))
+        return Heading(np.nan, np.nan, distance, problem, bool(relative_to_base))
+    error = max(float(np.degrees(np.sqrt(-2 * np.log(agreement)) / np.sqrt(len(directions)))), MIN_ERROR)
+    return Heading(float(np.degrees(np.angle(mean))), error, distance, "", bool(relative_to_base))

@@ -13,20 +13,21 @@ from lidar_perception.ground.threshold import fit_plane, fit_plane_by_ransac, he
 from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-TILTED_GROUND = ThresholdParams(max_slope=45.0, inlier_distance=0.08)  # allows for the largest tilt of a sensor
+TILTED_GROUND = ThresholdParams(max_slope=45.0, inlier_distance=0.08)  # for sensors with a tilt of up to 45 degrees
 MIN_DISTANCE_M = 0.3  # minimum distance of ground points, outside the robot
-RADIUS_RATIO = 2.5  # the plane is fitted up to this multiple of the distance of the nearest ground
+RADIUS_RATIO = 2.5  # radius of the plane fit, relative to the distance of the nearest ground
 MIN_RADIUS_M, MAX_RADIUS_M = 5.0, 25.0
-MIN_SHARE = 0.12  # minimum fraction of the low points that are on the plane
-MIN_POINTS = 60
+MIN_INLIER_FRACTION = 0.12  # minimum fraction of the low points that are on the plane
+MIN_POINTS = 60  # minimum number of ground points
 INLIER_DISTANCE_M = 0.05  # inlier distance of the final plane fit
 # Depth of points below the plane, and their maximum number relative to the inliers.
-MIN_DEPTH_M, MAX_BELOW_SHARE = 0.3, 0.25
-SECTORS = 6  # sectors of a scan, each left out once to estimate the error
-MIN_HEIGHT_M = 0.1  # a closer surface is what the sensor stands on
-UPSIDE_DOWN_RATIO = 8.0  # ratio of points above to points below from which the surface above is the floor
+MIN_DEPTH_M, MAX_BELOW_RATIO = 0.3, 0.25
+SECTORS = 6  # number of sectors for the jackknife estimate of the error
+MIN_HEIGHT_M = 0.1  # minimum height of the sensor; closer surfaces belong to its support
+UPSIDE_DOWN_RATIO = 8.0  # minimum ratio of points on the upper plane to points on the lower one if the sensor is
+# upside down
 MIN_EXTENT_M = 1.5  # minimum extent of the plane
-OFFSET_M = 1.0  # clouds are lowered by this to find a floor at their origin
+OFFSET_M = 1.0  # distance by which clouds are lowered to find a floor at their origin
 
 
 class Plane(NamedTuple):
@@ -51,7 +52,7 @@ class Plane(NamedTuple):
 
     @property
     def pitch(self) -> float:
-        """Pitch in rad, as in a URDF's rpy; positive looks down."""
+        """Pitch in rad, as in a URDF's rpy; positive if the sensor points down."""
         return float(-np.arcsin(np.clip(self.normal[0], -1.0, 1.0)))
 
 
@@ -64,7 +65,7 @@ class Mount(NamedTuple):
         error: (3,) standard errors of the medians of height, roll and pitch.
         spread: (3,) robust standard deviations of height, roll and pitch between scans.
         planes: Ground plane of each scan, None if none was found.
-        upside_down: The sensor's z axis points to the ground.
+        upside_down: True if the sensor's z axis points to the ground.
     """
 
     height: float
@@ -96,45 +97,45 @@ def find_ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:
 
     Args:
         xyz: (N, 3) points in the sensor's frame.
-        below: Search at z < 0; False searches at z > 0, for a sensor that is mounted upside down.
+        below: True to search at z < 0, False to search at z > 0, for sensors mounted upside down.
 
     Returns:
         The plane; None if no plane has enough points.
     """
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
-    side = (xyz[:, 2] < 0.0) if below else (xyz[:, 2] > 0.0)
-    candidate = side & (distance > MIN_DISTANCE_M) & (distance < MAX_RADIUS_M)
-    if candidate.sum() < MIN_POINTS:
+    on_side = (xyz[:, 2] < 0.0) if below else (xyz[:, 2] > 0.0)
+    is_candidate = on_side & (distance > MIN_DISTANCE_M) & (distance < MAX_RADIUS_M)
+    if is_candidate.sum() < MIN_POINTS:
         return None
-    plane = fit_plane_by_ransac(_keep_one_per_cell(xyz[candidate]), TILTED_GROUND)
+    plane = fit_plane_by_ransac(_keep_one_per_cell(xyz[is_candidate]), TILTED_GROUND)
     if plane is None or (plane[2] > -MIN_HEIGHT_M if below else plane[2] < MIN_HEIGHT_M):
         return None
-    # Only near ground counts, since roads slope towards their curbs.
-    ground = candidate & (np.abs(height_above_plane(xyz, plane)) <= TILTED_GROUND.inlier_distance)
-    if ground.sum() < MIN_POINTS:
+    # Only the ground near the sensor is used, because roads slope towards their curbs.
+    is_ground = is_candidate & (np.abs(height_above_plane(xyz, plane)) <= TILTED_GROUND.inlier_distance)
+    if is_ground.sum() < MIN_POINTS:
         return None
-    radius = np.clip(RADIUS_RATIO * np.percentile(distance[ground], 2), MIN_RADIUS_M, MAX_RADIUS_M)
-    near = candidate & (distance < radius)
+    radius = np.clip(RADIUS_RATIO * np.percentile(distance[is_ground], 2), MIN_RADIUS_M, MAX_RADIUS_M)
+    is_near = is_candidate & (distance < radius)
     for _ in range(10):
-        inliers = near & (np.abs(height_above_plane(xyz, plane)) <= INLIER_DISTANCE_M)
-        fitted = _fit_cell_means(xyz[inliers])
+        is_inlier = is_near & (np.abs(height_above_plane(xyz, plane)) <= INLIER_DISTANCE_M)
+        fitted = _fit_cell_means(xyz[is_inlier])
         if fitted is None:
             return None
         change, plane = np.abs(fitted - plane).max(), fitted
         if change < 1e-5:
             break
     height = height_above_plane(xyz, plane) if below else -height_above_plane(xyz, plane)
-    inliers = near & (np.abs(height) <= INLIER_DISTANCE_M)
-    count = inliers.sum()
+    is_inlier = is_near & (np.abs(height) <= INLIER_DISTANCE_M)
+    count = is_inlier.sum()
     if (
         count < MIN_POINTS
-        or count < MIN_SHARE * max(1, (near & (height < 1.0)).sum())
-        or (near & (height < -MIN_DEPTH_M)).sum() > MAX_BELOW_SHARE * count  # the plane is a table
-        or np.percentile(distance[inliers], 90) < MIN_EXTENT_M
+        or count < MIN_INLIER_FRACTION * max(1, (is_near & (height < 1.0)).sum())
+        or (is_near & (height < -MIN_DEPTH_M)).sum() > MAX_BELOW_RATIO * count  # the plane is a table
+        or np.percentile(distance[is_inlier], 90) < MIN_EXTENT_M
     ):
         return None
     normal = _compute_normal(plane, below)
-    return Plane(normal, float(abs(plane[2]) * abs(normal[2])), _estimate_error(xyz[inliers]), inliers)
+    return Plane(normal, float(abs(plane[2]) * abs(normal[2])), _estimate_error(xyz[is_inlier]), is_inlier)
 
 
 def _compute_normal(plane: np.ndarray, below: bool) -> np.ndarray:
@@ -142,19 +143,19 @@ def _compute_normal(plane: np.ndarray, below: bool) -> np.ndarray:
     return normal if below else -normal
 
 
-def _keep_one_per_cell(xyz: np.ndarray, cell: float = 0.25) -> np.ndarray:
-    """Subsample points (N, 3) to one per cell, so that near ground does not dominate."""
-    _, first = np.unique(np.floor(xyz / cell).astype(np.int64) @ [1 << 40, 1 << 20, 1], return_index=True)
-    return xyz[np.sort(first)]
+def _keep_one_per_cell(xyz: np.ndarray, cell_size: float = 0.25) -> np.ndarray:
+    """Subsample points (N, 3) to one per cell, so that the dense ground near the sensor does not dominate."""
+    _, indices = np.unique(np.floor(xyz / cell_size).astype(np.int64) @ [1 << 40, 1 << 20, 1], return_index=True)
+    return xyz[np.sort(indices)]
 
 
 def _fit_cell_means(xyz: np.ndarray) -> np.ndarray | None:
-    """Fit a plane to the mean points of cells, so that near ground does not dominate."""
+    """Fit a plane to the mean point of each cell, so that the dense ground near the sensor does not dominate."""
     if len(xyz) < 3:
         return None
     cells = np.floor(xyz[:, :2] / 0.5).astype(np.int64) @ [1 << 20, 1]
-    _, which, count = np.unique(cells, return_inverse=True, return_counts=True)
-    mean = np.column_stack([np.bincount(which, xyz[:, k]) / count for k in range(3)])
+    _, cell_index, count = np.unique(cells, return_inverse=True, return_counts=True)
+    mean = np.column_stack([np.bincount(cell_index, xyz[:, k]) / count for k in range(3)])
     return fit_plane(mean)
 
 
@@ -181,8 +182,8 @@ def _median_inlier_count(planes: Sequence[Plane | None]) -> float:
 def measure_mount(scans: Sequence[Scan]) -> Mount | None:
     """Measure height, roll and pitch of the sensor above the ground.
 
-    The sensor is upside down if a plane overhead is found in twice as many scans as a plane below,
-    or has far more points than the plane below, which may be a slice of a wall.
+    The sensor is upside down if a plane above is found in more than twice as many scans as a plane
+    below, or if the plane above has far more points. The plane below may be a slice of a wall.
 
     Returns:
         The mount; None if fewer than half of the scans show ground.
@@ -193,14 +194,14 @@ def measure_mount(scans: Sequence[Scan]) -> Mount | None:
         above_count >= below_count and _median_inlier_count(above) > UPSIDE_DOWN_RATIO * _median_inlier_count(below)
     )
     planes = above if upside_down else below
-    valid = [p for p in planes if p is not None]
-    if len(valid) * 2 < len(scans) or not valid:
+    valid_planes = [p for p in planes if p is not None]
+    if len(valid_planes) * 2 < len(scans) or not valid_planes:
         return None
-    rows = np.array([[p.height, np.unwrap([np.pi if upside_down else 0.0, p.roll])[1], p.pitch] for p in valid])
+    rows = np.array([[p.height, np.unwrap([np.pi if upside_down else 0.0, p.roll])[1], p.pitch] for p in valid_planes])
     median = np.median(rows, axis=0)
     spread = 1.4826 * np.median(np.abs(rows - median), axis=0)
-    scan_error = np.median([p.error for p in valid], axis=0)
-    # The spread between scans underestimates the error if all scans are of one place.
-    error = np.maximum(1.2533 * spread / np.sqrt(len(valid)), scan_error / np.sqrt(len(valid)))
+    scan_error = np.median([p.error for p in valid_planes], axis=0)
+    # The spread between scans underestimates the error if all scans are from one place.
+    error = np.maximum(1.2533 * spread / np.sqrt(len(valid_planes)), scan_error / np.sqrt(len(valid_planes)))
     roll = (median[1] + np.pi) % (2 * np.pi) - np.pi
     return Mount(float(median[0]), float(roll), float(median[2]), error, spread, list(planes), upside_down)

@@ -1,4 +1,4 @@
-"""Poses in a recording: the mount of the sensor, and the motion of the robot."""
+"""Recorded poses: the mount of the sensor, and the motion of the robot."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from lidar_perception.robot.placement import find_roll_pitch
 from lidar_perception.robot.poses import invert_pose
 from lidar_perception.robot.transform_tree import MissingTransform
 
-FOOTPRINT = "base_footprint"  # on the ground below base_link (REP-120)
+FOOTPRINT = "base_footprint"  # frame on the ground below base_link (REP-120)
 
 
 class RecordedPoses(NamedTuple):
     """Poses from the TF and odometry of a recording.
 
     Attributes:
-        base: Base frame of the robot, "" for none.
+        base: Base frame of the robot, "" if unknown.
         mount: (4, 4) pose of the sensor in the base; None if TF does not contain it.
         footprint: (4, 4) pose of the sensor in base_footprint; None if TF does not contain it.
-        poses: (4, 4) pose of the base (of the sensor, without a base) in a fixed frame, by number
-            of the cloud.
+        poses: (4, 4) pose of the base in a fixed frame, by cloud number; pose of the sensor if
+            there is no base.
         invalid_count: Number of transforms and odometry messages with invalid poses.
-        problem: Reason why most clouds have no pose although the recording has poses, else "".
+        problem: Reason why most clouds have no pose although the recording has poses; "" for none.
     """
 
     base: str = ""
@@ -55,7 +55,7 @@ class RecordedPoses(NamedTuple):
 
     @property
     def distance(self) -> float:
-        """Extent of the robot's path along x or y, the larger one, in metres; NaN without poses."""
+        """Larger extent of the robot's path along x and y, in metres; NaN without poses."""
         return float(np.ptp([pose[:2, 3] for pose in self.poses.values()], axis=0).max()) if self.poses else np.nan
 
 
@@ -67,26 +67,26 @@ def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int], stamps_n
 
     Args:
         poses: Poses of the bag; None for a recording without poses.
-        numbers: Numbers of the clouds whose poses are looked up.
+        numbers: Numbers of the clouds to look up.
         stamps_ns: Stamps of all clouds, ns; None if they have none.
     """
     if poses is None or stamps_ns is None or not (poses.base_frame or poses.odometry_topic):
         return NO_POSES
     base = poses.base_frame
     mount = poses.find_mount(base) if base else None
-    by_cloud = {}
+    cloud_poses = {}
     # Odometry without child_frame_id may be of another frame than the base.
     has_child = not poses.odometry_topic or poses.odometry_child_frame
     for number in numbers if has_child else ():
         pose = _find_base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))
         if pose is not None:
-            by_cloud[number] = pose
+            cloud_poses[number] = pose
     problem = ""
-    if 2 * len(by_cloud) < len(numbers) and poses.has_poses:
-        problem = f"{len(numbers) - len(by_cloud)} of {len(numbers)} clouds have no pose at their time"
+    if 2 * len(cloud_poses) < len(numbers) and poses.has_poses:
+        problem = f"{len(numbers) - len(cloud_poses)} of {len(numbers)} clouds have no pose at their time"
         if not has_child:
             problem = "the odometry has no child_frame_id"
-    return RecordedPoses(base, mount, poses.find_mount(FOOTPRINT), by_cloud, poses.invalid_count, problem)
+    return RecordedPoses(base, mount, poses.find_mount(FOOTPRINT), cloud_poses, poses.invalid_count, problem)
 
 
 def _find_base_pose(poses: BagPoses, stamp_ns: int, mount: np.ndarray | None) -> np.ndarray | None:

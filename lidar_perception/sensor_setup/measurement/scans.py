@@ -1,4 +1,4 @@
-"""Raw clouds with the columns of the driver, and the scale of their intensity."""
+"""Raw clouds of a driver, and the scale of their intensity."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from lidar_perception.wire.point_times import NAMES as TIMES
 from lidar_perception.wire.point_times import read_point_times
 from msg_utils.point_cloud2 import to_array
 
-# Columns with the beam number in the drivers of Velodyne, Ouster, Hesai, Nebula, Livox and RoboSense.
+# Names of the beam number column in the drivers of Velodyne, Ouster, Hesai, Nebula, Livox and RoboSense.
 RING_FIELDS = ("ring", "channel", "line", "laser_id", "laser_number", "row")
-MAX_MEDIAN_RANGE_M = 250.0  # maximum for a cloud in metres in the sensor's frame
+MAX_MEDIAN_RANGE_M = 250.0  # maximum median range of a cloud in metres in the sensor's frame
 MAX_SPREAD_M = 200.0  # maximum median distance to the cloud's centre for a cloud in metres in another frame
-MIN_ELEVATION_SPAN = 1.0  # in degrees; a sensor with a smaller span scans a plane
+MIN_ELEVATION_SPAN = 1.0  # minimum span of the elevations of a 3D sensor, in degrees
 MIN_POINTS = 100  # minimum number of usable points of a cloud
 
 
@@ -34,7 +34,7 @@ class Scan(NamedTuple):
         ground_range: (N,) m from the z axis.
         intensity: (N,) float64 in the scale of the cloud, or None.
         ring: (N,) int64 beam number, or None.
-        seconds: (N,) float64 seconds after the stamp, or None.
+        seconds: (N,) float64 seconds relative to the stamp, or None.
         stamp_ns: Stamp of the cloud, ns.
         frame_id: Frame of the cloud.
         columns: Names of the cloud's columns.
@@ -63,7 +63,8 @@ def read_scan(msg: Any, name: str = "the cloud") -> Scan:
         name: Name of the cloud in error messages.
 
     Raises:
-        InputError: The cloud has too few usable points, or its coordinates cannot be metres.
+        InputError: The cloud has too few usable points, or its coordinates are not metres in the
+            sensor's frame.
     """
     try:
         frame, indices = to_point_cloud(msg)
@@ -103,13 +104,13 @@ def read_scan(msg: Any, name: str = "the cloud") -> Scan:
 
 
 def _require_metres(xyz: np.ndarray, name: str) -> None:
-    """Raise InputError if points (N, 3), N > 0, cannot be metres from their sensor."""
+    """Raise InputError if points (N, 3), N > 0, cannot be in metres in the sensor's frame."""
     median_range = float(np.median(np.linalg.norm(xyz, axis=1)))
     if median_range <= MAX_MEDIAN_RANGE_M:
         return
     if np.median(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)) < MAX_SPREAD_M:
         raise InputError(
-            f"{name}: half of the points are farther than {median_range:.0f} m from the origin and near each "
+            f"{name}: half of the points are farther than {median_range:.0f} m from the origin, but close to each "
             "other, so the cloud is in a frame such as map; use the driver's own cloud"
         )
     raise InputError(
@@ -119,9 +120,9 @@ def _require_metres(xyz: np.ndarray, name: str) -> None:
 
 
 def require_3d(degrees: np.ndarray, name: str) -> None:
-    """Raise InputError if all elevations (N,), N > 0, in degrees, are equal, as from a 2D scanner."""
+    """Raise InputError if the elevations (N,), N > 0, in degrees, are those of a 2D scanner."""
     if np.subtract(*np.percentile(degrees, [99, 1])) < MIN_ELEVATION_SPAN:
-        raise InputError(f"{name}: all points are in one plane, as from a 2D scanner; use clouds of a 3D LiDAR")
+        raise InputError(f"{name}: all points are in one plane, like those of a 2D scanner; use clouds of a 3D LiDAR")
 
 
 def _read_column(points: np.ndarray, indices: np.ndarray, names: Sequence[str], dtype: type) -> np.ndarray | None:
@@ -135,31 +136,31 @@ class IntensityScale(NamedTuple):
     """Scale of the intensities of all scans.
 
     Attributes:
-        full_scale: Value of a full reflection, see intensity.infer_full_scale; the maximum if that
-            is far larger.
-        is_certain: The values are large enough to determine the scale.
-        is_integer: All values are whole numbers.
-        maximum: Largest value.
-        zero_share: Share of returns with intensity 0.
+        full_scale: Value of a full reflection, see intensity.infer_full_scale; the maximum value if
+            that is far larger.
+        is_certain: True if the values are large enough to determine the scale.
+        is_integer: True if all values are integers.
+        maximum: Maximum value.
+        zero_fraction: Fraction of returns with intensity 0.
     """
 
     full_scale: float
     is_certain: bool
     is_integer: bool
     maximum: float
-    zero_share: float
+    zero_fraction: float
 
 
 def measure_intensity(scans: Sequence[Scan]) -> IntensityScale | None:
-    """Measure the scale of the intensities; None if there are none, or all are equal."""
+    """Measure the scale of the intensities; None if there are none, or if all are equal."""
     values = np.concatenate([np.zeros(0), *(scan.intensity for scan in scans if scan.intensity is not None)])
     values = values[np.isfinite(values)]
     if not len(values) or values.min() == values.max():
         return None
     maximum = float(values.max())
-    sample = values[:: max(1, len(values) // 10_000)]  # over all scans, since one may begin with zeros
+    sample = values[:: max(1, len(values) // 10_000)]  # from all scans, because one may begin with zeros
     is_integer = bool((sample == np.round(sample)).all())
-    # No known driver sends whole numbers up to 1 as floats, so they count as integers.
+    # Whole numbers stored as floats count as integers: no known driver sends only 0.0 and 1.0.
     full_scale = infer_full_scale(values, np.int64 if is_integer else values.dtype)
     if maximum > MAX_UNIT * full_scale:
         full_scale = maximum

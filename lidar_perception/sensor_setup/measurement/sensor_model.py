@@ -11,7 +11,7 @@ from lidar_perception.sensor_setup.measurement.beams import Beams
 from lidar_perception.sensor_setup.measurement.measure import MIN_OUTDOOR_RANGE_M, SensorMeasurement
 from lidar_perception.simulation.sensor import Sensor, find_sensor
 
-DEFAULT_STEP = 0.2  # degrees between firings
+DEFAULT_STEP = 0.2  # azimuth step in degrees if it was not measured
 MODEL_FIELDS = (
     "divergence",
     "reach",
@@ -27,22 +27,23 @@ MODEL_FIELDS = (
 
 
 def make_sensor(m: SensorMeasurement) -> Sensor:
-    """Make a simulated sensor from a measurement; its z axis points up even if it is mounted upside down.
+    """Make a simulated sensor from a measurement.
 
-    Properties that clouds do not show, such as the divergence of the beams, are those of the model
-    with the same beams, or defaults. A sensor without beams becomes a grid with the same field of
-    view and number of points, whose beams wander.
+    Its z axis points up, even if the real sensor is mounted upside down. Properties that cannot be
+    measured from clouds, such as the divergence of the beams, are those of the model with the same
+    beams, or defaults. A sensor without beams becomes a grid of wandering beams with the same field
+    of view and number of points.
     """
     sensor = _make_in_sensor_frame(m)
     mount = m.mounting.mount
-    return sensor if mount is None or not mount.upside_down else _turn_upside_down(sensor)
+    return sensor if mount is None or not mount.upside_down else _flip_sensor(sensor)
 
 
-def _turn_upside_down(sensor: Sensor) -> Sensor:
-    """Rotate a sensor by 180 degrees about its x axis. Its blocked sectors must hide all beams."""
+def _flip_sensor(sensor: Sensor) -> Sensor:
+    """Rotate a sensor by 180 degrees about its x axis. Its sectors must block all beams."""
     return replace(
         sensor,
-        elevations=tuple(sensor.wander - up for up in reversed(sensor.elevations)),
+        elevations=tuple(sensor.wander - elevation for elevation in reversed(sensor.elevations)),
         lifts=tuple(-lift for lift in reversed(sensor.lifts)),
         blocked=tuple((first, -end % 360, -start % 360 or 360.0) for first, start, end in sensor.blocked),
     )
@@ -63,13 +64,13 @@ def _make_in_sensor_frame(m: SensorMeasurement) -> Sensor:
         fields["height"] = round(mounting.mount.height, 3)
     elif mounting.height_hint is not None:
         fields["height"] = mounting.height_hint
-    # The measured minimum is used only if it is smaller, since there may be no surface near the sensor.
+    # The measured minimum is used only if it is smaller: there may have been no surface near the sensor.
     min_range = fields.get("min_range", Sensor.min_range)
     if m.view.min_range < min_range:
         fields["min_range"] = float(np.floor(100 * m.view.min_range) / 100)
     if pattern.beams is None:
         return _make_grid(m, fields)
-    # Sectors that hide only lower beams are reliable if the robot moved, and if the sensor is level.
+    # Sectors that block only the lower beams are reliable only if the robot moved and the sensor is level.
     has_moved = coverage.stationary is False and not m.source.has_few_scans
     is_level = mounting.mount is not None and mounting.mount.is_level
     fields["blocked"] = tuple(b for b in coverage.blocked if (has_moved and is_level) or b[0] == 0)
@@ -81,9 +82,9 @@ def _make_in_sensor_frame(m: SensorMeasurement) -> Sensor:
 
 
 def _select_beams(beams: Beams, model: Sensor | None, fields: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the elevations (rad) and lifts of the model, or measured ones for None.
+    """Return the elevations (rad) and lifts (m) of the model, or measured ones without a model.
 
-    Beam numbers in fields["blocked"] are converted to those of the model.
+    The beam numbers in fields["blocked"] are converted to those of the model.
     """
     elevations = np.radians(np.round(beams.elevations, 4))
     if model is None:
@@ -100,15 +101,15 @@ def _make_grid(m: SensorMeasurement, fields: dict[str, Any]) -> Sensor:
     high, low = np.percentile(elevations, [99.8, 0.2])
     points = np.median([len(scan.xyz) for scan in m.source.scans])
     start, end = m.view.coverage.view
-    share = ((end - start) % 360 or 360) / 360
-    rows = int(np.clip(np.sqrt(points / share * (high - low) / 360), 4, 128))
-    gap = (high - low) / rows
-    columns = int(np.clip(points / share / rows, 90, 4000))
-    if share < 1:
+    fraction = ((end - start) % 360 or 360) / 360
+    rows = int(np.clip(np.sqrt(points / fraction * (high - low) / 360), 4, 128))
+    spacing = (high - low) / rows
+    columns = int(np.clip(points / fraction / rows, 90, 4000))
+    if fraction < 1:
         fields["blocked"] = ((0, end, start),)
     return Sensor(
-        tuple(np.radians(high - gap * np.arange(rows)).tolist()),
+        tuple(np.radians(high - spacing * np.arange(rows)).tolist()),
         2 * np.pi / columns,
-        wander=float(np.radians(gap)),
+        wander=float(np.radians(spacing)),
         **fields,
     )

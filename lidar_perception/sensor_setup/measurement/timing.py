@@ -1,4 +1,4 @@
-"""Rate of the sensor, and clouds missing between the recorded ones."""
+"""Rate of the sensor, and number of missing clouds."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-# Clouds are missing if two stamps are this many median periods apart. Longer gaps separate drives.
+# Range of gaps between stamps, in median periods, in which clouds are missing. Longer gaps separate drives.
 MIN_GAP, MAX_GAP = 1.5, 1000
-MIN_RATE, MAX_RATE = 0.5, 100.0  # turns per second of real sensors
+MIN_RATE, MAX_RATE = 0.5, 100.0  # rates of real sensors, in revolutions per second
 MIN_STAMPS = 4  # minimum number of stamps to compute a rate
 
 
@@ -19,9 +19,9 @@ class Timing(NamedTuple):
     """Timing of the clouds.
 
     Attributes:
-        rate: Turns per second, NaN if unknown.
+        rate: Revolutions per second, NaN if unknown.
         source: Source of the rate: "stamps", "times of the points" or "nothing".
-        missing_count: Number of clouds missing between the recorded ones.
+        missing_count: Number of missing clouds between the recorded ones.
         backward_count: Number of stamps that are not later than the previous one.
     """
 
@@ -35,7 +35,7 @@ def measure_timing(scans: Sequence[Scan], stamps_ns: np.ndarray | None) -> Timin
     """Measure the rate of the sensor, and count missing clouds.
 
     Args:
-        scans: Scans. Without stamps, the times of their points give the rate.
+        scans: The scans. Without stamps, the rate comes from the times of their points.
         stamps_ns: (M,) stamps of all clouds in ns; None if they have none.
     """
     spans = [float(np.nanmax(s.seconds) - np.nanmin(s.seconds)) for s in scans if s.seconds is not None]

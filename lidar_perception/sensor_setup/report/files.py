@@ -56,24 +56,24 @@ def format_sensor(m: SensorMeasurement) -> str:
 
 def format_params(m: SensorMeasurement) -> str:
     """Return the text of robot.param.yaml, with the reason for the value of each parameter."""
-    chosen = choose_params(m)
-    about = "All other parameters keep their defaults. Nodes ignore parameters that they do not have."
-    lines = [_format_header(m, f"{_describe_origin(m)} {about}"), "/**:"]
+    choices = choose_params(m)
+    note = "All other parameters keep their defaults. Nodes ignore parameters that they do not have."
+    lines = [_format_header(m, f"{_describe_origin(m)} {note}"), "/**:"]
     tree: dict[str, Any] = {}
-    for name, (value, reason) in chosen.items():
-        *path, last = name.split(".")
+    for name, (value, reason) in choices.items():
+        *path, leaf = name.split(".")
         branch = tree
         for part in path:
             branch = branch.setdefault(part, {})
-        branch[last] = (value, reason)
-    lines += ["  ros__parameters:", *_format_tree(tree, 4)] if chosen else ["  ros__parameters: {}"]
+        branch[leaf] = (value, reason)
+    lines += ["  ros__parameters:", *_format_tree(tree, 4)] if choices else ["  ros__parameters: {}"]
     return "\n".join(lines) + "\n"
 
 
 def _explain_sensor(m: SensorMeasurement, sensor: Sensor) -> dict[str, str]:
     """Return a comment for each value of sensor.yaml."""
     pattern, mounting, view = m.pattern, m.mounting, m.view
-    unmeasured = "not measured; " + (f"that of {pattern.model}" if pattern.model else "a default")
+    unmeasured = "not measured; " + (f"value of {pattern.model}" if pattern.model else "default value")
     height = "not measured: no ground in view" if mounting.height_hint is None else HINT_REASON
     if mounting.mount is not None:
         height = f"+- {mounting.mount.error[0]:.3f}"
@@ -81,7 +81,7 @@ def _explain_sensor(m: SensorMeasurement, sensor: Sensor) -> dict[str, str]:
     return {
         "height": height,
         "rate": f"from {m.timing.source}" if np.isfinite(m.timing.rate) else "not measured",
-        "azimuth_step": f"{sensor.columns} firings per turn",
+        "azimuth_step": f"{sensor.columns} firings per revolution",
         "min_range": "nearest return outside the robot's body" if has_min_range else unmeasured,
         "max_range": "farthest return" if view.max_range >= MIN_OUTDOOR_RANGE_M else unmeasured,
         "range_noise": unmeasured if np.isnan(pattern.range_noise) else "on smooth surfaces",
@@ -113,13 +113,15 @@ def _format_list(name: str, values: Sequence[float] | np.ndarray, digits: int) -
 
 
 def _format_tree(tree: Mapping[str, Any], indent: int) -> list[str]:
-    lines, pad = [], " " * indent
+    lines, indentation = [], " " * indent
     for name, value in tree.items():
         if isinstance(value, dict):
-            lines += [f"{pad}{name}:", *_format_tree(value, indent + 2)]
+            lines += [f"{indentation}{name}:", *_format_tree(value, indent + 2)]
             continue
-        number, reason = value
+        parameter_value, reason = value
         for line in reason.split("\n"):
-            lines += textwrap.wrap(line, LINE_WIDTH - indent, initial_indent=f"{pad}# ", subsequent_indent=f"{pad}# ")
-        lines.append(f"{pad}{name}: {format_value(number)}")
+            lines += textwrap.wrap(
+                line, LINE_WIDTH - indent, initial_indent=f"{indentation}# ", subsequent_indent=f"{indentation}# "
+            )
+        lines.append(f"{indentation}{name}: {format_value(parameter_value)}")
     return lines

@@ -1,4 +1,4 @@
-"""Parameters of the nodes chosen for a measured sensor, each with its reason."""
+"""Choice of node parameters for a measured sensor, each with its reason."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from lidar_perception.sensor_setup.measurement.mount import Mount
 from lidar_perception.sensor_setup.measurement.recorded_poses import FOOTPRINT
 from lidar_perception.types import InputError
 
-Choices = dict[str, tuple[Any, str]]  # value and reason by name of the parameter
+Choices = dict[str, tuple[Any, str]]  # parameter name -> (value, reason)
 
-# The paper's neighbourhoods (0.15, 0.30, 0.50 m up to 15, 30, 45 m) are this multiple of the beam
-# spacing of the HDL-64E at the end of each band.
-EPS_BEAMS = 1.33
+# DBSCAN radius at the end of a range band, as a multiple of the beam spacing there. The paper's values (0.15,
+# 0.30 and 0.50 m up to 15, 30 and 45 m) have this ratio for the HDL-64E.
+EPS_RATIO = 1.33
 RANGE_LIMITS_M = (15.0, 30.0, 45.0)  # range limits of the bands; the paper has the first two
 MAX_EPS_M = (0.5, 0.7, 0.9, 1.0)  # maximum eps per band; larger values merge people who walk side by side
 MIN_SAMPLES = 3
-DENSITY_SHARE = 0.75  # fraction of the sensor's density, so that clouds of this sensor do not count as sparse
-NO_INTENSITY_MAX = 1e9  # full scale at which every intensity is read as 0
-MIN_RANGE_SHARE = 0.9  # fraction of the distance to the nearest ground at which Patchwork++ starts
+DENSITY_FACTOR = 0.75  # clustering.density relative to the sensor's density; below 1 so that its clouds are not sparse
+NO_INTENSITY_MAX = 1e9  # full scale with which every intensity becomes 0
+MIN_RANGE_RATIO = 0.9  # minimum range of Patchwork++, relative to the distance of the nearest ground
 PATCHWORK_RANGE_M = 80.0  # default of ground.patchwork.max_range
 HINT_REASON = "from --height-hint; no ground in view"
 
@@ -39,25 +39,25 @@ def choose_params(m: SensorMeasurement) -> Choices:
     Raises:
         InputError: A value is out of the range of its parameter.
     """
-    chosen = _choose_intensity(m) | _choose_crop(m)
+    choices = _choose_intensity(m) | _choose_crop(m)
     mount = m.mounting.mount
     if mount is not None:
-        chosen |= _choose_ground(m, mount)
+        choices |= _choose_ground(m, mount)
     elif m.mounting.height_hint is not None:
-        chosen["ground.sensor_pose.height"] = (m.mounting.height_hint, HINT_REASON)
+        choices["ground.sensor_pose.height"] = (m.mounting.height_hint, HINT_REASON)
     max_range = float(np.clip(np.ceil(m.view.max_range), 20.0, 200.0))
     if max_range < PATCHWORK_RANGE_M and m.view.max_range > MIN_OUTDOOR_RANGE_M:
-        chosen["ground.patchwork.max_range"] = (max_range, "no return is farther")
+        choices["ground.patchwork.max_range"] = (max_range, "no return is farther")
     if m.pattern.beams is not None and np.isfinite(m.pattern.azimuth_step):
-        chosen |= _choose_clustering(m)
+        choices |= _choose_clustering(m)
     try:
-        with_values(PipelineParams(), {name: value for name, (value, _) in chosen.items()})
+        with_values(PipelineParams(), {name: value for name, (value, _) in choices.items()})
     except ValueError as error:
         raise InputError(
             f"{m.source.name}: the measured values are out of range: {error}; "
-            "give clouds in metres, of a sensor on a robot or a vehicle"
+            "use clouds in metres, from a sensor on a robot or a vehicle"
         ) from None
-    return chosen | _choose_ahead(m)
+    return choices | _choose_ahead(m)
 
 
 def format_value(value: Any) -> str:
@@ -74,7 +74,7 @@ def _choose_intensity(m: SensorMeasurement) -> Choices:
         return {"input.intensity_max": (m.intensity.full_scale, reason)}
     if scan.intensity is None or not scan.intensity.any():
         return {}
-    reason = "intensities are constant and carry no information: read as 0, as in sensor.yaml"
+    reason = "intensities are constant and carry no information: set to 0, as in sensor.yaml"
     return {"input.intensity_max": (NO_INTENSITY_MAX, reason)}
 
 
@@ -83,14 +83,14 @@ def _choose_crop(m: SensorMeasurement) -> Choices:
     if not coverage.can_crop:
         return {}
     reason = (
-        f"around the returns of the robot's body, {100 * coverage.body_share:.1f} % of all; "
-        f"{100 * coverage.foreign_share:.0f} % of the points in the box are not of the body" + _describe_base_box(m)
+        f"around the returns of the robot's body, {100 * coverage.body_fraction:.1f} % of all; "
+        f"{100 * coverage.foreign_fraction:.0f} % of the points in the box are not on the body" + _describe_base_box(m)
     )
     return {"crop.body": (tuple(round(float(v), 2) for v in coverage.box), reason)}
 
 
 def _describe_base_box(m: SensorMeasurement) -> str:
-    """Describe the body's box in base_frame: the box around the corners of the box in the sensor's frame."""
+    """Describe the body's box in base_frame, which encloses the box in the sensor's frame."""
     pose, frame = m.mounting.recorded.footprint, f"in '{FOOTPRINT}' by TF"
     if pose is None and m.mounting.mount is not None:
         pose = m.mounting.mount.pose
@@ -105,10 +105,10 @@ def _describe_base_box(m: SensorMeasurement) -> str:
 
 
 def _choose_ground(m: SensorMeasurement, mount: Mount) -> Choices:
-    chosen: Choices = {"ground.sensor_pose.height": (round(mount.height, 3), f"+- {mount.error[0]:.3f} m")}
+    choices: Choices = {"ground.sensor_pose.height": (round(mount.height, 3), f"+- {mount.error[0]:.3f} m")}
     for name, value, error in (("roll", mount.roll, mount.error[1]), ("pitch", mount.pitch, mount.error[2])):
         reason = f"{np.degrees(value):.2f} +- {np.degrees(error):.2f} degrees"
-        chosen[f"ground.sensor_pose.{name}"] = (round(value, 4), reason)
+        choices[f"ground.sensor_pose.{name}"] = (round(value, 4), reason)
     distances = []
     for scan, plane in zip(m.source.scans, mount.planes):
         if plane is not None:
@@ -116,20 +116,20 @@ def _choose_ground(m: SensorMeasurement, mount: Mount) -> Choices:
             distances.append(np.percentile(np.hypot(*ground[:, :2].T), 1))
     nearest = float(np.median(distances))
     reason = f"the nearest ground is {nearest:.1f} m away"
-    return chosen | {"ground.patchwork.min_range": (round(MIN_RANGE_SHARE * nearest, 1), reason)}
+    return choices | {"ground.patchwork.min_range": (round(MIN_RANGE_RATIO * nearest, 1), reason)}
 
 
 def _choose_ahead(m: SensorMeasurement) -> Choices:
     heading, recorded = m.mounting.heading, m.mounting.recorded
     if heading is None or not heading.is_off_axis or heading.may_be_reversed:
         return {}
-    agrees = abs(wrap_degrees(recorded.heading - heading.degrees)) <= MAX_OFF_AXIS
+    tf_agrees = abs(wrap_degrees(recorded.heading - heading.degrees)) <= MAX_OFF_AXIS
     reason = (
         "forward direction of the detectors, not the clouds' x axis: "
         f"{heading.degrees:.0f} +- {heading.error:.0f} degrees by the clouds"
         + (f", {recorded.heading:.0f} by TF" if np.isfinite(recorded.heading) else "")
     )
-    return {"input.ahead": (float(round(recorded.heading if agrees else heading.degrees)), reason)}
+    return {"input.ahead": (float(round(recorded.heading if tf_agrees else heading.degrees)), reason)}
 
 
 def _choose_clustering(m: SensorMeasurement) -> Choices:
@@ -137,20 +137,21 @@ def _choose_clustering(m: SensorMeasurement) -> Choices:
     default = flatten(PipelineParams())
     default_area = default["resolution.elevation_step"] * default["resolution.azimuth_step"]
     relative_density = default_area / (elevation_step * azimuth_step)
-    gaps = [np.radians(elevation_step) * limit for limit in (*RANGE_LIMITS_M, RANGE_LIMITS_M[-1] * 1.3)]
+    beam_spacing = [np.radians(elevation_step) * limit for limit in (*RANGE_LIMITS_M, RANGE_LIMITS_M[-1] * 1.3)]
     min_eps = (*default["clustering.dbscan.eps"], 0.7)
     eps = tuple(
-        round(float(min(max(EPS_BEAMS * gap, low), high)), 2) for gap, low, high in zip(gaps, min_eps, MAX_EPS_M)
+        round(float(min(max(EPS_RATIO * spacing, low), high)), 2)
+        for spacing, low, high in zip(beam_spacing, min_eps, MAX_EPS_M)
     )
     default_samples = default["clustering.dbscan.min_samples"]
     min_samples = int(np.clip(round(default_samples * relative_density), MIN_SAMPLES, default_samples))
     density = 1.0 / (elevation_step * azimuth_step)
     adapted = adapt_to_density(ClusteringParams(density=FULL_DENSITY), density).euclidean
     return {
-        "clustering.dbscan.range_limits": (RANGE_LIMITS_M, "a fourth band, as the resolution allows"),
+        "clustering.dbscan.range_limits": (RANGE_LIMITS_M, "a fourth band, because the resolution is high enough"),
         "clustering.dbscan.eps": (
             eps,
-            f"{EPS_BEAMS} times the beam spacing at the end of each band, at least the paper's, "
+            f"{EPS_RATIO} times the beam spacing at the end of each band, at least the paper's, "
             "and small enough not to merge people",
         ),
         "clustering.dbscan.join_bands": (True, "no cluster is cut at the end of a band"),
@@ -159,7 +160,7 @@ def _choose_clustering(m: SensorMeasurement) -> Choices:
             f"10 for the HDL-64E; the sensor has {relative_density:.2f} times as many points on a surface",
         ),
         "clustering.density": (
-            round(min(FULL_DENSITY, DENSITY_SHARE * density), 2),
+            round(min(FULL_DENSITY, DENSITY_FACTOR * density), 2),
             f"the values here are for {density:.1f} points per square degree; "
             "in sparser clouds they adapt to the density",
         ),

@@ -1,4 +1,4 @@
-"""Table of the measured values."""
+"""Table of measured values."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from lidar_perception.intensity import INTENSITY_FIELDS
 from lidar_perception.sensor_setup.measurement.measure import MIN_OUTDOOR_RANGE_M, SensorMeasurement
 from lidar_perception.sensor_setup.measurement.scans import RING_FIELDS
-from lidar_perception.sensor_setup.report.warnings import MAX_SLOPE_SPREAD, MIN_TURN_S, check_recorded_poses
+from lidar_perception.sensor_setup.report.warnings import MAX_SLOPE_SPREAD, MIN_REVOLUTION_S, check_recorded_poses
 from lidar_perception.wire.point_times import NAMES as TIME_FIELDS
 
 HIGH, FAIR, LOW = "high", "fair", "low"  # levels of confidence
@@ -28,7 +28,7 @@ class MeasuredValue(NamedTuple):
 
 
 def list_values(m: SensorMeasurement) -> list[MeasuredValue]:
-    """Return every measured value."""
+    """List all measured values."""
     rows = chain(
         _describe_beams(m),
         _describe_view(m),
@@ -55,22 +55,22 @@ def _describe_beams(m: SensorMeasurement) -> Rows:
         LOW if error > 0.3 else FAIR if error > 0.05 or p.is_moved else HIGH,
     )
     yield "model", p.model or "none of config/sensors", HIGH if p.model else FAIR
-    yield "azimuth step", f"{p.azimuth_step:.4f} deg, {360 / p.azimuth_step:.0f} in a turn", HIGH
+    yield "azimuth step", f"{p.azimuth_step:.4f} deg, {360 / p.azimuth_step:.0f} per revolution", HIGH
     yield "range noise", f"{100 * p.range_noise:.1f} cm", LOW if np.isnan(p.range_noise) else FAIR
 
 
 def _describe_view(m: SensorMeasurement) -> Rows:
     c, has_few_scans = m.view.coverage, m.source.has_few_scans
     start, end = c.view
-    is_full_turn = (start, end) == (0.0, 360.0)
-    field_of_view = "360 deg" if is_full_turn else f"{(end - start) % 360:.0f} deg, from {start:.0f} to {end:.0f}"
+    is_full_circle = (start, end) == (0.0, 360.0)
+    field_of_view = "360 deg" if is_full_circle else f"{(end - start) % 360:.0f} deg, from {start:.0f} to {end:.0f}"
     yield "field of view", field_of_view, LOW if has_few_scans else HIGH
     hidden = sum((b - a) % 360 or 360 for _, a, b in c.blocked)
-    yield "blind sectors", f"{len(c.blocked)}, {hidden:.0f} deg together", LOW if has_few_scans else FAIR
+    yield "blind sectors", f"{len(c.blocked)}, {hidden:.0f} deg in total", LOW if has_few_scans else FAIR
     body = "none found"
     if len(c.box):
         low, high = _format_point(c.box[:3]), _format_point(c.box[3:])
-        body = f"{100 * c.body_share:.1f} % of the points, from {low} to {high} m"
+        body = f"{100 * c.body_fraction:.1f} % of the points, from {low} to {high} m"
     is_body_certain = c.stationary is False and not has_few_scans and (c.can_crop or not len(c.box))
     yield "body", body, FAIR if is_body_certain else LOW
     is_outdoors = m.view.max_range > MIN_OUTDOOR_RANGE_M
@@ -87,14 +87,14 @@ def _describe_columns(m: SensorMeasurement) -> Rows:
     if intensity is not None:
         yield (
             "intensity",
-            f"0 to {intensity.full_scale:g}{' in whole numbers' if intensity.is_integer else ''}, "
-            f"0 for {100 * intensity.zero_share:.1f} % of the points",
+            f"0 to {intensity.full_scale:g}{' in integers' if intensity.is_integer else ''}, "
+            f"0 for {100 * intensity.zero_fraction:.1f} % of the points",
             HIGH if intensity.is_certain else LOW,
         )
     if scan.seconds is not None:
         low, high = float(np.nanmin(scan.seconds)), float(np.nanmax(scan.seconds))
         span = f"{1000 * low:.1f} to {1000 * high:.1f} ms after header.stamp"
-        yield "time of points", span, HIGH if high - low > MIN_TURN_S else LOW
+        yield "time of points", span, HIGH if high - low > MIN_REVOLUTION_S else LOW
 
 
 def _describe_mount(m: SensorMeasurement) -> Rows:
@@ -103,7 +103,7 @@ def _describe_mount(m: SensorMeasurement) -> Rows:
         yield "height", "unknown: no ground in view", LOW
         return
     error, spread = np.degrees(mount.error), np.degrees(mount.spread)
-    # In one place, the slope of the ground looks like a tilt of the sensor.
+    # In a single place, a slope of the ground cannot be distinguished from a tilt of the sensor.
     has_moved = not m.source.has_few_scans and not m.view.coverage.stationary
     is_certain = has_moved and spread[1:].max() < MAX_SLOPE_SPREAD and not m.pattern.is_moved
     confidence = HIGH if is_certain else FAIR
@@ -131,7 +131,7 @@ def _describe_heading(m: SensorMeasurement) -> Rows:
 
 def _describe_timing(m: SensorMeasurement) -> Rows:
     t, frame_ids = m.timing, m.source.frame_ids
-    rate = "unknown" if np.isnan(t.rate) else f"{t.rate:.2f} turns per second, from {t.source}"
+    rate = "unknown" if np.isnan(t.rate) else f"{t.rate:.2f} revolutions per second, from {t.source}"
     yield "rate", rate, {"stamps": HIGH, "nothing": LOW}.get(t.source, FAIR)
     if t.source == "stamps":
         yield "losses", f"{t.missing_count} of {m.source.total + t.missing_count} clouds", HIGH

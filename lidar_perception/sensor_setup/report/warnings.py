@@ -12,14 +12,14 @@ from lidar_perception.sensor_setup.measurement.motion import MAX_OFF_AXIS, wrap_
 from lidar_perception.sensor_setup.measurement.recorded_poses import FOOTPRINT
 from lidar_perception.simulation.sensor import find_sensor
 
-MAX_SLOPE_SPREAD = 1.0  # maximum variation of the slope between scans of level ground, in degrees
-MAX_HEIGHT_M = 5.0  # highest plausible mount of a sensor
-MAX_TILT = 6.0  # maximum roll or pitch in degrees that needs no check in a second place
-MAX_TILT_DIFFERENCE = 2.0  # tolerance between TF and ground in degrees, beyond the error; allows for road camber
+MAX_SLOPE_SPREAD = 1.0  # maximum variation of the slope of level ground between scans, in degrees
+MAX_HEIGHT_M = 5.0  # maximum plausible height of a sensor
+MAX_TILT = 6.0  # maximum roll or pitch, in degrees, that is plausible from one place
+MAX_TILT_DIFFERENCE = 2.0  # tolerance between TF and ground in degrees, in addition to the error, for road camber
 MAX_HEIGHT_DIFFERENCE_M = 0.1  # tolerance between the ground and TF or --height-hint
-MAX_MISSING_SHARE = 0.01  # maximum fraction of missing clouds
-MIN_GROUND_SHARE = 0.9  # minimum fraction of scans with ground
-MIN_TURN_S = 0.02  # minimum span of the point times of a revolution
+MAX_MISSING_FRACTION = 0.01  # maximum fraction of missing clouds
+MIN_GROUND_FRACTION = 0.9  # minimum fraction of scans with ground
+MIN_REVOLUTION_S = 0.02  # minimum time span of the points of one revolution
 MAX_SECOND_RETURNS = 0.05  # maximum fraction of second returns
 
 
@@ -44,7 +44,7 @@ def _check_motion(m: SensorMeasurement) -> Iterator[str]:
             "record a few minutes of driving"
         )
     elif m.view.coverage.stationary:
-        yield "the robot stands still: its body cannot be told from its surroundings; record while it drives"
+        yield "the robot stands still: its body cannot be distinguished from its surroundings; record while it drives"
     elif m.view.coverage.stationary is None:
         yield (
             f"cannot tell whether the robot moved: too few directions have returns beyond {MIN_FAR_M:.0f} m "
@@ -62,7 +62,7 @@ def _check_beams(m: SensorMeasurement) -> Iterator[str]:
     if beams is None:
         yield (
             "no beams found: the scan pattern does not repeat, clouds were merged or motion-corrected, or their "
-            "frame is rotated against the sensor; sensor.yaml describes a grid with the same field of view; "
+            "frame is rotated relative to the sensor; sensor.yaml describes a grid with the same field of view; "
             "record the driver's own cloud if possible"
         )
         return
@@ -115,7 +115,7 @@ def _check_mount(m: SensorMeasurement) -> Iterator[str]:
             "axis; if only the driver's frame has z down, rotate that frame instead"
         )
     ground_count = sum(plane is not None for plane in mount.planes)
-    if ground_count < MIN_GROUND_SHARE * len(scans):
+    if ground_count < MIN_GROUND_FRACTION * len(scans):
         yield (
             f"ground was found in only {ground_count} of {len(scans)} scans; record where the floor around the "
             "robot is free"
@@ -134,8 +134,8 @@ def _check_mount(m: SensorMeasurement) -> Iterator[str]:
     tilt = np.degrees([np.arctan2(np.sin(mount.roll), abs(np.cos(mount.roll))), mount.pitch])
     if np.abs(tilt).max() > MAX_TILT and (m.source.has_few_scans or m.view.coverage.stationary):
         yield (
-            f"the sensor is tilted by {np.abs(tilt).max():.0f} deg against the ground, because of its mount or of a "
-            "slope; record in several places"
+            f"the sensor is tilted by {np.abs(tilt).max():.0f} deg relative to the ground, because of its mount or "
+            "of a slope; record in several places"
         )
 
 
@@ -143,11 +143,13 @@ def _check_heading(m: SensorMeasurement) -> Iterator[str]:
     heading = m.mounting.heading
     if heading is None or len(m.source.scans) == 1:
         return  # missing ground or motion has its own warning
-    direction = f"the robot drives towards {heading.degrees:.0f} deg from the cloud's x axis, where detectors look"
+    direction = (
+        f"the robot drives towards {heading.degrees:.0f} deg from the cloud's x axis, which detectors take as forward"
+    )
     if heading.problem:
         yield (
             f"yaw unknown: {heading.problem}; record while the robot drives a few metres straight ahead, or check "
-            "that x of the clouds points ahead"
+            "that x of the clouds points forward"
         )
     elif heading.is_off_axis and heading.may_be_reversed:
         yield (
@@ -157,12 +159,12 @@ def _check_heading(m: SensorMeasurement) -> Iterator[str]:
     elif heading.is_off_axis:
         yield (
             f"{direction}: input.ahead corrects this in the nodes; for commands that read the recording, make a bag "
-            "with x ahead: convert --robot robot.param.yaml"
+            "whose x axis points forward: convert --robot robot.param.yaml"
         )
 
 
 def check_recorded_poses(m: SensorMeasurement) -> Iterator[str]:
-    """Yield warnings about invalid TF and odometry, and where they contradict the clouds."""
+    """Yield warnings about invalid TF and odometry, and about contradictions to the clouds."""
     recorded, mount, heading = m.mounting.recorded, m.mounting.mount, m.mounting.heading
     if recorded.invalid_count:
         yield (
@@ -171,20 +173,20 @@ def check_recorded_poses(m: SensorMeasurement) -> Iterator[str]:
         )
     if recorded.problem:
         yield (
-            f"the motion of the robot is measured from clouds alone: {recorded.problem}; record odometry or TF "
+            f"the motion of the robot is measured only from clouds: {recorded.problem}; record odometry or TF "
             "during the whole drive, with the base as child_frame_id and the same clock as the clouds"
         )
     if mount is not None and recorded.mount is not None:
         tilt, error = np.degrees([mount.roll, mount.pitch]), np.degrees(mount.error[1:])
         if (np.abs(wrap_degrees(tilt - recorded.roll_pitch)) > MAX_TILT_DIFFERENCE + 2 * error).any():
             yield (
-                f"TF has the sensor in '{recorded.base}' with roll {recorded.roll_pitch[0]:.1f} and pitch "
+                f"by TF, the sensor in '{recorded.base}' has roll {recorded.roll_pitch[0]:.1f} and pitch "
                 f"{recorded.roll_pitch[1]:.1f} deg, but the ground shows {tilt[0]:.1f} and {tilt[1]:.1f}; correct "
                 "the URDF, which base_frame uses, or do not set base_frame"
             )
     if mount is not None and abs(mount.height - recorded.height) > MAX_HEIGHT_DIFFERENCE_M + 2 * mount.error[0]:
         yield (
-            f"TF has the sensor {recorded.height:.2f} m above '{FOOTPRINT}', but it is {mount.height:.2f} m above "
+            f"by TF, the sensor is {recorded.height:.2f} m above '{FOOTPRINT}', but it is {mount.height:.2f} m above "
             "the ground; correct the URDF, which base_frame uses"
         )
     if heading is not None and not heading.problem and recorded.mount is not None:
@@ -199,21 +201,21 @@ def check_recorded_poses(m: SensorMeasurement) -> Iterator[str]:
 def _check_columns(m: SensorMeasurement) -> Iterator[str]:
     if m.intensity is None:
         yield (
-            "there is no intensity, or it is constant: detectors trained with intensity lose accuracy; turn it on "
-            "in the driver, or train with --sensor sensor.yaml, which simulates none either (silent: 1)"
+            "the clouds have no intensity, or it is constant: detectors trained with intensity lose accuracy; turn it "
+            "on in the driver, or train with --sensor sensor.yaml, which also has no intensity (silent: 1)"
         )
     elif not m.intensity.is_certain:
         yield (
             f"the full scale of the intensity ({m.intensity.full_scale:g}) is a guess: the highest value is "
             f"{m.intensity.maximum:g}, because no retroreflector was in view or the driver has another scale; look "
-            "it up and set input.intensity_max"
+            "it up in the manual and set input.intensity_max"
         )
     scan = m.source.scans[0]
     times = scan.seconds
-    if times is not None and np.nanmax(times) - np.nanmin(times) < MIN_TURN_S:
+    if times is not None and np.nanmax(times) - np.nanmin(times) < MIN_REVOLUTION_S:
         yield (
-            f"the times of the points span only {1000 * np.ptp(times):.1f} ms, not a whole turn: they have another "
-            "meaning or unit; do not use them for motion correction"
+            f"the times of the points span only {1000 * np.ptp(times):.1f} ms, less than a revolution: they have "
+            "another meaning or unit; do not use them for motion correction"
         )
     if scan.time_problem:
         yield f"{scan.time_problem}; motion correction cannot use this column"
@@ -222,7 +224,7 @@ def _check_columns(m: SensorMeasurement) -> Iterator[str]:
 def _check_timing(m: SensorMeasurement) -> Iterator[str]:
     if not np.isfinite(m.timing.rate):
         yield "the rate is unknown: the clouds have neither stamps nor point times; set rate in sensor.yaml"
-    if m.timing.missing_count > MAX_MISSING_SHARE * m.source.total:
+    if m.timing.missing_count > MAX_MISSING_FRACTION * m.source.total:
         yield (
             f"{m.timing.missing_count} clouds are missing between the stamps: the recorder or the network lost them; "
             "see docs/explanation/reliability.md"
@@ -239,16 +241,17 @@ def _check_view(m: SensorMeasurement) -> Iterator[str]:
     if m.view.max_range < MIN_OUTDOOR_RANGE_M:
         yield (
             f"no return is farther than {m.view.max_range:.0f} m: the room limits the range, not the sensor; "
-            "max_range in sensor.yaml is " + ("that of the model" if m.pattern.model else "a guess")
+            "max_range in sensor.yaml is " + ("the value of the model" if m.pattern.model else "a guess")
         )
     if coverage.has_walls:
         yield (
-            "constant surroundings, such as walls along the path, cannot be told from the robot's body: crop.body "
-            "and the sectors hidden by the body are not set; record a drive in an open place, or set crop.body by hand"
+            "constant surroundings, such as walls along the path, cannot be distinguished from the robot's body: "
+            "crop.body and the sectors hidden by the body are not set; record a drive in an open place, or set "
+            "crop.body by hand"
         )
     elif len(coverage.box) and not coverage.can_crop:
         yield (
-            f"{100 * coverage.foreign_share:.0f} % of the points in the box around the robot's body are not returns "
+            f"{100 * coverage.foreign_fraction:.0f} % of the points in the box around the robot's body are not returns "
             "of the robot: crop.body and the sectors hidden by the body are not set; set crop.body by hand"
         )
     if m.pattern.second_returns > MAX_SECOND_RETURNS:

@@ -15,10 +15,11 @@ from lidar_perception.simulation.shapes.scene_object import SceneObject, draw_si
 from lidar_perception.simulation.solids import compute_extents, make_parts
 
 BICYCLE, MOTORCYCLE, BICYCLIST, MOTORCYCLIST = 11, 15, 31, 32
-CRANK_M, GEAR_M = 0.17, 5.0  # length of a crank, distance per crank revolution
+CRANK_M = 0.17  # length of a crank
+GEAR_M = 5.0  # distance travelled per crank revolution
 SPOKE_TRANSMISSION = 0.5  # fraction of beams that pass between the spokes
-FRAME_TRANSMISSION = 0.6  # fraction of beams that pass between stays, chain, pedals and rack
-THIGH, SHANK = 0.26, 0.27  # lengths as shares of the rider's height
+FRAME_TRANSMISSION = 0.6  # fraction of beams that pass through the rear of the frame, with chain and rack
+THIGH, SHANK = 0.26, 0.27  # lengths as fractions of the rider's height
 
 
 class RiderBuild(NamedTuple):
@@ -43,7 +44,7 @@ class RiderBuild(NamedTuple):
 
 
 def make_cyclist(rng: np.random.Generator) -> SceneObject:
-    """Make a riding cyclist. Its box has the length of the bicycle and the width of the handlebar."""
+    """Make a cyclist who rides. The box is as long as the bicycle and as wide as the handlebar."""
     size = draw_size(rng, CLASSES[CYCLIST])
     rider = RiderBuild(
         size,
@@ -59,34 +60,39 @@ def make_cyclist(rng: np.random.Generator) -> SceneObject:
 
 
 def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
-    """Return the parts (P,) PART of a cyclist after a distance travelled in m, which turns the cranks."""
+    """Return the parts (P,) PART of a cyclist.
+
+    Args:
+        travelled: Distance travelled in m, which determines the angle of the cranks.
+        rider: Properties of the cyclist.
+    """
     length, width, height = rider.size
     seat = 0.53 * height
-    trunk = (height - seat) / (0.31 * cos(rider.lean) + 0.16)  # the rider's height
+    rider_height = (height - seat) / (0.31 * cos(rider.lean) + 0.16)
     hip = (-0.13 * length, seat)
-    ahead, up = sin(rider.lean), cos(rider.lean)
+    sin_lean, cos_lean = sin(rider.lean), cos(rider.lean)
 
-    def along(share: float) -> tuple[float, float]:
-        return hip[0] + share * trunk * ahead, seat + share * trunk * up
+    def point_on_trunk(fraction: float) -> tuple[float, float]:
+        return hip[0] + fraction * rider_height * sin_lean, seat + fraction * rider_height * cos_lean
 
-    shoulder, neck = along(0.27), along(0.31)
+    shoulder, neck = point_on_trunk(0.27), point_on_trunk(0.31)
     bar_x, bar_z = 0.22 * length, 0.61 * height
-    head = (neck[0] + 0.03, 0.0, height - 0.075 * trunk)
+    head = (neck[0] + 0.03, 0.0, height - 0.075 * rider_height)
     rows = [
         *_bicycle_parts(length, width / 2, (bar_x, bar_z), rider.frame),
-        ellipsoid(head, (0.057 * trunk, 0.047 * trunk, 0.075 * trunk), (SKIN + rider.head) / 2),
+        ellipsoid(head, (0.057 * rider_height, 0.047 * rider_height, 0.075 * rider_height), (SKIN + rider.head) / 2),
         ellipsoid(
-            (along(0.15)[0], 0.0, along(0.15)[1]),
-            (0.08 * trunk, min(0.125 * trunk, 0.42 * width), 0.17 * trunk),
+            (point_on_trunk(0.15)[0], 0.0, point_on_trunk(0.15)[1]),
+            (0.08 * rider_height, min(0.125 * rider_height, 0.42 * width), 0.17 * rider_height),
             rider.coat,
             pitch=rider.lean,
         ),
         ellipsoid((hip[0], 0.0, seat + 0.02), (0.16, min(0.17, 0.4 * width), 0.11), rider.trousers),
     ]
-    turn = rider.phase + 2 * pi * travelled / GEAR_M
-    for side, at in ((-1, turn), (1, turn + pi)):
-        foot = (-0.02 * length + CRANK_M * sin(at), 0.17 * height + CRANK_M * cos(at))
-        thigh, shank = THIGH * trunk, SHANK * trunk
+    crank_angle = rider.phase + 2 * pi * travelled / GEAR_M
+    for side, pedal_angle in ((-1, crank_angle), (1, crank_angle + pi)):
+        foot = (-0.02 * length + CRANK_M * sin(pedal_angle), 0.17 * height + CRANK_M * cos(pedal_angle))
+        thigh, shank = THIGH * rider_height, SHANK * rider_height
         x, z = find_knee(hip, foot, thigh, shank)
         y = side * 0.11
         rows += [
@@ -94,7 +100,7 @@ def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
             rod((x, y, z), (foot[0], y, foot[1] + 0.03), 0.06, rider.trousers),
             box((foot[0] + 0.05, y, foot[1]), (0.13, 0.045, 0.03), RUBBER),
             rod(
-                (shoulder[0], side * min(0.11 * trunk, 0.36 * width), shoulder[1]),
+                (shoulder[0], side * min(0.11 * rider_height, 0.36 * width), shoulder[1]),
                 (bar_x, side * (width / 2 - 0.06), bar_z),
                 0.05,
                 rider.coat,
@@ -105,17 +111,19 @@ def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
             block((bar_x + 0.05, -0.16, bar_z - 0.3), (bar_x + 0.33, 0.16, bar_z - 0.05), METAL, transmission=0.4)
         )
     elif rider.load == "backpack":
-        x, z = along(0.18)
-        rows.append(ellipsoid((x - 0.17 * up, 0.0, z + 0.17 * ahead), (0.1, 0.14, 0.22), 0.2, pitch=rider.lean))
+        x, z = point_on_trunk(0.18)
+        rows.append(
+            ellipsoid((x - 0.17 * cos_lean, 0.0, z + 0.17 * sin_lean), (0.1, 0.14, 0.22), 0.2, pitch=rider.lean)
+        )
     return make_parts(rows, BICYCLIST)
 
 
 def _bicycle_parts(length: float, half_bar: float, bar: tuple, frame: float) -> list[tuple]:
-    """Return wheels, tubes, and a handlebar at bar (x, z) with this half width.
+    """Return the wheels, the frame, and a handlebar at `bar` (x, z) with half of the width half_bar.
 
-    Parts are thicker than real ones, since beams are wide: 46 % of the points of KITTI's cyclists
-    are below 0.42 of their height, 22 % also more than 0.35 m from the centre (10 cyclists up to
-    40 m away).
+    Parts are thicker than in reality, because beams are wide. In KITTI, 46 % of the points on
+    cyclists are below 0.42 of their height, and 22 % also more than 0.35 m from the centre (10
+    cyclists up to 40 m away).
     """
     radius = 0.19 * length
     axle, crank = length / 2 - radius, (-0.02 * length, 0.0, 0.88 * radius)
@@ -135,7 +143,7 @@ def _bicycle_parts(length: float, half_bar: float, bar: tuple, frame: float) -> 
 
 
 def make_bicycle(rng: np.random.Generator) -> np.ndarray:
-    """Make a parked bicycle (P,) PART with a reflector."""
+    """Make a parked bicycle with a reflector, as (P,) PART."""
     length = rng.uniform(1.6, 1.85)
     seat = (-0.15 * length, 0.92)
     rows = [
@@ -147,14 +155,14 @@ def make_bicycle(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_motorcycle(rng: np.random.Generator) -> np.ndarray:
-    """Make a parked motorcycle or scooter (P,) PART."""
+    """Make a parked motorcycle or scooter, as (P,) PART."""
     return make_parts(
         _motorcycle_parts(rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5), rng.uniform(0.25, 0.31)), MOTORCYCLE
     )
 
 
 def _motorcycle_parts(length: float, paint: float, radius: float) -> list[tuple]:
-    """Return the parts of a motorcycle with this length, reflectance and radius of the wheels."""
+    """Return the parts of a motorcycle with this length, reflectance (paint) and wheel radius."""
     axle = length / 2 - radius
     return [
         disc((-axle, 0, radius), radius, 0.07, RUBBER),
@@ -169,20 +177,23 @@ def _motorcycle_parts(length: float, paint: float, radius: float) -> list[tuple]
 
 
 def make_motorcyclist(rng: np.random.Generator) -> SceneObject:
-    """Make a rider on a motorcycle or scooter, some with a passenger. Its label is Cyclist."""
-    length, trunk = rng.uniform(1.7, 2.15), rng.uniform(0.52, 0.62)  # trunk from the hip to the neck
+    """Make a rider on a motorcycle or scooter, labelled Cyclist. Some have a passenger."""
+    length, trunk_length = rng.uniform(1.7, 2.15), rng.uniform(0.52, 0.62)
     rows = _motorcycle_parts(length, rng.uniform(0.05, 0.6), rng.uniform(0.2, 0.31))
     lean, bar = rng.uniform(0.05, 0.4), length / 2 - 0.55
-    riders = [bar - rng.uniform(0.45, 0.6)]
+    hips = [bar - rng.uniform(0.45, 0.6)]
     if rng.random() < 0.2:
-        riders.append(riders[0] - 0.38)
-    for hip in riders:
+        hips.append(hips[0] - 0.38)
+    for hip in hips:
         coat, trousers, helmet = rng.uniform((0.15, 0.1, 0.1), (0.85, 0.7, 0.8))
-        shoulder = (hip + sin(lean) * trunk, 0.82 + cos(lean) * trunk)
+        shoulder = (hip + sin(lean) * trunk_length, 0.82 + cos(lean) * trunk_length)
         head = (shoulder[0] + 0.04, 0.0, shoulder[1] + 0.17)
         rows += [
             ellipsoid(
-                ((hip + shoulder[0]) / 2, 0.0, (0.82 + shoulder[1]) / 2), (0.14, 0.21, 0.6 * trunk), coat, pitch=lean
+                ((hip + shoulder[0]) / 2, 0.0, (0.82 + shoulder[1]) / 2),
+                (0.14, 0.21, 0.6 * trunk_length),
+                coat,
+                pitch=lean,
             ),
             ellipsoid(head, (0.14, 0.12, 0.14), helmet),
         ]

@@ -1,6 +1,6 @@
 """Street furniture, much of it as large as a person.
 
-Each function returns (P,) PART with the front facing +x. Fixed objects reach below the ground.
+Each function returns (P,) PART with the front facing +x. Fixed objects extend below the ground.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lidar_perception.simulation.shapes.primitives import (
 from lidar_perception.simulation.solids import make_parts
 
 BUILDING, FENCE, VEGETATION, POLE, SIGN, OTHER = 50, 51, 70, 80, 81, 99
-FOOT_M = -0.3  # bottom of fixed objects, below the ground
+FOOT_M = -0.3  # z of the bottom of fixed objects
 
 
 def make_pole(rng: np.random.Generator) -> np.ndarray:
@@ -58,35 +58,37 @@ def make_traffic_light(rng: np.random.Generator) -> np.ndarray:
 
 
 def make_sign(rng: np.random.Generator) -> np.ndarray:
-    """Make a post with one or two retroreflective plates; some are low, as on traffic islands.
+    """Make a post with one or two retroreflective plates, which are low on some, as on traffic islands.
 
     Half of the low plates are on a mast. In KITTI, 15 % of the clusters as wide as a person are
-    partly retroreflective, most of them low.
+    partly retroreflective, most of them close to the ground.
     """
-    low = rng.uniform(1.7, 2.2) if rng.random() < 0.6 else rng.uniform(0.4, 1.0)
+    plate_bottom = rng.uniform(1.7, 2.2) if rng.random() < 0.6 else rng.uniform(0.4, 1.0)
     size, child_rng = rng.uniform(0.25, 0.4), rng.spawn(1)[0]
-    plates = [(low, size)] + ([(low + 2 * size + 0.05, 0.2)] if rng.random() < 0.4 else [])
-    mast = low < 1.0 and child_rng.random() < 0.5
-    rows = [_post(child_rng.uniform(2.5, 4.0), 0.07) if mast else _post(low + 2 * size, 0.035)]
-    return make_parts(rows + [_plate(0.08 if mast else 0.04, z, half) for z, half in plates], POLE)
+    plates = [(plate_bottom, size)] + ([(plate_bottom + 2 * size + 0.05, 0.2)] if rng.random() < 0.4 else [])
+    has_mast = plate_bottom < 1.0 and child_rng.random() < 0.5
+    rows = [_post(child_rng.uniform(2.5, 4.0), 0.07) if has_mast else _post(plate_bottom + 2 * size, 0.035)]
+    return make_parts(rows + [_plate(0.08 if has_mast else 0.04, z, half_width) for z, half_width in plates], POLE)
 
 
-def _plate(x: float, z: float, half: float) -> tuple:
-    """Return a square plate at x, with its bottom at z."""
-    return block((x, -half, z), (x + 0.02, half, z + 2 * half), PLATE, semantic=SIGN)
+def _plate(x: float, z: float, half_width: float) -> tuple:
+    """Return a square plate at x with its lower edge at z."""
+    return block((x, -half_width, z), (x + 0.02, half_width, z + 2 * half_width), PLATE, semantic=SIGN)
 
 
 def make_fence(rng: np.random.Generator, length: float) -> np.ndarray:
     """Make a fence, centred along x: posts, two rails, and bars or boards with gaps.
 
-    Beams at grazing angles hit the bars more often.
+    Bars and boards are a block with a density, so that grazing beams hit them more often.
     """
     height, x = rng.uniform(0.8, 1.9), length / 2
-    rows = [rod((at, 0, -0.5), (at, 0, height), 0.04, METAL) for at in np.linspace(0.04 - x, x - 0.04, 5)]
-    rows += [block((-x, -0.02, share * height), (x, 0.02, share * height + 0.05), METAL) for share in (0.15, 0.9)]
+    rows = [rod((post_x, 0, -0.5), (post_x, 0, height), 0.04, METAL) for post_x in np.linspace(0.04 - x, x - 0.04, 5)]
+    rows += [
+        block((-x, -0.02, fraction * height), (x, 0.02, fraction * height + 0.05), METAL) for fraction in (0.15, 0.9)
+    ]
     rows.append(
         block((-x, -0.012, 0.05), (x, 0.012, 0.98 * height), 0.3, density=rng.choice((12.0, 25.0, 80.0)))
-    )  # passes 0.75, 0.55, 0.15
+    )  # 0.75, 0.55 or 0.15 of the beams pass at normal incidence
     return make_parts(rows, FENCE)
 
 
@@ -105,21 +107,21 @@ def make_litter_bin(rng: np.random.Generator) -> np.ndarray:
     """Make a round litter bin, standing or on a post."""
     grey = rng.uniform(0.1, 0.5)
     if rng.random() < 0.5:
-        high, radius = rng.uniform(0.7, 1.2), rng.uniform(0.2, 0.35)
+        height, radius = rng.uniform(0.7, 1.2), rng.uniform(0.2, 0.35)
         return make_parts(
-            [_cylinder(0.0, high, radius, grey), ellipsoid((0, 0, high), (radius, radius, 0.15), grey)], OTHER
+            [_cylinder(0.0, height, radius, grey), ellipsoid((0, 0, height), (radius, radius, 0.15), grey)], OTHER
         )
     return make_parts([_post(1.15, 0.03), cylinder((0.22, 0, 0.8), (0.19, 0.19, 0.28), grey)], OTHER)
 
 
 def make_wheelie_bin(rng: np.random.Generator) -> np.ndarray:
     """Make a bin on wheels, of 120 l or 1100 l."""
-    half, high = ((0.25, 0.24), 0.93) if rng.random() < 0.75 else ((0.55, 0.65), 1.3)
-    x, y = half
+    half_sizes, height = ((0.25, 0.24), 0.93) if rng.random() < 0.75 else ((0.55, 0.65), 1.3)
+    x, y = half_sizes
     return make_parts(
         [
-            block((-x, -0.9 * y, 0.1), (x, 0.9 * y, high), rng.uniform(0.1, 0.4)),
-            block((-x - 0.05, -y, high), (x + 0.04, y, high + 0.08), 0.2),
+            block((-x, -0.9 * y, 0.1), (x, 0.9 * y, height), rng.uniform(0.1, 0.4)),
+            block((-x - 0.05, -y, height), (x + 0.04, y, height + 0.08), 0.2),
             disc((0.1 - x, 0, 0.1), 0.1, y, RUBBER),
         ],
         OTHER,
@@ -128,13 +130,13 @@ def make_wheelie_bin(rng: np.random.Generator) -> np.ndarray:
 
 def make_bollard(rng: np.random.Generator) -> np.ndarray:
     """Make a bollard of 0.6 to 1.1 m, some with a retroreflective band."""
-    high, radius = rng.uniform(0.6, 1.1), rng.uniform(0.05, 0.14)
+    height, radius = rng.uniform(0.6, 1.1), rng.uniform(0.05, 0.14)
     rows = [
-        _cylinder(FOOT_M, high, radius, rng.uniform(0.1, 0.5)),
-        ellipsoid((0, 0, high), (radius, radius, 0.06), 0.3),
+        _cylinder(FOOT_M, height, radius, rng.uniform(0.1, 0.5)),
+        ellipsoid((0, 0, height), (radius, radius, 0.06), 0.3),
     ]
     if rng.random() < 0.3:
-        rows.append(_cylinder(high - 0.2, high - 0.1, radius + 0.003, PLATE))
+        rows.append(_cylinder(height - 0.2, height - 0.1, radius + 0.003, PLATE))
     return make_parts(rows, POLE)
 
 
@@ -143,32 +145,32 @@ def make_beacon(rng: np.random.Generator) -> np.ndarray:
 
     It is about as high as a person, but narrower. Some have a base or a round sign.
     """
-    high, low, half = rng.uniform((0.8, 0.05, 0.06), (1.6, 0.4, 0.3))
+    height, low, half_width = rng.uniform((0.8, 0.05, 0.06), (1.6, 0.4, 0.3))
     if rng.random() < 0.5:
-        rows = [_cylinder(FOOT_M, low, 0.8 * half, 0.3), _cylinder(low, high, half, PLATE)]
+        rows = [_cylinder(FOOT_M, low, 0.8 * half_width, 0.3), _cylinder(low, height, half_width, PLATE)]
     else:
-        rows = [_post(low, 0.04), block((-0.03, -half, low), (0.03, half, high), PLATE)]
+        rows = [_post(low, 0.04), block((-0.03, -half_width, low), (0.03, half_width, height), PLATE)]
     if rng.random() < 0.4:
         rows.append(block((-0.4, -0.2, 0.0), (0.4, 0.2, 0.1), RUBBER))
     if rng.random() < 0.3:
-        rows += [_post(high + 0.5, 0.04), ellipsoid((0, 0, high + 0.3), (0.03, 0.3, 0.3), PLATE)]
+        rows += [_post(height + 0.5, 0.04), ellipsoid((0, 0, height + 0.3), (0.03, 0.3, 0.3), PLATE)]
     return make_parts(rows, SIGN)
 
 
 def make_cabinet(rng: np.random.Generator) -> np.ndarray:
     """Make a telephone or power cabinet of 0.8 to 1.7 m."""
-    x, y, high = rng.uniform((0.15, 0.2, 0.8), (0.3, 0.8, 1.7))
+    x, y, height = rng.uniform((0.15, 0.2, 0.8), (0.3, 0.8, 1.7))
     return make_parts(
         [
-            block((-x, -y, FOOT_M), (x, y, high), rng.uniform(0.2, 0.5)),
-            block((-x - 0.03, -y - 0.03, high), (x + 0.03, y + 0.03, high + 0.05), 0.35),
+            block((-x, -y, FOOT_M), (x, y, height), rng.uniform(0.2, 0.5)),
+            block((-x - 0.03, -y - 0.03, height), (x + 0.03, y + 0.03, height + 0.05), 0.35),
         ],
         OTHER,
     )
 
 
 def make_bench(rng: np.random.Generator) -> np.ndarray:
-    """Make a bench with a back and a seat at 0.45 m."""
+    """Make a bench with a backrest and a seat at 0.45 m."""
     y = rng.uniform(0.7, 1.0)
     wood = rng.uniform(0.2, 0.4)
     rows = [
@@ -194,28 +196,35 @@ def make_shopping_trolley(rng: np.random.Generator) -> np.ndarray:
 
 def make_phone_box(rng: np.random.Generator) -> np.ndarray:
     """Make a phone box: four posts, panes, a roof and the telephone."""
-    half, high = 0.45, rng.uniform(2.2, 2.4)
+    half_width, height = 0.45, rng.uniform(2.2, 2.4)
     rows = [
-        rod((sx * half, sy * half, FOOT_M), (sx * half, sy * half, high), 0.04, METAL)
+        rod((sx * half_width, sy * half_width, FOOT_M), (sx * half_width, sy * half_width, height), 0.04, METAL)
         for sx in (-1, 1)
         for sy in (-1, 1)
     ]
-    rows += [block((-half, s * half, 0.3), (half, s * (half - 0.01), high), GLASS, transmission=0.7) for s in (-1, 1)]
     rows += [
-        block((-half - 0.05, -half - 0.05, high), (half + 0.05, half + 0.05, high + 0.15), 0.3),
-        block((-half, -half + 0.05, FOOT_M), (-half + 0.25, half - 0.05, 1.7), 0.3),
+        block(
+            (-half_width, s * half_width, 0.3), (half_width, s * (half_width - 0.01), height), GLASS, transmission=0.7
+        )
+        for s in (-1, 1)
+    ]
+    rows += [
+        block(
+            (-half_width - 0.05, -half_width - 0.05, height), (half_width + 0.05, half_width + 0.05, height + 0.15), 0.3
+        ),
+        block((-half_width, -half_width + 0.05, FOOT_M), (-half_width + 0.25, half_width - 0.05, 1.7), 0.3),
     ]
     return make_parts(rows, OTHER)
 
 
 def make_advertising_column(rng: np.random.Generator) -> np.ndarray:
     """Make a round advertising column of 2.5 to 3.6 m."""
-    high, radius = rng.uniform(2.5, 3.6), rng.uniform(0.5, 0.7)
+    height, radius = rng.uniform(2.5, 3.6), rng.uniform(0.5, 0.7)
     return make_parts(
         [
-            _cylinder(FOOT_M, high, radius, rng.uniform(0.3, 0.5)),
-            _cylinder(high, high + 0.15, radius + 0.08, 0.3),
-            ellipsoid((0, 0, high + 0.15), (radius, radius, 0.25), 0.3),
+            _cylinder(FOOT_M, height, radius, rng.uniform(0.3, 0.5)),
+            _cylinder(height, height + 0.15, radius + 0.08, 0.3),
+            ellipsoid((0, 0, height + 0.15), (radius, radius, 0.25), 0.3),
         ],
         OTHER,
     )
@@ -223,27 +232,31 @@ def make_advertising_column(rng: np.random.Generator) -> np.ndarray:
 
 def make_cone(rng: np.random.Generator) -> np.ndarray:
     """Make a traffic cone of 0.5 to 0.75 m with a retroreflective band."""
-    high = rng.uniform(0.5, 0.75)
+    height = rng.uniform(0.5, 0.75)
     return make_parts(
         [
             block((-0.19, -0.19, 0), (0.19, 0.19, 0.03), 0.3),
-            _cylinder(0.03, 0.4 * high, 0.13, 0.4),
-            _cylinder(0.4 * high, 0.7 * high, 0.09, PLATE),
-            _cylinder(0.7 * high, high, 0.05, 0.4),
+            _cylinder(0.03, 0.4 * height, 0.13, 0.4),
+            _cylinder(0.4 * height, 0.7 * height, 0.09, PLATE),
+            _cylinder(0.7 * height, height, 0.05, 0.4),
         ],
         OTHER,
     )
 
 
 def make_planter(rng: np.random.Generator) -> np.ndarray:
-    """Make a tub with a plant, about as high as a person."""
-    high = rng.uniform(0.35, 0.6)
-    tall = rng.uniform(0.35, 0.65)
+    """Make a tub with a plant, as high as a person."""
+    height = rng.uniform(0.35, 0.6)
+    plant_height = rng.uniform(0.35, 0.65)
     return make_parts(
         [
-            _cylinder(0.0, high, 0.32, rng.uniform(0.25, 0.45)),
+            _cylinder(0.0, height, 0.32, rng.uniform(0.25, 0.45)),
             ellipsoid(
-                (0, 0, high + 0.9 * tall), (0.3, 0.28, tall), 0.34, semantic=VEGETATION, density=rng.uniform(2, 6)
+                (0, 0, height + 0.9 * plant_height),
+                (0.3, 0.28, plant_height),
+                0.34,
+                semantic=VEGETATION,
+                density=rng.uniform(2, 6),
             ),
         ],
         OTHER,
@@ -252,10 +265,10 @@ def make_planter(rng: np.random.Generator) -> np.ndarray:
 
 def make_parasol(rng: np.random.Generator) -> np.ndarray:
     """Make a cafe table with two chairs under a parasol."""
-    high = rng.uniform(2.1, 2.5)
+    height = rng.uniform(2.1, 2.5)
     rows = [
-        rod((0, 0, 0), (0, 0, high), 0.025, METAL),
-        ellipsoid((0, 0, high), (1.3, 1.3, 0.2), 0.35),
+        rod((0, 0, 0), (0, 0, height), 0.025, METAL),
+        ellipsoid((0, 0, height), (1.3, 1.3, 0.2), 0.35),
         _cylinder(0.7, 0.74, 0.4, 0.35),
     ]
     for s in (-1, 1):
@@ -268,11 +281,11 @@ def make_parasol(rng: np.random.Generator) -> np.ndarray:
 
 def make_hydrant(rng: np.random.Generator) -> np.ndarray:
     """Make a pump, hydrant or parking meter: a post with a thicker head."""
-    high = rng.uniform(0.9, 1.5)
+    height = rng.uniform(0.9, 1.5)
     return make_parts(
         [
-            _cylinder(FOOT_M, high, rng.uniform(0.04, 0.12), 0.3),
-            ellipsoid((0, 0, high - 0.15), (0.14, 0.17, 0.22), rng.uniform(0.1, 0.4)),
+            _cylinder(FOOT_M, height, rng.uniform(0.04, 0.12), 0.3),
+            ellipsoid((0, 0, height - 0.15), (0.14, 0.17, 0.22), rng.uniform(0.1, 0.4)),
         ],
         OTHER,
     )
@@ -283,32 +296,32 @@ def make_stairs(rng: np.random.Generator, length: float) -> np.ndarray:
     x, count, rise = length / 2, int(rng.integers(2, 7)), rng.uniform(0.12, 0.17)
     end = 0.3 * count + rng.uniform(0.5, 2.0)
     rows = [block((-x, 0.3 * i, FOOT_M), (x, end, rise * (i + 1)), 0.4) for i in range(count)]
-    for at in np.linspace(-x + 0.05, x - 0.05, max(2, int(length / 4) + 1)):
-        top = (at, 0.3 * count, rise * count + 0.9)
+    for post_x in np.linspace(-x + 0.05, x - 0.05, max(2, int(length / 4) + 1)):
+        top = (post_x, 0.3 * count, rise * count + 0.9)
         rows += [
-            rod((at, 0.0, 0.9), top, 0.025, METAL),
-            rod((at, 0.05, 0.0), (at, 0.05, 0.9), 0.02, METAL),
-            rod((at, 0.3 * count, 0.0), top, 0.02, METAL),
+            rod((post_x, 0.0, 0.9), top, 0.025, METAL),
+            rod((post_x, 0.05, 0.0), (post_x, 0.05, 0.9), 0.02, METAL),
+            rod((post_x, 0.3 * count, 0.0), top, 0.02, METAL),
         ]
     return make_parts(rows, BUILDING)
 
 
 def make_bicycle_stand(rng: np.random.Generator) -> np.ndarray:
     """Make a hoop for locking bicycles."""
-    high = rng.uniform(0.7, 0.9)
-    rows = [rod((s * 0.35, 0, FOOT_M), (s * 0.35, 0, high), 0.025, METAL) for s in (-1, 1)]
-    return make_parts([*rows, rod((-0.35, 0, high), (0.35, 0, high), 0.025, METAL)], POLE)
+    height = rng.uniform(0.7, 0.9)
+    rows = [rod((s * 0.35, 0, FOOT_M), (s * 0.35, 0, height), 0.025, METAL) for s in (-1, 1)]
+    return make_parts([*rows, rod((-0.35, 0, height), (0.35, 0, height), 0.025, METAL)], POLE)
 
 
 def _post(height: float, radius: float) -> tuple:
     return _cylinder(FOOT_M, height, radius, METAL)
 
 
-def _cylinder(low: float, high: float, radius: float, reflectance: float) -> tuple:
-    return cylinder((0, 0, (low + high) / 2), (radius, radius, (high - low) / 2), reflectance)
+def _cylinder(low: float, height: float, radius: float, reflectance: float) -> tuple:
+    return cylinder((0, 0, (low + height) / 2), (radius, radius, (height - low) / 2), reflectance)
 
 
-# Makers of objects that a detector may confuse with a person.
+# Functions that make objects which a detector may confuse with a person.
 PERSON_SIZED = (
     make_sign,
     make_beacon,

@@ -24,25 +24,33 @@ TRUCK, ON_RAILS, OTHER_VEHICLE = 18, 16, 20
 
 
 def make_truck(rng: np.random.Generator) -> SceneObject:
-    """Make a truck with a closed body, or with an open platform that is lower than the cab."""
+    """Make a truck with a closed body, or with an open load that is lower than the cab."""
     length, width, height = size = draw_size(rng, "Truck")
-    open_load = rng.random() < 0.25
-    top = rng.uniform(1.6, 2.2) if open_load else height
-    cab = height if open_load else min(height, rng.uniform(2.7, 3.1))
-    parts = _truck_parts(length, width, top, cab, max(draw_paint(rng), 0.1), rng.uniform(0.2, 0.6))
+    is_open = rng.random() < 0.25
+    load_height = rng.uniform(1.6, 2.2) if is_open else height
+    cab_height = height if is_open else min(height, rng.uniform(2.7, 3.1))
+    parts = _truck_parts(length, width, load_height, cab_height, max(draw_paint(rng), 0.1), rng.uniform(0.2, 0.6))
     return make_rigid(parts, size, "Truck")
 
 
-def _truck_parts(length: float, width: float, load: float, cab: float, colour: float, cargo: float) -> np.ndarray:
-    """Return the parts of a truck; load and cab are the heights of load and cab in m."""
+def _truck_parts(
+    length: float, width: float, load_height: float, cab_height: float, colour: float, cargo: float
+) -> np.ndarray:
+    """Return the parts of a truck.
+
+    Args:
+        length, width: Size in m.
+        load_height, cab_height: Heights of the load and the cab, m.
+        colour, cargo: Reflectances of the cab and the load.
+    """
     x, y, radius, floor = length / 2, width / 2, 0.48, 1.15
-    back, belt, roof = x - min(2.2, 0.24 * length), 0.62 * cab, cab - 0.25
-    transmission = 0.75  # fraction of beams that pass the windows
+    back, belt, roof = x - min(2.2, 0.24 * length), 0.62 * cab_height, cab_height - 0.25
+    transmission = 0.75  # fraction of beams that pass through the windows
     rows = [
-        block((-x, -y, floor), (back - 0.35, y, load), cargo),
+        block((-x, -y, floor), (back - 0.35, y, load_height), cargo),
         block((0.3 - x, -0.45, 0.6), (back, 0.45, floor), 0.1),
         block((back, -0.97 * y, 0.95), (x - 0.1, 0.97 * y, belt), colour),
-        block((back, -0.97 * y, roof), (x - 0.15, 0.97 * y, cab), colour),
+        block((back, -0.97 * y, roof), (x - 0.15, 0.97 * y, cab_height), colour),
         block((back, -0.97 * y, belt), (back + 0.5, 0.97 * y, roof), colour),
         block((x - 0.35, -0.97 * y, 0.3), (x, 0.97 * y, 0.95), 0.5 * colour),
         slope((x - 0.08, belt), (x - 0.22, roof), 0.93 * y, GLASS, transmission=transmission),
@@ -65,7 +73,9 @@ def _truck_parts(length: float, width: float, load: float, cab: float, colour: f
             block((-0.1 * x, side * 0.9 * y, 0.5), (0.25 * x, side * 0.5 * y, 1.0), METAL),
             block((-x, side * 0.7 * y, 0.85), (0.02 - x, side * 0.98 * y, 1.0), PLATE),
         ]
-        rows += [disc((place, side * (y - 0.2), radius), radius, 0.18, RUBBER) for place in (x - 1.2, 1.4 - x, 2.6 - x)]
+        rows += [
+            disc((wheel_x, side * (y - 0.2), radius), radius, 0.18, RUBBER) for wheel_x in (x - 1.2, 1.4 - x, 2.6 - x)
+        ]
     return make_parts(rows, TRUCK)
 
 
@@ -93,12 +103,12 @@ def _coach_parts(
         colour: Reflectance of the body.
         semantic: SemanticKITTI class.
         radius: Radius of the wheels, m.
-        axles: Positions of the axles as shares of the length, from the tail.
+        axles: Positions of the axles from the tail, as fractions of the length.
     """
     length, width, height = size
     x, y = length / 2, width / 2
     belt, top, floor = 0.38 * height, 0.82 * height, 0.45
-    transmission = 0.7  # fraction of beams that pass the windows
+    transmission = 0.7  # fraction of beams that pass through the windows
     rows = [
         block((0.4 - x, -0.97 * y, top), (x - 0.4, 0.97 * y, height), colour),
         block((0.3 - x, -0.95 * y, 0.25), (x - 0.3, 0.95 * y, floor), 0.15),
@@ -117,13 +127,15 @@ def _coach_parts(
                 (0.4 - x, x - 0.4), (side * 0.99 * y, belt), (side * 0.95 * y, top), GLASS, transmission=transmission
             ),
         ]
-        rows += [disc(((share - 0.5) * length, side * (y - 0.16), radius), radius, 0.15, RUBBER) for share in axles]
         rows += [
-            rod((place, side * 0.93 * y, belt), (place, side * 0.91 * y, top), 0.07, colour)
-            for place in np.linspace(0.45 - x, x - 0.45, 6)
+            disc(((fraction - 0.5) * length, side * (y - 0.16), radius), radius, 0.15, RUBBER) for fraction in axles
+        ]
+        rows += [
+            rod((part_x, side * 0.93 * y, belt), (part_x, side * 0.91 * y, top), 0.07, colour)
+            for part_x in np.linspace(0.45 - x, x - 0.45, 6)
         ]
     rows += [
-        block((place, -0.85 * y, floor), (place + 0.2, 0.85 * y, belt + 0.35), 0.2, transmission=0.4)
-        for place in np.linspace(1.5 - x, x - 3, 3)
+        block((part_x, -0.85 * y, floor), (part_x + 0.2, 0.85 * y, belt + 0.35), 0.2, transmission=0.4)
+        for part_x in np.linspace(1.5 - x, x - 3, 3)
     ]
     return make_parts(rows, semantic)

@@ -1,6 +1,6 @@
-"""Wall elements and furniture of interiors.
+"""Wall segments and furniture of interiors.
 
-Each function returns (P,) PART. Walls are centred along x with their face at y = 0 facing -y.
+Each function returns (P,) PART. Wall segments are centred along x, with their face at y = 0 facing -y.
 Furniture faces +x.
 """
 
@@ -32,26 +32,26 @@ def make_wall(rng: np.random.Generator, length: float, height: float) -> np.ndar
 
 
 def make_door(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """Make a door in a wall; one in three is open and shows a room."""
-    x, half = length / 2, min(0.5, 0.45 * length)
-    rows = _opening_parts(rng, x, half, DOOR_HEIGHT_M, height)
+    """Make a wall with a door. One in three doors is open, with a room behind it."""
+    x, half_width = length / 2, min(0.5, 0.45 * length)
+    rows = _opening_parts(rng, x, half_width, DOOR_HEIGHT_M, height)
     tone = rng.uniform(0.15, 0.6)
     if rng.random() < 0.33:
-        leaf = half if rng.random() < 0.5 else -half
+        leaf = half_width if rng.random() < 0.5 else -half_width
         rows += [
             block((leaf - 0.02, 0.0, 0.0), (leaf + 0.02, 0.9, DOOR_HEIGHT_M), tone),
             *_room_parts(rng, x + rng.uniform(0.5, 1.5), height),
         ]
     else:
         rows += [
-            block((-half, 0.1, 0.0), (half, 0.15, DOOR_HEIGHT_M), tone),
-            rod((0.8 * half, 0.05, 1.05), (0.6 * half, 0.05, 1.05), 0.015, METAL),
+            block((-half_width, 0.1, 0.0), (half_width, 0.15, DOOR_HEIGHT_M), tone),
+            rod((0.8 * half_width, 0.05, 1.05), (0.6 * half_width, 0.05, 1.05), 0.015, METAL),
         ]
     return make_parts(rows, BUILDING)
 
 
 def make_glazing(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """Make a wall of glass panes between posts, with a room behind."""
+    """Make a wall of glass panes between posts, with a room behind it."""
     return make_parts(
         [*_pane_parts(rng, length, min(height, rng.uniform(2.3, 3.0)), height), *_room_parts(rng, length / 2, height)],
         BUILDING,
@@ -59,19 +59,19 @@ def make_glazing(rng: np.random.Generator, length: float, height: float) -> np.n
 
 
 def make_window(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
-    """Make a wall of glass panes between posts, with nothing behind."""
+    """Make a wall of glass panes between posts, with nothing behind it."""
     return make_parts(_pane_parts(rng, length, height - 0.3, height), BUILDING)
 
 
 def make_passage(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
     """Make the opening to another corridor."""
-    x, far = length / 2, rng.uniform(6.0, 25.0)
+    x, depth = length / 2, rng.uniform(6.0, 25.0)
     rows = [
-        block((s * x, 0.0, FOOT_M), (s * (x + WALL_THICKNESS_M), far, height), rng.uniform(0.4, 0.7)) for s in (-1, 1)
+        block((s * x, 0.0, FOOT_M), (s * (x + WALL_THICKNESS_M), depth, height), rng.uniform(0.4, 0.7)) for s in (-1, 1)
     ]
     rows += [
-        block((-x, far, FOOT_M), (x, far + WALL_THICKNESS_M, height), 0.5),
-        block((-x, WALL_THICKNESS_M, height), (x, far, height + WALL_THICKNESS_M), 0.6),
+        block((-x, depth, FOOT_M), (x, depth + WALL_THICKNESS_M, height), 0.5),
+        block((-x, WALL_THICKNESS_M, height), (x, depth, height + WALL_THICKNESS_M), 0.6),
     ]
     return make_parts(rows, BUILDING)
 
@@ -80,37 +80,43 @@ def _wall_panel(x: tuple, low: float, high: float, rng: np.random.Generator) -> 
     return block((x[0], 0.0, low), (x[1], WALL_THICKNESS_M, high), rng.uniform(0.4, 0.75))
 
 
-def _opening_parts(rng, x: float, half: float, top: float, height: float) -> list[tuple]:
-    """Return the wall around an opening."""
+def _opening_parts(rng, x: float, half_width: float, top: float, height: float) -> list[tuple]:
+    """Return the wall left of, right of and above an opening."""
     tone = rng.uniform(0.4, 0.75)
     return [
-        block((-x, 0.0, FOOT_M), (-half, WALL_THICKNESS_M, height), tone),
-        block((half, 0.0, FOOT_M), (x, WALL_THICKNESS_M, height), tone),
-        block((-half, 0.0, top), (half, WALL_THICKNESS_M, height), tone),
+        block((-x, 0.0, FOOT_M), (-half_width, WALL_THICKNESS_M, height), tone),
+        block((half_width, 0.0, FOOT_M), (x, WALL_THICKNESS_M, height), tone),
+        block((-half_width, 0.0, top), (half_width, WALL_THICKNESS_M, height), tone),
     ]
 
 
 def _room_parts(rng, x: float, height: float) -> list[tuple]:
     """Return the walls of a room behind an opening, with one piece of furniture."""
-    far, tone = rng.uniform(2.5, 6.0), rng.uniform(0.4, 0.7)
-    half_width, half_depth, high = rng.uniform((0.3, 0.2, 0.7), (0.7, 0.5, 2.0))
-    at = rng.uniform(-0.4, 0.4) * x
+    depth, tone = rng.uniform(2.5, 6.0), rng.uniform(0.4, 0.7)
+    half_width, half_depth, furniture_height = rng.uniform((0.3, 0.2, 0.7), (0.7, 0.5, 2.0))
+    furniture_x = rng.uniform(-0.4, 0.4) * x
     return [
-        block((-x, far, FOOT_M), (x, far + WALL_THICKNESS_M, height), tone),
-        *(block((s * x, WALL_THICKNESS_M, FOOT_M), (s * (x - 0.1), far, height), tone) for s in (-1, 1)),
-        block((-x, WALL_THICKNESS_M, height), (x, far, height + WALL_THICKNESS_M), tone),
-        block((at - half_width, far - 2 * half_depth, 0.0), (at + half_width, far, high), 0.3),
+        block((-x, depth, FOOT_M), (x, depth + WALL_THICKNESS_M, height), tone),
+        *(block((s * x, WALL_THICKNESS_M, FOOT_M), (s * (x - 0.1), depth, height), tone) for s in (-1, 1)),
+        block((-x, WALL_THICKNESS_M, height), (x, depth, height + WALL_THICKNESS_M), tone),
+        block(
+            (furniture_x - half_width, depth - 2 * half_depth, 0.0),
+            (furniture_x + half_width, depth, furniture_height),
+            0.3,
+        ),
     ]
 
 
 def _pane_parts(rng, length: float, top: float, height: float) -> list[tuple]:
-    """Return glass panes up to top, with a rail below and wall above."""
+    """Return glass panes up to `top`, with a rail below them and a wall above."""
     x, count = length / 2, max(round(length / rng.uniform(1.2, 2.0)), 1)
     rows = [
         block((-x, 0.06, 0.05), (x, 0.08, top), GLASS, transmission=rng.uniform(0.6, 0.9)),
         block((-x, 0.04, 0.0), (x, 0.1, rng.uniform(0.06, 0.2)), METAL),
     ]
-    rows += [block((at - 0.03, 0.02, 0.0), (at + 0.03, 0.12, top), METAL) for at in np.linspace(-x, x, count + 1)]
+    rows += [
+        block((post_x - 0.03, 0.02, 0.0), (post_x + 0.03, 0.12, top), METAL) for post_x in np.linspace(-x, x, count + 1)
+    ]
     if top < height:
         rows.append(_wall_panel((-x, x), top, height, rng))
     return rows
@@ -124,31 +130,31 @@ def make_ceiling(rng: np.random.Generator, length: float, width: float, height: 
     lamp_height = min(lamp_height, height - 2.35)
     if rng.random() < 0.7:
         rows += [
-            block((at - 0.15, -0.9 * y, height - lamp_height), (at + 0.15, 0.9 * y, height), 0.5)
-            for at in np.linspace(-x, x, count)
+            block((lamp_x - 0.15, -0.9 * y, height - lamp_height), (lamp_x + 0.15, 0.9 * y, height), 0.5)
+            for lamp_x in np.linspace(-x, x, count)
         ]
     return make_parts(rows, BUILDING)
 
 
 def make_column(rng: np.random.Generator, height: float) -> np.ndarray:
     """Make a round or square column."""
-    half, tone = rng.uniform(0.12, 0.4), rng.uniform(0.3, 0.7)
+    half_width, tone = rng.uniform(0.12, 0.4), rng.uniform(0.3, 0.7)
     if rng.random() < 0.5:
-        return make_parts([cylinder((0, 0, height / 2), (half, half, height / 2), tone)], BUILDING)
-    return make_parts([block((-half, -half, FOOT_M), (half, half, height), tone)], BUILDING)
+        return make_parts([cylinder((0, 0, height / 2), (half_width, half_width, height / 2), tone)], BUILDING)
+    return make_parts([block((-half_width, -half_width, FOOT_M), (half_width, half_width, height), tone)], BUILDING)
 
 
 def make_shelf(rng: np.random.Generator, length: float) -> np.ndarray:
     """Make a shelf along x, open to both sides, with goods."""
-    x, y, high = length / 2, rng.uniform(0.2, 0.35), rng.uniform(1.2, 2.2)
-    levels = np.arange(0.1, high, rng.uniform(0.35, 0.5))
-    rows = [block((s * x, -y, 0.0), (s * (x - 0.04), y, high), METAL) for s in (-1, 1)]
-    for z, left, right, tall, depth, tone in zip(levels, *rng.random((5, len(levels)))):
+    x, y, height = length / 2, rng.uniform(0.2, 0.35), rng.uniform(1.2, 2.2)
+    levels = np.arange(0.1, height, rng.uniform(0.35, 0.5))
+    rows = [block((s * x, -y, 0.0), (s * (x - 0.04), y, height), METAL) for s in (-1, 1)]
+    for z, left, right, height_sample, depth_sample, tone in zip(levels, *rng.random((5, len(levels)))):
         rows.append(block((-x, -y, z), (x, y, z + 0.03), 0.4))
         rows.append(
             block(
-                (-x + 0.6 * left * x, -(0.5 + 0.4 * depth) * y, z + 0.03),
-                (x - 0.6 * right * x, 0.9 * y, z + 0.1 + 0.2 * tall),
+                (-x + 0.6 * left * x, -(0.5 + 0.4 * depth_sample) * y, z + 0.03),
+                (x - 0.6 * right * x, 0.9 * y, z + 0.1 + 0.2 * height_sample),
                 0.1 + 0.5 * tone,
             )
         )
@@ -156,21 +162,25 @@ def make_shelf(rng: np.random.Generator, length: float) -> np.ndarray:
 
 
 def make_table(rng: np.random.Generator, length: float, width: float) -> np.ndarray:
-    """Make a table of 0.7 to 0.78 m on four legs or a central foot, some with an object on it."""
-    x, y, high = length / 2, width / 2, rng.uniform(0.7, 0.78)
-    rows = [block((-x, -y, high - 0.04), (x, y, high), rng.uniform(0.2, 0.6))]
+    """Make a table, 0.7 to 0.78 m high, on four legs or a central foot, some with an object on it."""
+    x, y, height = length / 2, width / 2, rng.uniform(0.7, 0.78)
+    rows = [block((-x, -y, height - 0.04), (x, y, height), rng.uniform(0.2, 0.6))]
     if rng.random() < 0.6:
         rows += [
-            rod((sx * 0.9 * x, sy * 0.85 * y, 0), (sx * 0.9 * x, sy * 0.85 * y, high), 0.025, METAL)
+            rod((sx * 0.9 * x, sy * 0.85 * y, 0), (sx * 0.9 * x, sy * 0.85 * y, height), 0.025, METAL)
             for sx in (-1, 1)
             for sy in (-1, 1)
         ]
     else:
-        rows += [rod((0, 0, 0), (0, 0, high), 0.05, METAL), block((-0.3, -0.3, 0.0), (0.3, 0.3, 0.03), METAL)]
+        rows += [rod((0, 0, 0), (0, 0, height), 0.05, METAL), block((-0.3, -0.3, 0.0), (0.3, 0.3, 0.03), METAL)]
     if rng.random() < 0.5:
-        at = rng.uniform(-0.6, 0.6) * x
+        object_x = rng.uniform(-0.6, 0.6) * x
         rows.append(
-            block((at - 0.2, -0.15, high), (at + 0.2, 0.15, high + rng.uniform(0.05, 0.35)), rng.uniform(0.05, 0.6))
+            block(
+                (object_x - 0.2, -0.15, height),
+                (object_x + 0.2, 0.15, height + rng.uniform(0.05, 0.35)),
+                rng.uniform(0.05, 0.6),
+            )
         )
     return make_parts(rows, OTHER)
 
@@ -195,23 +205,23 @@ def make_chair(rng: np.random.Generator) -> np.ndarray:
 
 def make_counter(rng: np.random.Generator) -> np.ndarray:
     """Make a service counter."""
-    y, high = rng.uniform(1.0, 2.5), rng.uniform(0.95, 1.2)
+    y, height = rng.uniform(1.0, 2.5), rng.uniform(0.95, 1.2)
     return make_parts(
         [
-            block((-0.35, -y, 0.0), (0.3, y, high), rng.uniform(0.2, 0.6)),
-            block((-0.4, -y - 0.05, high), (0.4, y + 0.05, high + 0.05), 0.4),
+            block((-0.35, -y, 0.0), (0.3, y, height), rng.uniform(0.2, 0.6)),
+            block((-0.4, -y - 0.05, height), (0.4, y + 0.05, height + 0.05), 0.4),
         ],
         OTHER,
     )
 
 
 def make_display(rng: np.random.Generator) -> np.ndarray:
-    """Make a display board on a foot, about as wide and high as a person."""
-    y, low, high = rng.uniform((0.2, 0.1, 1.5), (0.5, 0.9, 2.0))
+    """Make a display board on a foot, as large as a person."""
+    y, low, height = rng.uniform((0.2, 0.1, 1.5), (0.5, 0.9, 2.0))
     return make_parts(
         [
-            block((-0.03, -y, low), (0.03, y, high), rng.uniform(0.1, 0.7)),
-            rod((0, 0, 0), (0, 0, high), 0.025, METAL),
+            block((-0.03, -y, low), (0.03, y, height), rng.uniform(0.1, 0.7)),
+            rod((0, 0, 0), (0, 0, height), 0.025, METAL),
             block((-0.25, -0.8 * y, 0.0), (0.25, 0.8 * y, 0.03), METAL),
         ],
         OTHER,
@@ -220,11 +230,11 @@ def make_display(rng: np.random.Generator) -> np.ndarray:
 
 def make_machine(rng: np.random.Generator) -> np.ndarray:
     """Make a vending machine, wardrobe or locker."""
-    x, y, high = rng.uniform((0.2, 0.25, 1.4), (0.45, 0.6, 2.0))
+    x, y, height = rng.uniform((0.2, 0.25, 1.4), (0.45, 0.6, 2.0))
     return make_parts(
         [
-            block((-x, -y, 0.0), (x, y, high), rng.uniform(0.1, 0.6)),
-            block((x, -0.8 * y, 0.7), (x + 0.01, 0.4 * y, high - 0.15), GLASS),
+            block((-x, -y, 0.0), (x, y, height), rng.uniform(0.1, 0.6)),
+            block((x, -0.8 * y, 0.7), (x + 0.01, 0.4 * y, height - 0.15), GLASS),
         ],
         OTHER,
     )
@@ -233,23 +243,30 @@ def make_machine(rng: np.random.Generator) -> np.ndarray:
 def make_boxes(rng: np.random.Generator) -> np.ndarray:
     """Make a pile of two to four boxes."""
     rows, z = [], 0.0
-    for x, y, high, turn, tone in rng.random((rng.integers(2, 5), 5)).tolist():
-        half, tall = (0.15 + 0.15 * x, 0.15 + 0.15 * y), 0.2 + 0.3 * high
+    for x, y, height_sample, yaw_sample, tone in rng.random((rng.integers(2, 5), 5)).tolist():
+        half_size, box_height = (0.15 + 0.15 * x, 0.15 + 0.15 * y), 0.2 + 0.3 * height_sample
         rows.append(
-            block((-half[0], -half[1], z), (half[0], half[1], z + tall), 0.2 + 0.4 * tone, yaw=0.5 * (turn - 0.5))
+            block(
+                (-half_size[0], -half_size[1], z),
+                (half_size[0], half_size[1], z + box_height),
+                0.2 + 0.4 * tone,
+                yaw=0.5 * (yaw_sample - 0.5),
+            )
         )
-        z += tall
+        z += box_height
     return make_parts(rows, OTHER)
 
 
 def make_coat_stand(rng: np.random.Generator) -> np.ndarray:
     """Make a coat stand with coats."""
-    high, radius, low = rng.uniform((1.6, 0.12, 0.5), (1.85, 0.25, 1.1))
+    height, radius, low = rng.uniform((1.6, 0.12, 0.5), (1.85, 0.25, 1.1))
     return make_parts(
         [
-            rod((0, 0, 0), (0, 0, high), 0.025, METAL),
+            rod((0, 0, 0), (0, 0, height), 0.025, METAL),
             cylinder((0, 0, 0.02), (0.22, 0.22, 0.02), METAL),
-            cylinder((0, 0, (low + high) / 2 - 0.1), (radius, 0.8 * radius, (high - low) / 2), rng.uniform(0.1, 0.5)),
+            cylinder(
+                (0, 0, (low + height) / 2 - 0.1), (radius, 0.8 * radius, (height - low) / 2), rng.uniform(0.1, 0.5)
+            ),
         ],
         OTHER,
     )
@@ -257,13 +274,13 @@ def make_coat_stand(rng: np.random.Generator) -> np.ndarray:
 
 def make_cart(rng: np.random.Generator) -> np.ndarray:
     """Make a cart for cleaning, mail or trays."""
-    x, y, high = rng.uniform((0.3, 0.22, 0.8), (0.5, 0.3, 1.5))
-    rows = [block((-x, -y, z), (x, y, z + 0.04), METAL) for z in np.linspace(0.2, high, 3)]
-    rows += [rod((sx * x, sy * y, 0.1), (sx * x, sy * y, high), 0.02, METAL) for sx in (-1, 1) for sy in (-1, 1)]
+    x, y, height = rng.uniform((0.3, 0.22, 0.8), (0.5, 0.3, 1.5))
+    rows = [block((-x, -y, z), (x, y, z + 0.04), METAL) for z in np.linspace(0.2, height, 3)]
+    rows += [rod((sx * x, sy * y, 0.1), (sx * x, sy * y, height), 0.02, METAL) for sx in (-1, 1) for sy in (-1, 1)]
     rows += [disc((sx * 0.8 * x, 0, 0.06), 0.06, y, RUBBER, transmission=0.7) for sx in (-1, 1)]
-    rows.append(block((-0.8 * x, -0.8 * y, 0.24), (0.2 * x, 0.8 * y, 0.7 * high), rng.uniform(0.1, 0.6)))
+    rows.append(block((-0.8 * x, -0.8 * y, 0.24), (0.2 * x, 0.8 * y, 0.7 * height), rng.uniform(0.1, 0.6)))
     return make_parts(rows, OTHER)
 
 
-# Makers of objects that a detector may confuse with a person.
+# Functions that make objects which a detector may confuse with a person.
 PERSON_SIZED = (make_display, make_machine, make_boxes, make_coat_stand, make_cart, make_chair)

@@ -1,4 +1,4 @@
-"""Labelled objects and the distribution of their sizes."""
+"""Scene objects, and the distribution of the sizes of labelled ones."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 
 # Length, width, height in metres: mean, standard deviation, and correlation of length and height
 # of the labels in 57 frames of KITTI's object training set and 30 frames of tracking sequence 0000
-# (207 cars, 18 vans, 5 trucks, 4 trams, 15 pedestrians, 13 cyclists). They contain no sitting
-# person: its mean is that of the whole training set, its deviation a guess.
+# (207 cars, 18 vans, 5 trucks, 4 trams, 15 pedestrians, 13 cyclists). These frames contain no sitting
+# people, so their mean is that of the full training set, and their deviation is a guess.
 SIZES = {
     "Car": ((3.88, 1.62, 1.51), (0.47, 0.11, 0.11), 0.0),
     "Van": ((4.68, 1.83, 1.96), (0.59, 0.16, 0.19), 0.8),
@@ -27,8 +27,8 @@ class SceneObject(NamedTuple):
     """An object of a scene, with the size of its label.
 
     Attributes:
-        parts: parts(distance travelled in m) returns (P,) PART. Mirrors and pushed objects may
-            extend beyond the box.
+        parts: Function that returns the parts (P,) PART after a distance travelled in m. Mirrors
+            and pushed objects may extend beyond the box.
         size: Length, width, height in m of the labelled box, which is centred at
             (0, 0, height / 2) in all poses; (0, 0, 0) for an object without a label.
         label: One of CLASSES, "" for an object without a label.
@@ -40,7 +40,7 @@ class SceneObject(NamedTuple):
 
 
 def make_rigid(parts: np.ndarray, size: tuple[float, float, float], label: str) -> SceneObject:
-    """Return an object whose parts (P,) PART do not move against each other."""
+    """Return an object with the same parts (P,) PART in all poses."""
     return SceneObject(partial(_return_parts, parts), size, label)
 
 

@@ -24,22 +24,24 @@ from lidar_perception.simulation.shapes.scene_object import SceneObject, draw_si
 from lidar_perception.simulation.solids import make_parts
 
 CAR = 10
-PILLAR = 0.035  # radius of a roof pillar, m
-LIGHTS = 0.9  # reflectance
-# Shape of the ends of KITTI's cars (medians of 25 to 38 cars up to 40 m away). Front: distance from
-# the end of the box in the middle third is 0.06 m at 0.25 to 0.35 of the height, 0.2 m at 0.45,
-# 0.33 m at 0.52 and 0.84 m at 0.62, and 0.3 m more at 0.43 of the width from the middle. Tail: 0.06 m
-# in the middle third up to 0.7 of the height, 0.15 m at 0.86 of the half width, 0.4 m at 0.96. Sides
-# are 0.04 m inside the box, which may include the mirrors.
-BUMPER = 0.29  # height of the foremost point, as a share of the height
-BONNET = 0.13  # distance from the front of the box to the middle of the bonnet's edge, m
-CORNER = 0.3  # distance from the front of the box to the sides of that edge, m
-TAIL = 0.07  # distance from the rear of the box to the flat part of the tail, m
-TAIL_FLAT, TAIL_SIDE = 0.59, 0.95  # ends of the flat and the round part, as shares of the half width
-TAIL_ROUND = 0.45  # length of the round part, m
-TAIL_LOW, TAIL_TOP = 0.22, 0.67  # ends of the closed part of the tail, as shares of the height
-SIDE = 0.035  # distance from the side of the box to the body, m
-DOME = 0.09  # rise of the roof in the middle, m
+PILLAR_RADIUS_M = 0.035
+TAIL_LIGHT_REFLECTANCE = 0.9
+# Front and tail as on KITTI's cars (medians of 25 to 38 cars up to 40 m away). All distances are from the
+# box, which may include the mirrors. Front, middle third: 0.06 m at 0.25 to 0.35 of the height, 0.2 m at
+# 0.45, 0.33 m at 0.52 and 0.84 m at 0.62; 0.3 m more at 0.43 of the width from the middle. Tail: 0.06 m in
+# the middle third up to 0.7 of the height, 0.15 m at 0.86 of the half width, 0.4 m at 0.96. Sides: 0.04 m.
+BUMPER = 0.29  # height of the foremost point, as a fraction of the height
+BONNET_GAP_M = 0.13  # distance from the front of the box to the middle of the bonnet's front edge
+CORNER_GAP_M = 0.3  # distance from the front of the box to the ends of the bonnet's front edge
+TAIL_GAP_M = 0.07  # distance from the rear of the box to the flat part of the tail
+TAIL_FLAT, TAIL_SIDE = (
+    0.59,
+    0.95,
+)  # outer ends of the flat and the rounded part of the tail, as fractions of the half width
+TAIL_ROUND_M = 0.45  # length of the rounded part of the tail
+TAIL_LOW, TAIL_TOP = 0.22, 0.67  # lower and upper end of the closed part of the tail, as fractions of the height
+SIDE_GAP_M = 0.035  # distance from the side of the box to the body
+ROOF_RISE_M = 0.09  # height of the middle of the roof above its edges
 REFLECTANCE_SPREAD = 0.7  # standard deviation of the log reflectance of the parts of a car
 LEG_ROOM_M = 0.5  # minimum distance from a bench to the front seats
 
@@ -47,14 +49,14 @@ LEG_ROOM_M = 0.5  # minimum distance from a bench to the front seats
 class Style(NamedTuple):
     """Side view of a car body.
 
-    Positions are shares of the length from the tail (0) to the nose (1).
+    Positions are fractions of the length from the tail (0) to the nose (1).
 
     Attributes:
         screen_low, screen_high: Lower and upper end of the windscreen.
         roof_rear: Rear end of the roof.
         rear_low: Lower end of the rear window.
-        bonnet, belt: Heights of the bonnet and of the lower edge of the windows, as shares of the
-            height.
+        bonnet, belt: Heights of the bonnet and of the lower edge of the windows, as fractions of
+            the height.
         load: Front end of the closed load area of a panel van, 0 for none.
     """
 
@@ -100,21 +102,21 @@ def make_van(rng: np.random.Generator, driver: bool = True) -> SceneObject:
 def draw_paint(rng: np.random.Generator) -> float:
     """Draw the reflectance of a car's paint.
 
-    In KITTI, half of the points on cars are below 0.03 and a tenth is above 0.4. Dark cars still
-    have returns at 40 m.
+    In KITTI, half of the points on cars have an intensity below 0.03, and a tenth above 0.4. Dark
+    cars have returns up to at least 40 m.
     """
     dark, middle, light = (0.02, 0.05), (0.04, 0.35), (0.25, 0.6)
     return float(rng.uniform(*(dark, middle, light)[rng.choice(3, p=(0.5, 0.25, 0.25))]))
 
 
 def _vary_reflectance(solids: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Vary the reflectance between parts (P,) PART, as on KITTI's cars, in place.
+    """Vary the reflectance between parts (P,) PART, in place, as on KITTI's cars.
 
-    The numbers come from a child of rng, so that the layout of a street does not depend on them.
+    The numbers come from a child of rng, so that they do not change the layout of a street.
     """
     factor = rng.spawn(1)[0].lognormal(0.0, REFLECTANCE_SPREAD, len(solids))
-    dull = solids["reflectance"] < PLATE
-    solids["reflectance"][dull] = np.minimum(solids["reflectance"] * factor, 0.95)[dull]
+    is_dull = solids["reflectance"] < PLATE
+    solids["reflectance"][is_dull] = np.minimum(solids["reflectance"] * factor, 0.95)[is_dull]
     return solids
 
 
@@ -127,62 +129,79 @@ def make_body(
         size: Length, width, height in m, without the mirrors.
         style: Side view of the body.
         colour: Reflectance of the paint.
-        glass: Share of the beams that pass a window.
-        driver: A person sits in the car.
+        glass: Fraction of the beams that pass through a window.
+        driver: True if a person sits in the car.
     """
     length, width, height = size
-    x, y = length / 2, width / 2 - SIDE
+    x, y = length / 2, width / 2 - SIDE_GAP_M
     radius = min(0.205 * height, 0.34)
-    arch, clear = 2 * radius, 0.13 * height
+    arch, clearance = 2 * radius, 0.13 * height
     axle = max(0.305 * length, x - 0.95)
     front, rear = axle - radius - 0.03, radius + 0.03 - axle
     belt, bonnet = style.belt * height, style.bonnet * height
-    low, high, roof, tail = ((share - 0.5) * length for share in style[:4])
+    screen_low_x, screen_high_x, roof_rear_x, rear_low_x = ((fraction - 0.5) * length for fraction in style[:4])
     load = (style.load - 0.5) * length if style.load else rear - radius
     deck = height if style.load else TAIL_TOP * height
-    top, narrow = height - DOME, 0.86 * y if not style.load else 0.92 * y
+    top, roof_half_width = height - ROOF_RISE_M, 0.86 * y if not style.load else 0.92 * y
     rows = [
-        block((rear, -0.98 * y, clear), (front, 0.98 * y, arch), colour),
-        *_bonnet_parts((low, bonnet), x, 0.97 * y, height, colour),
-        block((TAIL - x, -TAIL_FLAT * y, TAIL_LOW * height), (load, TAIL_FLAT * y, deck - 0.02), colour),
-        block((TAIL + TAIL_ROUND - x, -TAIL_SIDE * y, clear), (load, TAIL_SIDE * y, deck - 0.02), colour),
-        *_corner_parts(TAIL - x, y, (TAIL_LOW * height, deck - 0.02), colour),
+        block((rear, -0.98 * y, clearance), (front, 0.98 * y, arch), colour),
+        *_bonnet_parts((screen_low_x, bonnet), x, 0.97 * y, height, colour),
+        block((TAIL_GAP_M - x, -TAIL_FLAT * y, TAIL_LOW * height), (load, TAIL_FLAT * y, deck - 0.02), colour),
+        block((TAIL_GAP_M + TAIL_ROUND_M - x, -TAIL_SIDE * y, clearance), (load, TAIL_SIDE * y, deck - 0.02), colour),
+        *_corner_parts(TAIL_GAP_M - x, y, (TAIL_LOW * height, deck - 0.02), colour),
         _bumper_part(x, 0.97 * y, height, colour),
         _bumper_part(-x, 0.97 * y, height, colour),
-        block((roof, -narrow, height - 0.13), (high, narrow, height - DOME), colour),
-        ellipsoid(((roof + high) / 2, 0.0, height - DOME), ((high - roof) / 2, narrow, DOME), 0.25 * colour),
-        slope((low, bonnet), (high, top), 0.9 * y, GLASS, transmission=glass),
+        block(
+            (roof_rear_x, -roof_half_width, height - 0.13),
+            (screen_high_x, roof_half_width, height - ROOF_RISE_M),
+            colour,
+        ),
+        ellipsoid(
+            ((roof_rear_x + screen_high_x) / 2, 0.0, height - ROOF_RISE_M),
+            ((screen_high_x - roof_rear_x) / 2, roof_half_width, ROOF_RISE_M),
+            0.25 * colour,
+        ),
+        slope((screen_low_x, bonnet), (screen_high_x, top), 0.9 * y, GLASS, transmission=glass),
     ]
     if style.load:
         rows.append(block((0.02 - x, -0.95 * y, belt), (0.2 - x, 0.95 * y, top), colour))
     else:
-        rows.append(slope((roof, top), (tail, deck), 0.88 * y, GLASS, transmission=glass))
+        rows.append(slope((roof_rear_x, top), (rear_low_x, deck), 0.88 * y, GLASS, transmission=glass))
     for side in (-1, 1):
-        start, end = (load if style.load else (roof + tail) / 2), (low + high) / 2
+        start, end = (load if style.load else (roof_rear_x + rear_low_x) / 2), (screen_low_x + screen_high_x) / 2
         rows += [
-            block((0.15 - x, side * y, arch), (low + 0.02, side * (y - 0.05), belt), colour),
-            upright_pane((start, end), (side * 0.97 * y, belt), (side * narrow, top), GLASS, transmission=glass),
-            rod((low, side * 0.94 * y, bonnet), (high, side * narrow, top), PILLAR, colour),
+            block((0.15 - x, side * y, arch), (screen_low_x + 0.02, side * (y - 0.05), belt), colour),
+            upright_pane(
+                (start, end), (side * 0.97 * y, belt), (side * roof_half_width, top), GLASS, transmission=glass
+            ),
+            rod(
+                (screen_low_x, side * 0.94 * y, bonnet),
+                (screen_high_x, side * roof_half_width, top),
+                PILLAR_RADIUS_M,
+                colour,
+            ),
             disc((axle, side * (y - 0.1), radius), radius, 0.1, 0.2),
             disc((-axle, side * (y - 0.1), radius), radius, 0.1, 0.2),
-            ellipsoid((low - 0.1, side * (y + 0.08), belt + 0.05), (0.07, 0.1, 0.08), colour),
+            ellipsoid((screen_low_x - 0.1, side * (y + 0.08), belt + 0.05), (0.07, 0.1, 0.08), colour),
         ]
         if not style.load:
             rows.append(
                 rod(
-                    (max(tail, 0.06 - x), side * 0.9 * y, belt),
-                    (max(roof, 0.06 - x), side * narrow, top - 0.02),
+                    (max(rear_low_x, 0.06 - x), side * 0.9 * y, belt),
+                    (max(roof_rear_x, 0.06 - x), side * roof_half_width, top - 0.02),
                     0.06,
                     colour,
                 )
             )
-    plate = BUMPER * height
-    rows += [  # plates in front and behind; the tail lights are at its corners
-        block((x - 0.05, -0.26, plate - 0.055), (x, 0.26, plate + 0.055), PLATE),
-        block((TAIL - 0.02 - x, -0.26, 0.4 * height), (TAIL - x, 0.26, 0.4 * height + 0.11), PLATE),
-        *_corner_parts(TAIL - 0.005 - x, y + 0.005, (0.38 * height, 0.44 * height), LIGHTS),
+    plate_height = BUMPER * height
+    rows += [  # front and rear plates, and tail lights
+        block((x - 0.05, -0.26, plate_height - 0.055), (x, 0.26, plate_height + 0.055), PLATE),
+        block((TAIL_GAP_M - 0.02 - x, -0.26, 0.4 * height), (TAIL_GAP_M - x, 0.26, 0.4 * height + 0.11), PLATE),
+        *_corner_parts(TAIL_GAP_M - 0.005 - x, y + 0.005, (0.38 * height, 0.44 * height), TAIL_LIGHT_REFLECTANCE),
     ]
-    rows += _seat_parts(0.5 * (low + high) - 0.75, load, 0.75 * y, arch, 0.45 * belt + 0.55 * top, driver)
+    rows += _seat_parts(
+        0.5 * (screen_low_x + screen_high_x) - 0.75, load, 0.75 * y, arch, 0.45 * belt + 0.55 * top, driver
+    )
     return make_parts(rows, CAR)
 
 
@@ -192,32 +211,32 @@ def _bumper_part(x: float, y: float, height: float, colour: float) -> tuple:
 
 
 def _corner_parts(x: float, y: float, heights: tuple, colour: float) -> list[tuple]:
-    """Return the two rounded corners of a tail at x between two heights."""
+    """Return the two rounded corners of a tail at x, between the lower and upper end `heights`."""
     low, high = heights
     return [
         cylinder(
-            (x + TAIL_ROUND, side * TAIL_FLAT * y, (low + high) / 2),
-            (TAIL_ROUND, (TAIL_SIDE - TAIL_FLAT) * y, (high - low) / 2),
+            (x + TAIL_ROUND_M, side * TAIL_FLAT * y, (low + high) / 2),
+            (TAIL_ROUND_M, (TAIL_SIDE - TAIL_FLAT) * y, (high - low) / 2),
             colour,
         )
         for side in (-1, 1)
     ]
 
 
-def _bonnet_parts(foot: tuple, x: float, y: float, height: float, colour: float) -> list[tuple]:
-    """Return a bonnet and its crown, from the foot (x, z) of the windscreen to the nose at x."""
-    low, top = foot
+def _bonnet_parts(windscreen_foot: tuple, x: float, y: float, height: float, colour: float) -> list[tuple]:
+    """Return a bonnet and its domed top, from the foot (x, z) of the windscreen to the nose at x."""
+    low, top = windscreen_foot
     return [
-        slope((x - CORNER, 0.44 * height - 0.08), (low, top - 0.08), y, colour, thickness=0.2),
-        ellipsoid((low, 0.0, 0.4 * height), (x - BONNET - low, y, top - 0.36 * height), colour),
+        slope((x - CORNER_GAP_M, 0.44 * height - 0.08), (low, top - 0.08), y, colour, thickness=0.2),
+        ellipsoid((low, 0.0, 0.4 * height), (x - BONNET_GAP_M - low, y, top - 0.36 * height), colour),
     ]
 
 
 def _seat_parts(x: float, rear: float, y: float, low: float, high: float, driver: bool) -> list[tuple]:
-    """Return the backs of the front seats at x and of a bench, if there is room, and the driver.
+    """Return the backrests of the front seats at x and of a rear bench, if there is room, and the driver.
 
-    They are mostly transparent, since returns through two panes are weak: 2 % of the points on
-    KITTI's cars seen from behind are on the bench, 1 to 2 % on these.
+    Backrests are mostly transparent, because returns through two panes are weak: in KITTI, 2 % of the
+    points on cars seen from behind are on the bench, here 1 to 2 %.
     """
     rows = [block((x - 0.08, -y, low), (x + 0.04, y, high), 0.02, transmission=0.75)]
     if x - rear > LEG_ROOM_M:
