@@ -43,22 +43,6 @@ def deskew(xyz: np.ndarray, seconds: np.ndarray, poses: PoseLookup) -> np.ndarra
     )
 
 
-def skew(xyz: np.ndarray, seconds: np.ndarray, poses: PoseLookup) -> np.ndarray:
-    """Invert deskew: return the points (N, 3) float32 as a moving sensor measures them.
-
-    Args:
-        xyz: (N, 3) points in the sensor's frame at the stamp.
-        seconds: (N,) time of each point, relative to the stamp.
-        poses: Motion of the sensor.
-    """
-
-    def invert_poses(at: np.ndarray) -> np.ndarray:
-        sensor_poses = poses(at)
-        return invert_pose(invert_pose(sensor_poses[-1]) @ sensor_poses)
-
-    return deskew(xyz, seconds, invert_poses)
-
-
 def make_constant_motion(velocity: np.ndarray, rotation: np.ndarray) -> PoseLookup:
     """Make the motion of a sensor with a constant twist.
 

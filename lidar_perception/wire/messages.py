@@ -24,7 +24,7 @@ from lidar_perception.types import (
     find_class_ids,
 )
 from lidar_perception.wire.topics import CAMERA_FRAME
-from msg_utils.markers import MarkedObjects, MarkerRow, make_marker_rows, rows_to_message, to_marker_array
+from msg_utils.markers import MarkedObjects, MarkerRow, make_marker_rows, to_marker_array
 from msg_utils.point_cloud2 import CloudError, from_array, read_columns, read_xyz, to_array
 from msg_utils.stamps import to_ns
 
@@ -316,18 +316,6 @@ def make_detection_rows(
     for text, cluster in zip(texts, () if clusters is None else clusters):
         text["cluster_id"] = int(cluster)
     return make_marker_rows(detections.boxes, labels, detections.scores, extras=texts, previous=previous)
-
-
-def make_detection_markers(
-    detections: Detections,
-    header: Any,
-    make: Any,
-    previous: Any = (),
-    lifetime_ns: int = 0,
-    clusters: np.ndarray | None = None,
-) -> Any:
-    """Make the MarkerArray of K detections; for the arguments see make_detection_rows."""
-    return rows_to_message(make_detection_rows(detections, previous, clusters), header, make, lifetime_ns)
 
 
 def make_odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -> Any:

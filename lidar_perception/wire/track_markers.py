@@ -9,7 +9,7 @@ import numpy as np
 
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.messages import MAX_ID
-from msg_utils.markers import ADD, COLORS, OTHER_COLOR, MarkerRow, list_marker_keys, make_marker_rows, rows_to_message
+from msg_utils.markers import ADD, COLORS, OTHER_COLOR, MarkerRow, list_marker_keys, make_marker_rows
 
 ARROW, LINE_STRIP, TEXT = 0, 4, 9
 # Namespaces in addition to those named after the classes.
@@ -84,24 +84,6 @@ def make_track_rows(
             boxes, labels, detections.scores, ids=numbers, extras=texts, previous=set(previous) - extra_keys
         )
         + extra_rows
-    )
-
-
-def make_track_markers(
-    ids: np.ndarray,
-    detections: Detections,
-    velocities: np.ndarray,
-    moving: np.ndarray,
-    trails: Sequence[np.ndarray],
-    header: Any,
-    make: Any,
-    *,
-    lifetime_ns: int = 0,
-    **more: Any,
-) -> Any:
-    """Make the MarkerArray of K tracks; for the arguments see make_track_rows."""
-    return rows_to_message(
-        make_track_rows(ids, detections, velocities, moving, trails, **more), header, make, lifetime_ns
     )
 
 

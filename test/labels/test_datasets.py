@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cli_samples import error_line, exit_of
 from format_samples import CALIBRATION, drive, make_labels, pose, same
+from marker_messages import make_detection_markers
 from nuscenes_folder import make_tables, save
 from robot_bags import ON_BASE, base_at, mount, moving, moving_tf, recorded, stamps
 from samples import DATA, needs_data
@@ -28,7 +29,6 @@ from lidar_perception.simulation.sensor import make_generic_sensor
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.types import SENSOR_HEIGHT, Detections, GroundTruth, InputError, PointCloud
 from lidar_perception.wire.codec import make_bag_message
-from lidar_perception.wire.messages import make_detection_markers
 from lidar_perception.wire.topics import ODOMETRY, POINTS
 from lidar_studio import results
 from msg_utils.detections import to_detection_array

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from marker_messages import make_detection_markers
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
@@ -24,7 +25,7 @@ from lidar_perception.tracking.ego import has_odometry
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import decode, encode, make_bag_message
-from lidar_perception.wire.messages import make_detection_markers, to_class_ids
+from lidar_perception.wire.messages import to_class_ids
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import make_header
 

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from marker_messages import make_detection_markers
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
@@ -15,7 +16,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.nodes.replay.evaluator import MAX_INCOMPLETE_FRAMES, Evaluator
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import make_bag_message
-from lidar_perception.wire.messages import make_camera_info, make_detection_markers, make_extrinsics
+from lidar_perception.wire.messages import make_camera_info, make_extrinsics
 from lidar_perception.wire.topics import CAMERA_FRAME
 from msg_utils.stamps import make_header
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from marker_messages import make_detection_markers
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
@@ -25,7 +26,7 @@ from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
 from lidar_perception.wire.codec import decode, encode, make_bag_message
-from lidar_perception.wire.messages import make_detection_markers, make_odometry, to_detections, to_truth
+from lidar_perception.wire.messages import make_odometry, to_detections, to_truth
 from lidar_perception.wire.topics import CAMERA_INFO, ODOMETRY, POINTS, TRUTH
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import ADD, from_marker_array

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from marker_messages import make_track_markers
 from tracking_samples import START, TENTH, crowd
 
 from lidar_perception.data.bag import BagWriter
@@ -17,7 +18,7 @@ from lidar_perception.types import GroundTruth, InputError
 from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_truth_markers
 from lidar_perception.wire.topics import TRUTH
-from lidar_perception.wire.track_markers import make_track_markers, read_trails
+from lidar_perception.wire.track_markers import read_trails
 from msg_utils.stamps import make_header
 
 MARKERS, TRACKS = "visualization_msgs/msg/MarkerArray", "/tracker/output/tracks"

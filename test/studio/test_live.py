@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from marker_messages import make_track_markers
 
 from lidar_perception.robot.poses import make_pose, transform_boxes, transform_points
 from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.topics import TRUTH
-from lidar_perception.wire.track_markers import make_track_markers
 from lidar_studio import live_graph
 from lidar_studio.live_graph import BOXES, LABELS, TRACKS, LiveGraph
 from lidar_studio.live_topics import select_box_topics, select_cloud_topic

@@ -6,6 +6,7 @@ import importlib.util
 
 import numpy as np
 import pytest
+from marker_messages import make_detection_markers
 from samples import each_make, header, scene, walker_truth
 
 from lidar_perception.data.bag import Bag
@@ -17,7 +18,7 @@ from lidar_perception.testing.detections import assert_detections, to_objects
 from lidar_perception.testing.launching import include_launch_file, make_description
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 from lidar_perception.wire.codec import make_bag_message
-from lidar_perception.wire.messages import make_detection_markers, make_truth_markers, to_point_cloud
+from lidar_perception.wire.messages import make_truth_markers, to_point_cloud
 from msg_utils.detections import to_detection_array
 from msg_utils.point_cloud2 import to_array
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from marker_messages import make_detection_markers
 from samples import CALIBRATION, each_make, header
 
 from lidar_perception.camera import Calibration, Camera
@@ -12,7 +13,6 @@ from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import decode, encode, make_bag_message
 from lidar_perception.wire.messages import (
     make_camera_info,
-    make_detection_markers,
     make_extrinsics,
     read_calibration,
     read_column,

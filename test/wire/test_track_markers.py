@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from marker_messages import make_track_markers
 from robot_bags import read_pose
 from samples import each_make, header
 from tracking_samples import CAR, START, TENTH, crowd, pose
@@ -12,7 +13,7 @@ from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import make_bag_message
 from lidar_perception.wire.messages import make_odometry, to_detections
-from lidar_perception.wire.track_markers import EXTRA_NAMESPACES, MAX_ID, NUMBER, VELOCITY, make_track_markers
+from lidar_perception.wire.track_markers import EXTRA_NAMESPACES, MAX_ID, NUMBER, VELOCITY
 from msg_utils.markers import ADD, DELETE, from_marker_array, list_marker_keys
 
 
