@@ -16,7 +16,7 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import MIN_SCORE, ScoreParams
 from lidar_perception.runs.terminal import console, show_progress
 from lidar_perception.scoring.tracking.pairs import to_tracked_labels
-from lidar_perception.scoring.tracking.report import TrackingReport, observe
+from lidar_perception.scoring.tracking.report import TrackingReport, make_observation
 from lidar_perception.tracking.drive_tracker import choose_ego_source
 from lidar_perception.tracking.ego import make_pose_reader
 from lidar_perception.tracking.params import TrackingParams
@@ -110,7 +110,7 @@ def _measure(drives: Mapping[str, Sequence[TrackedFrame]], make_step: Callable[[
             start = perf_counter()
             ids, detections = step(frame)
             ms.append((perf_counter() - start) * 1e3)
-            report.update(observe(name, i, frame.truth, to_tracked_labels(ids, detections), frame.calibration))
+            report.update(make_observation(name, i, frame.truth, to_tracked_labels(ids, detections), frame.calibration))
     return {**report.compute(), "ms": float(np.median(ms)) if ms else None}
 
 

@@ -29,7 +29,7 @@ from lidar_perception.ground.params import GROUND_METHODS, GroundParams
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.detections import measure_detector
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.scoring.run import Skipped, measure_frames
+from lidar_perception.scoring.run import SkipReason, measure_frames
 from lidar_perception.simulation.recording import simulate_recording
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import find_sensor
@@ -225,7 +225,7 @@ def evaluate(
     start = partial(measure_detector, lambda: loaded, 1.0, None)
     numbers = range(min(len(recording), limit or len(recording)))
     for _, result in measure_frames(recording, start, numbers):
-        if isinstance(result, Skipped):
+        if isinstance(result, SkipReason):
             report.skipped.append(str(result))
         elif result is not None:
             report.update(result)

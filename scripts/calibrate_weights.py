@@ -52,7 +52,7 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
             jobs=jobs,
             limit=limit,
         )
-        calibrations = fit_calibrations(Comparison.of(report.frames)) if report.frames else {}
+        calibrations = fit_calibrations(Comparison.concatenate(report.frames)) if report.frames else {}
         header = read_header(path)
         if missing := sorted({*header.calibration} - {*calibrations}):
             raise click.ClickException(

@@ -61,9 +61,9 @@ def measure_drive(
         for name, (boxes, _) in detect_with_all(frame.load(), sources, frame.sensor_height, "around").items():
             tracks = trackers[name](boxes, frame.stamp_ns, pose)
             result = select_boxes(frame, add_velocities(to_results(boxes, frame), tracks, pose))
-            if result.truth is None or result.counted is None:
+            if result.truth is None or result.scored is None:
                 return None
-            truth, detections[name] = result.truth, to_columns(result.counted)
+            truth, detections[name] = result.truth, to_columns(result.scored)
         rows.append({"truth": to_columns(truth), "found": detections})
     return rows
 

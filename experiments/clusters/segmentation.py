@@ -118,8 +118,8 @@ def limit_to_points(objects: Objects, mask: np.ndarray) -> Objects:
     return Objects(
         np.where(mask, objects.owner, 0),
         np.where(mask, objects.region, 0),
-        objects.near & mask,
-        objects.counted & mask,
+        objects.is_near & mask,
+        objects.is_counted & mask,
         objects.classes,
         objects.ranges,
     )
@@ -143,7 +143,7 @@ def count_points(cluster_ids: np.ndarray, ground: np.ndarray, objects: Objects) 
         objects, of points found for an object, of points on objects, of objects, of hits (IoU above
         0.5), and of clusters that score_clusters() judges; and the sum of the objects' IoU.
     """
-    is_compared = objects.counted & ((objects.owner > 0) | ~ground)
+    is_compared = objects.is_counted & ((objects.owner > 0) | ~ground)
     is_compared &= (objects.owner > 0) == (objects.region > 0)
     ids, owner = (a.compress(is_compared).astype(np.int64) for a in (cluster_ids, objects.owner))
     cluster_by_object = pair_clusters(ids, owner, len(objects.classes))
@@ -161,7 +161,7 @@ def count_points(cluster_ids: np.ndarray, ground: np.ndarray, objects: Objects) 
         int((owner > 0).sum()),
         int(has_points.sum()),
         int((score.iou[has_points] > 0.5).sum()),
-        score.judged,
+        score.judged_count,
         round(float(score.iou[has_points].sum()), 6),
     ]
 

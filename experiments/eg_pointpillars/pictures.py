@@ -79,12 +79,12 @@ def count_errors(frame: ComparedFrame) -> int:
     for name in SCORED:
         matches = overlaps > RELAXED_BEV[1][name]
         is_detected = (
-            (frame.found.class_ids == CLASSES.index(name))
-            & (frame.found.scores >= MIN_SHOWN_SCORE)
-            & (classify_detections(frame.found, name, "moderate") == COUNTED)
+            (frame.detections.class_ids == CLASSES.index(name))
+            & (frame.detections.scores >= MIN_SHOWN_SCORE)
+            & (classify_detections(frame.detections, name, "moderate") == COUNTED)
         )
-        is_counted_label = classify_labels(frame.true, name, "moderate") == COUNTED
-        is_label = frame.true.class_ids == CLASSES.index(name)
+        is_counted_label = classify_labels(frame.labels, name, "moderate") == COUNTED
+        is_label = frame.labels.class_ids == CLASSES.index(name)
         errors += int((is_counted_label & ~matches[is_detected].any(axis=0)).sum())
         errors += int((is_detected & ~matches[:, is_label].any(axis=1)).sum())
     return errors

@@ -84,7 +84,7 @@ def compute_cells(frames: list[ComparedFrame]) -> np.ndarray:
     cells = np.full((len(PROTOCOLS), len(CELLS) + 1), np.nan)
     if not frames:
         return cells
-    comparison = Comparison.of(frames)
+    comparison = Comparison.concatenate(frames)
     for i, (metric, overlaps) in enumerate(PROTOCOLS):
         for j, (name, level) in enumerate(CELLS):
             curve = compute_precision(comparison, name, metric, overlaps[name], level)

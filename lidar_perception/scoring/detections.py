@@ -1,4 +1,4 @@
-"""Detections of a frame, from a detector or from result files, for any scoring protocol."""
+"""Detections of frames, from a detector or from result files, for all scoring protocols."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class FrameDetections(Generic[BoxesT]):
 def thin_scan(frame: PointCloud, fraction: float, name: str) -> PointCloud:
     """Return a random fraction (0..1) of a frame's points to emulate a sparser sensor (paper C).
 
-    The choice depends on the frame's name only. A smaller fraction is a subset of a larger one.
+    The choice depends only on the frame's name. A smaller fraction is a subset of a larger one.
     """
     if fraction >= 1.0:
         return frame
@@ -54,7 +54,7 @@ def thin_scan(frame: PointCloud, fraction: float, name: str) -> PointCloud:
 
 
 def draw_subset(count: int, fraction: float, name: str) -> np.ndarray:
-    """Return a random mask (count,) bool, seeded by `name`, that is True for this fraction."""
+    """Return a random mask (count,) bool that is True for this fraction, seeded by `name`."""
     return np.random.default_rng(zlib.crc32(name.encode())).random(count) < fraction
 
 
@@ -86,7 +86,7 @@ def measure_detector(
 
     Args:
         open_detector: Function that loads the detector.
-        fraction: Fraction of the points that the detector gets, 0..1.
+        fraction: Fraction of the points to pass to the detector, 0..1.
         folder: Folder for KITTI result files, or None. With a folder, frames without labels are
             processed too.
     """
@@ -110,7 +110,7 @@ def measure_detector(
 def measure_result_files(folder: Path, recording: Recording) -> Callable[[Frame], FrameDetections[GroundTruth] | None]:
     """Make a function that reads the KITTI result file folder/NAME.txt of each labelled frame.
 
-    `folder` may be the output of `detect`; frames that `detect` skipped are skipped here too.
+    `folder` may be the output of `detect`. Frames that `detect` skipped are skipped here too.
     partial(measure_result_files, folder) is a StartMeasurement of scoring.run.
     """
     result_folder = find_result_folder(folder)

@@ -1,7 +1,7 @@
 """Confidence intervals of scores: the bootstrap over drives (Efron, 1979).
 
-Frames of one drive show the same street and the same people, so drives are drawn with replacement,
-not frames. A recording with fewer than MIN_DRIVES drives is divided into blocks of BLOCK_FRAMES
+Frames of one drive show the same street and the same people. Therefore, drives are drawn with
+replacement, not frames. A recording with fewer than MIN_DRIVES drives is divided into blocks of BLOCK_FRAMES
 frames.
 """
 
@@ -49,13 +49,13 @@ def compute_interval(
         count: Number of bootstrap draws.
 
     Returns:
-        The interval, or None for fewer than two groups or if no draw has a score.
+        The interval; None for fewer than two groups, or if no draw has a score.
     """
     return compute_bounds(score(frames) for frames in draw_samples(groups, count))
 
 
 def draw_samples(groups: Sequence[np.ndarray], count: int) -> Iterator[np.ndarray]:
-    """Yield the frame indices (F,) of `count` bootstrap draws (fixed seed); none for one group."""
+    """Yield the frame indices (F,) of `count` bootstrap draws with a fixed seed. Nothing for one group."""
     rng = np.random.default_rng(0)
     for _ in range(count if len(groups) > 1 else 0):
         yield np.concatenate([groups[i] for i in rng.integers(len(groups), size=len(groups))])

@@ -1,4 +1,4 @@
-"""Writing of Matplotlib figures to files."""
+"""Writing of Matplotlib figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results that ROS nodes recorded to a bag, with the labels of the same frames."""
+"""Results of ROS nodes in a bag, with the labels of the same frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from msg_utils.markers import MarkedObjects, from_marker_array
 
 @dataclass(frozen=True)
 class RecordedResult:
-    """Labels of one frame and the objects that a node published for it."""
+    """Labels of a frame, and the objects that a node published for it."""
 
     stamp_ns: int
     truth: MarkedObjects
@@ -24,7 +24,7 @@ class RecordedResult:
 def read_results(path: Path, *topics: str) -> list[list[RecordedResult]]:
     """Read the results of labelled frames from each topic, in order of time.
 
-    Results are transformed into the frame of the labels. If several messages have the same stamp,
+    Results are transformed to the coordinate frame of the labels. If several messages have the same stamp,
     the last one is used.
 
     Raises:
@@ -49,8 +49,8 @@ def read_objects_by_stamp(bag: Bag, topics: Iterable[str]) -> dict[str, dict[int
     If several messages have the same stamp, the last one is used. A topic that is not in the bag
     has no objects.
     """
-    by_topic: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in topics}
-    for topic, _, message in bag.messages(by_topic.keys() & bag.topics.keys()):
+    objects_by_topic: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in topics}
+    for topic, _, message in bag.messages(objects_by_topic.keys() & bag.topics.keys()):
         objects = from_marker_array(message)
-        by_topic[topic][objects.stamp_ns] = objects
-    return by_topic
+        objects_by_topic[topic][objects.stamp_ns] = objects
+    return objects_by_topic

@@ -1,4 +1,4 @@
-"""Measurement of the frames of a recording, in one process, in several, or on a Dask cluster.
+"""Processing of the frames of a recording in one process, in several, or on a Dask cluster.
 
     for i, result in measure_frames(recording, start, jobs=4): ...
     fill_report(report, recording, start)   # calls update() with each result, lists skipped frames
@@ -30,12 +30,12 @@ from lidar_perception.types import InputError, RunError
 
 StartMeasurement = Callable[[Recording], Callable[[Frame], Any]]
 
-CONNECT_S = 20.0  # timeout for a Dask scheduler and its first worker
+CONNECT_TIMEOUT_S = 20.0  # timeout for a Dask scheduler and its first worker
 TASKS_PER_THREAD = 2  # number of tasks per thread of a Dask cluster
 
 
 class Report(Protocol):
-    """Collection of the results of frames; `skipped` has one line per skipped frame."""
+    """Collects the results of frames. `skipped` has one line for each skipped frame."""
 
     skipped: list[str]
 
@@ -46,8 +46,8 @@ class Report(Protocol):
         """Return the scores as a JSON object."""
 
 
-class Skipped(str):
-    """Reason why a frame was not measured."""
+class SkipReason(str):
+    """Reason why a frame was skipped."""
 
 
 def fill_report(
@@ -62,8 +62,7 @@ def fill_report(
 ) -> None:
     """Measure a recording, add the results to a report, and show a progress bar.
 
-    Skipped frames are added to report.skipped. Without a limit these include labels whose scan is
-    missing.
+    Skipped frames are added to report.skipped. Without a limit, these include labels without a scan.
 
     Args:
         limit: Number of frames to measure, None for all.
@@ -75,7 +74,7 @@ def fill_report(
     results = measure_frames(recording, start, range(count), jobs=jobs, dask=dask)
     with closing(results):
         for _, result in show_progress(results, title, count):
-            if isinstance(result, Skipped):
+            if isinstance(result, SkipReason):
                 report.skipped.append(str(result))
             elif result is not None:
                 report.update(result)
@@ -99,7 +98,7 @@ def fill_journal(
     that contains {"frame": name}. A skipped frame is written as {"frame": name, "skipped": reason}.
 
     Args:
-        names: Names of the frames to measure, the first ones of the recording.
+        names: Names of the first frames of the recording, which are measured.
 
     Raises:
         InputError: A process or the cluster failed.
@@ -108,7 +107,7 @@ def fill_journal(
     results = measure_frames(recording, start, unfinished, jobs=jobs, dask=dask)
     with closing(results):
         for i, line in show_progress(results, title, len(unfinished)):
-            journal.add(json.dumps({"frame": names[i], "skipped": str(line)}) if isinstance(line, Skipped) else line)
+            journal.add(json.dumps({"frame": names[i], "skipped": str(line)}) if isinstance(line, SkipReason) else line)
 
 
 def measure_frames(
@@ -119,7 +118,7 @@ def measure_frames(
     jobs: int = 1,
     dask: str | None = None,
 ) -> Generator[tuple[int, Any]]:
-    """Yield (i, result), or (i, Skipped) for a frame that is skipped, in the order of the frames.
+    """Yield (i, result), or (i, SkipReason) for a skipped frame, in the order of the frames.
 
     Args:
         numbers: Indices of the frames in ascending order, None for all.
@@ -141,13 +140,13 @@ def measure_frames(
 
 def sort_results(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]) -> Generator[tuple[int, Any]]:
     """Yield pairs (number, value) in the order of `numbers`, each as soon as it is available."""
-    held_back: dict[int, Any] = {}
+    finished: dict[int, Any] = {}
     remaining = iter(numbers)
     next_number = next(remaining, None)
     for number, value in pairs:
-        held_back[number] = value
-        while next_number in held_back:
-            yield next_number, held_back.pop(next_number)
+        finished[number] = value
+        while next_number in finished:
+            yield next_number, finished.pop(next_number)
             next_number = next(remaining, None)
 
 
@@ -166,15 +165,15 @@ def _measure_safely(measure: Callable[[Frame], Any], frame: Frame) -> Any:
     except RunError:
         raise
     except InputError as error:
-        return Skipped(error)
+        return SkipReason(error)
     except Exception as error:
-        error.add_note(f"while frame {frame.name} was measured")
+        error.add_note(f"while processing frame {frame.name}")
         raise
 
 
 def _require_reopen(recording: Recording) -> Callable[[], Recording]:
     if recording.reopen is None:
-        raise InputError(f"{recording.path} cannot be opened by other processes; use one job")
+        raise InputError(f"{recording.path} cannot be opened by other processes; use --jobs 1")
     return recording.reopen
 
 
@@ -204,12 +203,12 @@ def _measure_on_dask(
         from distributed.comm import CommClosedError
     except ImportError:
         raise InputError(
-            "--dask needs the package distributed; run pip install 'lidar_perception[distributed]'"
+            "--dask requires the package distributed; run pip install 'lidar_perception[distributed]'"
         ) from None
     measure_on_worker = functools.partial(_measure_on_cluster, uuid4().hex, _require_reopen(recording), start)
     try:
-        client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
-        client.wait_for_workers(1, timeout=CONNECT_S)
+        client = distributed.Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+        client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
     except (OSError, ValueError) as error:
         raise InputError(
             f"cannot reach a Dask scheduler with workers at {address}: {str(error) or repr(error)}"

@@ -9,11 +9,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-MAX_SHOWN = 5  # maximum number of reasons listed for skipped frames
+MAX_SHOWN = 5  # maximum number of skipped frames to list
 
 
 def make_table(title: str, first: str, *others: str, width: int = 0) -> Table:
-    """Make a table with one column of text, then right-aligned columns of at least `width`."""
+    """Make a table with a column of text, followed by right-aligned columns of at least `width`."""
     table = Table(title=title, box=SIMPLE_HEAD, padding=0, caption_justify="left")
     table.add_column(first, overflow="fold")
     for name in others:
@@ -22,12 +22,12 @@ def make_table(title: str, first: str, *others: str, width: int = 0) -> Table:
 
 
 def format_number(value: float | None, digits: int = 2, width: int = 5) -> str:
-    """Format a number with at most `width` characters (84.00, 100.0); None and inf as a dash."""
+    """Format a number with at most `width` characters (84.00, 100.0). None and inf become a dash."""
     return "-" if value is None or math.isinf(value) else f"{value:.{digits}f}"[:width].rstrip(".")
 
 
 def format_interval(interval: list[float] | None) -> str:
-    """Format an interval like 44-89; None as a dash."""
+    """Format an interval like 44-89. None becomes a dash."""
     return "-" if interval is None else "-".join(f"{value:.0f}" for value in interval)
 
 
@@ -44,7 +44,7 @@ def format_counts(row: dict, *keys: str) -> list[str]:
 def print_time(ms: float | None, console: Console) -> None:
     """Print the median run time of the detector, unless it is None."""
     if ms is not None:
-        console.print(f"detector: {ms:.1f} ms a frame (median)")
+        console.print(f"detector: {ms:.1f} ms per frame (median)")
 
 
 def print_skipped(lines: list[str], console: Console) -> None:

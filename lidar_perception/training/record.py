@@ -85,7 +85,7 @@ def summarize_report(report: DetectionReport, score: str, classes: Sequence[str]
     """Return metrics and calibration for Task.validate."""
     return (
         select_metrics(report.compute(), score, classes),
-        fit_calibrations(Comparison.of(report.frames)) if report.frames else {},
+        fit_calibrations(Comparison.concatenate(report.frames)) if report.frames else {},
     )
 
 

@@ -34,7 +34,7 @@ from lidar_perception.detectors.open import LOAD
 from lidar_perception.labels.exchange import import_labels
 from lidar_perception.scoring.recorded import read_objects_by_stamp
 from lidar_perception.scoring.run import fill_report
-from lidar_perception.scoring.tracking.report import TrackingReport, measure_tracking, observe
+from lidar_perception.scoring.tracking.report import TrackingReport, make_observation, measure_tracking
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import Detections
 from lidar_perception.wire.topics import POINTS, TRUTH
@@ -236,7 +236,7 @@ def test_written_tracks_score_like_the_tracker(drives, tmp_path, monkeypatch):
     for frame in recording:
         if (truth := frame.truth()) is not None:
             found = read_tracking_labels(tmp_path / f"kitti/{frame.sequence}.txt", frame.calibration().lidar_to_camera)
-            read.update(observe(frame.sequence, frame.index, truth, found[frame.index], frame.calibration()))
+            read.update(make_observation(frame.sequence, frame.index, truth, found[frame.index], frame.calibration()))
     scores = [report.compute()["classes"] for report in (read, itself)]
     assert scores[0].keys() == scores[1].keys() and scores[0]["Pedestrian"]["boxes"] > 0
     assert numbers_in(scores[0]) == pytest.approx(numbers_in(scores[1]), abs=1e-3)

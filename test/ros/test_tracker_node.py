@@ -19,7 +19,7 @@ from lidar_perception.nodes.graph import ODOMETRY_INPUT, build_graph
 from lidar_perception.nodes.tracker import TrackerNode
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.scoring.tracking.pairs import to_tracked_labels
-from lidar_perception.scoring.tracking.report import TrackingReport, observe
+from lidar_perception.scoring.tracking.report import TrackingReport, make_observation
 from lidar_perception.testing.peer import Peer
 from lidar_perception.testing.processes import NodesUnderTest
 from lidar_perception.tracking.params import TrackingParams
@@ -152,7 +152,7 @@ def test_ids_follow_the_people_of_the_drive(looped, drive_bag):
     report = TrackingReport()
     for i, message in enumerate(heard["behind"][:clouds]):
         stamp, ids, found, _ = read(message)
-        report.update(observe("drive", i, truth[stamp], to_tracked_labels(np.array(ids), found)))
+        report.update(make_observation("drive", i, truth[stamp], to_tracked_labels(np.array(ids), found)))
     people = report.compute()["classes"]["Pedestrian"]
     assert people["switches"] == 0 and people["hits"] > clouds
 

@@ -59,11 +59,12 @@ def test_scores_equal_to_the_precision_are_reliable(seed):
     found = true.copy()
     found[rng.random(400) >= share] += [1e4, 0, 0, 0, 0, 0, 0]
     honest, modest = (
-        measure_reliability(Comparison.of([frame(true, found, scores)]), "Car") for scores in (share, 0.05 + share / 10)
+        measure_reliability(Comparison.concatenate([frame(true, found, scores)]), "Car")
+        for scores in (share, 0.05 + share / 10)
     )
     assert sum(row["boxes"] for row in honest["bins"]) == 400
     assert honest["error"] < 12 and modest["error"] > 30
-    assert measure_reliability(Comparison.of([frame(true, found[:0])]), "Car")["error"] is None
+    assert measure_reliability(Comparison.concatenate([frame(true, found[:0])]), "Car")["error"] is None
 
 
 @settings(max_examples=5)
@@ -76,11 +77,11 @@ def test_fitted_calibration_recovers_distorted_scores(seed):
     found = true.copy()
     found[rng.random(3000) >= share] += [1e6, 0, 0, 0, 0, 0, 0]
     bent = expit((logit(share) + 0.7) / 1.6)
-    slope, offset = fit_calibrations(Comparison.of([frame(true[i::30], found[i::30], bent[i::30]) for i in range(30)]))[
-        "Car"
-    ]
+    slope, offset = fit_calibrations(
+        Comparison.concatenate([frame(true[i::30], found[i::30], bent[i::30]) for i in range(30)])
+    )["Car"]
     assert slope == pytest.approx(1.6, abs=0.25) and offset == pytest.approx(-0.7, abs=0.25)
-    assert fit_calibrations(Comparison.of([frame(true[:5], found[:5], bent[:5])])) == {}
+    assert fit_calibrations(Comparison.concatenate([frame(true[:5], found[:5], bent[:5])])) == {}
 
 
 def test_known_box_errors_are_measured():

@@ -71,7 +71,7 @@ def concatenate(*lines):
 def test_scores_equal_an_independent_implementation(seed, count, noise):
     rng = np.random.default_rng(seed)
     frames = [reference.random_frame(rng, noise=noise) for _ in range(count)]
-    compared = Comparison.of(report(frames).frames)
+    compared = Comparison.concatenate(report(frames).frames)
     few_objects = many_objects = 0
     for metric, overlaps in ROWS.values():
         prepared = reference.prepare(frames, metric)
@@ -338,9 +338,9 @@ def test_error_about_non_finite_number_names_the_frame(broken):
 @pytest.mark.parametrize(
     "shift, taller, words",
     [
-        (0.62, 0, "0.62 m too high; check the sensor height"),
-        (-0.62, 0, "0.62 m too low; check the sensor"),
-        (-0.75, 0, "0.75 m too low; that is half their height"),
+        (0.62, 0, "0.62 m too high (median); check the sensor height"),
+        (-0.62, 0, "0.62 m too low (median); check the sensor"),
+        (-0.75, 0, "0.75 m too low (median); that is half their height"),
         (0, 0, ""),
         (0.1, 0, ""),
         (0, 4.0, "0.00 m too high or too low, and 4.00 m too tall"),

@@ -135,7 +135,7 @@ def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
     assert detector.asked == [("v4.onnx", "cpu", MIN_SCORE, SENSOR_HEIGHT)]
     assert len(detector.scans) == 2
     assert len(detector.scans[0]) == len(open_recording(kitti).frames[0].load())
-    assert content["ms"] >= 0 and "ms a frame" in text
+    assert content["ms"] >= 0 and "ms per frame" in text
     for (_, row, _), cell in cells(content).items():
         if row not in ("image", "aos"):  # 2D boxes of these labels are not projections
             assert cell["r40"] == 100

@@ -94,7 +94,7 @@ def test_a_checkpoint_is_run_and_its_results_score_the_same(root, detector, tmp_
     assert direct["all"]["map"] == pytest.approx(0.3 * direct["ours"]["map"])
     read, _ = evaluate(tmp_path, "--data", root, "--results", out)
     assert {**read, "source": None, "ms": None} == {**direct, "source": None, "ms": None}
-    for words in ("92.68", "83.45", "our three ", "all ten", "result file", "ms a frame"):
+    for words in ("92.68", "83.45", "our three ", "all ten", "result file", "ms per frame"):
         assert words in text
     assert max(len(line) for line in text.splitlines() if str(out) not in line) <= 80
 

@@ -29,7 +29,7 @@ from lidar_perception.scoring.centres.report import (
 )
 from lidar_perception.scoring.detections import FrameDetections
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.scoring.run import Skipped, fill_report, measure_frames
+from lidar_perception.scoring.run import SkipReason, fill_report, measure_frames
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError, PointCloud
 
 seeds = st.integers(0, 2**32 - 1)
@@ -225,7 +225,7 @@ def test_report_is_json_and_counts_every_pedestrian():
             frame("again", truth_of(HERE)),
         ]
     )
-    assert [type(r) for r in found] == [CandidateResult, NoneType, NoneType, Skipped, CandidateResult]
+    assert [type(r) for r in found] == [CandidateResult, NoneType, NoneType, SkipReason, CandidateResult]
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     assert content["frames"] == 2 and content["ground_truth"] == 3
     assert content["ground_truth_by_range"] == {"0-15": 2, "15-30": 1, "30-45": 0, "45-60": 0, "60+": 0}

@@ -16,7 +16,13 @@ import pytest
 from lidar_perception.data.nuscenes.boxes import CATEGORIES, NAMES, GlobalBoxes
 from lidar_perception.data.nuscenes.folder import open_nuscenes
 from lidar_perception.data.nuscenes.results import META, read_results
-from lidar_perception.scoring.nuscenes.protocol import RANGES, compute_errors, score_class, select_counted, summarize
+from lidar_perception.scoring.nuscenes.protocol import (
+    RANGES,
+    compute_errors,
+    score_class,
+    select_scored_boxes,
+    summarize,
+)
 from lidar_perception.scoring.nuscenes.report import DETECTED_NAMES, NuscenesReport, select_boxes
 from lidar_perception.types import InputError
 
@@ -141,7 +147,7 @@ def test_error_is_a_mean_of_means_over_recall():
 def test_a_class_counts_within_its_range_of_the_vehicle(kind):
     there = np.array([100.0, 50.0])
     away = RANGES[kind]
-    kept = select_counted(
+    kept = select_scored_boxes(
         boxes(*(there + [away * s, 0] for s in (0.999, 1, -0.999, 1.2)), kind=kind), np.array([100, 50, 7]), boxes()
     )
     assert kept.tolist() == [True, False, True, False]
@@ -151,15 +157,15 @@ def test_a_class_counts_within_its_range_of_the_vehicle(kind):
 def test_empty_labels_and_bicycles_in_racks_do_not_count():
     rack = boxes((0, 0), yaw=math.pi / 2)  # 2 m along x, 4 m along y
     for kind, inside in ("bicycle", False), ("motorcycle", False), ("pedestrian", True):
-        kept = select_counted(boxes((0.9, 1.9), (1.9, 0.9), kind=kind), np.zeros(3), rack)
+        kept = select_scored_boxes(boxes((0.9, 1.9), (1.9, 0.9), kind=kind), np.zeros(3), rack)
         assert kept.tolist() == [inside, True]
-    assert select_counted(boxes((0, 0), (1, 0), (2, 0), points=[0, 3, -1]), np.zeros(3), boxes()).tolist() == [
+    assert select_scored_boxes(boxes((0, 0), (1, 0), (2, 0), points=[0, 3, -1]), np.zeros(3), boxes()).tolist() == [
         False,
         True,
         True,
     ]
     none = GlobalBoxes.of(np.zeros((1, 3)), np.ones((1, 3)), [[1, 0, 0, 0]], -1)
-    assert not select_counted(none, np.zeros(3), boxes()).any()
+    assert not select_scored_boxes(none, np.zeros(3), boxes()).any()
 
 
 def reported(root, results):

@@ -14,7 +14,7 @@ from samples import object_folder, walker_label, write
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.scoring.detections import measure_result_files
-from lidar_perception.scoring.run import Skipped, fill_report, measure_frames, sort_results
+from lidar_perception.scoring.run import SkipReason, fill_report, measure_frames, sort_results
 from lidar_perception.types import InputError, RunError
 
 COUNT = 5
@@ -62,7 +62,7 @@ def test_results_are_equal_and_ordered_with_many_processes(root):
     one, two = ([*measure_frames(recording, counting, jobs=jobs)] for jobs in (1, 2))
     kinds = [type(result) for _, result in one]
     assert one == two and kinds == [type(result) for _, result in two]
-    assert kinds == [tuple, Skipped, tuple, type(None), tuple]
+    assert kinds == [tuple, SkipReason, tuple, type(None), tuple]
     assert [i for i, _ in one] == [*range(COUNT)]
     chosen = [1, 2, 4]
     assert [*measure_frames(recording, counting, chosen)] == [one[i] for i in chosen]
@@ -114,7 +114,7 @@ def test_programming_error_is_raised_with_frame_name(root):
 
     with pytest.raises(ZeroDivisionError) as error:
         [*measure_frames(open_recording(root), mistaken)]
-    assert error.value.__notes__ == ["while frame 000002 was measured"]
+    assert error.value.__notes__ == ["while processing frame 000002"]
 
 
 @pytest.mark.parametrize(

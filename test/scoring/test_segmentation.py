@@ -142,7 +142,7 @@ def test_neutral_points_count_for_other_objects():
 def test_clusters_of_ignored_points_are_not_scored(counted):
     """Most points of a frame can be unlabelled."""
     truth = objects(np.repeat([1, 0, 2], 10), near=np.ones(30), counted=np.arange(30) < counted)
-    assert score_clusters(np.repeat([1, 2, 3], 10), truth).judged == counted / 10
+    assert score_clusters(np.repeat([1, 2, 3], 10), truth).judged_count == counted / 10
 
 
 @given(seeds)
@@ -152,7 +152,9 @@ def test_order_of_points_and_numbers_of_clusters_do_not_matter(seed):
     order = rng.permutation(len(found))
     large = rng.permutation(np.unique(rng.integers(1, 2**31, 40)))[:10]  # lookup tables would take gigabytes
     renamed = np.concatenate([[0], large])[found]
-    shuffled = replace(truth, **{name: getattr(truth, name)[order] for name in ("owner", "region", "near", "counted")})
+    shuffled = replace(
+        truth, **{name: getattr(truth, name)[order] for name in ("owner", "region", "is_near", "is_counted")}
+    )
     assert report_of(renamed[order], shuffled) == report_of(found, truth)
 
 
@@ -160,7 +162,7 @@ def test_order_of_points_and_numbers_of_clusters_do_not_matter(seed):
 def test_scores_equal_a_plain_loop_over_sets(seed):
     found, truth = some(seed)
     score = score_clusters(found, truth)
-    keep = truth.counted
+    keep = truth.is_counted
     sets = {c: set(np.flatnonzero(keep & (found == c))) for c in set(found.tolist()) - {0}}
     own = [set(np.flatnonzero(keep & (truth.owner == k + 1))) for k in range(len(truth.classes))]
     pieces = [{c for c, s in sets.items() if s & o and 10 * len(s & o) >= len(o)} for o in own]
@@ -170,12 +172,12 @@ def test_scores_equal_a_plain_loop_over_sets(seed):
         best = {c for c, v in ious.items() if v == max(ious.values())}
         assert score.iou[k] == max(ious.values(), default=0)
         assert score.pieces[k] == len(pieces[k])
-        assert score.shared[k] == any(
+        assert score.is_shared[k] == any(
             c in pieces[k] and any(c in p for j, p in enumerate(pieces) if j != k) for c in best
         )
-    near = set(np.flatnonzero(truth.near))
-    assert score.judged == sum(2 * len(s & near) > len(s) for s in sets.values())
-    assert score.judged >= np.sum(score.iou > 0.5)  # so that ratios are at most 1
+    near = set(np.flatnonzero(truth.is_near))
+    assert score.judged_count == sum(2 * len(s & near) > len(s) for s in sets.values())
+    assert score.judged_count >= np.sum(score.iou > 0.5)  # so that ratios are at most 1
 
 
 def test_no_clusters_or_no_objects_have_scores():
@@ -205,8 +207,8 @@ def test_low_points_are_neutral_and_small_objects_ignored():
     found = find_objects_in_boxes(xyz, truth)
     assert found.owner.tolist() == [0] * 5 + [1] * 12 + [0] * 16
     assert found.region.tolist() == [1] * 17 + [0] * 16
-    assert found.near.tolist() == [True] * 17 + [False] * 9 + [True] * 3 + [False] * 4
-    assert found.counted.all() and found.classes == ("Van",) and found.ranges.tolist() == [10]
+    assert found.is_near.tolist() == [True] * 17 + [False] * 9 + [True] * 3 + [False] * 4
+    assert found.is_counted.all() and found.classes == ("Van",) and found.ranges.tolist() == [10]
 
 
 def test_a_point_in_two_boxes_belongs_to_the_smaller():
@@ -223,7 +225,7 @@ def test_dont_care_and_no_boxes_are_no_objects():
     xyz = column(10, 0, (-1, 0), 20).astype(np.float32)
     for truth in (GroundTruth.of([[10, 0, 0, 2, 2, 4, 0]], [CLASSES.index("DontCare")]), GroundTruth.of([], [])):
         found = find_objects_in_boxes(xyz, truth)
-        assert found.classes == () and not found.owner.any() and not found.near.any()
+        assert found.classes == () and not found.owner.any() and not found.is_near.any()
 
 
 def test_instances_include_moving_points():
@@ -246,7 +248,7 @@ def test_instances_include_moving_points():
     assert found.classes == ("car", "car", "person")
     assert found.owner.tolist() == np.repeat([1, 2, 3, 0, 0, 0, 0, 0, 0], counts).tolist()
     # Not counted: a car without an instance, a bicycle of 9 points, unlabelled, outliers.
-    assert found.counted.tolist() == np.repeat([1, 1, 1, 0, 0, 1, 0, 0, 1], counts).tolist()
+    assert found.is_counted.tolist() == np.repeat([1, 1, 1, 0, 0, 1, 0, 0, 1], counts).tolist()
     assert found.ranges.tolist() == [50, 0, 0]
     assert set(MOVING) == set(range(252, 260)) and set(MOVING.values()) <= set(THINGS)
 

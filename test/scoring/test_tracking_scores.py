@@ -19,7 +19,7 @@ from lidar_perception.scoring.tracking.clear import ClearCounts, count_clear
 from lidar_perception.scoring.tracking.hota import HotaCounts, count_hota
 from lidar_perception.scoring.tracking.over_recall import score_over_recall
 from lidar_perception.scoring.tracking.pairs import Pairs, drop_ignored, make_pairs, to_tracked_labels
-from lidar_perception.scoring.tracking.report import TrackingReport, measure_tracking, observe
+from lidar_perception.scoring.tracking.report import TrackingReport, make_observation, measure_tracking
 from lidar_perception.scoring.tracking.tables import print_tracking_report
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.tracking.params import TrackingParams
@@ -58,8 +58,8 @@ def plainly(sequences):
     return [
         [
             (
-                list(zip(f.true_ids.tolist(), f.ignored.tolist())),
-                list(zip(f.track_ids.tolist(), f.scores.tolist(), f.excused.tolist())),
+                list(zip(f.true_ids.tolist(), f.is_ignored.tolist())),
+                list(zip(f.track_ids.tolist(), f.scores.tolist(), f.is_excused.tolist())),
                 lambda i, j, f=f: float(f.similarity[i, j]),
                 lambda i, j, f=f: float(f.overlap[i, j]),
             )
@@ -112,7 +112,7 @@ def drive(ids=(1, 2), frames=10, switch_at=None, kind=CAR):
 def scored(frames, similarity="3d", order=None, calibration=None):
     report = TrackingReport()
     for i in order or range(len(frames)):
-        report.update(observe("a", i, *frames[i], calibration, similarity))
+        report.update(make_observation("a", i, *frames[i], calibration, similarity))
     return report.compute()["classes"]["Car"]
 
 
@@ -241,8 +241,8 @@ def test_no_tracks_are_misses_and_no_labels_false_positives():
 def test_error_explains_why_tracks_cannot_be_scored():
     truth, tracks = drive(frames=1)[0]
     twice = to_tracked_labels(np.array([3, 3]), Detections.of(tracks.boxes, CAR))
-    with pytest.raises(InputError, match="a/0: a frame has the track id 3 twice"):
-        observe("a", 0, truth, twice)
+    with pytest.raises(InputError, match="a/0: a frame contains the track id 3 twice"):
+        make_observation("a", 0, truth, twice)
     with pytest.raises(InputError, match="no track id"):
         make_pairs(GroundTruth.of(truth.boxes, truth.class_ids), tracks, None)
     frame = Frame(
@@ -251,7 +251,7 @@ def test_error_explains_why_tracks_cannot_be_scored():
     measure = measure_tracking(lambda: None, TrackingParams(), "none", Recording("a", "", [frame], frozenset()))
     with pytest.raises(InputError, match="no track id"):  # reported before the scan is loaded
         measure(frame)
-    with pytest.raises(InputError, match="needs a calibration"):
+    with pytest.raises(InputError, match="requires a camera calibration"):
         make_pairs(truth, tracks, None, "image")
 
 

@@ -29,7 +29,7 @@ from lidar_perception.scoring.points.clusters import (
     find_unlabelled,
     label_clusters,
     label_points,
-    mask_unlabelled,
+    set_unlabelled_to_unknown,
 )
 from lidar_perception.training.augment import TrainingScene, raise_scene
 from lidar_perception.training.data import SceneReader
@@ -130,8 +130,8 @@ def test_background_in_unlabelled_regions_is_unknown(rng):
     blind = find_unlabelled(truth, camera, clusters.points[:, :3])
     assert blind.all() and not find_unlabelled(replace(truth, notes=()), camera, clusters.points[:, :3]).any()
     blind[:14] = False  # the first cluster, and 40 % of the second
-    assert mask_unlabelled(np.array([3, 3, 3]), clusters, blind, 3).tolist() == [3, UNKNOWN, UNKNOWN]
-    assert mask_unlabelled(np.array([0, 1, 2]), clusters, blind, 3).tolist() == [0, 1, 2]
+    assert set_unlabelled_to_unknown(np.array([3, 3, 3]), clusters, blind, 3).tolist() == [3, UNKNOWN, UNKNOWN]
+    assert set_unlabelled_to_unknown(np.array([0, 1, 2]), clusters, blind, 3).tolist() == [0, 1, 2]
 
 
 def test_cluster_and_point_scores_agree_with_hand_count(rng):

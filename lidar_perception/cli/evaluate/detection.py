@@ -105,7 +105,7 @@ class DetectionRequest:
 
         content = {"source": self.source, "keep": self.keep, **report.compute()}
         if self.errors and report.frames:
-            comparison = Comparison.of(report.frames)
+            comparison = Comparison.concatenate(report.frames)
             content["errors"] = {name: measure_box_errors(report.frames, name, self.errors_from) for name in SCORED}
             content["reliability"] = {name: measure_reliability(comparison, name) for name in SCORED}
         if self.intervals and report.frames:

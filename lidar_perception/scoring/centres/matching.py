@@ -15,8 +15,8 @@ def match_centres(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Match detections (K, >=3) and labels (M, >=3) one to one by their 3D centres.
 
-    Centres of a pair are at most max_distance apart. The number of pairs is as large as possible,
-    then the total distance as small as possible.
+    The centres of a pair are at most max_distance apart. The number of pairs is maximal; among these
+    assignments, the total distance is minimal.
 
     Returns:
         Indices (P,) of the detections and (P,) of the labels of the pairs.
@@ -28,18 +28,18 @@ def match_centres(
 def assign_pairs(cost: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Assign rows to columns of a non-negative cost matrix (K, M).
 
-    The number of pairs is as large as possible, then the total cost as small as possible. Only
-    pairs with allowed (K, M) bool are assigned. Returns rows (P,) and columns (P,).
+    Only pairs with allowed (K, M) bool are assigned. The number of pairs is maximal; among these
+    assignments, the total cost is minimal. Returns rows (P,) and columns (P,).
     """
-    # so that a forbidden pair costs more than all allowed pairs together
-    forbidden = cost[allowed].max(initial=0.0) * cost.size + 1.0
-    rows, columns = linear_sum_assignment(np.where(allowed, cost, forbidden))
+    # A forbidden pair costs more than all allowed pairs together.
+    forbidden_cost = cost[allowed].max(initial=0.0) * cost.size + 1.0
+    rows, columns = linear_sum_assignment(np.where(allowed, cost, forbidden_cost))
     is_allowed = allowed[rows, columns]
     return rows[is_allowed], columns[is_allowed]
 
 
 def find_range_bins(boxes: np.ndarray) -> np.ndarray:
-    """Return the index (K,) into RANGE_NAMES for each of the boxes (K, >=2)."""
+    """Return the index (K,) into RANGE_NAMES of each box (K, >=2)."""
     return np.searchsorted(RANGE_LIMITS, np.hypot(boxes[:, 0], boxes[:, 1]), side="right")
 
 
@@ -57,8 +57,8 @@ def count_by_range(
         pairs: Result of match_centres.
 
     Returns:
-        True positives, false positives, misses, each (5,) int by RANGE_NAMES, and the sums (5,) of
-        the centre errors, metres.
+        True positives, false positives and misses, (5,) int each by RANGE_NAMES, and the sums (5,)
+        of the centre errors, metres.
     """
     i, j = pairs
     label_bins, detection_bins = find_range_bins(labels), find_range_bins(detections)
@@ -86,12 +86,12 @@ class Score:
     def make_rows(self) -> dict[str, dict]:
         """Return tp, fp, fn, precision, recall, f1 and centre_error_m for each range and for "all".
 
-        A ratio with denominator 0 is 0; centre_error_m is None without true positives.
+        A ratio with denominator 0 is 0. centre_error_m is None without true positives.
         """
-        rows = {name: self._row(i) for i, name in enumerate(RANGE_NAMES)}
-        return {**rows, "all": self._row(slice(None))}
+        rows = {name: self._make_row(i) for i, name in enumerate(RANGE_NAMES)}
+        return {**rows, "all": self._make_row(slice(None))}
 
-    def _row(self, index) -> dict:
+    def _make_row(self, index) -> dict:
         tp, fp, fn = (int(np.sum(a[index])) for a in (self.tp, self.fp, self.fn))
         return dict(
             tp=tp,

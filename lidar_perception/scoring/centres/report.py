@@ -25,7 +25,7 @@ from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, find_r
 from lidar_perception.scoring.kitti.camera_objects import select_in_image
 from lidar_perception.types import PEDESTRIAN, GroundTruth, InputError
 
-MAX_TIMES = 10_000  # durations kept per step
+MAX_TIMES = 10_000  # maximum number of stored durations per step
 
 
 def select_pedestrians(truth: GroundTruth | None) -> np.ndarray:
@@ -36,7 +36,7 @@ def select_pedestrians(truth: GroundTruth | None) -> np.ndarray:
 def load_pedestrians(frame: Frame, view: bool = True) -> np.ndarray:
     """Load the pedestrian boxes (M, 7) of a frame.
 
-    With `view`, only boxes in the camera's image are returned, as for a pipeline that uses only
+    With `view`, only boxes in the camera's image are returned, to match a pipeline that uses only the
     points in the camera's view.
     """
     truth = frame.truth()
@@ -79,7 +79,7 @@ def measure_frame(
 ) -> CandidateResult | None:
     """Run the pipeline on one frame with the seeds of make_seed_source().
 
-    Returns None for a frame without a pedestrian.
+    Returns None for a frame without pedestrians.
     """
     truth = load_pedestrians(frame, params.view.enabled)
     if len(truth) == 0:
@@ -87,13 +87,13 @@ def measure_frame(
     scan, camera = frame.load(), frame.camera()
     try:
         _, candidates = find_candidates(scan, make_seed_source(truth, templates, params), camera, params)
-    except InputError as error:  # without a seed or a camera, the frame has no candidates
+    except InputError as error:  # no seed or no camera calibration
         return CandidateResult(truth, collect_boxes(Candidates.none()), {}, f"{frame.name}: {error}")
     return CandidateResult(truth, collect_boxes(candidates), candidates.ms, name=frame.name)
 
 
 def collect_boxes(candidates: Candidates) -> dict[str, np.ndarray]:
-    """Return the boxes (K, 7) by stage."""
+    """Return the boxes (K, 7) of each stage."""
     return {stage: getattr(candidates, stage).boxes for stage in STAGES}
 
 
@@ -114,8 +114,8 @@ def make_seed_source(truth: np.ndarray, templates: Sequence[Seed] | None, params
 class CandidateReport:
     """Scores of each stage on frames with a pedestrian, and durations of the steps.
 
-    Only sums, reasons for skipped frames and the last MAX_TIMES durations of each step are kept,
-    so that memory use stays small in a node that runs for days.
+    Only sums, reasons for skipped frames and the last MAX_TIMES durations of each step are stored, so
+    that memory use stays small in a node that runs for days.
     """
 
     frames: int = 0
@@ -139,7 +139,7 @@ class CandidateReport:
             self.update_times({**result.ms, "total": sum(result.ms.values())})
 
     def update_times(self, ms: dict[str, float]) -> None:
-        """Add durations of steps in ms; nodes measure them separately from the candidates."""
+        """Add durations of steps in ms. Nodes receive them separately from the candidates."""
         for step, value in ms.items():
             self.times.setdefault(step, deque(maxlen=MAX_TIMES)).append(value)
 

@@ -1,7 +1,7 @@
 """Pedestrian scores by centre distance (paper A, Section 3.8), for detections with a score.
 
-F1 depends on the score threshold, and a detector returns many detections of low score. F1 is
-therefore reported for all detections and at the best threshold, an upper bound on these frames.
+F1 depends on the score threshold, and a detector returns many detections with a low score.
+Therefore, F1 is reported for all detections and at the best threshold, which is an upper bound.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ class CentreScores:
     names: list[str] = field(default_factory=list)
 
     def update(self, truth: np.ndarray, boxes: np.ndarray, scores: np.ndarray, name: str = "") -> None:
-        """Add one frame; ignore it if truth is empty, as in the paper."""
+        """Add one frame. Frames without labels are ignored, as in the paper."""
         if len(truth):
             order = np.lexsort([*boxes.T, -scores])
             self.frames.append((truth, boxes[order], scores[order]))
             self.names.append(name)
 
     def find_best_score(self) -> float | None:
-        """Return the score threshold with the best F1 (the highest one), None without detections."""
+        """Return the score threshold with the best F1 (the highest of several), None without detections."""
         score_parts, hit_parts = [np.zeros(0)], [np.zeros(0, int)]
         for truth, boxes, frame_scores in self.frames:
             hit_counts = [len(match_centres(boxes[:n], truth)[0]) for n in range(len(boxes) + 1)]
@@ -48,7 +48,9 @@ class CentreScores:
         scores, hits = scores[order], np.cumsum(hits[order])
         label_count = sum(len(truth) for truth, _, _ in self.frames)
         f1 = 2 * hits / (np.arange(1, len(hits) + 1) + label_count)
-        is_last_of_score = np.append(scores[1:] < scores[:-1], True)  # equal scores stay together
+        is_last_of_score = np.append(
+            scores[1:] < scores[:-1], True
+        )  # detections with equal scores are kept or dropped together
         return float(scores[is_last_of_score][np.argmax(f1[is_last_of_score])])
 
     def make_rows(self, min_score: float = -np.inf) -> dict[str, dict]:

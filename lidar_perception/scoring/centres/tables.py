@@ -9,8 +9,8 @@ from lidar_perception.scoring.centres.matching import RANGE_NAMES
 from lidar_perception.scoring.tables import format_counts, format_number, format_percent, make_table, print_skipped
 
 STAGE_TITLES = {"stage1": "clusters", "stage2": "STM", "final": "STM + CPA"}
-# Tables 3 and 6 of the STM-CPA paper: recall, precision and F1 in percent, fraction of the matches of
-# stage 1 that are kept in percent, centre error in metres.
+# Tables 3 and 6 of the STM-CPA paper: recall, precision, F1, and kept matches of stage 1 in percent, and centre
+# error in metres.
 PAPER_TABLE_6 = {
     "stage1": (55.5, 27.6, 36.8, None, 0.15),
     "stage2": (44.7, 60.5, 51.4, 80.6, 0.14),

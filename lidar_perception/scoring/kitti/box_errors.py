@@ -1,4 +1,4 @@
-"""Errors of detected boxes, the effect of correcting each of them, and a diagnosis of height errors."""
+"""Errors of detected boxes, the effect of correcting each error, and a diagnosis of height errors."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from lidar_perception.scoring.kitti.protocol import METRICS, RELAXED, ComparedFr
 from lidar_perception.scoring.tables import make_table
 from lidar_perception.types import CLASSES
 
-RANGES = (0.0, 15.0, 30.0, 45.0, np.inf)  # limits of the ranges in metres
+RANGES = (0.0, 15.0, 30.0, 45.0, np.inf)  # limits of the range bins in metres
 ERRORS = ("away", "aside", "bottom", "length", "width", "height", "yaw")
-# name of a correction -> columns of a box that are corrected
+# Name of each correction -> columns of the box that it corrects.
 CORRECTIONS = {
     "as it is": [],
     "z": [2],
@@ -27,15 +27,15 @@ CORRECTIONS = {
     "height": [5],
     "yaw": [6],
 }
-MIN_BEV_AP = 20.0  # in percent; below this value nothing is diagnosed
-MIN_AP_RATIO = 4  # ratio of BEV AP to 3D AP from which heights are diagnosed as wrong
-MAX_MEDIAN_ERROR = 0.1  # in metres; a smaller median height error does not count as bias
+MIN_BEV_AP = 20.0  # minimum BEV AP for a diagnosis, in percent
+MIN_AP_RATIO = 4  # minimum ratio of BEV AP to 3D AP if heights are wrong
+MAX_MEDIAN_ERROR = 0.1  # maximum median height error without bias, in metres
 
 
 def match_boxes(frames: list[ComparedFrame], name: str, min_score: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
     """Match the detections and labels of a class.
 
-    Each label matches the detection with the highest BEV IoU, if it is above the relaxed overlap.
+    Each label matches the detection with the highest BEV IoU, if the IoU exceeds the relaxed overlap.
     Detections below min_score are ignored.
 
     Returns:
@@ -43,12 +43,12 @@ def match_boxes(frames: list[ComparedFrame], name: str, min_score: float = -np.i
     """
     class_id, pairs = CLASSES.index(name), [(np.zeros((0, 7)), np.zeros((0, 7)))]
     for frame in frames:
-        detections = np.flatnonzero((frame.found.class_ids == class_id) & (frame.found.scores >= min_score))
-        labels = np.flatnonzero(frame.true.class_ids == class_id)
+        detections = np.flatnonzero((frame.detections.class_ids == class_id) & (frame.detections.scores >= min_score))
+        labels = np.flatnonzero(frame.labels.class_ids == class_id)
         overlaps = frame.overlaps[METRICS.index("bev")][np.ix_(detections, labels)]
         matched_labels = np.flatnonzero(overlaps.max(axis=0, initial=0.0) > RELAXED[name])
         best_detections = overlaps[:, matched_labels].argmax(axis=0) if len(matched_labels) else matched_labels
-        pairs.append((frame.found.boxes[detections[best_detections]], frame.true.boxes[labels[matched_labels]]))
+        pairs.append((frame.detections.boxes[detections[best_detections]], frame.labels.boxes[labels[matched_labels]]))
     detected_boxes, true_boxes = map(np.concatenate, zip(*pairs))
     return detected_boxes, true_boxes
 
@@ -97,16 +97,16 @@ def diagnose_heights(name: str, rows: dict, matched: dict) -> str:
 
 def _describe_heights(matched: dict) -> str:
     z_error, height_error, height = (matched[key] for key in ("z_error_m", "height_error_m", "height_m"))
-    boxes = f"the {matched['pairs']} matched boxes are"
+    boxes = f"The {matched['pairs']} matched boxes are"
     if abs(z_error) < MAX_MEDIAN_ERROR:
         return (
-            f"In the median {boxes} {matched['abs_z_error_m']:.2f} m too high or too low, and "
-            f"{abs(height_error):.2f} m too {'tall' if height_error > 0 else 'flat'}."
+            f"{boxes} {matched['abs_z_error_m']:.2f} m too high or too low, and {abs(height_error):.2f} m too "
+            f"{'tall' if height_error > 0 else 'short'} (medians)."
         )
     reason = "check the sensor height and the frame of the boxes."
     if abs(abs(z_error) - height / 2) < MAX_MEDIAN_ERROR:
         reason = "that is half their height: z is probably the bottom of a box, not its centre."
-    return f"In the median {boxes} {abs(z_error):.2f} m too {'high' if z_error > 0 else 'low'}; {reason}"
+    return f"{boxes} {abs(z_error):.2f} m too {'high' if z_error > 0 else 'low'} (median); {reason}"
 
 
 def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def measure_box_errors(frames: list[ComparedFrame], name: str, min_score: float)
             `median` and `median_size` (median of absolute values), in metres and radians. Errors
             are detected minus labelled: centre along the ray from the sensor (away) and to the left
             of the ray (aside), bottom, length, width, height, and yaw modulo pi.
-        strict: For each of CORRECTIONS the percentage of pairs above the strict overlap in 3D
+        strict: For each of CORRECTIONS, the percentage of pairs above the strict overlap in 3D
             (`space`) and in BEV (`above`), None without pairs.
     """
     detected_boxes, label_boxes = match_boxes(frames, name, min_score)
@@ -196,12 +196,12 @@ def print_box_errors(errors: dict[str, dict[str, Any]], console: Console) -> Non
             table.add_row("", "", *(_format(row[e]["median_size"], ".2f") for e in ERRORS), style="dim")
         table.caption = (
             f"Metres, yaw in radians; boxes with a score of {content['min_score']:g} "
-            "or more. away, aside: of the centre, along the ray from the sensor and "
-            "to its left."
+            "or more. away, aside: error of the centre along the ray from the sensor, "
+            "and to the left of it."
         )
         console.print(table)
         table = make_table(
-            f"{name}: pairs beyond the overlap {DETECTED[name].strict:g}, %", "corrected", *CORRECTIONS, width=7
+            f"{name}: pairs above the overlap {DETECTED[name].strict:g}, %", "corrected", *CORRECTIONS, width=7
         )
         for view, title in (("space", "3D"), ("above", "BEV")):
             table.add_row(title, *(f"{row[view]:.0f}" for row in content["strict"].values()))

@@ -13,8 +13,8 @@ from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import Detections, GroundTruth, InputError, find_class_ids
 
 NO_ANGLE = -10.0  # KITTI's value for an unknown alpha
-# Truncation levels of the tracking layout: 0 inside, 1 at the image border, 2 ends of tracks;
-# of the raw layout: 2 outside, 99 behind. Objects of level 2 or higher are ignored.
+# Minimum truncation level of ignored objects. Levels of the tracking layout: 0 inside the image, 1 at its
+# border, 2 at the ends of tracks; of the raw layout: 2 outside the image, 99 behind the camera.
 IGNORED_LEVEL = 2
 
 
@@ -129,7 +129,7 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
 
 
 def select_in_image(truth: GroundTruth, calibration: Calibration | None) -> GroundTruth:
-    """Return the labels that are at least partly in the image; all of them without a calibration."""
+    """Return the labels that are at least partly in the image, or all labels without a calibration."""
     rows = np.flatnonzero(to_camera_objects(truth, calibration).pixels_high[: len(truth)] > 0)
     return GroundTruth.of(truth.boxes[rows], truth.class_ids[rows], [truth.extras[i] for i in rows], truth.notes)
 

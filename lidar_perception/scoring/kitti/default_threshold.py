@@ -23,12 +23,12 @@ def score_at_threshold(frames: list[ComparedFrame]) -> dict[str, dict[str, float
     """Score all detections by class (BEV, relaxed overlap, moderate difficulty).
 
     Returns:
-        labels, hits, wrong, missed, precision, recall and f1 of each class, or {} without frames. A
-        ratio with denominator 0 is 0.
+        labels, hits, wrong (false positives), missed, precision, recall and f1 of each class, or {}
+        without frames. A ratio with denominator 0 is 0.
     """
     if not frames:
         return {}
-    comparison = Comparison.of(frames)
+    comparison = Comparison.concatenate(frames)
     return {name: _score_class(comparison, name) for name in SCORED}
 
 
@@ -36,7 +36,7 @@ def _score_class(comparison: Comparison, name: str) -> dict[str, float]:
     hits, false_positives = (
         int(n[0]) for n in count_hits(comparison, name, "bev", RELAXED[name], LEVEL, np.array([-np.inf]))
     )
-    labels = int((classify_labels(comparison.true, name, LEVEL) == COUNTED).sum())
+    labels = int((classify_labels(comparison.labels, name, LEVEL) == COUNTED).sum())
     return {
         "labels": labels,
         "hits": hits,
@@ -71,5 +71,5 @@ def print_scores_at_threshold(content: dict[str, dict[str, float]], frames: int,
                 *format_counts(row, "labels", "hits", "wrong", "missed"),
                 *format_percent(row, "precision", "recall", "f1"),
             )
-    table.caption = "BEV, by the protocol of KITTI, moderate."
+    table.caption = "BEV, KITTI protocol, moderate difficulty."
     console.print(table)

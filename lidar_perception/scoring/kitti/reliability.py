@@ -14,15 +14,16 @@ from lidar_perception.scoring.tables import make_table
 
 EDGES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)  # lower edges of the bins of scores
 
-LOG_ODDS = np.arange(-7.0, 7.05, 0.1)  # finer bins for the fit
-MIN_BOXES = 10  # minimum number of correct and of wrong boxes for a fit
+LOG_ODDS = np.arange(-7.0, 7.05, 0.1)  # lower edges of the finer bins for the fit, as log odds
+MIN_BOXES = 10  # minimum number of true positives, and of false positives, for a fit
 
 
 def fit_calibrations(frames: Comparison) -> dict[str, tuple[float, float]]:
     """Fit the score calibration of each class; see detectors/calibration.py.
 
     The fit is a logistic regression on the log odds of the scores: true against false positives.
-    Classes with fewer than MIN_BOXES of either, or with uninformative scores, are left out.
+    Classes with fewer than MIN_BOXES true or false positives, or with uninformative scores, are left
+    out.
     """
     from sklearn.linear_model import LogisticRegression
 
@@ -42,7 +43,7 @@ def fit_calibrations(frames: Comparison) -> dict[str, tuple[float, float]]:
 
 
 def _count_by_score(frames: Comparison, name: str, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Count true and false positives (B,) in each bin of scores with lower edges (B,).
+    """Count true and false positives, (B,) each, in bins of the score with lower edges (B,).
 
     Matches are in BEV at the relaxed overlap, with hard difficulty.
     """
@@ -53,10 +54,10 @@ def _count_by_score(frames: Comparison, name: str, edges: np.ndarray) -> tuple[n
 def measure_reliability(frames: Comparison, name: str) -> dict[str, Any]:
     """Measure the reliability of the scores of a class (hard difficulty, BEV, relaxed overlap).
 
-    Boxes that KITTI's protocol ignores are not counted; a duplicate box is a false positive.
+    Boxes that KITTI's protocol ignores are not counted. Duplicate boxes are false positives.
 
     Returns:
-        bins: For each bin of EDGES the number of `boxes` and the percentage of true positives
+        bins: For each bin of EDGES, the number of `boxes` and the percentage of true positives
             (`right`, None without boxes).
         error: Expected calibration error in percent: the mean gap between the centre of a bin and
             its fraction of true positives, weighted by the number of boxes.
@@ -76,7 +77,7 @@ def measure_reliability(frames: Comparison, name: str) -> dict[str, Any]:
 
 def print_reliability(scores: dict[str, dict[str, Any]], console: Console) -> None:
     """Print one table with the reliability of all classes."""
-    table = make_table("Right boxes by score, %", "score from", *(f"{edge:g}" for edge in EDGES), "error", width=5)
+    table = make_table("True positives by score, %", "score from", *(f"{edge:g}" for edge in EDGES), "error", width=5)
     for name, content in scores.items():
         table.add_row(
             name,
@@ -84,5 +85,5 @@ def print_reliability(scores: dict[str, dict[str, Any]], console: Console) -> No
             "" if content["error"] is None else f"{content['error']:.0f}",
         )
         table.add_row("  boxes", *(str(row["boxes"]) for row in content["bins"]), style="dim")
-    table.caption = "BEV at the relaxed overlap. error: mean gap to the middle of the bin, weighted by boxes."
+    table.caption = "BEV at the relaxed overlap. error: mean difference from the middle of the bin, weighted by boxes."
     console.print(table)

@@ -26,7 +26,7 @@ from lidar_perception.scoring.kitti.protocol import (
 )
 from lidar_perception.types import PEDESTRIAN, Detections, InputError
 
-# Row of the JSON file -> metric and overlap.
+# Row of the JSON file -> metric and overlaps by class.
 ROWS = {
     "image": ("image", STRICT),
     "bev": ("bev", STRICT),
@@ -40,9 +40,9 @@ INTERVALS = "bev_relaxed", "bev", "3d"
 
 @dataclass
 class DetectionReport:
-    """Collection of the frames to score, reasons for skipped frames, and detector run times.
+    """Frames to score, reasons for skipped frames, and detector run times.
 
-    `sequential` is described in intervals.group_frames.
+    See intervals.group_frames for `sequential`.
     """
 
     frames: list[ComparedFrame] = field(default_factory=list)
@@ -61,7 +61,7 @@ class DetectionReport:
         on occlusion only.
 
         Raises:
-            InputError: A box or score is not finite; the message names the frame.
+            InputError: A box or score is not finite. The message contains the frame name.
         """
         if result.problem is not None:
             self.skipped.append(f"{result.name}: {result.problem}")
@@ -100,8 +100,8 @@ class DetectionReport:
             "skipped": self.skipped,
         }
         if self.frames:
-            comparison = Comparison.of(self.frames)
-            result["ap"] = {name: self._class_content(comparison, name) for name in SCORED}
+            comparison = Comparison.concatenate(self.frames)
+            result["ap"] = {name: self._score_class(comparison, name) for name in SCORED}
             result["map_3d"] = average_3d(result["ap"])
             result["matched"] = {name: measure_heights(self.frames, name) for name in SCORED}
             result["diagnosis"] = [
@@ -120,14 +120,14 @@ class DetectionReport:
         """
         draws: dict[tuple[str, str], list[float | None]] = {(name, row): [] for name in SCORED for row in INTERVALS}
         for frames in draw_samples(group_frames(self.names, self.sequential), count):
-            comparison = Comparison.of([self.frames[i] for i in frames])
+            comparison = Comparison.concatenate([self.frames[i] for i in frames])
             for (name, row), scores in draws.items():
                 metric, overlaps = ROWS[row]
                 value = compute_precision(comparison, name, metric, overlaps[name], "moderate")
                 scores.append(None if value is None else value.r40)
         return {name: {row: compute_bounds(draws[name, row]) for row in INTERVALS} for name in SCORED}
 
-    def _class_content(self, comparison: Comparison, name: str) -> dict:
+    def _score_class(self, comparison: Comparison, name: str) -> dict:
         rows = {
             row: {level: compute_precision(comparison, name, metric, overlaps[name], level) for level in DIFFICULTIES}
             for row, (metric, overlaps) in ROWS.items()
@@ -167,8 +167,10 @@ def _to_angle_content(value: Precision | None) -> dict | None:
 def average_3d(ap: dict) -> dict | None:
     """Average the 3D AP over classes and difficulties, as in the EG-PointPillars paper.
 
-    Classes and difficulties without labels are left out. Returns r11 and r40, or None if no labels
-    remain.
+    Classes and difficulties without labels are left out.
+
+    Returns:
+        r11 and r40, or None without labels.
     """
     rows = [row for name in SCORED for level in DIFFICULTIES if (row := ap[name]["3d"][level])]
     return {key: float(np.mean([row[key] for row in rows])) for key in ("r11", "r40")} if rows else None

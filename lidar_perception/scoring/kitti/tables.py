@@ -19,8 +19,8 @@ from lidar_perception.scoring.tables import (
     print_time,
 )
 
-# The EG-PointPillars paper, Table 5: 3D AP at 0.7 (Car) and 0.5; easy, moderate, hard. The number
-# of recall points is not given.
+# Table 5 of the EG-PointPillars paper: 3D AP (easy, moderate, hard) at overlap 0.7 for Car and 0.5 for others.
+# The paper does not state the number of recall points.
 COLUMNS = tuple(CLASSES[i] for i in (CAR, CYCLIST, PEDESTRIAN))
 PAPER = {
     "PointPillars": ((84.00, 72.89, 68.24), (80.57, 61.96, 58.32), (52.66, 47.09, 43.21)),
@@ -30,7 +30,7 @@ PAPER = {
     "V4": ((86.69, 76.44, 74.93), (81.21, 66.74, 61.91), (56.73, 52.31, 46.92)),
 }
 PAPER_MAP = {"PointPillars": 63.21, "V1": 65.00, "V2": 65.71, "V3": 65.18, "V4": 67.09}
-# The STM-CPA paper, Tables 6 and 7: F1 of pedestrians within 1.0 m.
+# Tables 6 and 7 of the STM-CPA paper: F1 of pedestrians within 1.0 m.
 CENTRE_F1 = {"STM-CPA": 0.521, "PointPillars": 0.52, "AVOD": 0.48, "PointCNN": 0.37, "F-PointNet": 0.33}
 TITLES = {"image": "2D box", "aos": "orientation", "bev": "BEV", "3d": "3D", "bev_relaxed": "BEV", "3d_relaxed": "3D"}
 
@@ -64,8 +64,8 @@ def _print_precision(content: dict, console: Console) -> None:
                 )
         table.add_section()
     table.caption = (
-        "Next to the class: labels of each difficulty. * too few for KITTI's own "
-        "sampling of recall; the whole curve is sampled."
+        "Next to the class: number of labels by difficulty. *: too few for KITTI's "
+        "sampling of recall; the full curve is used instead."
     )
     console.print(table)
 
@@ -89,7 +89,7 @@ def _print_paper(content: dict, console: Console) -> None:
 def print_intervals(content: dict[str, dict], console: Console) -> None:
     """Print the AP intervals of DetectionReport.compute_intervals."""
     table = make_table(
-        f"{INTERVAL_PERCENT} % intervals of AP (R40, moderate), drawn by drive",
+        f"{INTERVAL_PERCENT} % intervals of AP (R40, moderate), bootstrap over drives",
         "",
         *(TITLES[row] + overlap for row, overlap in zip(INTERVALS, (", relaxed", "", ""))),
         width=10,
@@ -115,7 +115,7 @@ def _print_centres(centres: dict, console: Console) -> None:
     )
     rows = {"all": centres["of_all"]["all"]}
     if centres["best_score"] is not None:
-        rows[f"score {centres['best_score']:.3g} and more"] = centres["at_best_score"]["all"]
+        rows[f"score {centres['best_score']:.3g} or more"] = centres["at_best_score"]["all"]
     for title, row in rows.items():
         table.add_row(title, *format_counts(row, "tp", "fp", "fn"), *format_percent(row, "precision", "recall", "f1"))
     table.caption = "F1 in the STM-CPA paper: " + ", ".join(f"{name} {100 * f1:.1f}" for name, f1 in CENTRE_F1.items())

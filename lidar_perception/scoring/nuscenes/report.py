@@ -1,4 +1,4 @@
-"""Report of nuScenes detection scores, from a detector or a result file."""
+"""Report of nuScenes detection scores for a detector or a result file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
 from lidar_perception.data.nuscenes.results import NAME_BY_CLASS, read_results, to_results
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.detections import run_detector
-from lidar_perception.scoring.nuscenes.protocol import ClassScores, score_class, select_counted, summarize
+from lidar_perception.scoring.nuscenes.protocol import ClassScores, score_class, select_scored_boxes, summarize
 from lidar_perception.types import InputError
 
 DETECTED_NAMES = tuple(NAME_BY_CLASS.values())
@@ -27,8 +27,8 @@ class KeyFrameResult:
     Attributes:
         token: Sample token.
         boxes: All detected boxes, as in a result file.
-        truth: Labels that are scored, None if the frame has no labels.
-        counted: Detected boxes that are scored, None if the frame has no labels.
+        truth: Scored labels, None if the frame has no labels.
+        scored: Scored detections, None if the frame has no labels.
         ms: Run time of the detector, None for result files.
         problem: Reason why the detector rejected the frame, or None.
     """
@@ -36,7 +36,7 @@ class KeyFrameResult:
     token: str
     boxes: GlobalBoxes
     truth: GlobalBoxes | None
-    counted: GlobalBoxes | None
+    scored: GlobalBoxes | None
     ms: float | None = None
     problem: str | None = None
 
@@ -44,7 +44,7 @@ class KeyFrameResult:
 def select_boxes(
     frame: Frame, boxes: GlobalBoxes, ms: float | None = None, problem: str | None = None
 ) -> KeyFrameResult:
-    """Select the detected boxes and labels of a nuScenes frame that are scored."""
+    """Select the labels and detections of a nuScenes frame that are scored."""
     key = frame.native
     labels = key.labels()
     if labels is None:
@@ -53,8 +53,8 @@ def select_boxes(
     return KeyFrameResult(
         key.token,
         boxes,
-        labels.boxes[select_counted(labels.boxes, key.ego, racks)],
-        boxes[select_counted(boxes, key.ego, racks)],
+        labels.boxes[select_scored_boxes(labels.boxes, key.ego, racks)],
+        boxes[select_scored_boxes(boxes, key.ego, racks)],
         ms,
         problem,
     )
@@ -70,7 +70,7 @@ def measure_key_frames(
 
     Args:
         open_detector: Function that loads the detector.
-        include_unlabelled: Also run on key frames without labels.
+        include_unlabelled: True to run also on key frames without labels.
     """
     detector = open_detector()
 
@@ -126,12 +126,12 @@ class NuscenesReport:
             self.skipped.append(result.problem)
         if result.ms is not None:
             self.ms.append(result.ms)
-        if result.truth is not None and result.counted is not None:
+        if result.truth is not None and result.scored is not None:
             self.truth.append(result.truth)
-            self.detections.append(result.counted)
+            self.detections.append(result.scored)
 
     def compute(self) -> dict:
-        """Return the content of the JSON file; ap, map and nds are in percent.
+        """Return the content of the JSON file. ap, map and nds are in percent.
 
         "all" is the mean over the ten classes, as in nuScenes' ranking. "ours" is the mean over the
         three classes of the package's detectors.

@@ -8,7 +8,7 @@ from lidar_perception.scoring.nuscenes.protocol import DISTANCES, ERRORS
 from lidar_perception.scoring.nuscenes.report import DETECTED_NAMES
 from lidar_perception.scoring.tables import format_number, make_table, print_skipped, print_time
 
-# The improved-PointNet paper on nuScenes, which states neither split nor classes, AOE, AVE or AAE.
+# The improved-PointNet paper on nuScenes. It does not state the split, the classes, AOE, AVE or AAE.
 PAPER = {"map": 92.68, "ate": 0.298, "ase": 0.218, "nds": 83.45}
 
 
@@ -43,7 +43,7 @@ def print_nuscenes_report(content: dict, console: Console) -> None:
     table.caption = (
         "AP in percent by centre distance; ATE m, ASE 1 - IoU, AOE rad, AVE m/s, AAE 1 - accuracy. "
         "A class that is not detected has AP 0 and errors 1. Our three: car, pedestrian, bicycle "
-        "(our Cyclist), no figure of nuScenes' ranking. Without velocities and attributes AVE and "
+        "(our Cyclist); nuScenes does not rank this mean. Without velocities and attributes AVE and "
         "AAE are 1, and NDS is 80 at most. The paper names neither its classes nor its split."
     )
     console.print(table)

@@ -1,4 +1,4 @@
-"""True classes of clusters and points, and the confusion matrix of a cluster network (paper C)."""
+"""Labels of clusters and points, and the confusion matrix of a cluster network (paper C)."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, GroundTruth
 
 UNKNOWN = -1  # label of clusters and points that are not scored
-MIN_OBJECT_SHARE = 0.5  # minimum fraction of a cluster's points in a box to count as that object
-MAX_BACKGROUND_SHARE = 0.15  # maximum fraction of a cluster's points in boxes to count as background
-BOX_MARGIN = 0.05  # in metres; points this close to a box belong to it, because labels are rounded
-# Classes that resemble a scored class, and DontCare
+MIN_OBJECT_FRACTION = 0.5  # minimum fraction of a cluster's points in the box of its object
+MAX_BACKGROUND_FRACTION = 0.15  # maximum fraction of a background cluster's points in a box
+BOX_MARGIN = 0.05  # margin of boxes in metres, because labels are rounded
+# Classes that resemble a scored class, and DontCare.
 IGNORED_CLASSES = [row.name for row in TABLE if row.numbers is None and (row.looks_like or row.vehicle)] + [
     CLASSES[DONT_CARE]
 ]
-MIN_POINTS = 10  # clusters with fewer points are ignored
+MIN_POINTS = 10  # minimum number of points of a scored cluster
 
 
 def label_clusters(
@@ -47,21 +47,21 @@ def label_clusters(
         classes: Names of the labels.
 
     Returns:
-        Labels (K,) int64: index into classes, len(classes) for background, UNKNOWN for neither; and
-        the index (K,) int64 of each cluster's box, -1 for none.
+        Labels (K,) int64: index into classes, len(classes) for background, UNKNOWN for clusters that
+        are not scored; and the index (K,) int64 of each cluster's box, -1 for none.
     """
     count, background = len(clusters), len(classes)
     cluster_index = np.repeat(np.arange(count), clusters.sizes)
     best_fraction, owners = np.zeros(count), np.full(count, -1)
     sizes = np.maximum(clusters.sizes, 1)
     for i, box in enumerate(boxes):
-        inside = points_in_box(clusters.points[:, :3], box, BOX_MARGIN)
-        fraction = np.bincount(cluster_index[inside], minlength=count) / sizes
+        in_box = points_in_box(clusters.points[:, :3], box, BOX_MARGIN)
+        fraction = np.bincount(cluster_index[in_box], minlength=count) / sizes
         is_better = fraction > best_fraction
         best_fraction[is_better], owners[is_better] = fraction[is_better], i
     label_of_box = np.append(map_labels(class_ids, classes), background)
-    labels = np.where(best_fraction >= MIN_OBJECT_SHARE, label_of_box[owners], UNKNOWN)
-    labels[best_fraction < MAX_BACKGROUND_SHARE] = background
+    labels = np.where(best_fraction >= MIN_OBJECT_FRACTION, label_of_box[owners], UNKNOWN)
+    labels[best_fraction < MAX_BACKGROUND_FRACTION] = background
     owners[(labels == UNKNOWN) | (labels == background)] = -1
     return labels, owners
 
@@ -79,26 +79,32 @@ def label_points(xyz: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray, clas
 
 
 def find_unlabelled(truth: GroundTruth, camera: Camera, xyz: np.ndarray) -> np.ndarray:
-    """Return a mask (N,) of the points in regions without labels (DontCare) of the image."""
+    """Return a mask (N,) of the points in DontCare regions of the image."""
     regions = [extra["bbox"] for name, extra in truth.notes if name == "DontCare"]
     return camera.in_regions(xyz, np.array(regions, float))
 
 
-def mask_unlabelled(labels: np.ndarray, clusters: Clusters, unlabelled: np.ndarray, background: int) -> np.ndarray:
-    """Return the labels (K,), with UNKNOWN for background clusters in unlabelled regions.
+def set_unlabelled_to_unknown(
+    labels: np.ndarray, clusters: Clusters, is_unlabelled: np.ndarray, background: int
+) -> np.ndarray:
+    """Return labels (K,) in which background clusters in unlabelled regions are UNKNOWN.
 
-    These are clusters with at least half of their points in such a region: unlabelled (P,) bool
-    masks the points of all clusters.
+    Args:
+        labels: (K,) labels of the clusters.
+        clusters: K clusters.
+        is_unlabelled: (P,) bool, points of the clusters that are in an unlabelled region. A cluster
+            is in such a region if at least half of its points are.
+        background: Label of the background.
     """
     cluster_index = np.repeat(np.arange(len(clusters)), clusters.sizes)
-    fraction = np.bincount(cluster_index, unlabelled, minlength=len(clusters)) / np.maximum(clusters.sizes, 1)
+    fraction = np.bincount(cluster_index, is_unlabelled, minlength=len(clusters)) / np.maximum(clusters.sizes, 1)
     return np.where((labels == background) & (fraction >= 0.5), UNKNOWN, labels)
 
 
 def map_labels(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
-    """Map class_ids (M,) to labels (M,) int64, indices into classes.
+    """Map class_ids (M,), indices into CLASSES, to labels (M,) int64, indices into classes.
 
-    IGNORED_CLASSES become UNKNOWN, other classes become len(classes) (background).
+    IGNORED_CLASSES become UNKNOWN. All others that are not in classes become len(classes) (background).
     """
     return np.array(
         [
@@ -151,7 +157,8 @@ def measure_network(weights: Path, settings: Mapping[str, Any], recording: Recor
 
     Args:
         weights: Checkpoint of the network.
-        settings: Ground and clustering parameters, by dotted name, that differ from training.
+        settings: Ground and clustering parameters that differ from training, by dotted name.
+        recording: The recording.
     """
     classifier = load_pointnet_detector(
         weights, "cpu", PointNetDetectorParams(pointnet=PointNetParams(warm_up=False))
@@ -167,14 +174,14 @@ def measure_network(weights: Path, settings: Mapping[str, Any], recording: Recor
         ground = segment_ground(scan, params.ground)
         ids = cluster_obstacles(scan.xyz, ground, params.clustering)
         camera = frame.camera()
-        if camera is None:  # without a camera, labels cover all directions
+        if camera is None:  # labels cover all directions
             indices, find_hidden = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)
         else:
             indices, find_hidden = (np.flatnonzero(camera.in_view(scan.xyz)), partial(find_unlabelled, truth, camera))
         view_cloud, ids = scan.take(indices), ids[indices]
         clusters = make_clusters(view_cloud, ids, ground=ground[indices])
         labels, _ = label_clusters(clusters, truth.boxes, truth.class_ids, config.classes)
-        labels = mask_unlabelled(labels, clusters, find_hidden(clusters.points[:, :3]), background)
+        labels = set_unlabelled_to_unknown(labels, clusters, find_hidden(clusters.points[:, :3]), background)
         point_labels = label_points(view_cloud.xyz, truth.boxes, truth.class_ids, config.classes)
         point_labels[(point_labels == background) & find_hidden(view_cloud.xyz)] = UNKNOWN
         return count_confusions(clusters, labels, classifier.predict(clusters), point_labels, ids, config.classes)
@@ -206,7 +213,7 @@ class ClusterScores:
         self.frames += 1
 
     def compute(self) -> dict[str, Any]:
-        """Return the content of the JSON file; ratios in percent, None if the denominator is 0."""
+        """Return the content of the JSON file. Ratios are in percent, None if the denominator is 0."""
         return {
             "frames": self.frames,
             "classes": [*self.classes, "background"],
@@ -218,7 +225,7 @@ class ClusterScores:
 
 
 def _compute_scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, Any]:
-    """Compute the accuracy, and precision, recall, F1 and IoU by class and averaged over classes."""
+    """Compute accuracy, and precision, recall, F1 and IoU for each class and averaged over classes."""
     correct = np.diag(confusion)
     true, predicted = confusion.sum(axis=1), confusion.sum(axis=0)
     rows = {}

@@ -47,7 +47,7 @@ class SegmentationResult:
     Attributes:
         ground: Arguments of GroundReport.update by method.
         clusters: Arguments of ClusterReport.update by method.
-        without_camera: True if the frame has no camera calibration and was scored all around.
+        without_camera: True if the frame has no camera calibration and was scored in all directions.
     """
 
     ground: dict[str, tuple] = field(default_factory=dict)
@@ -112,19 +112,19 @@ def measure_methods(
 
 
 class Timer:
-    """Stopwatch: timer(function, *arguments) -> (result, milliseconds).
+    """Stopwatch: timer(function, *arguments) returns (result, milliseconds).
 
     Each method runs once before its first measurement, to load compiled code.
     """
 
     def __init__(self) -> None:
-        self.warm: set[tuple[Any, str]] = set()
+        self.warmed_up: set[tuple[Any, str]] = set()
 
     def __call__(self, function: Callable, *arguments: Any) -> tuple[Any, float]:
         key = function, arguments[-1].method
-        if key not in self.warm:
+        if key not in self.warmed_up:
             function(*arguments)
-            self.warm.add(key)
+            self.warmed_up.add(key)
         start = perf_counter()
         result = function(*arguments)
         return result, (perf_counter() - start) * 1e3
@@ -171,7 +171,7 @@ class SegmentationReport:
 def segment_by_methods(
     frame: Frame, params: SegmentationParams, ground_methods: tuple[str, ...]
 ) -> tuple[PointCloud, PointTruth | None, dict[str, np.ndarray]]:
-    """Return a frame's cloud, its point labels, and its ground (N,) bool by method, to draw them."""
+    """Return the cloud of a frame, its point labels, and a ground mask (N,) for each method."""
     scan = frame.load()
     return (
         scan,

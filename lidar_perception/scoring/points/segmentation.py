@@ -1,16 +1,16 @@
 """Scores of ground and clusters on labelled points (SemanticKITTI) or boxes (KITTI, bags).
 
-Ground is road, parking, sidewalk, other-ground, lane-marking and terrain; unlabelled points and
-outliers are ignored. There are three protocols, since vegetation changes F1 by several points:
+Ground is road, parking, sidewalk, other-ground, lane-marking and terrain. Unlabelled points and
+outliers are ignored. There are three protocols, because vegetation changes F1 by several points:
 
-    without vegetation     vegetation is ignored (Patchwork++, Lee et al., IROS 2022, Section IV-A);
-    with vegetation        vegetation is ground below z = -1.3 m in the LiDAR frame of KITTI, 0.43 m
-    above the road, else not ground (Patchwork, Lim et al., RA-L 2021);
-    vegetation not ground  vegetation is not ground.
+- without vegetation: vegetation is ignored (Patchwork++, Lee et al., IROS 2022, Section IV-A).
+- with vegetation: vegetation is ground below z = -1.3 m in KITTI's LiDAR frame, which is 0.43 m above
+  the road, and not ground above it (Patchwork, Lim et al., RA-L 2021).
+- vegetation not ground: vegetation is not ground.
 
-A cluster and an object are compared by their points: IoU = |C and O| / |C or O|. A hit is an IoU
-above one half, so a cluster hits at most one object. Points of an object that were segmented as
-ground count as missed.
+A cluster C and an object O are compared by their points: IoU = |C and O| / |C or O|. A hit is an IoU
+above one half, so that a cluster hits at most one object. Object points that were segmented as ground
+are in no cluster, which lowers the IoU.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from lidar_perception.groups import renumber_ids
 from lidar_perception.types import CLASSES, GroundTruth
 
 PROTOCOLS = ("without vegetation", "with vegetation", "vegetation not ground")
-LOW_VEGETATION_Z = -1.3  # in metres, in KITTI's LiDAR frame, which is 1.73 m above the road
+LOW_VEGETATION_Z = -1.3  # maximum z of ground in metres, in KITTI's LiDAR frame (1.73 m above the road)
 
 HIT_IOU = 0.5
-MIN_POINTS = 10  # objects with fewer points are ignored
-BOTTOM_MARGIN = 0.2  # in metres above the bottom of a box; lower points may be road
-BOX_MARGIN = 0.2  # in metres; a cluster is scored if most of its points are in boxes enlarged by this
-MIN_PIECE_SHARE = 0.1  # minimum fraction of an object's points for a cluster to be a piece of it
+MIN_POINTS = 10  # minimum number of points of an object; others are ignored
+BOTTOM_MARGIN = 0.2  # height above the bottom of a box in metres below which points may be road
+BOX_MARGIN = 0.2  # margin of boxes in metres; a cluster is scored if most of its points are in enlarged boxes
+MIN_PIECE_FRACTION = 0.1  # minimum fraction of an object's points in a cluster that is a piece of it
 RANGE_NAMES = ("0-15", "15-30", "30-45", "45+")
 RANGE_LIMITS = np.array([15.0, 30.0, 45.0])
 
 
 def select_true_ground(semantic: np.ndarray, z: np.ndarray, protocol: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return two masks (N,): points of the true ground, and points that are counted.
+    """Return two masks (N,): points of the true ground, and points to score.
 
     Args:
         semantic: (N,) SemanticKITTI classes.
@@ -54,18 +54,18 @@ def select_true_ground(semantic: np.ndarray, z: np.ndarray, protocol: str) -> tu
 
 
 def count_ground(predicted: np.ndarray, ground: np.ndarray, is_counted: np.ndarray) -> np.ndarray:
-    """Count the points of predicted ground (N,) bool, as (4,) int64 [tp fp fn tn]."""
+    """Count true and false positives and negatives (4,) int64 [tp fp fn tn] of a ground mask (N,)."""
     case = np.where(ground, np.where(predicted, 0, 2), np.where(predicted, 1, 3))
     return np.bincount(case.compress(is_counted), minlength=4)
 
 
 def count_by_protocol(predicted: np.ndarray, semantic: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:
-    """Count the points of predicted ground (N,) bool by protocol; see count_ground."""
+    """Return the result of count_ground for each protocol."""
     return {name: count_ground(predicted, *select_true_ground(semantic, z, name)) for name in PROTOCOLS}
 
 
 def to_ground_row(counts: np.ndarray) -> dict:
-    """Return counts (4,) and their ratios for the JSON file; a ratio with denominator 0 is 0."""
+    """Return counts (4,) and their ratios for the JSON file. A ratio with denominator 0 is 0."""
     tp, fp, fn, tn = counts.tolist()
     return dict(
         tp=tp,
@@ -87,7 +87,7 @@ class GroundReport:
     ms: list[float] = field(default_factory=list)
 
     def update(self, counts: dict[str, np.ndarray], ms: float) -> None:
-        """Add one scan: the result of count_by_protocol and the duration of the method."""
+        """Add one scan: the result of count_by_protocol, and the run time in ms."""
         for name, total in self.counts.items():
             total += counts[name]
         self.ms.append(ms)
@@ -106,18 +106,19 @@ class Objects:
     """K labelled objects among N points.
 
     Attributes:
-        owner: (N,) int32 object 1..K of each point, or 0.
-        region: (N,) int32 like owner, plus the points that are neutral for clusters of an object.
-        near: (N,) bool points near an object; clusters elsewhere are not scored.
-        counted: (N,) bool points with a known class; other points are ignored.
+        owner: (N,) int32 object 1..K of each point, 0 for none.
+        region: (N,) int32, owner extended by neutral points, such as the road in the box of an
+            object. They do not change the IoU of the object.
+        is_near: (N,) bool, points near an object; clusters elsewhere are not scored.
+        is_counted: (N,) bool, points with a known class; other points are ignored.
         classes: Class names of the K objects.
         ranges: (K,) horizontal range, metres.
     """
 
     owner: np.ndarray
     region: np.ndarray
-    near: np.ndarray
-    counted: np.ndarray
+    is_near: np.ndarray
+    is_counted: np.ndarray
     classes: tuple[str, ...]
     ranges: np.ndarray
 
@@ -126,15 +127,15 @@ def find_objects_in_boxes(xyz: np.ndarray, truth: GroundTruth) -> Objects:
     """Find the objects in labelled boxes, except DontCare, with at least MIN_POINTS points.
 
     A box contains some of the road, so only points more than BOTTOM_MARGIN above its bottom belong
-    to the object; lower ones are neutral. A point in two boxes belongs to the smaller one.
+    to the object. Lower points are neutral. A point in two boxes belongs to the smaller one.
     """
     owner, region = np.zeros((2, len(xyz)), np.int32)
     for k in np.argsort(-np.prod(truth.boxes[:, 3:6], axis=1), kind="stable"):
         box = truth.boxes[k]
         if CLASSES[truth.class_ids[k]] != "DontCare":
-            inside = points_in_box(xyz, box)
-            region[inside] = k + 1
-            owner[inside] = np.where(xyz[inside, 2] > box[2] - box[5] / 2 + BOTTOM_MARGIN, k + 1, 0)
+            in_box = points_in_box(xyz, box)
+            region[in_box] = k + 1
+            owner[in_box] = np.where(xyz[in_box, 2] > box[2] - box[5] / 2 + BOTTOM_MARGIN, k + 1, 0)
     kept_indices = np.flatnonzero(np.bincount(owner, minlength=len(truth) + 1)[1:] >= MIN_POINTS)
     near_object = np.zeros(len(xyz), bool)
     for box in truth.boxes[kept_indices]:
@@ -155,10 +156,10 @@ def find_instances(xyz: np.ndarray, semantic: np.ndarray, instance: np.ndarray) 
     An object consists of the points of one class and instance, moving or not. Unlabelled points,
     outliers, object classes without an instance id, and smaller objects are ignored.
     """
-    table = np.zeros(1 << 16, np.int32)
-    table[list(THINGS)] = list(THINGS)
-    table[list(MOVING)] = list(MOVING.values())
-    thing_class = table[semantic]
+    thing_of_class = np.zeros(1 << 16, np.int32)
+    thing_of_class[list(THINGS)] = list(THINGS)
+    thing_of_class[list(MOVING)] = list(MOVING.values())
+    thing_class = thing_of_class[semantic]
     keys, key_index, counts = np.unique(
         np.where((thing_class > 0) & (instance > 0), thing_class << 16 | instance, 0),
         return_inverse=True,
@@ -185,28 +186,32 @@ class ClusterScore:
 
     Attributes:
         iou: (K,) IoU with the best cluster, 0 if no cluster overlaps.
-        pieces: (K,) number of clusters with at least MIN_PIECE_SHARE of the object's points.
-        shared: (K,) bool, True if the best cluster also contains a piece of another object.
-        clusters: Number of clusters.
-        judged: Number of clusters with most of their points near objects.
+        pieces: (K,) number of clusters with at least MIN_PIECE_FRACTION of the object's points.
+        is_shared: (K,) bool, True if the best cluster also contains a piece of another object.
+        cluster_count: Number of clusters.
+        judged_count: Number of clusters with most of their points near objects, which are scored.
     """
 
     iou: np.ndarray
     pieces: np.ndarray
-    shared: np.ndarray
-    clusters: int
-    judged: int
+    is_shared: np.ndarray
+    cluster_count: int
+    judged_count: int
 
 
 def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
-    """Score the clusters of a frame; cluster_ids (N,) int are 0 for points without a cluster.
+    """Score the clusters of a frame.
 
-    The result does not depend on the values of the ids. Memory grows only with the number of pairs
-    of objects and clusters that share points.
+    Memory grows only with the number of pairs of objects and clusters that share points.
+
+    Args:
+        cluster_ids: (N,) int, any id for each cluster, 0 for points without a cluster.
+        objects: Labelled objects among the N points.
     """
     labels, numbers = renumber_ids(cluster_ids)
     ids, owner, region, is_near = (
-        a.compress(objects.counted).astype(np.int64) for a in (labels, objects.owner, objects.region, objects.near)
+        a.compress(objects.is_counted).astype(np.int64)
+        for a in (labels, objects.owner, objects.region, objects.is_near)
     )
     size, rows = np.bincount(ids, minlength=len(numbers) + 1), len(objects.classes) + 1
     points = np.bincount(owner, minlength=rows)
@@ -214,15 +219,15 @@ def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
     pairs, shared_points = np.unique(owner[in_both] * len(size) + ids[in_both], return_counts=True)
     region_pairs, region_points = np.unique(region * len(size) + ids, return_counts=True)
     object_index, cluster_index = np.divmod(pairs, len(size))
-    # the points of an object are in its region, so each pair is also a pair of the regions
+    # Object points are in the region of the object, so each of the pairs is also one of the region_pairs.
     iou = shared_points / (
         size[cluster_index] + points[object_index] - region_points[np.searchsorted(region_pairs, pairs)]
     )
-    is_piece = shared_points >= MIN_PIECE_SHARE * points[object_index]
+    is_piece = shared_points >= MIN_PIECE_FRACTION * points[object_index]
     best_iou = np.zeros(rows)
     np.maximum.at(best_iou, object_index, iou)
     has_several_pieces = np.bincount(cluster_index[is_piece], minlength=len(size)) > 1
-    shared = (
+    is_shared = (
         np.bincount(
             object_index[(iou == best_iou[object_index]) & is_piece & has_several_pieces[cluster_index]], minlength=rows
         )
@@ -232,7 +237,7 @@ def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
     return ClusterScore(
         best_iou[1:],
         np.bincount(object_index[is_piece], minlength=rows)[1:],
-        shared[1:],
+        is_shared[1:],
         len(numbers),
         int(is_judged.sum()),
     )
@@ -246,20 +251,21 @@ class ClusterReport:
     ms: list[float] = field(default_factory=list)
 
     def update(self, classes: tuple[str, ...], ranges: np.ndarray, score: ClusterScore, ms: float) -> None:
-        """Add one frame: classes and ranges (K,) of its Objects, its score, and the duration in ms."""
+        """Add one frame: classes and ranges (K,) of its Objects, its score, and the run time in ms."""
         self.frames.append((classes, ranges, score))
         self.ms.append(ms)
 
     def compute(self) -> dict:
-        """Return the content of the JSON file; precision is the fraction of judged clusters that hit."""
+        """Return the content of the JSON file. Precision is the fraction of judged clusters that are hits."""
         classes = np.array([c for names, _, _ in self.frames for c in names], str)
         ranges = _concatenate(frame_ranges for _, frame_ranges, _ in self.frames)
         bins = np.searchsorted(RANGE_LIMITS, ranges, "right")
         columns = [
-            _concatenate(getattr(score, name) for _, _, score in self.frames) for name in ("iou", "pieces", "shared")
+            _concatenate(getattr(score, name) for _, _, score in self.frames) for name in ("iou", "pieces", "is_shared")
         ]
         overall = _to_object_row(*columns)
-        clusters, judged = (sum(getattr(score, name) for _, _, score in self.frames) for name in ("clusters", "judged"))
+        clusters = sum(score.cluster_count for _, _, score in self.frames)
+        judged = sum(score.judged_count for _, _, score in self.frames)
         hits = overall["hits"]
         return {
             "frames": len(self.frames),
@@ -277,10 +283,10 @@ class ClusterReport:
         }
 
 
-def _to_object_row(iou: np.ndarray, pieces: np.ndarray, shared: np.ndarray) -> dict:
-    """Return counts and ratios of K objects; mean_pieces is the mean over objects with a piece."""
+def _to_object_row(iou: np.ndarray, pieces: np.ndarray, is_shared: np.ndarray) -> dict:
+    """Return counts and ratios of K objects. mean_pieces is the mean over objects with a piece."""
     count, hits = len(iou), int(np.sum(iou > HIT_IOU))
-    over_segmented, under_segmented = int(np.sum(pieces > 1)), int(np.sum(shared))
+    over_segmented, under_segmented = int(np.sum(pieces > 1)), int(np.sum(is_shared))
     return dict(
         objects=count,
         hits=hits,
@@ -295,7 +301,7 @@ def _to_object_row(iou: np.ndarray, pieces: np.ndarray, shared: np.ndarray) -> d
 
 
 def _renumber(ids: np.ndarray, kept_ids: np.ndarray) -> np.ndarray:
-    """Map ids (N,) to their position 1.. in kept_ids, other ids to 0, as (N,) int32."""
+    """Map ids (N,) to their position in kept_ids, from 1, and all other ids to 0; return (N,) int32."""
     new_ids = np.zeros(max(ids.max(initial=0), kept_ids.max(initial=0)) + 1, np.int32)
     new_ids[kept_ids] = np.arange(1, len(kept_ids) + 1)
     return new_ids[ids]

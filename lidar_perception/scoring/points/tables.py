@@ -12,11 +12,11 @@ from lidar_perception.scoring.points.segmentation import HIT_IOU, MIN_POINTS, PR
 from lidar_perception.scoring.tables import format_counts, format_percent, make_table, print_skipped
 from lidar_perception.types import PointCloud
 
-# Patchwork++ on sequences 00 to 10 of SemanticKITTI, mean over sequences, percent: precision,
-# recall, F1. The first row is from the paper (IROS 2022, Table I), the second from its repository.
+# Precision, recall and F1 of Patchwork++ in percent, mean over sequences 00 to 10 of SemanticKITTI. The first
+# row is from the paper (IROS 2022, Table I), the second from its repository.
 PUBLISHED = {"without vegetation": (94.92, 98.18, 96.51), "with vegetation": (93.72, 92.33, 92.87)}
 
-MAX_DRAWN_RANGE = 50.0  # in metres to each side
+MAX_DRAWN_RANGE = 50.0  # half width of the picture in metres
 
 
 def print_scores(content: dict, ground_method: str, console: Console) -> None:
@@ -56,8 +56,8 @@ def _print_ground(reports: dict, console: Console) -> None:
         if protocol in PUBLISHED:
             table.add_row("  Patchwork++ published", *(f"{v:.1f}" for v in PUBLISHED[protocol]), style="dim")
     table.caption = (
-        "Ground: road, parking, sidewalk, other-ground, lane-marking, terrain. ms are "
-        "for one scan. Published: mean of the sequences 00 to 10."
+        "Ground: road, parking, sidewalk, other-ground, lane-marking, terrain. ms: "
+        "per scan. Published: mean of the sequences 00 to 10."
     )
     console.print(table)
 
@@ -89,19 +89,19 @@ def _print_clusters(reports: dict, title: str, console: Console) -> None:
         table.add_section()
     table.caption = (
         f"Objects with {MIN_POINTS} points or more; hit: IoU above {HIT_IOU} with one "
-        "cluster. over: cut in pieces; under: in one cluster with another; found: "
-        "clusters a frame; ms: a frame."
+        "cluster. over: split into pieces; under: merged with another one; found: "
+        "clusters per frame; ms: per frame."
     )
     console.print(table)
 
 
 def _format_object(row: dict) -> list[str]:
-    """Format one row of objects; precision and F1 exist only for all objects together."""
-    judged = format_percent(row, "precision", "f1") if "precision" in row else ("", "")
+    """Format one row of objects. Only the row of all objects has precision and F1."""
+    precision_cells = format_percent(row, "precision", "f1") if "precision" in row else ("", "")
     return [
         *format_counts(row, "objects", "hits"),
         *format_percent(row, "recall"),
-        *judged,
+        *precision_cells,
         *format_percent(row, "mean_iou", "over_segmentation", "under_segmentation"),
     ]
 
@@ -117,9 +117,9 @@ def _format_count(count: int, noun: str) -> str:
 def draw_ground(
     path: Path, name: str, frame: PointCloud, semantic: np.ndarray, ground_by_method: dict[str, np.ndarray]
 ) -> None:
-    """Draw the ground (N,) bool of each method in BEV, forward up, and write a PNG file.
+    """Draw a BEV picture of the ground (N,) bool of each method, forward up, and write a PNG file.
 
-    Vegetation is not counted.
+    Vegetation is not scored.
     """
     import matplotlib
 
@@ -132,11 +132,11 @@ def draw_ground(
     )
     for axes, (method, ground) in zip(rows[0], ground_by_method.items()):
         for mask, color, label, size in (
-            (~is_counted, "#dddddd", "not counted", 0.2),
-            (is_counted & ~is_ground & ~ground, "#b0b0b0", "not ground", 0.3),
-            (is_counted & is_ground & ground, "#009e73", "ground, found", 0.3),
-            (is_counted & is_ground & ~ground, "#0072b2", "ground, missed", 1.2),
-            (is_counted & ~is_ground & ground, "#d55e00", "found, but not ground", 1.2),
+            (~is_counted, "#dddddd", "not scored", 0.2),
+            (is_counted & ~is_ground & ~ground, "#b0b0b0", "true negative", 0.3),
+            (is_counted & is_ground & ground, "#009e73", "true positive", 0.3),
+            (is_counted & is_ground & ~ground, "#0072b2", "false negative", 1.2),
+            (is_counted & ~is_ground & ground, "#d55e00", "false positive", 1.2),
         ):
             axes.scatter(
                 -frame.xyz[mask, 1],

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidar_perception.scoring.tracking.pairs import EPS, MIN_SIMILARITY, Pairs, find_best_pairs
 
-CONTINUATION_GAIN = 1000.0  # bonus for pairs of the previous frame, larger than any similarity
+CONTINUATION_GAIN = 1000.0  # gain of pairs that matched in the previous frame, above any similarity
 
 
 @dataclass(frozen=True)
@@ -19,12 +19,12 @@ class ClearCounts:
         tp: Boxes that match a label.
         fn: Labels without a match.
         fp: Boxes without a match.
-        switches: Labels that match another track id than the last time.
-        fragments: Labels that match again after a gap.
+        switches: Matches with another track id than in the last match of the labelled track.
+        fragments: Gaps in the matches of labelled tracks.
         mostly_tracked: Labelled tracks that match in more than 80 % of their frames.
         partly_tracked: Labelled tracks that match in 20 % to 80 % of their frames.
         mostly_lost: Labelled tracks that match in less than 20 % of their frames.
-        located: Sum of the similarities of all matches.
+        similarity: Sum of the similarities of all matches.
     """
 
     tp: int = 0
@@ -35,7 +35,7 @@ class ClearCounts:
     mostly_tracked: int = 0
     partly_tracked: int = 0
     mostly_lost: int = 0
-    located: float = 0.0
+    similarity: float = 0.0
 
     def __add__(self, other: ClearCounts) -> ClearCounts:
         return ClearCounts(*(a + b for a, b in zip(astuple(self), astuple(other))))
@@ -48,14 +48,14 @@ class ClearCounts:
         objects = max(1, self.tp + self.fn)
         return {
             "MOTA": (self.tp - self.fp - self.switches) / objects,
-            "MOTP": self.located / max(1, self.tp),
+            "MOTP": self.similarity / max(1, self.tp),
             "recall": self.tp / objects,
             "precision": self.tp / max(1, self.tp + self.fp),
         }
 
 
 def count_clear(frames: list[Pairs], min_similarity: float = MIN_SIMILARITY) -> ClearCounts:
-    """Count one sequence.
+    """Count the matches and errors of one sequence.
 
     A label keeps its track of the previous frame if possible.
 
@@ -67,25 +67,25 @@ def count_clear(frames: list[Pairs], min_similarity: float = MIN_SIMILARITY) -> 
     last_track, previous_track = (np.full(len(true_ids), -1, np.int64) for _ in range(2))
     frame_counts, match_counts, run_counts = (np.zeros(len(true_ids), int) for _ in range(3))
     tp = fp = switches = 0
-    located = 0.0
+    similarity = 0.0
     for f in frames:
         i = np.searchsorted(true_ids, f.true_ids)
         frame_counts[i] += 1
         fp += len(f.track_ids)
         if len(i) == 0 or len(f.track_ids) == 0:
-            continue  # earlier matches can continue after such a frame, as in TrackEval
+            continue  # previous_track is kept over such a frame, as in TrackEval
         gain = CONTINUATION_GAIN * (f.track_ids == previous_track[i][:, None]) + f.similarity
         rows, columns = find_best_pairs(np.where(f.similarity < min_similarity - EPS, 0.0, gain))
-        matched, ids = i[rows], f.track_ids[columns]
-        switches += int(((last_track[matched] >= 0) & (last_track[matched] != ids)).sum())
-        run_counts[matched] += previous_track[matched] < 0
-        last_track[matched] = ids
+        matched_tracks, ids = i[rows], f.track_ids[columns]
+        switches += int(((last_track[matched_tracks] >= 0) & (last_track[matched_tracks] != ids)).sum())
+        run_counts[matched_tracks] += previous_track[matched_tracks] < 0
+        last_track[matched_tracks] = ids
         previous_track[:] = -1
-        previous_track[matched] = ids
-        match_counts[matched] += 1
-        tp += len(matched)
-        fp -= len(matched)
-        located += float(f.similarity[rows, columns].sum())
+        previous_track[matched_tracks] = ids
+        match_counts[matched_tracks] += 1
+        tp += len(matched_tracks)
+        fp -= len(matched_tracks)
+        similarity += float(f.similarity[rows, columns].sum())
     matched_fraction = match_counts / np.maximum(frame_counts, 1)
     mostly_tracked, at_least_partly = int((matched_fraction > 0.8).sum()), int((matched_fraction >= 0.2).sum())
     return ClearCounts(
@@ -97,5 +97,5 @@ def count_clear(frames: list[Pairs], min_similarity: float = MIN_SIMILARITY) -> 
         mostly_tracked,
         at_least_partly - mostly_tracked,
         len(true_ids) - at_least_partly,
-        located,
+        similarity,
     )

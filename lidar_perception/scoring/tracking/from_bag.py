@@ -1,4 +1,4 @@
-"""Scores of tracks that were recorded to a bag with labels."""
+"""Scores of tracks in a bag with labels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import is_same_drive
 from lidar_perception.scoring.recorded import RecordedResult
 from lidar_perception.scoring.tracking.pairs import to_tracked_labels
-from lidar_perception.scoring.tracking.report import TrackingReport, observe
+from lidar_perception.scoring.tracking.report import TrackingReport, make_observation
 from lidar_perception.wire.messages import to_detections, to_truth
 
 
@@ -27,7 +27,7 @@ def count_recorded_tracks(frames: Sequence[RecordedResult]) -> dict[str, int]:
 def score_recorded_tracks(
     frames: Sequence[RecordedResult], calibration: Calibration | None
 ) -> dict[str, dict[str, Any] | None]:
-    """Score the recorded tracks; return the "classes" of TrackingReport.compute.
+    """Score recorded tracks and return "classes" of TrackingReport.compute.
 
     Raises:
         InputError: The labels have no track ids.
@@ -37,7 +37,7 @@ def score_recorded_tracks(
         drive += not is_same_drive(last_stamp_ns, frame.stamp_ns)
         last_stamp_ns = frame.stamp_ns
         report.update(
-            observe(
+            make_observation(
                 f"drive {drive}",
                 i,
                 to_truth(frame.truth),

@@ -26,15 +26,15 @@ class HotaCounts:
         tp: True positives.
         fn: Misses.
         fp: False positives.
-        associated: Sum of the association accuracies of the true positives.
-        located: Sum of the similarities of the true positives.
+        association: Sum of the association accuracies of the true positives.
+        similarity: Sum of the similarities of the true positives.
     """
 
     tp: np.ndarray = field(default_factory=_zeros)
     fn: np.ndarray = field(default_factory=_zeros)
     fp: np.ndarray = field(default_factory=_zeros)
-    associated: np.ndarray = field(default_factory=_zeros)
-    located: np.ndarray = field(default_factory=_zeros)
+    association: np.ndarray = field(default_factory=_zeros)
+    similarity: np.ndarray = field(default_factory=_zeros)
 
     def __add__(self, other: HotaCounts) -> HotaCounts:
         return HotaCounts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
@@ -45,24 +45,30 @@ class HotaCounts:
         A ratio with denominator 0 is 0.
         """
         det_a = self.tp / np.maximum(1.0, self.tp + self.fn + self.fp)
-        ass_a = self.associated / np.maximum(1.0, self.tp)
+        ass_a = self.association / np.maximum(1.0, self.tp)
         curves = {
             "HOTA": np.sqrt(det_a * ass_a),
             "DetA": det_a,
             "AssA": ass_a,
             "DetRe": self.tp / np.maximum(1.0, self.tp + self.fn),
             "DetPr": self.tp / np.maximum(1.0, self.tp + self.fp),
-            "LocA": np.maximum(1e-10, self.located) / np.maximum(1e-10, self.tp),
+            "LocA": np.maximum(1e-10, self.similarity) / np.maximum(1e-10, self.tp),
         }
         return {name: float(curve.mean()) for name, curve in curves.items()}
 
 
 def count_hota(frames: list[Pairs]) -> HotaCounts:
-    """Count one sequence, given its frames in order as returned by drop_ignored."""
+    """Count one sequence.
+
+    Args:
+        frames: Frames of the sequence in order, as returned by drop_ignored.
+    """
     true_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.true_ids for f in frames)]))
     track_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.track_ids for f in frames)]))
     indices = [(np.searchsorted(true_ids, f.true_ids), np.searchsorted(track_ids, f.track_ids)) for f in frames]
-    shared_frames = np.zeros((len(true_ids), len(track_ids)))  # summed weight of each pair
+    shared_frames = np.zeros(
+        (len(true_ids), len(track_ids))
+    )  # number of common frames of each pair, weighted by similarity
     true_frames, track_frames = np.zeros((len(true_ids), 1)), np.zeros((1, len(track_ids)))
     for f, (i, j) in zip(frames, indices):
         similarity = f.similarity
@@ -72,16 +78,20 @@ def count_hota(frames: list[Pairs]) -> HotaCounts:
         track_frames[0, j] += 1
     alignment = shared_frames / np.maximum(true_frames + track_frames - shared_frames, EPS)
     matches = np.zeros((len(ALPHAS), len(true_ids), len(track_ids)))
-    located = _zeros()
+    similarity_sum = _zeros()
     for f, (i, j) in zip(frames, indices):
-        # pairs of similarity 0 can be assigned too; they are below every alpha
+        # Pairs of similarity 0 may be assigned too. They are below every alpha.
         rows, columns = find_best_pairs(alignment[np.ix_(i, j)] * f.similarity)
         similarities = f.similarity[rows, columns]
         is_match = similarities >= ALPHAS[:, None] - EPS
         matches[:, i[rows], j[columns]] += is_match
-        located += (is_match * similarities).sum(axis=1)
+        similarity_sum += (is_match * similarities).sum(axis=1)
     tp = matches.sum(axis=(1, 2))
     union = np.maximum(1.0, true_frames + track_frames - matches)
     return HotaCounts(
-        tp, true_frames.sum() - tp, track_frames.sum() - tp, (matches * matches / union).sum(axis=(1, 2)), located
+        tp,
+        true_frames.sum() - tp,
+        track_frames.sum() - tp,
+        (matches * matches / union).sum(axis=(1, 2)),
+        similarity_sum,
     )

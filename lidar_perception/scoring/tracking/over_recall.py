@@ -1,4 +1,4 @@
-"""AB3DMOT's sAMOTA, AMOTA and AMOTP (Weng et al., IROS 2020): 3D CLEAR MOT averaged over recall.
+"""AB3DMOT's sAMOTA, AMOTA and AMOTP (Weng et al., IROS 2020): CLEAR MOT in 3D, averaged over recall.
 
 The counts follow the paper's own script for KITTI with 3D IoU: each of 40 thresholds selects the
 tracks with at least this mean score. Unlike CLEAR MOT, the script counts matches of ignored labels
@@ -17,16 +17,16 @@ from scipy.optimize import linear_sum_assignment
 from lidar_perception.scoring.tracking.pairs import Pairs
 
 MIN_OVERLAP = 0.25  # minimum IoU of a match
-STEPS = 40  # recall thresholds 1/40, 2/40, ..., 1
-FORBIDDEN = 1e6  # cost of a pair below MIN_OVERLAP
+STEPS = 40  # number of recalls 1/40, 2/40, ..., 1
+FORBIDDEN_COST = 1e6  # cost of a pair below MIN_OVERLAP
 
 
 @dataclass(frozen=True)
 class RecallPoint:
-    """Counts over tracks with a mean score of at least `threshold`.
+    """Counts for tracks with a mean score of at least `threshold`.
 
-    tp includes matches of ignored labels; objects and fn exclude ignored labels. overlap is the sum
-    of the IoU of all matches.
+    tp includes matches of ignored labels. objects and fn exclude ignored labels. overlap is the sum of
+    the IoU of all matches.
     """
 
     threshold: float
@@ -45,7 +45,7 @@ class RecallPoint:
 
     @property
     def smota(self) -> float:
-        """MOTA divided by the best value that is possible at this recall, clipped to 0..1."""
+        """MOTA divided by the best possible value at this recall, clipped to 0..1."""
         if not self.objects:
             return 0.0
         errors = self.fn + self.fp + self.switches - (1 - self.recall) * self.objects
@@ -109,7 +109,7 @@ def _count_at_threshold(
     recall: float,
     hits: list[float],
 ) -> RecallPoint:
-    """Count at one threshold.
+    """Count matches, misses, false positives and id switches at one score threshold.
 
     Appends the score of each match to `hits`. Updates `matched` in place: a track that has matched
     once is never excused again, as in the paper's script.
@@ -125,9 +125,9 @@ def _count_at_threshold(
             columns = track_indices[columns]
             matched_once[columns] = True
             hits += mean_scores[columns].tolist()
-            is_excused = f.excused[track_indices] & ~matched_once[track_indices]
-            ignored_hits = int(f.ignored[rows].sum())
-            label_count = int((~f.ignored).sum())
+            is_excused = f.is_excused[track_indices] & ~matched_once[track_indices]
+            ignored_hits = int(f.is_ignored[rows].sum())
+            label_count = int((~f.is_ignored).sum())
             objects += label_count
             tp += len(rows)
             fn += label_count - (len(rows) - ignored_hits)
@@ -135,24 +135,24 @@ def _count_at_threshold(
             overlap += float(f.overlap[rows, columns].sum())
             ids = np.full(len(f.true_ids), -1, np.int64)
             ids[rows] = f.track_ids[columns]
-            for true_id, track, ignored in zip(f.true_ids.tolist(), ids.tolist(), f.ignored):
+            for true_id, track, ignored in zip(f.true_ids.tolist(), ids.tolist(), f.is_ignored):
                 histories.setdefault(true_id, []).append((track, bool(ignored)))
         switches += sum(map(_count_switches, histories.values()))
     return RecallPoint(threshold, recall, tp, fn, fp, switches, objects, overlap)
 
 
 def _match(overlap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    cost = np.where(overlap >= MIN_OVERLAP, 1.0 - overlap, FORBIDDEN)
+    cost = np.where(overlap >= MIN_OVERLAP, 1.0 - overlap, FORBIDDEN_COST)
     rows, columns = linear_sum_assignment(cost)
-    is_allowed = cost[rows, columns] < FORBIDDEN
+    is_allowed = cost[rows, columns] < FORBIDDEN_COST
     return rows[is_allowed], columns[is_allowed]
 
 
 def _count_switches(history: list[tuple[int, bool]]) -> int:
-    """Count the id switches of one label.
+    """Count the id switches of one labelled object.
 
     Args:
-        history: Track id (-1 for none) and ignored flag for each frame of the label.
+        history: Track id (-1 for none) and ignored flag, for each frame of the object.
     """
     count, last_track = 0, history[0][0]
     if all(ignored for _, ignored in history):

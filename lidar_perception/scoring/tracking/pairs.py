@@ -1,8 +1,8 @@
 """Labels and tracks of one frame for the tracking scores, and their similarity.
 
 As in KITTI's tracking benchmark (TrackEval), labels of neighbour classes, truncated or hardly
-visible labels, DontCare regions and small boxes are ignored. Labels outside the image, which KITTI
-does not have, are also ignored.
+visible labels, DontCare regions and small boxes are ignored. Labels outside the image are also
+ignored; KITTI has no such labels.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 
 MAX_OCCLUSION, MAX_TRUNCATION = 2, 0  # maximum levels, as in the tracking layout
 MIN_HEIGHT = 25.0  # minimum height of the 2D box in pixels
-MAX_REGION_SHARE = 0.5  # maximum fraction of a box inside a DontCare region
-MAX_CENTRE_DISTANCE = 2.0  # in metres; more distant centres have similarity 0
+MAX_DONT_CARE_FRACTION = 0.5  # maximum fraction of a box inside a DontCare region
+MAX_CENTRE_DISTANCE = 2.0  # distance of centres in metres at which the similarity becomes 0
 MIN_SIMILARITY = 0.5  # minimum similarity of a match in CLEAR MOT and of a match with an ignored label
 
 SIMILARITIES = ("centres", "3d", "image")
@@ -34,25 +34,25 @@ class Pairs:
 
     Attributes:
         true_ids: (M,) int64, unique track ids of the labels.
-        ignored: (M,) bool, True for labels that need not be detected.
+        is_ignored: (M,) bool, True for labels that need not be detected.
         track_ids: (K,) int64, unique ids of the tracks.
         scores: (K,) float64 scores of the tracks.
-        excused: (K,) bool, True for tracks that are not false positives if they match no label.
+        is_excused: (K,) bool, True for tracks that are not false positives if they match no label.
         similarity: (M, K) float64 0..1, for HOTA and CLEAR MOT.
         overlap: (M, K) float64 3D IoU, for AB3DMOT's scores.
     """
 
     true_ids: np.ndarray
-    ignored: np.ndarray
+    is_ignored: np.ndarray
     track_ids: np.ndarray
     scores: np.ndarray
-    excused: np.ndarray
+    is_excused: np.ndarray
     similarity: np.ndarray
     overlap: np.ndarray
 
 
 def to_tracked_labels(ids: np.ndarray, detections: Detections) -> GroundTruth:
-    """Convert tracks with ids (K,) to labels with track_id and score."""
+    """Convert K tracked detections with these ids (K,) to labels with track_id and score."""
     return GroundTruth.of(
         detections.boxes,
         detections.class_ids,
@@ -68,8 +68,7 @@ def make_pairs(
     Args:
         truth: Labels with a track_id in extras.
         tracks: Tracks as labels with a track_id and score in extras.
-        calibration: Camera calibration. With None, no box is too small and DontCare regions are not
-            applied.
+        calibration: Camera calibration. With None, box heights and DontCare regions are not used.
         similarity: "centres": 1 - distance / 2 m, "3d": 3D IoU, "image": IoU of the 2D boxes.
 
     Raises:
@@ -78,14 +77,11 @@ def make_pairs(
     if similarity not in SIMILARITIES:
         raise InputError(f"similarity = {similarity!r} must be one of {', '.join(SIMILARITIES)}")
     if similarity == "image" and calibration is None:
-        raise InputError("similarity in the image needs a calibration; take 'centres' or '3d'")
+        raise InputError("similarity 'image' requires a camera calibration; use 'centres' or '3d'")
     true_ids, track_ids = read_track_ids(truth, "label"), read_track_ids(tracks, "track")
     camera_labels, camera_tracks = (to_camera_objects(objects, calibration) for objects in (truth, tracks))
-    # regions without a box come last and are listed in .regions
-    labels_in_scene, tracks_in_scene = (
-        camera_labels.take(np.arange(len(truth))),
-        camera_tracks.take(np.arange(len(tracks))),
-    )
+    # Labels without a 3D box come last. They are DontCare regions and are also listed in .regions.
+    labels_3d, tracks_3d = (camera_labels.take(np.arange(len(truth))), camera_tracks.take(np.arange(len(tracks))))
     is_ignored = np.array(
         [
             extra.get("occluded", 0) > MAX_OCCLUSION or round(extra.get("truncated", 0)) > MAX_TRUNCATION
@@ -93,15 +89,13 @@ def make_pairs(
         ],
         bool,
     )
-    is_ignored |= labels_in_scene.pixels_high == 0
-    region_fraction = compute_image_iou(tracks_in_scene.image_boxes, camera_labels.regions, over_first=True)
-    is_excused = (tracks_in_scene.pixels_high <= MIN_HEIGHT + EPS) | (region_fraction > MAX_REGION_SHARE + EPS).any(
+    is_ignored |= labels_3d.pixels_high == 0
+    dont_care_fraction = compute_image_iou(tracks_3d.image_boxes, camera_labels.regions, over_first=True)
+    is_excused = (tracks_3d.pixels_high <= MIN_HEIGHT + EPS) | (dont_care_fraction > MAX_DONT_CARE_FRACTION + EPS).any(
         axis=1
     )
     return {
-        name: _make_class_pairs(
-            name, labels_in_scene, tracks_in_scene, true_ids, track_ids, is_ignored, is_excused, similarity
-        )
+        name: _make_class_pairs(name, labels_3d, tracks_3d, true_ids, track_ids, is_ignored, is_excused, similarity)
         for name in DETECTED
     }
 
@@ -118,9 +112,9 @@ def read_track_ids(objects: GroundTruth, noun: str) -> np.ndarray:
     """
     ids = np.array([extra.get("track_id", -1) for extra in objects.extras], np.int64)
     if (ids < 0).any():
-        raise InputError(f"a {noun} has no track id; tracking scores need one in each")
+        raise InputError(f"a {noun} has no track id; tracking scores require an id for every {noun}")
     if len(np.unique(ids)) < len(ids):
-        raise InputError(f"a frame has the {noun} id {np.sort(ids)[:-1][np.diff(np.sort(ids)) == 0][0]} twice")
+        raise InputError(f"a frame contains the {noun} id {np.sort(ids)[:-1][np.diff(np.sort(ids)) == 0][0]} twice")
     return ids
 
 
@@ -130,8 +124,8 @@ def _make_class_pairs(
     camera_tracks: CameraObjects,
     true_ids: np.ndarray,
     track_ids: np.ndarray,
-    ignored: np.ndarray,
-    excused: np.ndarray,
+    is_ignored: np.ndarray,
+    is_excused: np.ndarray,
     similarity: str,
 ) -> Pairs:
     class_id, neighbour_id = CLASSES.index(name), CLASSES.index(NEIGHBOURS.get(name, name))
@@ -146,10 +140,10 @@ def _make_class_pairs(
         class_similarity = overlap if similarity == "3d" else compute_image_iou(labels.image_boxes, tracks.image_boxes)
     return Pairs(
         true_ids[rows],
-        ignored[rows] | (labels.class_ids != class_id),
+        is_ignored[rows] | (labels.class_ids != class_id),
         track_ids[columns],
         tracks.scores,
-        excused[columns],
+        is_excused[columns],
         class_similarity,
         overlap,
     )
@@ -161,26 +155,27 @@ def drop_ignored(pairs: Pairs) -> Pairs:
     Drops ignored labels, tracks that match one, and excused tracks without a match.
     """
     rows, columns = find_best_pairs(np.where(pairs.similarity < MIN_SIMILARITY - EPS, 0.0, pairs.similarity))
-    is_dropped = pairs.excused.copy()
-    is_dropped[columns] = pairs.ignored[rows]
-    labels, tracks = np.flatnonzero(~pairs.ignored), np.flatnonzero(~is_dropped)
+    is_dropped = pairs.is_excused.copy()
+    is_dropped[columns] = pairs.is_ignored[rows]
+    labels, tracks = np.flatnonzero(~pairs.is_ignored), np.flatnonzero(~is_dropped)
     kept_pairs = np.ix_(labels, tracks)
     return replace(
         pairs,
         true_ids=pairs.true_ids[labels],
-        ignored=pairs.ignored[labels],
+        is_ignored=pairs.is_ignored[labels],
         track_ids=pairs.track_ids[tracks],
         scores=pairs.scores[tracks],
-        excused=pairs.excused[tracks],
+        is_excused=pairs.is_excused[tracks],
         similarity=pairs.similarity[kept_pairs],
         overlap=pairs.overlap[kept_pairs],
     )
 
 
 def find_best_pairs(gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Assign rows to columns so that the total gain is maximal; gain is (M, K).
+    """Assign the rows of a gain matrix (M, K) to columns so that the total gain is maximal.
 
-    Returns the rows (P,) and columns (P,) of the pairs with a positive gain.
+    Returns:
+        Rows (P,) and columns (P,) of the pairs with a positive gain.
     """
     rows, columns = linear_sum_assignment(gain, maximize=True)
     has_gain = gain[rows, columns] > EPS

@@ -1,4 +1,4 @@
-"""Tracking scores by class, from frames in any order."""
+"""Tracking scores by class. Frames may come in any order."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Observation:
     has_pose: bool = True
 
 
-def observe(
+def make_observation(
     sequence: str,
     index: int,
     truth: GroundTruth,
@@ -43,10 +43,10 @@ def observe(
     calibration: Calibration | None = None,
     similarity: str = "centres",
 ) -> Observation:
-    """Make the Observation of a frame; for the arguments see make_pairs.
+    """Make the Observation of a frame. See make_pairs for the other arguments.
 
     Raises:
-        InputError: The frame cannot be scored; the message names the sequence and frame.
+        InputError: The frame cannot be scored. The message contains the sequence and frame.
     """
     try:
         return Observation(sequence, index, make_pairs(truth, tracks, calibration, similarity))
@@ -75,7 +75,8 @@ def measure_tracking(
             return None
         tracked_labels = to_tracked_labels(tracks.ids, tracks.detections)
         return replace(
-            observe(tracker.drive, frame.index, truth, tracked_labels, frame.calibration()), has_pose=tracker.has_pose
+            make_observation(tracker.drive, frame.index, truth, tracked_labels, frame.calibration()),
+            has_pose=tracker.has_pose,
         )
 
     return measure
@@ -83,7 +84,7 @@ def measure_tracking(
 
 @dataclass
 class TrackingReport:
-    """Collection of the frames of all sequences; a repeated frame replaces the earlier one."""
+    """Frames of all sequences. A frame that is added again replaces the earlier one."""
 
     frames: dict[tuple[str, int], dict[str, Pairs]] = field(default_factory=dict)
     without_pose: set[tuple[str, int]] = field(default_factory=set)
@@ -96,19 +97,19 @@ class TrackingReport:
         (self.without_pose.discard if observation.has_pose else self.without_pose.add)(key)
 
     def compute(self) -> dict:
-        """Return the content of the JSON file: counts of frames, and scores (0..1) by class.
+        """Return the content of the JSON file: numbers of frames, and scores (0..1) by class.
 
         The scores are None for a class without labels and tracks.
         """
         names = sorted({sequence for sequence, _ in self.frames})
-        ordered = {name: [self.frames[key] for key in sorted(self.frames) if key[0] == name] for name in names}
+        sequences = {name: [self.frames[key] for key in sorted(self.frames) if key[0] == name] for name in names}
         return {
             "frames": len(self.frames),
             "without_pose": len(self.without_pose),
             "sequences": len(names),
             "skipped": self.skipped,
             "classes": {
-                name: _score_class([[frame[name] for frame in frames] for frames in ordered.values()])
+                name: _score_class([[frame[name] for frame in frames] for frames in sequences.values()])
                 for name in DETECTED
             },
         }
