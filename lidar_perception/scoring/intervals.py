@@ -1,8 +1,8 @@
 """Confidence intervals of scores: the bootstrap over drives (Efron, 1979).
 
 Frames of one drive show the same street and the same people. Therefore, drives are drawn with
-replacement, not frames. A recording with fewer than MIN_DRIVES drives is divided into blocks of BLOCK_FRAMES
-frames.
+replacement, not frames. A recording with fewer than MIN_DRIVES drives is divided into blocks of
+BLOCK_FRAMES frames.
 """
 
 from __future__ import annotations

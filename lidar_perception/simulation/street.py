@@ -138,7 +138,7 @@ STREET_KINDS = {
 
 
 class Lane(NamedTuple):
-    """A lane.
+    """A lane, parallel to the x axis.
 
     Attributes:
         y: Position of the centre line, m.

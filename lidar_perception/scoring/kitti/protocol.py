@@ -179,7 +179,7 @@ def compute_precision(frames: Comparison, name: str, metric: str, overlap: float
         difficulty: One of DIFFICULTIES.
 
     Returns:
-        None without counted labels. AOS is NaN if a hit has no observation angle.
+        The precision; None without counted labels. AOS is NaN if a hit has no observation angle.
     """
     pairs = _collect_pairs(frames, name, metric, overlap, difficulty)
     objects = int((pairs.labels == COUNTED).sum())

@@ -63,7 +63,7 @@ class Coverage(NamedTuple):
 
     @property
     def can_crop(self) -> bool:
-        """True if the box can be cropped without losing much else: no walls, and few other points or a small box."""
+        """True if cropping the box removes few other points: no walls, and few foreign points or a small box."""
         return (
             len(self.box) > 0
             and not self.has_walls

@@ -24,8 +24,8 @@ INLIER_DISTANCE_M = 0.05  # inlier distance of the final plane fit
 MIN_DEPTH_M, MAX_BELOW_RATIO = 0.3, 0.25
 SECTORS = 6  # number of sectors for the jackknife estimate of the error
 MIN_HEIGHT_M = 0.1  # minimum height of the sensor; closer surfaces belong to its support
-UPSIDE_DOWN_RATIO = 8.0  # minimum ratio of points on the upper plane to points on the lower one if the sensor is
-# upside down
+# Minimum ratio of points on the upper plane to points on the lower one if the sensor is upside down.
+UPSIDE_DOWN_RATIO = 8.0
 MIN_EXTENT_M = 1.5  # minimum extent of the plane
 OFFSET_M = 1.0  # distance by which clouds are lowered to find a floor at their origin
 

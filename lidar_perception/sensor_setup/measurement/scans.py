@@ -160,7 +160,7 @@ def measure_intensity(scans: Sequence[Scan]) -> IntensityScale | None:
     maximum = float(values.max())
     sample = values[:: max(1, len(values) // 10_000)]  # from all scans, because one may begin with zeros
     is_integer = bool((sample == np.round(sample)).all())
-    # Whole numbers stored as floats count as integers: no known driver sends only 0.0 and 1.0.
+    # Float columns with only integer values are treated as integers, even if the maximum is 1.
     full_scale = infer_full_scale(values, np.int64 if is_integer else values.dtype)
     if maximum > MAX_UNIT * full_scale:
         full_scale = maximum

@@ -79,7 +79,7 @@ def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
     bar_x, bar_z = 0.22 * length, 0.61 * height
     head = (neck[0] + 0.03, 0.0, height - 0.075 * rider_height)
     rows = [
-        *_bicycle_parts(length, width / 2, (bar_x, bar_z), rider.frame),
+        *_make_bicycle_parts(length, width / 2, (bar_x, bar_z), rider.frame),
         ellipsoid(head, (0.057 * rider_height, 0.047 * rider_height, 0.075 * rider_height), (SKIN + rider.head) / 2),
         ellipsoid(
             (point_on_trunk(0.15)[0], 0.0, point_on_trunk(0.15)[1]),
@@ -118,7 +118,7 @@ def pose_rider(travelled: float, rider: RiderBuild) -> np.ndarray:
     return make_parts(rows, BICYCLIST)
 
 
-def _bicycle_parts(length: float, half_bar: float, bar: tuple, frame: float) -> list[tuple]:
+def _make_bicycle_parts(length: float, half_bar: float, bar: tuple, frame: float) -> list[tuple]:
     """Return the wheels, the frame, and a handlebar at `bar` (x, z) with half of the width half_bar.
 
     Parts are thicker than in reality, because beams are wide. In KITTI, 46 % of the points on
@@ -147,7 +147,7 @@ def make_bicycle(rng: np.random.Generator) -> np.ndarray:
     length = rng.uniform(1.6, 1.85)
     seat = (-0.15 * length, 0.92)
     rows = [
-        *_bicycle_parts(length, 0.3, (0.22 * length, 1.02), rng.uniform(0.05, 0.5)),
+        *_make_bicycle_parts(length, 0.3, (0.22 * length, 1.02), rng.uniform(0.05, 0.5)),
         ellipsoid((seat[0], 0, seat[1]), (0.13, 0.08, 0.05), RUBBER),
         block((seat[0] - 0.4, -0.04, 0.68), (seat[0] - 0.38, 0.04, 0.74), PLATE),
     ]
@@ -157,11 +157,11 @@ def make_bicycle(rng: np.random.Generator) -> np.ndarray:
 def make_motorcycle(rng: np.random.Generator) -> np.ndarray:
     """Make a parked motorcycle or scooter, as (P,) PART."""
     return make_parts(
-        _motorcycle_parts(rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5), rng.uniform(0.25, 0.31)), MOTORCYCLE
+        _make_motorcycle_parts(rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5), rng.uniform(0.25, 0.31)), MOTORCYCLE
     )
 
 
-def _motorcycle_parts(length: float, paint: float, radius: float) -> list[tuple]:
+def _make_motorcycle_parts(length: float, paint: float, radius: float) -> list[tuple]:
     """Return the parts of a motorcycle with this length, reflectance (paint) and wheel radius."""
     axle = length / 2 - radius
     return [
@@ -179,7 +179,7 @@ def _motorcycle_parts(length: float, paint: float, radius: float) -> list[tuple]
 def make_motorcyclist(rng: np.random.Generator) -> SceneObject:
     """Make a rider on a motorcycle or scooter, labelled Cyclist. Some have a passenger."""
     length, trunk_length = rng.uniform(1.7, 2.15), rng.uniform(0.52, 0.62)
-    rows = _motorcycle_parts(length, rng.uniform(0.05, 0.6), rng.uniform(0.2, 0.31))
+    rows = _make_motorcycle_parts(length, rng.uniform(0.05, 0.6), rng.uniform(0.2, 0.31))
     lean, bar = rng.uniform(0.05, 0.4), length / 2 - 0.55
     hips = [bar - rng.uniform(0.45, 0.6)]
     if rng.random() < 0.2:

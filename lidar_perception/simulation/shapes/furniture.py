@@ -26,7 +26,7 @@ FOOT_M = -0.3  # z of the bottom of fixed objects
 
 def make_pole(rng: np.random.Generator) -> np.ndarray:
     """Make a bare mast of 2.5 to 8 m."""
-    return make_parts([_post(rng.uniform(2.5, 8.0), rng.uniform(0.04, 0.12))], POLE)
+    return make_parts([_make_post(rng.uniform(2.5, 8.0), rng.uniform(0.04, 0.12))], POLE)
 
 
 def make_lamp(rng: np.random.Generator) -> np.ndarray:
@@ -34,8 +34,8 @@ def make_lamp(rng: np.random.Generator) -> np.ndarray:
     height, arm = rng.uniform(4.0, 8.0), rng.uniform(0.4, 1.5)
     return make_parts(
         [
-            _post(height, 0.06),
-            _post(1.1, 0.09),
+            _make_post(height, 0.06),
+            _make_post(1.1, 0.09),
             rod((0, 0, height), (arm, 0, height + 0.1), 0.03, METAL),
             ellipsoid((arm + 0.25, 0, height + 0.08), (0.35, 0.14, 0.08), METAL),
         ],
@@ -47,13 +47,14 @@ def make_traffic_light(rng: np.random.Generator) -> np.ndarray:
     """Make a mast with lights at 2.2 m, a push button, and up to two signs."""
     height, child_rng = rng.uniform(3.0, 3.5), rng.spawn(1)[0]
     rows = [
-        _post(height, 0.07),
+        _make_post(height, 0.07),
         block((0.08, -0.15, height - 0.95), (0.3, 0.15, height), 0.05),
         block((0.06, -0.28, height - 1.0), (0.08, 0.28, height + 0.05), 0.1),
         block((-0.16, -0.06, 1.0), (-0.06, 0.06, 1.25), 0.4),
     ]
     return make_parts(
-        rows + [_plate(0.1, *child_rng.uniform((0.5, 0.2), (1.6, 0.35))) for _ in range(child_rng.integers(3))], POLE
+        rows + [_make_plate(0.1, *child_rng.uniform((0.5, 0.2), (1.6, 0.35))) for _ in range(child_rng.integers(3))],
+        POLE,
     )
 
 
@@ -67,11 +68,11 @@ def make_sign(rng: np.random.Generator) -> np.ndarray:
     size, child_rng = rng.uniform(0.25, 0.4), rng.spawn(1)[0]
     plates = [(plate_bottom, size)] + ([(plate_bottom + 2 * size + 0.05, 0.2)] if rng.random() < 0.4 else [])
     has_mast = plate_bottom < 1.0 and child_rng.random() < 0.5
-    rows = [_post(child_rng.uniform(2.5, 4.0), 0.07) if has_mast else _post(plate_bottom + 2 * size, 0.035)]
-    return make_parts(rows + [_plate(0.08 if has_mast else 0.04, z, half_width) for z, half_width in plates], POLE)
+    rows = [_make_post(child_rng.uniform(2.5, 4.0), 0.07) if has_mast else _make_post(plate_bottom + 2 * size, 0.035)]
+    return make_parts(rows + [_make_plate(0.08 if has_mast else 0.04, z, half_width) for z, half_width in plates], POLE)
 
 
-def _plate(x: float, z: float, half_width: float) -> tuple:
+def _make_plate(x: float, z: float, half_width: float) -> tuple:
     """Return a square plate at x with its lower edge at z."""
     return block((x, -half_width, z), (x + 0.02, half_width, z + 2 * half_width), PLATE, semantic=SIGN)
 
@@ -109,9 +110,13 @@ def make_litter_bin(rng: np.random.Generator) -> np.ndarray:
     if rng.random() < 0.5:
         height, radius = rng.uniform(0.7, 1.2), rng.uniform(0.2, 0.35)
         return make_parts(
-            [_cylinder(0.0, height, radius, grey), ellipsoid((0, 0, height), (radius, radius, 0.15), grey)], OTHER
+            [
+                _make_upright_cylinder(0.0, height, radius, grey),
+                ellipsoid((0, 0, height), (radius, radius, 0.15), grey),
+            ],
+            OTHER,
         )
-    return make_parts([_post(1.15, 0.03), cylinder((0.22, 0, 0.8), (0.19, 0.19, 0.28), grey)], OTHER)
+    return make_parts([_make_post(1.15, 0.03), cylinder((0.22, 0, 0.8), (0.19, 0.19, 0.28), grey)], OTHER)
 
 
 def make_wheelie_bin(rng: np.random.Generator) -> np.ndarray:
@@ -132,11 +137,11 @@ def make_bollard(rng: np.random.Generator) -> np.ndarray:
     """Make a bollard of 0.6 to 1.1 m, some with a retroreflective band."""
     height, radius = rng.uniform(0.6, 1.1), rng.uniform(0.05, 0.14)
     rows = [
-        _cylinder(FOOT_M, height, radius, rng.uniform(0.1, 0.5)),
+        _make_upright_cylinder(FOOT_M, height, radius, rng.uniform(0.1, 0.5)),
         ellipsoid((0, 0, height), (radius, radius, 0.06), 0.3),
     ]
     if rng.random() < 0.3:
-        rows.append(_cylinder(height - 0.2, height - 0.1, radius + 0.003, PLATE))
+        rows.append(_make_upright_cylinder(height - 0.2, height - 0.1, radius + 0.003, PLATE))
     return make_parts(rows, POLE)
 
 
@@ -147,13 +152,16 @@ def make_beacon(rng: np.random.Generator) -> np.ndarray:
     """
     height, low, half_width = rng.uniform((0.8, 0.05, 0.06), (1.6, 0.4, 0.3))
     if rng.random() < 0.5:
-        rows = [_cylinder(FOOT_M, low, 0.8 * half_width, 0.3), _cylinder(low, height, half_width, PLATE)]
+        rows = [
+            _make_upright_cylinder(FOOT_M, low, 0.8 * half_width, 0.3),
+            _make_upright_cylinder(low, height, half_width, PLATE),
+        ]
     else:
-        rows = [_post(low, 0.04), block((-0.03, -half_width, low), (0.03, half_width, height), PLATE)]
+        rows = [_make_post(low, 0.04), block((-0.03, -half_width, low), (0.03, half_width, height), PLATE)]
     if rng.random() < 0.4:
         rows.append(block((-0.4, -0.2, 0.0), (0.4, 0.2, 0.1), RUBBER))
     if rng.random() < 0.3:
-        rows += [_post(height + 0.5, 0.04), ellipsoid((0, 0, height + 0.3), (0.03, 0.3, 0.3), PLATE)]
+        rows += [_make_post(height + 0.5, 0.04), ellipsoid((0, 0, height + 0.3), (0.03, 0.3, 0.3), PLATE)]
     return make_parts(rows, SIGN)
 
 
@@ -222,8 +230,8 @@ def make_advertising_column(rng: np.random.Generator) -> np.ndarray:
     height, radius = rng.uniform(2.5, 3.6), rng.uniform(0.5, 0.7)
     return make_parts(
         [
-            _cylinder(FOOT_M, height, radius, rng.uniform(0.3, 0.5)),
-            _cylinder(height, height + 0.15, radius + 0.08, 0.3),
+            _make_upright_cylinder(FOOT_M, height, radius, rng.uniform(0.3, 0.5)),
+            _make_upright_cylinder(height, height + 0.15, radius + 0.08, 0.3),
             ellipsoid((0, 0, height + 0.15), (radius, radius, 0.25), 0.3),
         ],
         OTHER,
@@ -236,9 +244,9 @@ def make_cone(rng: np.random.Generator) -> np.ndarray:
     return make_parts(
         [
             block((-0.19, -0.19, 0), (0.19, 0.19, 0.03), 0.3),
-            _cylinder(0.03, 0.4 * height, 0.13, 0.4),
-            _cylinder(0.4 * height, 0.7 * height, 0.09, PLATE),
-            _cylinder(0.7 * height, height, 0.05, 0.4),
+            _make_upright_cylinder(0.03, 0.4 * height, 0.13, 0.4),
+            _make_upright_cylinder(0.4 * height, 0.7 * height, 0.09, PLATE),
+            _make_upright_cylinder(0.7 * height, height, 0.05, 0.4),
         ],
         OTHER,
     )
@@ -250,7 +258,7 @@ def make_planter(rng: np.random.Generator) -> np.ndarray:
     plant_height = rng.uniform(0.35, 0.65)
     return make_parts(
         [
-            _cylinder(0.0, height, 0.32, rng.uniform(0.25, 0.45)),
+            _make_upright_cylinder(0.0, height, 0.32, rng.uniform(0.25, 0.45)),
             ellipsoid(
                 (0, 0, height + 0.9 * plant_height),
                 (0.3, 0.28, plant_height),
@@ -269,7 +277,7 @@ def make_parasol(rng: np.random.Generator) -> np.ndarray:
     rows = [
         rod((0, 0, 0), (0, 0, height), 0.025, METAL),
         ellipsoid((0, 0, height), (1.3, 1.3, 0.2), 0.35),
-        _cylinder(0.7, 0.74, 0.4, 0.35),
+        _make_upright_cylinder(0.7, 0.74, 0.4, 0.35),
     ]
     for s in (-1, 1):
         rows += [
@@ -284,7 +292,7 @@ def make_hydrant(rng: np.random.Generator) -> np.ndarray:
     height = rng.uniform(0.9, 1.5)
     return make_parts(
         [
-            _cylinder(FOOT_M, height, rng.uniform(0.04, 0.12), 0.3),
+            _make_upright_cylinder(FOOT_M, height, rng.uniform(0.04, 0.12), 0.3),
             ellipsoid((0, 0, height - 0.15), (0.14, 0.17, 0.22), rng.uniform(0.1, 0.4)),
         ],
         OTHER,
@@ -313,11 +321,11 @@ def make_bicycle_stand(rng: np.random.Generator) -> np.ndarray:
     return make_parts([*rows, rod((-0.35, 0, height), (0.35, 0, height), 0.025, METAL)], POLE)
 
 
-def _post(height: float, radius: float) -> tuple:
-    return _cylinder(FOOT_M, height, radius, METAL)
+def _make_post(height: float, radius: float) -> tuple:
+    return _make_upright_cylinder(FOOT_M, height, radius, METAL)
 
 
-def _cylinder(low: float, height: float, radius: float, reflectance: float) -> tuple:
+def _make_upright_cylinder(low: float, height: float, radius: float, reflectance: float) -> tuple:
     return cylinder((0, 0, (low + height) / 2), (radius, radius, (height - low) / 2), reflectance)
 
 

@@ -29,11 +29,11 @@ def make_truck(rng: np.random.Generator) -> SceneObject:
     is_open = rng.random() < 0.25
     load_height = rng.uniform(1.6, 2.2) if is_open else height
     cab_height = height if is_open else min(height, rng.uniform(2.7, 3.1))
-    parts = _truck_parts(length, width, load_height, cab_height, max(draw_paint(rng), 0.1), rng.uniform(0.2, 0.6))
+    parts = _make_truck_parts(length, width, load_height, cab_height, max(draw_paint(rng), 0.1), rng.uniform(0.2, 0.6))
     return make_rigid(parts, size, "Truck")
 
 
-def _truck_parts(
+def _make_truck_parts(
     length: float, width: float, load_height: float, cab_height: float, colour: float, cargo: float
 ) -> np.ndarray:
     """Return the parts of a truck.
@@ -82,18 +82,18 @@ def _truck_parts(
 def make_bus(rng: np.random.Generator) -> SceneObject:
     """Make a city bus of 10.5 to 13 m."""
     size = (rng.uniform(10.5, 13.0), rng.uniform(2.45, 2.55), rng.uniform(2.9, 3.2))
-    parts = _coach_parts(size, max(draw_paint(rng), 0.15), OTHER_VEHICLE, 0.5, (2.2 / size[0], 0.78))
+    parts = _make_coach_parts(size, max(draw_paint(rng), 0.15), OTHER_VEHICLE, 0.5, (2.2 / size[0], 0.78))
     return make_rigid(parts, size, "Misc")
 
 
 def make_tram(rng: np.random.Generator) -> SceneObject:
     """Make a tram, or one section of a tram."""
     size = draw_size(rng, "Tram")
-    parts = _coach_parts(size, max(draw_paint(rng), 0.15), ON_RAILS, 0.38, (0.18, 0.82))
+    parts = _make_coach_parts(size, max(draw_paint(rng), 0.15), ON_RAILS, 0.38, (0.18, 0.82))
     return make_rigid(parts, size, "Tram")
 
 
-def _coach_parts(
+def _make_coach_parts(
     size: tuple[float, float, float], colour: float, semantic: int, radius: float, axles: tuple[float, float]
 ) -> np.ndarray:
     """Return the parts of a bus or tram: body with windows and pillars, seats and wheels.

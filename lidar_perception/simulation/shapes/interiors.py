@@ -19,7 +19,10 @@ WALL_THICKNESS_M = 0.2
 def make_wall(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
     """Make a wall with a skirting board, some with a handrail, a notice board or a picture."""
     x = length / 2
-    rows = [_wall_panel((-x, x), FOOT_M, height, rng), block((-x, -0.015, 0.0), (x, 0.0, 0.1), rng.uniform(0.1, 0.5))]
+    rows = [
+        _make_wall_panel((-x, x), FOOT_M, height, rng),
+        block((-x, -0.015, 0.0), (x, 0.0, 0.1), rng.uniform(0.1, 0.5)),
+    ]
     pick = rng.random()
     if pick < 0.15:
         rows.append(block((-x, -0.08, 0.85), (x, -0.03, 0.95), 0.3))
@@ -34,13 +37,13 @@ def make_wall(rng: np.random.Generator, length: float, height: float) -> np.ndar
 def make_door(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
     """Make a wall with a door. One in three doors is open, with a room behind it."""
     x, half_width = length / 2, min(0.5, 0.45 * length)
-    rows = _opening_parts(rng, x, half_width, DOOR_HEIGHT_M, height)
+    rows = _make_opening_parts(rng, x, half_width, DOOR_HEIGHT_M, height)
     tone = rng.uniform(0.15, 0.6)
     if rng.random() < 0.33:
         leaf = half_width if rng.random() < 0.5 else -half_width
         rows += [
             block((leaf - 0.02, 0.0, 0.0), (leaf + 0.02, 0.9, DOOR_HEIGHT_M), tone),
-            *_room_parts(rng, x + rng.uniform(0.5, 1.5), height),
+            *_make_room_parts(rng, x + rng.uniform(0.5, 1.5), height),
         ]
     else:
         rows += [
@@ -53,14 +56,17 @@ def make_door(rng: np.random.Generator, length: float, height: float) -> np.ndar
 def make_glazing(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
     """Make a wall of glass panes between posts, with a room behind it."""
     return make_parts(
-        [*_pane_parts(rng, length, min(height, rng.uniform(2.3, 3.0)), height), *_room_parts(rng, length / 2, height)],
+        [
+            *_make_pane_parts(rng, length, min(height, rng.uniform(2.3, 3.0)), height),
+            *_make_room_parts(rng, length / 2, height),
+        ],
         BUILDING,
     )
 
 
 def make_window(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
     """Make a wall of glass panes between posts, with nothing behind it."""
-    return make_parts(_pane_parts(rng, length, height - 0.3, height), BUILDING)
+    return make_parts(_make_pane_parts(rng, length, height - 0.3, height), BUILDING)
 
 
 def make_passage(rng: np.random.Generator, length: float, height: float) -> np.ndarray:
@@ -76,11 +82,11 @@ def make_passage(rng: np.random.Generator, length: float, height: float) -> np.n
     return make_parts(rows, BUILDING)
 
 
-def _wall_panel(x: tuple, low: float, high: float, rng: np.random.Generator) -> tuple:
+def _make_wall_panel(x: tuple, low: float, high: float, rng: np.random.Generator) -> tuple:
     return block((x[0], 0.0, low), (x[1], WALL_THICKNESS_M, high), rng.uniform(0.4, 0.75))
 
 
-def _opening_parts(rng, x: float, half_width: float, top: float, height: float) -> list[tuple]:
+def _make_opening_parts(rng, x: float, half_width: float, top: float, height: float) -> list[tuple]:
     """Return the wall left of, right of and above an opening."""
     tone = rng.uniform(0.4, 0.75)
     return [
@@ -90,7 +96,7 @@ def _opening_parts(rng, x: float, half_width: float, top: float, height: float) 
     ]
 
 
-def _room_parts(rng, x: float, height: float) -> list[tuple]:
+def _make_room_parts(rng, x: float, height: float) -> list[tuple]:
     """Return the walls of a room behind an opening, with one piece of furniture."""
     depth, tone = rng.uniform(2.5, 6.0), rng.uniform(0.4, 0.7)
     half_width, half_depth, furniture_height = rng.uniform((0.3, 0.2, 0.7), (0.7, 0.5, 2.0))
@@ -107,7 +113,7 @@ def _room_parts(rng, x: float, height: float) -> list[tuple]:
     ]
 
 
-def _pane_parts(rng, length: float, top: float, height: float) -> list[tuple]:
+def _make_pane_parts(rng, length: float, top: float, height: float) -> list[tuple]:
     """Return glass panes up to `top`, with a rail below them and a wall above."""
     x, count = length / 2, max(round(length / rng.uniform(1.2, 2.0)), 1)
     rows = [
@@ -118,7 +124,7 @@ def _pane_parts(rng, length: float, top: float, height: float) -> list[tuple]:
         block((post_x - 0.03, 0.02, 0.0), (post_x + 0.03, 0.12, top), METAL) for post_x in np.linspace(-x, x, count + 1)
     ]
     if top < height:
-        rows.append(_wall_panel((-x, x), top, height, rng))
+        rows.append(_make_wall_panel((-x, x), top, height, rng))
     return rows
 
 

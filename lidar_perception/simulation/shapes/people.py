@@ -80,8 +80,8 @@ def make_pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
 def _measure_stride(build: PersonBuild) -> tuple[float, float]:
     """Return the smallest and largest x of the body over half a stride; the other half is symmetric."""
     body = build._replace(carried="backpack" if build.carried == "backpack" else "", phase=0.0)
-    poses = [_limb_parts(i / 24, body) for i in range(12 if build.step else 1)]
-    rows = [row for limbs, _ in poses for row in limbs] + _trunk_parts(body, 0.0)
+    poses = [_make_limb_parts(i / 24, body) for i in range(12 if build.step else 1)]
+    rows = [row for limbs, _ in poses for row in limbs] + _make_trunk_parts(body, 0.0)
     low, _, _, high, _, _ = compute_hull(make_parts(rows, PERSON))
     return low, high
 
@@ -93,14 +93,14 @@ def pose_walker(travelled: float, build: PersonBuild) -> np.ndarray:
     slip, and the hips are lower while the legs are apart.
     """
     strides = build.phase + (travelled / (2 * build.step) if build.step else 0.0)
-    limbs, dz = _limb_parts(strides, build)
-    trunk = _trunk_parts(build, dz)
+    limbs, dz = _make_limb_parts(strides, build)
+    trunk = _make_trunk_parts(build, dz)
     parts = make_parts(trunk[:5] + limbs + trunk[5:], PERSON)
     parts["centre"][:, 0] += build.shift
     return parts
 
 
-def _trunk_parts(build: PersonBuild, dz: float) -> list[tuple]:
+def _make_trunk_parts(build: PersonBuild, dz: float) -> list[tuple]:
     """Return face and hair, neck, chest, hips and load, shifted up by `dz` metres."""
     h, w = build.height, build.width
     return [
@@ -109,11 +109,11 @@ def _trunk_parts(build: PersonBuild, dz: float) -> list[tuple]:
         rod((0, 0, 0.8 * h + dz), (0.005 * h, 0, 0.89 * h + dz), 0.032 * h, SKIN),
         ellipsoid((0, 0, 0.70 * h + dz), (0.08 * h, min(0.125 * h, 0.42 * w), 0.15 * h), build.coat),
         ellipsoid((0, 0, 0.54 * h + dz), (0.075 * h, min(0.105 * h, 0.38 * w), 0.11 * h), build.trousers),
-        *_load_parts(build.carried, h, w, dz, build.coat),
+        *_make_load_parts(build.carried, h, w, dz, build.coat),
     ]
 
 
-def _limb_parts(strides: float, build: PersonBuild) -> tuple[list[tuple], float]:
+def _make_limb_parts(strides: float, build: PersonBuild) -> tuple[list[tuple], float]:
     """Return arms, legs and feet after a number of strides, and the vertical shift of the hips in m."""
     h = build.height
     feet = [_pose_foot((strides + phase) % 1.0, 2 * build.step, h) for phase in (0.0, 0.5)]
@@ -122,9 +122,9 @@ def _limb_parts(strides: float, build: PersonBuild) -> tuple[list[tuple], float]
     )
     dz, rows = hip - HIP * h, []
     for side, (phase, is_left) in zip((-1, 1), ((strides + 0.5, False), (strides, True))):
-        rows += _arm_parts(side, phase, build, dz, is_left)
+        rows += _make_arm_parts(side, phase, build, dz, is_left)
     for side, (_, _, ankle) in zip((-1, 1), feet):
-        rows += _leg_parts(side, ankle, hip, h, build.trousers)
+        rows += _make_leg_parts(side, ankle, hip, h, build.trousers)
     for side, (toe, tilt, _) in zip((-1, 1), feet):
         cos_tilt, sin_tilt, half_length = cos(tilt), sin(tilt), FOOT * h / 2
         rows.append(
@@ -169,7 +169,7 @@ def _pose_foot(phase: float, stride: float, h: float) -> tuple[tuple, float, tup
     return toe, tilt, ankle
 
 
-def _leg_parts(side: int, ankle: tuple, hip: float, h: float, trousers: float) -> list[tuple]:
+def _make_leg_parts(side: int, ankle: tuple, hip: float, h: float, trousers: float) -> list[tuple]:
     """Return thigh and shank."""
     start = (0.12 * ankle[0], hip)
     x, z = find_knee(start, ankle, THIGH * h, SHANK * h)
@@ -191,7 +191,7 @@ def find_knee(hip: tuple, ankle: tuple, thigh: float, shank: float) -> tuple[flo
     return hip[0] + projection * x - bend * z, hip[1] + projection * z + bend * x
 
 
-def _arm_parts(side: int, phase: float, build: PersonBuild, dz: float, is_left: bool) -> list[tuple]:
+def _make_arm_parts(side: int, phase: float, build: PersonBuild, dz: float, is_left: bool) -> list[tuple]:
     """Return upper arm and forearm, which swing with the opposite leg or hold the load."""
     h, w, coat = build.height, build.width, build.coat
     swing = 0.45 * min(build.step / (0.43 * h), 1.2) * cos(2 * pi * phase)
@@ -208,7 +208,7 @@ def _arm_parts(side: int, phase: float, build: PersonBuild, dz: float, is_left: 
     return [rod(shoulder, elbow, radius, coat), rod(elbow, hand, radius, coat)]
 
 
-def _load_parts(carried: str, h: float, w: float, dz: float, coat: float) -> list[tuple]:
+def _make_load_parts(carried: str, h: float, w: float, dz: float, coat: float) -> list[tuple]:
     """Return the parts of a load that the person carries, pulls or pushes."""
     if carried == "backpack":
         return [ellipsoid((-0.1 * h, 0, 0.7 * h + dz), (0.07 * h, 0.085 * h, 0.13 * h), 0.5 * coat)]

@@ -145,12 +145,12 @@ def make_body(
     top, roof_half_width = height - ROOF_RISE_M, 0.86 * y if not style.load else 0.92 * y
     rows = [
         block((rear, -0.98 * y, clearance), (front, 0.98 * y, arch), colour),
-        *_bonnet_parts((screen_low_x, bonnet), x, 0.97 * y, height, colour),
+        *_make_bonnet_parts((screen_low_x, bonnet), x, 0.97 * y, height, colour),
         block((TAIL_GAP_M - x, -TAIL_FLAT * y, TAIL_LOW * height), (load, TAIL_FLAT * y, deck - 0.02), colour),
         block((TAIL_GAP_M + TAIL_ROUND_M - x, -TAIL_SIDE * y, clearance), (load, TAIL_SIDE * y, deck - 0.02), colour),
-        *_corner_parts(TAIL_GAP_M - x, y, (TAIL_LOW * height, deck - 0.02), colour),
-        _bumper_part(x, 0.97 * y, height, colour),
-        _bumper_part(-x, 0.97 * y, height, colour),
+        *_make_corner_parts(TAIL_GAP_M - x, y, (TAIL_LOW * height, deck - 0.02), colour),
+        _make_bumper_part(x, 0.97 * y, height, colour),
+        _make_bumper_part(-x, 0.97 * y, height, colour),
         block(
             (roof_rear_x, -roof_half_width, height - 0.13),
             (screen_high_x, roof_half_width, height - ROOF_RISE_M),
@@ -197,20 +197,20 @@ def make_body(
     rows += [  # front and rear plates, and tail lights
         block((x - 0.05, -0.26, plate_height - 0.055), (x, 0.26, plate_height + 0.055), PLATE),
         block((TAIL_GAP_M - 0.02 - x, -0.26, 0.4 * height), (TAIL_GAP_M - x, 0.26, 0.4 * height + 0.11), PLATE),
-        *_corner_parts(TAIL_GAP_M - 0.005 - x, y + 0.005, (0.38 * height, 0.44 * height), TAIL_LIGHT_REFLECTANCE),
+        *_make_corner_parts(TAIL_GAP_M - 0.005 - x, y + 0.005, (0.38 * height, 0.44 * height), TAIL_LIGHT_REFLECTANCE),
     ]
-    rows += _seat_parts(
+    rows += _make_seat_parts(
         0.5 * (screen_low_x + screen_high_x) - 0.75, load, 0.75 * y, arch, 0.45 * belt + 0.55 * top, driver
     )
     return make_parts(rows, CAR)
 
 
-def _bumper_part(x: float, y: float, height: float, colour: float) -> tuple:
+def _make_bumper_part(x: float, y: float, height: float, colour: float) -> tuple:
     """Return a bumper with a rounded outline that extends to x in its middle."""
     return ellipsoid((x - copysign(0.5, x), 0.0, BUMPER * height), (0.5, y, 0.17 * height), colour)
 
 
-def _corner_parts(x: float, y: float, heights: tuple, colour: float) -> list[tuple]:
+def _make_corner_parts(x: float, y: float, heights: tuple, colour: float) -> list[tuple]:
     """Return the two rounded corners of a tail at x, between the lower and upper end `heights`."""
     low, high = heights
     return [
@@ -223,7 +223,7 @@ def _corner_parts(x: float, y: float, heights: tuple, colour: float) -> list[tup
     ]
 
 
-def _bonnet_parts(windscreen_foot: tuple, x: float, y: float, height: float, colour: float) -> list[tuple]:
+def _make_bonnet_parts(windscreen_foot: tuple, x: float, y: float, height: float, colour: float) -> list[tuple]:
     """Return a bonnet and its domed top, from the foot (x, z) of the windscreen to the nose at x."""
     low, top = windscreen_foot
     return [
@@ -232,7 +232,7 @@ def _bonnet_parts(windscreen_foot: tuple, x: float, y: float, height: float, col
     ]
 
 
-def _seat_parts(x: float, rear: float, y: float, low: float, high: float, driver: bool) -> list[tuple]:
+def _make_seat_parts(x: float, rear: float, y: float, low: float, high: float, driver: bool) -> list[tuple]:
     """Return the backrests of the front seats at x and of a rear bench, if there is room, and the driver.
 
     Backrests are mostly transparent, because returns through two panes are weak: in KITTI, 2 % of the
