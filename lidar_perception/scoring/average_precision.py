@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 STEPS = 40  # number of recall steps from 0 to 1
-MIN_OBJECTS = STEPS + 1  # objects needed to fill all points
+MIN_OBJECTS = STEPS + 1  # minimum number of objects to fill all recall points
 
 
 def choose_thresholds(scores: np.ndarray, objects: int) -> np.ndarray:
@@ -41,21 +41,19 @@ def choose_thresholds(scores: np.ndarray, objects: int) -> np.ndarray:
 
 
 def sample_curve(values: np.ndarray, objects: int, official: bool = False) -> np.ndarray:
-    """Return for recall 0, 1/40, .. 1 the highest value at this recall or above, as (41,).
+    """Return the highest value (41,) at or above each recall 0, 1/40, .. 1. It is 0 at recalls that are not reached.
 
     Args:
         values: (T,) value at each threshold of choose_thresholds.
         objects: Number of labelled objects.
-        official: Sample like KITTI's program even if there are few objects.
-
-    Recall levels that are not reached get 0.
+        official: True to sample like KITTI's program even if there are few objects.
     """
     best_values = np.maximum.accumulate(values[::-1])[::-1]
     curve = np.zeros(MIN_OBJECTS)
     if objects >= MIN_OBJECTS or official:
         curve[: len(best_values)] = best_values
         return curve
-    # the first true positive that reaches the recall
+    # Index of the first true positive that reaches each recall.
     threshold_indices = np.maximum((np.arange(MIN_OBJECTS) * objects + STEPS - 1) // STEPS - 1, 0)
     is_reached = threshold_indices < len(best_values)
     curve[is_reached] = best_values[threshold_indices[is_reached]]

@@ -16,7 +16,7 @@ INTERVAL_PERCENT = 90  # percentage of the draws inside an interval
 
 
 def group_frames(names: Sequence[str], sequential: bool = False) -> list[np.ndarray]:
-    """Group frames into the drives or blocks that the bootstrap draws from.
+    """Group frames into drives or blocks, from which the bootstrap draws.
 
     Args:
         names: Names of the frames, DRIVE/FRAME.

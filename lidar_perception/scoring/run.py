@@ -35,7 +35,7 @@ TASKS_PER_THREAD = 2  # number of tasks per thread of a Dask cluster
 
 
 class Report(Protocol):
-    """Collects the results of frames. `skipped` has one line for each skipped frame."""
+    """Collection of frame results. `skipped` has one line for each skipped frame."""
 
     skipped: list[str]
 

@@ -31,7 +31,7 @@ class CampusKind:
 
     fraction: float  # fraction of scenes of this kind
     left: tuple[float, float]  # distance from the trajectory to the left edge of the court
-    right: tuple[float, float]  # the same to the right edge
+    right: tuple[float, float]  # distance from the trajectory to the right edge
     fronts: dict[str, float]  # probability of each kind of edge, see FRONTS and CAMPUS_FRONTS
     max_heading: float  # maximum deviation of the robot's heading from x, rad
     lane_chance: float = 0.0  # probability of a car lane on the right

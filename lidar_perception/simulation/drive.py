@@ -80,7 +80,7 @@ def simulate_drive(
 def simulate_scan(seed: int, i: int, sensor: Sensor, scenes: Scenes = ALL_STREETS) -> SimulatedScan:
     """Simulate scan i of the drive through the scene of a seed; see simulate_drive."""
     # The seed shifts wandering beams too, because a scene may have only one scan.
-    scene, sensor = _make_cached_scene(seed, scenes), sensor.at_revolution(seed + i)
+    scene, sensor = _make_cached_scene(seed, scenes), sensor.shift_beams(seed + i)
     state = scene.compute_state(i / sensor.rate, sensor.height)
     hits = cast_rays(state.solids, scene.ground, state.position, sensor, state.motion, (seed << 20) + i, state.heading)
     returns = make_returns(hits, sensor, state.motion, np.random.default_rng([seed, i]))

@@ -67,7 +67,7 @@ def merge_hits(one, other, pulse, key):
     """Merge the hits of a beam's two rays into one RayHit."""
     if one.solid == other.solid:
         return one
-    fraction = hash_uniform(5, key)  # of the energy that falls on the other hit
+    fraction = hash_uniform(5, key)  # fraction of the energy on the other hit
     power, other_power = one.brightness * (1 - fraction), other.brightness * fraction
     if one.range < np.inf and other.range < np.inf and abs(one.range - other.range) < pulse:
         return RayHit(

@@ -92,7 +92,7 @@ class Court(NamedTuple):
         )
 
     def shrink(self, margin: float) -> Court:
-        """Return the rectangle without a margin in m at each edge."""
+        """Return the rectangle, shrunk by a margin in m at each edge."""
         return Court(self.x0 + margin, self.y0 + margin, self.x1 - margin, self.y1 - margin)
 
     def draw_positions(self, rng: np.random.Generator, rate: float) -> Iterator[tuple[float, float]]:

@@ -236,7 +236,7 @@ def _draw_solids(hits, rays, mask, shapes, windows, order, max_range, leaf_fract
                 if is_counted and last_owner[column, ring] != owner:
                     last_owner[column, ring] = owner
                     hits.unoccluded_counts[owner] += 1
-                # Of equal ranges in float32, the solid with the lower index wins, whatever the drawing order.
+                # If ranges are equal in float32, the solid with the lower index is hit, in any drawing order.
                 t32, closest32, closest_solid = np.float32(t), np.float32(closest_range), hits.solid[column, ring]
                 if t32 < closest32 or (t32 == closest32 and (closest_solid < 0 or s < closest_solid)):
                     hits.range[column, ring], hits.solid[column, ring] = t, s

@@ -31,7 +31,7 @@ def furnish(rng: np.random.Generator, street: Street, actors: ActorSet) -> None:
 
 
 def is_plant(actor: Actor) -> bool:
-    """Return True if an actor has only parts of vegetation and trunk classes."""
+    """Return True if all parts of an actor are vegetation or trunks."""
     return PLANT_CLASSES.issuperset(actor.obj.parts(0.0)["semantic"].tolist())
 
 

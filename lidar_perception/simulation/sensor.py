@@ -17,8 +17,8 @@ from lidar_perception.types import SENSOR_HEIGHT, InputError, suggest_name
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the C loader is ten times faster, but optional
 MAX_BYTES = 1 << 20  # maximum size of a sensor file
 GOLDEN_RATIO = 0.6180339887498949
-MAX_RATE = 1000.0  # revolutions per second
-MAX_NOISE = 1.0  # metres
+MAX_RATE = 1000.0  # maximum rate in revolutions per second
+MAX_NOISE = 1.0  # maximum range noise in metres
 MAX_BEAMS = 1 << 16  # the ring column is uint16
 MAX_RAYS = 5_000_000  # rays per revolution, 100 bytes each; the densest sensors have 0.5 million
 
@@ -114,15 +114,15 @@ class Sensor:
         """Number of beams."""
         return len(self.elevations)
 
-    def at_revolution(self, number: int) -> Sensor:
-        """Return the sensor with its beams shifted as in one revolution; unchanged if `wander` is 0.
+    def shift_beams(self, revolution: int) -> Sensor:
+        """Return the sensor with its beams shifted as in this revolution. Unchanged if `wander` is 0.
 
         All beams are lowered by the same fraction of `wander`. The golden ratio distributes these
         fractions evenly over the revolutions.
         """
         if not self.wander:
             return self
-        shift = self.wander * (number * GOLDEN_RATIO % 1.0)
+        shift = self.wander * (revolution * GOLDEN_RATIO % 1.0)
         return replace(self, elevations=tuple(elevation - shift for elevation in self.elevations))
 
     def compute_directions(self) -> np.ndarray:
@@ -222,7 +222,7 @@ def make_generic_sensor(
     Raises:
         InputError: A value is invalid.
     """
-    if beams > MAX_BEAMS:  # before the list of elevations uses up the memory
+    if beams > MAX_BEAMS:  # checked before the elevations are allocated
         raise InputError(f"invalid sensor: beams = {beams} must be at most {MAX_BEAMS}")
     if beams > 1 and not lowest < highest:
         raise InputError(f"invalid sensor: lowest {lowest} must be below highest {highest}")

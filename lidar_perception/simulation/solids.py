@@ -34,7 +34,7 @@ PART = np.dtype(
 )
 
 
-def part(
+def make_part_row(
     kind: int,
     centre: tuple,
     half_size: tuple,

@@ -26,7 +26,7 @@ class StreetKind:
     """
 
     fraction: float  # fraction of streets of this kind; not taken from data
-    fronts: dict[str, float]  # weights of the kinds of roadside, see roadside.py
+    fronts: dict[str, float]  # probability of each kind of roadside, see roadside.py
     lane_width: tuple[float, float] = (3.0, 3.5)
     extra_lanes: tuple[int, int] = (0, 1)  # number of additional lanes in the ego direction, upper bound excluded
     oncoming_lanes: tuple[int, int] = (1, 2)

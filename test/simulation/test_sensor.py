@@ -167,9 +167,9 @@ def test_error_names_the_bad_sensor_file_and_the_reason(tmp_path, text, message)
 
 def test_shifts_of_wandering_beams_are_evenly_distributed():
     sensor = replace(SMALL, wander=np.radians(2.0))
-    sensors = [sensor.at_revolution(i) for i in range(50)]
+    sensors = [sensor.shift_beams(i) for i in range(50)]
     shifts = np.sort([sensor.elevations[3] - shifted.elevations[3] for shifted in sensors])
-    assert SMALL.at_revolution(7) is SMALL and sensors[0] == sensor
+    assert SMALL.shift_beams(7) is SMALL and sensors[0] == sensor
     assert 0 <= shifts[0] and shifts[-1] < np.radians(2.0)
     assert np.diff(shifts).max() < np.radians(2.0) / 50 * 2.7
 

@@ -79,7 +79,7 @@ def simulate_tilted(sensor: Sensor, roll: float, pitch: float, street: int, numb
     scene = drive._make_cached_scene(street, ALL_STREETS)
     ground = scene.ground._replace(**EVEN) if even else scene.ground
     scene = replace(scene, ground=ground)
-    sensor = sensor.at_revolution(number)
+    sensor = sensor.shift_beams(number)
     state = scene.compute_state(number / sensor.rate, sensor.height)
     axes, road_point = find_road_pose(ground, state.position[:2])
     position = road_point + sensor.height * axes[:, 2]

@@ -88,7 +88,7 @@ class DetectionReport:
         )
 
     def compute(self) -> dict:
-        """Return the content of the JSON file; ap is in percent."""
+        """Return the content of the JSON file. AP is in percent."""
         result: dict[str, Any] = {
             "frames": len(self.frames),
             "ap": {},

@@ -35,10 +35,10 @@ RANGES = {
 DISTANCES = (0.5, 1.0, 2.0, 4.0)  # maximum centre distances of a match, metres
 ERROR_DISTANCE = 2.0  # centre distance of the matches used for the errors
 RECALLS = np.linspace(0.0, 1.0, 101)
-FIRST_RECALL_INDEX = 11  # index of the first of RECALLS above 0.1
+FIRST_RECALL_INDEX = 11  # index of the first recall above 0.1 in RECALLS
 MIN_PRECISION = 0.1  # precision above which AP is computed
 MAP_WEIGHT = 5  # weight of mAP in NDS; each of ERRORS has weight 1
-RACK_CLASSES = ("bicycle", "motorcycle")  # ignored inside a bicycle rack
+RACK_CLASSES = ("bicycle", "motorcycle")  # classes that are ignored inside a bicycle rack
 
 # Translation (m), scale (1 - IoU of the aligned boxes), orientation (rad), velocity (m/s), and attribute
 # (1 - accuracy).

@@ -182,7 +182,7 @@ def find_instances(xyz: np.ndarray, semantic: np.ndarray, instance: np.ndarray) 
 
 @dataclass(frozen=True)
 class ClusterScore:
-    """Clusters of one frame against K objects.
+    """Scores of the clusters of one frame for K objects.
 
     Attributes:
         iou: (K,) IoU with the best cluster, 0 if no cluster overlaps.

@@ -150,9 +150,9 @@ def _make_class_pairs(
 
 
 def drop_ignored(pairs: Pairs) -> Pairs:
-    """Return the pairs for HOTA and CLEAR MOT.
+    """Drop the pairs that HOTA and CLEAR MOT ignore.
 
-    Drops ignored labels, tracks that match one, and excused tracks without a match.
+    These are ignored labels, tracks that match one of them, and excused tracks without a match.
     """
     rows, columns = find_best_pairs(np.where(pairs.similarity < MIN_SIMILARITY - EPS, 0.0, pairs.similarity))
     is_dropped = pairs.is_excused.copy()

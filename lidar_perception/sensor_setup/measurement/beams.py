@@ -19,9 +19,9 @@ MIN_RANGE_M = 2.0  # minimum range; the elevations of nearer points depend on th
 MAX_SPREAD = {"ring": 3.0, "order": 0.12, "elevation": 0.01}
 MIN_PEAK_FRACTION = 0.75  # minimum fraction of points near a peak of the histogram
 MIN_COUNT_FRACTION = 0.2  # minimum fraction of scans that must agree on a number of beams
-SECTORS = 72  # sectors of a revolution
+SECTORS = 72  # number of sectors per revolution
 MAX_LIFT_ERROR_M = 0.01  # maximum error of a reliable lift
-MIN_LIFT_M = 0.03  # smaller lifts are measurement errors
+MIN_LIFT_M = 0.03  # minimum lift; smaller ones are measurement errors
 MAX_LIFT_M = 0.5  # maximum lift; no sensor is larger
 ANGLE_RESOLUTION = 1e-3  # rounding of angles, in degrees
 MAX_GAP_STEPS = 3.5  # maximum gap, in azimuth steps, that is used to measure the azimuth step
@@ -255,7 +255,7 @@ def measure_azimuth_step(scans: Sequence[Scan], beams: Beams) -> tuple[float, fl
             gaps = gaps[gaps >= ANGLE_RESOLUTION]
             if len(gaps) < MIN_BEAM_POINTS // 2:
                 continue
-            # The mean, because encoders round azimuths. Gaps with lost returns count as several steps.
+            # Use the mean, because encoders round azimuths. Gaps with lost returns count as several steps.
             step = float(np.median(gaps))
             for _ in range(3):
                 plausible_gaps = gaps[(gaps > 0.4 * step) & (gaps < MAX_GAP_STEPS * step)]

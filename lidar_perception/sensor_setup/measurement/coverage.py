@@ -13,13 +13,13 @@ from lidar_perception.sensor_setup.measurement.beams import Beams
 from lidar_perception.sensor_setup.measurement.mount import Mount
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
-SECTORS = 360  # sectors of a revolution
+SECTORS = 360  # number of sectors per revolution
 NEAR_BODY_M = 1.0  # range below which constant returns come from the robot, even if it stands still
 MAX_BODY_M = 4.0  # range below which constant returns come from the robot while it drives
 MAX_ROBOT_SIZE_M = (5.5, 2.6)  # maximum length and width of a robot: a van
 MAX_BODY_FRACTION = 0.3  # maximum fraction of points on the body; with more, walls are among them
 MAX_FOREIGN_FRACTION = 0.2  # maximum fraction of points in the body box that do not belong to the robot
-MIN_BODY_SCANS = 0.7  # minimum fraction of scans with a return from the body
+MIN_BODY_FRACTION = 0.7  # minimum fraction of scans with a return from the body
 MAX_BODY_VARIATION_M = 0.06  # maximum variation of the body's range
 MIN_BODY_HEIGHT_M = 0.15  # minimum height of the body above the ground
 MIN_CELLS = 20  # minimum number of (sector, beam) cells of a body; fewer may be chance
@@ -229,7 +229,9 @@ def _find_body(
     padded_ranges[:, ~has_return.any(axis=0)] = 1e9
     median = np.nanmedian(padded_ranges, axis=0)
     variation = np.nanmedian(np.abs(padded_ranges - median), axis=0)
-    is_constant = (has_return.mean(axis=0) >= MIN_BODY_SCANS) & (variation <= MAX_BODY_VARIATION_M) & (len(ranges) >= 3)
+    is_constant = (
+        (has_return.mean(axis=0) >= MIN_BODY_FRACTION) & (variation <= MAX_BODY_VARIATION_M) & (len(ranges) >= 3)
+    )
     if stationary is False and len(ranges) >= 5 and mount is not None:  # the mount excludes the floor
         body = is_constant & (median < MAX_BODY_M)
         body &= median * (_compute_cell_directions(rows) @ mount.normal) + mount.height > MIN_BODY_HEIGHT_M

@@ -59,7 +59,7 @@ class CloudSource(NamedTuple):
 
     @property
     def has_few_scans(self) -> bool:
-        """True with fewer than MIN_SCANS scans."""
+        """True if there are fewer than MIN_SCANS scans."""
         return len(self.scans) < MIN_SCANS
 
 

@@ -75,7 +75,7 @@ def read_recorded_poses(poses: BagPoses | None, numbers: Sequence[int], stamps_n
     base = poses.base_frame
     mount = poses.find_mount(base) if base else None
     cloud_poses = {}
-    # Odometry without child_frame_id may be of another frame than the base.
+    # Odometry without child_frame_id may refer to another frame than the base.
     has_child = not poses.odometry_topic or poses.odometry_child_frame
     for number in numbers if has_child else ():
         pose = _find_base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))

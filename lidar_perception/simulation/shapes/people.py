@@ -159,7 +159,7 @@ def _pose_foot(phase: float, stride: float, h: float) -> tuple[tuple, float, tup
         x = stride * (STANCE * (smooth - 0.5))
         lift, rise = 0.03 * stride * sin(pi * swing_phase), 1.0 - smooth
     tilt = max_tilt * rise
-    toe_distance = 0.7 * FOOT * h  # from the ankle
+    toe_distance = 0.7 * FOOT * h  # distance from the ankle to the toe
     cos_tilt, sin_tilt = cos(tilt), sin(tilt)
     toe = (x + toe_distance, lift)
     ankle = (

@@ -1,30 +1,30 @@
 """Primitives of scene objects: rows of PART for boxes, ellipsoids, cylinders and thin boards.
 
-Positions are (x, y, z) in metres. `surface` is passed on to solids.part.
+Positions are (x, y, z) in metres. `surface` is passed on to solids.make_part_row.
 """
 
 from __future__ import annotations
 
 from math import atan2, hypot, pi
 
-from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID, RETROREFLECTOR, part
+from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID, RETROREFLECTOR, make_part_row
 
 RUBBER, METAL, SKIN, GLASS, PLATE = 0.06, 0.3, 0.4, 0.04, RETROREFLECTOR  # reflectances
 
 
 def box(centre: tuple, half_size: tuple, reflectance: float, **surface) -> tuple:
     """Return a box with these half sizes along its axes."""
-    return part(BOX, centre, half_size, reflectance, **surface)
+    return make_part_row(BOX, centre, half_size, reflectance, **surface)
 
 
 def ellipsoid(centre: tuple, half_size: tuple, reflectance: float, **surface) -> tuple:
     """Return an ellipsoid with these half axes."""
-    return part(ELLIPSOID, centre, half_size, reflectance, **surface)
+    return make_part_row(ELLIPSOID, centre, half_size, reflectance, **surface)
 
 
 def cylinder(centre: tuple, half_size: tuple, reflectance: float, **surface) -> tuple:
     """Return a cylinder along z. Its half sizes are two half axes and half of its height."""
-    return part(CYLINDER, centre, half_size, reflectance, **surface)
+    return make_part_row(CYLINDER, centre, half_size, reflectance, **surface)
 
 
 def block(corner: tuple, opposite: tuple, reflectance: float, **surface) -> tuple:
@@ -64,7 +64,7 @@ def upright_pane(x: tuple, low: tuple, high: tuple, reflectance: float, thicknes
         low, high: Lower and upper edge, (y, z) each.
         reflectance: Reflectance.
         thickness: Thickness, m.
-        surface: See solids.part.
+        surface: See solids.make_part_row.
     """
     (y0, z0), (y1, z1) = low, high
     centre = ((x[0] + x[1]) / 2, (y0 + y1) / 2, (z0 + z1) / 2)
