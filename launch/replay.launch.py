@@ -30,7 +30,7 @@ from lidar_perception.nodes.graph import (
     configure_evaluator,
     list_awaited_topics,
     list_result_topics,
-    relative_name,
+    make_relative,
 )
 from lidar_perception.nodes.launch_parameters import (
     add_arguments,
@@ -80,7 +80,7 @@ def replay(context, argument_names):
     sim_time = {"use_sim_time": value["use_sim_time"] == "true"}
     log_level = ["--log-level", value["log_level"]]
     remap, scoring = configure_evaluator(value["scores"], single, detectors)
-    detection_topics = [relative_name(list_result_topics(single, name)[FINAL_STAGE]) for name in detectors]
+    detection_topics = [make_relative(list_result_topics(single, name)[FINAL_STAGE]) for name in detectors]
     real_time = value["real_time"] == "true"
     # Left out if empty, because launch cannot determine the type of an empty list.
     follow = {} if real_time else {"follow": detection_topics}
@@ -108,7 +108,7 @@ def replay(context, argument_names):
             },
         ),
         # Relative names, which follow the namespace if this file is included in one.
-        remappings=[(t, relative_name(POINTS if t == cloud_topic else t)) for t in topics if t not in GLOBAL_TOPICS],
+        remappings=[(t, make_relative(POINTS if t == cloud_topic else t)) for t in topics if t not in GLOBAL_TOPICS],
         ros_arguments=log_level,
     )
     evaluator = Node(
@@ -126,7 +126,7 @@ def replay(context, argument_names):
     graph = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(HERE / "detectors.launch.py")),
         launch_arguments={
-            "points": relative_name(POINTS),
+            "points": make_relative(POINTS),
             **FIXED_ARGUMENTS,
             "config": ",".join(files),
             "detectors": value["detectors"],

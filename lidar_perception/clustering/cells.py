@@ -29,7 +29,7 @@ def sort_into_cells(xyz: np.ndarray, reach: float) -> Cells:
     return Cells(reach, order, take_columns(xyz, order), rest[0], *_find_ranges(*rest))
 
 
-def mean_neighbourhood_size(cells: Cells) -> float:
+def compute_mean_neighbourhood_size(cells: Cells) -> float:
     """Return the mean number of points in the cells around a point."""
     return float(np.diff(cells.start) @ cells.size) / len(cells.order)
 

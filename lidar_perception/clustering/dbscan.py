@@ -14,7 +14,7 @@ from lidar_perception.clustering.dbscan_cells import dbscan_by_cells
 from lidar_perception.clustering.dbscan_growth import dbscan_by_growing
 from lidar_perception.clustering.grid import find_root
 from lidar_perception.clustering.params import DbscanParams
-from lidar_perception.clustering.thinning import SLACK, max_exact_distances, thin_points
+from lidar_perception.clustering.thinning import SLACK, compute_max_exact_distances, thin_points
 from lidar_perception.clustering.tree import build_tree, find_touching_labels
 from lidar_perception.geometry import counting_sort, horizontal_range
 
@@ -130,7 +130,7 @@ def _find_touching_clusters(
     distinct_labels, label = np.unique(labels[rows], return_inverse=True)
     side = (np.arange(len(rows)) >= len(inner)).astype(np.int64)
     tree = build_tree(xyz[rows])
-    max_work = max_exact_distances(len(rows))
+    max_work = compute_max_exact_distances(len(rows))
     pairs, work = find_touching_labels(tree, label[tree.order], side[tree.order], reach * reach, max_work)
     if work > max_work:
         kept_rows, _ = thin_points(xyz[rows], reach, label)

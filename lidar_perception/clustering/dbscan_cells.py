@@ -18,7 +18,7 @@ from lidar_perception.clustering.grid import (
     number_clusters,
     take_columns,
 )
-from lidar_perception.clustering.thinning import SLACK, max_exact_distances, thin_points
+from lidar_perception.clustering.thinning import SLACK, compute_max_exact_distances, thin_points
 
 
 def dbscan_by_cells(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray:
@@ -29,7 +29,7 @@ def dbscan_by_cells(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray
     first, second = _find_neighbour_cells(cell_z, column_start, neighbours)
     x, y, z = take_columns(xyz, order)
     core = _find_core_points(x, y, z, start, first, second, eps * eps, min_samples)
-    cells, max_work = (x, y, z, start, first, second), max_exact_distances(len(xyz))
+    cells, max_work = (x, y, z, start, first, second), compute_max_exact_distances(len(xyz))
     parent, work = _join_cells(*cells, core, eps * eps, max_work)
     if work > max_work:
         core_rows, kept_core = np.flatnonzero(core), np.zeros(len(core), bool)

@@ -74,7 +74,7 @@ def adapt_to_density(params: ClusteringParams, density: float) -> ClusteringPara
         dbscan=replace(
             dbscan,
             eps=tuple(
-                min(max(eps, SPACINGS_PER_EPS * point_spacing(density) * end), widening * eps)
+                min(max(eps, SPACINGS_PER_EPS * compute_point_spacing(density) * end), widening * eps)
                 for eps, end in zip(dbscan.eps, band_ends)
             ),
             min_samples=_reduce_count(dbscan.min_samples, widening**2, MIN_CLUSTER_POINTS - 1),
@@ -89,7 +89,7 @@ def adapt_to_density(params: ClusteringParams, density: float) -> ClusteringPara
     )
 
 
-def point_spacing(density: float) -> float:
+def compute_point_spacing(density: float) -> float:
     """Return the distance in metres between neighbouring points on a surface 1 m from the sensor.
 
     The surface faces the sensor. density is in points per square degree and above 0.
@@ -116,4 +116,4 @@ def compute_radii(xyz: np.ndarray, density: float, low: float, high: float) -> n
         (N,) float64 radii in metres.
     """
     ranges = horizontal_range(xyz).astype(np.float64)
-    return np.clip(SPACINGS_PER_RADIUS * point_spacing(density) * ranges, low, high)
+    return np.clip(SPACINGS_PER_RADIUS * compute_point_spacing(density) * ranges, low, high)

@@ -35,25 +35,30 @@ from numba import njit
 
 from lidar_perception.clustering.cells import (
     Cells,
+    compute_mean_neighbourhood_size,
     find_core_points,
     gather_neighbourhood,
     gather_sample,
-    mean_neighbourhood_size,
     sample_cells,
     sort_into_cells,
 )
 from lidar_perception.clustering.curvature import find_consistent_points
 from lidar_perception.clustering.grid import number_clusters
 from lidar_perception.clustering.params import EuclideanParams
-from lidar_perception.clustering.thinning import MAX_DISTANCES_PER_POINT, SLACK, max_exact_distances, thin_points
+from lidar_perception.clustering.thinning import (
+    MAX_DISTANCES_PER_POINT,
+    SLACK,
+    compute_max_exact_distances,
+    thin_points,
+)
 from lidar_perception.clustering.tree import (
     Tree,
     build_tree,
+    compute_squared_distance,
     find_components,
     find_core_points_in_tree,
     find_nearest_core_points,
     find_nearest_distances,
-    squared_distance,
 )
 
 # The first cells are FIRST_CELL_MEDIANS times as wide as the median distance of SAMPLE_SIZE points
@@ -88,17 +93,17 @@ def cluster_euclidean(
     xyz = np.ascontiguousarray(xyz, np.float32)
     radii, max_work = (np.full(n, params.radius) if radii is None else radii, min(max_work, MAX_WORK_PER_POINT * n))
     if params.threshold == "global":
-        mean, cells = _mean_nearest_distance(xyz, max_distances)
+        mean, cells = _compute_mean_nearest_distance(xyz, max_distances)
         reach = np.full(n, np.float32(params.alpha * mean), np.float64)
     elif params.threshold == "fixed":
         cells, reach = sort_into_cells(xyz, params.distance), np.full(n, params.distance)
     else:
         cells, reach = sort_into_cells(xyz, float(radii.max())), np.empty(n)
-        radii2, is_exact = radii[cells.order] ** 2, mean_neighbourhood_size(cells) * n <= max_work
+        radii2, is_exact = radii[cells.order] ** 2, compute_mean_neighbourhood_size(cells) * n <= max_work
         means = (
-            _mean_distances(cells, radii2)
+            _compute_mean_distances(cells, radii2)
             if is_exact
-            else _mean_distances_to_sample(cells, sample_cells(cells, max_work), radii2)
+            else _estimate_mean_distances(cells, sample_cells(cells, max_work), radii2)
         )
         reach[cells.order] = np.float32(params.alpha * means)
     if reach.max() > cells.reach:
@@ -123,7 +128,7 @@ def cluster_euclidean(
     return labels.astype(np.int32)
 
 
-def _mean_nearest_distance(xyz: np.ndarray, max_distances: float) -> tuple[float, Cells]:
+def _compute_mean_nearest_distance(xyz: np.ndarray, max_distances: float) -> tuple[float, Cells]:
     """Compute the mean distance to the nearest other point.
 
     Points without a neighbour within reach of the cells are searched again in larger cells.
@@ -134,7 +139,7 @@ def _mean_nearest_distance(xyz: np.ndarray, max_distances: float) -> tuple[float
     n, coordinates = len(xyz), xyz.T.astype(np.float64, order="C")
     if n == 1:
         return 0.0, sort_into_cells(xyz, 0.0)
-    sample = [_nearest_squared_distance(coordinates, n, i) for i in range(0, n, -(-n // SAMPLE_SIZE))]
+    sample = [_find_nearest_squared_distance(coordinates, n, i) for i in range(0, n, -(-n // SAMPLE_SIZE))]
     median = float(np.sqrt(np.median(sample)))
     first_cells = cells = sort_into_cells(xyz, max(FIRST_CELL_MEDIANS * median, 1e-3))
     squared = np.full(n, np.inf)
@@ -146,13 +151,13 @@ def _mean_nearest_distance(xyz: np.ndarray, max_distances: float) -> tuple[float
         unresolved = np.flatnonzero(squared > cells.reach**2)
         squared[unresolved] = np.inf  # a closer point may lie outside the searched cells
         if len(unresolved) * n <= MAX_BRUTE_FORCE:
-            squared[unresolved] = [_nearest_squared_distance(coordinates, n, i) for i in unresolved]
+            squared[unresolved] = [_find_nearest_squared_distance(coordinates, n, i) for i in unresolved]
             return np.sqrt(squared).mean(), first_cells
         cells = sort_into_cells(xyz, 4.0 * cells.reach)
 
 
 @njit(cache=True, nogil=True)
-def _nearest_squared_distance(points, size, i):
+def _find_nearest_squared_distance(points, size, i):
     """Return the squared distance from point i to the nearest other one of points (3, >= size).
 
     Non-negative floats sort like their bits, and the minimum of integers is vectorised.
@@ -185,12 +190,12 @@ def _find_nearest_in_cells(cells, squared, budget):
                     gather_neighbourhood(cells, a, neighbours)
                     needs_gathering = False
                 own_index = i - cells.start[cells.low[a, 0]]
-                squared[cells.order[i]] = _nearest_squared_distance(neighbours, cells.size[a], own_index)
+                squared[cells.order[i]] = _find_nearest_squared_distance(neighbours, cells.size[a], own_index)
     return budget
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "nsz"})
-def _mean_distances(cells, radii2):
+def _compute_mean_distances(cells, radii2):
     """Compute the mean distance (N,) to the other points within each point's radius, in cell order.
 
     Each distance is computed twice, which is faster than storing it.
@@ -219,8 +224,8 @@ def _mean_distances(cells, radii2):
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "nsz"})
-def _mean_distances_to_sample(cells, sample, radii2):
-    """Estimate the result of _mean_distances from a sample of each cell."""
+def _estimate_mean_distances(cells, sample, radii2):
+    """Estimate the result of _compute_mean_distances from a sample of each cell."""
     means = np.zeros(len(cells.order))
     for a in range(len(cells.size)):
         neighbours, weight = gather_sample(cells, sample, a)
@@ -240,7 +245,7 @@ def _mean_distances_to_sample(cells, sample, radii2):
 def _find_components_by_tree(tree: Tree, reach2: np.ndarray, min_points: float, can_grow: np.ndarray) -> np.ndarray:
     """Return the result of _find_components in the order of the tree."""
     is_core = find_core_points_in_tree(tree, reach2, min_points)[0] & can_grow
-    max_work = max_exact_distances(len(is_core))
+    max_work = compute_max_exact_distances(len(is_core))
     component, work = find_components(tree, reach2, is_core, 0.0, max_work)
     if work > max_work:
         kept_rows, group = thin_points(tree.points[is_core], np.sqrt(reach2[is_core]))
@@ -298,14 +303,14 @@ def _find_components(cells, points, is_core, budget):
                         budget -= new_end[b] - start[b] + start[b + 1] - other_begin[b]
                         for m in range(new_end[b] - 1, start[b] - 1, -1):
                             j = items[m]
-                            if squared_distance(p, points[j]) <= max(p[3], points[j, 3]):
+                            if compute_squared_distance(p, points[j]) <= max(p[3], points[j, 3]):
                                 component[j], stack[stack_size] = count, j
                                 new_end[b] -= 1
                                 stack_size += 1
                                 items[m], items[new_end[b]] = items[new_end[b]], j
                         for m in range(other_begin[b], start[b + 1]):
                             j = items[m]
-                            squared, q = squared_distance(p, points[j]), points[nearest[j]]
+                            squared, q = compute_squared_distance(p, points[j]), points[nearest[j]]
                             if squared <= p[3] and (
                                 squared < least_squared[j]
                                 or (squared == least_squared[j] and (p[0], p[1], p[2]) < (q[0], q[1], q[2]))
@@ -346,5 +351,5 @@ def _compute_centres(xyz, labels):
             low[entry], high[entry] = min(low[entry], value), max(high[entry], value)
     for a in range(1, count):
         centre[a] /= size[a]
-        diameter[a] = np.sqrt(squared_distance(low[a], high[a]))
+        diameter[a] = np.sqrt(compute_squared_distance(low[a], high[a]))
     return centre, diameter

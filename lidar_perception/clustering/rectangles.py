@@ -89,7 +89,7 @@ def fit_rectangles(x, y, start, l_shape):
             continue
         # Relative to the first point, so that float64 holds the differences exactly.
         x0, y0 = np.float64(x[begin]), np.float64(y[begin])
-        hull = _convex_hull(x[begin:end] - x0, y[begin:end] - y0)
+        hull = _compute_convex_hull(x[begin:end] - x0, y[begin:end] - y0)
         cos, sin = _find_min_area_direction(hull)
         low_u, high_u, low_v, high_v = _find_spans(hull, cos, sin)
         # In a narrower rectangle all points have the minimum distance to a side.
@@ -107,7 +107,7 @@ def fit_rectangles(x, y, start, l_shape):
 
 
 @njit(cache=True, nogil=True)
-def _convex_hull(x, y):
+def _compute_convex_hull(x, y):
     """Return the corners (2, H) float64 of the convex hull, counter-clockwise (monotone chain).
 
     The points must be sorted by x, then y. Collinear points give two corners, coincident points one.

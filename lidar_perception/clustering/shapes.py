@@ -90,13 +90,13 @@ def fit_ellipses(xyz: np.ndarray, labels: np.ndarray) -> np.ndarray:
     cluster, count = labels[members] - 1, count_clusters(labels)
     sizes = np.maximum(np.bincount(cluster, minlength=count), 1)
 
-    def mean(values: np.ndarray) -> np.ndarray:
+    def compute_mean(values: np.ndarray) -> np.ndarray:
         return np.bincount(cluster, values, count) / sizes
 
     x, y = xyz[members, :2].T.astype(np.float64)
-    centre_x, centre_y = mean(x), mean(y)
+    centre_x, centre_y = compute_mean(x), compute_mean(y)
     x, y = x - centre_x[cluster], y - centre_y[cluster]
-    xx, yy, xy = mean(x * x), mean(y * y), mean(x * y)
+    xx, yy, xy = compute_mean(x * x), compute_mean(y * y), compute_mean(x * y)
     half_trace, half_gap = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     a, b = 2 * np.sqrt(half_trace + half_gap), 2 * np.sqrt(np.maximum(half_trace - half_gap, 0))
     yaw = _fold_direction(np.arctan2(2 * xy, xx - yy) / 2)

@@ -19,7 +19,7 @@ MAX_DISTANCES_PER_POINT = 2_000
 MIN_DISTANCES = 2**30  # minimum budget of a search in distances, about a second
 
 
-def max_exact_distances(count: int) -> float:
+def compute_max_exact_distances(count: int) -> float:
     """Return the maximum number of distances for an exact search of `count` points."""
     return float(max(MAX_DISTANCES_PER_POINT * count, MIN_DISTANCES))
 

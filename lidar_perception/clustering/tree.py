@@ -82,14 +82,14 @@ def _partition(points, order, first, last, middle, axis):
 
 
 @njit(cache=True, nogil=True)
-def squared_distance(p, q):
+def compute_squared_distance(p, q):
     """Return the squared distance between points p (3,) and q (3,)."""
     dx, dy, dz = p[0] - q[0], p[1] - q[1], p[2] - q[2]
     return dx * dx + dy * dy + dz * dz
 
 
 @njit(cache=True, nogil=True)
-def _min_squared_distance(tree, k, p):
+def _compute_min_squared_distance(tree, k, p):
     """Return the squared distance from p to box k; no point in the box is nearer."""
     dx = max(tree.low[k, 0] - p[0], 0.0, p[0] - tree.high[k, 0])
     dy = max(tree.low[k, 1] - p[1], 0.0, p[1] - tree.high[k, 1])
@@ -98,7 +98,7 @@ def _min_squared_distance(tree, k, p):
 
 
 @njit(cache=True, nogil=True)
-def _max_squared_distance(tree, k, p):
+def _compute_max_squared_distance(tree, k, p):
     """Return the squared distance from p to the farthest corner of box k."""
     dx = max(tree.high[k, 0] - p[0], p[0] - tree.low[k, 0])
     dy = max(tree.high[k, 1] - p[1], p[1] - tree.low[k, 1])
@@ -110,7 +110,7 @@ def _max_squared_distance(tree, k, p):
 def _push_halves(tree, stack, stack_size, k, p):
     """Push the halves of box k onto the stack, the nearer one on top."""
     bottom, top = 2 * k, 2 * k + 1
-    if _min_squared_distance(tree, bottom, p) < _min_squared_distance(tree, top, p):
+    if _compute_min_squared_distance(tree, bottom, p) < _compute_min_squared_distance(tree, top, p):
         bottom, top = top, bottom
     stack[stack_size], stack[stack_size + 1] = bottom, top
     return stack_size + 2
@@ -131,14 +131,14 @@ def find_nearest_distances(tree):
         while stack_size:
             stack_size -= 1
             k = stack[stack_size]
-            if _min_squared_distance(tree, k, p) >= best:
+            if _compute_min_squared_distance(tree, k, p) >= best:
                 continue
             if k < tree.leaves:
                 stack_size = _push_halves(tree, stack, stack_size, k, p)
                 continue
             for j in range(tree.begin[k], tree.end[k]):
                 if j != i:
-                    best = min(best, squared_distance(p, tree.points[j]))
+                    best = min(best, compute_squared_distance(p, tree.points[j]))
             work += tree.end[k] - tree.begin[k]
         squared[i] = best
     return squared, work
@@ -161,15 +161,15 @@ def find_core_points_in_tree(tree, reach2, min_points):
         while stack_size and count < min_points:
             stack_size -= 1
             k = stack[stack_size]
-            if _min_squared_distance(tree, k, p) > reach2[i]:
+            if _compute_min_squared_distance(tree, k, p) > reach2[i]:
                 continue
-            if _max_squared_distance(tree, k, p) <= reach2[i]:
+            if _compute_max_squared_distance(tree, k, p) <= reach2[i]:
                 count += tree.end[k] - tree.begin[k]
             elif k < tree.leaves:
                 stack_size = _push_halves(tree, stack, stack_size, k, p)
             else:
                 for j in range(tree.begin[k], tree.end[k]):
-                    count += 1 if squared_distance(p, tree.points[j]) <= reach2[i] else 0
+                    count += 1 if compute_squared_distance(p, tree.points[j]) <= reach2[i] else 0
                 work += tree.end[k] - tree.begin[k]
         is_core[i] = count >= min_points
     return is_core, work
@@ -247,7 +247,7 @@ def find_components(tree, size, selected, gamma, max_work):
                 stack_size -= 1
                 k = stack[stack_size]
                 if remaining[k] == 0 or not _are_linked(
-                    _min_squared_distance(tree, k, p), size[i], max_sizes[k], gamma
+                    _compute_min_squared_distance(tree, k, p), size[i], max_sizes[k], gamma
                 ):
                     continue
                 if k < tree.leaves:
@@ -256,7 +256,7 @@ def find_components(tree, size, selected, gamma, max_work):
                 for j in range(tree.begin[k], tree.end[k]):
                     if selected[j] and component[j] < 0:
                         work += 1
-                        if _are_linked(squared_distance(p, tree.points[j]), size[i], size[j], gamma):
+                        if _are_linked(compute_squared_distance(p, tree.points[j]), size[i], size[j], gamma):
                             component[j], pending[pending_count] = count, j
                             pending_count += 1
                             _remove_point(remaining, k)
@@ -297,7 +297,7 @@ def find_nearest_core_points(tree, reach2, is_core):
         while stack_size:
             stack_size -= 1
             k = stack[stack_size]
-            squared = _min_squared_distance(tree, k, p)
+            squared = _compute_min_squared_distance(tree, k, p)
             if (
                 core_counts[k] == 0
                 or squared > min(best, max_reach2[k])
@@ -310,7 +310,7 @@ def find_nearest_core_points(tree, reach2, is_core):
             for j in range(tree.begin[k], tree.end[k]):
                 if is_core[j]:
                     work += 1
-                    squared, q = squared_distance(p, tree.points[j]), tree.points[j]
+                    squared, q = compute_squared_distance(p, tree.points[j]), tree.points[j]
                     if squared <= reach2[j] and (
                         squared < best or (squared == best and _precedes(q, tree.points[nearest[i]]))
                     ):
@@ -364,7 +364,7 @@ def find_touching_labels(tree, label, side, reach2, max_work):
             while stack_size and reached < 0:
                 stack_size -= 1
                 k = stack[stack_size]
-                if opposite[k] == 0 or _min_squared_distance(tree, k, p) > reach2:
+                if opposite[k] == 0 or _compute_min_squared_distance(tree, k, p) > reach2:
                     continue
                 if k < tree.leaves:
                     stack_size = _push_halves(tree, stack, stack_size, k, p)
@@ -372,7 +372,7 @@ def find_touching_labels(tree, label, side, reach2, max_work):
                 for j in range(tree.begin[k], tree.end[k]):
                     if side[j] != side[i] and not is_reached[label[j]]:
                         work += 1
-                        if squared_distance(p, tree.points[j]) <= reach2:
+                        if compute_squared_distance(p, tree.points[j]) <= reach2:
                             reached = label[j]
                             break
             if reached < 0:

@@ -10,7 +10,7 @@ import numpy as np
 from lidar_perception.data.frame import Recording
 from lidar_perception.ground.params import SensorPoseParams, ThresholdParams
 from lidar_perception.ground.segment import level_points
-from lidar_perception.ground.threshold import fit_plane_by_ransac, height_above_plane
+from lidar_perception.ground.threshold import compute_height_above_plane, fit_plane_by_ransac
 from lidar_perception.types import SENSOR_HEIGHT, InputError, PointCloud
 
 # Range of points that are used to fit the floor: beyond the vehicle, and close enough for one plane.
@@ -107,7 +107,7 @@ def _find_floor(xyz: np.ndarray, params: ThresholdParams = FLOOR_PLANE) -> np.nd
     plane = fit_plane_by_ransac(lowest, params)
     if plane is None:
         return None
-    on_plane = np.abs(height_above_plane(lowest, plane)) <= params.inlier_distance
+    on_plane = np.abs(compute_height_above_plane(lowest, plane)) <= params.inlier_distance
     return plane if on_plane.mean() >= MIN_FLOOR_FRACTION else None
 
 

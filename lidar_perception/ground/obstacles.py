@@ -32,12 +32,12 @@ def find_obstacles(
     if not (params.min_height or params.max_height) or not ground.any():
         return is_obstacle
     xyz = level_points(xyz, pose)
-    height = height_above_ground(xyz.compress(is_obstacle, axis=0), xyz.compress(ground, axis=0))
+    height = compute_height_above_ground(xyz.compress(is_obstacle, axis=0), xyz.compress(ground, axis=0))
     is_obstacle[is_obstacle] = (height >= (params.min_height or -np.inf)) & (height <= (params.max_height or np.inf))
     return is_obstacle
 
 
-def height_above_ground(xyz: np.ndarray, ground: np.ndarray) -> np.ndarray:
+def compute_height_above_ground(xyz: np.ndarray, ground: np.ndarray) -> np.ndarray:
     """Compute the height of points above the ground around them.
 
     The ground height is the mean of the ground points in the nearest cell that has any.

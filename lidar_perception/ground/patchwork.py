@@ -186,14 +186,14 @@ def _fit_ground(points, state, size, zone, plane, settings):
         if zone > 0 or not plane[2] < settings.uprightness:
             break
         for i in range(size):
-            if state[i] != REMOVED and abs(_signed_distance(plane, points, i)) < VERTICAL_DISTANCE:
+            if state[i] != REMOVED and abs(_compute_signed_distance(plane, points, i)) < VERTICAL_DISTANCE:
                 state[i] = REMOVED
     _mark_seeds(points, state, size, min_height, settings.seed_distance)
     _fit_plane(points, state, size, plane)
     for _ in range(ITERATIONS):  # Region-wise ground plane fitting (R-GPF)
         for i in range(size):
             if state[i] != REMOVED:
-                is_ground = _signed_distance(plane, points, i) < settings.inlier_distance
+                is_ground = _compute_signed_distance(plane, points, i) < settings.inlier_distance
                 state[i] = GROUND if is_ground else OTHER
         _fit_plane(points, state, size, plane)
 
@@ -222,7 +222,7 @@ def _mark_seeds(points, state, size, min_height, distance):
 
 
 @njit(cache=True, nogil=True)
-def _signed_distance(plane, points, i):
+def _compute_signed_distance(plane, points, i):
     return np.float32(plane[0] * points[0, i] + plane[1] * points[1, i] + plane[2] * points[2, i]) + plane[OFFSET]
 
 

@@ -34,7 +34,7 @@ def segment_by_threshold(
     plane = find_plane(xyz, params, sensor_height)
     if plane is None:
         return np.zeros(len(xyz), bool)
-    return np.abs(height_above_plane(xyz, plane)) <= params.inlier_distance
+    return np.abs(compute_height_above_plane(xyz, plane)) <= params.inlier_distance
 
 
 def find_plane(
@@ -103,12 +103,12 @@ def compute_inlier_fraction(xyz: np.ndarray, plane: np.ndarray, params: Threshol
     Low points are less than max_height above the plane. The fraction shows how well the plane
     describes the ground; it is 0 if there are no low points.
     """
-    height = height_above_plane(xyz, plane)
+    height = compute_height_above_plane(xyz, plane)
     is_low = height < params.max_height
     return float((np.abs(height[is_low]) <= params.inlier_distance).mean()) if is_low.any() else 0.0
 
 
-def height_above_plane(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:
+def compute_height_above_plane(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """Return the height (N,) float64 of points (N, 3) above the plane along z, in metres."""
     x, y, z = xyz.T.astype(np.float64)  # NumPy 1 would compute in float32
     return z - (plane[0] * x + plane[1] * y + plane[2])

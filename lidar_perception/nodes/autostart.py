@@ -43,7 +43,7 @@ class Autostart:
             self.unmanaged_since = monotonic()
             return
         begin = monotonic()
-        is_configured = node.state_label() == "inactive" or node.trigger_configure() == SUCCESS
+        is_configured = node.get_state_label() == "inactive" or node.trigger_configure() == SUCCESS
         if is_configured and node.trigger_activate() == SUCCESS:
             if self.retry_at is not None:
                 node.get_logger().info("ready")

@@ -60,14 +60,14 @@ class DetectorNode(ManagedNode):
     def configure(self) -> None:
         self.sensor = SensorCheck(self)
         self.results = DetectionOutputs(self, self.loader.steps)
-        weights = self._network_params(self.params).weights
+        weights = self._get_network_params(self.params).weights
         if self.loader.allows_custom and (reference := find_reference(weights)):
             self._load_custom_detector(reference)
         else:
             self._load_network()
         self.inputs.subscribe("points", CLOUD, self.on_points)
 
-    def _network_params(self, params: Any) -> NetworkParams:
+    def _get_network_params(self, params: Any) -> NetworkParams:
         network_params: NetworkParams = getattr(params, self.loader.group)
         return network_params
 
@@ -95,7 +95,7 @@ class DetectorNode(ManagedNode):
 
     def _load_on_device(self) -> Any:
         """Load the detector, on the CPU if CUDA is missing and cpu_fallback is set."""
-        network_params, fallback = self._network_params(self.params), None
+        network_params, fallback = self._get_network_params(self.params), None
         weights = self.loader.find_weights(network_params)
         from lidar_perception.detectors.devices import find_device
 
@@ -116,7 +116,7 @@ class DetectorNode(ManagedNode):
         with self.diagnostics.measure_frame(to_ns(msg.header.stamp)):
             frame, indices, params = self.sensor.read_frame(msg, with_intensity=True)
             ground, clusters = read_column(msg, "ground", indices), read_cluster_ids(msg, indices)
-            network_params = self._network_params(params)
+            network_params = self._get_network_params(params)
             detector = self.detector.with_params(self._lower_thresholds(params, network_params))
             result = detector(
                 frame,

@@ -181,14 +181,14 @@ class EgoInput:
         at = np.array([stamp])
         if source == "kiss_icp":
             scan = self.scans.lookup(START, SCAN, stamp, max_gap)
-            return scan @ self._pose_on_scan(frame_id.lstrip("/"), at, max_gap)
+            return scan @ self._look_up_pose_on_scan(frame_id.lstrip("/"), at, max_gap)
         if source == "odometry" and not self.is_mounting_known:
-            return self.transforms.odometry_poses(at, max_gap)[0]
+            return self.transforms.look_up_odometry_poses(at, max_gap)[0]
         if source == NO_SOURCE:
             return None
-        return self.transforms.sensor_poses(source, frame_id, at, max_gap)[0]
+        return self.transforms.look_up_sensor_poses(source, frame_id, at, max_gap)[0]
 
-    def _pose_on_scan(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
+    def _look_up_pose_on_scan(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
         """Return the (4, 4) pose of a frame in the frame of the scans at times (1,) ns."""
         if not frame_id or frame_id == self.scan_frame:
             self.is_disconnected = False

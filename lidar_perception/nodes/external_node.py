@@ -156,7 +156,7 @@ class GraphMonitor(ExternalNode):
     poll_s = 0.1
 
     def __init__(self, domain: int, detections: str):
-        with _localhost_discovery():
+        with _limit_discovery_to_localhost():
             super().__init__(domain, "watch")
         self.frames = 0
         on_detections: Any = self._on_detections  # raw: CDR
@@ -167,7 +167,7 @@ class GraphMonitor(ExternalNode):
 
 
 @contextmanager
-def _localhost_discovery():
+def _limit_discovery_to_localhost():
     """Limit discovery to this machine for contexts that are created inside the with block."""
     previous = os.environ.get(DISCOVERY_RANGE)
     os.environ[DISCOVERY_RANGE] = "LOCALHOST"

@@ -29,16 +29,16 @@ from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POIN
 Graph = Mapping[str, Mapping[str, str]]  # node -> its topic remappings
 
 
-def relative_name(topic: str) -> str:
+def make_relative(topic: str) -> str:
     """Remove the leading slash of a topic, so that the topic is in the namespace of its node."""
     return topic.lstrip("/")
 
 
-CAMERA_INPUTS = {"~/input/camera_info": relative_name(CAMERA_INFO), "~/input/extrinsics": relative_name(EXTRINSICS)}
-TRUTH_INPUT = {"~/input/ground_truth": relative_name(TRUTH)}
-CLOUD_INPUT = {"~/input/points": relative_name(POINTS)}
+CAMERA_INPUTS = {"~/input/camera_info": make_relative(CAMERA_INFO), "~/input/extrinsics": make_relative(EXTRINSICS)}
+TRUTH_INPUT = {"~/input/ground_truth": make_relative(TRUTH)}
+CLOUD_INPUT = {"~/input/points": make_relative(POINTS)}
 CLUSTERED_CLOUD_INPUT = {"~/input/points": "clustering/output/points"}
-ODOMETRY_INPUT = {"~/input/odometry": relative_name(ODOMETRY)}
+ODOMETRY_INPUT = {"~/input/odometry": make_relative(ODOMETRY)}
 TRACKER = "tracker"
 MAX_CORES_FOR_ONE_PROCESS = 4
 SEPARATOR = "---"  # separates the arguments of nodes that share a process
@@ -189,9 +189,9 @@ def configure_evaluator(
     remap = (
         TRUTH_INPUT
         | ({} if only_candidates else CAMERA_INPUTS)
-        | {f"~/input/{k}": relative_name(v) for k, v in topics.items()}
+        | {f"~/input/{k}": make_relative(v) for k, v in topics.items()}
     )
-    timing = [*map(relative_name, list_timing_topics(detectors, single))]
+    timing = [*map(make_relative, list_timing_topics(detectors, single))]
     return remap, {
         "stages": list(topics),
         "timing": timing,
@@ -216,7 +216,7 @@ def runs_in_one_process(processes: str | bool | None) -> bool:
 
 def find_connected_outputs(graph: Graph) -> dict[str, set[str]]:
     """Return {node: its outputs to which another node of the graph subscribes}, without a namespace."""
-    inputs = {f"/{relative_name(topic)}" for remap in graph.values() for topic in remap.values()}
+    inputs = {f"/{make_relative(topic)}" for remap in graph.values() for topic in remap.values()}
     return {node: {topic for topic in inputs if topic.startswith(f"/{node}/")} for node in graph}
 
 
@@ -240,7 +240,7 @@ def list_awaited_topics(
         *internal_topics,
         *(topic for name in detectors for topic in list_result_topics(single, name).values()),
     ]
-    return [*map(relative_name, topics)]
+    return [*map(make_relative, topics)]
 
 
 _domain_locks: list[Any] = []  # lock files of the reserved domains, open until this process ends

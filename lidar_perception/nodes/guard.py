@@ -37,12 +37,12 @@ def start_guard(signals: int, pipe: int) -> np.ndarray:
         (2,) int64 state for the caller to set: phase, and exit code when CLOSED.
     """
     state = np.array([RUNNING, 0], np.int64)
-    threading.Thread(target=_guard, args=(state, signals, pipe), daemon=True).start()
+    threading.Thread(target=_run_guard, args=(state, signals, pipe), daemon=True).start()
     return state
 
 
 @njit("void(i8[::1], i8, i8)", nogil=True, cache=True)
-def _guard(state, signals, pipe):
+def _run_guard(state, signals, pipe):
     signal = np.zeros(SIGINFO, np.uint8)
     while _read(signals, signal.ctypes.data, SIGINFO) < 0:
         _usleep(int(TICK_S * 1e6))

@@ -20,7 +20,7 @@ from lidar_perception.candidates.seed_sources import (
 )
 from lidar_perception.candidates.seeds import Seed, load_seeds
 from lidar_perception.candidates.segmented_cloud import SegmentedCloud
-from lidar_perception.nodes.graph import relative_name
+from lidar_perception.nodes.graph import make_relative
 from lidar_perception.nodes.interfaces import LATCHED, MARKERS, RELIABLE, SENSOR_DATA
 from lidar_perception.nodes.runtime import LidarNode
 from lidar_perception.robot.poses import invert_pose, transform_boxes, transform_points
@@ -158,7 +158,7 @@ class SeedInput:
         self.matcher = StampMatcher(self._deliver_with_truth, on_drop=self._count_dropped)
         node.inputs.subscribe("ground_truth", MARKERS, self._on_truth, RELIABLE)
         node.inputs.subscribe(
-            relative_name(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE, private=False
+            make_relative(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE, private=False
         )
         node.inputs.items.append(self)
         if self.params.source in ("file", "automatic"):
@@ -235,7 +235,7 @@ class SeedInput:
         if not self.clicked_seeds:
             raise InputError(
                 "no seed yet: click a pedestrian (a PointStamped on "
-                f"{relative_name(CLICK)}, as RViz and Foxglove publish it)"
+                f"{make_relative(CLICK)}, as RViz and Foxglove publish it)"
             )
         return self.clicked_seeds
 

@@ -33,7 +33,7 @@ from lidar_perception.nodes.graph import (
     find_executable,
     find_expert_range,
     find_trackers,
-    relative_name,
+    make_relative,
     runs_in_one_process,
 )
 from lidar_perception.nodes.launch_parameters import (
@@ -62,7 +62,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
         "stay global.",
     ),
     "name_prefix": dict(default_value="", description="Prefix of all node names."),
-    "points": dict(default_value=relative_name(POINTS), description="Topic of the clouds."),
+    "points": dict(default_value=make_relative(POINTS), description="Topic of the clouds."),
     "reliability": dict(
         default_value="",
         description="Parameter input.reliability: auto, reliable or best_effort; empty: as in the parameter file.",
@@ -116,7 +116,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
         description="Track the detections of each detector in a tracker node, or with `single` in the detector itself.",
     ),
     "odometry": dict(
-        default_value=relative_name(ODOMETRY), description="Topic of the odometry for the trackers and deskew."
+        default_value=make_relative(ODOMETRY), description="Topic of the odometry for the trackers and deskew."
     ),
     "single": dict(**SWITCH, description="Run each detector in one process that also computes ground and clusters."),
     "processes": dict(
@@ -163,7 +163,9 @@ def make_launch_description(config_folder: Path, detectors: str) -> LaunchDescri
         value = {k: context.perform_substitution(LaunchConfiguration(k)) for k in ("detectors", *ARGUMENTS)}
         processes = create_nodes(value, config_folder)
         files = list_parameter_files(value["config"], value["experts"])
-        lines = [f"warning: {line}" for file in files for line in describe_unknown_nodes(file, _graph(value))]
+        lines = [
+            f"warning: {line}" for file in files for line in describe_unknown_nodes(file, _build_launch_graph(value))
+        ]
         lines += describe_conflicts(value, config_folder)
         return [*(LogInfo(msg=line) for line in lines), *processes]
 
@@ -218,7 +220,7 @@ def reject_unknown_arguments(names: list[Any], context: Any, valid_names: Collec
 
 def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
     """Return one launch node per process, given the values of the launch arguments."""
-    graph, detectors, single = _graph(value), _detectors(value), value["single"] == "true"
+    graph, detectors, single = _build_launch_graph(value), _parse_detectors(value), value["single"] == "true"
     prefix, user_files = value["name_prefix"], list_parameter_files(value["config"])
     files = {
         node: [_find_package_file(name, config_folder), *user_files]
@@ -227,7 +229,7 @@ def create_nodes(value: dict[str, str], config_folder: Path) -> list[Node]:
     }
     files |= {node: _list_expert_files(value, config_folder) for node in EXPERTS}
     files |= {node: [str(config_folder / f"{TRACKER}.param.yaml"), *user_files] for node in find_trackers(detectors)}
-    topics = {relative_name(POINTS): value["points"], relative_name(ODOMETRY): value["odometry"]}
+    topics = {make_relative(POINTS): value["points"], make_relative(ODOMETRY): value["odometry"]}
     viewer = [_make_rviz_node(value, config_folder)] if value["rviz"] == "true" else []
     common = {
         "package": "lidar_perception",
@@ -268,8 +270,8 @@ def _list_arguments(executable: str, name: str, parameters: list[Any], remapping
     ]
 
 
-def _graph(value: dict[str, str]) -> dict[str, dict[str, str]]:
-    detectors, single = _detectors(value), value["single"] == "true"
+def _build_launch_graph(value: dict[str, str]) -> dict[str, dict[str, str]]:
+    detectors, single = _parse_detectors(value), value["single"] == "true"
     tracking = value["tracking"] == "true" and not single
     return add_node_prefix(build_graph(detectors, single, tracking), value["name_prefix"])
 
@@ -277,7 +279,7 @@ def _graph(value: dict[str, str]) -> dict[str, dict[str, str]]:
 def describe_conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
     """Return a line for each detector whose package file has other parameters of ground and clusters
     than are used; none if the user has chosen a file."""
-    detectors, experts = _detectors(value), value["experts"]
+    detectors, experts = _parse_detectors(value), value["experts"]
     if value["single"] == "true":
         return (
             ["experts has no effect: with single:=true each detector computes ground and clusters itself"]
@@ -308,7 +310,7 @@ def _find_package_file(detector: str, config_folder: Path) -> str:
 
 def _list_expert_files(value: dict[str, str], config_folder: Path) -> list[str]:
     """Return the parameter files of ground segmentation and clustering."""
-    detector = value["experts"] if value["experts"] in CONFIGS else _detectors(value)[0]
+    detector = value["experts"] if value["experts"] in CONFIGS else _parse_detectors(value)[0]
     user_files = list_parameter_files(value["config"], value["experts"])
     return [_find_package_file(detector, config_folder), *user_files]
 
@@ -346,7 +348,7 @@ def _list_expert_range(value: dict[str, str], files: dict[str, list[str]]) -> li
             for key, v in values.items()
         }
 
-    params, detectors = read("ground_segmentation"), _detectors(value)
+    params, detectors = read("ground_segmentation"), _parse_detectors(value)
     if "range" in params:
         return []
     for node in [f"{name}_detector" for name in detectors if name in NETWORKS]:
@@ -355,7 +357,7 @@ def _list_expert_range(value: dict[str, str], files: dict[str, list[str]]) -> li
     return [] if ground_range == "all" else [{"range": ground_range}]
 
 
-def _detectors(value: dict[str, str]) -> list[str]:
+def _parse_detectors(value: dict[str, str]) -> list[str]:
     return split_detectors(value["detectors"])
 
 
@@ -386,8 +388,8 @@ def read_rviz_topics(file: Path) -> list[tuple[str, str]]:
 
 def _rename_rviz_topic(topic: str, value: dict[str, str]) -> str:
     node, slash, rest = topic.partition("/")
-    detectors, single = _detectors(value), value["single"] == "true"
-    if topic == relative_name(POINTS):
+    detectors, single = _parse_detectors(value), value["single"] == "true"
+    if topic == make_relative(POINTS):
         return value["points"]
     if node == TRACKER:  # the tracker follows the first detector
         node = next(iter(SINGLE_PROCESS_NODES[detectors[0]] if single else find_trackers(detectors)))

@@ -224,9 +224,9 @@ def _spin_node(node: LidarNode, arguments: list[str], begin: float) -> None:
     from rclpy.executors import SingleThreadedExecutor
 
     from lidar_perception.nodes.node_parameters import describe_misspelt_parameters
-    from lidar_perception.nodes.rclpy_compat import parameter_overrides
+    from lidar_perception.nodes.rclpy_compat import get_parameter_overrides
 
-    undeclared = [name for name in parameter_overrides(node) if not node.has_parameter(name)]
+    undeclared = [name for name in get_parameter_overrides(node) if not node.has_parameter(name)]
     for line in [*describe_misspelt_parameters(undeclared), *_find_misspelt_sections(arguments, node.get_name())]:
         node.get_logger().warning(line)  # before the node starts, which may take long
     if not node.stop.done():

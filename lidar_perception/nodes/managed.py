@@ -15,10 +15,10 @@ from rclpy.node import Node
 from lidar_perception.nodes.autostart import UNCONFIGURED, Autostart
 from lidar_perception.nodes.diagnostics import ERROR, OK, WAITING, WARN, Problem
 from lidar_perception.nodes.rclpy_compat import (
-    allowed_transitions,
-    clock_subscription,
     destroy_state_machine,
-    state_label,
+    get_clock_subscription,
+    get_state_label,
+    list_allowed_transitions,
     wrap_change_state,
 )
 from lidar_perception.nodes.runtime import LidarNode
@@ -78,19 +78,19 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         self.autostart.start()
 
     def is_ready(self) -> bool:
-        return self.state_label() == "active"
+        return self.get_state_label() == "active"
 
     def destroy_node(self) -> None:
         super().destroy_node()
         destroy_state_machine(self)
 
-    def state_label(self) -> str:
+    def get_state_label(self) -> str:
         """Return the lifecycle state, such as "inactive", or "configuring" in a transition."""
-        return state_label(self)
+        return get_state_label(self)
 
     def values(self) -> dict[str, Any]:
         """Return the lifecycle state for the diagnostics."""
-        return {"lifecycle": self.state_label()}
+        return {"lifecycle": self.get_state_label()}
 
     def problems(self) -> list[Problem]:
         """Return an empty list, because no lifecycle state is a problem."""
@@ -99,11 +99,11 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
     def _change(self, change: Callable, request: Any, response: Any) -> Any:
         """Change the state, or reject the request if the state does not allow it; rclpy would crash."""
         transition = request.transition.label or request.transition.id
-        if transition in allowed_transitions(self):
+        if transition in list_allowed_transitions(self):
             self.autostart.retry_at = None
             return change(request, response)
         self.get_logger().error(
-            f"transition {transition} is not possible: the node is {self.state_label()}"
+            f"transition {transition} is not possible: the node is {self.get_state_label()}"
             + (
                 "; set the parameter autostart to false for use with a lifecycle manager"
                 if self.node_params.autostart
@@ -197,7 +197,7 @@ class NodeSnapshot:
         self.node.outputs.clear()
         self.node.diagnostics.sources = [*self.sources]
         self.node.diagnostics.reset()
-        preserved = [*self.entities, clock_subscription(self.node)]
+        preserved = [*self.entities, get_clock_subscription(self.node)]
         for kind, destroy in ENTITIES.items():
             for entity in [e for e in getattr(self.node, kind) if e not in preserved]:
                 destroy(self.node, entity)

@@ -52,13 +52,17 @@ class ClusterBoxes:
             header, output = to_output_frame(self.node, header, boxes())
             ids = range(1, len(output) + 1)  # the ids in the column cluster_id
             rows = make_marker_rows(
-                output, ["cluster"] * len(output), ids=ids, previous=self.marker_keys, extras=_marker_texts(output, ids)
+                output,
+                ["cluster"] * len(output),
+                ids=ids,
+                previous=self.marker_keys,
+                extras=_make_marker_texts(output, ids),
             )
             self.marker_keys = list_marker_keys(rows)
             self.publisher.publish(MarkerRows(rows, header, find_marker_lifetime_ns(self.node)))
 
 
-def _marker_texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
+def _make_marker_texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
     """Return the text of each marker: the id, and the class by the size of the box."""
     return [
         {"id": i, **({"size_class": CLASSES[c]} if c >= 0 else {})}

@@ -8,7 +8,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from lidar_perception.nodes.rclpy_compat import parameter_overrides, store_empty_list
+from lidar_perception.nodes.rclpy_compat import get_parameter_overrides, store_empty_list
 from lidar_perception.param_fields import collect_fields, with_values
 
 TYPES = {
@@ -34,9 +34,9 @@ def declare_parameters(node: Node, params: Any) -> Any:
     Raises:
         ValueError: a value is out of range.
     """
-    declared, overrides = {}, parameter_overrides(node)
+    declared, overrides = {}, get_parameter_overrides(node)
     for name, f in collect_fields(params).items():
-        kind = _kind(f)
+        kind = _find_type(f)
         value = list(f.default) if isinstance(f.default, tuple) else f.default
         if name in overrides:
             override = convert_to_declared_type(overrides.pop(name), kind)
@@ -44,7 +44,7 @@ def declare_parameters(node: Node, params: Any) -> Any:
                 value = []
             else:
                 overrides[name] = override
-        declared[name] = node.declare_parameter(name, kind if value == [] else value, _descriptor(f, kind)).value
+        declared[name] = node.declare_parameter(name, kind if value == [] else value, _make_descriptor(f, kind)).value
         if declared[name] is None:
             store_empty_list(node, name, kind)
             declared[name] = []
@@ -62,11 +62,11 @@ def convert_to_declared_type(parameter: Parameter, kind: Parameter.Type) -> Para
     return Parameter(parameter.name, kind, convert(parameter.value)) if convert else parameter
 
 
-def _kind(f: Any) -> Parameter.Type:
+def _find_type(f: Any) -> Parameter.Type:
     return LISTS[f.metadata["item"]] if isinstance(f.default, tuple) else TYPES[type(f.default)]
 
 
-def _descriptor(f: Any, kind: Parameter.Type) -> ParameterDescriptor:
+def _make_descriptor(f: Any, kind: Parameter.Type) -> ParameterDescriptor:
     limits = f.metadata
     unit = f" [{limits['unit']}]" if limits["unit"] else ""
     choices = f"one of {', '.join(limits['choices'])}" if limits["choices"] else ""

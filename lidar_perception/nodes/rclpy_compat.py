@@ -26,13 +26,13 @@ class UnknownParameterError(ParameterNotDeclaredException):
         Exception.__init__(self, message)
 
 
-def parameter_overrides(node: Node) -> dict[str, Parameter]:
+def get_parameter_overrides(node: Node) -> dict[str, Parameter]:
     """Return the parameters that the user has set for this node, declared or not; the dict is mutable."""
     overrides: dict[str, Parameter] = node._parameter_overrides
     return overrides
 
 
-def parameter_names(node: Node) -> list[str]:
+def list_parameter_names(node: Node) -> list[str]:
     """Return the names of all declared parameters of a node."""
     return list(node._parameters)
 
@@ -46,7 +46,7 @@ def store_empty_list(node: Node, name: str, kind: Parameter.Type) -> None:
     node._parameters[name] = Parameter(name, kind, [])
 
 
-def clock_subscription(node: Node) -> Any:
+def get_clock_subscription(node: Node) -> Any:
     """Return the subscription to /clock that rclpy creates if use_sim_time is set, or None."""
     return node._time_source._clock_sub
 
@@ -59,13 +59,13 @@ def take_messages(subscription: Any, message_type: type) -> Iterator[tuple[bytes
             yield message
 
 
-def state_label(node: Any) -> str:
+def get_state_label(node: Any) -> str:
     """Return the lifecycle state of a managed node, such as "inactive" or "configuring"."""
     label: str = node._state_machine.current_state[1]
     return label
 
 
-def allowed_transitions(node: Any) -> set[int | str]:
+def list_allowed_transitions(node: Any) -> set[int | str]:
     """Return the ids and labels of the transitions that the current state allows."""
     return {key for number, label, *_ in node._state_machine.available_transitions for key in (number, label)}
 

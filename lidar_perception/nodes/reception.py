@@ -16,7 +16,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from lidar_perception.nodes.arrivals import DEPTH, WINDOW, Arrivals
 from lidar_perception.nodes.diagnostics import ERROR, STALE, WARN, Problem
 from lidar_perception.nodes.links import Links, Output, find_only_output
-from lidar_perception.nodes.rclpy_compat import InvalidHandle, parameter_overrides, take_messages
+from lidar_perception.nodes.rclpy_compat import InvalidHandle, get_parameter_overrides, take_messages
 from lidar_perception.nodes.shared_memory import SOCKET_BUFFER, read_socket_buffer_size
 from lidar_perception.params import ReceptionParams
 
@@ -75,7 +75,9 @@ class Reception:
         self.links: Links | None = getattr(node, "links", None)
         self.what = what
         self.topic = node.resolve_topic_name(name)
-        self.has_fixed_reliability = f"qos_overrides.{self.topic}.subscription.reliability" in parameter_overrides(node)
+        self.has_fixed_reliability = f"qos_overrides.{self.topic}.subscription.reliability" in get_parameter_overrides(
+            node
+        )
         self.reliability = BEST_EFFORT if params().reliability == "best_effort" else RELIABLE
         self.waiting: deque[Any] = deque()
         self.linked: deque[tuple[Any, dict]] = deque()  # messages received through a link, see _receive
@@ -151,7 +153,7 @@ class Reception:
         )
         self.arrivals.depth = self.subscription.qos_profile.depth
 
-    def publishers(self) -> list[Any]:
+    def list_publishers(self) -> list[Any]:
         """Return the endpoint infos of all publishers of the topic."""
         return self.node.get_publishers_info_by_topic(self.topic)
 
@@ -163,11 +165,11 @@ class Reception:
             self._disconnect()
             self._connect()
             self.arrivals.record_interruption(0)
-            self.node.get_logger().info(f"{self.topic} is now received {self._reliability_label()}")
+            self.node.get_logger().info(f"{self.topic} is now received {self._describe_reliability()}")
         if self.output is not None:
-            self.last_publishers = self.publishers() or self.last_publishers
+            self.last_publishers = self.list_publishers() or self.last_publishers
             return
-        setting, publishers = self.params().reliability, self.publishers()
+        setting, publishers = self.params().reliability, self.list_publishers()
         self.last_publishers = publishers or self.last_publishers
         offers = {info.qos_profile.reliability for info in publishers}
         if setting == "auto" and offers:
@@ -179,9 +181,9 @@ class Reception:
         self.reliability = reliability
         self.node.destroy_subscription(self.subscription)
         self._subscribe()
-        self.node.get_logger().info(f"{self.topic} is now received {self._reliability_label()}")
+        self.node.get_logger().info(f"{self.topic} is now received {self._describe_reliability()}")
 
-    def _reliability_label(self) -> str:
+    def _describe_reliability(self) -> str:
         if self.output is not None:
             return "in this process"
         return self.subscription.qos_profile.reliability.name.lower().replace("_", " ")
@@ -189,7 +191,7 @@ class Reception:
     def _on_message(self, data: bytes, info: dict) -> None:
         """Take all messages from the middleware, which would drop some of them without counting."""
         messages = [(data, info), *take_messages(self.subscription, self.kind)]
-        self._accept(messages, one_publisher=len(self.publishers()) < 2)
+        self._accept(messages, one_publisher=len(self.list_publishers()) < 2)
 
     def _receive(self, message: Any, info: dict) -> None:
         """Queue a message of a link; called in the thread of its publisher."""
@@ -256,16 +258,16 @@ class Reception:
         """Return the values for the diagnostics."""
         if not self.is_open:
             return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped}
-        rate, expected = self.arrivals.measure_rate(), self.expected_rate()
+        rate, expected = self.arrivals.measure_rate(), self.get_expected_rate()
         return {
             "lost": self.arrivals.lost,
             "dropped": self.arrivals.dropped,
-            "reliability": self._reliability_label(),
+            "reliability": self._describe_reliability(),
             **({"rate_hz": f"{rate:.1f}"} if rate else {}),
             **({"expected_rate_hz": f"{expected:.1f}"} if expected else {}),
         }
 
-    def expected_rate(self) -> float | None:
+    def get_expected_rate(self) -> float | None:
         """Return the expected rate in Hz: input.rate, or the rate of the first clouds; None before that."""
         return self.params().rate or self.arrivals.learned
 
@@ -274,9 +276,9 @@ class Reception:
         if not self.is_open:
             return []
         problems, params = [], self.params()
-        publishers = self.publishers()
+        publishers = self.list_publishers()
         if len(publishers) > 1:
-            names = ", ".join(sorted(_name(p) for p in publishers))
+            names = ", ".join(sorted(_get_full_name(p) for p in publishers))
             problems.append(
                 (
                     "publishers",
@@ -291,7 +293,7 @@ class Reception:
             return [*problems, ("waiting", WARN, f"the {self.what} on {self.topic} waits for {self.needs}")]
         if silence := self._find_silence():
             return [*problems, silence]
-        expected, rate = self.expected_rate(), self.arrivals.measure_rate()
+        expected, rate = self.get_expected_rate(), self.arrivals.measure_rate()
         if expected and rate and rate < params.min_rate * expected:
             problems.append(
                 (
@@ -322,7 +324,7 @@ class Reception:
 
     def _find_silence(self) -> Problem | None:
         """Return a problem if no cloud has arrived for longer than a slow sensor needs for one."""
-        params, expected = self.params(), self.expected_rate()
+        params, expected = self.params(), self.get_expected_rate()
         period = 1 / expected if expected else 0.0
         silence = monotonic() - (self.last_time or monotonic())
         error_limit = max(params.error_after, SILENT_PERIODS * period)
@@ -338,7 +340,7 @@ class Reception:
 
     def _list_hints(self) -> list[str]:
         """Return the hints of HINTS for the current publishers."""
-        names = sorted({_name(p) for p in self.last_publishers})
+        names = sorted({_get_full_name(p) for p in self.last_publishers})
         if names and all(name.endswith("_player") for name in names):
             kind = "player"  # matches bag_player and rosbag2_player
         elif self.what != "cloud":
@@ -349,7 +351,7 @@ class Reception:
 
     def _find_incompatible_publisher(self, publishers: list[Any]) -> Problem | None:
         """Return a problem for best-effort publishers if the parameters demand a reliable subscription."""
-        names = [_name(p) for p in publishers if p.qos_profile.reliability == BEST_EFFORT]
+        names = [_get_full_name(p) for p in publishers if p.qos_profile.reliability == BEST_EFFORT]
         adapts = not self.has_fixed_reliability and self.params().reliability != "reliable"
         if not names or adapts or self.output is not None or (self.subscription.qos_profile.reliability != RELIABLE):
             return None
@@ -373,7 +375,7 @@ class Reception:
                 else ""
             )
             return (
-                f"make {_name(publishers[0])} publish reliable, or start it with "
+                f"make {_get_full_name(publishers[0])} publish reliable, or start it with "
                 f"FASTRTPS_DEFAULT_PROFILES_FILE={FASTDDS_PROFILE}{sysctl}"
             )
         if self.output is None and self.subscription.qos_profile.reliability == BEST_EFFORT:
@@ -387,5 +389,5 @@ def _trigger(guard: Any) -> None:
         guard.trigger()
 
 
-def _name(endpoint: Any) -> str:
+def _get_full_name(endpoint: Any) -> str:
     return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"

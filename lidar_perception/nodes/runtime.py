@@ -15,7 +15,7 @@ from rclpy.task import Future
 from lidar_perception.nodes.diagnostics import Diagnostics
 from lidar_perception.nodes.links import Links, Outputs
 from lidar_perception.nodes.parameter_declaration import convert_to_declared_type, declare_parameters
-from lidar_perception.nodes.rclpy_compat import UnknownParameterError, parameter_names
+from lidar_perception.nodes.rclpy_compat import UnknownParameterError, list_parameter_names
 from lidar_perception.nodes.subscriptions import Inputs
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.types import find_closest_name
@@ -86,7 +86,7 @@ class LidarNode(Node):
 
     def _before_set(self, changes: list[Parameter]) -> list[Parameter]:
         if unknown := [c.name for c in changes if not self.has_parameter(c.name)]:
-            guess = find_closest_name(unknown[0], parameter_names(self))
+            guess = find_closest_name(unknown[0], list_parameter_names(self))
             raise UnknownParameterError(
                 f"{self.get_fully_qualified_name()} has no parameter "
                 f"{unknown[0][:80]!r}" + (f"; did you mean {guess!r}?" if guess else "")

@@ -151,7 +151,7 @@ def find_marker_lifetime_ns(node: LidarNode) -> int:
     not flicker.
     """
     seconds = node.node_params.output.marker_lifetime
-    rates = [rate for reception in node.inputs.receptions if (rate := reception.expected_rate())]
+    rates = [rate for reception in node.inputs.receptions if (rate := reception.get_expected_rate())]
     if seconds and rates:
         seconds = max(seconds, min(MIN_LIFETIME_PERIODS / min(rates), MAX_LIFETIME_S))
     return int(seconds * SECOND_NS)

@@ -146,8 +146,8 @@ class Transforms:
             for frame in filter(None, (self.base_frame, self.target_frame)):
                 self._require_connection(frame, frame_id, stamp)
             if self.node.node_params.input.deskew != "off":
-                end = stamp + round(self._sweep_duration(cloud) * SECOND_NS)
-                self.sensor_poses(self.node.node_params.input.deskew, frame_id, np.array([end]))
+                end = stamp + round(self._estimate_sweep_duration(cloud) * SECOND_NS)
+                self.look_up_sensor_poses(self.node.node_params.input.deskew, frame_id, np.array([end]))
         except MissingTransform as error:
             return str(error) if error.late else None
         return None
@@ -165,7 +165,7 @@ class Transforms:
             raise MissingTransform(str(error), error.late or is_first) from None
         self._connected_pairs.add((frame, frame_id))
 
-    def _sweep_duration(self, cloud: Any) -> float:
+    def _estimate_sweep_duration(self, cloud: Any) -> float:
         """Return the time from the stamp to the last point of a cloud, in seconds.
 
         It is the time of the last deskewed cloud; before the first one, the time of this cloud.
@@ -198,7 +198,7 @@ class Transforms:
         ahead = np.radians(self.node.node_params.input.ahead)
         sensor_pose = base
         if sensor_pose is None and ahead:  # the yaw rotation comes after levelling, so both are applied here
-            sensor_pose = self._configured_pose()
+            sensor_pose = self._make_configured_pose()
             sensor_pose = np.eye(4) if sensor_pose is None else sensor_pose
         level = None if sensor_pose is None else find_level_transform(sensor_pose, ahead)
         target = self._look_up("target_frame", self.target_frame, frame_id, stamp_ns)
@@ -250,7 +250,7 @@ class Transforms:
                     "; specify the box in that frame, as `setup` does in its parameter file"
                 )
         level = placement.level
-        pose = None if placement.base is not None else self._configured_pose()
+        pose = None if placement.base is not None else self._make_configured_pose()
         if level is None and pose is not None:
             level = find_level_transform(pose)
         return crop_frame(frame, crop, placement.base, level)
@@ -269,7 +269,9 @@ class Transforms:
 
     # Motion of the sensor
 
-    def sensor_poses(self, source: str, frame_id: str, at: np.ndarray, max_gap: float | None = None) -> np.ndarray:
+    def look_up_sensor_poses(
+        self, source: str, frame_id: str, at: np.ndarray, max_gap: float | None = None
+    ) -> np.ndarray:
         """Return the poses of a frame of the robot in a fixed frame.
 
         Args:
@@ -289,9 +291,9 @@ class Transforms:
             return self.tree.lookup_many(fixed_frame, frame_id, at, max_gap)
         if frame_id.lstrip("/") == self.odometry_frame != "":  # the sensor does not move in its own odometry frame
             return np.tile(np.eye(4), (len(at), 1, 1))
-        return self.odometry_poses(at, max_gap) @ self._find_child_poses(frame_id, at, max_gap)
+        return self.look_up_odometry_poses(at, max_gap) @ self._find_child_poses(frame_id, at, max_gap)
 
-    def odometry_poses(self, at: np.ndarray, max_gap: float | None = None) -> np.ndarray:
+    def look_up_odometry_poses(self, at: np.ndarray, max_gap: float | None = None) -> np.ndarray:
         """Return the (M, 4, 4) poses of the child frame of the odometry at times (M,) ns.
 
         Raises:
@@ -320,7 +322,7 @@ class Transforms:
             return self.tree.lookup_many(self.odometry_child, frame_id, at, max_gap)
         except MissingTransform as error:
             self.subscribe_to_tf()
-            pose = self._configured_pose() if self.odometry_child == self.base_frame else None
+            pose = self._make_configured_pose() if self.odometry_child == self.base_frame else None
             if pose is None:
                 raise MissingTransform(f"the odometry is for '{self.odometry_child}': {error}", error.late) from None
             return pose[None]
@@ -335,7 +337,7 @@ class Transforms:
             return error.late
         return True
 
-    def _configured_pose(self) -> np.ndarray | None:
+    def _make_configured_pose(self) -> np.ndarray | None:
         """Return the pose of the sensor above the ground from ground.sensor_pose, or None."""
         ground = getattr(self.node.params, "ground", None)
         pose = ground and ground.sensor_pose
@@ -371,7 +373,7 @@ class Transforms:
         def look_up_poses(at: np.ndarray) -> np.ndarray:
             # Set before the lookup: after a failure, the next cloud waits for the end of its sweep.
             self.sweep = float(at.max() - frame.stamp_ns) / SECOND_NS
-            return self.sensor_poses(self.node.node_params.input.deskew, frame.frame_id, at)
+            return self.look_up_sensor_poses(self.node.node_params.input.deskew, frame.frame_id, at)
 
         result = deskew_points(msg, frame, indices, look_up_poses)
         if result is None:

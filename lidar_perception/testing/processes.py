@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lidar_perception.nodes.graph import CLOUD_INPUT, Graph, Processes, build_graph, relative_name
+from lidar_perception.nodes.graph import CLOUD_INPUT, Graph, Processes, build_graph, make_relative
 from lidar_perception.param_fields import flatten
 from lidar_perception.testing.forking import ForkedNode
 from lidar_perception.wire.topics import POINTS
@@ -47,7 +47,7 @@ class NodesUnderTest(Processes):
         params: Any = None,
         *,
         single: bool = False,
-        points: str = relative_name(POINTS),
+        points: str = make_relative(POINTS),
         namespace: str = "",
     ) -> Graph:
         """Start the nodes of one or several detectors, as the launch files do.

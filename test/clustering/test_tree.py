@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 
 from benchmark.plain_euclidean import cluster_euclidean as plain_euclidean
 from lidar_perception.clustering import euclidean
-from lidar_perception.clustering.cells import mean_neighbourhood_size, sample_cells, sort_into_cells
+from lidar_perception.clustering.cells import compute_mean_neighbourhood_size, sample_cells, sort_into_cells
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
 from lidar_perception.clustering.euclidean import cluster_euclidean
 from lidar_perception.clustering.params import DbscanParams, EuclideanParams
@@ -190,17 +190,17 @@ def test_sampled_means_are_close_and_ignore_the_order(arrange):
     cells = sort_into_cells(xyz, 0.5)
     exact, sampled = np.empty(3000), np.empty(3000)
     radii2 = np.full(3000, 0.25)
-    exact[cells.order] = euclidean._mean_distances(cells, radii2)
-    sample = sample_cells(cells, int(mean_neighbourhood_size(cells) * 3000 / 4))
-    sampled[cells.order] = euclidean._mean_distances_to_sample(cells, sample, radii2)
+    exact[cells.order] = euclidean._compute_mean_distances(cells, radii2)
+    sample = sample_cells(cells, int(compute_mean_neighbourhood_size(cells) * 3000 / 4))
+    sampled[cells.order] = euclidean._estimate_mean_distances(cells, sample, radii2)
     dense = exact > 0
     error = np.abs(sampled[dense] / exact[dense] - 1)
     assert len(error) == 0 or np.median(error) < 0.05
     order = np.random.default_rng(1).permutation(3000)
     shuffled = sort_into_cells(xyz[order], 0.5)
-    sample = sample_cells(shuffled, int(mean_neighbourhood_size(shuffled) * 3000 / 4))
+    sample = sample_cells(shuffled, int(compute_mean_neighbourhood_size(shuffled) * 3000 / 4))
     other = np.empty(3000)
-    other[order[shuffled.order]] = euclidean._mean_distances_to_sample(shuffled, sample, radii2)
+    other[order[shuffled.order]] = euclidean._estimate_mean_distances(shuffled, sample, radii2)
     np.testing.assert_allclose(other, sampled, rtol=1e-9, atol=1e-12)
 
 

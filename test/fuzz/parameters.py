@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter
 from fuzz.case import FAILED, REFUSED, Case, Outcome, make_generator, pick
 from fuzz.mutation import FLOATS, INTEGERS, TEXTS
 from fuzz.nodes import BUG, FedNode, Nodes, draw_node
-from lidar_perception.nodes.rclpy_compat import parameter_names
+from lidar_perception.nodes.rclpy_compat import list_parameter_names
 
 NOT_OURS = ("qos_overrides.", "use_sim_time", "start_type_description_service")
 
@@ -28,7 +28,7 @@ class Attempt(Nodes):
     def __call__(self, case: Case) -> Outcome:
         name, seed, number = case.settings
         fed, rng = self.nodes[name], make_generator("values", seed, number)
-        names = [name for name in parameter_names(fed.node) if not name.startswith(NOT_OURS)]
+        names = [name for name in list_parameter_names(fed.node) if not name.startswith(NOT_OURS)]
         before = [fed.node.get_parameter(pick(rng, names)) for _ in range(pick(rng, (1, 1, 1, 2)))]
         changes = [Parameter(p.name, value=make_hostile_value(p.value, rng, find_limits(fed, p.name))) for p in before]
         shown = ", ".join(f"{p.name} = {str(p.value)[:40]!r}" for p in changes)

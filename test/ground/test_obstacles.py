@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidar_perception.ground.obstacles import CELL_M, find_obstacles, height_above_ground
+from lidar_perception.ground.obstacles import CELL_M, compute_height_above_ground, find_obstacles
 from lidar_perception.ground.params import ObstacleParams, SensorPoseParams
 from lidar_perception.ground.segment import level_points
 
@@ -34,7 +34,7 @@ def test_height_is_above_the_nearest_cell_with_ground(seed, count, reach):
     xyz, ground = make_cloud(rng, 50), make_cloud(rng, count)
     far = np.float32([reach, -reach, 0])
     for found, heights in zip(
-        height_above_ground(xyz + far, ground + far), plain_heights(xyz + far, ground + far), strict=True
+        compute_height_above_ground(xyz + far, ground + far), plain_heights(xyz + far, ground + far), strict=True
     ):
         assert np.abs(heights - found).min() <= 1e-9
 
@@ -46,7 +46,7 @@ def test_error_on_a_slope_is_at_most_the_rise_of_a_cell(seed, a, b):
     xy = rng.uniform(-5, 5, (4000, 2))
     ground = np.column_stack([xy, xy @ [a, b] - 1.73])
     high = rng.uniform(0, 3, len(xy))
-    found = height_above_ground(ground + np.column_stack([0 * xy, high]), ground)
+    found = compute_height_above_ground(ground + np.column_stack([0 * xy, high]), ground)
     assert np.abs(found - high).max() <= CELL_M * (abs(a) + abs(b)) + 1e-9
 
 
@@ -55,7 +55,7 @@ def test_obstacles_are_non_ground_points_within_the_band():
     xyz, ground = make_cloud(rng, 3000), rng.random(3000) < 0.4
     np.testing.assert_array_equal(find_obstacles(xyz, ground), ~ground)
     height = np.full(len(xyz), np.nan)
-    height[~ground] = height_above_ground(xyz[~ground], xyz[ground])
+    height[~ground] = compute_height_above_ground(xyz[~ground], xyz[ground])
     for low, high in ((0.2, 0), (0, 5), (0.2, 5)):
         found = find_obstacles(xyz, ground, ObstacleParams(low, high))
         expected = (height >= (low or -np.inf)) & (height <= (high or np.inf))

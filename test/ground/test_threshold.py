@@ -11,10 +11,10 @@ from sklearn.linear_model import LinearRegression, RANSACRegressor
 
 from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.ground.threshold import (
+    compute_height_above_plane,
     find_plane,
     fit_plane,
     fit_plane_by_ransac,
-    height_above_plane,
     segment_by_threshold,
 )
 
@@ -79,7 +79,7 @@ def test_the_plane_is_a_fixed_point_of_fitting(seed, a, b, offset):
     np.testing.assert_allclose(refitted[:2], plane[:2], rtol=0, atol=1e-9)
     origin = np.array([[offset, 0.0, 0.0]])
     np.testing.assert_allclose(
-        height_above_plane(origin, refitted), height_above_plane(origin, plane), rtol=0, atol=1e-9
+        compute_height_above_plane(origin, refitted), compute_height_above_plane(origin, plane), rtol=0, atol=1e-9
     )
 
 
@@ -116,7 +116,7 @@ def test_plane_of_a_real_cloud_equals_sklearn_ransac(scan):
     model.fit(low[sample, :2].astype(float), low[sample, 2].astype(float))
     plane = np.array([*model.estimator_.coef_, model.estimator_.intercept_])
     for _ in range(100):  # refine to the fixed point on all points, like the implementation
-        near = np.abs(height_above_plane(low, plane)) <= params.inlier_distance
+        near = np.abs(compute_height_above_plane(low, plane)) <= params.inlier_distance
         plane, before = fit_plane(low[near]), plane
         if np.array_equal(plane, before):
             break
@@ -203,7 +203,7 @@ def test_a_plane_steeper_than_max_slope_is_not_ground():
 def test_ground_continues_where_the_road_rises_above_max_height():
     # A slope of 12 degrees is 4 m high at 20 m; a threshold on z would end after 2 m.
     xyz = sloped_scene(2, [0.2, 0, -1.73], outliers=0.3)
-    on_plane = np.abs(height_above_plane(xyz, np.array([0.2, 0, -1.73]))) < 0.05
+    on_plane = np.abs(compute_height_above_plane(xyz, np.array([0.2, 0, -1.73]))) < 0.05
     ground = segment_by_threshold(xyz)
     assert ground[on_plane].mean() > 0.99 and ground[xyz[:, 0] > 10].sum() > 400
     assert ground.sum() < 1.1 * on_plane.sum()

@@ -250,7 +250,7 @@ def test_odometry_without_child_frame_is_ignored(start):
     )
     assert "child_frame_id is empty" in node.diagnostics.state[1]
     with pytest.raises(MissingTransform, match="child_frame_id"):
-        node.transforms.sensor_poses("odometry", "lidar", np.array([START]))
+        node.transforms.look_up_sensor_poses("odometry", "lidar", np.array([START]))
 
 
 def test_scan_poses_are_converted_to_detection_frame(start):

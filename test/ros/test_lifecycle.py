@@ -242,11 +242,11 @@ def test_failed_activation_is_reported_and_retried(here, peer, monkeypatch):
     with monkeypatch.context() as broken:
         broken.setattr(Reception, "open", refuse)
         node = here(GroundSegmentation, {}, {"~/input/points": "/in"})
-        assert (node.state_label(), node.diagnostics.state[0]) == ("inactive", ERROR)
+        assert (node.get_state_label(), node.diagnostics.state[0]) == ("inactive", ERROR)
         assert "not active: RuntimeError: no such policy" in node.diagnostics.state[1]
     monkeypatch.setattr("lidar_perception.nodes.autostart.MIN_RETRY_PERIOD_S", 0.0)
     node.autostart.retry_at = 0.0
-    peer.wait(lambda: node.inputs.is_open and node.state_label() == "active", "another attempt")
+    peer.wait(lambda: node.inputs.is_open and node.get_state_label() == "active", "another attempt")
     assert node.diagnostics.state[1] == WAITING
 
 

@@ -23,7 +23,7 @@ from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.inputs import StampMatcher
 from lidar_perception.nodes.interfaces import LATCHED
 from lidar_perception.nodes.perception import Perception
-from lidar_perception.nodes.rclpy_compat import parameter_names
+from lidar_perception.nodes.rclpy_compat import list_parameter_names
 from lidar_perception.param_fields import collect_fields, flatten
 from lidar_perception.testing.clouds import make_cloud_message
 from lidar_perception.wire.codec import make_bag_message
@@ -95,7 +95,7 @@ def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
 def test_every_parameter_is_readable_and_lists_may_be_empty(start, kind):
     """`ros2 param dump` reads all parameters; `ros2 param set` sends [] as a list of booleans."""
     node = start(kind)
-    declared = parameter_names(node)
+    declared = list_parameter_names(node)
     values = node.get_parameters(declared)
     assert not [p.name for p in values if p.value is None or p.type_ == Parameter.Type.NOT_SET]
     empty = [p for p in values if p.value == []]

@@ -164,7 +164,7 @@ def test_bag_with_wrong_metadata_is_played_with_a_warning(start, text_bag, tmp_p
 
 
 def test_topic_of_several_publishers_offers_best_qos():
-    from lidar_perception.nodes.replay.bag_player import _qos
+    from lidar_perception.nodes.replay.bag_player import _make_qos
 
     def profile(reliability, durability):
         return SimpleNamespace(
@@ -173,7 +173,7 @@ def test_topic_of_several_publishers_offers_best_qos():
 
     poor, good = profile("BEST_EFFORT", "VOLATILE"), profile("RELIABLE", "TRANSIENT_LOCAL")
     for profiles, best in (([poor], False), ([good], True), ([poor, good], True)):
-        made = _qos(profiles, 1, lossless=False)
+        made = _make_qos(profiles, 1, lossless=False)
         assert (made.reliability.name, made.durability.name) == (
             ("RELIABLE", "TRANSIENT_LOCAL") if best else ("BEST_EFFORT", "VOLATILE")
         )

@@ -248,7 +248,7 @@ def test_incompatible_publisher_is_reported_with_remedy(start, monkeypatch, valu
             )
             for kind in offered
         ]
-        monkeypatch.setattr(reception, "publishers", lambda there=there: there)
+        monkeypatch.setattr(reception, "list_publishers", lambda there=there: there)
         reception.adapt()
         asked = reception.subscription.qos_profile.reliability
         said = [text for kind, _, text in reception.problems() if kind == "incompatible"]
@@ -278,7 +278,7 @@ def test_source_of_losses_is_named_after_it_has_ended(start, monkeypatch):
         node_namespace="/", node_name="driver", qos_profile=SimpleNamespace(reliability=BEST_EFFORT)
     )
     for there in ([driver], []):
-        monkeypatch.setattr(reception, "publishers", lambda there=there: there)
+        monkeypatch.setattr(reception, "list_publishers", lambda there=there: there)
         reception.adapt()
         reception.arrivals.add(
             [{"publication_sequence_number": number, "source_timestamp": number} for number in (1, 3)], 0
@@ -341,7 +341,7 @@ class Late:
         handle = MagicMock()
         handle.take_message.return_value = None
         self.reception.subscription = MagicMock(handle=handle)
-        self.reception.publishers = lambda: []
+        self.reception.list_publishers = lambda: []
 
     def deliver(self, stamp, patient):
         known = self.now >= stamp + self.lag(stamp)

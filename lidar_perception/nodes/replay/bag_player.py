@@ -133,7 +133,9 @@ class BagPlayer(LidarNode):
         kind = self.kinds[topic]
         try:
             return self.outputs.advertise(
-                self.names[topic], kind, _qos(self.bag.qos(topic), self._count_latched(topic), lossless=self.follows)
+                self.names[topic],
+                kind,
+                _make_qos(self.bag.qos(topic), self._count_latched(topic), lossless=self.follows),
             ).publisher
         except (ModuleNotFoundError, AttributeError):
             self.get_logger().warning(f"{topic} is not played: {kind} is not installed on this machine")
@@ -323,18 +325,18 @@ class BagPlayer(LidarNode):
     def _pause(self, _: Any, response: Any) -> Any:
         self._advance()
         self.is_paused = True
-        return _answer(response, "paused")
+        return _fill_response(response, "paused")
 
     def _resume(self, _: Any, response: Any) -> Any:
         self._advance()
         self.is_paused = False
-        return _answer(response, "playing")
+        return _fill_response(response, "playing")
 
     def _step(self, _: Any, response: Any) -> Any:
         if not self.is_paused:
-            return _answer(response, "pause first", success=False)
+            return _fill_response(response, "pause first", success=False)
         self.steps += 1
-        return _answer(response, f"next message of {self.step_topic}")
+        return _fill_response(response, f"next message of {self.step_topic}")
 
     def _set_rate(self, request: Any, response: Any) -> Any:
         from rclpy.parameter import Parameter
@@ -348,12 +350,12 @@ class BagPlayer(LidarNode):
         self.bag.close()
 
 
-def _answer(response: Any, message: str, success: bool = True) -> Any:
+def _fill_response(response: Any, message: str, success: bool = True) -> Any:
     response.success, response.message = success, message
     return response
 
 
-def _qos(profiles: list, latched_count: int, lossless: bool) -> QoSProfile:
+def _make_qos(profiles: list, latched_count: int, lossless: bool) -> QoSProfile:
     """Return a profile that matches all subscribers that the recorded publishers matched.
 
     Args:

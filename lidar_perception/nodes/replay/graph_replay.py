@@ -24,7 +24,7 @@ from lidar_perception.nodes.graph import (
     find_result_cloud_topic,
     list_awaited_topics,
     list_result_topics,
-    relative_name,
+    make_relative,
     reserve_domain,
     runs_in_one_process,
 )
@@ -132,8 +132,8 @@ def replay(
         cloud_subscribers = 1 + (poses == "kiss_icp") + (POINTS in recorded_topics)
         rules = list_awaited_topics([detector], single, cloud_subscribers, 1 + scored)
         # The detections have four subscribers: monitor, recorder, tracker, evaluator.
-        rules += [f"{relative_name(stages[FINAL_STAGE])}:={3 + scored}"]
-        rules += [relative_name(ODOMETRY)] if poses == "recording" else []
+        rules += [f"{make_relative(stages[FINAL_STAGE])}:={3 + scored}"]
+        rules += [make_relative(ODOMETRY)] if poses == "recording" else []
         first, last = CpuTimes(), CpuTimes()  # CPU times at the first and the last result
         node_processes.start(
             "bag_player",
@@ -151,7 +151,7 @@ def replay(
             task = bar.add_task("replaying", total=clouds)
             previous_frames = -1
 
-            def finished() -> bool:
+            def is_finished() -> bool:
                 bar.update(task, completed=monitor.frames)
                 if monitor.frames > last.frames:
                     last.read(monitor.frames, node_processes)
@@ -161,16 +161,18 @@ def replay(
                     memory.update(node_processes.measure_memory_mb())
                 return monitor.frames >= clouds
 
-            while not finished() and (monitor.frames != previous_frames or not node_processes.has_ended("bag_player")):
+            while not is_finished() and (
+                monitor.frames != previous_frames or not node_processes.has_ended("bag_player")
+            ):
                 previous_frames = monitor.frames
-                monitor.spin_until(finished, SILENCE_TIMEOUT_S, lambda: node_processes.check("bag_player"))
+                monitor.spin_until(is_finished, SILENCE_TIMEOUT_S, lambda: node_processes.check("bag_player"))
 
         # Both timings lag behind the results by their own processing time.
-        def caught_up(node: str) -> bool:
+        def has_caught_up(node: str) -> bool:
             return int(monitor.get_value(node, "frames") or 0) >= monitor.frames
 
         for node in {"evaluator", TRACKER} & nodes.keys():
-            monitor.spin_until(partial(caught_up, node), SILENCE_TIMEOUT_S)
+            monitor.spin_until(partial(has_caught_up, node), SILENCE_TIMEOUT_S)
         stage_ms = {node: float(ms) for node in graph if (ms := monitor.get_value(node, "processing_ms_median"))}
         codes = node_processes.stop(timeout=30)
     if failed := {node: code for node, code in codes.items() if code}:
@@ -184,7 +186,7 @@ def replay(
         "latency_ms": {
             name: float(monitor.get_value("bag_player", f"latency_ms_{name}") or 0.0) for name in ("median", "p95")
         },
-        "cpu_ms_by_process": last.ms_per_frame(first),
+        "cpu_ms_by_process": last.compute_ms_per_frame(first),
         "stage_ms": stage_ms,
         "one_process": one_process,
         "slower": float(monitor.get_value("bag_player", "slower") or 1.0),
@@ -205,7 +207,7 @@ class CpuTimes:
         self.frames = frames
         self.seconds.update(processes.measure_cpu_seconds(), watch=process_time())
 
-    def ms_per_frame(self, earlier: CpuTimes) -> dict[str, float]:
+    def compute_ms_per_frame(self, earlier: CpuTimes) -> dict[str, float]:
         """Return {process: CPU time per result since an earlier reading, in ms}."""
         frames = max(self.frames - earlier.frames, 1)
         return {

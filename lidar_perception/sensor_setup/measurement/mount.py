@@ -9,7 +9,7 @@ import numpy as np
 
 from lidar_perception.data.mount_check import MAX_TILT_DEG
 from lidar_perception.ground.params import ThresholdParams
-from lidar_perception.ground.threshold import fit_plane, fit_plane_by_ransac, height_above_plane
+from lidar_perception.ground.threshold import compute_height_above_plane, fit_plane, fit_plane_by_ransac
 from lidar_perception.robot.placement import make_tilted_pose
 from lidar_perception.sensor_setup.measurement.scans import Scan
 
@@ -111,20 +111,20 @@ def find_ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:
     if plane is None or (plane[2] > -MIN_HEIGHT_M if below else plane[2] < MIN_HEIGHT_M):
         return None
     # Only the ground near the sensor is used, because roads slope towards their curbs.
-    is_ground = is_candidate & (np.abs(height_above_plane(xyz, plane)) <= TILTED_GROUND.inlier_distance)
+    is_ground = is_candidate & (np.abs(compute_height_above_plane(xyz, plane)) <= TILTED_GROUND.inlier_distance)
     if is_ground.sum() < MIN_POINTS:
         return None
     radius = np.clip(RADIUS_RATIO * np.percentile(distance[is_ground], 2), MIN_RADIUS_M, MAX_RADIUS_M)
     is_near = is_candidate & (distance < radius)
     for _ in range(10):
-        is_inlier = is_near & (np.abs(height_above_plane(xyz, plane)) <= INLIER_DISTANCE_M)
+        is_inlier = is_near & (np.abs(compute_height_above_plane(xyz, plane)) <= INLIER_DISTANCE_M)
         fitted = _fit_cell_means(xyz[is_inlier])
         if fitted is None:
             return None
         change, plane = np.abs(fitted - plane).max(), fitted
         if change < 1e-5:
             break
-    height = height_above_plane(xyz, plane) if below else -height_above_plane(xyz, plane)
+    height = compute_height_above_plane(xyz, plane) if below else -compute_height_above_plane(xyz, plane)
     is_inlier = is_near & (np.abs(height) <= INLIER_DISTANCE_M)
     count = is_inlier.sum()
     if (
