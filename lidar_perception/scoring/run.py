@@ -226,5 +226,6 @@ def _measure_on_dask(
                     futures.add(client.submit(measure_on_worker, number, pure=False))
         except (distributed.KilledWorker, CommClosedError, CancelledError) as error:
             raise InputError(
-                f"the Dask cluster at {address} failed: {error}; finished frames are kept, and the same command resumes"
+                f"the Dask cluster at {address} failed: {error}; finished frames are kept, run the "
+                "same command again to resume"
             ) from None

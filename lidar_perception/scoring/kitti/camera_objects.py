@@ -90,8 +90,8 @@ def to_camera_objects(objects: GroundTruth, calibration: Calibration | None) -> 
     not_finite[: len(objects)] |= ~np.isfinite(objects.boxes).all(axis=1)
     if not_finite.any():
         raise InputError(
-            f"box {np.argmax(not_finite) + 1} of {len(not_finite)} or its score is not finite; "
-            "a detector must not return such boxes"
+            f"box {np.argmax(not_finite) + 1} of {len(not_finite)} has a value or score that is not finite; "
+            "fix the detector or the result file"
         )
     if calibration is None:
         return _make_without_camera(objects, scores[: len(objects)])

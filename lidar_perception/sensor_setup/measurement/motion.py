@@ -189,7 +189,7 @@ def estimate_heading(shifts: Shifts, base: Shifts) -> Heading:
         problem = "the surroundings have too few distinct features to measure the robot's motion"
         return Heading(np.nan, np.nan, np.nan, problem)
     if not long_shifts:
-        problem = f"the robot moved only {distance:.1f} m between the clouds that were compared"
+        problem = f"the robot moved only {distance:.1f} m between the compared clouds"
         return Heading(np.nan, np.nan, distance, problem)
     relative_to_base = {
         pair: long_shifts[pair] / complex(*step)
