@@ -76,7 +76,7 @@ def run_busy_processes(count: int) -> Iterator[None]:
 
 def print_graph(content: dict[str, dict]) -> None:
     table = Table(title="Nodes over DDS at 10 Hz")
-    for name in ("graph", "clouds", "lost", "speed", "median ms", "95 % under ms", "CPU ms", "memory MB", "load"):
+    for name in ("graph", "clouds", "lost", "speed", "median ms", "95th pct. ms", "CPU ms", "memory MB", "load"):
         table.add_column(name, justify="left" if name == "graph" else "right")
     for name, run in content.items():
         table.add_row(

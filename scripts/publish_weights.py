@@ -41,13 +41,13 @@ from lidar_perception.scoring.run import fill_report
 from lidar_perception.training.record import round_metrics, select_metrics
 
 ROWS = (("bev_relaxed", "BEV"), ("bev", "BEV"), ("3d_relaxed", "3D"), ("3d", "3D"))
-EARLY_SENSOR = {"name": "hdl64e", "beams": 64, "height": 1.73}  # of weights whose header has no such entry
+EARLY_SENSOR = {"name": "hdl64e", "beams": 64, "height": 1.73}  # sensor of weights whose header names none
 SAMPLES = 200  # bootstrap samples of the intervals
 SENSOR_FAILURES = [
     "Other sensors: many people are missed if the beams are sparser than in training.",
     "Clouds without intensity: fewer people are found.",
 ]
-FAILURES = {  # by the name of the network
+FAILURES = {  # network -> known failures
     "pointpillars": [
         *SENSOR_FAILURES,
         "False people: thin objects beyond 36 m, round signs on posts, posts with reflectors.",

@@ -40,7 +40,7 @@ NO_SETTINGS: Settings = {}
 
 
 @dataclass(frozen=True)
-class Missing:
+class MissingDetector:
     """A detector without weights, and the reason."""
 
     name: str
@@ -72,7 +72,7 @@ def open_contenders(
     sensor_height: float = SENSOR_HEIGHT,
     range: str = "auto",
     settings: Settings = NO_SETTINGS,
-) -> tuple[list[Contender], list[Missing]]:
+) -> tuple[list[Contender], list[MissingDetector]]:
     """Open every detector of the package that has weights.
 
     Args:
@@ -110,11 +110,11 @@ def open_contenders(
         opened_detectors.append(OpenedDetector(name, detector, path))
     contenders = [detector.to_contender() for detector in opened_detectors]
     opened_names = [detector.name for detector in opened_detectors]
-    missing = [Missing(name, reason) for name, reason in missing_reasons.items() if name not in opened_names]
+    missing = [MissingDetector(name, reason) for name, reason in missing_reasons.items() if name not in opened_names]
     try:
         contenders.append(make_contender(FUSED, open_one(FUSED), "those of PointPillars and PointNet"))
     except InputError as error:
-        missing.append(Missing(FUSED, str(error)))
+        missing.append(MissingDetector(FUSED, str(error)))
     paper, best = (
         with_values(set_sensor_height(params, sensor_height), settings.get(CANDIDATES, {})) for params in (PAPER, BEST)
     )

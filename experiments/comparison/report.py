@@ -103,14 +103,14 @@ def _print_pedestrians(content: dict, console: Console) -> None:
         width=4,
     )
     for name, row in content["rows"].items():
-        default, best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
+        at_default, at_best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
         table.add_row(
             name,
-            f"{default['score']:.2f}",
-            *format_counts(default, "tp", "fp", "fn"),
-            *format_percent(default, "precision", "recall", "f1"),
-            *format_percent(best, "f1"),
-            format_number(best["score"]),
+            f"{at_default['score']:.2f}",
+            *format_counts(at_default, "tp", "fp", "fn"),
+            *format_percent(at_default, "precision", "recall", "f1"),
+            *format_percent(at_best, "f1"),
+            format_number(at_best["score"]),
             format_number(row["ms"]),
             str(row["frames"]),
             str(len(row["failed"])),

@@ -104,11 +104,11 @@ def reproduce(
     EXPERIMENT is one of:
       stm-cpa                  every table of the STM-CPA paper (default)
       stm-cpa-configurations   configurations `paper` and `best`, with and without a labelled seed
-      eg-pointpillars          the versions of EG-PointPillars, trained first
+      eg-pointpillars          the versions of EG-PointPillars after their training
       eg-pointpillars-shipped  the versions with the shipped weights, without training
       clusters                 every table of adaptive clustering and improved PointNet
-      clusters-segmentation    its tables without a network
-      clusters-shipped         its detection tables with the shipped weights
+      clusters-segmentation    the tables of clusters that need no network
+      clusters-shipped         the detection tables of clusters with the shipped weights
 
     FOLDER gets report.html, report.md, report.json, the tables as CSV and the figures as PNG, and
     frames.jsonl with the record of every frame. Trained networks are in models/. Workers of --dask

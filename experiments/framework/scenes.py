@@ -61,7 +61,7 @@ class ExperimentScenes:
         """
         if data == SIM:
             if test is not None:
-                raise InputError("--split is for recordings; simulated scenes have no names")
+                raise InputError("--split is for recordings; simulated scenes have no frame names to list")
             return ExperimentScenes(SIM)
         path = Path(data)
         frames = open_labelled_frames(path)

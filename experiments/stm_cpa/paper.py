@@ -30,7 +30,7 @@ TABLE_4: dict[str, dict[str, Scores]] = {
     "60+": {"stage1": (0.0, 0.0, 0.0, None, None)},
 }
 
-# Table 5: CPA at 15 to 60 m with 0 to 8 steps, with the same columns.
+# Table 5: CPA at 15 to 60 m with 0 to 8 steps, in the columns of PAPER_TABLE_6.
 TABLE_5 = (
     (44.7, 60.5, 51.4, 80.6, 0.14),
     (46.4, 56.6, 51.0, 83.1, 0.14),

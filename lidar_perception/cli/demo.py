@@ -283,8 +283,8 @@ def _print_pace(content: dict, rate: float, clouds: int) -> None:
         pace_text = f"{speed:.2g}x real time: {slowest} needs {stages[slowest]:.0f} ms per cloud on this machine"
     console.print(f"{clouds} clouds replayed at {pace_text}")
     console.print(
-        f"{content['results']} results; latency cloud to tracks median "
-        f"{latency['median']:.0f} ms, 95 % under {latency['p95']:.0f} ms; memory of the "
+        f"{content['results']} results; latency from cloud to tracks: median "
+        f"{latency['median']:.0f} ms, 95th percentile {latency['p95']:.0f} ms; memory of the "
         f"graph {content['memory_mb']:.0f} MB"
     )
     console.print(

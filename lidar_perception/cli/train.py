@@ -239,7 +239,7 @@ def print_fusion_fits(kind: str, fits: Any) -> None:
 def print_result(progress: Any, steps: int, batches: Any, out: Path) -> None:
     """Print the result of a run. If it was stopped, exit with code 130."""
     if batches.skipped:
-        console.print(f"{len(batches.skipped)} scenes were skipped, such as: {next(iter(batches.skipped))}")
+        console.print(f"{len(batches.skipped)} scenes were skipped; first reason: {next(iter(batches.skipped))}")
     if progress.skipped:
         console.print(f"{progress.skipped} of {progress.step} steps were skipped because of non-finite values")
     if progress.best is not None:

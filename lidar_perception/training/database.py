@@ -35,7 +35,7 @@ class Database:
         boxes: (K, 7) float64.
         class_ids: (K,) int32, BACKGROUND_ID for background.
         points: (P, 4) float32; object i has points[first[i]:first[i + 1]].
-        first: (K + 1,) int64.
+        first: (K + 1,) int64, where each object starts in points.
     """
 
     boxes: np.ndarray

@@ -40,7 +40,7 @@ def test_broken_scenes_are_skipped_reported_and_counted(tmp_path, capsys):
     assert "000001.txt:1" in reasons[0] and "000003.bin" in reasons[1]
     assert capsys.readouterr().err.replace("\n", "").count("skipped:") == 2  # each one is printed once
     broken = Stream((RecordedScenes(root, ("000001", "000003")),), prepare_all)
-    with pytest.raises(InputError, match="none of the 2 scenes"):
+    with pytest.raises(InputError, match="no usable scene among 2"):
         broken[0]
 
 

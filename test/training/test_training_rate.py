@@ -103,7 +103,7 @@ def run_timed(seconds, validation: float, folder: Path, monkeypatch, **others) -
         return validate(module)
 
     toy.validate = validate_slowly
-    return toy, train(toy.task(), PLANNED, folder, validation=validation, **others)
+    return toy, train(toy.task(), PLANNED, folder, validation_s=validation, **others)
 
 
 @pytest.fixture(scope="module")
