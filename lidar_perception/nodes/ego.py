@@ -203,7 +203,7 @@ class EgoInput:
         return poses[0]
 
     def _try_next_source(self, stamp: int, has_pose: bool) -> None:
-        """With ego.source auto, subscribe to TF without odometry, and start KISS-ICP without both."""
+        """Fall back to TF if there is no odometry, and to KISS-ICP if there is no pose in TF either."""
         if self.source in ("odometry", "tf") or has_pose:
             self.without_ns = None
             return

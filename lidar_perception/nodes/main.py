@@ -172,7 +172,7 @@ def _run_nodes(
             node.stop.set_result(None)
 
     try:
-        stop.on_signal = lambda: None  # from now on DDS must shut down after a signal, see stop.requested
+        stop.on_signal = lambda: None  # DDS is starting and must be shut down after a signal, see stop.requested
         rclpy.init(args=process_arguments, signal_handler_options=SignalHandlerOptions.NO)
         for node_class, arguments, options in node_specs:
             log = get_logger(_find_logger_name(arguments))

@@ -18,7 +18,7 @@ def add_transforms(tree: TransformTree, msg: Any, static: bool) -> None:
     """Add the valid transforms of a tf2_msgs/TFMessage.
 
     Raises:
-        InputError: A transform is invalid; the valid ones are added nevertheless.
+        InputError: A transform is invalid; all valid ones are added.
     """
     problem = None
     for stamped in msg.transforms:
@@ -39,7 +39,7 @@ def add_transforms(tree: TransformTree, msg: Any, static: bool) -> None:
 
 
 def add_odometry(tree: TransformTree, msg: Any) -> None:
-    """Add a nav_msgs/Odometry to a separate tree, as the pose of MOVING in FIXED.
+    """Add the pose of a nav_msgs/Odometry to a tree of its own, as the pose of MOVING in FIXED.
 
     Raises:
         InputError: The pose is invalid.

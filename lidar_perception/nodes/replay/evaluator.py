@@ -34,7 +34,7 @@ WRITE_PERIOD_S = 5.0
 MAX_INCOMPLETE_FRAMES = 100
 MAX_DONE_STAMPS = 100_000  # enough for 2.8 hours at 10 Hz; uses 10 MB
 MAX_AP_FRAMES = 10_000  # maximum number of frames stored for the average precision
-LOSSLESS_QOS = QoSProfile(depth=1000)  # for small messages that must not be lost
+LOSSLESS_QOS = QoSProfile(depth=1000)  # QoS of small messages that must not be lost
 TRUTH = "ground_truth"
 
 
